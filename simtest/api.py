@@ -148,12 +148,15 @@ def sample_views(
     variant: str | None = None,
     progress: "Progress | None" = None,
     along: tuple[float, float] | None = None,
+    fps: float | None = None,
+    labels: bool = False,
 ) -> "SampledViews":
     """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path.
 
     At most ten viewpoints are tried for each view wanted: 0, 1, 2, ..., or, where ``surface.view`` is not auto, evenly
     spread over the camera path. The folder gets views.json, with the poses and what was left out, a picture of each
-    view, sheet.png, which shows all of them, and film.avi of a sequence.
+    view, sheet.png, which shows all of them, the poses in the files of other programs (transforms.json, colmap/), and
+    film.avi and trajectory.txt of a sequence.
 
     Parameters
     ----------
@@ -167,6 +170,11 @@ def sample_views(
         Called with views found, views wanted, and what was tried.
     along : tuple of float, optional
         First and last share of the camera path: a sequence of views evenly spaced between them, none left out.
+    fps : float, optional
+        Frames a second of the sequence, 0.1 to 1000; default 25.
+    labels : bool
+        Whether to write the sequence's optical flow (flow_NNNN.npz), covisibility.npy, and tracks.json, the true
+        highlights with their identities.
 
     Returns
     -------
@@ -175,24 +183,22 @@ def sample_views(
     Raises
     ------
     InputError
-        If the scene is malformed or no anatomy's, or `count` is out of range.
+        If the scene is malformed or no anatomy's, `count` or `fps` is out of range, or `fps` or `labels` is given
+        without `along`.
     BackendError
         If the rendering backend cannot be used.
     """
-    from simtest.runtime.files import write_json
     from simtest.runtime.locks import exclusive_folder
-    from simtest.simulation.view_files import ViewWriter
-    from simtest.simulation.viewpoints import along_path, candidates, sample_views, viewpoint_key
+    from simtest.simulation.view_folder import sample_into
+    from simtest.simulation.viewpoints import along_path, candidates
 
     check_count("views", count, "count")
     described = _scene(scene, settings, {})
     viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
+    if along is None and (fps is not None or labels):
+        raise InputError(f"{'labels' if labels else 'fps'}: needs along, a sequence of views")
     with exclusive_folder(Path(out)):
-        writer = ViewWriter(Path(out), film=along is not None)
-        sampled = sample_views(described, count, viewpoints, variant, progress, writer.add, along is not None)
-        writer.close()
-        write_json(Path(out) / "views.json", sampled.to_json(viewpoint_key(described)))
-    return sampled
+        return sample_into(Path(out), described, count, viewpoints, variant, progress, along is not None, fps, labels)
 
 
 def validate(

@@ -18,13 +18,18 @@ def views(
     along: Annotated[
         str | None, Parameter(help="First,last share of the camera path: a sequence of views in order, none left out.")
     ] = None,
+    fps: Annotated[float | None, Parameter(help="Frames a second of the sequence; default 25.")] = None,
+    labels: Annotated[
+        bool,
+        Parameter(help="Write the sequence's optical flow, co-visibility and highlights with identities.", negative=""),
+    ] = False,
     settings: Settings = None,
     variant: Variant = None,
     as_json: AsJson = False,
 ) -> None:
     """Pick viewpoints of an anatomy that show isolated highlights: views.json, a picture of each, a sheet of all.
 
-    With --along, a film along the camera path instead.
+    With --along, a film along the camera path instead. The poses are written for other programs, too.
     """
     from simtest import api
     from simtest.cli.printing import print_files
@@ -33,7 +38,7 @@ def views(
 
     ends = None if along is None else _ends(along)
     with progress_bar("sampling views") as move:
-        sampled = api.sample_views(scene, out, count, parse_settings(settings or []), variant, move, ends)
+        sampled = api.sample_views(scene, out, count, parse_settings(settings or []), variant, move, ends, fps, labels)
     with_one = sum(view.isolated_highlights > 0 for view in sampled.views)
     if as_json:
         told = {"tried": sampled.tried, "kept": len(sampled.views), "with_isolated_highlight": with_one}
@@ -42,6 +47,8 @@ def views(
     print(f"{with_one} of {sampled.tried} views show an isolated highlight")
     for reason, number in sampled.rejected.items():
         print(f"left out: {number} ({reason})")
+    for reason in sampled.poses_left_out:
+        print(f"not written: {reason}")
     print(out / "views.json")
 
 

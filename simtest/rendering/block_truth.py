@@ -43,6 +43,19 @@ def solve(mi: Any, surface: SurfaceModel, origins: Array, directions: Array, hit
     return SurfacePoints(**{**whole, **shared})  # type: ignore[arg-type]
 
 
+def distances(mi: Any, surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> Array:
+    """Compute the exact distances of many rays, shape (N,), mm, as `solve` does, without normals and curvatures."""
+    kernel = None if surface.chart is None else TubeKernel(mi, surface.chart)
+    block = BLOCK if kernel is None else tube_kernel.BLOCK
+    solver = surface.distances if kernel is None else kernel.distances
+    whole = np.empty(len(directions))
+    for start in range(0, len(directions), block):
+        some = slice(start, start + block)
+        part = RayHits(hits.distance[some], hits.face[some], hits.barycentric[some])
+        whole[some] = solver(origins[some], directions[some], part)
+    return whole
+
+
 def _of_numpy(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> dict[str, Array]:
     """Return the fields of a block's points; without a relief the base has none of its own."""
     points = exact.solve(surface, origins, directions, hits)

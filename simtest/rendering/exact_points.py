@@ -9,7 +9,7 @@ from simtest.rendering.frames import TruthMaps
 from simtest.rendering.hits import make_hit
 from simtest.rendering.kernel_arrays import to_kernel, vectors_from_kernel, vectors_to_kernel
 from simtest.rendering.relief_kernel import ReliefKernel
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, Mask
 from simtest.surfaces import RayHits, Shape, SurfaceModel, SurfacePoints
 
 _OF_POINTS = (
@@ -78,6 +78,15 @@ def trace_starts(mi: Any, scene: Any, origins: Array, directions: Array) -> RayH
         np.array(preliminary.prim_index),
         vectors_from_kernel(preliminary.prim_uv, np.float32),
     )
+
+
+def trace_blocked(mi: Any, scene: Any, origins: Array, directions: Array, reach: Array) -> Mask:
+    """Return which rays, shape (N, 3), model frame, mm, meet the rendered shape before `reach`, shape (N,), mm."""
+    if not len(origins):
+        return np.empty(0, dtype=bool)
+    ray, asked = _rays(mi, origins, directions)
+    ray.maxt = to_kernel(mi.Float, np.nan_to_num(reach), np.float32)
+    return np.array(scene.ray_test(ray, False, asked & (ray.maxt > 0)))
 
 
 def _rays(mi: Any, origins: Array, directions: Array) -> tuple[Any, Any]:

@@ -107,6 +107,20 @@ class TubeKernel:
         if not len(origins):
             # Dr.Jit ends the process on a kernel without rays.
             return {name: np.empty((0, *shape), dtype=kind) for name, (shape, kind) in _FIELDS.items()}
+        origin, direction, *solved = self._solved(origins, directions, hits)
+        return self._described(origin, direction, *solved, model_from_camera)
+
+    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Compute the distances of `solve` alone, shape (N,), mm; NaN where a ray has no point."""
+        if not len(origins):
+            return np.empty(0)
+        import drjit as dr
+
+        t, _, _, found = self._solved(origins, directions, hits)[2:]
+        return np.array(dr.select(found & dr.isfinite(t), t, dr.nan))
+
+    def _solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Any, ...]:
+        """Return rays as lanes of a kernel, and their solutions: distance, u, v and which are found."""
         import drjit as dr
 
         mi = self.mi
@@ -123,7 +137,7 @@ class TubeKernel:
         u, v = (sum((s * c[i] for s, c in zip(shares, corners, strict=True)), mi.Float64(0)) for i in range(2))
         t, u, v, found = self._newton(origin, direction, start, u, v, valid)
         found &= (u >= -END_MM) & (u <= self._n["length"] + END_MM)
-        return self._described(origin, direction, t, u, v, found, model_from_camera)
+        return origin, direction, t, u, v, found
 
     def _newton(self, origin: Any, direction: Any, start: Any, u: Any, v: Any, valid: Any) -> tuple[Any, ...]:
         """Solve P(u, v) = origin + t direction (see `Tube.solve`); return t, u, v and which are found."""

@@ -15,6 +15,7 @@ from simtest.simulation.rendered_view import RenderedView
 from simtest.simulation.viewpoints import WrittenView
 
 FRAMES_PER_SECOND = 25.0
+"""Of a sequence whose frame rate is not given."""
 SHEET_WIDTH = 1600
 SHEET_COLUMNS = 10
 
@@ -26,15 +27,14 @@ class ViewWriter:
     ----------
     folder : Path
         An existing folder; pictures of an earlier call are removed.
-    film : bool
-        Write film.avi too.
+    fps : float, optional
+        Frames a second of film.avi; default no film.
     """
 
-    def __init__(self, folder: Path, film: bool) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, fps: float | None = None) -> None:
+        self._folder, self._fps = folder, fps
         self._thumbnails: list[Picture] = []
         self._film: cv2.VideoWriter | None = None
-        self._film_wanted = film
         for old in (*folder.glob("view_*.png"), folder / "sheet.png", folder / "film.avi"):
             old.unlink(missing_ok=True)
 
@@ -52,19 +52,19 @@ class ViewWriter:
         # Film and sheet show sRGB, whatever the sensor's response.
         shown = to_uint8(sensor.response.model().decode(frame).astype(np.float32))
         shown = np.ascontiguousarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR) if shown.ndim == 2 else shown[:, :, ::-1])
-        if self._film_wanted:
-            self._write(shown)
+        if self._fps is not None:
+            self._write(shown, self._fps)
         # Thumbnails for the sheet.
         width = SHEET_WIDTH // SHEET_COLUMNS
         small = cv2.resize(shown, (width, round(width * shown.shape[0] / shown.shape[1])), interpolation=cv2.INTER_AREA)
         self._thumbnails.append(np.asarray(small, dtype=np.uint8))
         return WrittenView(name, seed)
 
-    def _write(self, picture: Picture) -> None:
+    def _write(self, picture: Picture, fps: float) -> None:
         if self._film is None:
             # Motion JPEG is the codec that OpenCV writes everywhere.
             file, codec = str(self._folder / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG")
-            self._film = cv2.VideoWriter(file, codec, FRAMES_PER_SECOND, (picture.shape[1], picture.shape[0]))
+            self._film = cv2.VideoWriter(file, codec, fps, (picture.shape[1], picture.shape[0]))
             if not self._film.isOpened():
                 raise InputError(f"{file}: no film can be written here (OpenCV has no Motion JPEG)")
         self._film.write(picture)

@@ -45,20 +45,32 @@ class SampledView:
         Pose, mm.
     written : WrittenView, optional
         Its picture.
+    time_s : float, optional
+        When it is seen, s; None where the views are no sequence.
     """
 
     viewpoint: int | float
     isolated_highlights: int
     model_from_camera: Array
     written: WrittenView | None
+    time_s: float | None = None
+
+    @property
+    def world_from_camera(self) -> Array:
+        """Pose, shape (4, 4), mm: the world is the surface's own frame."""
+        return self.model_from_camera
 
     def to_json(self, key: str) -> dict[str, Json]:
         """Return the entry of views.json; `key` is the viewpoint's key path."""
         entry: dict[str, Json] = {
             key: self.viewpoint,
             "isolated_highlights": self.isolated_highlights,
+            "world_from_camera": self.model_from_camera.tolist(),
+            # The older name of the same pose.
             "model_from_camera": self.model_from_camera.tolist(),
         }
+        if self.time_s is not None:
+            entry["time_s"] = self.time_s
         if self.written is not None:
             entry |= {"picture": self.written.picture, "sensor.seed": self.written.seed}
         return entry
@@ -75,10 +87,13 @@ class SampledViews:
     rejected : dict
         Number of viewpoints left out by reason: `NO_HIGHLIGHT`, or why the highlight of the view that stands out most
         is not isolated (theory.md section 6).
+    poses_left_out : tuple of str
+        Why the poses were not written in a format: it lacks the camera's lens.
     """
 
     views: list[SampledView]
     rejected: dict[str, int]
+    poses_left_out: tuple[str, ...] = ()
 
     @property
     def tried(self) -> int:
@@ -97,7 +112,8 @@ def sample_views(
     variant: str | None = None,
     progress: Progress | None = None,
     write: Callable[[RenderedView], WrittenView] | None = None,
-    keep_all: bool = False,
+    fps: float | None = None,
+    label: Callable[[Session, RenderedView], None] | None = None,
 ) -> SampledViews:
     """Try viewpoints one after the other until `count` of them show an isolated highlight, or none is left.
 
@@ -115,8 +131,10 @@ def sample_views(
         See `Progress`.
     write : callable, optional
         Writes the picture of a view that is kept.
-    keep_all : bool
-        Keep every view, whatever it shows: a sequence.
+    fps : float, optional
+        Frames a second of a sequence: every view is kept, whatever it shows.
+    label : callable, optional
+        Called with the session at the scene of a view that is kept, and the view: it labels the sequence.
 
     Raises
     ------
@@ -130,14 +148,18 @@ def sample_views(
     rejected: Counter[str] = Counter()
     for viewpoint in viewpoints:
         # Render.
-        moved = scene.model_copy(update={"surface": scene.surface.model_copy(update={name: viewpoint})})
+        time_s = scene.time_s + (0.0 if fps is None else len(kept) / fps)
+        surface = scene.surface.model_copy(update={name: viewpoint})
+        moved = scene.model_copy(update={"surface": surface, "time_s": time_s if scene.deformation else scene.time_s})
         session = session or Session(moved, variant)
         view = render_view(session, moved)
         # Keep, or count the reason.
         isolated = sum(highlight.isolated for highlight in view.highlights)
-        if isolated or keep_all:
-            pose = session.surface.model_from_camera
-            kept.append(SampledView(viewpoint, isolated, pose, write(view) if write else None))
+        if isolated or fps is not None:
+            pose, time = session.surface.model_from_camera, None if fps is None else time_s
+            kept.append(SampledView(viewpoint, isolated, pose, write(view) if write else None, time))
+            if label is not None:
+                label(session, view)
         else:
             rejected[_reason(view)] += 1
         if progress:

@@ -44,6 +44,10 @@ class BuiltMesh(ABC):
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
         """Return distance, normal and S of the surface on rays that hit the mesh; NaN if there is no solution."""
 
+    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return the distances of `at_hits` alone."""
+        return self.at_hits(origins, directions, hits)[0]
+
 
 class MeshedSurface(SurfaceModel):
     """A surface that is rendered as a mesh."""
@@ -61,6 +65,14 @@ class MeshedSurface(SurfaceModel):
     def clearance(self, points: Array) -> Array:
         """Return the signed distance to the surface (see `SurfaceModel.clearance`)."""
         return self._build.clearance(points)
+
+    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return how far along rays the surface lies (see `SurfaceModel.distances`)."""
+        hit = np.flatnonzero(np.isfinite(hits.distance))
+        found = RayHits(hits.distance[hit], hits.face[hit], hits.barycentric[hit])
+        distance = np.full(len(origins), np.nan)
+        distance[hit] = self._build.distances(origins[hit], directions[hit], found)
+        return distance
 
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Return the points where rays meet the surface (see `SurfaceModel.points`)."""

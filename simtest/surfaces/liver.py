@@ -235,6 +235,10 @@ class BuiltLiver(BuiltMesh):
         normals[good], operators[good] = implicit_shape_operator(at.gradient, at.hessian)
         return distance, normals, operators
 
+    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return the distances of `at_hits` alone (see `BuiltMesh.distances`)."""
+        return self.body.solve(origins, directions, hits.distance)
+
 
 @lru_cache(maxsize=4)
 def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:

@@ -99,6 +99,10 @@ class PreparedMesh(BuiltMesh):
         projector = np.eye(3) - normal[:, :, None] * normal[:, None, :]
         return hits.distance, normal, projector @ operator @ projector
 
+    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return the distances of the hits on the triangles, in double precision (see `BuiltMesh.distances`)."""
+        return on_triangles(origins, directions, hits, self.mesh).distance
+
     def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
         """Return how points and normals move within the hit triangles (see `SurfaceModel.motion`)."""
         faces = self.mesh.faces[hits.face]
@@ -247,6 +251,8 @@ class MeshSurface(MeshedSurface):
     Raises `InputError` if the file is missing or malformed, no camera can be placed, or the relief has waves as long as
     the mesh's own.
     """
+
+    faceted = True
 
     def __init__(self, spec: AnatomySurface) -> None:
         how = Refinement(spec.subdivisions, spec.edge_mm, spec.smoothing_mm)

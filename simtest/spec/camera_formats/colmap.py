@@ -149,6 +149,7 @@ def images_text(poses: Poses) -> str:
         "# Image list with two lines of data per image:",
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
         "#   POINTS2D[] as (X, Y, POINT3D_ID)",
+        "# unit: mm",
     ]
     for index, (name, world_from_camera) in enumerate(poses, 1):
         if not name or name.split() != [name]:

@@ -157,6 +157,9 @@ def transforms_text(camera: Camera, poses: Poses | None = None) -> str:
     }  # fmt: skip
     if camera.view_mask is not None:
         data["view_mask"] = mask_table(camera.view_mask)
+    if poses is not None:
+        # Others pass over it; `simtest reconstruct --poses` needs it.
+        data["unit"] = "mm"
     data["frames"] = [
         {"file_path": frame, "transform_matrix": (np.asarray(pose, dtype=float) @ GL_FROM_CV).tolist()}
         for frame, pose in poses or ()

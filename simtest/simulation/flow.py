@@ -1,0 +1,195 @@
+"""Optical flow between two frames of a sequence, and which surface points both of them see.
+
+The flow at a pixel's centre is exact: the surface point on its ray, moved to the other frame's moment, and projected by
+the other frame's camera. It needs no search for matches, so it is true where a highlight slides over the surface, too.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.geometry import Camera
+from simtest.rendering import Session
+from simtest.runtime.arrays import Array, Mask
+
+NONE, SEEN, OUT, HIDDEN, INSTRUMENT = range(5)
+"""State of a pixel: its ray meets no surface; the other frame sees its point too; the point lies outside the other
+frame's view; something hides it from the other frame; an instrument is seen here."""
+
+STATES = ("no surface", "seen in both", "out of view", "hidden", "instrument")
+"""The states' names, by their numbers."""
+
+SLACK = 1e-3
+"""What stands before a point by less than this share of its distance does not hide it: the rendered mesh differs from
+the smooth surface."""
+
+NEAR = 0.05
+"""Within this share of the distance the mesh may seem to hide a point at a grazing ray: the exact surface decides."""
+
+EXACT = 1e-9
+"""The same share for points at the edges of what both frames see, where the exact surface decides."""
+
+JUMP = 0.02
+"""Where the distances of neighbours differ by more than this share there is an edge."""
+
+_NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
+
+Moved = Callable[[Array], Array]
+"""Maps points of the world, shape (N, 3), mm, at one frame's moment to where the same material is at the other's."""
+
+
+@dataclass(frozen=True)
+class SeenSurface:
+    """What a frame sees of the surface.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its camera.
+    world_from_camera : ndarray, shape (4, 4)
+        The camera's pose, mm.
+    position : ndarray, shape (H, W, 3)
+        Surface point at each pixel's centre, world frame, mm; NaN where there is none.
+    instrument : ndarray of uint8, shape (H, W), or None
+        Not 0 where an instrument is seen; None: nowhere.
+    """
+
+    camera: Camera
+    world_from_camera: Array
+    position: Array
+    instrument: npt.NDArray[np.uint8] | None = None
+
+    @classmethod
+    def of(cls, session: Session) -> "SeenSurface":
+        """Return what a session's frame sees."""
+        camera, pose = session.camera, np.array(session.surface.model_from_camera)
+        depth = session.depths()
+        rays = camera.unproject(camera.pixel_centres()).reshape(-1, 3) @ pose[:3, :3].T
+        position = pose[:3, 3] + rays * depth.reshape(-1, 1)
+        cover = session.cover()
+        return cls(camera, pose, position.reshape(*depth.shape, 3), None if cover is None else cover.numbers)
+
+    def project(self, points: Array) -> Array:
+        """Return the pixels, shape (N, 2), at which the camera images points of the world, shape (N, 3)."""
+        pose = self.world_from_camera
+        return self.camera.project((points - pose[:3, 3]) @ pose[:3, :3])
+
+
+@dataclass(frozen=True)
+class Flow:
+    """Flow from one frame to another.
+
+    Parameters
+    ----------
+    flow_px : ndarray, shape (H, W, 2)
+        Where the surface point at each pixel's centre lies in the other frame, less that centre, px; also where the
+        other frame does not see it. NaN where there is no surface point or the other camera images none.
+    state : ndarray of uint8, shape (H, W)
+        Index in `STATES`.
+    """
+
+    flow_px: Array
+    state: npt.NDArray[np.uint8]
+
+    @property
+    def covisible(self) -> float:
+        """Share of the pixels with a surface point whose point the other frame sees; NaN without any."""
+        counts = np.bincount(self.state.ravel(), minlength=len(STATES))
+        surface = int(counts[SEEN] + counts[OUT] + counts[HIDDEN])
+        return float(counts[SEEN] / surface) if surface else float("nan")
+
+
+def flow_between(session: Session, first: SeenSurface, second: SeenSurface, moved: Moved | None = None) -> Flow:
+    """Compute the flow from the first frame to the second.
+
+    Parameters
+    ----------
+    session : Session
+        At a scene whose surface has the form of the second frame's moment.
+    first, second : SeenSurface
+        The frames, in either order of time.
+    moved : callable, optional
+        See `Moved`, from the first frame's moment to the second's; default points stay.
+    """
+    size = first.position.shape[:2]
+    points = first.position.reshape(-1, 3)
+    state = np.full(len(points), NONE, dtype=np.uint8)
+    target = np.full((len(points), 2), np.nan)
+    known = np.isfinite(points[:, 0])
+    if first.instrument is not None:
+        covered = first.instrument.reshape(-1) > 0
+        state[covered] = INSTRUMENT
+        known &= ~covered
+    index = np.flatnonzero(known)
+    there = points[index] if moved is None else moved(points[index])
+    target[index] = second.project(there)
+    # In view, and then not hidden.
+    with np.errstate(invalid="ignore"):
+        inside = second.camera.contains(target[index])
+    state[index[~inside]] = OUT
+    candidates = index[inside]
+    hidden = hides(session, second.world_from_camera[:3, 3], there[inside])
+    if second.instrument is not None:
+        hidden |= _at(second.instrument, target[candidates]) > 0
+    state[candidates] = np.where(hidden, HIDDEN, SEEN)
+    # At the edges of what both see a point may be hidden by less than the slack.
+    edge = candidates[_edges(state.reshape(size), first).reshape(-1)[candidates]]
+    at = np.searchsorted(index, edge)
+    state[edge[_not_shown(session, second.world_from_camera[:3, 3], there[at])]] = HIDDEN
+    flow = target.reshape(*size, 2) - first.camera.pixel_centres()
+    return Flow(flow, state.reshape(size))
+
+
+def hides(session: Session, centre: Array, points: Array) -> Mask:
+    """Return which points of a session's surface, shape (N, 3), it hides itself from a camera; world frame, mm.
+
+    `centre` is that of one camera, shape (3,), or of each point's, shape (N, 3).
+    """
+    towards = points - centre
+    distance = np.sqrt(np.einsum("ij,ij->i", towards, towards))
+    directions = towards / distance[:, None]
+    origins = np.broadcast_to(centre, points.shape)
+    hidden = session.blocked(origins, directions, distance * (1 - SLACK))
+    # Grazing rays may meet the mesh where the exact surface is free.
+    doubtful = np.flatnonzero(hidden)
+    rays = origins[doubtful], directions[doubtful]
+    hits = session.exact_hits(*rays)
+    close = hits.distance > distance[doubtful] * (1 - NEAR)
+    near, rays = doubtful[close], (rays[0][close], rays[1][close])
+    if len(near):
+        exact = session.exact_distances(*rays)
+        with np.errstate(invalid="ignore"):
+            # A ray that grazes the mesh and misses the exact surface is free.
+            hidden[near] = exact < distance[near] * (1 - SLACK)
+    return hidden
+
+
+def _not_shown(session: Session, centre: Array, points: Array) -> Mask:
+    """Return which points, world frame, mm, are not the exact surface's points on the rays from a camera centre."""
+    towards = points - centre
+    distance = np.sqrt(np.einsum("ij,ij->i", towards, towards))
+    exact = session.exact_distances(np.broadcast_to(centre, points.shape), towards / distance[:, None])
+    # Another point, nearer, or farther where the mesh lets the ray pass; a ray without a solution touches at best.
+    return ~(np.abs(exact - distance) < EXACT * distance)
+
+
+def _edges(state: npt.NDArray[np.uint8], frame: SeenSurface) -> Mask:
+    """Return which pixels that both frames see lie beside one that they do not, or at a jump of the distance."""
+    seen = state == SEEN
+    gone = ((state == NONE) | (state == HIDDEN)).astype(np.uint8)
+    beside = cv2.dilate(gone, _NEIGHBOURS) > 0
+    distance = np.linalg.norm(frame.position - frame.world_from_camera[:3, 3], axis=-1).astype(np.float32)
+    far = cv2.dilate(np.nan_to_num(distance, nan=0.0), _NEIGHBOURS)
+    near = cv2.erode(np.nan_to_num(distance, nan=np.inf), _NEIGHBOURS)
+    return np.asarray(seen & (beside | (far / (1 + JUMP) > near)))
+
+
+def _at(image: npt.NDArray[np.uint8], points_px: Array) -> npt.NDArray[np.uint8]:
+    """Return the values of the pixels in which points, shape (N, 2), lie."""
+    height, width = image.shape
+    columns = np.clip(points_px[:, 0].astype(np.int64), 0, width - 1)
+    rows = np.clip(points_px[:, 1].astype(np.int64), 0, height - 1)
+    return image[rows, columns]
