@@ -152,13 +152,13 @@ def test_glints_are_born_and_merge_in_pairs():
 
 def test_glints_obey_the_law_and_the_base_has_its_own_highlight():
     # The relief turns normals and moves no points: its curvature is that of a surface up to the slope's square.
-    shift = (0.004, 0.002, 0.0)
-    found = [Followed(along(rough(seed, 4.0, 1.0), shift, (0, 0, 0), 2)).errors() for seed in (5, 6, 7)]
+    shift = (0.002, 0.001, 0.0)
+    found = [Followed(along(rough(seed, 2.0, 0.6), shift, (0, 0, 0), 2)).errors() for seed in (5, 6, 7)]
     errors, bends = np.concatenate(found).T
     assert len(errors) > 20
     # Next to a fold the motion within a step is no straight line; there the law's two ends differ.
-    straight = bends < 0.1
-    assert np.mean(straight) > 0.8
+    straight = bends < 0.05
+    assert np.mean(straight) > 0.7
     assert errors[straight].max() < LAW
     base = Followed(along(rough(5), (0.15, 0.1, 0.0), (0, 0, 0), 3), fine=False)
     assert [len(track.entries) for track in base.tracks.tracks] == [3]
@@ -175,7 +175,8 @@ def test_another_way_round_gives_the_same_links():
 @pytest.mark.slow
 @pytest.mark.parametrize("where", ["colon", "liver"])
 def test_highlights_of_anatomies_obey_the_law(where):
-    settings = {"surface.path": where, "surface.viewpoint": 31}
+    place = {"surface.view": "wall", "surface.path_share": 0.61} if where == "colon" else {"surface.viewpoint": 31}
+    settings = {"surface.path": where, **place}
     scene = load_scene("anatomy", settings)
     followed = Followed(along(scene, (0.1, -0.05, 0.02), (0.1, 0.2, 0), 3))
     errors, bends = followed.errors().T

@@ -33,6 +33,7 @@ def poses_of(settings, shares):
     return np.array([make_surface(surface).model_from_camera for surface in surfaces])
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_every_record_holds_the_cameras_pose(film):
     folder, settings = film
@@ -48,6 +49,7 @@ def test_every_record_holds_the_cameras_pose(film):
     assert cv2.VideoCapture(str(folder / "film.avi")).get(cv2.CAP_PROP_FPS) == pytest.approx(10.0)
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_a_rendered_frame_and_a_view_hold_the_same_pose(film, tmp_path):
     from simtest.simulation.frame_files import write_frame
@@ -69,6 +71,7 @@ def test_a_rendered_frame_and_a_view_hold_the_same_pose(film, tmp_path):
     np.testing.assert_allclose(flow["forward"][seen], expected[seen], atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_labels_of_a_film(film):
     folder, _ = film
@@ -123,7 +126,7 @@ def test_a_flow_pictures_colours():
     blue, green, red = picture[0, 2].astype(int)
     # Right is red, left is cyan, no motion is white, unknown is black, hidden is darker.
     assert (red, green, blue) == (255, 0, 0)
-    assert tuple(picture[0, 0]) == (255, 255, 0)
+    np.testing.assert_allclose(picture[0, 0], (255, 255, 0), atol=2)
     assert tuple(picture[0, 1]) == (255, 255, 255)
     assert tuple(picture[0, 50]) == (0, 0, 0)
     assert 100 < picture[0, 40].max() < 130
