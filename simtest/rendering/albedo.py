@@ -9,6 +9,7 @@ from simtest.rendering.mitsuba_values import channels
 from simtest.surfaces.segment_table import PRIMES
 
 if TYPE_CHECKING:
+    from simtest.rendering.rest_map import RestMap
     from simtest.surfaces.tissue_pattern import Lattice, TissuePattern
 
 CHANNELS = 3
@@ -35,10 +36,16 @@ class AlbedoKernel:
         mitsuba with the variant set.
     pattern : TissuePattern
         Of the surface.
+
+    Attributes
+    ----------
+    rest : RestMap or None
+        Where the tissue was, of a deformed surface.
     """
 
     def __init__(self, mi: Any, pattern: "TissuePattern") -> None:
         self.mi, self.pattern = mi, pattern
+        self.rest: RestMap | None = None
         lattices = (pattern.mottling, pattern.capillaries)
         self._nodes = len(pattern.mottling.values)
         table = pattern.vessels
@@ -50,6 +57,10 @@ class AlbedoKernel:
         self._first = sum(map(len, parts[:3]))
         parts[0].view(np.uint32)[ROWS] = sum(map(len, parts[:4])) // PACKET
         self._buffer = mi.Float(np.concatenate(parts))
+
+    def of(self, si: Any, active: Any) -> Any:
+        """Compute the albedo, mitsuba.Spectrum, of surface points, mitsuba.SurfaceInteraction3f."""
+        return self.at(si.p if self.rest is None else self.rest.point(si, active), active)
 
     def at(self, p: Any, active: Any) -> Any:
         """Compute the albedo, mitsuba.Spectrum, at points of the surface, mitsuba.Point3f, model frame, mm."""

@@ -17,11 +17,11 @@ from simtest.rendering.direct import DirectLight
 from simtest.rendering.materials import bsdf_dict, parameter_updates, parts_alone
 from simtest.rendering.mesh_edges import MeshEdges
 from simtest.rendering.shape_labels import ShapeLabels
-from simtest.rendering.shapes import make_shape
+from simtest.rendering.shapes import flat, make_shape
 from simtest.runtime.arrays import Array
 from simtest.spec.reflectance import Reflectance
 from simtest.spec.rig import LightSpec, Rig
-from simtest.surfaces import Shape
+from simtest.surfaces import Shape, TriangleMesh
 
 
 @dataclass
@@ -40,6 +40,8 @@ class BuiltScene:
         What traces the labels of its shape; made when first needed.
     edges : MeshEdges, optional
         Edges of its mesh; made when first needed.
+    mesh : TriangleMesh, optional
+        The mesh as it was written last.
     """
 
     key: tuple[Any, ...]
@@ -49,6 +51,7 @@ class BuiltScene:
     base_parameters: Any
     labels: ShapeLabels | None = None
     edges: MeshEdges | None = None
+    mesh: TriangleMesh | None = None
 
     def write(self, mi: Any, shape: Shape, reflectance: Reflectance) -> None:
         """Write pose and material of the surface."""
@@ -56,6 +59,8 @@ class BuiltScene:
         if "to_model" in shape.parameters:
             matrix = shape.parameters["to_model"]
             self._set("surface.to_world", mi.AffineTransform4f(matrix.tolist()))
+        if shape.mesh is not None and not _same(shape.mesh, self.mesh):
+            self._deform(shape.mesh)
         # Material: the whole and its base alone.
         for name, value in parameter_updates(mi, reflectance).items():
             self._set(f"bsdf.{name}", value)
@@ -63,6 +68,15 @@ class BuiltScene:
                 self.base_parameters[name] = value
         if self.base is not None:
             self.base_parameters.update()
+
+    def _deform(self, mesh: TriangleMesh) -> None:
+        """Move the vertices of the mesh; the triangles stay."""
+        self._set("surface.vertex_positions", flat(mesh.vertices, np.float32))
+        self.parameters.update()
+        # Mitsuba has recomputed the normals from the triangles.
+        self._set("surface.vertex_normals", flat(mesh.normals, np.float32))
+        self.parameters.update()
+        self.mesh, self.labels, self.edges = mesh, None, None
 
     def place_lights(self, mi: Any, rig: Rig, model_from_camera: Array) -> DirectLight:
         """Write the lights of a rig at a pose of the camera, shape (4, 4), and all that was set before.
@@ -86,7 +100,7 @@ class BuiltScene:
         """Let bounced light find the albedo of tissue by its own points."""
         # Weak: what a BSDF holds, Mitsuba holds, and Python could not free it at its end.
         found = weakref.proxy(albedo)
-        self.scene.shapes()[0].bsdf().albedo_at = lambda si, active: found.at(si.p, active)
+        self.scene.shapes()[0].bsdf().albedo_at = lambda si, active: found.of(si, active)
 
     def _set(self, suffix: str, value: Any) -> None:
         """Assign the one parameter whose path ends in `suffix`; Mitsuba names paths by its own rules."""
@@ -108,4 +122,11 @@ def build(
     base = None
     if not parts_alone(reflectance):
         base = mi.load_dict(bsdf_dict(reflectance, plugin, diffuse_only=True), optimize=False)
-    return BuiltScene(key, scene, mi.traverse(scene), base, base and mi.traverse(base))
+    return BuiltScene(key, scene, mi.traverse(scene), base, base and mi.traverse(base), mesh=shape.mesh)
+
+
+def _same(mesh: TriangleMesh, other: TriangleMesh | None) -> bool:
+    """Return whether two meshes of the same triangles have the same vertices and normals."""
+    if other is None or mesh is other:
+        return mesh is other
+    return np.array_equal(mesh.vertices, other.vertices) and np.array_equal(mesh.normals, other.normals)

@@ -59,7 +59,7 @@ class Material:
 
     def albedo_of(self, hit: Hit) -> Any:
         """Compute the albedo of tissue at a hit, once for all its lights; None where the albedo is the BSDF's own."""
-        return None if self.albedo is None else self.albedo.at(hit.base.p, hit.base.is_valid())
+        return None if self.albedo is None else self.albedo.of(hit.base, hit.base.is_valid())
 
     def parts(self, mi: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
         """Compute f cos(theta) of the lobe and of the base."""

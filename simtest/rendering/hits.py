@@ -32,5 +32,5 @@ def make_hit(mi: Any, si: Any, relief: ReliefKernel | None, bent: bool = False) 
     """Make a hit of the base's surface points; with the relief's second derivatives if `bent`."""
     if relief is None:
         return Hit(si, si, si)
-    jets = relief.jets(si.p, si.is_valid(), bent)
+    jets = relief.jets_at(si, bent)
     return Hit(si, turned(mi, si, jets.gradient), turned(mi, si, jets.diffused), jets)

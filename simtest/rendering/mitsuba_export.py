@@ -73,7 +73,7 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
     mi = backend.load(variant)
     plugin = phong.register(mi, str(mi.variant()))
     tissue.register(mi, str(mi.variant()))
-    surface = make_surface(scene.surface, moved=scene.camera.moved)
+    surface = make_surface(scene.surface, None, scene.camera.moved, scene.deformation, scene.time_s)
     shape = _cut_to_view(surface.shape(), surface, scene.camera.model())
     text = _xml(mi, scene, surface, shape, plugin)
     make_folder(out)

@@ -1,12 +1,15 @@
 """The relief of a surface inside a kernel: the splines of `simtest.surfaces.relief_field`, gathered at each hit."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from simtest.runtime.arrays import Array
 from simtest.surfaces.relief_field import NODES, ReliefField
+
+if TYPE_CHECKING:
+    from simtest.rendering.rest_map import RestMap
 
 Order = tuple[int, ...]
 """Orders of a derivative along x, y and z of the lattice."""
@@ -50,12 +53,14 @@ class ReliefKernel:
         mitsuba with the variant set.
     field : ReliefField
         The relief.
+    rest : RestMap, optional
+        Where the tissue was, of a deformed surface.
     """
 
-    def __init__(self, mi: Any, field: ReliefField) -> None:
+    def __init__(self, mi: Any, field: ReliefField, rest: "RestMap | None" = None) -> None:
         import drjit as dr
 
-        self.mi, self.field = mi, field
+        self.mi, self.field, self._rest = mi, field, rest
         self._bands = [
             _Band(
                 mi.Matrix3f(band.lattice_from_model.tolist()),
@@ -72,6 +77,13 @@ class ReliefKernel:
     def key(self) -> tuple[tuple[bool, ...], bool]:
         """What of the relief is compiled into the kernel: each band, whether diffuse light sees it; and a film."""
         return tuple(band.diffused is not None for band in self._bands), self._pool is not None
+
+    def jets_at(self, si: Any, bent: bool = False) -> KernelJets:
+        """Compute the jets at surface points, mitsuba.SurfaceInteraction3f, as `jets` does."""
+        active = si.is_valid()
+        if self._rest is None:
+            return self.jets(si.p, active, bent)
+        return self._rest.carry(si, active, self.jets(self._rest.point(si, active), active, bent))
 
     def jets(self, p: Any, active: Any, bent: bool = False) -> KernelJets:
         """Compute the jets at points, mitsuba.Point3f, model frame; with second derivatives if `bent`."""

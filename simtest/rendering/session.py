@@ -30,6 +30,7 @@ from simtest.rendering.misfit_maps import trace_misfits, trace_tiles
 from simtest.rendering.placement_checks import check_camera, check_lights, check_motion
 from simtest.rendering.rays import Sightlines
 from simtest.rendering.relief_kernel import ReliefKernel
+from simtest.rendering.rest_map import rest_map
 from simtest.rendering.shape_labels import ShapeLabels, as_hits, as_labels
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.spec.motion import Motion
@@ -133,12 +134,15 @@ class Session:
 
     def _load_surface(self, scene: Scene) -> None:
         # A malformed surface raises here, and the session stays at its scene.
-        surface = make_surface(scene.surface, scene.film_level, scene.camera.moved)
+        moment = scene.deformation, scene.time_s
+        surface = make_surface(scene.surface, scene.film_level, scene.camera.moved, *moment)
         check_camera(scene, surface)
         check_lights(scene, surface)
         check_motion(scene, surface)
         self._shape = surface.shape()
-        self._relief = None if surface.relief is None else ReliefKernel(self.mi, surface.relief)
+        # Relief and colour are looked up where the tissue is at rest.
+        self._rest = rest_map(self.mi, surface)
+        self._relief = None if surface.relief is None else ReliefKernel(self.mi, surface.relief, self._rest)
         self.surface: SurfaceModel = surface
         self._set_tissue(scene)
         self.scene = scene
@@ -150,7 +154,7 @@ class Session:
             # Imported here: it loads more of SciPy, which other scenes do not need.
             from simtest.surfaces.tissue_pattern import make_pattern
 
-            self._pattern = make_pattern(self.surface, scene.albedo)
+            self._pattern = make_pattern(self.surface.at_rest, scene.albedo)
 
     def _set_camera(self, scene: Scene) -> None:
         self._camera_spec, self.camera = scene.camera.still, scene.camera.model()
@@ -187,6 +191,7 @@ class Session:
         if self._albedo is None or self._albedo.pattern is not self._pattern:
             self._albedo = AlbedoKernel(self.mi, self._pattern) if self._pattern else None
         if self._albedo is not None:
+            self._albedo.rest = self._rest
             self._built.let_bounces_find(self._albedo)
 
     def _place_lights(self, model_from_camera: Array) -> None:

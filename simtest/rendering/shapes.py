@@ -22,15 +22,15 @@ def _make_mesh(mi: Any, mesh: TriangleMesh, bsdf: MitsubaDict) -> Any:
     properties["mesh_bsdf"] = mi.load_dict(bsdf)
     made = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, props=properties)
     parameters = mi.traverse(made)
-    parameters["vertex_positions"] = _flat(mesh.vertices, np.float32)
-    parameters["faces"] = _flat(mesh.faces, np.uint32)
+    parameters["vertex_positions"] = flat(mesh.vertices, np.float32)
+    parameters["faces"] = flat(mesh.faces, np.uint32)
     parameters.update()
     # Mitsuba recomputes the normals from the triangles when positions change, so the exact ones are set afterwards.
-    parameters["vertex_normals"] = _flat(mesh.normals, np.float32)
+    parameters["vertex_normals"] = flat(mesh.normals, np.float32)
     parameters.update()
     return made
 
 
-def _flat(values: Any, dtype: Any) -> Any:
+def flat(values: Any, dtype: Any) -> Any:
     """Flatten an array row by row into 32-bit numbers, as Mitsuba stores buffers."""
     return np.ascontiguousarray(values, dtype=dtype).ravel()

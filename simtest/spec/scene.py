@@ -13,12 +13,13 @@ from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import find
 from simtest.runtime.short_repr import short_repr
 from simtest.spec.camera_spec import SceneCamera
+from simtest.spec.deformation import MOST_DEFORMATIONS, Deformation
 from simtest.spec.instrument import Instrument
 from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueReflectance
 from simtest.spec.rig import Rig
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import Millimetres, Spec, validate
-from simtest.spec.surface import Surface
+from simtest.spec.surface import AnatomySurface, QuadricSurface, Surface
 from simtest.spec.tissue_colour import TissueColour
 from simtest.spec.toml_files import read_toml, source_name
 from simtest.spec.translucency import Translucency
@@ -91,6 +92,10 @@ class Scene(Spec):
     instruments: tuple[Instrument, ...] = Field(
         (), max_length=MOST_INSTRUMENTS, description="metal instruments in the picture, in the camera frame"
     )
+    deformation: tuple[Deformation, ...] = Field(
+        (), max_length=MOST_DEFORMATIONS, description="how the surface deforms in time, applied in this order"
+    )
+    time_s: float = Field(0.0, ge=-1e6, le=1e6, description="moment of the deformation, s")
     views: Views | None = Field(None, description="further views, for an experiment on motion; default none")
 
     __repr__ = short_repr
@@ -104,7 +109,7 @@ class Scene(Spec):
     @property
     def placement(self) -> tuple[object, ...]:
         """What determines the surface and the camera's place before it."""
-        return self.surface, self.film_level, self.camera.moved
+        return self.surface, self.film_level, self.camera.moved, self.deformation, self.time_s
 
     @property
     def film_level(self) -> float | None:
@@ -143,12 +148,25 @@ class Scene(Spec):
             )
         return self
 
+    @model_validator(mode="after")
+    def _deforms(self) -> "Scene":
+        if self.deformation and not isinstance(self.surface, AnatomySurface | QuadricSurface):
+            raise ValueError(
+                f"surface.type = {self.surface.type}: only meshes deform; must be anatomy or quadric where deformation "
+                "is given (a plane is a quadric of curvatures 0)"
+            )
+        return self
+
     @model_serializer(mode="wrap")
     def _as_ever(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out what says nothing: a scene without instruments is written as it was before there were any."""
         dumped: dict[str, Any] = dump(self)
         if not self.instruments:
             dumped.pop("instruments", None)
+        if not self.deformation:
+            dumped.pop("deformation", None)
+        if not self.time_s:
+            dumped.pop("time_s", None)
         if self.views is None:
             dumped.pop("views", None)
         if self.camera.moved is None:

@@ -1,9 +1,11 @@
 """From the description of a surface to its model, and from a recipe to a mesh."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
+from simtest.spec.deformation import Deformation
 from simtest.spec.surface import (
     AnatomySurface,
     CylinderSurface,
@@ -19,7 +21,13 @@ from simtest.surfaces.model import SurfaceModel, TriangleMesh, principal_curvatu
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
 
 
-def make_surface(spec: Surface, film_level: float | None = None, moved: Moved | None = None) -> SurfaceModel:
+def make_surface(
+    spec: Surface,
+    film_level: float | None = None,
+    moved: Moved | None = None,
+    deformation: Sequence[Deformation] = (),
+    time_s: float = 0.0,
+) -> SurfaceModel:
     """Make the model of a scene's surface.
 
     Parameters
@@ -30,6 +38,10 @@ def make_surface(spec: Surface, film_level: float | None = None, moved: Moved | 
         Up to where a liquid film fills the valleys of its relief, in standard deviations of the height.
     moved : Moved, optional
         Where the camera stands, from where the description puts it.
+    deformation : sequence of Deformation
+        How it deforms; the camera is not moved with it.
+    time_s : float
+        The moment of the deformation, s.
 
     Raises
     ------
@@ -44,6 +56,12 @@ def make_surface(spec: Surface, film_level: float | None = None, moved: Moved | 
         from simtest.surfaces.relief_field import make_relief
 
         surface.relief = make_relief(spec.relief, film_level)
+    if deformation:
+        # Imported here, as the relief above.
+        from simtest.surfaces.deformation import DeformationAt
+        from simtest.surfaces.deformed import DeformedSurface
+
+        return DeformedSurface(surface, DeformationAt(deformation, time_s), spec.type)
     return surface
 
 

@@ -252,6 +252,8 @@ class MeshSurface(MeshedSurface):
     the mesh's own.
     """
 
+    faceted = True
+
     def __init__(self, spec: AnatomySurface) -> None:
         how = Refinement(spec.subdivisions, spec.edge_mm, spec.smoothing_mm)
         self._build = self.prepared = prepare(find(spec.path, "meshes", suffixes=MESH_SUFFIXES), how, spec.kind)

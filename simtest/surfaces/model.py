@@ -114,7 +114,8 @@ class Shape:
     mesh : TriangleMesh, optional
         For kind "mesh".
     key : str
-        Identity of what the renderer builds; two shapes with equal keys differ in `parameters` alone.
+        Identity of what the renderer builds; two shapes with equal keys differ in `parameters` alone, and in vertices
+        and normals where the surface deforms.
     """
 
     kind: str
@@ -134,13 +135,21 @@ class SurfaceModel(ABC):
     solid : bool
         Whether the far side is matter, in which no light can be; a shell (a lumen, a sphere seen from inside) has
         free space beyond its wall.
+    faceted : bool
+        Whether the mesh is itself the surface, whose normals change within its triangles (see `motion`).
     relief : ReliefField or None
         Its fine relief; `points` are those of the base without it (see `fine_points`).
     """
 
     model_from_camera: Array
     solid: bool = True
+    faceted: bool = False
     relief: "ReliefField | None" = None
+
+    @property
+    def at_rest(self) -> "SurfaceModel":
+        """The surface before any deformation: itself, unless it is deformed."""
+        return self
 
     @abstractmethod
     def shape(self) -> Shape:

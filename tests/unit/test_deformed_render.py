@@ -1,0 +1,122 @@
+"""Deforming surfaces in a session: vertices move, nothing is rebuilt, and relief and colour ride on the tissue."""
+
+import numpy as np
+import pytest
+
+from simtest.rendering import Session
+from simtest.spec import scene_from_dict
+
+DENT = {"type": "dent", "amplitude_mm": -2.0, "period_s": 2.0, "direction": [0.2, 0, 1], "radius_mm": 5.0,
+        "centre_mm": [1, 0, 0]}  # fmt: skip
+WARP = {"type": "breathing", "amplitude_mm": 1.5, "period_s": 4.0, "direction": [0, 1, 1], "along": [1, 0.5, 0],
+        "wavelength_mm": 40.0, "turn_deg": 3.0, "axis": [1, 0, 0]}  # fmt: skip
+RELIEF = {"bands": [{"slope_deg": 4.0, "wavelength_mm": 2.0}]}
+TISSUE = {"type": "tissue", "film": {"index": 1.35, "alpha": 0.05}, "albedo": {}}
+
+
+def scene(time_s=0.0, deformation=(WARP, DENT), moved=None, **changes):
+    surface = {"type": "quadric", "distance_mm": 20.0, "k1_per_mm": 0.02, "k2_per_mm": -0.01, "tilt_deg": 15.0}
+    surface |= changes.pop("surface", {})
+    camera = {"width": 64, "height": 48, "fx": 56.0, "fy": 56.0, "cx": 32.0, "cy": 24.0}
+    camera |= {"moved": moved} if moved else {}
+    data = {"surface": surface, "camera": camera, "time_s": time_s, "deformation": list(deformation)}
+    return scene_from_dict({**data, **changes})
+
+
+def test_moments_are_rendered_without_rebuilding():
+    session = Session(scene(), labelled=True)
+    first = session.frame()
+    for time_s in (0.6, 1.0):
+        session.update(scene(time_s))
+    moved = session.frame()
+    assert session.rebuilds == 1
+    assert np.abs(moved.labels.depth - first.labels.depth).max() > 0.5
+    # The same as a session that begins there.
+    fresh = Session(scene(1.0), labelled=True).frame()
+    assert np.array_equal(fresh.radiance.total, moved.radiance.total)
+    assert np.array_equal(fresh.labels.k_max, moved.labels.k_max)
+    # And back to the start.
+    session.update(scene(0.0))
+    assert np.array_equal(session.frame().radiance.total, first.radiance.total)
+
+
+def test_at_rest_the_frame_is_that_without_deformation():
+    with_table = Session(scene(0.0)).frame()
+    without = Session(scene(0.0, deformation=())).frame()
+    assert np.array_equal(with_table.radiance.total, without.radiance.total)
+
+
+def test_labels_follow_the_exact_truth_on_relief():
+    """Triangles and exact surface agree; relief looked up where the tissue is not would be off by its slope."""
+    session = Session(scene(1.0, surface={"relief": RELIEF}), labelled=True)
+    labels, truth = session.frame().labels, session.truth()
+    assert truth.mask.all()
+    fine = np.linalg.norm(labels.normal - truth.normal, axis=-1)
+    assert np.percentile(fine, 99) < 2e-3
+    assert np.percentile(np.abs(labels.k_max - truth.k_max), 99) < 1e-3 * np.percentile(np.abs(truth.k_max), 99)
+    slope = np.linalg.norm(truth.normal - truth.normal_base, axis=-1)
+    assert np.median(slope) > 0.03
+    # Control: the relief of the space, not of the tissue.
+    at = truth.position.reshape(-1, 3)[::7]
+    X = session.to_model(at)
+    rest = session.surface.deformation.at_rest(X)
+    own, other = (session.surface.at_rest.relief.jets(p).gradient for p in (rest, X))
+    assert np.median(np.linalg.norm(own - other, axis=1)) > 0.03
+
+
+@pytest.mark.parametrize("reflectance", [{"type": "phong", "exponent": 200.0}, TISSUE])
+def test_a_rigid_motion_of_tissue_is_the_reverse_motion_of_the_camera(reflectance):
+    """A film, relief and colour that move rigidly with a camera look as before."""
+    rigid = {"type": "breathing", "amplitude_mm": 4.0, "period_s": 2.0, "direction": [0, 0, 1], "warp": 0.0}
+    # At tilt 0 the camera looks along -z of the model: 4 mm along z is 4 mm back.
+    common = {"surface": {"tilt_deg": 0.0, "relief": RELIEF}, "reflectance": reflectance}
+    still = Session(scene(0.0, deformation=(), **common)).frame()
+    moved = Session(scene(1.0, deformation=(rigid,), moved={"translation_mm": [0, 0, -4.0]}, **common)).frame()
+    tolerance = 2e-4 * float(still.radiance.total.max())
+    assert tolerance > 0
+    assert moved.radiance.total == pytest.approx(still.radiance.total, rel=2e-3, abs=tolerance)
+    # Control: without the motion of the camera it looks otherwise.
+    seen = Session(scene(1.0, deformation=(rigid,), **common)).frame()
+    assert np.abs(seen.radiance.total - still.radiance.total).max() > 0.05 * still.radiance.total.max()
+
+
+def test_a_failed_moment_leaves_the_session_where_it_was():
+    press = {**DENT, "amplitude_mm": 30.0, "radius_mm": 30.0, "direction": [0, 0, 1]}
+    session = Session(scene(0.0, deformation=(press,)))
+    before = session.frame().radiance.total
+    with pytest.raises(Exception, match="inside the wall"):
+        session.update(scene(1.0, deformation=(press,)))
+    assert np.array_equal(session.frame().radiance.total, before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("anatomy", ["colon", "liver"])
+def test_anatomies_deform(anatomy):
+    """The exact points on a deformed anatomy have the normals of differences of neighbouring exact points."""
+    surface = {"type": "anatomy", "path": anatomy, "viewpoint": 1}
+    camera = {"width": 80, "height": 60, "fx": 70.0, "fy": 70.0, "cx": 40.0, "cy": 30.0}
+    still = Session(scene_from_dict({"surface": surface, "camera": camera}))
+    pose = still.surface.model_from_camera
+    near = {"centre_mm": (pose[:3, 3] + 20 * pose[:3, 2]).tolist()}
+    wave = {"type": "peristalsis", "amplitude_mm": 3.0, "period_s": 3.0, "axis": pose[:3, 2].tolist(),
+            "radius_mm": 15.0, "wavelength_mm": 40.0, **near}  # fmt: skip
+    table = {"surface": surface, "camera": camera, "time_s": 0.7, "deformation": [wave, {**WARP, **near}]}
+    session = Session(scene_from_dict(table))
+    pixels, step = np.random.default_rng(0).uniform([5, 5], [75, 55], (300, 2)), 2e-3
+    points = session.exact_points(pixels)
+    seen = points.valid
+    assert seen.mean() > 0.5
+
+    def along(direction):
+        near, far = (
+            session.exact_points(pixels + n * step * np.array(direction)).position
+            - session.exact_points(pixels - n * step * np.array(direction)).position
+            for n in (1, 2)
+        )
+        return 8 * near - far
+
+    normal = np.cross(along((1, 0)), along((0, 1)))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    gap = np.linalg.norm(np.cross(normal, points.normal), axis=1)
+    # Where a neighbour lies behind a fold there is no difference.
+    assert np.nanpercentile(gap[seen], 95) < 1e-8
