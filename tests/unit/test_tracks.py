@@ -81,7 +81,9 @@ class Followed:
                 across = (normals[0] + normals[1]) / np.linalg.norm(normals[0] + normals[1])
                 went = went - across * (across @ went)
                 size = np.linalg.norm(went)
-                errors.append([np.linalg.norm(went - (ends[0] + ends[1]) / 2), np.linalg.norm(ends[0] - ends[1])] / size)
+                errors.append(
+                    [np.linalg.norm(went - (ends[0] + ends[1]) / 2), np.linalg.norm(ends[0] - ends[1])] / size
+                )
         return np.array(errors).reshape(-1, 2)
 
 
@@ -141,7 +143,9 @@ def test_glints_are_born_and_merge_in_pairs():
         links += len(followed.errors())
         # Between two frames the number of merged and of born glints is even.
         for frame in range(1, 4):
-            ends = [t for t in followed.tracks.tracks if t.first_frame + len(t.entries) == frame and t.death == "merged"]
+            ends = [
+                t for t in followed.tracks.tracks if t.first_frame + len(t.entries) == frame and t.death == "merged"
+            ]
             starts = [t for t in followed.tracks.tracks if t.first_frame == frame and t.birth == "split"]
             assert len(ends) % 2 == 0
             assert len(starts) % 2 == 0
