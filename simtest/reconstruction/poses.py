@@ -151,7 +151,8 @@ def _unit_mm(unit: object, where: str) -> float:
         number = np.nan
     if not 0 < number < np.inf:
         raise InputError(
-            f"{where}: unit = {shown(str(unit), 40)}; must be one of {', '.join(UNITS_MM)}, or the millimetres of one unit"
+            f"{where}: unit = {shown(str(unit), 40)}; must be one of {', '.join(UNITS_MM)}, or the millimetres of one "
+            "unit"
         )
     return number
 

@@ -18,6 +18,7 @@ import numpy as np
 from simtest.geometry.vectors import tangent_basis
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, IntArray, Mask
+from simtest.surfaces import RayHits, SurfaceModel
 from simtest.surfaces.relief_field import normal_derivative
 
 NEWTON_STEPS = 8
@@ -68,6 +69,14 @@ class Contact:
 class SurfaceInTime(Protocol):
     """The surface between two frames."""
 
+    @property
+    def deforms(self) -> bool:
+        """Whether it changes its form in time."""
+
+    @property
+    def reversed(self) -> "SurfaceInTime":
+        """The surface with time running backwards."""
+
     def meet(self, shares: Array, origins: Array, directions: Array) -> Contact:
         """Return where rays, shape (N, 3), world frame, meet the surface, each at its own moment.
 
@@ -89,18 +98,28 @@ class StillSurface:
 
     session: Session
     fine: bool = True
+    deforms = False
+
+    @property
+    def reversed(self) -> "StillSurface":
+        """Itself: it is the same at all moments."""
+        return self
 
     def meet(self, shares: Array, origins: Array, directions: Array) -> Contact:
         """Return where rays meet the surface (see `SurfaceInTime.meet`)."""
-        surface = self.session.surface
         hits = self.session.exact_hits(origins, directions)
-        base = surface.points(origins, directions, hits)
-        plane, derivative = surface.motion(base, hits)
-        normal = base.normal
-        if self.fine and surface.relief is not None:
-            jets = surface.relief.jets(np.where(base.valid[:, None], base.position, 0.0))
-            normal, derivative = normal_derivative(normal, derivative, jets)
-        return Contact(base.position, normal, plane, derivative)
+        return contact(self.session.surface, origins, directions, hits, self.fine)
+
+
+def contact(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits, fine: bool) -> Contact:
+    """Return where rays, shape (N, 3), meet a surface, from their hits; normals of the relief if `fine`."""
+    base = surface.points(origins, directions, hits)
+    plane, derivative = surface.motion(base, hits)
+    normal = base.normal
+    if fine and surface.relief is not None:
+        jets = surface.relief.jets(np.where(base.valid[:, None], base.position, 0.0))
+        normal, derivative = normal_derivative(normal, derivative, jets)
+    return Contact(base.position, normal, plane, derivative)
 
 
 @dataclass(frozen=True)
@@ -159,7 +178,7 @@ class Continued:
 
 @dataclass
 class _State:
-    """Points at their moments: position, gap between normal and bisector, and the linear map of motions to its change."""
+    """Points at their moments: position, gap of normal and bisector, and the linear map of motions to its change."""
 
     position: Array
     gap: Array
@@ -195,8 +214,8 @@ def follow(surface: SurfaceInTime, motion: Motion, positions: Array, lights: Int
         own = _part(state, going)
         # Predict, then correct at the next moment.
         size = np.minimum(step[going], 1 - share[going])
-        predicted = _solve(own, own.driven) * size[:, None]
         later = share[going] + size
+        predicted = _predicted(surface, motion, later, lights[going], own, size)
         found, moved, why = _corrected(surface, motion, later, lights[going], own, predicted)
         # Accept, or halve the step.
         accepted = going[moved]
@@ -210,6 +229,17 @@ def follow(surface: SurfaceInTime, motion: Motion, positions: Array, lights: Int
                 end[i] = str(reason)
         going = np.array([i for i in going if share[i] < 1 and step[i] >= LEAST_STEP], dtype=np.int64)
     return Continued(position, share, end)
+
+
+def _predicted(
+    surface: SurfaceInTime, motion: Motion, shares: Array, lights: IntArray, start: _State, size: Array
+) -> Array:
+    """Return the expected motions of points, shape (N, 3), mm, until their next moments, a share `size` later."""
+    if not surface.deforms:
+        return _solve(start, start.driven) * size[:, None]
+    # The surface moves too: one step of Newton's method at the next moment holds all motions to first order.
+    ahead = _state(surface, motion, shares, lights, start.position)
+    return ahead.position - _solve(ahead, ahead.gap) - start.position
 
 
 def _corrected(
@@ -237,7 +267,7 @@ def _corrected(
         same = (ratio > 1 / BEND) & (ratio < BEND)
         jumped = state.offset >= ANOTHER
     missed = ~np.isfinite(state.position).all(axis=1)
-    why = [OFF if off else HIDDEN if behind else MERGED for off, behind in zip(missed, jumped, strict=True)]
+    why = np.select([missed, jumped], [OFF, HIDDEN], MERGED).tolist()
     return state, done & near & same & ~jumped & ~missed, why
 
 

@@ -49,7 +49,7 @@ def _coloured(flow_px: Array, value: Array, full_px: float) -> Picture:
 
 
 def _draw_key(picture: Picture, full_px: float) -> None:
-    """Draw the wheel of colours in the lower right corner: a point's colour is that of the flow from the centre to it."""
+    """Draw the wheel in the lower right corner: a point's colour is that of the flow from the centre to it."""
     height, width = picture.shape[:2]
     size = min(math.ceil(WHEEL_SHARE * height), width)
     radius = size / 2

@@ -12,6 +12,7 @@ from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.array_files import write_arrays
 from simtest.runtime.arrays import Array, Picture
 from simtest.runtime.files import Json, write_atomically, write_json
+from simtest.simulation.deforming import SurfaceOverTime, moved_between
 from simtest.simulation.flow import STATES, SeenSurface, flow_between, hides
 from simtest.simulation.flow_picture import flow_picture
 from simtest.simulation.rendered_view import RenderedView
@@ -30,12 +31,12 @@ COVISIBILITY, TRACKS, FLOW_SHEET = "covisibility.npy", "tracks.json", "flow_shee
 FIELDS = {
     "flow_NNNN.npz": "from frame NNNN to the next: forward, backward (float32, (H, W, 2), px) and their states "
     "(forward_state, backward_state, uint8, (H, W))",
-    "forward": "where the surface point at each pixel's centre lies in the next frame, less that centre, px; also where "
-    "it is not seen there; NaN off the surface and on instruments. backward: from the next frame to this one, at the "
+    "forward": "where the surface point at each pixel's centre lies in the next frame, less that centre, px; also "
+    "where it is not seen there; NaN off the surface and on instruments. backward: from the next frame to this one, at the "
     "next frame's pixels",
     "states": ", ".join(f"{number}: {name}" for number, name in enumerate(STATES)),
     "covisibility.npy": "float32, (N, N): share of the surface points of frame i that frame j sees, on every "
-    f"{STRIDE_PX}th pixel; NaN for frames more than {MOST_APART} apart",
+    f"{STRIDE_PX}th pixel; NaN for frames more than {MOST_APART} apart, and for j < i where the surface deforms",
     "flow_sheet.png": "the forward flow of each frame: hue its direction, saturation its length, dark what the next "
     "frame does not see; the wheel is the key",
     "highlights": "of each frame, in the order of the identities: bp_px, position_world_mm, normal_world, light, lit, "
@@ -72,7 +73,8 @@ class SequenceLabels:
         self._folder = folder
         self._frames: list[_Frame] = []
         self._shares: dict[tuple[int, int], float] = {}
-        self._fine, self._base = Tracks(fine=True), Tracks(fine=False)
+        self._time = SurfaceOverTime()
+        self._fine, self._base = (Tracks(fine, self._time.between) for fine in (True, False))
         self._listed: list[Json] = []
         self._listed_base: list[Json] = []
         self._pictures: list[Picture] = []
@@ -86,7 +88,7 @@ class SequenceLabels:
         points = seen.position[STRIDE_PX // 2 :: STRIDE_PX, STRIDE_PX // 2 :: STRIDE_PX].reshape(-1, 3)
         frame = _Frame(view.scene, seen, points[np.isfinite(points[:, 0])])
         if self._frames:
-            self._write_flow(session, self._frames[-1].seen, seen)
+            self._write_flow(session, self._frames[-1], frame)
         self._frames.append(frame)
         self._compare(session)
         if len(self._frames) > 1:
@@ -98,9 +100,18 @@ class SequenceLabels:
         self._listed.append(_listed(session, view.highlights, self._fine.add(session, view.highlights)))
         if session.surface.relief is not None:
             self._listed_base.append(_listed(session, view.clouds, self._base.add(session, view.clouds)))
+        self._time.time_s = view.scene.time_s
 
-    def _write_flow(self, session: Session, last: SeenSurface, seen: SeenSurface) -> None:
-        forward, backward = flow_between(session, last, seen), flow_between(session, seen, last)
+    def _write_flow(self, session: Session, last: _Frame, new: _Frame) -> None:
+        times = last.scene.time_s, new.scene.time_s
+        there, back = moved_between(session, *times), moved_between(session, *times[::-1])
+        forward = flow_between(session, last.seen, new.seen, there)
+        if back is not None:
+            # The last frame's camera looks at the surface of its own moment.
+            session.update(last.scene)
+        backward = flow_between(session, new.seen, last.seen, back)
+        if back is not None:
+            session.update(new.scene)
         arrays: dict[str, npt.NDArray[np.generic]] = {
             "forward": forward.flow_px.astype(np.float32),
             "forward_state": forward.state,
@@ -115,11 +126,15 @@ class SequenceLabels:
         """Compare the newest frame with those before it, both ways, on sparse points."""
         new = len(self._frames) - 1
         earlier = range(max(0, new - MOST_APART), new)
-        pairs = [(old, new) for old in earlier] + [(new, old) for old in earlier]
+        pairs = [(old, new) for old in earlier]
+        if not session.scene.deformation:
+            pairs += [(new, old) for old in earlier]
         # All rays of a frame in one launch.
         inside, centres = [], []
         for i, j in pairs:
             points, other = self._frames[i].sparse, self._frames[j].seen
+            if moved := moved_between(session, self._frames[i].scene.time_s, self._frames[j].scene.time_s):
+                points = moved(points)
             with np.errstate(invalid="ignore"):
                 inside.append(points[other.camera.contains(other.project(points))])
             centres.append(np.broadcast_to(other.world_from_camera[:3, 3], inside[-1].shape))

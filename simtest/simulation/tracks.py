@@ -40,9 +40,9 @@ class Track:
     first_frame : int
         Frame in which it is born.
     birth : str
-        Why: "sequence" (it is there in the first frame), "frame border" (it enters the view), "split" (a pair is born at
-        a fold of the misfit), "hidden" (another part of the surface stood before it), "off the surface", or "not found"
-        (it lies in the view of the frame before too, but the search did not list it there).
+        Why: "sequence" (it is there in the first frame), "frame border" (it enters the view), "split" (a pair is born
+        at a fold of the misfit), "hidden" (another part of the surface stood before it), "off the surface", or "not
+        found" (it lies in the view of the frame before too, but the search did not list it there).
     death : str
         Why it has no point in the frame after its last: by the same names, "merged" instead of "split".
     entries : list of int
@@ -154,14 +154,14 @@ class Tracks:
         return [numbers[id(of_entry[entry])] for entry in range(len(highlights))]
 
     def _linked(self, session: Session, last: _Seen, seen: _Seen) -> tuple[dict[int, int], list[str], list[str]]:
-        """Return which entry of the last frame each linked one of this frame continues; reasons of births and deaths."""
+        """Return the last frame's entry that each linked one of this frame continues; why others are born and die."""
         surface = self._surface(session, self.fine)
         motion = Motion((last.world_from_camera[:3, 3], seen.world_from_camera[:3, 3]), (last.lights, seen.lights))
         forward = continuation.follow(surface, motion, last.positions, last.light)
         partner, deaths = _arrivals(forward, last.light, seen)
         # Back from what is left over: where a fold is near, one way may succeed where the other does not.
         rest = np.array([i for i in range(len(seen.light)) if i not in partner], dtype=np.int64)
-        backward = continuation.follow(surface, motion.reversed, seen.positions[rest], seen.light[rest])
+        backward = continuation.follow(surface.reversed, motion.reversed, seen.positions[rest], seen.light[rest])
         origins, why = _arrivals(backward, seen.light[rest], last)
         births = [ENDS] * len(seen.light)
         taken = set(partner.values())
@@ -170,7 +170,7 @@ class Tracks:
         for origin, of_rest in origins.items():
             if origin not in taken:
                 partner[int(rest[of_rest])] = origin
-        births = [UNLISTED if not birth else birth for birth in births]
+        births = [birth or UNLISTED for birth in births]
         return partner, births, [death or UNLISTED for death in deaths]
 
     def to_json(self) -> list[Json]:

@@ -148,13 +148,15 @@ def sample_views(
     rejected: Counter[str] = Counter()
     for viewpoint in viewpoints:
         # Render.
-        moved = scene.model_copy(update={"surface": scene.surface.model_copy(update={name: viewpoint})})
+        time_s = scene.time_s + (0.0 if fps is None else len(kept) / fps)
+        surface = scene.surface.model_copy(update={name: viewpoint})
+        moved = scene.model_copy(update={"surface": surface, "time_s": time_s if scene.deformation else scene.time_s})
         session = session or Session(moved, variant)
         view = render_view(session, moved)
         # Keep, or count the reason.
         isolated = sum(highlight.isolated for highlight in view.highlights)
         if isolated or fps is not None:
-            pose, time = session.surface.model_from_camera, None if fps is None else len(kept) / fps
+            pose, time = session.surface.model_from_camera, None if fps is None else time_s
             kept.append(SampledView(viewpoint, isolated, pose, write(view) if write else None, time))
             if label is not None:
                 label(session, view)

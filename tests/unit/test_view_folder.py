@@ -112,7 +112,7 @@ def test_what_sequences_alone_have_needs_one(tmp_path):
         api.sample_views("anatomy", tmp_path, 1, labels=True)
     with pytest.raises(InputError, match="fps: needs along"):
         api.sample_views("anatomy", tmp_path, 1, fps=25.0)
-    with pytest.raises(InputError, match="fps = 0: must be 0.1 to 1000"):
+    with pytest.raises(InputError, match=r"fps = 0: must be 0\.1 to 1000"):
         api.sample_views("anatomy", tmp_path, 1, {"surface.view": "wall"}, along=(0.4, 0.5), fps=0.0)
 
 
