@@ -6,9 +6,8 @@ import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
-from simtest.conventions import ON_INSTRUMENT
 from simtest.errors import InputError
-from simtest.nightly.gate.quantities import OLDEST_COLUMNS, RESULT_COLUMNS
+from simtest.nightly.gate.quantities import OLDEST_COLUMNS, OPTIONAL_COLUMNS, RESULT_COLUMNS
 from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
 from simtest.nightly.records import CELL, NightlyRun, RunRecord
 from simtest.nightly.small_rows import small, whole
@@ -28,10 +27,10 @@ from simtest.validation.results_table import SCHEMA
 LOG = "log.jsonl"
 MAX_REASON = 1000
 
-COLUMNS = (*CELL, "realisation", *RESULT_COLUMNS, ON_INSTRUMENT)
+COLUMNS = (*CELL, "realisation", *RESULT_COLUMNS, *OPTIONAL_COLUMNS)
 """Columns of the rows that a baseline keeps: what names a row, and what `simtest.nightly.gate.compare` reads.
 
-`ON_INSTRUMENT` is that of scenes with instruments alone.
+Those of `OPTIONAL_COLUMNS` stand in runs of some scenes alone.
 """
 
 NEEDED = (*CELL, "realisation", *OLDEST_COLUMNS)
@@ -58,7 +57,8 @@ def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
             f"of the profile {profile}"
         )
     rows = whole(run.rows, folder / BASELINE_ROWS)
-    known = {name: dtype for name, dtype in SCHEMA.items() if name in NEEDED or name in rows.columns}
+    types = {**SCHEMA, **OPTIONAL_COLUMNS}
+    known = {name: dtype for name, dtype in types.items() if name in NEEDED or name in rows.columns}
     check_columns(folder / BASELINE_ROWS, rows, known)
     return dataclasses.replace(run, rows=rows)
 

@@ -16,6 +16,7 @@ from simtest.nightly import cost
 from simtest.nightly.canaries import randomness as noise
 from simtest.nightly.canaries import run_canaries
 from simtest.nightly.canaries.canary import or_failed_canary
+from simtest.nightly.canaries.signs import wrong_signs
 from simtest.nightly.gate.figures import setting_figures
 from simtest.nightly.ladder import ladder_canary, ladder_figures, ladder_values
 from simtest.nightly.records import FIGURES, NightlyRun, RunRecord, figure_table
@@ -105,6 +106,7 @@ def measure_run(
         figures.insert(0, setting_figures(rows, frames_of(experiments, cases)))
         if profile.canaries:
             figures.append(or_failed_canary("noises_of", lambda: figure_table(noise.noises_of(rows, experiments))))
+            figures.append(or_failed_canary("wrong_signs", lambda: figure_table(wrong_signs(rows))))
     if profile.costs:
         steps.show("costs")
         figures.append(or_failed_canary("costs", lambda: cost.run_times(options.variant)))

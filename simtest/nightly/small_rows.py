@@ -6,13 +6,13 @@ import numpy as np
 import polars as pl
 
 from simtest.errors import InputError
-from simtest.nightly.gate.quantities import OLDEST_COLUMNS, RESULT_COLUMNS
+from simtest.nightly.gate.quantities import OLDEST_COLUMNS, OPTIONAL_COLUMNS, RESULT_COLUMNS
 from simtest.runtime.resources import shown
 from simtest.validation.results_table import SCHEMA
 
-SINGLE_PRECISION = tuple(
-    name for name in RESULT_COLUMNS if name not in OLDEST_COLUMNS and SCHEMA[name] == pl.Float64()
-)  # fmt: skip
+_TYPES = {name: SCHEMA[name] for name in RESULT_COLUMNS if name not in OLDEST_COLUMNS} | OPTIONAL_COLUMNS
+
+SINGLE_PRECISION = tuple(name for name, dtype in _TYPES.items() if dtype == pl.Float64())
 """Columns that a baseline keeps in single precision, for it lies in git: they are compared with margins."""
 
 REFERENCE = "error_deg"
