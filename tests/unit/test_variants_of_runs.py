@@ -1,6 +1,5 @@
 """Each experiment of a run has its own Mitsuba variant: its rows do not depend on the experiments beside it."""
 
-import itertools
 import json
 
 import numpy as np
@@ -61,7 +60,7 @@ def alone(experiments, tmp_path_factory):
     return {name: run(experiments, [name], folder)[name] for name in experiments}
 
 
-@pytest.mark.parametrize("names", itertools.permutations(TEXTS, 2))
+@pytest.mark.parametrize("names", [("coloured", "grey"), ("grey", "coloured")])
 def test_an_experiment_beside_one_of_another_variant_has_the_rows_that_it_has_alone(
     names, experiments, alone, tmp_path
 ):
