@@ -264,27 +264,16 @@ def validate(
     ('index.html', ['cone_axis'])
     """
     from simtest.estimators.process.naming import close_cores
-    from simtest.report import write_report
-    from simtest.report.run_results import RunResults
     from simtest.runtime.engines import make_engine
     from simtest.runtime.locks import exclusive_folder
     from simtest.runtime.machine_errors import disk_problem, write_error
-    from simtest.validation.runner import run_experiment
-
-    if export is not None:
-        from simtest.dataset.export import check_export, export_run
 
     described = _experiment(experiment, settings, overrides)
     chosen = engine or make_engine(workers=workers)
+    frames = None if export is None else Path(export)
     with exclusive_folder(Path(out)):
         try:
-            if export is not None:
-                check_export(described, Path(out), Path(export))
-            run = run_experiment(described, Path(out), command, variant, progress, chosen)
-            page = write_report(run.folder, progress)
-            if export is not None:
-                export_run(run.folder, described, Path(export), chosen, progress)
-            made = RunResults(page)
+            made = _run_and_report(described, Path(out), command, variant, progress, chosen, frames)
             made.warn_of_faults()
             return made
         except OSError as error:
@@ -295,6 +284,27 @@ def validate(
         finally:
             # The page's worst cases are estimated again.
             close_cores()
+
+
+def _run_and_report(
+    experiment: "Experiment", out: Path, command: str, variant: str | None, progress: "Progress | None",
+    engine: "Engine", export: Path | None,
+) -> "RunResults":  # fmt: skip
+    """Run an experiment, write its page, and export its frames where a folder for them is given."""
+    from simtest.report import write_report
+    from simtest.report.run_results import RunResults
+    from simtest.validation.runner import run_experiment
+
+    if export is not None:
+        from simtest.dataset.export import check_export, export_run
+
+        # Before the work.
+        check_export(experiment, out, export)
+    run = run_experiment(experiment, out, command, variant, progress, engine)
+    page = write_report(run.folder, progress)
+    if export is not None:
+        export_run(run.folder, experiment, export, engine, progress)
+    return RunResults(page)
 
 
 def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, overrides: Mapping[str, Any]) -> "Scene":

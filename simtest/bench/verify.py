@@ -16,7 +16,8 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.runtime.engines import Engine
 from simtest.runtime.files import JsonObject
 from simtest.runtime.resources import shown
-from simtest.validation.runner import RESULTS, Progress
+from simtest.validation.run_folder import RESULTS
+from simtest.validation.runner import Progress
 from simtest.validation.statistics import PENALTY_DEG
 
 

@@ -42,7 +42,8 @@ from simtest.spec import Experiment, calibration_toml, camera_table
 from simtest.spec.sensor import Sensor
 from simtest.validation.cases import expand
 from simtest.validation.matching import peak_px
-from simtest.validation.runner import EXPORTING, Progress
+from simtest.validation.run_folder import EXPORTING
+from simtest.validation.runner import Progress
 
 FRAMES, PREVIEWS, CAMERAS = "frames", "previews", "cameras"
 TABLES = {

@@ -34,7 +34,8 @@ from simtest.runtime.engines import Engine
 from simtest.runtime.locks import LOCK
 from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.relief import Relief
-from simtest.validation.runner import EXPORT, EXPORTING, Progress
+from simtest.validation.run_folder import EXPORT, EXPORTING
+from simtest.validation.runner import Progress
 
 MAX_DEPTH_NORMAL_DEG = 5.0
 """The median angle between a sample's normals and those of its depth map is far below this, whatever its noise."""

@@ -6,13 +6,11 @@ import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
-import polars as pl
-
-from simtest.conventions import ON_INSTRUMENT
 from simtest.errors import InputError
-from simtest.nightly.gate.quantities import OLDEST_COLUMNS, RESULT_COLUMNS
+from simtest.nightly.gate.quantities import OLDEST_COLUMNS, OPTIONAL_COLUMNS, RESULT_COLUMNS
 from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
 from simtest.nightly.records import CELL, NightlyRun, RunRecord
+from simtest.nightly.small_rows import small, whole
 from simtest.nightly.storage import (
     BASELINE_ROWS,
     LATEST_ROWS,
@@ -29,19 +27,14 @@ from simtest.validation.results_table import SCHEMA
 LOG = "log.jsonl"
 MAX_REASON = 1000
 
-COLUMNS = (*CELL, "realisation", *RESULT_COLUMNS, ON_INSTRUMENT)
+COLUMNS = (*CELL, "realisation", *RESULT_COLUMNS, *OPTIONAL_COLUMNS)
 """Columns of the rows that a baseline keeps: what names a row, and what `simtest.nightly.gate.compare` reads.
 
-`ON_INSTRUMENT` is that of scenes with instruments alone.
+Those of `OPTIONAL_COLUMNS` stand in runs of some scenes alone.
 """
 
 NEEDED = (*CELL, "realisation", *OLDEST_COLUMNS)
 """Columns without which a baseline is none; one of an older version may lack the others."""
-
-SINGLE_PRECISION = tuple(
-    name for name in RESULT_COLUMNS if name not in OLDEST_COLUMNS and SCHEMA[name] == pl.Float64()
-)  # fmt: skip
-"""Columns that a baseline keeps in single precision, for it lies in git: they are compared with margins."""
 
 
 def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
@@ -63,8 +56,9 @@ def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
             f"{shown(folder / RUN_FILE)}: profile = {shown(run.record.profile)}; the baseline of this night must be "
             f"of the profile {profile}"
         )
-    rows = run.rows.with_columns(pl.col(name).cast(pl.Float64) for name in SINGLE_PRECISION if name in run.rows.columns)
-    known = {name: dtype for name, dtype in SCHEMA.items() if name in NEEDED or name in rows.columns}
+    rows = whole(run.rows, folder / BASELINE_ROWS)
+    types = {**SCHEMA, **OPTIONAL_COLUMNS}
+    known = {name: dtype for name, dtype in types.items() if name in NEEDED or name in rows.columns}
     check_columns(folder / BASELINE_ROWS, rows, known)
     return dataclasses.replace(run, rows=rows)
 
@@ -134,10 +128,8 @@ def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
     with scratch(reports, new_run_id(now)) as folder, exclusive_replacement(target):
         new = folder / "baseline"
         new.mkdir()
-        small = run.rows.with_columns(
-            pl.col(name).cast(pl.Float32) for name in SINGLE_PRECISION if name in run.rows.columns
-        )
-        save_run(new, NightlyRun(record, small, run.figures), BASELINE_ROWS, COLUMNS)
+        rows = small(run.rows.select(name for name in COLUMNS if name in run.rows.columns))
+        save_run(new, NightlyRun(record, rows, run.figures), BASELINE_ROWS, smallest=True)
         # The log of all acceptances goes along.
         if (target / LOG).is_file():
             shutil.copyfile(target / LOG, new / LOG)

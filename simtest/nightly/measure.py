@@ -10,11 +10,13 @@ from pathlib import Path
 
 import polars as pl
 
+from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.nightly import cost
 from simtest.nightly.canaries import randomness as noise
 from simtest.nightly.canaries import run_canaries
 from simtest.nightly.canaries.canary import or_failed_canary
+from simtest.nightly.canaries.signs import wrong_signs
 from simtest.nightly.gate.figures import setting_figures
 from simtest.nightly.ladder import ladder_canary, ladder_figures, ladder_values
 from simtest.nightly.records import FIGURES, NightlyRun, RunRecord, figure_table
@@ -26,6 +28,7 @@ from simtest.runtime.measuring import PeakMemory
 from simtest.spec import Experiment, Profile, experiments_of
 from simtest.validation.cases import Case, expand
 from simtest.validation.fingerprints import definition
+from simtest.validation.jobs import variant_of
 from simtest.validation.runner import Progress, run_experiments
 
 _LOOK_S = 0.5
@@ -79,13 +82,13 @@ def measure_run(
     Raises
     ------
     SimtestError
-        If an experiment is malformed or cannot be run.
+        If an experiment is malformed or cannot be run, or nothing was measured.
     """
     started, clock = datetime.now(UTC), time.monotonic()
     # Asked at the start: the checkout may have moved on before the run ends.
     origin = {**provenance.environment(), "source_hash": provenance.source_hash()}
     experiments, cases = planned or plan_run(profile)
-    definitions = {own.name: definition(own, of_own) for own, of_own in zip(experiments, cases, strict=True)}
+    planned_pairs = list(zip(experiments, cases, strict=True))
     steps = _Steps(options.progress, sum(case.realisations for of_own in cases for case in of_own))
     figures: list[pl.DataFrame] = []
     with PeakMemory(os.getpid(), _LOOK_S) as peak:
@@ -103,30 +106,43 @@ def measure_run(
         figures.insert(0, setting_figures(rows, frames_of(experiments, cases)))
         if profile.canaries:
             figures.append(or_failed_canary("noises_of", lambda: figure_table(noise.noises_of(rows, experiments))))
+            figures.append(or_failed_canary("wrong_signs", lambda: figure_table(wrong_signs(rows))))
     if profile.costs:
         steps.show("costs")
         figures.append(or_failed_canary("costs", lambda: cost.run_times(options.variant)))
         figures.append(cost.memory(peak.peak_mib, options.workers))
     steps.end()
+    table = pl.concat([each.select(*FIGURES) for each in figures])
+    if not table.height:
+        raise InputError(
+            f"profile {profile.name}: its experiments gave no rows, and canaries and costs are off; "
+            "give it settings with a highlight in view, or canaries = true"
+        )
+    record = {
+        **_origin_of(profile, options),
+        "id": run_id,
+        "started": started.isoformat(timespec="seconds"),
+        "duration_s": round(time.monotonic() - clock, 1),
+        "experiments_s": round(took_s, 1),
+        "definitions": {own.name: definition(own, of_own) for own, of_own in planned_pairs},
+        "variants": {own.name: variant_of(of_own, options.variant) for own, of_own in planned_pairs},
+        **origin,
+    }
+    return NightlyRun(RunRecord.model_validate(record), rows, table)
+
+
+def _origin_of(profile: Profile, options: RunOptions) -> dict[str, object]:
+    """Return what a run's record says of the profile and of how the run was made."""
     library = backend.library_in_use()
-    record = RunRecord.model_validate(
-        {
-            "id": run_id,
-            "profile": profile.name,
-            "title": profile.title or profile.name,
-            "started": started.isoformat(timespec="seconds"),
-            "duration_s": round(time.monotonic() - clock, 1),
-            "experiments_s": round(took_s, 1),
-            "workers": options.workers,
-            "definitions": definitions,
-            "command": options.command,
-            **origin,
-            "variant": backend.requested_variant(options.variant),
-            # Its name alone: runs of two machines are compared, where it lies elsewhere.
-            "llvm": None if library is None else Path(library).name,
-        }
-    )
-    return NightlyRun(record, rows, pl.concat([table.select(*FIGURES) for table in figures]))
+    return {
+        "profile": profile.name,
+        "title": profile.title or profile.name,
+        "workers": options.workers,
+        "command": options.command,
+        "variant": backend.requested_variant(options.variant),
+        # Its name alone: runs of two machines are compared, where it lies elsewhere.
+        "llvm": None if library is None else Path(library).name,
+    }
 
 
 def measured_ladder() -> pl.DataFrame:

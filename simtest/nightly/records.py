@@ -109,8 +109,8 @@ class RunRecord(BaseModel):
     """A run's record, as run.json holds it: when and where the run was made, of what, and by which versions.
 
     Fields that a record lacks have their defaults; `to_json` writes those alone that were given. Keys that this version
-    does not know are kept. `definitions` is a hash by experiment (what was run); `reason` and `accepted` are a
-    baseline's.
+    does not know are kept. `definitions` is a hash by experiment (what was run); `variant` is Mitsuba's for
+    grey scenes, `variants` that of each experiment; `reason` and `accepted` are a baseline's.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -132,6 +132,7 @@ class RunRecord(BaseModel):
     system: str | None = None
     source_hash: str | None = None
     variant: str | None = None
+    variants: dict[str, str] = {}
     llvm: str | None = None
     reason: str | None = None
     accepted: str | None = None

@@ -3,7 +3,7 @@
 import contextlib
 import errno
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +46,11 @@ def disk_errors_in_one_line(root: Path, what: str, left: str) -> Iterator[None]:
         raise SimtestError(f"--reports {shown(root)}: {what} ({why}); {left}") from error
 
 
-def save_run(folder: Path, run: NightlyRun, rows_file: str, columns: Sequence[str] | None = None) -> None:
-    """Write a run into an existing folder: run.json, the figures, and the rows, or some of their columns."""
-    rows = run.rows if columns is None else run.rows.select(name for name in columns if name in run.rows.columns)
+def save_run(folder: Path, run: NightlyRun, rows_file: str, smallest: bool = False) -> None:
+    """Write a run into an existing folder: run.json, the figures and the rows, in the `smallest` form if need be."""
     # The record comes last: it holds the hashes of the tables.
-    tables = {rows_file: rows, FIGURES_FILE: run.figures}
-    how = _FAST if columns is None else _SMALL
+    tables = {rows_file: run.rows, FIGURES_FILE: run.figures}
+    how = _SMALL if smallest else _FAST
     for name, table in tables.items():
         write_atomically(folder / name, lambda part, table=table: table.write_parquet(part, **how))  # type: ignore[misc]
     hashes = {name: file_hash(folder / name) for name in tables}

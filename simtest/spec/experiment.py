@@ -125,8 +125,8 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     # The experiment's own keys; all others are keys of the scenes.
     settings = dict(settings or {})
     own = {key: settings.pop(key) for key in list(settings) if key in _EXPERIMENT_KEYS}
-    changes = {key: value for key, value in settings.items() if value is not None or key != "views"}
     views = settings.pop("views", None)
+    changes = [f"{key}={value}" for key, value in settings.items()]
     _check_first_parts(settings)
     experiment = load(Experiment, path, own)
     groups = tuple(_override(group, settings) for group in experiment.groups)
@@ -140,7 +140,10 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     # The page must say that this is not the experiment as shipped.
     description = experiment.description
     if changes:
-        description = f"{description} With {', '.join(f'{key}={value}' for key, value in changes.items())}.".strip()
+        description = f"{description} With {', '.join(changes)}.".strip()
+    if views is not None:
+        kept = "the first viewpoint" if views == 1 else f"the first {views} viewpoints"
+        description = f"{description} Cut down by views={views}: at most {kept} of each setting.".strip()
     return experiment.model_copy(update={"groups": groups, "description": description})
 
 

@@ -14,6 +14,7 @@ from simtest.surfaces.mesh_file import other_unit, read_mesh
 from simtest.surfaces.mesh_geometry import area_quantile, edge_lengths, edge_uses, vertex_areas
 from simtest.surfaces.mesh_surface import is_lumen
 from simtest.surfaces.model import principal_curvatures
+from simtest.surfaces.poses import nearest_mm
 from simtest.surfaces.repair import MAX_CROSSING_FACES, Condition, Repairs, examine
 from simtest.surfaces.subdivision import shape_operators
 
@@ -173,15 +174,15 @@ class Verdict:
             yield f"verdict     too coarse: edges of {self.needed_edge_mm:.2g} mm are needed (surface.edge_mm)"
 
 
-def check_mesh(path: str | Path, distance_mm: float, concentration: float, kind: str = "auto") -> Verdict:
+def check_mesh(path: str | Path, distance_mm: float | None, concentration: float, kind: str = "auto") -> Verdict:
     """Judge a mesh file.
 
     Parameters
     ----------
     path : str or Path
         PLY, OBJ, STL or VTK; lengths in mm.
-    distance_mm : float
-        Distance of camera and light from the surface, mm.
+    distance_mm : float or None
+        Distance of camera and light from the surface, mm; None: that of the nearest viewpoints on the camera's side.
     concentration : float
         c of the lobe (`simtest.surfaces.fineness`).
     kind : {"auto", "lumen", "organ"}
@@ -195,6 +196,7 @@ def check_mesh(path: str | Path, distance_mm: float, concentration: float, kind:
     # size, unit and side, after the repairs
     vertices, faces, repairs = read_mesh(path)
     lumen = is_lumen(vertices, faces, kind)
+    distance_mm = nearest_mm(lumen) if distance_mm is None else distance_mm
     lengths, extents = edge_lengths(vertices, faces), np.ptp(vertices, axis=0)
     # Curvature, and the edges that highlights need because of it
     median = p95 = needed = share = None

@@ -18,7 +18,7 @@ from simtest.surfaces.fineness import DEFAULT_EXPONENT, needed_edge, phong_conce
 from simtest.surfaces.mesh_file import MESH_SUFFIXES, other_unit, read_mesh
 from simtest.surfaces.mesh_geometry import area_quantile, edge_lengths, isoperimetric_quotient
 from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures
-from simtest.surfaces.poses import AXIS_RANGE_MM, ORGAN_RANGE_MM, lumen_pose, organ_pose
+from simtest.surfaces.poses import lumen_pose, nearest_mm, organ_pose
 from simtest.surfaces.repair import examine
 from simtest.surfaces.subdivision import (
     allowed_smoothing,
@@ -239,7 +239,7 @@ def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: 
     """
     vertices, faces = refine(vertices, faces, 0, smoothing_mm)
     # The nearest camera sees the narrowest highlights.
-    distance = (AXIS_RANGE_MM if lumen else ORGAN_RANGE_MM)[0]
+    distance = nearest_mm(lumen)
     k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
     needed = needed_edge(distance, AUTO_CONCENTRATION, k_min, k_max)
     return area_quantile(needed, vertices, faces, EDGE_QUANTILE)

@@ -32,12 +32,18 @@ ORGAN_RANGE_MM = (40.0, 150.0)
 ORGAN_TILT_DEG = 25.0
 """Largest angle between the sightline and the normal of the point it looks at."""
 
+
 _DIRECTIONS = 64
 _TARGETS = 64
 
 Generator = np.random.Generator
 Clearance = Callable[[Array], Array]
 Cast = Callable[[Array, Array], Array]
+
+
+def nearest_mm(lumen: bool) -> float:
+    """Return the distance, mm, from the wall of a lumen or from an organ that chosen viewpoints keep at least."""
+    return (AXIS_RANGE_MM if lumen else ORGAN_RANGE_MM)[0]
 
 
 class MeshProbe:

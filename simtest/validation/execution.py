@@ -1,5 +1,6 @@
 """The parts that an experiment's work is split into: each makes some rows, in any process and in any order."""
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,6 +13,7 @@ from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.process.naming import forgive_cores
 from simtest.runtime.engines import OnStep
 from simtest.spec import Experiment
+from simtest.spec.paper import PaperSetting
 from simtest.validation import gallery_items as gallery
 from simtest.validation.cases import Case
 from simtest.validation.paper.bound import cramer_rao_bound
@@ -22,6 +24,9 @@ from simtest.validation.results_table import ResultRow, Value, completed, table
 
 PAPER_CHUNK = 125
 """Realisations of the published protocol that a part makes: a second's work."""
+
+GALLERY_ITEMS = 18
+"""Cases of an experiment that are kept for the gallery."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,7 @@ class Part:
 
 @lru_cache(maxsize=1)
 def realiser_of(variant: str | None) -> Realiser:
-    """Return this process's realiser, which stays from part to part."""
+    """Return this process's realiser, which stays from part to part; that of another variant is let go."""
     return Realiser(variant)
 
 
@@ -63,6 +68,14 @@ def forget() -> None:
     realiser_of.cache_clear()
     _estimators.cache_clear()
     pipeline_with.cache_clear()
+
+
+def gallery_cases(cases: list[Case]) -> set[int]:
+    """Choose the cases whose first realisation is kept: evenly spaced ones, and the published protocol's defaults."""
+    count = min(GALLERY_ITEMS, len(cases))
+    chosen = set(np.linspace(0, len(cases) - 1, count).round().astype(int).tolist())
+    at_defaults = (i for i, case in enumerate(cases) if case.is_paper and case.paper_setting() == PaperSetting())
+    return chosen | set(itertools.islice(at_defaults, 1))
 
 
 def parts_of(

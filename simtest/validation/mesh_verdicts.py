@@ -15,9 +15,6 @@ from simtest.spec.type_change import replace_values
 if TYPE_CHECKING:
     from simtest.surfaces.mesh_check import Verdict
 
-DISTANCE_MM = 30.0
-"""Of camera and light, as `simtest mesh check` takes it: the viewpoints are chosen later."""
-
 
 @dataclass(frozen=True)
 class MeshVerdict:
@@ -79,17 +76,18 @@ def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
     from simtest.surfaces.mesh_check import check_mesh
 
     lobe = concentration(None, None) if curvature is None else curvature
-    found = check_mesh(surface.file(), DISTANCE_MM, lobe, surface.kind)
-    needed, fine = found.needed_edge_mm, found.fine
+    found = check_mesh(surface.file(), None, lobe, surface.kind)
+    # At the distance of the nearest viewpoints, which see the narrowest highlights.
+    needed, fine, at = found.needed_edge_mm, found.fine, f" at {found.distance_mm:g} mm"
     if fine:
         text = "fine enough"
     elif needed is None:
         text = "too large to be judged"
     elif surface.edge_mm is None:
-        text = f"too coarse: edges of {needed:.2g} mm are needed at {DISTANCE_MM:g} mm (surface.edge_mm)"
+        text = f"too coarse: edges of {needed:.2g} mm are needed{at} (surface.edge_mm)"
     else:
         reached = _refined_edge(found, needed if surface.edge_mm == "auto" else surface.edge_mm)
-        fine, at = reached <= needed, f" at {DISTANCE_MM:g} mm"
+        fine = reached <= needed
         text = f"refined to edges of {reached:.2g} mm by surface.edge_mm = {surface.edge_mm}"
         text += f", at most {needed:.2g} mm are needed{at}" if fine else f": too coarse, {needed:.2g} mm are needed{at}"
     text += f"; taken for {found.side}"

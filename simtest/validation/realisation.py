@@ -61,7 +61,7 @@ class Realiser:
     """
 
     def __init__(self, variant: str | None) -> None:
-        self._variant = variant
+        self.variant = variant
         self._view: RenderedView | None = None
         self._further: list[FurtherView] = []
 
@@ -77,7 +77,7 @@ class Realiser:
         scene, drawn = case.scene(experiment, number)
         # A scene without drawn values is rendered once for all realisations.
         if self._view is None:
-            self.session = Session(scene, self._variant)
+            self.session = Session(scene, self.variant)
         if self._view is None or scene != self._view.scene:
             self._further = further_views(self.session, scene)
             self._view = render_view(self.session, scene)

@@ -15,7 +15,8 @@ from simtest.validation.conditions import conditions_of
 from simtest.validation.faults import faults_of
 from simtest.validation.mesh_verdicts import mesh_verdicts
 from simtest.validation.realism import realism_of
-from simtest.validation.runner import RESULTS, RunRecord
+from simtest.validation.run_folder import RESULTS
+from simtest.validation.runner import RunRecord
 from simtest.validation.statistics import summarise
 
 

@@ -11,6 +11,7 @@ from simtest.estimators import load_estimators
 from simtest.spec import Experiment
 from simtest.validation import gallery_items as gallery
 from simtest.validation.cases import Case, expand
+from simtest.validation.jobs import variant_of
 from simtest.validation.paper.gallery_item import save_realisation
 from simtest.validation.realisation import Realiser
 from simtest.validation.results_table import Value
@@ -122,7 +123,8 @@ def save_worst(
     by_name = {experiment.name: experiment for experiment in experiments}
     expanded: dict[str, list[Case]] = {}
     folder.mkdir(parents=True, exist_ok=True)
-    files, realiser = [], Realiser(variant)
+    files: list[Path] = []
+    realiser = Realiser(variant)
     for i, worst in enumerate(cases):
         experiment = by_name.get(worst.experiment)
         if experiment is None:
@@ -134,6 +136,9 @@ def save_worst(
         if case.is_paper:
             save_realisation(file, experiment, case, worst.realisation, worst.why)
         else:
+            # The variant is the one that the experiment was run with.
+            own = variant_of(expanded[worst.experiment], variant)
+            realiser = realiser if realiser.variant == own else Realiser(own)
             made = realiser.make(experiment, case, worst.realisation, load_estimators(experiment.estimators))
             gallery.save(file, realiser.session, experiment, case, made, worst.why)
         files.append(file)

@@ -133,7 +133,7 @@ def test_few_viewpoints_of_an_experiment():
     assert {case.setting for case in expand(few)} == kinds
     # 48, 5 x 12 and 3 x 8 frames, or 3 of each.
     assert (len(expand(all_of_them)), len(expand(few))) == (132, 27)
-    assert few.description.endswith("With views=3.")
+    assert few.description.endswith("Cut down by views=3: at most the first 3 viewpoints of each setting.")
     assert len(expand(load_experiment("mesh", {"views": 1000}))) == 132
     refused(lambda: load_experiment("curvature", {"views": 3}), "--set views: no group of", "varies surface.viewpoint")
 

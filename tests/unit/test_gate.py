@@ -265,6 +265,16 @@ def test_what_else_ran_otherwise_is_said(key):
     assert compare(night(table, **{key: "new"}), night(table)).notes == ()
 
 
+def test_an_experiment_of_another_variant_is_named():
+    table, mono, rgb = rows(), {"e": "mono", "f": "mono", "old": "rgb"}, {"e": "rgb", "f": "mono", "new": "rgb"}
+    verdict = compare(night(table, variant="mono", variants=rgb), night(table, variant="mono", variants=mono))
+    assert verdict.notes == ("The variant of e changed from mono to rgb.",)
+    # The change of the whole run's variant is told once; records of older versions have no variants.
+    whole_run = compare(night(table, variant="rgb", variants={"e": "rgb"}), night(table, variant="mono", variants=mono))
+    assert whole_run.notes == ("The variant changed from mono to rgb.",)
+    assert compare(night(table, variants=rgb), night(table)).notes == ()
+
+
 def test_false_detections_are_counted_by_frames():
     table = rows()
     false = changed(table, True, true_id=None, specularity=1, error_deg=None, mahalanobis2=None, axis_ratio=None)

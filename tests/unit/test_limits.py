@@ -27,7 +27,7 @@ from simtest.surfaces import mesh_file, vtk_file
 from simtest.surfaces.mesh_file import read_mesh
 from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.vtk_file import read_vtk
-from simtest.validation import runner
+from simtest.validation import run_folder
 from simtest.validation.cases import check_effort
 from simtest.validation.depth_maps import read_depth
 from studies.bad_inputs import files
@@ -300,7 +300,7 @@ def test_a_fingerprint_that_cannot_be_one_is_not_read(tmp_path):
     record = tmp_path / "parts" / "fingerprint.json"
     record.parent.mkdir()
     files.sparse('"digest"')(record)
-    runner._prepare(tmp_path, "digest")
+    run_folder.prepare(tmp_path, "digest")
     assert record.read_text().strip() == '"digest"'
 
 

@@ -11,6 +11,8 @@ import trimesh
 from simtest.cli.manners import MANNERS
 from simtest.cli.validate import validate
 from simtest.spec import Experiment, Group
+from simtest.surfaces.fineness import concentration
+from simtest.surfaces.mesh_check import check_mesh
 from simtest.surfaces.mesh_file import read_mesh
 from simtest.surfaces.ply_polygons import read_mixed_polygons
 from simtest.validation.mesh_verdicts import MeshVerdict, mesh_verdicts
@@ -110,6 +112,18 @@ def experiment(**values):
     return Experiment(name="x", groups=(Group(scene="anatomy", set=values), Group(scene="plane")))
 
 
+@pytest.mark.parametrize(("kind", "distance"), [("lumen", 10), ("organ", 40)])
+def test_a_mesh_is_judged_at_the_distance_of_its_nearest_viewpoints(tmp_path, kind, distance):
+    path = tmp_path / "ball.ply"
+    ball().export(path)
+    (verdict,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.kind": kind}))
+    at_distance = check_mesh(path, distance, concentration(200.0, None), kind)
+    assert f"edges of {at_distance.needed_edge_mm:.2g} mm are needed at {distance} mm" in verdict.text
+    assert at_distance.needed_edge_mm != pytest.approx(
+        check_mesh(path, 30.0, concentration(200.0, None), kind).needed_edge_mm, rel=0.05
+    )
+
+
 def test_an_experiment_judges_its_mesh_files_once(tmp_path, monkeypatch):
     path = tmp_path / "ball.ply"
     ball().export(path)
@@ -118,12 +132,12 @@ def test_an_experiment_judges_its_mesh_files_once(tmp_path, monkeypatch):
     (coarse,) = mesh_verdicts(experiment(**{"surface.path": str(path)}))
     assert not coarse.usable
     assert str(coarse).startswith(f"mesh {path}: too coarse: edges of 0.")
-    assert str(coarse).endswith(" mm are needed at 30 mm (surface.edge_mm); taken for an organ, camera outside")
+    assert str(coarse).endswith(" mm are needed at 40 mm (surface.edge_mm); taken for an organ, camera outside")
     assert coarse.to_json() == {"file": str(path), "usable": False, "verdict": coarse.text}
     (refined,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.edge_mm": "auto"}))
     assert refined.usable
     assert re.fullmatch(
-        r"refined to edges of 0\.\d+ mm by surface.edge_mm = auto, at most 0\.\d+ mm are needed at 30 mm; "
+        r"refined to edges of 0\.\d+ mm by surface.edge_mm = auto, at most 0\.\d+ mm are needed at 40 mm; "
         "taken for an organ, camera outside",
         refined.text,
     )

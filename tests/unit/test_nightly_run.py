@@ -31,7 +31,6 @@ from simtest.runtime.resources import data_root
 from simtest.spec import experiments_of, load_profile
 from simtest.validation.cases import expand
 from simtest.validation.fingerprints import definition
-from simtest.validation.runner import is_coloured
 from tests.unit.nightly_samples import STARTED, canary, make_rows, make_run, regression
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -122,10 +121,8 @@ def contents(folder):
 def test_shipped_profiles_represent_every_experiment(name):
     experiments = experiments_of(load_profile(name))
     shipped = {file.stem for file in (data_root("scenes") / "experiments").glob("*.toml")}
-    # `mesh` is `colon` until it is given a mesh. `dense` has frames in colour, which need another Mitsuba variant: all
-    # experiments of a night share one, and in colour three channels average the noise of those that are grey.
-    assert {experiment.name for experiment in experiments} == shipped - {"mesh", "dense"}
-    assert not any(is_coloured(expand(experiment)) for experiment in experiments)
+    # `mesh` is `colon` until it is given a mesh.
+    assert {experiment.name for experiment in experiments} == shipped - {"mesh"}
     for experiment in experiments:
         assert expand(experiment)
 
@@ -438,9 +435,21 @@ def night_of(tmp_path, text=PAPER):
     return measure.measure_run(profile_of(tmp_path, text), folder, "id")
 
 
+def test_a_run_that_measured_nothing_is_refused(tmp_path):
+    """No highlight lies in view, and nothing else is measured: history and gate would have no figure at all."""
+    (tmp_path / "blank.toml").write_text(
+        'realisations = 1\nestimators = ["brightest_point"]\n[[groups]]\nscene = "plane"\n'
+        'set = { "surface.tilt_deg" = 60.0, "reflectance.diffuse" = 0.3, "camera.width" = 32, "camera.height" = 32 }\n'
+    )
+    blank = 'canaries = false\ncosts = false\n[[experiments]]\nexperiment = "blank.toml"\n'
+    with pytest.raises(InputError, match="profile mine: its experiments gave no rows, and canaries and costs are off"):
+        night_of(tmp_path, blank)
+
+
 def test_canaries_come_first(parts, tmp_path):
     run = night_of(tmp_path)
     assert parts == ["canaries", "ladder", "experiments", "noises_of", "costs"]
+    assert run.record.variants == {"paper": "llvm_ad_mono"}
     assert run.failed_canaries.height == 0
     assert set(run.figures["kind"]) == {"setting", "canary", "ladder", "cost"}
 

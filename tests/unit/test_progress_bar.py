@@ -9,7 +9,7 @@ from rich import progress as rich
 from simtest.cli import progress
 from simtest.cli.progress import progress_bar
 from simtest.cli.remaining import LEAST_STEPS, Remaining
-from simtest.validation.runner import _told as told
+from simtest.validation.case_work import names_of as told
 
 
 @pytest.fixture

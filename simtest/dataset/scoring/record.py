@@ -23,7 +23,7 @@ from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import Case, expand
 from simtest.validation.fingerprints import definition
-from simtest.validation.runner import EXPORT
+from simtest.validation.run_folder import EXPORT
 
 Format = Literal["simtest export, version 1"]
 FORMAT: Format = "simtest export, version 1"

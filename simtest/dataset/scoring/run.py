@@ -28,13 +28,14 @@ from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
 from simtest.validation import gallery_items
 from simtest.validation.cases import swept_example
-from simtest.validation.execution import forget
+from simtest.validation.execution import forget, gallery_cases
 from simtest.validation.fingerprints import input_hashes
 from simtest.validation.realisation import realise
 from simtest.validation.results_table import ResultRow, Value
 from simtest.validation.results_table import table as results_table
+from simtest.validation.run_folder import EXPORT, check_folder, remove_folder
 from simtest.validation.run_summary import run_summary, settings_summary, write_results
-from simtest.validation.runner import EXPORT, Progress, Run, RunRecord, check_folder, gallery_cases, remove_folder
+from simtest.validation.runner import Progress, Run, RunRecord
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ WORDS = {
     "no_axis_ratio": "the share of answers without an axis ratio to judge",
     "no_law": "the share of answers without a law",
     "flagged": "the share of answers with a flag",
+    "wrong_sign": "the share of wrong signs among those that motion told",
     "n": "the number of true highlights",
     "run_time": "the run time",
     "peak_memory": "the peak memory",

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from simtest.conventions import ON_INSTRUMENT
 from simtest.nightly.gate.causes import causes
 from simtest.nightly.gate.checks import inconsistent
 from simtest.nightly.gate.contrasts import Outcomes, paired, unpaired
@@ -20,6 +19,7 @@ from simtest.nightly.gate.pairing_units import paired_sums, sums
 from simtest.nightly.gate.pooling import pooled
 from simtest.nightly.gate.published import unlike_rows
 from simtest.nightly.gate.quantities import (
+    OPTIONAL_COLUMNS,
     RESULT_COLUMNS,
     SAME_AS,
     WHERE_MIXED,
@@ -117,8 +117,7 @@ def _aligned(baseline: NightlyRun, tonight: NightlyRun) -> tuple[tuple[NightlyRu
     held = baseline.rows.columns
     absent = [name for name in RESULT_COLUMNS if name not in held]
     lacking = [pl.lit(None, SCHEMA[name]).alias(name) for name in absent]
-    if ON_INSTRUMENT not in held:
-        lacking.append(pl.lit(None, pl.Boolean()).alias(ON_INSTRUMENT))
+    lacking += [pl.lit(None, dtype).alias(name) for name, dtype in OPTIONAL_COLUMNS.items() if name not in held]
     both = [run.rows.with_columns(lacking) for run in (baseline, tonight)]
     return (replace(baseline, rows=both[0]), replace(tonight, rows=both[1])), absent
 

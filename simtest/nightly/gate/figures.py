@@ -1,11 +1,12 @@
 """Figures of a run's rows by cell, and the hash of each cell's results."""
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import polars as pl
 
+from simtest.conventions import MOTION_COLUMNS
 from simtest.nightly.gate.quantities import RATIO_OFF
 from simtest.nightly.records import CELL, Cell, Figure, figure_table
 from simtest.validation.results_table import SCHEMA
@@ -122,15 +123,14 @@ def digests_of(rows: pl.DataFrame) -> dict[Cell, str]:
     """Hash each cell's results, rows in any order: equal for two runs exactly where all numbers are the same bytes.
 
     SHA-256, hexadecimal, over the cell's rows sorted by `DIGEST_KEYS`: which entries are null, the keys as int64, the
-    numbers as float64, little-endian, the names, and the flags of answers. A column that is absent counts as null.
+    numbers as float64, little-endian, the names, and the flags of answers. A column that is absent counts as null. What
+    motion told is hashed in the cells that have it.
     """
     held = rows.sort(*CELL, *DIGEST_KEYS, nulls_last=True)
-    parts = []
+    parts: list[np.ndarray] = []
     for names, kind, dtype in ((DIGEST_KEYS, pl.Int64, "<i8"), (DIGEST_NUMBERS, pl.Float64, "<f8")):
-        columns = [_column(held, name).cast(kind).alias(name) for name in names]
-        table = held.select(columns)
-        parts.append(np.ascontiguousarray(table.select(pl.all().is_null()).to_numpy()))
-        parts.append(np.ascontiguousarray(table.fill_null(0).to_numpy(), dtype=dtype))
+        parts += _nulls_and_values(held, names, kind, dtype)
+    of_motion = _nulls_and_values(held, MOTION_COLUMNS, pl.Float64, "<f8")
     flags = pl.when(pl.col("status") == "ok").then(_column(held, "flags")).alias("flags")
     texts = held.select(*(_column(held, name).alias(name) for name in DIGEST_NAMES), flags).fill_null("").rows()
     cells = held.with_row_index("row").group_by(CELL, maintain_order=True).agg(first="row").rows()
@@ -138,11 +138,20 @@ def digests_of(rows: pl.DataFrame) -> dict[Cell, str]:
     for *cell, index in cells:
         own = slice(index[0], index[-1] + 1)
         found = hashlib.sha256(f"{len(index)} {DIGEST_KEYS} {DIGEST_NUMBERS} {DIGEST_NAMES}".encode())
-        for part in parts:
+        for part in (*parts, *(() if of_motion[0][own].all() else of_motion)):
             found.update(part[own].tobytes())
         found.update(repr(texts[own]).encode())
         made[Cell(*cell)] = found.hexdigest()
     return made
+
+
+def _nulls_and_values(
+    table: pl.DataFrame, names: Sequence[str], kind: type[pl.DataType], dtype: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which entries of some columns are null, and the values, as arrays of shape (rows, columns)."""
+    chosen = table.select(_column(table, name).cast(kind).alias(name) for name in names)
+    nulls = np.ascontiguousarray(chosen.select(pl.all().is_null()).to_numpy())
+    return nulls, np.ascontiguousarray(chosen.fill_null(0).to_numpy(), dtype=dtype)
 
 
 def _column(table: pl.DataFrame, name: str) -> pl.Expr:

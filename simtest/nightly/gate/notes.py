@@ -63,6 +63,7 @@ def notes_on(
         # A record that lacks a key says nothing of it.
         if getattr(before, key) and getattr(after, key):
             made.append(_changed(f"The {key}", getattr(before, key), getattr(after, key)))
+    made += _other_variants(before, after)
     if names := redefined(before, after):
         made.append(f"The definition of {', '.join(names)} changed: their cells were compared unpaired.")
     if unmatched:
@@ -77,6 +78,15 @@ def notes_on(
     if not bit_equal:
         made += _numbers(baseline, tonight, limits)
     return tuple(note for note in made if note)
+
+
+def _other_variants(before: RunRecord, after: RunRecord) -> list[str]:
+    """Report the experiments that both records name with another Mitsuba variant than the run's own."""
+    shared = [name for name in sorted(before.variants) if name in after.variants]
+    pairs = {name: (before.variants[name], after.variants[name]) for name in shared}
+    # A change of the run's own variant is told once.
+    pairs = {name: pair for name, pair in pairs.items() if pair != (before.variant, after.variant)}
+    return [_changed(f"The variant of {name}", was, now) for name, (was, now) in pairs.items()]
 
 
 def nothing_to_compare(tonight: NightlyRun) -> tuple[str, ...]:

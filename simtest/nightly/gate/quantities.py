@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import polars as pl
 from scipy import stats
 
-from simtest.conventions import ON_INSTRUMENT
+from simtest.conventions import MOTION, ON_INSTRUMENT
 from simtest.nightly.gate.limits import Limits
 from simtest.nightly.records import CELL
 from simtest.validation.results_table import BUDGET_COLUMNS
@@ -29,6 +29,12 @@ RESULT_COLUMNS = (
     "peak_snr", "distance_mm", "kd_min", "kd_max", "normal_x", "normal_y", "normal_z", *BUDGET_COLUMNS,
 )  # fmt: skip
 """Columns that `compare` reads, beside those that name a row: cell and realisation."""
+
+OPTIONAL_COLUMNS: dict[str, pl.DataType] = {
+    ON_INSTRUMENT: pl.Boolean(),
+    **{f"motion_{kind}_{i}": pl.Float64() for kind in ("sign", "gain") for i in (1, 2)},
+}
+"""Columns that `compare` reads too, by type: results have them only where a scene has instruments, or further views."""
 
 PENALISED = "mean_penalised_deg"
 """Mean error with `PENALTY_DEG` for unanswered highlights: every true highlight has a value."""
@@ -86,6 +92,7 @@ def quantities(limits: Limits) -> dict[str, Quantity]:
         "no_axis_ratio": share,
         "no_law": share,
         "flagged": Quantity("", 0.0, limits.rate, span=1.0, level=True),
+        "wrong_sign": share,
     }
 
 
@@ -115,6 +122,13 @@ def _of_answers(value: pl.Expr) -> pl.Expr:
 
 _LAW = pl.col("error_law_deg")
 
+_SIGNS = [pl.col(f"motion_sign_{i}").fill_null(0) for i in (1, 2)]
+_TOLD = sum(((sign != 0).cast(pl.Float64) for sign in _SIGNS), pl.lit(0.0))
+_WRONG = sum(
+    ((sign * pl.col(f"motion_gain_{i}") < 0).fill_null(False).cast(pl.Float64) for i, sign in enumerate(_SIGNS, 1)),
+    pl.lit(0.0),
+)
+
 HARMS: dict[str, pl.Expr] = {
     "mean_deg": pl.when(ANSWERED).then(pl.col("error_deg")),
     PENALISED: pl.when(ANSWERED).then(pl.col("error_deg")).when(IS_TRUE).then(PENALTY_DEG),
@@ -143,6 +157,8 @@ HARMS: dict[str, pl.Expr] = {
     "no_axis_ratio": pl.when(ANSWERED).then(RATIO_OFF.is_null().cast(pl.Float64)),
     "no_law": pl.when(ANSWERED).then((~_LAW.is_finite().fill_null(False)).cast(pl.Float64)),
     "flagged": pl.when(ANSWERED).then((pl.col("flags").fill_null("") != "").cast(pl.Float64)),
+    # Signs of curvatures that motion tells of a highlight: the wrong ones among them.
+    "wrong_sign": pl.when(IS_TRUE & (pl.col("estimator") == MOTION) & (_TOLD > 0)).then(_WRONG / _TOLD),
 }
 """Value of a row by quantity; null where the row has none. False detections are counted by frames instead."""
 
@@ -165,7 +181,7 @@ def harms(rows: pl.DataFrame, cells: pl.DataFrame) -> pl.DataFrame:
     A row for each true highlight and quantity, and one for each frame's false detections, with a null `true_id`.
     `cells` numbers the names of the cells as `cell`; rows of others are left out.
     """
-    own = rows.join(cells, on=CELL, how="inner", maintain_order="left")
+    own = with_optional(rows).join(cells, on=CELL, how="inner", maintain_order="left")
     index = ["cell", "realisation", "true_id", "seed"]
     true = own.filter(IS_TRUE).select(*index, **HARMS)
     true = true.unpivot(list(HARMS), index=index, variable_name="quantity").drop_nulls("value")
@@ -174,6 +190,13 @@ def harms(rows: pl.DataFrame, cells: pl.DataFrame) -> pl.DataFrame:
         pl.lit(None, own.schema["true_id"]).alias("true_id"), quantity=pl.lit("false"), value=count
     )
     return pl.concat([true, false.select(true.columns)])
+
+
+def with_optional(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows with the columns of `OPTIONAL_COLUMNS` that they lack, as null."""
+    return rows.with_columns(
+        pl.lit(None, dtype).alias(name) for name, dtype in OPTIONAL_COLUMNS.items() if name not in rows.columns
+    )
 
 
 def is_false(rows: pl.DataFrame) -> pl.Expr:
@@ -191,7 +214,7 @@ def is_false(rows: pl.DataFrame) -> pl.Expr:
 
 def told_twice(rows: pl.DataFrame, cells: pl.DataFrame) -> pl.DataFrame:
     """Return the quantities of `SAME_AS` that are the other one in all rows of a cell: `cell`, `quantity`."""
-    own = rows.join(cells, on=CELL, how="inner").filter(IS_TRUE).select("cell", **HARMS)
+    own = with_optional(rows).join(cells, on=CELL, how="inner").filter(IS_TRUE).select("cell", **HARMS)
     same = [
         ((pl.col(name) - pl.col(other)).abs().fill_null(0.0) <= TWICE * (1 + pl.col(other).abs().fill_null(0.0))).all()
         .and_((pl.col(name).is_null() == pl.col(other).is_null()).all()).alias(name)

@@ -1,0 +1,109 @@
+"""Wrong signs of motion: the gate's quantity, the digest and the canary see them."""
+
+import numpy as np
+import polars as pl
+import pytest
+from gate_nights import night, rows
+
+from simtest.conventions import MOTION, MOTION_COLUMNS
+from simtest.estimators.two_views import RankedHypotheses
+from simtest.nightly.canaries.signs import ALPHA, STATED, wrong_signs
+from simtest.nightly.gate.compare import compare
+from simtest.nightly.gate.figures import digests_of
+from simtest.spec import load_experiment
+from simtest.validation.runner import run_experiment
+from studies.gate.faults import Mutation, planted
+
+SETTINGS = tuple("abcdefghijkl")
+
+
+def with_signs(wrong=0.0, told=1.0, seed=0, count=20):
+    """Return rows of `motion` with true gains of both signs; a share of the told signs is wrong."""
+    table = rows(count=count, settings=SETTINGS, estimators=("cone_axis", MOTION))
+    rng = np.random.default_rng(seed)
+    gains = np.random.default_rng(3).choice([-0.5, 1.5], (table.height, 2))
+    signs = np.sign(gains) * np.where(rng.random(gains.shape) < wrong, -1, 1)
+    signs = np.where(np.random.default_rng(4).random(gains.shape) < told, signs, 0.0)
+    values = dict.fromkeys(MOTION_COLUMNS, np.full(table.height, 1.0))
+    for i in (0, 1):
+        values |= {f"motion_sign_{i + 1}": signs[:, i], f"motion_gain_{i + 1}": gains[:, i]}
+    mine = pl.col("estimator") == MOTION
+    return table.with_columns(pl.Series(name, value) for name, value in values.items()).with_columns(
+        pl.when(mine).then(pl.col(name)) for name in MOTION_COLUMNS
+    )
+
+
+def outcomes(tonight, baseline):
+    found = compare(night(tonight), night(baseline)).comparisons.filter(quantity="wrong_sign")
+    return dict(found.group_by("outcome").len().iter_rows()), found
+
+
+def test_more_wrong_signs_are_a_regression_and_fewer_must_be_explained():
+    few, many = with_signs(), with_signs(wrong=0.2)
+    worse, found = outcomes(many, few)
+    assert worse["worse"] >= 1
+    # The share is that of the told signs.
+    assert found.filter(setting="all")["tonight"].mean() == pytest.approx(0.2, abs=0.04)
+    assert outcomes(few, many)[0]["better"] >= 1
+    verdict = compare(night(many), night(few))
+    assert verdict.state == "regression"
+    assert any("the share of wrong signs among those that motion told" in cause for cause in verdict.causes)
+
+
+def test_equal_signs_are_equal_and_one_wrong_sign_is_no_finding():
+    assert compare(night(with_signs(told=0.5)), night(with_signs(told=0.5))).bit_equal
+    verdict = compare(night(with_signs(wrong=0.002)), night(with_signs()))
+    assert verdict.comparisons.filter(quantity="wrong_sign", outcome="worse").is_empty()
+
+
+def test_signs_alone_change_the_hash_of_their_cells_and_of_no_other():
+    first, second = (digests_of(table) for table in (with_signs(), with_signs(wrong=0.9)))
+    changed = {cell.estimator for cell in first if first[cell] != second[cell]}
+    assert changed == {MOTION}
+    plain = digests_of(rows(settings=SETTINGS))
+    without = digests_of(with_signs().filter(pl.col("estimator") != MOTION))
+    assert plain == without
+
+
+def test_a_baseline_without_signs_is_compared():
+    """What it lacks is judged from the next accepted baseline on, as for any other column."""
+    verdict = compare(night(with_signs(wrong=1.0)), night(with_signs().drop(MOTION_COLUMNS)))
+    assert verdict.state == "fine"
+    assert verdict.comparisons.filter(quantity="wrong_sign").is_empty()
+
+
+@pytest.mark.parametrize(("wrong", "passed"), [(0.0, True), (0.01, True), (0.15, False), (1.0, False)])
+def test_the_canary_holds_told_signs_to_the_stated_rate(wrong, passed):
+    (canary,) = wrong_signs(with_signs(wrong=wrong, count=60))
+    assert canary.passed == passed
+    assert canary.n == 720
+    assert STATED < canary.high < 2 * STATED
+    assert ALPHA <= 1e-4
+
+
+@pytest.mark.parametrize(("count", "passed"), [(2, True), (3, False), (10, False)])
+def test_three_highlights_all_wrong_are_enough(count, passed):
+    table = with_signs(wrong=1.0).filter(pl.col("estimator") == MOTION).head(count)
+    assert [canary.passed for canary in wrong_signs(table)] == [passed]
+
+
+def test_a_run_whose_motion_tells_nothing_does_not_pass_and_one_without_motion_has_no_canary():
+    (silent,) = wrong_signs(with_signs(told=0.0))
+    assert not silent.passed
+    assert wrong_signs(rows()) == []
+
+
+@pytest.mark.render
+def test_reversed_signs_are_seen_where_nothing_else_changes(tmp_path):
+    whole = load_experiment("motion", {"realisations": 3})
+    group = next(group for group in whole.groups if group.label == "saddle")
+    small = group.model_copy(update={"sweep": ({"views.length_mm": (0.5, 1.0)},)})
+    experiment = whole.model_copy(update={"groups": (small,)})
+    sound = run_experiment(experiment, tmp_path / "sound").results
+    told = "np.sign(self.hypotheses[0])"
+    with planted(Mutation(RankedHypotheses.told_signs.fget, told, f"-{told}")):
+        reversed_ = run_experiment(experiment, tmp_path / "reversed").results
+    assert [canary.passed for canary in wrong_signs(sound)] == [True]
+    assert [canary.passed for canary in wrong_signs(reversed_)] == [False]
+    assert sound.drop(MOTION_COLUMNS).equals(reversed_.drop(MOTION_COLUMNS))
+    assert digests_of(sound) != digests_of(reversed_)

@@ -1,0 +1,113 @@
+"""Each experiment of a run has its own Mitsuba variant: its rows do not depend on the experiments beside it."""
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+
+from simtest.runtime.engines import make_engine
+from simtest.spec import load_experiment
+from simtest.validation.case_work import by_variant
+from simtest.validation.cases import expand
+from simtest.validation.jobs import make_jobs, variant_of
+from simtest.validation.runner import run_experiments
+from simtest.validation.worst import WorstCase, save_worst
+
+pytestmark = pytest.mark.render
+
+CAMERA = '"camera.width" = 160, "camera.height" = 160, "sensor.noise_sigma" = 0.02'
+GREY = f"""
+realisations = 2
+estimators = ["cone_axis", "brightest_point"]
+[[groups]]
+scene = "cylinder"
+set = {{ {CAMERA} }}
+sweep = [{{ "surface.radius_mm" = [5.0, 10.0] }}]
+"""
+COLOURED = f"""
+realisations = 2
+estimators = ["cone_axis", "brightest_point"]
+[[groups]]
+scene = "sphere"
+set = {{ {CAMERA}, "reflectance" = {{ type = "phong", exponent = 50.0, albedo = {{ preset = "colon_mucosa" }} }} }}
+"""
+TEXTS = {"coloured": COLOURED, "grey": GREY, "grey_too": GREY}
+VARIANTS = {"coloured": "llvm_ad_rgb", "grey": "llvm_ad_mono", "grey_too": "llvm_ad_mono"}
+
+
+@pytest.fixture(scope="module")
+def experiments(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("experiments")
+    for name, text in TEXTS.items():
+        (folder / f"{name}.toml").write_text(text)
+    return {name: load_experiment(folder / f"{name}.toml") for name in TEXTS}
+
+
+def run(experiments, names, folder, workers=1):
+    """Run experiments in one piece; return the rows by name."""
+    engine = make_engine(workers=workers)
+    runs = run_experiments([(experiments[name], folder / name) for name in names], engine=engine)
+    for name, made in zip(names, runs, strict=True):
+        assert json.loads((made.folder / "summary.json").read_text())["run"]["variant"] == VARIANTS[name]
+    return {name: made.results for name, made in zip(names, runs, strict=True)}
+
+
+@pytest.fixture(scope="module")
+def alone(experiments, tmp_path_factory):
+    """The rows of each experiment that is run alone."""
+    folder = tmp_path_factory.mktemp("alone")
+    return {name: run(experiments, [name], folder)[name] for name in experiments}
+
+
+@pytest.mark.parametrize("names", [("coloured", "grey"), ("grey", "coloured")])
+def test_an_experiment_beside_one_of_another_variant_has_the_rows_that_it_has_alone(
+    names, experiments, alone, tmp_path
+):
+    for name, rows in run(experiments, names, tmp_path).items():
+        assert rows.equals(alone[name])
+        assert rows.filter(status="ok").height > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [("coloured", "grey"), ("grey", "coloured", "grey_too")])
+def test_workers_change_the_variant_between_experiments(names, experiments, alone, tmp_path):
+    for name, rows in run(experiments, names, tmp_path, workers=2).items():
+        assert rows.equals(alone[name])
+
+
+def test_a_grey_experiment_in_the_variant_of_colour_has_other_rows(experiments, alone, tmp_path):
+    """Negative control: three channels of a grey scene average their noise."""
+    (made,) = run_experiments([(experiments["grey"], tmp_path / "grey")], variant="llvm_ad_rgb")
+    assert not made.results.equals(alone["grey"])
+    errors = [rows["error_deg"].drop_nulls().to_numpy() for rows in (made.results, alone["grey"])]
+    assert np.all(np.abs(errors[0] - errors[1]) > 1e-6)
+
+
+def test_jobs_of_one_variant_follow_each_other(experiments, tmp_path):
+    jobs = make_jobs([(experiments[name], tmp_path / name) for name in ("grey", "coloured", "grey_too")], None)
+    assert [job.folder.name for job in by_variant(jobs)] == ["grey", "grey_too", "coloured"]
+    assert len({job.digest for job in jobs}) == 3
+
+
+def test_the_variant_is_that_of_the_scenes_unless_one_is_named(experiments):
+    for name, experiment in experiments.items():
+        cases = expand(experiment)
+        assert variant_of(cases) == VARIANTS[name]
+        assert variant_of(cases, "cuda") == VARIANTS[name].replace("llvm", "cuda")
+        assert variant_of(cases, "llvm_ad_mono") == "llvm_ad_mono"
+
+
+def test_worst_cases_are_rendered_in_the_variant_of_their_experiment(experiments, alone, tmp_path):
+    names = ("grey", "coloured", "grey_too")
+    settings = {name: alone[name]["setting"][0] for name in names}
+    worst = [WorstCase(name, settings[name], 0, "cone_axis", "why") for name in names]
+    files = save_worst(worst, experiments.values(), tmp_path)
+    for name, file in zip(names, files, strict=True):
+        with np.load(file) as data:
+            estimates = json.loads(str(data["meta"]))["estimates"]
+        rows = alone[name].filter(pl.col("setting") == settings[name], realisation=0)
+        for estimate in estimates:
+            own = rows.filter(estimator=estimate["estimator"], true_id=estimate["true_id"])
+            assert own["error_deg"].to_list() == [estimate["error_deg"]]
+        assert estimates
