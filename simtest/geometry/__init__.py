@@ -14,11 +14,13 @@ if TYPE_CHECKING:
     from simtest.geometry.camera import Camera, ViewMask
     from simtest.geometry.circle_from_cone import CirclePose, CirclePoses, circle_pose, circle_poses, cone_axes
     from simtest.geometry.conics import Ellipse, cone_of_conic, cone_rays, ellipse_of_conic
-    from simtest.geometry.distortion import BrownConrady, Distortion, KannalaBrandt
+    from simtest.geometry.distortion import Distortion, KannalaBrandt
     from simtest.geometry.ellipse_fit import FittedConic, fit_ellipse, fit_ellipses
     from simtest.geometry.gaussian_smoothing import smooth
     from simtest.geometry.omnidirectional import Scaramuzza
     from simtest.geometry.patch import Patch
+    from simtest.geometry.perspective import BrownConrady
+    from simtest.geometry.unified import Mei
     from simtest.runtime.arrays import Array, Image, Index, Mask
 
 _HOMES = {
@@ -26,11 +28,13 @@ _HOMES = {
     "simtest.geometry.camera": ("Camera", "ViewMask"),
     "simtest.geometry.circle_from_cone": ("CirclePose", "CirclePoses", "circle_pose", "circle_poses", "cone_axes"),
     "simtest.geometry.conics": ("Ellipse", "cone_of_conic", "cone_rays", "ellipse_of_conic"),
-    "simtest.geometry.distortion": ("BrownConrady", "Distortion", "KannalaBrandt"),
+    "simtest.geometry.distortion": ("Distortion", "KannalaBrandt"),
     "simtest.geometry.ellipse_fit": ("FittedConic", "fit_ellipse", "fit_ellipses"),
     "simtest.geometry.gaussian_smoothing": ("smooth",),
     "simtest.geometry.omnidirectional": ("Scaramuzza",),
     "simtest.geometry.patch": ("Patch",),
+    "simtest.geometry.perspective": ("BrownConrady",),
+    "simtest.geometry.unified": ("Mei",),
     "simtest.runtime.arrays": ("Array", "Image", "Index", "Mask"),
 }
 
@@ -48,6 +52,7 @@ __all__ = [
     "Index",
     "KannalaBrandt",
     "Mask",
+    "Mei",
     "Patch",
     "Scaramuzza",
     "ViewMask",

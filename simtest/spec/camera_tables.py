@@ -63,7 +63,12 @@ def camera_toml(camera: Camera) -> str:
     """Return a camera as the text of simtest's own TOML file."""
     table = camera_table(camera)
     inner = {key: value for key, value in table.items() if isinstance(value, dict)}
-    lens = {"brown_conrady": "Brown-Conrady", "kannala_brandt": "Kannala-Brandt", "scaramuzza": "Scaramuzza"}
+    lens = {
+        "brown_conrady": "Brown-Conrady",
+        "kannala_brandt": "Kannala-Brandt",
+        "scaramuzza": "Scaramuzza",
+        "mei": "Mei",
+    }
     kind = f"{lens[inner['distortion']['type']]} camera" if "distortion" in inner else "Pinhole camera"
     lines = [f"# {kind}; pixel centres at integer + 0.5."]
     lines += [f"{key} = {toml_value(value)}" for key, value in table.items() if key not in inner]

@@ -3,7 +3,7 @@
 from studies.mutants.mutant import Change, Mutant, mutant
 
 _CAMERA = "simtest.geometry.camera:Camera"
-_BROWN = "simtest.geometry.distortion:BrownConrady"
+_BROWN = "simtest.geometry.perspective:BrownConrady"
 _FISHEYE = "simtest.geometry.distortion:KannalaBrandt"
 _CHAIN = "simtest.simulation.camera_chain"
 _RESPONSE = "simtest.calibration.response"

@@ -114,7 +114,16 @@ CAMERAS = {
         "cam0: camera_model = 'ds': simtest lacks it; must be pinhole",
     ),
     "kalibr: intrinsics": ("c.yaml", swap(KALIBR, ", 246.0", ""), "cam0: intrinsics: 3 values; must be 4"),
-    "kalibr: mirror": ("c.yaml", swap(swap(KALIBR, "pinhole", "omni"), "[461.6", "[0.8, 461.6"), "xi = 0.8: must be 0"),
+    "kalibr: mirror": (
+        "c.yaml",
+        swap(swap(swap(KALIBR, "pinhole", "omni"), "[461.6", "[0.8, 461.6"), "radtan", "equidistant"),
+        "must be none or radtan with camera_model 'omni'",
+    ),
+    "opencv: mirror": (
+        "c.yml",
+        "image_width: 64\nimage_height: 48\nK: [50, 0, 32, 0, 50, 24, 0, 0, 1]\nxi: [-0.5]\nD: [0, 0, 0, 0]\n",
+        "distortion.xi = -0.5",
+    ),
     "kalibr: distortion": ("c.yaml", swap(KALIBR, "radtan", "fov"), "distortion_model = 'fov': simtest lacks it"),
     "kalibr: coefficients": ("c.yaml", swap(KALIBR, ", 0.0]", "]"), "distortion_coeffs: 3 values; must be 4"),
     "kalibr: no resolution": ("c.yaml", swap(KALIBR, "resolution", "size"), "resolution = None: must be a list"),

@@ -10,7 +10,7 @@ from simtest.detection import detect, estimate_noise
 from simtest.errors import Failure, Reason
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.isophote_fit import fit_isophote_of_each
-from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, Scaramuzza, ViewMask, smooth
+from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Mei, Patch, Scaramuzza, ViewMask, smooth
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
@@ -64,12 +64,20 @@ LENSES = {
         900, 900, 240.0, 240.0, 440.0, 455.0, 0.0, Scaramuzza(-0.45, 0.1, -0.06, 0.999, 0.004, -0.006),
         ViewMask(450, 450, 400),
     ),
+    "mei": Camera(
+        900, 900, 420.0, 410.0, 440.0, 455.0, 1.0, Mei(1.1, -0.03, 0.004, 1e-3, -1e-3), ViewMask(450, 450, 400),
+    ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("lens", "angle"),
-    [("barrel", 5), ("barrel", 25), *((lens, angle) for lens in ("fisheye", "omni") for angle in (40, 80, 105))],
+    [
+        ("barrel", 5),
+        ("barrel", 25),
+        *((lens, angle) for lens in ("fisheye", "omni") for angle in (40, 80, 105)),
+        ("mei", 70),
+    ],
 )
 def test_a_circular_cone_is_found_through_a_lens(lens, angle):
     camera, u = LENSES[lens], np.radians(angle)

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 PUBLIC = {
     "BackendError": "simtest.errors",
-    "BrownConrady": "simtest.geometry.distortion",
+    "BrownConrady": "simtest.geometry.perspective",
     "Calibration": "simtest.calibration.calibration",
     "Camera": "simtest.geometry.camera",
     "Estimate": "simtest.estimators.protocol",
@@ -24,6 +24,7 @@ PUBLIC = {
     "Failure": "simtest.errors",
     "InputError": "simtest.errors",
     "KannalaBrandt": "simtest.geometry.distortion",
+    "Mei": "simtest.geometry.unified",
     "Scaramuzza": "simtest.geometry.omnidirectional",
     "LabelledFrame": "simtest.simulation.labelled_frame",
     "Patch": "simtest.geometry.patch",

@@ -84,7 +84,10 @@ def _lens(data: Mapping[str, Any], xi: float, at: str) -> Table:
         )
     told = [] if name == "none" else numbers(data.get("distortion_coeffs"), at, "distortion_coeffs", 4)
     if xi != 0:
-        raise InputError(f"{at}: intrinsics: xi = {xi:g}: must be 0; simtest lacks the mirror of the omni model")
+        if name in ("equidistant", "equi"):
+            raise InputError(f"{at}: distortion_model = {name!r}: must be none or radtan with camera_model 'omni'")
+        lens = dict(zip(("k1", "k2", "p1", "p2"), told or (0.0,) * 4, strict=True))
+        return {"distortion": {"type": "mei", "xi": xi, **lens}}
     if name in ("equidistant", "equi"):
         return {"distortion": {"type": "kannala_brandt", **dict(zip(("k1", "k2", "k3", "k4"), told, strict=True))}}
     if not any(told):

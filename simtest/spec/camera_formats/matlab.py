@@ -14,7 +14,7 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Mei, Scaramuzza
 from simtest.runtime.limits import check_file
 from simtest.runtime.resources import shown
 from simtest.spec.camera_formats.common import Table, mask_of_text, mask_text
@@ -168,8 +168,9 @@ def matlab_bytes(camera: Camera) -> bytes:
             "DistortionCenter": np.array([camera.cx, camera.cy]) + PIXEL_CENTRE,
             "StretchMatrix": np.array([[lens.c, lens.d], [lens.e, 1.0]]),
         }
-    elif isinstance(lens, KannalaBrandt):
-        raise InputError("camera.distortion: MATLAB has no Kannala-Brandt lens; save as TOML instead")
+    elif isinstance(lens, KannalaBrandt | Mei):
+        kind = "Mei" if isinstance(lens, Mei) else "Kannala-Brandt"
+        raise InputError(f"camera.distortion: MATLAB has no {kind} lens; save as TOML instead")
     else:
         lens = lens or BrownConrady()
         if lens.k4 or lens.k5 or lens.k6:

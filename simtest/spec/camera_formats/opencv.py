@@ -17,7 +17,7 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Mei, Scaramuzza
 from simtest.runtime.resources import shown
 from simtest.spec.camera_formats.common import Table
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
@@ -200,6 +200,11 @@ def _check_whole(data: Mapping[str, Any], where: str) -> None:
 def _lens(data: Mapping[str, Any], where: str) -> dict[str, str | float] | None:
     """Return the lens as the table of a `DistortionSpec`; None for a pinhole."""
     name, value = _one_of(data, LENS_NAMES, where)
+    if "xi" in data:
+        # The omnidir module's mirror; without it the other numbers mean another lens.
+        (xi,) = _numbers(data["xi"] if not isinstance(data["xi"], int | float) else [data["xi"]], where, "xi", (1,))
+        told = [0.0] * 4 if name is None else _numbers(value, where, name, (4,))
+        return {"type": "mei", "xi": xi, **dict(zip(("k1", "k2", "p1", "p2"), told, strict=True))}
     fisheye, model = _is_fisheye(data, where), data.get("distortion_model") or ""
     if name is None:
         _check_no_other_lens(data, where)
@@ -267,6 +272,8 @@ def opencv_text(camera: Camera, suffix: str) -> str:
     storage.write("image_height", camera.height)
     if isinstance(camera.distortion, KannalaBrandt):
         storage.write("fisheye_model", 1)
+    if isinstance(camera.distortion, Mei):
+        storage.write("xi", np.array([[camera.distortion.xi]]))
     storage.write("camera_matrix", matrix)
     storage.write("distortion_coefficients", np.array([coefficients]))
     if (mask := _shifted_mask(camera)) is not None:
@@ -303,6 +310,10 @@ def _shifted(camera: Camera, whose: str) -> tuple[Any, list[float]]:
     lens = camera.distortion
     if isinstance(lens, Scaramuzza):
         raise InputError(f"camera.distortion: {whose} has no Scaramuzza lens; save as TOML or for MATLAB instead")
+    if isinstance(lens, Mei):
+        if whose == "ROS":
+            raise InputError("camera.distortion: ROS has no Mei lens; save as TOML or for OpenCV instead")
+        return matrix, [float(getattr(lens, name)) for name in ("k1", "k2", "p1", "p2")]
     if isinstance(lens, KannalaBrandt):
         return matrix, [float(getattr(lens, name)) for name in ("k1", "k2", "k3", "k4")]
     values = [float(getattr(lens or BrownConrady(), name)) for name in BROWN_ORDER]
