@@ -26,7 +26,7 @@ from simtest.bench.draws import Seeds, experiment_of, public_seeds
 from simtest.bench.phrases import NONE, degrees
 from simtest.bench.ranking import Ranking, SceneSums, agreement, rank
 from simtest.bench.scores import score_part
-from simtest.bench.suite import FrozenCase, Suite, load_suite
+from simtest.bench.suite import FrozenCase, Suite, layout_of, load_suite
 from simtest.validation.runner import run_experiments
 
 ESTIMATORS = ("bisector", "cone_axis", "photometric", "curved", "brightest_point", "circle_pose")
@@ -67,7 +67,7 @@ def scene_sums(suite: Suite, seeds: Seeds, part: str, folder: Path) -> list[Scen
     found: list[SceneSums] = []
     for name in ESTIMATORS:
         rows = run.results.filter(pl.col("estimator") == name)
-        score, narrow = (score_part(held, suite, part) for held in (rows, with_covariance(rows, NARROW)))
+        score, narrow = (score_part(held, layout_of(suite, part)) for held in (rows, with_covariance(rows, NARROW)))
         stated = score.uncertainty
         print(
             f"{folder.name:10} {part:10} {name:16} n {score.n:4} score {degrees(score.score_deg)} "
@@ -112,7 +112,7 @@ def main() -> None:
     for name, seeds in sets.items():
         tables[name] = ranked({part: scene_sums(suite, seeds, part, given.out / name) for part in parts})
         for part, table in tables[name].items():
-            order = sorted(range(len(ESTIMATORS)), key=lambda i, held=table: (held.first[i], held.scores[i]))
+            order = np.lexsort((table.scores, table.first))
             told = (f"{table.first[i]}-{table.last[i]} {ESTIMATORS[i]} {table.scores[i]:.3f}" for i in order)
             print(f"{name:10} {part:10} ranks: {', '.join(told)}", flush=True)
     for first, second in combinations(tables, 2):

@@ -257,4 +257,4 @@ def _print_parts(content: dict[str, Any]) -> None:
         print(f"a {request['unit']} takes {request['median_ms']:.3g} ms")
     overall = content["overall"]
     if overall["complete"]:
-        print(f"overall: {overall['penalised_deg']:.3f} deg, the mean of the parts' penalised errors")
+        print(f"overall: {overall['score_deg']:.3f} deg, the mean of the parts' scores")
