@@ -293,3 +293,27 @@ def test_the_commands_say_what_they_have_checked(
         bench.verify(tmp_path / "run", quick=True, verified=tmp_path / "list")
     bench.table(tmp_path / "run", out=tmp_path / "table", verified=tmp_path / "list")
     assert "run again</td>" in (tmp_path / "table" / "index.html").read_text()
+
+
+def test_a_stop_says_what_is_kept(
+    suite: Suite, made: BenchRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sums over maps, and a verification without --out, are not gone on with; a core's run is."""
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("simtest.bench.suite.load_suite", lambda *_: suite)
+    for name in ("run.run_maps", "run.run_bench", "verify.verify_run"):
+        monkeypatch.setattr(f"simtest.bench.{name}", stopped)
+    for command, told in (
+        (
+            lambda: bench.run(out=tmp_path / "run", maps=tmp_path),
+            "finished frames are kept; the same command scores all",
+        ),
+        (lambda: bench.verify(made.certificate), "without --out nothing is kept"),
+        (lambda: bench.verify(made.certificate, out=tmp_path / "again"), "^$"),
+        (lambda: bench.run(out=tmp_path / "run", core="cone_axis"), "^$"),
+    ):
+        with pytest.raises(KeyboardInterrupt, match=told):
+            command()
