@@ -128,11 +128,7 @@ def agreement(first: IntMatrix, second: IntMatrix) -> float:
 
 def _residuals(part: Part) -> tuple[Array, list[Array]]:
     """Return each core's mean, and by case its scenes' linearised residuals (sum - mean number) / total number."""
-    totals = np.array([sum(scene[0] for case in core.values() for scene in case) for core in part], dtype=float)
-    sums = np.array([sum(scene[1] for case in core.values() for scene in case) for core in part], dtype=float)
+    cases = [np.array([core[case] for core in part], dtype=float) for case in part[0]]
+    totals, sums = (sum((case[:, :, column].sum(axis=1) for case in cases), np.zeros(len(part))) for column in (0, 1))
     means = sums / totals
-    strata = []
-    for case in part[0]:
-        held = np.array([core[case] for core in part], dtype=float)
-        strata.append((held[:, :, 1] - means[:, None] * held[:, :, 0]) / totals[:, None])
-    return means, strata
+    return means, [(case[:, :, 1] - means[:, None] * case[:, :, 0]) / totals[:, None] for case in cases]

@@ -20,7 +20,7 @@ def _cores(seed: int, factors: list[float], shared: float = 0.5) -> list[SceneSu
     variance, in the logarithm, is of the scene and highlight, the rest is each core's own noise.
     """
     rng = np.random.default_rng(seed)
-    cores: list[dict[str, list[tuple[int, float]]]] = [{} for _ in factors]
+    cores: list[dict[str, list[list[float]]]] = [{} for _ in factors]
     for case, scenes in enumerate(SCENES):
         numbers = rng.integers(0, 5, scenes)
         scene_of = np.repeat(np.arange(scenes), numbers)
@@ -29,8 +29,7 @@ def _cores(seed: int, factors: list[float], shared: float = 0.5) -> list[SceneSu
         for core, factor in zip(cores, factors, strict=True):
             own = np.sqrt(1 - shared) * 0.8 * rng.standard_normal(len(scene_of))
             errors = np.where(missed, CAP_DEG, np.minimum(factor * TYPICAL_DEG * np.exp(common + own), CAP_DEG))
-            sums = np.bincount(scene_of, errors, scenes)
-            core[f"case {case}"] = list(zip(numbers.tolist(), sums.tolist(), strict=True))
+            core[f"case {case}"] = np.stack([numbers, np.bincount(scene_of, errors, scenes)], axis=1).tolist()
     return list(cores)
 
 
@@ -40,8 +39,8 @@ def _claims(factors: list[float], runs: int) -> Array:
 
 
 def test_equal_cores_are_tied() -> None:
-    """Six cores that differ in noise alone: no pair is ordered in any of 200 tables, thanks to the margin."""
-    assert np.count_nonzero(_claims([1.0] * 6, 200)) == 0
+    """Six cores that differ in noise alone: no pair is ordered in any of 100 tables, thanks to the margin."""
+    assert np.count_nonzero(_claims([1.0] * 6, 100)) == 0
 
 
 def test_a_planted_difference_is_seen() -> None:
@@ -58,11 +57,11 @@ def test_a_planted_difference_is_seen() -> None:
 def test_the_risk_of_a_claim_is_as_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the margin, six equal cores give any claim in 5 % of tables, as Bonferroni's level allows at most."""
     monkeypatch.setattr("simtest.bench.ranking.margin", lambda first, second: np.zeros(()))
-    claimed = (_claims([1.0] * 6, 400) != 0).any(axis=(1, 2)).mean()
-    # 400 tables tell 5 % to 1.1 %; the pairs of six cores hang together, so the level is not used up.
-    assert 0.01 < claimed < ALPHA + 0.033
+    claimed = (_claims([1.0] * 6, 300) != 0).any(axis=(1, 2)).mean()
+    # 300 tables tell 5 % to 1.3 %; the pairs of six cores hang together, so the level is not used up.
+    assert 0.0 < claimed < ALPHA + 0.038
     # The negative control: at the level of a single pair, equal cores are ordered in many tables.
-    each = np.array([rank([_cores(seed, [1.0] * 6)], alpha=15 * ALPHA).better for seed in range(200)])
+    each = np.array([rank([_cores(seed, [1.0] * 6)], alpha=15 * ALPHA).better for seed in range(60)])
     assert (each != 0).any(axis=(1, 2)).mean() > 0.2
 
 

@@ -309,7 +309,7 @@ def test_a_stop_says_what_is_kept(
     for command, told in (
         (
             lambda: bench.run(out=tmp_path / "run", maps=tmp_path),
-            "finished frames are kept; the same command scores all",
+            "frames are kept; the same command scores all maps anew",
         ),
         (lambda: bench.verify(made.certificate), "without --out nothing is kept"),
         (lambda: bench.verify(made.certificate, out=tmp_path / "again"), "^$"),
