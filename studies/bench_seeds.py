@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from scipy.stats import kendalltau
 
 from simtest.bench.draws import Seeds, experiment_of, public_seeds
 from simtest.bench.phrases import NONE, degrees
@@ -86,14 +87,18 @@ def ranked(parts: Mapping[str, list[SceneSums]]) -> dict[str, Ranking]:
 
 
 def compared(first: Ranking, second: Ranking) -> str:
-    """Return tau-b of two tables, and how many pairs are reversed and how many are tied in one of them alone."""
+    """Return tau-b of two tables, how many pairs are reversed and how many are tied in one of them alone.
+
+    Beside it stands tau of the scores themselves, whose order claims differences that are none.
+    """
     upper = np.triu_indices(len(ESTIMATORS), 1)
     one, other = first.better[upper], second.better[upper]
     reversed_, changed = np.count_nonzero(one * other < 0), np.count_nonzero((one == 0) != (other == 0))
     ordered = np.count_nonzero(one)
     return (
         f"tau-b {agreement(first.better, second.better):.3f}, {ordered} of {len(one)} pairs ordered, "
-        f"{reversed_} reversed, {changed} tied in one alone"
+        f"{reversed_} reversed, {changed} tied in one alone; "
+        f"tau of the bare scores {kendalltau(first.scores, second.scores).statistic:.2f}"
     )
 
 
