@@ -20,6 +20,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Angle = Annotated[float, Field(ge=0, le=180)]
 Figure = Annotated[float, Field(ge=0)]
 Interval = Annotated[list[Angle], Field(min_length=2, max_length=2), AfterValidator(_ordered)]
+SceneSum = Annotated[list[Figure], Field(min_length=2, max_length=2)]
 Shares = Annotated[list[Share], Field(min_length=2, max_length=2), AfterValidator(_ordered)]
 
 
@@ -139,8 +140,9 @@ class PartForm(Form):
     median_interval: Interval | None
     mean_deg: Angle | None
     p95_deg: Angle | None
-    penalised_deg: Angle | None
-    penalised_interval: Interval | None
+    score_deg: Angle | None
+    score_interval: Interval | None
+    scenes: dict[Text, list[SceneSum]]
     uncertainty: UncertaintyForm
     results: Hash
     # Of maps alone.
@@ -162,8 +164,8 @@ class OverallForm(Form):
     """The headline."""
 
     complete: bool
-    penalised_deg: Angle | None
-    penalised_interval: Interval | None
+    score_deg: Angle | None
+    score_interval: Interval | None
 
 
 class RequestForm(Form):

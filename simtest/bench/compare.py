@@ -28,6 +28,9 @@ _MEDIANS = ("median_deg",)
 _NOT_COMPARED = ("conventions",)
 """Texts for the reader, which hold figures."""
 
+_SCENES = "scenes"
+"""Key of the sums by scene, which are compared all together."""
+
 
 @dataclass(frozen=True)
 class Verified:
@@ -147,7 +150,9 @@ class _Comparison:
             stated: Any = told.get(key)
             again: Any = found.get(key)
             name = f"{where}.{shown(key, 60)}"
-            if key == "refused" and isinstance(stated, dict) and isinstance(again, dict):
+            if key == _SCENES and isinstance(stated, dict) and isinstance(again, dict):
+                self._scenes(name, stated, again, found["score_deg"] or 0.0, n)
+            elif key == "refused" and isinstance(stated, dict) and isinstance(again, dict):
                 for reason in dict.fromkeys([*again, *stated]):
                     self._count(f"{name}.{shown(reason, 60)}", stated.get(reason, 0), again.get(reason, 0), n)
             elif isinstance(stated, dict) and isinstance(again, dict):
@@ -183,6 +188,19 @@ class _Comparison:
             self.problems.append(f"{name}: differs by {apart:.2g}{unit}; at most {allowed:.3g} is allowed")
         elif apart > SAME:
             self.notes.append(f"{name}: {told:.6g}, here {found:.6g}")
+
+    def _scenes(self, name: str, told: JsonObject, found: JsonObject, score: float, n: int) -> None:
+        """Compare scene by scene: the figures of all together say nothing of which scenes they come from."""
+        if {case: len(held) for case, held in told.items()} != {case: len(held) for case, held in found.items()}:
+            self.problems.append(f"{name}: other cases or another number of scenes")
+            return
+        pairs = [pair for case, held in found.items() for pair in zip(told[case], held, strict=True)]
+        numbers = sum(abs(stated[0] - again[0]) for stated, again in pairs)
+        if numbers > max(1.0, COUNTS * n):
+            self.problems.append(f"{name}: the numbers of highlights differ by {numbers:g} over all scenes")
+        apart, allowed = sum(abs(stated[1] - again[1]) for stated, again in pairs) / n, self._allowed(_SCENES, score, n)
+        if apart > allowed:
+            self.problems.append(f"{name}: differ by {apart:.2g} deg a highlight; at most {allowed:.3g} is allowed")
 
     def _count(self, name: str, told: int, found: int, n: int) -> None:
         most = max(1.0, COUNTS * n)

@@ -1,4 +1,4 @@
-"""The table of certificates: cores ranked by their penalised errors, with ties where intervals overlap."""
+"""The table of certificates: cores ranked in pairs, scene by scene, with ties where no difference is clear."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,6 +7,8 @@ from typing import Any
 
 from simtest.bench.certificate import CERTIFICATE, Certificate, check_suite, read_certificate
 from simtest.bench.phrases import COLUMNS, NONE, degrees, part_cells, spanned
+from simtest.bench.ranking import ALPHA, CAP_DEG, rank
+from simtest.bench.run import parts_of_overall
 from simtest.bench.suite import Suite
 from simtest.bench.verified import mark_of
 from simtest.bench.verify import check_quick
@@ -19,13 +21,13 @@ from simtest.runtime.resources import shown
 PAGE = "index.html"
 MOST_CERTIFICATES = 1000
 
-Figure = Callable[[Certificate], tuple[float | None, Sequence[float] | None]]
-"""What a table is ranked by: a value and its interval, of a certificate."""
+Figure = Callable[[Certificate], float | None]
+"""A certificate's score, which a table is ordered by."""
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """A row of a table: a certificate and the ranks that its interval allows; None where it has no figure."""
+    """A row of a table: a certificate and the ranks that it may have; None where it has no score."""
 
     certificate: Certificate
     first: int | None
@@ -48,9 +50,9 @@ class Board:
     seeds : str
         "public seed N", or the commitment.
     overall : list of Ranked
-        By the mean of the parts' penalised errors.
+        By the mean of the parts' scores.
     parts : dict
-        By each part's penalised error.
+        By each part's score.
     verified : dict
         Whether certificates that were run again hold, by their hashes.
     """
@@ -72,11 +74,18 @@ class Board:
     @property
     def leader(self) -> str:
         """Who leads, as a sentence: over all parts, or on each where no core has run them all."""
-        if self.overall[0].first:
-            return f"{self.overall[0].certificate.core['name']} has the smallest error over all parts"
-        leaders = [(part, rows[0]) for part, rows in self.parts.items() if rows[0].first]
-        told = [f"{row.certificate.core['name']} has the smallest error on the part {part}" for part, row in leaders]
+        if found := _leaders(self.overall):
+            return f"{found} over all parts"
+        told = [f"{found} on the part {part}" for part, rows in self.parts.items() if (found := _leaders(rows))]
         return ", ".join(told) or "No core has answered"
+
+
+def _leaders(rows: list[Ranked]) -> str:
+    """Return which cores have none ranked above them, as the beginning of a sentence; empty without any."""
+    names: list[str] = [row.certificate.core["name"] for row in rows if row.first == 1]
+    if len(names) < 2:
+        return f"{names[0]} ranks first" if names else ""
+    return f"{', '.join(names[:-1])} and {names[-1]} share the first rank"
 
 
 def _names(rows: list[Ranked]) -> JsonObject:
@@ -130,42 +139,32 @@ def _seeds(certificate: Certificate) -> str:
 
 
 def _board(suite: Suite, seeds: str, certificates: list[Certificate], verified: dict[str, bool]) -> Board:
-    def overall(certificate: Certificate) -> tuple[float | None, Sequence[float] | None]:
-        told = certificate.content["overall"]
-        return told["penalised_deg"], told["penalised_interval"]
-
-    def of_part(part: str) -> Figure:
-        def figure(certificate: Certificate) -> tuple[float | None, Sequence[float] | None]:
-            told = certificate.parts[part]
-            return told["penalised_deg"], told["penalised_interval"]
-
-        return figure
+    def score_on(part: str) -> Figure:
+        return lambda certificate: certificate.parts[part]["score_deg"]
 
     parts = {
-        part.name: ranked([entry for entry in certificates if part.name in entry.parts], of_part(part.name))
+        part.name: ranked(
+            [entry for entry in certificates if part.name in entry.parts], [part.name], score_on(part.name)
+        )
         for part in suite.spec.parts
         if any(part.name in entry.parts for entry in certificates)
     }
-    return Board(seeds, ranked(certificates, overall), parts, verified)
+    overall = ranked(certificates, parts_of_overall(suite), lambda entry: entry.content["overall"]["score_deg"])
+    return Board(seeds, overall, parts, verified)
 
 
-def ranked(certificates: list[Certificate], figure: Figure) -> list[Ranked]:
-    """Rank certificates, the smallest figure first; those whose intervals overlap are tied."""
-    told = [figure(entry) for entry in certificates]
-    spans = [
-        None if value is None else (value, value) if interval is None else (float(interval[0]), float(interval[1]))
-        for value, interval in told
+def ranked(certificates: list[Certificate], parts: Sequence[str], score: Figure) -> list[Ranked]:
+    """Rank certificates by some parts, the smallest score first (`simtest.bench.ranking`)."""
+    # Files of different makers may have the same score.
+    order = sorted(certificates, key=lambda entry: (score(entry) is None, score(entry) or 0.0, str(entry.path)))
+    scored = [entry for entry in order if score(entry) is not None]
+    if not scored:
+        return [Ranked(entry, None, None) for entry in order]
+    found = rank([[entry.parts[part]["scenes"] for entry in scored] for part in parts])
+    held = [
+        Ranked(entry, int(first), int(last)) for entry, first, last in zip(scored, found.first, found.last, strict=True)
     ]
-    rows = []
-    for entry, own in zip(certificates, spans, strict=True):
-        if own is None:
-            rows.append(Ranked(entry, None, None))
-            continue
-        better = sum(span is not None and span[1] < own[0] for span in spans)
-        not_worse = sum(span is not None and span[0] <= own[1] for span in spans)
-        rows.append(Ranked(entry, 1 + better, not_worse))
-    order = sorted(range(len(rows)), key=lambda i: (told[i][0] is None, told[i][0] or 0.0, str(certificates[i].path)))
-    return [rows[i] for i in order]
+    return held + [Ranked(entry, None, None) for entry in order[len(scored) :]]
 
 
 def write_leaderboard(suite: Suite, boards: list[Board], out: Path) -> Path:
@@ -175,6 +174,7 @@ def write_leaderboard(suite: Suite, boards: list[Board], out: Path) -> Path:
     made_by = provenance.environment()
     html = environment().get_template("leaderboard.html.j2").render(
         suite=suite, boards=boards, columns=COLUMNS, cells=part_cells, headline=_headline, about=_about, mark=mark_of,
+        cap=f"{CAP_DEG:g}", risk=f"{100 * ALPHA:g}",
         provenance={"commit": made_by["commit"] or NONE, "simtest": made_by["version"]},
     )  # fmt: skip
     write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
@@ -183,7 +183,7 @@ def write_leaderboard(suite: Suite, boards: list[Board], out: Path) -> Path:
 
 def _headline(certificate: Certificate) -> str:
     told = certificate.content["overall"]
-    return spanned(told["penalised_deg"], told["penalised_interval"])
+    return spanned(told["score_deg"], told["score_interval"])
 
 
 def _about(certificate: Certificate) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-COLUMNS = ("median", "mean", "p95", "penalised", "answered", "refused", "missed", "coverage", "verdict", "95 % axis",
+COLUMNS = ("median", "mean", "p95", "score", "answered", "refused", "missed", "coverage", "verdict", "95 % axis",
            "energy")  # fmt: skip
 """Headings of `part_cells`; errors, axis and score are in deg."""
 
@@ -17,7 +17,7 @@ def part_cells(told: Mapping[str, Any]) -> tuple[str, ...]:
         spanned(told["median_deg"], told["median_interval"]),
         degrees(told["mean_deg"]),
         degrees(told["p95_deg"]),
-        spanned(told["penalised_deg"], told["penalised_interval"]),
+        spanned(told["score_deg"], told["score_interval"]),
         f"{told['answered']} of {told['n']}",
         str(sum(told["refused"].values())),
         str(told["missed"]),

@@ -11,7 +11,7 @@ from simtest.bench.certificate import FORMAT, KIND, cases_of, environment, suite
 from simtest.bench.cores import check_core, core_record, time_core
 from simtest.bench.draws import Seeds, experiment_of
 from simtest.bench.scores import score_part
-from simtest.bench.suite import Suite, frames_of
+from simtest.bench.suite import Suite, layout_of
 from simtest.errors import InputError
 from simtest.runtime.engines import Engine
 from simtest.runtime.files import JsonObject, make_folder
@@ -40,13 +40,18 @@ class BenchRun:
     content: JsonObject
 
 
+def parts_of_overall(suite: Suite) -> list[str]:
+    """Return the parts whose scores make the headline: those whose unit is the highlight."""
+    return [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
+
+
 def chosen_parts(suite: Suite, wanted: Sequence[str] | None) -> list[str]:
     """Return the parts that are run: those asked for, or all whose unit is the highlight.
 
     Raises `InputError` for a part that is unknown, named twice, or scored by maps.
     """
     if not wanted:
-        return [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
+        return parts_of_overall(suite)
     for name in wanted:
         if suite.part(name).kind != HIGHLIGHTS:
             raise InputError(f"--part {name}: is scored by maps of normals or depths; give --maps in place of --core")
@@ -99,7 +104,7 @@ def run_bench(
         # Part by part: the colours that one part needs are not those that another is rendered in.
         (run,) = run_experiments([(experiment, folder / part)], "", variant, progress, engine)
         durations[part] = round(time.monotonic() - clock, 1)
-        scores[part] = score_part(run.results, frames_of(suite, part)).to_json()
+        scores[part] = score_part(run.results, layout_of(suite, part)).to_json()
     timing: JsonObject = {"parts_s": durations, "request": time_core(suite, chosen[0], core, seeds, variant)}
     return _certified(suite, seeds, folder, told, scores, timing)
 
@@ -154,18 +159,18 @@ def _seeds_record(suite: Suite, seeds: Seeds) -> JsonObject:
 
 
 def overall_of(suite: Suite, parts: "dict[str, JsonObject]") -> JsonObject:
-    """Return the headline: the mean over parts of the penalised mean error, where every part was run.
+    """Return the headline: the mean of the parts' scores, where every part was run.
 
-    Its interval takes the parts' errors as independent. `parts` holds the figures as they stand in a certificate.
+    Its interval takes the parts as independent. `parts` holds the figures as they stand in a certificate.
     """
-    wanted = [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
+    wanted = parts_of_overall(suite)
     told = [parts[part] for part in wanted if part in parts]
-    values = [part["penalised_deg"] for part in told if part["penalised_deg"] is not None]
+    values = [part["score_deg"] for part in told if part["score_deg"] is not None]
     if len(values) < len(wanted):
-        return {"complete": False, "penalised_deg": None, "penalised_interval": None}
+        return {"complete": False, "score_deg": None, "score_interval": None}
     mean = sum(values) / len(values)
-    spans = [part["penalised_interval"] for part in told if part["penalised_interval"] is not None]
+    spans = [part["score_interval"] for part in told if part["score_interval"] is not None]
     if len(spans) < len(wanted):
-        return {"complete": True, "penalised_deg": mean, "penalised_interval": None}
+        return {"complete": True, "score_deg": mean, "score_interval": None}
     half = math.hypot(*((high - low) / 2 for low, high in spans)) / len(spans)
-    return {"complete": True, "penalised_deg": mean, "penalised_interval": [max(0.0, mean - half), mean + half]}
+    return {"complete": True, "score_deg": mean, "score_interval": [max(0.0, mean - half), mean + half]}

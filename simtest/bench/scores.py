@@ -1,19 +1,19 @@
 """The figures of a part: accuracy with intervals over scenes, refusals and misses, and the uncertainty."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from simtest.bench.suite import digest_of
+from simtest.bench.ranking import CAP_DEG
+from simtest.bench.suite import Layout, digest_of
 from simtest.bench.uncertainty import UncertaintyScore, score_uncertainty
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import Json, JsonObject
 from simtest.runtime.seeds import from_integer
-from simtest.validation.statistics import PENALTY_DEG, figures
+from simtest.validation.statistics import figures
 
 RESAMPLES = 1000
 """Of the bootstrap over scenes; its seed is fixed, so that the same rows give the same intervals."""
@@ -25,6 +25,9 @@ HASHED = (
     "normal_z", "cov_11", "cov_12", "cov_22", "mahalanobis2", "n_candidates",
 )  # fmt: skip
 """Columns that the hash of a part's results is of."""
+
+SUM_DIGITS = 6
+"""Decimals of the sums by scene: the score is computed of the rounded ones, so that it follows from a certificate."""
 
 Interval = tuple[float, float]
 
@@ -43,8 +46,11 @@ class PartScore:
         Of the errors of the answers.
     median_interval : tuple of float or None
         95 % interval of the median, by bootstrap over scenes.
-    penalised_deg, penalised_interval
-        Mean error with 90 deg for each highlight that was refused or missed, and its interval.
+    score_deg, score_interval
+        What cores are ranked by, and its interval: the mean of the errors, each at most `CAP_DEG`, with `CAP_DEG` for
+        each highlight that was refused or missed.
+    scenes : dict
+        By case, for each scene: its number of highlights, and the sum of their errors as the score takes them, deg.
     uncertainty : UncertaintyScore
         Of the answers that state one.
     results : str
@@ -60,25 +66,32 @@ class PartScore:
     median_interval: Interval | None
     mean_deg: float | None
     p95_deg: float | None
-    penalised_deg: float | None
-    penalised_interval: Interval | None
+    score_deg: float | None
+    score_interval: Interval | None
+    scenes: dict[str, list[tuple[int, float]]]
     uncertainty: UncertaintyScore
     results: str
 
     def to_json(self) -> JsonObject:
         """Return the score as a JSON object."""
         spans = {name: None if (held := getattr(self, name)) is None else list(held)
-                 for name in ("median_interval", "penalised_interval")}  # fmt: skip
-        return {**vars(self), **spans, "uncertainty": self.uncertainty.to_json()}
+                 for name in ("median_interval", "score_interval")}  # fmt: skip
+        scenes: JsonObject = {case: [list(scene) for scene in held] for case, held in self.scenes.items()}
+        return {**vars(self), **spans, "scenes": scenes, "uncertainty": self.uncertainty.to_json()}
 
 
-def score_part(rows: pl.DataFrame, frames: Mapping[str, int]) -> PartScore:
-    """Compute the figures of a part's rows; `frames` says of how many frames each case's scenes are."""
+def score_part(rows: pl.DataFrame, layout: Layout) -> PartScore:
+    """Compute the figures of a part's rows.
+
+    Raises `ValueError` for rows of scenes that the part does not have.
+    """
     told = figures(rows)
     true = rows.filter(pl.col("true_id").is_not_null())
     answered = true.filter(pl.col("status") == "ok")
     errors = answered["error_deg"].to_numpy()
-    penalised = np.where(true["status"] == "ok", true["error_deg"].fill_null(PENALTY_DEG), PENALTY_DEG)
+    capped = np.where(true["status"] == "ok", true["error_deg"].fill_null(CAP_DEG).clip(0.0, CAP_DEG), CAP_DEG)
+    scenes = scene_sums(true, capped, layout)
+    number, total = (sum(scene[i] for held in scenes.values() for scene in held) for i in (0, 1))
     return PartScore(
         n=told.n,
         answered=told.n_ok,
@@ -86,22 +99,45 @@ def score_part(rows: pl.DataFrame, frames: Mapping[str, int]) -> PartScore:
         false=told.n_false,
         refused=told.n_failed_by_reason,
         median_deg=told.median_deg,
-        median_interval=_interval(errors, scenes_of(answered, frames), median=True),
+        median_interval=_interval(errors, scenes_of(answered, layout), median=True),
         mean_deg=told.mean_deg,
         p95_deg=told.p95_deg,
-        penalised_deg=told.mean_penalised_deg,
-        penalised_interval=_interval(penalised, scenes_of(true, frames)),
-        uncertainty=score_uncertainty(answered, scenes_of(answered, frames)),
+        score_deg=total / number if number else None,
+        score_interval=_interval(capped, scenes_of(true, layout)),
+        scenes=scenes,
+        uncertainty=score_uncertainty(answered, scenes_of(answered, layout)),
         results=results_hash(rows),
     )
 
 
-def scenes_of(rows: pl.DataFrame, frames: Mapping[str, int]) -> Array:
+def scenes_of(rows: pl.DataFrame, layout: Layout) -> Array:
     """Return a number for the scene of each row: frames of one scene differ in noise alone."""
-    settings, numbers = rows["setting"].to_list(), rows["realisation"].to_list()
     index: dict[tuple[str, int], int] = {}
-    keys = [(s, k // frames.get(s, 1)) for s, k in zip(settings, numbers, strict=True)]
-    return np.array([index.setdefault(key, len(index)) for key in keys], dtype=int)
+    return np.array([index.setdefault(key, len(index)) for key in _scene_keys(rows, layout)], dtype=int)
+
+
+def scene_sums(rows: pl.DataFrame, values: Array, layout: Layout) -> dict[str, list[tuple[int, float]]]:
+    """Return how many rows each scene has, and the sum of their values, by case; scenes without rows are held."""
+    numbers = {case: [0] * scenes for case, (scenes, _) in layout.items()}
+    sums = {case: [0.0] * scenes for case, (scenes, _) in layout.items()}
+    for (case, scene), value in zip(_scene_keys(rows, layout), values.tolist(), strict=True):
+        numbers[case][scene] += 1
+        sums[case][scene] += value
+    return {
+        case: [(number, round(total, SUM_DIGITS)) for number, total in zip(held, sums[case], strict=True)]
+        for case, held in numbers.items()
+    }
+
+
+def _scene_keys(rows: pl.DataFrame, layout: Layout) -> list[tuple[str, int]]:
+    """Return the case of each row, and the number of its scene there."""
+    keys = []
+    for case, number in zip(rows["setting"].to_list(), rows["realisation"].to_list(), strict=True):
+        scenes, frames = layout.get(case, (0, 1))
+        if not 0 <= number < scenes * frames:
+            raise ValueError(f"setting {case!r}, realisation {number}: the part has no such frame")
+        keys.append((case, number // frames))
+    return keys
 
 
 def results_hash(rows: pl.DataFrame) -> str:

@@ -29,6 +29,9 @@ HASHES, SUITE = "hashes.json", "suite.toml"
 
 PartKind = Literal["highlights", "maps"]
 
+Layout = Mapping[str, tuple[int, int]]
+"""By case: the number of its scenes, and of the frames of each."""
+
 
 class Draw(Spec):
     """The distribution of a value that is drawn for each scene of a case."""
@@ -171,7 +174,9 @@ def read_suite(folder: Path) -> Suite:
     Raises `InputError` if a file is missing or malformed.
     """
     spec = load(SuiteSpec, folder / SUITE)
-    cases = tuple(_read_case(folder, case) for case in spec.cases)
+    # The hash is of the file's own tables: the model's would change with each key that a later release adds.
+    tables = read_toml(folder / SUITE)["cases"]
+    cases = tuple(_read_case(folder, case, table) for case, table in zip(spec.cases, tables, strict=True))
     # The suite's prose may be mended; what defines it may not.
     parts = [{"name": part.name, "kind": part.kind} for part in spec.parts]
     whole: Json = {
@@ -207,15 +212,15 @@ def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
     return suite
 
 
-def frames_of(suite: Suite, part: str) -> dict[str, int]:
-    """Return how many frames each scene of a part's cases is taken in, by case."""
-    return {case.spec.name: case.spec.realisations for case in suite.of_part(part)}
+def layout_of(suite: Suite, part: str) -> Layout:
+    """Return how many scenes each case of a part has, and how many frames each scene is taken in."""
+    return {case.spec.name: (case.spec.draws, case.spec.realisations) for case in suite.of_part(part)}
 
 
-def _read_case(folder: Path, spec: CaseSpec) -> FrozenCase:
+def _read_case(folder: Path, spec: CaseSpec, table: dict[str, Any]) -> FrozenCase:
     file = folder / spec.part / f"{spec.name}.toml"
     scene = read_toml(file)
-    content: Json = {"format": FORMAT, "case": spec.model_dump(mode="json"), "scene": scene, "files": _meshes(scene)}
+    content: Json = {"format": FORMAT, "case": table, "scene": scene, "files": _meshes(scene)}
     return FrozenCase(spec, file, scene, digest_of(content))
 
 

@@ -8,9 +8,10 @@ from simtest.bench.certificate import Certificate, check_suite
 from simtest.bench.compare import SAME, Verified, alike, compare, differing
 from simtest.bench.draws import Seeds
 from simtest.bench.maps import BASELINE, MAPS, PART, SHADING, stated_options
+from simtest.bench.ranking import CAP_DEG
 from simtest.bench.run import overall_of, run_bench, run_maps
 from simtest.bench.scores import score_part
-from simtest.bench.suite import Suite, frames_of
+from simtest.bench.suite import Suite, layout_of
 from simtest.errors import InputError
 from simtest.estimators.installed import ESTIMATORS
 from simtest.runtime.engines import Engine
@@ -19,6 +20,9 @@ from simtest.runtime.resources import shown
 from simtest.validation.run_folder import RESULTS
 from simtest.validation.runner import Progress
 from simtest.validation.statistics import PENALTY_DEG
+
+_ROUNDED = 1e-5
+"""How far sums of a part's errors and of its scenes' may lie apart by rounding, deg."""
 
 
 def check_seeds(certificate: Certificate, suite: Suite, seeds: Seeds) -> None:
@@ -46,23 +50,38 @@ def check_quick(certificate: Certificate, suite: Suite) -> Verified:
     if certificate.commitment is None and (stated["kind"] != "public" or stated.get("seed") != suite.spec.seed):
         problems.append(f"seeds: neither a commitment nor the public seed {suite.spec.seed}")
     for part, told in certificate.parts.items():
-        problems += _against_itself(part, told) + _against_results(certificate, suite, part, told, notes)
+        problems += _against_itself(suite, part, told) + _against_results(certificate, suite, part, told, notes)
     if overall_of(suite, certificate.parts) != certificate.content["overall"]:
         problems.append("overall: does not follow from the parts")
     return Verified(tuple(problems), tuple(notes))
 
 
-def _against_itself(part: str, told: JsonObject) -> list[str]:
-    """Compare a part's counts with each other, and its penalised error with the mean of the answers."""
+def _against_itself(suite: Suite, part: str, told: JsonObject) -> list[str]:
+    """Compare a part's counts with each other, and its score with its scenes' sums, with the mean and the counts."""
+    n, answered = told["n"], told["answered"]
     refused = told["missed"] + sum(told["refused"].values())
-    if told["n"] != told["answered"] + refused:
-        return [f"{part}: answered, missed and refused do not add up to n = {told['n']}"]
-    if (told["mean_deg"] is None) != (told["answered"] == 0) or (told["penalised_deg"] is None) != (told["n"] == 0):
-        return [f"{part}: mean and penalised error do not go with {told['answered']} answers of {told['n']}"]
-    if told["n"]:
-        expected = ((told["mean_deg"] or 0.0) * told["answered"] + PENALTY_DEG * refused) / told["n"]
-        if not alike(expected, told["penalised_deg"], SAME):
-            return [f"{part}: penalised error {told['penalised_deg']:.6g} does not follow from the mean and the counts"]
+    if n != answered + refused:
+        return [f"{part}: answered, missed and refused do not add up to n = {n}"]
+    if (told["mean_deg"] is None) != (answered == 0) or (told["score_deg"] is None) != (n == 0):
+        return [f"{part}: mean and score do not go with {answered} answers of {n}"]
+    layout = {case: scenes for case, (scenes, _) in layout_of(suite, part).items()}
+    if {case: len(held) for case, held in told["scenes"].items()} != layout:
+        return [f"{part}: scenes: must be {', '.join(f'{count} of {case}' for case, count in layout.items())}"]
+    sums = [scene for held in told["scenes"].values() for scene in held]
+    if sum(number for number, _ in sums) != n:
+        return [f"{part}: the scenes' numbers do not add up to n = {n}"]
+    if not n:
+        return []
+    if not alike(sum(total for _, total in sums) / n, told["score_deg"], SAME):
+        return [f"{part}: score {told['score_deg']:.6g} does not follow from the scenes' sums"]
+    of_maps = suite.part(part).kind == MAPS
+    penalty = PENALTY_DEG if of_maps else CAP_DEG
+    if not of_maps and any(total > CAP_DEG * number + 1e-6 for number, total in sums):
+        return [f"{part}: a scene's sum exceeds {CAP_DEG:g} deg for each of its highlights"]
+    most = ((told["mean_deg"] or 0.0) * answered + penalty * refused) / n
+    least = most if of_maps else penalty * refused / n
+    if not least - _ROUNDED <= told["score_deg"] <= most + _ROUNDED:
+        return [f"{part}: score {told['score_deg']:.6g} does not go with the mean and the counts"]
     return []
 
 
@@ -75,7 +94,7 @@ def _against_results(
         return []
     try:
         rows = pl.read_parquet(file)
-        score = score_part(rows, frames_of(suite, part)).to_json()
+        score = score_part(rows, layout_of(suite, part)).to_json()
     except (OSError, ValueError, TypeError, pl.exceptions.PolarsError) as error:
         return [f"{part}: its results cannot be read ({shown(error)})"]
     if score["results"] != told["results"]:

@@ -1,5 +1,7 @@
 """`simtest bench`: run the frozen benchmark, verify a certificate, make the table, seal seeds."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -70,7 +72,8 @@ def run(
     with exclusive_folder(out), progress_bar() as progress:
         if core is None:
             options = MapOptions(name, encoding, frame, depth, unit_mm)
-            made = run_maps(read, maps or "", out, seeds, options, chosen, progress)
+            with _told_when_stopped("finished frames are kept; the same command scores all maps anew"):
+                made = run_maps(read, maps or "", out, seeds, options, chosen, progress)
         else:
             refuse_dense_options(name=name, encoding=encoding, frame=frame, depth=depth, unit_mm=unit_mm)
             made = run_bench(read, core, out, seeds, parts, chosen, progress)
@@ -114,7 +117,6 @@ def verify(
     certificate : Path
         certificate.json, or its folder.
     """
-    from contextlib import nullcontext
     from tempfile import TemporaryDirectory
 
     from simtest.bench.certificate import read_certificate
@@ -137,7 +139,8 @@ def verify(
         seeds = _seeds(suite, sealed)
         with TemporaryDirectory() if out is None else nullcontext(str(out)) as folder, progress_bar() as progress:
             chosen = make_engine(engine, workers, address)
-            found = verify_run(told, suite, Path(folder), seeds, core, maps, chosen, progress)
+            with nullcontext() if out else _told_when_stopped("without --out nothing is kept"):
+                found = verify_run(told, suite, Path(folder), seeds, core, maps, chosen, progress)
         if verified is not None:
             keep_verified(verified, told, found)
     if as_json:
@@ -242,6 +245,15 @@ def _seeds(suite: "Suite", sealed: Path | None) -> "Seeds":
     return public_seeds(suite) if sealed is None else open_seal(suite, sealed)
 
 
+@contextmanager
+def _told_when_stopped(kept: str) -> Iterator[None]:
+    """Say what a stop leaves, where it is not that the same command goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(kept) from None
+
+
 def _print_parts(content: dict[str, Any]) -> None:
     """Print a row for each part, the reasons of its refusals, and the headline."""
     from simtest.bench.phrases import COLUMNS, part_cells, refusals
@@ -257,4 +269,4 @@ def _print_parts(content: dict[str, Any]) -> None:
         print(f"a {request['unit']} takes {request['median_ms']:.3g} ms")
     overall = content["overall"]
     if overall["complete"]:
-        print(f"overall: {overall['penalised_deg']:.3f} deg, the mean of the parts' penalised errors")
+        print(f"overall: {overall['score_deg']:.3f} deg, the mean of the parts' scores")

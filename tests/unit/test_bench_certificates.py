@@ -34,12 +34,12 @@ def made(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> BenchRun:
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("penalised_deg", 1e-5), ("mean_deg", 1e-5), ("p95_deg", 1e-5), ("median_deg", 1e-5),
-        ("median_interval", [0.0, 1e-5]), ("penalised_interval", [0.0, 1e-5]), ("answered", 3), ("n", 9),
+        ("score_deg", 1e-5), ("mean_deg", 1e-5), ("p95_deg", 1e-5), ("median_deg", 1e-5),
+        ("median_interval", [0.0, 1e-5]), ("score_interval", [0.0, 1e-5]), ("answered", 3), ("n", 9),
         ("refused", {"core_died": 3}), ("uncertainty.verdict", "calibrated"), ("uncertainty.coverage", 0.5),
         ("uncertainty.n", 500), ("uncertainty.interval", [0.0, 0.1]), ("uncertainty.semi_axis_deg", 1e-5),
         ("uncertainty.inflation", 9.0), ("uncertainty.energy_deg", 1e-5), ("more", 1), ("refused", 5),
-        ("p95_deg", None),
+        ("p95_deg", None), ("scenes", {"plane": [[2, 0.0], [2, 0.0], [2, 60.0]]}), ("scenes", {"plane": [[6, 0.1]]}),
     ],
 )  # fmt: skip
 def test_no_figure_is_taken_on_trust(made: BenchRun, results: str, key: str, value: Any) -> None:
@@ -61,18 +61,18 @@ def test_what_processors_differ_by_is_allowed(made: BenchRun) -> None:
     """Highlights that one processor refuses change means by 90 deg over their number; figures else by 5 %."""
     found = copy.deepcopy(made.content)
     part = found["parts"]["smooth"]
-    part.update(n=600, answered=600, mean_deg=0.4, penalised_deg=0.4, p95_deg=1.0, results="0" * 64)
+    part.update(n=600, answered=600, mean_deg=0.4, score_deg=0.4, p95_deg=1.0, results="0" * 64)
     told = copy.deepcopy(found)
     stated = told["parts"]["smooth"]
     stated["results"] = "1" * 64
     stated["median_deg"] += 9e-4
-    stated.update(penalised_deg=0.415, mean_deg=0.385, p95_deg=1.04)
+    stated.update(score_deg=0.415, mean_deg=0.385, p95_deg=1.04)
     assert compare(told, found).holds
-    stated["penalised_deg"] = 0.43
+    stated["score_deg"] = 0.43
     (problem,) = compare(told, found).problems
-    assert problem == "smooth.penalised_deg: differs by 0.03 deg; at most 0.021 is allowed"
+    assert problem == "smooth.score_deg: differs by 0.03 deg; at most 0.021 is allowed"
     # two of 600 refused: 0.3 deg
-    stated.update(answered=598, refused={"not_converged": 2}, penalised_deg=0.7)
+    stated.update(answered=598, refused={"not_converged": 2}, score_deg=0.7)
     compared = compare(told, found)
     assert compared.holds
     assert "smooth.answered: 598, here 600: contours changed their topology" in compared.notes
@@ -88,6 +88,12 @@ def test_another_core_or_machine_is_told(made: BenchRun) -> None:
     assert compare(made.content, found).holds
     found["core"]["sha256"] = "abc"
     assert compare(made.content, found).problems == ("core sha256: stated None, here abc",)
+
+
+def _scored(content: Any, scenes: list[list[float]]) -> None:
+    """State other sums by scene, and the score that follows from them."""
+    score = sum(total for _, total in scenes) / sum(number for number, _ in scenes)
+    content["parts"]["smooth"].update(scenes={"plane": scenes}, score_deg=score)
 
 
 @pytest.mark.render
@@ -120,11 +126,15 @@ def test_an_altered_certificate_is_refused(suite: Suite, made: BenchRun, tmp_pat
         (lambda c: c.update(kind="other"), "is no certificate"),
         (lambda c: c.pop("core"), "has no key core"),
         (lambda c: c["parts"]["smooth"].update(missed=3), "do not add up to n = 6"),
-        (lambda c: c["overall"].update(penalised_deg=0.0), "overall: does not follow"),
+        (lambda c: c["overall"].update(score_deg=0.0), "overall: does not follow"),
         (lambda c: c["cases"].clear(), "case smooth/plane is not that of"),
         (lambda c: c["parts"].update(soft=c["parts"]["smooth"]), "part soft is none of|part 'soft' is none of"),
         (lambda c: c["seeds"].update(seed=6), "neither a commitment nor the public seed 5"),
-        (lambda c: c["parts"]["smooth"].update(penalised_deg=0.001), "does not follow from the mean and the counts"),
+        (lambda c: c["parts"]["smooth"].update(score_deg=0.001), "score 0.001 does not follow from the scenes' sums"),
+        (lambda c: _scored(c, [[2, 8.0], [2, 8.0], [2, 8.0]]), "score 4 does not go with the mean and the counts"),
+        (lambda c: _scored(c, [[1, 12.0], [3, 0.0], [2, 0.0]]), "a scene's sum exceeds 10 deg for each of its"),
+        (lambda c: _scored(c, [[2, 0.0], [2, 0.0]]), "scenes: must be 3 of plane"),
+        (lambda c: _scored(c, [[2, 0.0], [2, 0.0], [3, 0.0]]), "numbers do not add up to n = 6"),
         (lambda c: c["parts"]["smooth"].update(mean_deg=None), "do not go with 6 answers"),
         (lambda c: c["parts"]["smooth"].pop("n"), r"parts.smooth.n"),
         (lambda c: c["parts"]["smooth"].update(median_deg="0.1"), r"parts.smooth.median_deg"),
@@ -151,9 +161,11 @@ _REMOVED = object()
     ("path", "value"),
     [
         ("parts.smooth", None), ("parts.smooth.refused", _REMOVED), ("parts.smooth.uncertainty", _REMOVED),
-        ("parts.smooth.penalised_deg", -5.0), ("parts.smooth.penalised_deg", 10**400), ("parts.smooth.p95_deg", 181.0),
-        ("parts.smooth.penalised_interval", [90.0, 0.0]), ("parts.smooth.median_interval", [0.1]),
+        ("parts.smooth.score_deg", -5.0), ("parts.smooth.score_deg", 10**400), ("parts.smooth.p95_deg", 181.0),
+        ("parts.smooth.score_interval", [90.0, 0.0]), ("parts.smooth.median_interval", [0.1]),
         ("parts.smooth.median_deg", 179.0), ("parts.smooth.refused", {"core_died": -1}), ("parts.smooth.more", 1),
+        ("parts.smooth.scenes", _REMOVED), ("parts.smooth.scenes", {"plane": [[2, -1.0]]}),
+        ("parts.smooth.scenes", {"plane": [[2]]}), ("parts.smooth.scenes", [[2, 0.1]]),
         ("parts.smooth.uncertainty.n", 500), ("parts.smooth.uncertainty.verdict", "calibrated"),
         ("parts.smooth.uncertainty.interval", [0.3, 0.2]), ("parts", {}), ("parts.smooth.zones", {"all": {}}),
         ("cases", []), ("suite", "v1"), ("core", "x"), ("core", {}), ("core.sha256", 5), ("core.name", "\ud800"),
@@ -197,25 +209,31 @@ def test_what_has_no_hash_is_refused(made: BenchRun, tmp_path: Path, number: str
 
 @pytest.mark.render
 def test_the_table_ranks_and_ties(suite: Suite, made: BenchRun, tmp_path: Path) -> None:
-    def named(name: str, low: float, high: float, seeds: Any = None) -> None:
+    """Cores that differ by the same in each scene are ranked, however much the scenes differ; else they are tied."""
+
+    def named(name: str, sums: list[float], seeds: Any = None) -> None:
         def change(content: Any) -> None:
             content["core"]["name"] = name
             content["seeds"] = seeds or content["seeds"]
-            figures = {"penalised_deg": (low + high) / 2, "penalised_interval": [low, high]}
-            content["parts"]["smooth"].update(figures, mean_deg=(low + high) / 2)
+            figures = {"score_deg": sum(sums) / 6, "score_interval": [0.0, 10.0]}
+            content["parts"]["smooth"].update(
+                figures, mean_deg=sum(sums) / 6, scenes={"plane": [[2, total] for total in sums]}
+            )
             # the headline of a single part is that part's
-            content["overall"].update(figures)
+            half = [max(0.0, sum(sums) / 6 - 5.0), sum(sums) / 6 + 5.0]
+            content["overall"].update(figures, score_interval=half)
 
         copied(made, tmp_path / "all" / name, change)
 
-    named("best", 1.0, 2.0)
-    named("tied", 1.5, 2.5)
-    named("middle", 2.2, 3.0)
-    named("<worst>", 4.0, 5.0)
-    named("sealed one", 1.0, 2.0, {"kind": "sealed", "commitment": COMMITMENT})
+    named("best", [0.2, 3.0, 6.0])
+    named("middle", [2.2, 5.0, 8.0])
+    named("unsteady", [6.4, 3.0, 6.0])
+    named("<worst>", [12.2, 15.0, 18.0])
+    named("sealed one", [0.2, 3.0, 6.0], {"kind": "sealed", "commitment": COMMITMENT})
     boards = read_entries(tmp_path / "all", suite)
     ranks = [(row.certificate.core["name"], row.rank) for row in boards[0].overall]
-    assert ranks == [("best", "1–2"), ("tied", "1–3"), ("middle", "2–3"), ("<worst>", "4")]
+    assert ranks == [("best", "1–2"), ("middle", "2–3"), ("unsteady", "1–4"), ("<worst>", "3–4")]
+    assert [row.rank for row in boards[0].parts["smooth"]] == [rank for _, rank in ranks]
     assert [row.rank for row in boards[1].overall] == ["1"]
     page = write_leaderboard(suite, boards, tmp_path / "table").read_text()
     assert "&lt;worst&gt;" in page
@@ -223,7 +241,9 @@ def test_the_table_ranks_and_ties(suite: Suite, made: BenchRun, tmp_path: Path) 
     assert page.count("<h1>") == 1
     assert page.count("as stated</td>") == 5
     # the first headline is of the seeds in text order, and each part's name is that of the command
-    assert "best has the smallest error over all parts" in page
+    assert "best and unsteady share the first rank over all parts" in page
+    assert "sealed one ranks first over all parts" in page
+    assert "clear at 5&nbsp;% for the whole table" in page
     assert "(<code>smooth</code>)" in page
 
 
@@ -250,9 +270,13 @@ def test_the_table_marks_what_was_run_again(suite: Suite, made: BenchRun, tmp_pa
         read_verified(tmp_path / "missing", required=True)
 
 
-def test_a_core_without_a_figure_has_no_rank(tmp_path: Path) -> None:
+def test_a_core_without_a_score_has_no_rank(tmp_path: Path) -> None:
     from simtest.bench.certificate import Certificate
 
-    held = [Certificate(tmp_path / name, {"value": value}) for name, value in (("a", None), ("b", 1.0))]
-    rows = ranked(held, lambda certificate: (certificate.content["value"], None))
+    held = [
+        Certificate(tmp_path / name, {"value": value, "parts": {"smooth": {"scenes": {"plane": scenes}}}})
+        for name, value, scenes in (("a", None, [[0, 0.0], [0, 0.0]]), ("b", 1.0, [[1, 1.0], [1, 1.0]]))
+    ]
+    rows = ranked(held, ["smooth"], lambda certificate: certificate.content["value"])
     assert [(row.certificate.path.name, row.rank) for row in rows] == [("b", "1"), ("a", "–")]
+    assert [row.rank for row in ranked(held[:1], ["smooth"], lambda _: None)] == ["–"]

@@ -21,7 +21,7 @@ from simtest.bench.leaderboard import read_entries
 from simtest.bench.maps import export_frames, maps_record
 from simtest.bench.run import BenchRun, chosen_parts, run_bench, run_maps
 from simtest.bench.seal import SEALED, seal
-from simtest.bench.suite import Suite, digest_of, frames_of
+from simtest.bench.suite import Suite, digest_of, layout_of
 from simtest.bench.verify import check_quick, check_seeds, verify_run
 from simtest.cli import bench
 from simtest.dataset.scoring.dense.conventions import MapOptions
@@ -51,9 +51,11 @@ def test_a_certificate_tells_what_was_run(suite: Suite, made: BenchRun) -> None:
     part = told["parts"]["smooth"]
     assert (part["n"], part["answered"], part["missed"]) == (6, 6, 0)
     assert 0 < part["median_deg"] < 0.5
+    assert [n for n, _ in part["scenes"]["plane"]] == [2, 2, 2]
+    assert part["score_deg"] == pytest.approx(part["mean_deg"], abs=1e-6)
     assert told["overall"] == {
-        "complete": True, "penalised_deg": part["penalised_deg"],
-        "penalised_interval": pytest.approx(told["overall"]["penalised_interval"]),
+        "complete": True, "score_deg": part["score_deg"],
+        "score_interval": pytest.approx(told["overall"]["score_interval"]),
     }  # fmt: skip
     assert told["timing"]["request"]["n"] >= 1
 
@@ -134,6 +136,7 @@ def test_maps_are_scored_on_the_dense_part(suite: Suite, tmp_path: Path) -> None
     part = told.parts["dense"]
     assert part["mean_deg"] == pytest.approx(np.mean(tilts), abs=1e-3)
     assert part["n"] == part["answered"] == part["zones"]["all"]["n"] > 10_000
+    assert [total / n for n, total in part["scenes"]["plane"]] == pytest.approx(tilts, abs=1e-3)
     assert told.core["kind"] == "maps"
     assert not told.content["overall"]["complete"]
     assert check_quick(told, suite).holds
@@ -169,9 +172,9 @@ def test_a_folder_that_is_called_as_the_baseline_is_a_folder(tmp_path: Path, mon
     assert maps_record("shading", made_score(Path("shading")))["kind"] == "maps"
 
 
-def test_frames_of_a_scene_are_those_of_its_part(suite: Suite) -> None:
-    assert frames_of(suite, "smooth") == {"plane": 2}
-    assert frames_of(suite, "dense") == {"plane": 1}
+def test_layout_of_a_scene_are_those_of_its_part(suite: Suite) -> None:
+    assert layout_of(suite, "smooth") == {"plane": (3, 2)}
+    assert layout_of(suite, "dense") == {"plane": (2, 1)}
 
 
 def test_parts_that_cannot_be_run_are_told(suite: Suite) -> None:
@@ -290,3 +293,27 @@ def test_the_commands_say_what_they_have_checked(
         bench.verify(tmp_path / "run", quick=True, verified=tmp_path / "list")
     bench.table(tmp_path / "run", out=tmp_path / "table", verified=tmp_path / "list")
     assert "run again</td>" in (tmp_path / "table" / "index.html").read_text()
+
+
+def test_a_stop_says_what_is_kept(
+    suite: Suite, made: BenchRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sums over maps, and a verification without --out, are not gone on with; a core's run is."""
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("simtest.bench.suite.load_suite", lambda *_: suite)
+    for name in ("run.run_maps", "run.run_bench", "verify.verify_run"):
+        monkeypatch.setattr(f"simtest.bench.{name}", stopped)
+    for command, told in (
+        (
+            lambda: bench.run(out=tmp_path / "run", maps=tmp_path),
+            "frames are kept; the same command scores all maps anew",
+        ),
+        (lambda: bench.verify(made.certificate), "without --out nothing is kept"),
+        (lambda: bench.verify(made.certificate, out=tmp_path / "again"), "^$"),
+        (lambda: bench.run(out=tmp_path / "run", core="cone_axis"), "^$"),
+    ):
+        with pytest.raises(KeyboardInterrupt, match=told):
+            command()

