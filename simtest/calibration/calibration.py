@@ -1,5 +1,6 @@
 """A camera with what is known of it, and the correction of its frames: response, vignetting and emission undone."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
@@ -13,8 +14,10 @@ from simtest.errors import InputError
 from simtest.geometry import Array, Image, Mask
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.geometry.camera import Camera
-from simtest.geometry.checks import check_kind, check_number
+from simtest.geometry.checks import check_kind, check_number, check_numbers
 from simtest.runtime.short_repr import short_repr
+
+OPTICAL_AXIS = (0.0, 0.0, 1.0)
 
 MIN_FALLOFF = 0.05
 """The correction divides by at least this share of the frame's largest falloff: below it there is little but noise."""
@@ -66,7 +69,7 @@ class Calibration:
     vignetting : AngularProfile
         Share of the light that the lens transmits, over the angle between sightline and optical axis.
     emission : AngularProfile
-        Emission of a light at the camera that shines along the optical axis, over the same angle.
+        Emission of a light at the camera, over the angle between sightline and `emission_axis`.
     noise : NoiseModel
         Of the known noise; white noise beyond it is estimated from each frame.
     saturation_level : float, optional
@@ -74,6 +77,8 @@ class Calibration:
     priors : Priors
         Of lights, distance, lobe, camera and relief; passed on to the estimators. With a vignetting or emission that is
         not uniform, none is left in the frame, and the prior on its power is dropped.
+    emission_axis : tuple of float
+        Direction in which the light shines, camera frame, unit; default the optical axis.
 
     Raises
     ------
@@ -97,6 +102,7 @@ class Calibration:
     noise: NoiseModel = field(default_factory=NoiseModel)
     saturation_level: float | None = None
     priors: Priors = NO_PRIORS
+    emission_axis: tuple[float, float, float] = OPTICAL_AXIS
 
     __repr__ = short_repr
 
@@ -108,6 +114,9 @@ class Calibration:
         for name in ("vignetting", "emission"):
             check_kind(f"calibration {name}", getattr(self, name), AngularProfile)
         check_kind("calibration noise", self.noise, NoiseModel)
+        check_numbers("emission_axis", self.emission_axis)
+        if len(self.emission_axis) != 3 or not math.isclose(math.hypot(*self.emission_axis), 1, abs_tol=1e-9):
+            raise InputError(f"emission_axis = {self.emission_axis}: must be a unit vector of 3 numbers")
         if self.saturation_level is not None:
             check_number("saturation_level", self.saturation_level, above=0)
         # A told falloff is undone, so none that nobody told is left.
@@ -119,7 +128,7 @@ class Calibration:
         """Vignetting times emission at each pixel's centre, shape (H, W); None where both are uniform."""
         if self.vignetting.is_uniform and self.emission.is_uniform:
             return None
-        return falloff_map(self.camera, self.vignetting) * falloff_map(self.camera, self.emission)
+        return falloff_map(self.camera, self.vignetting) * falloff_map(self.camera, self.emission, self.emission_axis)
 
     def correct(self, values: Image) -> CorrectedFrame:
         """Undo the response, average the channels, divide by the known falloff; smoothing comes after.
@@ -174,7 +183,11 @@ def _planes(values: Image) -> Sequence[Image]:
     return [np.asarray(plane) for plane in cv2.split(values)]
 
 
-def falloff_map(camera: Camera, profile: AngularProfile) -> Array:
-    """Evaluate a profile about the optical axis at each pixel's centre, shape (H, W); 0 where there is no sightline."""
-    x, y, cosine = np.moveaxis(camera.unproject(camera.pixel_centres()), -1, 0)
-    return np.where(np.isfinite(cosine), profile.at(cosine, np.hypot(x, y)), 0.0)
+def falloff_map(camera: Camera, profile: AngularProfile, axis: tuple[float, float, float] = OPTICAL_AXIS) -> Array:
+    """Evaluate a profile about a unit axis at each pixel's centre, shape (H, W); 0 where there is no sightline."""
+    rays = camera.unproject(camera.pixel_centres())
+    if axis == OPTICAL_AXIS:
+        cosine, sine = rays[..., 2], np.hypot(rays[..., 0], rays[..., 1])
+    else:
+        cosine, sine = rays @ np.array(axis), np.linalg.norm(np.cross(rays, axis), axis=-1)
+    return np.where(np.isfinite(cosine), profile.at(cosine, sine), 0.0)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from simtest.calibration import Calibration
 from simtest.errors import InputError
@@ -12,7 +13,9 @@ from simtest.spec.spec_model import validate
 from simtest.spec.toml_files import read_toml
 
 
-def load_calibration(path: str | Path) -> Calibration:
+def load_calibration(
+    path: str | Path, photometric: str | Path | None = None, view_radius_px: float | None = None
+) -> Calibration:
     """Read a calibration file, or a camera file.
 
     Parameters
@@ -20,6 +23,10 @@ def load_calibration(path: str | Path) -> Calibration:
     path : str or Path
         TOML with the tables of `CalibrationSpec`, the camera's keys under ``[camera]`` or at top level; or anything
         else that `load_camera` reads.
+    photometric : str or Path, optional
+        EndoMapper's photometric calibration: response, vignetting and light, which the first file then leaves out.
+    view_radius_px : float, optional
+        As `load_camera` takes it.
 
     Returns
     -------
@@ -29,25 +36,27 @@ def load_calibration(path: str | Path) -> Calibration:
     Raises
     ------
     InputError
-        If the file is missing or malformed.
+        If a file is missing or malformed, or both state the same.
 
     Examples
     --------
     >>> import simtest, tempfile
     >>> from pathlib import Path
-    >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
+        >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
     >>> simtest.save_calibration(simtest.Calibration(simtest.Camera.from_fov(70.0, 640, 480)), path)
     >>> simtest.load_calibration(path).camera.width
     640
     """
     path = Path(path)
     # camera
-    camera = load_camera(path)
+    camera = load_camera(path, view_radius_px)
     # everything else, which only TOML holds
     data = read_toml(path) if recognise(path) == "toml" else {}
     if not isinstance(data.get("camera"), Mapping):
         # The camera's keys stand at top level, before the other tables.
         data = {key: value for key, value in data.items() if key in NOT_OF_THE_CAMERA}
+    if photometric is not None:
+        data = _with_photometry(data, Path(photometric), path)
     if not data.keys() - {"camera"}:
         return Calibration(camera)
     # Imported here: the models of sensor and lobe are slow to load, and a camera alone needs none.
@@ -55,6 +64,19 @@ def load_calibration(path: str | Path) -> Calibration:
 
     # The camera's own table has been read, by its own rules.
     return validate(CalibrationSpec, {**data, "camera": {}}, str(path)).calibration(camera)
+
+
+def _with_photometry(data: Mapping[str, Any], photometric: Path, path: Path) -> dict[str, Any]:
+    """Return the tables of a calibration file with those of a photometric calibration."""
+    from simtest.spec.camera_formats.photometric import read_photometric
+
+    made = dict(data)
+    for name, table in read_photometric(photometric).items():
+        told = data.get(name, {}) if name == "rig" else {}
+        if (name in data and name != "rig") or (isinstance(told, Mapping) and set(told) & set(table)):
+            raise InputError(f"{shown(path)}: {name}: {shown(photometric)} states it too; leave it out in one of them")
+        made[name] = {**told, **table}
+    return made
 
 
 def save_calibration(calibration: Calibration, path: str | Path) -> None:
@@ -76,7 +98,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     --------
     >>> import simtest, tempfile
     >>> from pathlib import Path
-    >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
+        >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
     >>> simtest.save_calibration(simtest.Calibration(simtest.Camera.from_fov(70.0, 640, 480)), path)
     >>> simtest.load_calibration(path).camera.width
     640

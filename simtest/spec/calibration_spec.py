@@ -16,10 +16,11 @@ from simtest.calibration import (
     Uniform,
     exactly,
 )
+from simtest.calibration.calibration import OPTICAL_AXIS
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
 from simtest.geometry import Camera
 from simtest.spec.camera_spec import CameraSpec
-from simtest.spec.falloff import CosineProfile, Profile
+from simtest.spec.falloff import CosineProfile, Profile, TableProfile
 from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
 from simtest.spec.spec_model import Millimetres, Spec
 
@@ -139,6 +140,39 @@ class SurfaceCalibration(Spec):
         return self
 
 
+Direction = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+
+class _Emission(Spec):
+    """Where an emission's axis points."""
+
+    direction: tuple[Direction, Direction, Direction] = Field(
+        OPTICAL_AXIS, description="in which the light shines, camera frame, any length; default the optical axis"
+    )
+
+    @model_validator(mode="after")
+    def _points(self) -> Self:
+        if not any(self.direction):
+            raise ValueError(f"direction = {list(self.direction)}: must have a length")
+        return self
+
+    @property
+    def axis(self) -> tuple[float, float, float]:
+        """The direction as a unit vector."""
+        length = math.hypot(*self.direction)
+        # A unit vector keeps its digits, so that what is written reads back the same.
+        x, y, z = self.direction if math.isclose(length, 1, abs_tol=1e-12) else (v / length for v in self.direction)
+        return (x, y, z)
+
+
+class CosineEmission(_Emission, CosineProfile):
+    """cos^power of the angle from the direction in which the light shines."""
+
+
+class TableEmission(_Emission, TableProfile):
+    """A table over the angle from the direction in which the light shines."""
+
+
 class CalibrationSpec(Spec):
     """A calibration file; all tables but the camera may be left out."""
 
@@ -147,8 +181,8 @@ class CalibrationSpec(Spec):
     vignetting: Profile = Field(
         CosineProfile(), description="share of the light that the lens passes, over the angle from the optical axis"
     )
-    emission: Profile = Field(
-        CosineProfile(), description="of a light at the camera, shining along the optical axis, over the same angle"
+    emission: Annotated[CosineEmission | TableEmission, Field(discriminator="type")] = Field(
+        CosineEmission(), description="of a light at the camera, over the angle from the direction in which it shines"
     )
     sensor: SensorCalibration = SensorCalibration()
     rig: RigCalibration = RigCalibration()
@@ -162,7 +196,8 @@ class CalibrationSpec(Spec):
         sensor = self.sensor
         noise = NoiseModel(sensor.noise_sigma, sensor.full_well, sensor.read_noise, sensor.bits, response or Response())
         falloff = (self.vignetting.model(), self.emission.model())
-        return Calibration(camera, response, *falloff, noise, sensor.saturation_level, self.priors())
+        level, axis = sensor.saturation_level, self.emission.axis
+        return Calibration(camera, response, *falloff, noise, level, self.priors(), axis)
 
     def priors(self) -> Priors:
         """Return the priors on lights, distance, lobe, camera, falloff and relief."""

@@ -6,6 +6,7 @@ from dataclasses import fields
 from typing import Any
 
 from simtest.calibration import Calibration, Distribution, NoiseModel, Normal, Priors, Response, Uniform
+from simtest.calibration.calibration import OPTICAL_AXIS
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
 from simtest.errors import InputError
 from simtest.geometry.angular_profile import AngularProfile
@@ -42,6 +43,8 @@ def calibration_tables(calibration: Calibration) -> Tables:
     for name in ("vignetting", "emission"):
         if not (profile := getattr(calibration, name)).is_uniform:
             tables[name] = _profile(profile)
+    if calibration.emission_axis != OPTICAL_AXIS and "emission" in tables:
+        tables["emission"]["direction"] = list(calibration.emission_axis)
     if priors.falloff_power is None and not {"vignetting", "emission"} & set(tables):
         # None is left in the frame, which a file says by stating that it is uniform.
         tables["vignetting"] = {"type": "cosine", "power": 0.0}
@@ -140,6 +143,8 @@ def _parts(one: Calibration, other: Calibration) -> Iterator[tuple[str, object, 
     """Yield name and both values of what two calibrations hold, the priors one by one."""
     for name in ("response", "vignetting", "emission", "noise", "saturation_level"):
         yield name, getattr(one, name), getattr(other, name)
+    if not one.emission.is_uniform:
+        yield "emission_axis", one.emission_axis, other.emission_axis
     for item in fields(Priors):
         yield item.name, getattr(one.priors, item.name), getattr(other.priors, item.name)
 

@@ -227,7 +227,7 @@ def _centre(cx: float | None, cy: float | None, middle: tuple[float, float]) -> 
     return middle[0] if cx is None else cx, middle[1] if cy is None else cy
 
 
-def load_camera(path: str | Path) -> Camera:
+def load_camera(path: str | Path, view_radius_px: float | None = None) -> Camera:
     """Read a camera file; the half pixel between conventions is added or subtracted here (docs/howto/cameras.md).
 
     Parameters
@@ -236,6 +236,8 @@ def load_camera(path: str | Path) -> Camera:
         A camera file of OpenCV, ROS, MATLAB, COLMAP, NeRF, Kalibr, Vicalib, OCamCalib or C3VD, recognised by what it
         holds, or TOML with the keys of `CameraSpec`, at top level or under ``[camera]``. FILE#ID names one camera of
         several.
+    view_radius_px : float, optional
+        Radius of a round view about the image's centre, where the file states none.
 
     Raises
     ------
@@ -256,7 +258,7 @@ def load_camera(path: str | Path) -> Camera:
 
     path = Path(path)
     if recognise(path) != "toml":
-        return _validated(read_table(path), path)
+        return _validated(_with_view(read_table(path), view_radius_px, path), path, HOW_TO_MASK)
     # The camera's keys under [camera], or at top level beside the other tables of a calibration file
     data = {key: value for key, value in read_toml(path).items() if key not in NOT_OF_THE_CAMERA}
     table = data.get("camera", data)
@@ -265,11 +267,29 @@ def load_camera(path: str | Path) -> Camera:
     missing = [key for key in ("width", "height", *(() if "fov_deg" in told else ("fx", "fy"))) if key not in told]
     if missing:
         raise InputError(f"{path}: {missing[0]}: missing; a camera needs width, height, and fx and fy or fov_deg")
-    return _validated(table, path)
+    return _validated(_with_view(told, view_radius_px, path), path)
 
 
-def _validated(table: Mapping[str, Any], path: Path) -> Camera:
-    return validate(CameraSpec, table, str(path)).model()
+HOW_TO_MASK = "; simtest camera convert FILE --view-radius PX --to toml --out FILE.toml states one"
+
+
+def _with_view(table: Mapping[str, Any], radius_px: float | None, path: Path) -> Mapping[str, Any]:
+    """Return a camera's table with a round view where one is given and the table has none."""
+    if radius_px is None:
+        return table
+    if table.get("view_mask") is not None:
+        raise InputError(f"{path}: view_mask: stated in the file; leave the view's radius out")
+    return {**table, "view_mask": {"radius": radius_px}}
+
+
+def _validated(table: Mapping[str, Any], path: Path, how: str = "") -> Camera:
+    try:
+        return validate(CameraSpec, table, str(path)).model()
+    except InputError as error:
+        # A file of another program has no place for the mask that would help.
+        if how and "folds over" in str(error):
+            raise InputError(f"{error}{how}") from None
+        raise
 
 
 def save_camera(

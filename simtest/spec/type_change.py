@@ -1,4 +1,4 @@
-"""What becomes of a table whose type a setting replaces: the keys of the former type go."""
+"""What becomes of a table when a setting replaces its type, or one key by another that excludes it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,6 +8,9 @@ from pydantic import BaseModel
 from simtest.spec.json_schema import nodes_at
 from simtest.spec.toml_files import apply_settings
 
+RIVALS = {"camera.fov_deg": ("fx", "fy"), "camera.fx": ("fov_deg", "fov_of"), "camera.fy": ("fov_deg", "fov_of")}
+"""Keys of the camera that exclude each other."""
+
 
 def replace_values(
     model: type[BaseModel], data: Mapping[str, Any], settings: Mapping[str, Any], where: str
@@ -15,7 +18,8 @@ def replace_values(
     """Replace values at key paths as `apply_settings` does, and drop what a table's new type does not have.
 
     Setting ``reflectance.type`` to another type leaves no key of the former one behind, unless it is set as well: then
-    it is refused by its name. Keys that both types have stay.
+    it is refused by its name. Keys that both types have stay. In the same way ``camera.fov_deg`` replaces the camera's
+    focal lengths, and they replace it.
 
     Parameters
     ----------
@@ -33,7 +37,7 @@ def replace_values(
     InputError
         As `apply_settings` does.
     """
-    result = apply_settings(data, settings, where)
+    result = apply_settings(_without_rivals(data, settings), settings, where)
     for path, value in settings.items():
         *parents, last = path.split(".")
         if last != "type" or not isinstance(value, str):
@@ -50,6 +54,15 @@ def replace_values(
         for key in set(before) - allowed - given:
             table.pop(key, None)
     return result
+
+
+def _without_rivals(data: Mapping[str, Any], settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return tables without the keys of the camera that a setting's key excludes."""
+    camera = data.get("camera")
+    if not isinstance(camera, Mapping):
+        return data
+    gone = {key for path in settings for key in RIVALS.get(path, ())}
+    return {**data, "camera": {key: value for key, value in camera.items() if key not in gone}} if gone else data
 
 
 def _at(data: Any, path: list[str]) -> Any:

@@ -425,7 +425,7 @@ MATLAB_BAD = {
     "missing": ({"s": {k: v for k, v in STRUCT.items() if k != "RadialDistortion"}}, "RadialDistortion: missing"),
     "text": ({"s": {**STRUCT, "TangentialDistortion": "ab"}}, "TangentialDistortion = 'ab': must be 2 numbers"),
     "not transposed": ({"s": {**STRUCT, "IntrinsicMatrix": STRUCT["IntrinsicMatrix"].T}}, "must be triangular"),
-    "fisheye": ({"s": {"MappingCoefficients": np.zeros(4)}}, "MATLAB's fisheye model is not known"),
+    "fisheye": ({"s": {"MappingCoefficients": np.zeros(4)}}, "ImageSize: missing"),
 }
 
 
@@ -518,7 +518,7 @@ def test_what_cannot_be_saved(tmp_path):
     for camera, name, kind, fragment in (
         (skewed, "c.yml", None, "camera.skew = 2: must be 0, since OpenCV ignores it"),
         (skewed, "c.yml", "ros", "since ROS ignores it"),
-        (PINHOLE, "c.mat", None, "opencv needs a file name that ends in .yml, .yaml, .xml, .json"),
+        (PINHOLE, "c.mat", "opencv", "opencv needs a file name that ends in .yml, .yaml, .xml, .json"),
         (PINHOLE, "c.yml", "toml", "toml needs a file name that ends in .toml"),
         (PINHOLE, "c.yml", "kalibr", "format = 'kalibr': must be one of toml, opencv, ros"),
         (np.eye(3), "c.yml", None, "camera is a ndarray"),

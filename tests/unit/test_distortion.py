@@ -7,7 +7,7 @@ from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 
 from simtest.errors import InputError
-from simtest.geometry import BrownConrady, Camera, KannalaBrandt, ViewMask
+from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Scaramuzza, ViewMask
 
 WIDTH, HEIGHT = 640, 480
 MASK = ViewMask(325.0, 236.0, 220.0)
@@ -29,10 +29,14 @@ BROWN = st.builds(
     k3=spread(-0.05, 0.05), k4=spread(-0.3, 0.3), k5=spread(-0.1, 0.1), k6=spread(-0.05, 0.05),
 )  # fmt: skip
 FISHEYE = st.builds(KannalaBrandt, *(spread(-width, width) for width in (0.2, 0.05, 0.01, 0.002)))
+OMNI = st.builds(
+    Scaramuzza, k2=spread(-0.8, 0.3), k3=spread(-0.3, 0.4), k4=spread(-0.6, 0.1), c=spread(0.98, 1.02),
+    d=spread(-0.01, 0.01), e=spread(-0.01, 0.01),
+)  # fmt: skip
 
 
 @settings(max_examples=80, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
-@given(st.one_of(BROWN, FISHEYE), st.sampled_from([None, MASK]), spread(150, 900))
+@given(st.one_of(BROWN, FISHEYE, OMNI), st.sampled_from([None, MASK]), spread(150, 900))
 def test_pixels_round_trip(lens, mask, focal):
     try:
         camera = Camera(WIDTH, HEIGHT, focal, 0.9 * focal, 331.2, 225.7, 3.0, lens, mask)
@@ -46,7 +50,7 @@ def test_pixels_round_trip(lens, mask, focal):
 
 
 @settings(max_examples=120, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
-@given(st.one_of(BROWN, FISHEYE), st.integers(0, 2**32 - 1))
+@given(st.one_of(BROWN, FISHEYE, OMNI), st.integers(0, 2**32 - 1))
 def test_directions_round_trip(lens, seed):
     """On the first branch, undistort takes back what distort did, to the digits that the branch's slope leaves."""
     rng = np.random.default_rng(seed)
@@ -57,7 +61,7 @@ def test_directions_round_trip(lens, seed):
     seen = np.isfinite(there).all(axis=-1)  # tangential terms may fold a little earlier
     back = lens.undistort(there[seen])
     np.testing.assert_allclose(lens.distort(back), there[seen], atol=2e-13)
-    if isinstance(lens, KannalaBrandt) or lens.p1 == lens.p2 == 0:
+    if not isinstance(lens, BrownConrady) or lens.p1 == lens.p2 == 0:
         assert seen.all()
         np.testing.assert_allclose(back, rays, atol=1e-10)
 
@@ -66,6 +70,11 @@ def test_undistort_is_exact():
     m = np.random.default_rng(3).uniform(-0.45, 0.45, (1000, 2))
     for lens in (BrownConrady(-0.3, 0.1, 0.001, -0.002, 0.01), BrownConrady(-0.3, 0.1), KannalaBrandt(0.05, -0.01)):
         np.testing.assert_allclose(lens.distort(lens.undistort(m)), m, atol=1e-13)
+    lens = Scaramuzza(-0.6, 0.3, -0.5, 0.999, 0.003, -0.002)
+    np.testing.assert_allclose(lens.distort(lens.undistort(m)), m, atol=1e-13)
+    np.testing.assert_array_equal(lens.undistort([[0.0, 0.0]]), [[0, 0, 1]])
+    np.testing.assert_array_equal(lens.distort([[0.0, 0.0, 2.0]]), [[0, 0]])
+    assert lens.distort(np.ones((3, 4, 3))).shape == (3, 4, 2)
     np.testing.assert_array_equal(BrownConrady(-0.3).undistort([0.0, 0.0]), [0, 0, 1])
     np.testing.assert_array_equal(KannalaBrandt(0.1).undistort([[0.0, 0.0]]), [[0, 0, 1]])
     assert BrownConrady(-0.3).undistort(np.zeros((3, 4, 2))).shape == (3, 4, 3)
@@ -96,6 +105,28 @@ def test_kannala_brandt_is_opencvs():
     np.testing.assert_allclose(camera.project(points[:, 0]), again[:, 0] + 0.5, atol=1e-6)
 
 
+def test_an_omnidirectional_lens_sees_sideways_and_backwards():
+    """Its definition in numbers: r = 2 sees the direction (2, 0, 1 - 0.5 * 4), which is behind the camera."""
+    lens = Scaramuzza(k2=-0.5)
+    np.testing.assert_allclose(lens.undistort([2.0, 0.0]), np.array([2, 0, -1]) / np.sqrt(5), atol=1e-15)
+    np.testing.assert_allclose(lens.distort([4.0, 0.0, -2.0]), [2, 0], atol=1e-14)
+    np.testing.assert_allclose(lens.distort([0.0, 3.0, 0.0]), [0, np.sqrt(2)], atol=1e-14)
+    assert np.isnan(lens.distort([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [np.nan, 0.0, 1.0]])).any(axis=1).all()
+    # The stretch, after the radius: (c x + d y, e x + y).
+    sheared = Scaramuzza(k2=-0.5, c=1.1, d=0.2, e=-0.1)
+    np.testing.assert_allclose(sheared.distort([2.0, 2.0, 1.0]), lens.distort([2.0, 2.0, 1.0]) * [1.3, 0.9], atol=1e-14)
+    np.testing.assert_allclose(sheared.undistort(sheared.distort([2.0, -1.0, 0.5])), np.array([4, -2, 1]) / np.sqrt(21))
+    # Without coefficients it is a pinhole.
+    plain = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    omni = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 0.0, Scaramuzza())
+    points = np.random.default_rng(4).uniform(0, 480, (50, 2))
+    np.testing.assert_allclose(omni.unproject(points), plain.unproject(points), atol=1e-15)
+    np.testing.assert_allclose(omni.project([[1.0, 2.0, 9.0]]), plain.project([[1.0, 2.0, 9.0]]), atol=1e-10)
+    for c, d, e in ((1.0, 2.0, 0.5), (-1.0, 0.0, 0.0), (0.0, 0.0, 0.0)):
+        with pytest.raises(InputError, match=r"distortion\.c = .* c - d e must be > 0"):
+            Scaramuzza(-0.1, 0.0, 0.0, c, d, e)
+
+
 def test_a_fisheye_sees_sideways_and_backwards():
     camera = Camera(800, 800, 180.0, 180.0, 400.0, 400.0, 0.0, KannalaBrandt(0.01), ViewMask(400, 400, 350))
     right, edge = camera.unproject([[400 + 180 * np.pi / 2 * (1 + 0.01 * (np.pi / 2) ** 2), 400], [749.9, 400.0]])
@@ -113,6 +144,12 @@ def test_beyond_the_fold_nothing_is_seen():
     assert lens.limit == pytest.approx(np.sqrt(1 / 1.2))
     assert KannalaBrandt(k1=-0.2).limit_angle == pytest.approx(np.sqrt(1 / 0.6))
     assert BrownConrady(k1=0.1).limit == 1e6
+    # f - r f' = 1 - k2 r^2 vanishes where the direction (r, f) is farthest from the axis.
+    assert Scaramuzza(k2=0.25).limit == pytest.approx(2)
+    assert Scaramuzza(k2=0.25).limit_angle == pytest.approx(np.arctan2(2, 2))
+    assert np.isnan(Scaramuzza(k2=0.25).undistort([2.001, 0])).all()
+    assert np.isfinite(Scaramuzza(k2=0.25).undistort([1.999, 0])).all()
+    assert (Scaramuzza(k4=-0.1).limit_angle, Scaramuzza().limit_angle) == pytest.approx((np.pi, np.pi / 2), abs=2e-6)
     assert BrownConrady(k4=-0.25).limit == pytest.approx(2)  # the pole
     before, after = lens.limit - 1e-3, lens.limit + 1e-3
     assert np.isfinite(lens.distort([before, 0, 1])).all()
@@ -133,9 +170,11 @@ def test_tangential_terms_fold_too():
     Camera(600, 600, 1500.0, 1500.0, 300.0, 300.0, 0.0, lens)
 
 
-@pytest.mark.parametrize("lens", [BrownConrady(k1=-0.4), KannalaBrandt(k1=-0.4, k2=-0.05)])
+@pytest.mark.parametrize("lens", [BrownConrady(k1=-0.4), KannalaBrandt(k1=-0.4, k2=-0.05), Scaramuzza(k2=0.3)])
 def test_a_lens_that_folds_over_in_view_is_refused(lens):
-    fold = float(lens.distort([np.sin(0.9999 * lens.limit_angle), 0, np.cos(0.9999 * lens.limit_angle)])[0])
+    near = 0.9999 * lens.limit_angle
+    # An omnidirectional lens has its fold in the angle, not in the radius.
+    fold = lens.limit if isinstance(lens, Scaramuzza) else float(lens.distort([np.sin(near), 0, np.cos(near)])[0])
     size, focal = 600, 300 / fold
     with pytest.raises(InputError, match=rf"folds over at {np.degrees(lens.limit_angle):.4g} deg .* over the image"):
         Camera(size, size, focal, focal, 300.0, 300.0, 0.0, lens)
@@ -148,8 +187,8 @@ def test_a_lens_that_folds_over_in_view_is_refused(lens):
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), "0.1", None, True])
 def test_coefficients_that_are_none(bad):
-    for lens in (BrownConrady, KannalaBrandt):
-        with pytest.raises(InputError, match=r"distortion\.k2 = .*: must be a finite number"):
+    for lens in (BrownConrady, KannalaBrandt, Scaramuzza):
+        with pytest.raises(InputError, match=r"distortion\.k[23] = .*: must be a finite number"):
             lens(0.1, bad)
     with pytest.raises(InputError, match=r"view_mask\.cy = .*: must be a finite number"):
         ViewMask(3.0, bad, 5.0)

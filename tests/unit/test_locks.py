@@ -263,6 +263,7 @@ FILES = {
     "fit": ("fit", "a.png", "--recipe", "tiny", "--scene", "plane", "--out", "held.toml"),
     "mesh": ("mesh", "colon", "--out", "held.ply"),
     "view": ("view", "plane", "--screenshot", "held.png"),
+    "camera": ("camera", "convert", "c.toml", "--out", "held.toml"),
     "preview": ("dataset", "preview", "nothing", "--out", "held.html"),
     "nightly": ("nightly", "--profile", "quick", "--reports", "."),
 }

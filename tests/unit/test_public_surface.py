@@ -24,6 +24,7 @@ PUBLIC = {
     "Failure": "simtest.errors",
     "InputError": "simtest.errors",
     "KannalaBrandt": "simtest.geometry.distortion",
+    "Scaramuzza": "simtest.geometry.omnidirectional",
     "LabelledFrame": "simtest.simulation.labelled_frame",
     "Patch": "simtest.geometry.patch",
     "Reason": "simtest.errors",

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from simtest.geometry import BrownConrady, Camera, KannalaBrandt, ViewMask
+from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Scaramuzza, ViewMask
 from simtest.geometry.vectors import bisect
 from simtest.nightly.canaries.canary import canary
 from simtest.nightly.records import Figure
@@ -18,13 +18,14 @@ from simtest.spec.rig import Rig
 FX, FY, CX, CY, SKEW = 310.0, 300.0, 163.3, 117.8, 7.0
 BROWN = {"k1": -0.21, "k2": 0.06, "p1": 0.004, "p2": -0.006, "k3": -0.02, "k4": 0.03, "k5": -0.015, "k6": 0.012}
 FISHEYE = {"k1": 0.05, "k2": -0.02, "k3": 0.008, "k4": -0.003}
+OMNI = {"k2": -0.55, "k3": 0.21, "k4": -0.17, "c": 0.997, "d": 0.006, "e": -0.004}
 
 SMALL = {"width": 48, "height": 36, "fx": 31.0, "fy": 30.0, "cx": 25.3, "cy": 17.8, "skew": 1.5}
 DISTANCE_MM, TILT_DEG, AZIMUTH_DEG = 10.0, 12.0, 40.0
 
 
 def lenses() -> list[Figure]:
-    """Project directions through both lenses with all coefficients and a skew, by hand, and back."""
+    """Project directions through all lenses with all coefficients and a skew, by hand, and back."""
     x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.45, 0.45, 9), np.linspace(-0.35, 0.35, 7)))
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     rays /= np.sqrt((rays**2).sum(axis=1, keepdims=True))
@@ -34,6 +35,7 @@ def lenses() -> list[Figure]:
     for name, lens, seen, normalised in (
         ("brown_conrady", BrownConrady(**BROWN), rays, _brown(x, y)),
         ("kannala_brandt", KannalaBrandt(**FISHEYE), wide, _fisheye(wide)),
+        ("scaramuzza", Scaramuzza(**OMNI), wide, _omni(wide)),
     ):
         camera = Camera(320, 240, FX, FY, CX, CY, SKEW, lens)
         u, v = normalised
@@ -49,17 +51,21 @@ def lenses() -> list[Figure]:
 
 
 def lens_rays(variant: str | None) -> list[Figure]:
-    """Trace a tilted plane through a skewed pinhole and a skewed fisheye; compare its points with rays by hand."""
+    """Trace a tilted plane through a skewed pinhole, fisheye and omnidirectional lens; compare with rays by hand."""
     tilt, azimuth = math.radians(TILT_DEG), math.radians(AZIMUTH_DEG)
     normal = np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), -math.cos(tilt)])
     made, session = [], None
-    for name, lens in (("pinhole", None), ("fisheye", {"type": "kannala_brandt", **FISHEYE})):
+    for name, lens in (
+        ("pinhole", None),
+        ("fisheye", {"type": "kannala_brandt", **FISHEYE}),
+        ("omni", {"type": "scaramuzza", **OMNI}),
+    ):
         surface = {"type": "plane", "distance_mm": DISTANCE_MM, "tilt_deg": TILT_DEG, "azimuth_deg": AZIMUTH_DEG}
         scene = scene_from_dict({"surface": surface, "camera": {**SMALL, "distortion": lens}}, "canary")
         if session is None:
             session = Session(scene, variant)
         session.update(scene)
-        rays = _rays(lens is not None)
+        rays = _rays(name)
         along = DISTANCE_MM * normal[2] / (rays @ normal)
         seen = along > 0
         points = session.frame().labels.position.astype(float)
@@ -88,7 +94,7 @@ def view_masks() -> list[Figure]:
 
 
 def camera_files() -> list[Figure]:
-    """Read the same camera from files of OpenCV, ROS and MATLAB, whose first pixels are centred at 0, 0 and 1."""
+    """Read a camera from files of OpenCV, ROS, MATLAB and COLMAP, whose first pixels are centred at 0, 0, 1 and 0.5."""
     from scipy.io import savemat
 
     K = [[500.0, 2.0, 310.25], [0.0, 480.0, 225.75], [0.0, 0.0, 1.0]]
@@ -101,8 +107,9 @@ def camera_files() -> list[Figure]:
         "ros.yaml": "image_width: 640\nimage_height: 480\ndistortion_model: plumb_bob\n"
         f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: [{flat}]\n"
         f"distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [{lens}]\n",
+        "colmap.txt": "1 FULL_OPENCV 640 480 500 480 310.25 225.75 -0.2 0.05 0.001 -0.002 0.01 0 0 0\n",
     }
-    first = {"opencv.yml": 0.0, "ros.yaml": 0.0, "matlab.mat": 1.0}
+    first = {"opencv.yml": 0.0, "ros.yaml": 0.0, "matlab.mat": 1.0, "colmap.txt": 0.5}
     made = []
     with tempfile.TemporaryDirectory() as folder:
         for name, centre in first.items():
@@ -115,7 +122,8 @@ def camera_files() -> list[Figure]:
                                      "TangentialDistortion": tangential}})  # fmt: skip
             camera = load_camera(path)
             # Pixel centres lie at + 0.5 here, at `centre` there.
-            wanted = [500.0, 480.0, 310.25 + 0.5 - centre, 225.75 + 0.5 - centre, 2.0, -0.2, 0.05, 0.001, -0.002, 0.01]
+            skew = 0.0 if name == "colmap.txt" else 2.0
+            wanted = [500.0, 480.0, 310.25 + 0.5 - centre, 225.75 + 0.5 - centre, skew, -0.2, 0.05, 0.001, -0.002, 0.01]
             d = camera.distortion
             found = [camera.fx, camera.fy, camera.cx, camera.cy, camera.skew]
             found += [getattr(d, key, math.nan) for key in ("k1", "k2", "p1", "p2", "k3")]
@@ -182,13 +190,35 @@ def _fisheye(rays: Array) -> tuple[Array, Array]:
     return _radius(theta) * np.cos(phi), _radius(theta) * np.sin(phi)
 
 
-def _rays(fisheye: bool) -> Array:
+def _omni(rays: Array) -> tuple[Array, Array]:
+    """Image unit directions by Scaramuzza's model: the smallest positive root of its quartic in r, ray by ray."""
+    c = OMNI
+    made = []
+    for x, y, z in rays.tolist():
+        across = math.sqrt(x * x + y * y)
+        if across == 0:
+            made.append((0.0, 0.0))
+            continue
+        roots = np.roots([c["k4"], c["k3"], c["k2"], -z / across, 1.0])
+        r = min(root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0)
+        made.append((r * x / across, r * y / across))
+    x, y = np.array(made).T
+    return c["c"] * x + c["d"] * y, c["e"] * x + y
+
+
+def _rays(kind: str) -> Array:
     """Compute unit sightlines of the small camera, shape (H, W, 3); a fisheye's angle by bisection."""
     c = SMALL
     px, py = np.meshgrid(np.arange(c["width"]) + 0.5, np.arange(c["height"]) + 0.5)
     v = (py - c["cy"]) / c["fy"]
     u = (px - c["cx"] - c["skew"] * v) / c["fx"]
-    if not fisheye:
+    if kind == "omni":
+        m = OMNI
+        x, y = np.linalg.solve([[m["c"], m["d"]], [m["e"], 1.0]], [u.ravel(), v.ravel()])
+        r = np.sqrt(x * x + y * y)
+        rays = np.stack([x, y, 1 + m["k2"] * r**2 + m["k3"] * r**3 + m["k4"] * r**4], axis=-1).reshape(*u.shape, 3)
+        return np.asarray(rays / np.sqrt((rays**2).sum(axis=-1, keepdims=True)))
+    if kind == "pinhole":
         rays = np.stack([u, v, np.ones_like(u)], axis=-1)
         return np.asarray(rays / np.sqrt((rays**2).sum(axis=-1, keepdims=True)))
     radius = np.sqrt(u * u + v * v)

@@ -53,10 +53,10 @@ _JSON_KINDS: tuple[tuple[str, Kind], ...] = (
 )
 _YAML_KINDS: tuple[tuple[str, Kind], ...] = ((r"^cam\d+\s*:", "kalibr"),)
 _TEXT_KINDS: tuple[tuple[str, Kind], ...] = (
-    (r"^\s*\d+\s+[A-Z][A-Z_]+\s+\d+\s+\d+\s", "colmap"),
-    (r"^\s*\d+(\s+[-+.\deE]+){7}\s+\d+\s+\S", "colmap images"),
-    (r"^\s*#?\s*polynomial coefficients|^\s*\d+(\s+[-+]?\d*\.?\d+([eE][-+]?\d+)?){5,}\s*$", "ocamcalib"),
-    (r"^\s*a0\s*[=:]", "c3vd"),
+    (r"^[ \t]*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d", "colmap"),
+    (r"^[ \t]*\d+([ \t]+[-+.\deE]+){7}[ \t]+\d+[ \t]+\S", "colmap images"),
+    (r"^[ \t]*#?[ \t]*polynomial coefficients|^[ \t]*\d+([ \t]+[-+.\deE]+){5,}[ \t]*$", "ocamcalib"),
+    (r"^[ \t]*a0[ \t]*[=:]", "c3vd"),
 )
 
 
@@ -64,7 +64,7 @@ def split_id(path: str | Path) -> tuple[Path, str | None]:
     """Return the file and the camera's id of "FILE#ID"; no id where there is none, or a file has that very name."""
     path = Path(path)
     head, mark, wanted = path.name.rpartition("#")
-    if not mark or not head or path.exists():
+    if not mark or not head or _holds(path, Path.exists):
         return path, None
     return path.with_name(head), wanted
 
@@ -77,7 +77,7 @@ def recognise(path: str | Path) -> Kind:
     """
     path, _ = split_id(path)
     suffix = path.suffix.lower()
-    if path.is_dir() and (path / "cameras.txt").is_file():
+    if _holds(path / "cameras.txt", Path.is_file):
         return "colmap"
     if suffix == MATLAB_SUFFIX:
         return "matlab"
@@ -94,6 +94,14 @@ def recognise(path: str | Path) -> Kind:
     if suffix in OPENCV_SUFFIXES:
         return _first(_YAML_KINDS, head, "opencv")
     return _first((*_TEXT_KINDS, *_YAML_KINDS), head, "toml")
+
+
+def _holds(path: Path, test: Callable[[Path], bool]) -> bool:
+    """Return whether a test of a path holds; a name that no file can have is refused where the file is read."""
+    try:
+        return test(path)
+    except (OSError, ValueError):
+        return False
 
 
 def _first(kinds: tuple[tuple[str, Kind], ...], head: str, otherwise: Kind) -> Kind:
@@ -113,8 +121,10 @@ def read_cameras(path: str | Path) -> dict[str, Table]:
     kind = recognise(path)
     if path.is_dir():
         path = path / "cameras.txt"
-    if kind in ("colmap images", "photometric", "toml"):
-        raise InputError(f"{shown(path)}: {NAMES[kind]}: holds no camera that is read here; must be a camera file")
+    if kind == "photometric":
+        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no lens; give it as --photometric beside a camera file")
+    if kind in ("colmap images", "toml"):
+        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no camera; must be a camera file of another program")
     return _readers()[kind](path)
 
 
