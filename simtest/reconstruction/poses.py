@@ -1,4 +1,6 @@
-"""Poses of the camera over the frames of a sequence, from a file: views.json, a list of matrices, or a TUM trajectory.
+"""Poses of the camera over the frames of a sequence, from a file.
+
+It is views.json, a list of matrices, a TUM trajectory, or a file of COLMAP or NeRF.
 
 docs/howto/motion.md describes the formats.
 """
@@ -33,6 +35,8 @@ LISTS = ("frames", "views", "accepted", "poses")
 MATRICES = ("world_from_camera", "model_from_camera")
 NERF = "transform_matrix"
 """Key of a pose in NeRF's files: with other axes, in an arbitrary unit."""
+COLMAP_WORDS = 10
+"""Words of an image's line in COLMAP's images.txt."""
 SETTINGS = ("unit", "translation_error", "rotation_error_deg")
 NAMES = ("frame", "picture", "image", "name")
 
@@ -107,17 +111,21 @@ def read_poses(path: Path) -> Poses:
     except UnicodeDecodeError as error:
         raise InputError(f"{where}: no text (byte {error.start}); must be JSON or a TUM trajectory") from error
     is_json = path.suffix.lower() == ".json"
-    poses, names, settings = _from_json(text, where) if is_json else _from_tum(text, where)
+    foreign = _is_foreign(text, is_json)
+    if foreign:
+        poses, names, settings = _from_others(path, text, is_json, where)
+    else:
+        poses, names, settings = _from_json(text, where) if is_json else _from_tum(text, where)
     if not poses:
         raise InputError(f"{where}: holds no pose; must hold one for each frame")
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])
         raise InputError(f"{where}: names {shown(twice, 60)} twice; must give each frame one pose")
-    unit = settings.pop("unit", "mm" if is_json else "m")
-    if not isinstance(unit, str) or unit not in UNITS_MM:
-        raise InputError(f"{where}: unit = {shown(str(unit), 40)}; must be one of {', '.join(UNITS_MM)}")
+    if foreign and "unit" not in settings:
+        how = 'a key "unit": "mm"' if is_json else "a line # unit: mm"
+        raise InputError(f"{where}: its unit of length is arbitrary; state it by {how}, or the millimetres of one unit")
     made = np.array(poses)
-    made[:, :3, 3] *= UNITS_MM[unit]
+    made[:, :3, 3] *= _unit_mm(settings.pop("unit", "mm" if is_json else "m"), where)
     if (farthest := float(np.abs(made[:, :3, 3]).max())) > MOST_MM:
         raise InputError(f"{where}: a position of {farthest:.3g} mm; must be at most {MOST_MM:g} mm from the origin")
     translation = _share(settings, "translation_error", 1.0, where)
@@ -131,6 +139,22 @@ def read_poses(path: Path) -> Poses:
 
 
 Read = tuple[list[Array], list[str], dict[str, Any]]
+
+
+def _unit_mm(unit: object, where: str) -> float:
+    """Return the millimetres of a unit: a name, or their number."""
+    if isinstance(unit, str) and unit in UNITS_MM:
+        return UNITS_MM[unit]
+    try:
+        number = np.nan if isinstance(unit, bool) or not isinstance(unit, str | int | float) else float(unit)
+    except (ValueError, OverflowError):
+        number = np.nan
+    if not 0 < number < np.inf:
+        raise InputError(
+            f"{where}: unit = {shown(str(unit), 40)}; must be one of {', '.join(UNITS_MM)}, or the millimetres of one "
+            "unit"
+        )
+    return number
 
 
 def _share(settings: dict[str, Any], key: str, most: float, where: str) -> float | None:
@@ -186,6 +210,44 @@ def _from_json(text: str, where: str) -> Read:
     )
 
 
+def _is_foreign(text: str, is_json: bool) -> bool:
+    """Return whether a file is one of COLMAP's, a line of which has ten words, or of NeRF's, which has its own key."""
+    if is_json:
+        return f'"{NERF}"' in text and not any(f'"{key}"' in text for key in MATRICES)
+    lines = (line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
+    return len(next(lines, ())) == COLMAP_WORDS
+
+
+def _from_others(path: Path, text: str, is_json: bool, where: str) -> Read:
+    """Read the poses of another program's file, and the settings that it states."""
+    from simtest.spec.camera_formats import read_poses as read_foreign
+
+    try:
+        found = read_foreign(path)
+    except InputError as error:
+        raise InputError(f"--poses {error}") from None
+    settings: dict[str, Any] = {}
+    if is_json:
+        table = json.loads(text)
+        for key in table:
+            _check_setting(key, where)
+        settings = {key: table[key] for key in SETTINGS if key in table}
+    else:
+        for number, line in enumerate(text.splitlines(), 1):
+            settings |= _setting(line, f"{where}: line {number}")
+    poses = [_matrix(T.tolist(), f"{where}: pose {number}") for number, (_, T) in enumerate(found)]
+    return poses, [Path(name).name for name, _ in found], settings
+
+
+def _setting(line: str, at: str) -> dict[str, Any]:
+    """Return the setting that a comment states, as key: value; none of any other line."""
+    if not (stated := re.match(r"#\s*([A-Za-z_]+)\s*[:=]\s*(\S+)\s*$", line)):
+        return {}
+    key = stated[1].lower()
+    _check_setting(key, at)
+    return {key: stated[2]} if key in SETTINGS else {}
+
+
 def _check_setting(key: str, where: str) -> None:
     """Raise `InputError` for a key that is nearly a setting: what it says would be passed over."""
     if key not in SETTINGS and (meant := close_names(key.lower(), SETTINGS)):
@@ -220,13 +282,10 @@ def _nearest_rotation(R: Array) -> Array:
 
 def _from_tum(text: str, where: str) -> Read:
     """Read lines of timestamp tx ty tz qx qy qz qw; comments begin with # and may state a setting as key: value."""
-    poses, settings = [], {}
+    poses: list[Array] = []
+    settings: dict[str, Any] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        if setting := re.match(r"#\s*([A-Za-z_]+)\s*[:=]\s*(\S+)\s*$", line):
-            key = setting[1].lower()
-            _check_setting(key, f"{where}: line {number}")
-            if key in SETTINGS:
-                settings[key] = setting[2]
+        settings |= _setting(line, f"{where}: line {number}")
         if not (words := line.partition("#")[0].replace(",", " ").split()):
             continue
         at = f"{where}: line {number}"

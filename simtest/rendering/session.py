@@ -412,7 +412,7 @@ class Session:
         return self.surface.distances(origins, directions, self.exact_hits(origins, directions))
 
     def blocked(self, origins: Array, directions: Array, reach: Array) -> Mask:
-        """Return which rays of the model frame, shape (N, 3), meet the rendered shape before `reach`, shape (N,), mm."""
+        """Return which rays, shape (N, 3), model frame, meet the rendered shape before `reach`, shape (N,), mm."""
         return exact.trace_blocked(self.mi, self._built.scene, origins, directions, reach)
 
     def lit(self, positions: Array, light: int) -> Any:

@@ -178,7 +178,7 @@ class Continued:
 
 @dataclass
 class _State:
-    """Points at their moments: position, gap between normal and bisector, and the linear map of motions to its change."""
+    """Points at their moments: position, gap of normal and bisector, and the linear map of motions to its change."""
 
     position: Array
     gap: Array
@@ -267,7 +267,7 @@ def _corrected(
         same = (ratio > 1 / BEND) & (ratio < BEND)
         jumped = state.offset >= ANOTHER
     missed = ~np.isfinite(state.position).all(axis=1)
-    why = [OFF if off else HIDDEN if behind else MERGED for off, behind in zip(missed, jumped, strict=True)]
+    why = np.select([missed, jumped], [OFF, HIDDEN], MERGED).tolist()
     return state, done & near & same & ~jumped & ~missed, why
 
 

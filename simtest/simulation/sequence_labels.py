@@ -10,12 +10,14 @@ import numpy.typing as npt
 
 from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.array_files import write_arrays
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, Picture
 from simtest.runtime.files import Json, write_atomically, write_json
 from simtest.simulation.deforming import SurfaceOverTime, moved_between
 from simtest.simulation.flow import STATES, SeenSurface, flow_between, hides
+from simtest.simulation.flow_picture import flow_picture
 from simtest.simulation.rendered_view import RenderedView
 from simtest.simulation.tracks import Tracks
+from simtest.simulation.view_files import thumbnail, write_sheet
 from simtest.spec import Scene
 
 STRIDE_PX = 16
@@ -24,17 +26,19 @@ STRIDE_PX = 16
 MOST_APART = 32
 """Frames farther apart than this are not compared."""
 
-COVISIBILITY, TRACKS = "covisibility.npy", "tracks.json"
+COVISIBILITY, TRACKS, FLOW_SHEET = "covisibility.npy", "tracks.json", "flow_sheet.png"
 
 FIELDS = {
     "flow_NNNN.npz": "from frame NNNN to the next: forward, backward (float32, (H, W, 2), px) and their states "
     "(forward_state, backward_state, uint8, (H, W))",
-    "forward": "where the surface point at each pixel's centre lies in the next frame, less that centre, px; also where "
-    "it is not seen there; NaN off the surface and on instruments. backward: from the next frame to this one, at the "
-    "next frame's pixels",
+    "forward": "where the surface point at each pixel's centre lies in the next frame, less that centre, px; also "
+    "where it is not seen there; NaN off the surface and on instruments. backward: from the next frame to this one, "
+    "at the next frame's pixels",
     "states": ", ".join(f"{number}: {name}" for number, name in enumerate(STATES)),
     "covisibility.npy": "float32, (N, N): share of the surface points of frame i that frame j sees, on every "
     f"{STRIDE_PX}th pixel; NaN for frames more than {MOST_APART} apart, and for j < i where the surface deforms",
+    "flow_sheet.png": "the forward flow of each frame: hue its direction, saturation its length, dark what the next "
+    "frame does not see; the wheel is the key",
     "highlights": "of each frame, in the order of the identities: bp_px, position_world_mm, normal_world, light, lit, "
     "isolated, kd_min, kd_max, and identity: the index in tracks",
     "tracks": "first_frame, and in each frame of the track: entries (index in the frame's highlights), bp_px, "
@@ -73,7 +77,8 @@ class SequenceLabels:
         self._fine, self._base = (Tracks(fine, self._time.between) for fine in (True, False))
         self._listed: list[Json] = []
         self._listed_base: list[Json] = []
-        for old in (*folder.glob("flow_*.npz"), folder / COVISIBILITY, folder / TRACKS):
+        self._pictures: list[Picture] = []
+        for old in (*folder.glob("flow_*.npz"), folder / COVISIBILITY, folder / TRACKS, folder / FLOW_SHEET):
             old.unlink(missing_ok=True)
 
     def add(self, session: Session, view: RenderedView) -> None:
@@ -113,6 +118,7 @@ class SequenceLabels:
             "backward": backward.flow_px.astype(np.float32),
             "backward_state": backward.state,
         }
+        self._pictures.append(thumbnail(flow_picture(forward)))
         path = self._folder / f"flow_{len(self._frames) - 1:04d}.npz"
         write_atomically(path, lambda part: write_arrays(part, arrays))
 
@@ -159,6 +165,9 @@ class SequenceLabels:
         fields = cast(Json, FIELDS)
         table = {"fields": fields, "highlights": self._listed, "tracks": self._fine.to_json(), "base": base}
         write_json(files[1], table, compact=True)
+        if self._pictures:
+            files.append(self._folder / FLOW_SHEET)
+            write_sheet(files[-1], self._pictures)
         return [*sorted(self._folder.glob("flow_*.npz")), *files]
 
 

@@ -40,9 +40,9 @@ class Track:
     first_frame : int
         Frame in which it is born.
     birth : str
-        Why: "sequence" (it is there in the first frame), "frame border" (it enters the view), "split" (a pair is born at
-        a fold of the misfit), "hidden" (another part of the surface stood before it), "off the surface", or "not found"
-        (it lies in the view of the frame before too, but the search did not list it there).
+        Why: "sequence" (it is there in the first frame), "frame border" (it enters the view), "split" (a pair is born
+        at a fold of the misfit), "hidden" (another part of the surface stood before it), "off the surface", or "not
+        found" (it lies in the view of the frame before too, but the search did not list it there).
     death : str
         Why it has no point in the frame after its last: by the same names, "merged" instead of "split".
     entries : list of int
@@ -154,7 +154,7 @@ class Tracks:
         return [numbers[id(of_entry[entry])] for entry in range(len(highlights))]
 
     def _linked(self, session: Session, last: _Seen, seen: _Seen) -> tuple[dict[int, int], list[str], list[str]]:
-        """Return which entry of the last frame each linked one of this frame continues; reasons of births and deaths."""
+        """Return the last frame's entry that each linked one of this frame continues; why others are born and die."""
         surface = self._surface(session, self.fine)
         motion = Motion((last.world_from_camera[:3, 3], seen.world_from_camera[:3, 3]), (last.lights, seen.lights))
         forward = continuation.follow(surface, motion, last.positions, last.light)
@@ -170,7 +170,7 @@ class Tracks:
         for origin, of_rest in origins.items():
             if origin not in taken:
                 partner[int(rest[of_rest])] = origin
-        births = [UNLISTED if not birth else birth for birth in births]
+        births = [birth or UNLISTED for birth in births]
         return partner, births, [death or UNLISTED for death in deaths]
 
     def to_json(self) -> list[Json]:

@@ -54,10 +54,7 @@ class ViewWriter:
         shown = np.ascontiguousarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR) if shown.ndim == 2 else shown[:, :, ::-1])
         if self._fps is not None:
             self._write(shown, self._fps)
-        # Thumbnails for the sheet.
-        width = SHEET_WIDTH // SHEET_COLUMNS
-        small = cv2.resize(shown, (width, round(width * shown.shape[0] / shown.shape[1])), interpolation=cv2.INTER_AREA)
-        self._thumbnails.append(np.asarray(small, dtype=np.uint8))
+        self._thumbnails.append(thumbnail(np.asarray(shown, dtype=np.uint8)))
         return WrittenView(name, seed)
 
     def _write(self, picture: Picture, fps: float) -> None:
@@ -74,10 +71,22 @@ class ViewWriter:
         if self._film is not None:
             self._film.release()
         if self._thumbnails:
-            ok, data = cv2.imencode(".png", _sheet(self._thumbnails))
-            assert ok
-            write_atomically(self._folder / "sheet.png", lambda part: part.write_bytes(bytes(data)))
+            write_sheet(self._folder / "sheet.png", self._thumbnails)
         return [file for name in ("sheet.png", "film.avi") if (file := self._folder / name).is_file()]
+
+
+def thumbnail(picture: Picture) -> Picture:
+    """Return a picture, shape (H, W, 3), at the size it has on a sheet."""
+    width = SHEET_WIDTH // SHEET_COLUMNS
+    size = (width, round(width * picture.shape[0] / picture.shape[1]))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def write_sheet(path: Path, pictures: list[Picture]) -> None:
+    """Write pictures of one size, blue first, as a sheet."""
+    ok, data = cv2.imencode(".png", _sheet(pictures))
+    assert ok
+    write_atomically(path, lambda part: part.write_bytes(bytes(data)))
 
 
 def _sheet(pictures: list[Picture]) -> Picture:

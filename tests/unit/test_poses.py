@@ -85,7 +85,22 @@ MALFORMED = {
     "must be a 4 x 4 matrix": ("a.json", "[[1, 2, 3]]"),
     "no world_from_camera or model_from_camera": ("a.json", '[{"frame": "a.png"}]'),
     "but transform_matrix, whose camera has y up": (
+        "a.json", json.dumps({"frames": [{"transform_matrix": np.eye(4).tolist()},
+                                         {"world_from_camera": np.eye(4).tolist()}]})),
+    'state it by a key "unit": "mm"': (
         "a.json", json.dumps({"frames": [{"file_path": "a", "transform_matrix": np.eye(4).tolist()}]})),
+    "state it by a line # unit: mm": ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n"),
+    "unit = -3; must be one of mm, m, or the millimetres": ("images.txt", "# unit: -3\n1 1 0 0 0 0 0 0 1 a.png\n\n"),
+    "unit = true": ("a.json", json.dumps({"unit": True, "poses": [np.eye(4).tolist()]})),
+    "unit = inf": ("a.txt", "# unit: inf\n0 0 0 0 0 0 0 1\n"),
+    "images.txt: line 3": ("images.txt", "# unit: mm\n1 1 0 0 0 0 0 0 1 a.png\n0 0\n"),
+    "quaternion of length 0": ("images.txt", "# unit: mm\n1 0 0 0 0 0 0 0 1 a.png\n\n"),
+    "names a.png twice; must give": (
+        "images.txt", "# unit: mm\n1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 0 1 b/a.png\n\n"),
+    "line 1: translation_err: unknown": ("images.txt", "# translation_err: 1\n1 1 0 0 0 0 0 0 1 a.png\n\n"),
+    "transform_matrix: missing": (
+        "a.json", json.dumps({"unit": "mm", "frames": [{"file_path": "a", "transform_matrix": np.eye(4).tolist()},
+                                                         {"file_path": "b"}]})),
     "determinant 1": ("a.json", json.dumps([np.diag([1.0, 1, -1, 1]).tolist()])),
     "must be rigid": ("a.json", json.dumps([np.diag([1.0, 1, 2, 1]).tolist()])),
     "NaN": ("a.json", "[[[NaN, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]"),

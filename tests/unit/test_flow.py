@@ -1,0 +1,149 @@
+"""Optical flow: closed on the exact surface, equal to a plane's homography, and hidden where the horizon says so."""
+
+import numpy as np
+import pytest
+
+from simtest.rendering import Session
+from simtest.simulation.flow import HIDDEN, INSTRUMENT, NONE, OUT, SEEN, Flow, SeenSurface, flow_between
+from simtest.spec import scene_from_dict
+from simtest.spec.views import Moved
+
+pytestmark = pytest.mark.render
+
+SIZE = 96
+LENS = {"type": "kannala_brandt", "k1": 0.02, "k2": -0.003}
+SURFACES = {
+    "plane": {"type": "plane", "distance_mm": 10, "tilt_deg": 25, "azimuth_deg": 40},
+    "sphere": {"type": "sphere", "distance_mm": 10, "radius_mm": 6},
+    "inside": {"type": "sphere", "distance_mm": 10, "radius_mm": 14, "side": "inside"},
+    "cylinder": {"type": "cylinder", "distance_mm": 10, "radius_mm": 4, "spin_deg": 20},
+    "saddle": {"type": "quadric", "distance_mm": 10, "k1_per_mm": 0.05, "k2_per_mm": -0.05},
+}
+
+
+def scene_of(surface, lens=None, **tables):
+    camera = {"width": SIZE, "height": SIZE, "fx": 90.0, "fy": 90.0, **({"distortion": lens} if lens else {})}
+    return scene_from_dict({"surface": surface, "camera": camera, **tables})
+
+
+def moved(scene, shift, turn):
+    there = Moved(translation_mm=shift, rotation_deg=turn)
+    return scene.model_copy(update={"camera": scene.camera.model_copy(update={"moved": there})})
+
+
+def two_frames(scene, shift=(0.7, -0.4, 0.5), turn=(1.0, -2.0, 3.0)):
+    session = Session(scene)
+    first = SeenSurface.of(session)
+    session.update(moved(scene, shift, turn))
+    return session, first, SeenSurface.of(session)
+
+
+def cycle_px(session, first, second, flow):
+    """Cast back from where points arrive: how far from their pixels they end, px."""
+    seen = flow.state == SEEN
+    there = first.camera.pixel_centres()[seen] + flow.flow_px[seen]
+    pose = second.world_from_camera
+    directions = second.camera.unproject(there) @ pose[:3, :3].T
+    origins = np.broadcast_to(pose[:3, 3], directions.shape)
+    points = origins + directions * session.exact_distances(origins, directions)[:, None]
+    return np.linalg.norm(first.project(points) - first.camera.pixel_centres()[seen], axis=1)
+
+
+@pytest.mark.parametrize("name", list(SURFACES))
+@pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "fisheye"])
+def test_the_cycle_closes(name, lens):
+    session, first, second = two_frames(scene_of(SURFACES[name], lens))
+    for a, b in ((first, second), (second, first)):
+        flow = flow_between(session, a, b)
+        assert np.count_nonzero(flow.state == SEEN) > SIZE * SIZE / 4
+        found = cycle_px(session, a, b, flow)
+        # A ray along an edge of a mesh may miss both its triangles.
+        assert np.count_nonzero(np.isnan(found)) <= 2
+        assert np.nanmax(found) < 1e-6
+
+
+@pytest.mark.parametrize("wrong", ["inverted", "axes"])
+def test_a_wrong_pose_opens_the_cycle(wrong):
+    session, first, second = two_frames(scene_of(SURFACES["sphere"]))
+    between = np.linalg.inv(first.world_from_camera) @ second.world_from_camera
+    other = np.linalg.inv(between) if wrong == "inverted" else between @ np.diag([1.0, -1, -1, 1])
+    off = SeenSurface(second.camera, first.world_from_camera @ other, second.position)
+    flow = flow_between(session, first, off)
+    state = np.where(np.isfinite(flow.flow_px[..., 0]), SEEN, NONE).astype(np.uint8)
+    found = cycle_px(session, first, second, Flow(flow.flow_px, state))
+    assert not np.any(found[np.isfinite(found)] < 1e-6)
+
+
+def test_a_planes_flow_is_its_homography():
+    scene = scene_of(SURFACES["plane"])
+    session, first, second = two_frames(scene)
+    flow = flow_between(session, first, second)
+    # n . X = d in the first camera's frame, from the plane's own description.
+    tilt, azimuth = np.radians([25, 40])
+    n = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)])
+    d = n @ [0, 0, 10.0]
+    pose = Moved(translation_mm=(0.7, -0.4, 0.5), rotation_deg=(1.0, -2.0, 3.0)).pose()
+    K = first.camera.K
+    R, t = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+    H = K @ (R + np.outer(t, n) / d) @ np.linalg.inv(K)
+    pixels = first.camera.pixel_centres()
+    mapped = np.concatenate([pixels, np.ones((SIZE, SIZE, 1))], axis=-1) @ H.T
+    np.testing.assert_allclose(pixels + flow.flow_px, mapped[..., :2] / mapped[..., 2:], atol=1e-9)
+    assert set(np.unique(flow.state)) == {SEEN, OUT}
+
+
+def test_what_lies_beyond_the_horizon_is_hidden():
+    scene = scene_of({"type": "sphere", "distance_mm": 10, "radius_mm": 3})
+    session, first, second = two_frames(scene, (6.0, 0.0, 0.0), (0.0, -20.0, 0.0))
+    flow = flow_between(session, first, second)
+    # On a sphere the tangent plane at a point decides; the centre is 13 mm before the first camera.
+    T = first.world_from_camera
+    centre = T[:3, :3] @ [0, 0, 13.0] + T[:3, 3]
+    facing = np.einsum("...i,...i", first.position - centre, second.world_from_camera[:3, 3] - first.position) > 0
+    with np.errstate(invalid="ignore"):
+        inside = second.camera.contains(first.camera.pixel_centres() + flow.flow_px)
+    on = np.isfinite(first.position[..., 0])
+    np.testing.assert_array_equal(flow.state == SEEN, on & inside & facing)
+    np.testing.assert_array_equal(flow.state == HIDDEN, on & inside & ~facing)
+    np.testing.assert_array_equal(flow.state == OUT, on & ~inside)
+    np.testing.assert_array_equal(flow.state == NONE, ~on)
+    assert np.isnan(flow.flow_px[~on]).all()
+    assert np.count_nonzero(flow.state == HIDDEN) > 50
+    assert flow.covisible == pytest.approx(np.count_nonzero(on & inside & facing) / np.count_nonzero(on))
+
+
+def test_instruments_have_no_flow_and_hide():
+    shaft = {"kind": "shaft", "tip": [0.5, 0.5], "depth_share": 0.5, "diameter_mm": 2}
+    scene = scene_of(SURFACES["plane"], instruments=[shaft])
+    session, first, second = two_frames(scene, (0.0, 1.5, 0.0), (0.0, 0.0, 0.0))
+    flow = flow_between(session, first, second)
+    covered = first.instrument > 0
+    assert np.count_nonzero(covered) > 100
+    np.testing.assert_array_equal(flow.state == INSTRUMENT, covered)
+    assert np.isnan(flow.flow_px[covered]).all()
+    hidden = flow.state == HIDDEN
+    assert np.count_nonzero(hidden) > 100
+    at = (first.camera.pixel_centres() + np.nan_to_num(flow.flow_px)).astype(int)[hidden]
+    assert (second.instrument[at[:, 1], at[:, 0]] > 0).all()
+
+
+def test_material_that_moves_takes_its_flow_along():
+    session, first, _ = two_frames(scene_of(SURFACES["plane"]))
+    session.update(scene_of(SURFACES["plane"]))
+    shift = first.world_from_camera[:3, :3] @ [0.2, 0.0, 0.0]
+    flow = flow_between(session, first, first, lambda points: points + shift)
+    still = flow_between(session, first, first)
+    np.testing.assert_allclose(still.flow_px, 0, atol=1e-9)
+    depth = ((first.position - first.world_from_camera[:3, 3]) @ first.world_from_camera[:3, :3])[..., 2]
+    np.testing.assert_allclose(flow.flow_px[..., 0], 90.0 * 0.2 / depth, rtol=1e-9)
+    np.testing.assert_allclose(flow.flow_px[..., 1], 0, atol=1e-9)
+
+
+def test_depths_are_those_of_the_truth():
+    tissue = {"seed": 1, "bands": [{"slope_deg": 3.0, "wavelength_mm": 2.0}]}
+    for surface in ({"type": "anatomy", "path": "colon", "relief": tissue}, SURFACES["saddle"], SURFACES["inside"]):
+        session = Session(scene_of(surface))
+        depth = session.depths()
+        truth = session.truth()
+        np.testing.assert_array_equal(np.isfinite(depth), truth.mask)
+        np.testing.assert_allclose(depth, truth.depth, rtol=0, atol=1e-9)

@@ -1,0 +1,132 @@
+"""The folder of `simtest views`: the camera's pose in every record, and a sequence's labels."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from simtest import api
+from simtest.errors import InputError
+from simtest.reconstruction.poses import read_poses
+from simtest.simulation.flow import STATES, Flow
+from simtest.simulation.flow_picture import flow_picture
+from simtest.spec import load_scene
+from simtest.surfaces import make_surface
+
+SMALL = {"camera.width": 160, "camera.height": 120, "camera.fx": 80.0, "camera.fy": 80.0}
+LABELS = ("covisibility.npy", "tracks.json", "flow_sheet.png", "flow_0000.npz", "flow_0001.npz")
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    """A labelled film of three frames."""
+    folder = tmp_path_factory.mktemp("film")
+    settings = {**SMALL, "surface.view": "wall", "sensor.exposure.percentile": 99.5}
+    api.sample_views("anatomy", folder, 3, settings, along=(0.4, 0.42), fps=10.0, labels=True)
+    return folder, settings
+
+
+def poses_of(settings, shares):
+    scene = load_scene("anatomy", settings)
+    surfaces = [scene.surface.model_copy(update={"path_share": share}) for share in shares]
+    return np.array([make_surface(surface).model_from_camera for surface in surfaces])
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_every_record_holds_the_cameras_pose(film):
+    folder, settings = film
+    written = json.loads((folder / "views.json").read_text())["accepted"]
+    poses = poses_of(settings, [view["surface.path_share"] for view in written])
+    for key in ("world_from_camera", "model_from_camera"):
+        np.testing.assert_allclose([view[key] for view in written], poses, rtol=0, atol=1e-9)
+    for name in ("views.json", "trajectory.txt", "transforms.json", "colmap/images.txt"):
+        read = read_poses(folder / name)
+        np.testing.assert_allclose(read.world_from_camera, poses, rtol=0, atol=1e-9, err_msg=name)
+        assert not read.names or list(read.names) == [view["picture"] for view in written]
+    assert [view["time_s"] for view in written] == pytest.approx([0.0, 0.1, 0.2])
+    assert cv2.VideoCapture(str(folder / "film.avi")).get(cv2.CAP_PROP_FPS) == pytest.approx(10.0)
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_a_rendered_frame_and_a_view_hold_the_same_pose(film, tmp_path):
+    from simtest.simulation.frame_files import write_frame
+
+    folder, settings = film
+    view = json.loads((folder / "views.json").read_text())["accepted"][1]
+    frame = api.render("anatomy", {**settings, "surface.path_share": view["surface.path_share"]})
+    write_frame(frame, tmp_path)
+    told = json.loads((tmp_path / "frame.json").read_text())["world_from_camera"]
+    np.testing.assert_allclose(told, view["world_from_camera"], rtol=0, atol=1e-9)
+    # The flow takes the frame's own surface points to where the next frame sees them.
+    third = json.loads((folder / "views.json").read_text())["accepted"][2]
+    T = np.linalg.inv(third["world_from_camera"]) @ told
+    points = np.load(tmp_path / "truth.npz")["position_mm"] @ T[:3, :3].T + T[:3, 3]
+    flow = np.load(folder / "flow_0001.npz")
+    expected = frame.camera.project(points) - frame.camera.pixel_centres()
+    seen = flow["forward_state"] == STATES.index("seen in both")
+    assert np.count_nonzero(seen) > 5000
+    np.testing.assert_allclose(flow["forward"][seen], expected[seen], atol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_labels_of_a_film(film):
+    folder, _ = film
+    table = json.loads((folder / "tracks.json").read_text())
+    assert len(table["highlights"]) == 3
+    for number, track in enumerate(table["tracks"]):
+        for i, (entry, pixel) in enumerate(zip(track["entries"], track["bp_px"], strict=True)):
+            listed = table["highlights"][track["first_frame"] + i][entry]
+            assert listed["identity"] == number
+            assert listed["bp_px"] == pixel
+            assert listed["light"] == track["light"]
+    assert table["base"] is None
+    with np.load(folder / "flow_0000.npz") as flow:
+        assert flow["forward"].dtype == flow["backward"].dtype == np.float32
+        assert flow["forward"].shape == (120, 160, 2)
+        assert flow["forward_state"].max() < len(STATES)
+        share = np.mean(flow["forward_state"] == 1) / np.mean(np.isin(flow["forward_state"], (1, 2, 3)))
+    shares = np.load(folder / "covisibility.npy")
+    assert shares.shape == (3, 3)
+    np.testing.assert_array_equal(np.diag(shares), 1)
+    assert shares[0, 1] == pytest.approx(share, abs=0.05)
+    assert 0 < shares[0, 2] <= shares[0, 1]
+    assert cv2.imread(str(folder / "flow_sheet.png")).shape[1] == 2 * 160
+
+
+@pytest.mark.render
+def test_labels_of_an_earlier_film_are_removed(tmp_path):
+    for name in (*LABELS, "trajectory.txt"):
+        (tmp_path / name).write_text("of an earlier call")
+    api.sample_views("anatomy", tmp_path, 1, SMALL)
+    assert not [name for name in (*LABELS, "trajectory.txt") if (tmp_path / name).exists()]
+    assert (tmp_path / "colmap" / "images.txt").is_file()
+    assert (tmp_path / "transforms.json").is_file()
+
+
+def test_what_sequences_alone_have_needs_one(tmp_path):
+    with pytest.raises(InputError, match="labels: needs along"):
+        api.sample_views("anatomy", tmp_path, 1, labels=True)
+    with pytest.raises(InputError, match="fps: needs along"):
+        api.sample_views("anatomy", tmp_path, 1, fps=25.0)
+    with pytest.raises(InputError, match=r"fps = 0: must be 0\.1 to 1000"):
+        api.sample_views("anatomy", tmp_path, 1, {"surface.view": "wall"}, along=(0.4, 0.5), fps=0.0)
+
+
+def test_a_flow_pictures_colours():
+    x, y = np.meshgrid([-2.0, 0.0, 2.0] * 30, np.zeros(90))
+    state = np.ones(x.shape, dtype=np.uint8)
+    state[:, 40] = STATES.index("hidden")
+    flow = np.stack([x, y], axis=-1)
+    flow[:, 50] = np.nan
+    picture = flow_picture(Flow(flow, state), 2.0)
+    blue, green, red = picture[0, 2].astype(int)
+    # Right is red, left is cyan, no motion is white, unknown is black, hidden is darker.
+    assert (red, green, blue) == (255, 0, 0)
+    np.testing.assert_allclose(picture[0, 0], (255, 255, 0), atol=2)
+    assert tuple(picture[0, 1]) == (255, 255, 255)
+    assert tuple(picture[0, 50]) == (0, 0, 0)
+    assert 100 < picture[0, 40].max() < 130
