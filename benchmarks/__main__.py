@@ -10,6 +10,7 @@ NAMES = ("estimators", "published", "rendering", "colour", "camera_chain", "data
 
 ON_REQUEST = (
     "blender",
+    "flow",
     "transfers",
     "growth",
     "cost",

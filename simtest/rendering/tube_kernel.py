@@ -107,7 +107,8 @@ class TubeKernel:
         if not len(origins):
             # Dr.Jit ends the process on a kernel without rays.
             return {name: np.empty((0, *shape), dtype=kind) for name, (shape, kind) in _FIELDS.items()}
-        return self._described(*self._solved(origins, directions, hits), model_from_camera=model_from_camera)
+        origin, direction, t, u, v, found = self._solved(origins, directions, hits)
+        return self._described(origin, direction, t, u, v, found, model_from_camera)
 
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Compute the distances of `solve` alone, shape (N,), mm; NaN where a ray has no point."""

@@ -62,4 +62,6 @@ def _draw_key(picture: Picture, full_px: float) -> None:
     label, scale = f"{full_px:.3g} px", max(size / 200, 0.3)
     (text_width, text_height), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
     at = (width - text_width - 2, height - size - max(text_height // 2, 2))
-    cv2.putText(picture, label, at, cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 1, cv2.LINE_AA)
+    # A dark border: the picture below may have any colour.
+    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(picture, label, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thickness, cv2.LINE_AA)

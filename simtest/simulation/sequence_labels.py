@@ -32,8 +32,8 @@ FIELDS = {
     "flow_NNNN.npz": "from frame NNNN to the next: forward, backward (float32, (H, W, 2), px) and their states "
     "(forward_state, backward_state, uint8, (H, W))",
     "forward": "where the surface point at each pixel's centre lies in the next frame, less that centre, px; also "
-    "where it is not seen there; NaN off the surface and on instruments. backward: from the next frame to this one, at the "
-    "next frame's pixels",
+    "where it is not seen there; NaN off the surface and on instruments. backward: from the next frame to this one, "
+    "at the next frame's pixels",
     "states": ", ".join(f"{number}: {name}" for number, name in enumerate(STATES)),
     "covisibility.npy": "float32, (N, N): share of the surface points of frame i that frame j sees, on every "
     f"{STRIDE_PX}th pixel; NaN for frames more than {MOST_APART} apart, and for j < i where the surface deforms",

@@ -83,6 +83,11 @@ class BuiltColon(BuiltMesh):
         normals[good], operators[good] = self.tube.normal_and_shape_operator(u[good], v[good])
         return distance, normals, operators
 
+    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return the distances of `at_hits` alone (see `BuiltMesh.distances`)."""
+        u, v = np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
+        return self.tube.solve(origins, directions, hits.distance, u, v)[0]
+
 
 @lru_cache(maxsize=4)
 def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:

@@ -43,7 +43,17 @@ label = "no noise"
 set = {{ {SMALL}, "surface.radius_mm" = 11.731, "surface.tilt_deg" = 5.4321, "sensor.noise_sigma" = 0.0 }}
 """  # noqa: E501
 
-NAMES = ("trial_of_mine", "steep tube", "eight bits", "no noise", "cylinder", "sphere", "987654321")
+NAMES = (
+    "trial_of_mine",
+    "steep tube",
+    "eight bits",
+    "no noise",
+    "cylinder",
+    "sphere",
+    "987654321",
+    "world_from",
+    "from_camera",
+)
 
 
 @pytest.fixture(scope="module")
