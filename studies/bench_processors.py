@@ -1,7 +1,7 @@
 """Whether two processors agree on the benchmark: medians, statuses and bits of two folders of `studies.bench_seeds`.
 
-``python -m studies.bench_processors FIRST SECOND`` compares what ``python -m studies.bench_seeds FIRST --sealed 0`` wrote
-on one processor with what the same command wrote on another. A processor can be emulated, at 15 times the cost::
+``python -m studies.bench_processors FIRST SECOND`` compares what ``python -m studies.bench_seeds FIRST --sealed 0``
+wrote on one processor with what the same command wrote on another. A processor can be emulated, at 15 times the cost::
 
     export NPY_DISABLE_CPU_FEATURES=X86_V3
     qemu-x86_64 -cpu Haswell .venv/bin/python -m studies.bench_seeds SECOND --sealed 0 --scenes 1
