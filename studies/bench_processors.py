@@ -25,7 +25,8 @@ TOLERANCE_DEG = 1e-3
 
 def compare(first: Path, second: Path) -> Iterator[tuple[bool, str]]:
     """Yield for each part and estimator whether two runs agree, and a line that says by how much they differ."""
-    for part in sorted(path.parent.name for path in (first / "public").glob("*/results.parquet")):
+    parts = [{path.parent.name for path in folder.glob("public/*/results.parquet")} for folder in (first, second)]
+    for part in sorted(set.intersection(*parts)):
         tables = [pl.read_parquet(folder / "public" / part / "results.parquet") for folder in (first, second)]
         for estimator in tables[0]["estimator"].unique(maintain_order=True):
             yield _line(part, estimator, *(table.filter(pl.col("estimator") == estimator) for table in tables))
