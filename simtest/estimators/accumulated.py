@@ -3,7 +3,7 @@
 With the light at the camera, a highlight at a tissue point X shows that the fine normal there faces the camera
 (theory.md section 7; the idea of Chen, Goesele and Seidel 2006). A camera that moves sweeps highlights over the relief.
 Over a patch of the base, the mean of the normals found is not the base's: only normals that face a camera are ever
-seen. So the highlights are taken as a Poisson process over the patch, whose density in each frame follows the slope that
+seen. So the highlights are taken as a Poisson process over the patch. Its density in each frame follows the slope that
 a highlight takes at X:
 
     log lambda_f(X) = alpha + beta . q_f(X) - gamma |q_f(X)|^2 / 2,
