@@ -131,7 +131,7 @@ def solve(
     normal, _, chi2, z = _normal_equations(camera, mirrors, highlights, source, kept, (lights, z))
     if not np.isfinite(normal).all():
         return None
-    return Bundle(lights, np.linalg.inv(normal), z, chi2, 2 * len(kept) - 3 * len(lights))
+    return Bundle(lights, np.asarray(np.linalg.inv(normal), dtype=float), z, chi2, 2 * len(kept) - 3 * len(lights))
 
 
 def _normal_equations(

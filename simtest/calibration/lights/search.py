@@ -26,6 +26,7 @@ from simtest.geometry import Array, chi_squared
 from simtest.geometry.camera import Camera
 
 Labels = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
 
 MOST_LIGHTS = 4
 PAIRS = 24
@@ -74,7 +75,7 @@ class _Candidates:
     taken: Labels
     chi2: Array
 
-    def only(self, kept: npt.NDArray[np.bool_]) -> "_Candidates":
+    def only(self, kept: Mask) -> "_Candidates":
         return _Candidates(self.lights[kept], self.covariances[kept], self.taken[kept], self.chi2[kept])
 
 
@@ -131,7 +132,7 @@ def _candidates(camera: Camera, mirrors: Mirrors, highlights: Highlights) -> _Ca
             normal += np.swapaxes(J, 1, 2) @ weights @ J
             gradient += np.einsum("nki,nkl,nl->ni", J, weights, residual)
             chi2 += np.einsum("nk,nkl,nl->n", residual, weights, residual)
-        fine = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(gradient).all(axis=1)
+        fine = np.asarray(np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(gradient).all(axis=1))
         covariances = np.linalg.inv(np.where(fine[:, None, None], normal, np.eye(3)))
         lights = np.where(fine[:, None], lights + np.einsum("nij,nj->ni", covariances, gradient), np.nan)
     taken = np.full((len(lights), len(mirrors)), -1, dtype=np.intp)
@@ -172,7 +173,7 @@ def _weighted(
     """Return residuals (N, 2), derivatives by the light (N, 2, 3) and inverse covariances (N, 2, 2) of highlights."""
     predicted, J, K = derivatives(camera, mirrors, view, lights, np.zeros(3))
     spread = highlights.covariance[measured] + K @ np.swapaxes(K, 1, 2)
-    fine = np.isfinite(spread).all(axis=(1, 2))
+    fine = np.asarray(np.isfinite(spread).all(axis=(1, 2)))
     weights = np.linalg.inv(np.where(fine[:, None, None], spread, np.eye(2)))
     return highlights.pixels[measured] - predicted, J, np.where(fine[:, None, None], weights, np.nan)
 
@@ -190,7 +191,7 @@ def _grow(camera: Camera, mirrors: Mirrors, highlights: Highlights, held: _Candi
         # the nearest highlight, in standard deviations
         gaps = highlights.pixels[own][None] - predicted[:, None]
         whole = spread[:, None] + highlights.covariance[own][None]
-        fine = np.isfinite(whole).all(axis=(2, 3)) & np.isfinite(gaps).all(axis=2)
+        fine = np.asarray(np.isfinite(whole).all(axis=(2, 3)) & np.isfinite(gaps).all(axis=2))
         inverse = np.linalg.inv(np.where(fine[..., None, None], whole, np.eye(2)))
         squares = np.where(fine, np.einsum("nhi,nhij,nhj->nh", gaps, inverse, gaps), np.inf)
         nearest = squares.argmin(axis=1)
@@ -206,16 +207,16 @@ def _grow(camera: Camera, mirrors: Mirrors, highlights: Highlights, held: _Candi
     return held
 
 
-def _counted(candidates: _Candidates, free: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+def _counted(candidates: _Candidates, free: Mask) -> npt.NDArray[np.intp]:
     """Return how many free highlights each candidate has taken."""
     return np.asarray(((candidates.taken >= 0) & free[candidates.taken]).sum(axis=1), np.intp)
 
 
 def _refined(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, starts: Array, free: npt.NDArray[np.bool_], rounds: int
+    camera: Camera, mirrors: Mirrors, highlights: Highlights, starts: Array, free: Mask, rounds: int
 ) -> tuple[Bundle, Labels] | None:
     """Assign highlights to lights and fit the lights, in turn, until the assignment stays."""
-    bundle: Bundle | None = Bundle(starts, np.kron(np.eye(len(starts)), np.eye(3)), np.zeros(3), 0.0, 0)
+    bundle: Bundle | None = Bundle(starts, np.eye(starts.size), np.zeros(3), 0.0, 0)
     source = np.full(len(highlights), -1, dtype=np.intp)
     for _ in range(max(rounds, 2)):
         assert bundle is not None
@@ -252,7 +253,7 @@ def assign(
         predicted, spread = prediction(camera, mirrors, bundle, np.full(len(lights), view), lights)
         gaps = highlights.pixels[own][:, None] - predicted[None]
         whole = spread[None] + highlights.covariance[own][:, None]
-        fine = np.isfinite(whole).all(axis=(2, 3)) & np.isfinite(gaps).all(axis=2)
+        fine = np.asarray(np.isfinite(whole).all(axis=(2, 3)) & np.isfinite(gaps).all(axis=2))
         inverse = np.linalg.inv(np.where(fine[..., None, None], whole, np.eye(2)))
         squares = np.where(fine, np.einsum("hsi,hsij,hsj->hs", gaps, inverse, gaps), np.inf)
         rows, columns = linear_sum_assignment(np.minimum(squares, GATE))

@@ -8,6 +8,9 @@ import numpy.typing as npt
 
 from simtest.geometry import Array
 
+Peaks = npt.NDArray[np.intp]
+"""Row and column of each peak, shape (K, 2)."""
+
 SMOOTHING_PX = 0.7
 MOST = 12
 """Highlights of a picture; the brightest ones."""
@@ -66,15 +69,15 @@ def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px
         return []
     corner = np.array([columns[0], rows[0]])
     window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    values, inside = np.asarray(intensity[window], dtype=np.float32), where[window]
-    smooth = cv2.GaussianBlur(values, (0, 0), SMOOTHING_PX)
+    values, inside = np.asarray(intensity[window], dtype=float), where[window]
+    smooth = np.asarray(cv2.GaussianBlur(values, (0, 0), SMOOTHING_PX), dtype=float)
     around = _surroundings(smooth, widest_px)
     above = np.where(inside, smooth - around, 0.0)
     noise = noise_of(values, inside)
     # candidates: the highest pixel of each neighbourhood
     highest = (smooth >= cv2.dilate(smooth, np.ones((3, 3), np.uint8))) & inside
     limit = max(LEAST_NOISE * noise, LEAST_SHARE * float(above.max()))
-    peaks = np.argwhere(highest & (above > limit))
+    peaks = np.argwhere(np.asarray(highest) & (above > limit))
     peaks = peaks[np.argsort(-above[tuple(peaks.T)], kind="stable")]
     found, claimed = list[MeasuredHighlight](), np.zeros(values.shape, dtype=bool)
     for row, column in peaks:
@@ -109,7 +112,7 @@ def _region(mask: npt.NDArray[np.bool_], row: int, column: int) -> npt.NDArray[n
 
 
 def _measured(
-    values: Array, region: npt.NDArray[np.bool_], level: float, noise: float, corner: Array, peaks: Array,
+    values: Array, region: npt.NDArray[np.bool_], level: float, noise: float, corner: Array, peaks: Peaks,
     smooth: Array, widest_px: float,
 ) -> MeasuredHighlight:  # fmt: skip
     """Return the centroid of what stands above half height, with its error by the noise."""
@@ -124,7 +127,7 @@ def _measured(
     return MeasuredHighlight(centre + corner, covariance, _problem(region, peaks, smooth, spread, widest_px))
 
 
-def _problem(region: npt.NDArray[np.bool_], peaks: Array, smooth: Array, spread: Array, widest_px: float) -> str:
+def _problem(region: npt.NDArray[np.bool_], peaks: Peaks, smooth: Array, spread: Array, widest_px: float) -> str:
     """Return why a spot is no single highlight of a light; empty where it is one."""
     border = np.concatenate([region[0], region[-1], region[:, 0], region[:, -1]])
     if border.any():

@@ -20,7 +20,6 @@ ON_EDGE_PX = 1.5
 LEAST_ON_EDGE = 0.5
 """Share of the directions whose strongest edge must lie on the outline."""
 
-ROUNDS = 3
 DISPLAY_GAMMA = 2.2
 
 
@@ -42,7 +41,8 @@ def trace_outline(
     intensity: Array, camera: Camera, centre_px: Array, radius_px: float
 ) -> tuple[BallOutline, float] | None:
     """Return the outline on the strongest edges near a circle, and the share of directions that agree with it."""
-    for reach in (REACH, REACH / 2, REACH / 4)[:ROUNDS]:
+    outline, edges = None, np.empty((0, 2))
+    for reach in (REACH, REACH / 2, REACH / 4):
         edges = _edges(intensity, camera, centre_px, radius_px, reach)
         outline = _robust(camera, edges)
         if outline is None:
@@ -54,6 +54,8 @@ def trace_outline(
         radius_px = float(np.linalg.norm(border - centre_px, axis=1).mean())
         if radius_px < LEAST_RADIUS_PX:
             return None
+    if outline is None:
+        return None
     return outline, float(np.mean(_gaps(camera, outline, edges) < ON_EDGE_PX) * len(edges) / DIRECTIONS)
 
 

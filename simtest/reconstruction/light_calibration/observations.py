@@ -55,7 +55,7 @@ class View:
     """
 
     name: str
-    intensity: Image
+    intensity: Array
     highlights: list[MeasuredHighlight]
     outline: BallOutline | None = None
     plane: tuple[Array, float] | None = None
@@ -149,17 +149,17 @@ def _plane(world_from_camera: Array) -> tuple[Array, float] | None:
     return side * normal / np.linalg.norm(normal), -abs(height) / float(np.linalg.norm(normal))
 
 
-def _linear(name: str, values: Image, calibration: Calibration) -> Image:
+def _linear(name: str, values: Image, calibration: Calibration) -> Array:
     camera = calibration.camera
     if values.shape[:2] != (camera.height, camera.width):
         raise InputError(
             f"{shown(name)}: {values.shape[1]} x {values.shape[0]} px; must be {camera.width} x {camera.height} px as "
             "the calibration's camera"
         )
-    return calibration.correct(np.asarray(values, dtype=np.float32)).intensity
+    return np.asarray(calibration.correct(np.asarray(values, dtype=np.float32)).intensity, dtype=float)
 
 
-def _outline(intensity: Image, camera: Camera, circle: Circle | None) -> BallOutline | str:
+def _outline(intensity: Array, camera: Camera, circle: Circle | None) -> BallOutline | str:
     """Return a ball's outline, or why there is none."""
     if circle is None:
         searched = find_ball(intensity, camera)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.camera import Camera
-from simtest.geometry.vectors import basis_across, rotation
+from simtest.geometry.vectors import basis_across
 
 SECTORS = 24
 BAND_PX = 5.0
@@ -103,7 +103,7 @@ def outline_through(camera: Camera, pixels: npt.ArrayLike, sd_px: float = 0.5) -
     """
     points = np.asarray(pixels, dtype=float)
     rays = camera.unproject(points)
-    m, *_ = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)
+    m: Array = np.asarray(np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0], dtype=float)
     length = float(np.linalg.norm(m))
     if not length > 1:
         raise InputError(f"outline: {len(points)} points lie on no ball's outline; must be px on its edge")
@@ -112,7 +112,7 @@ def outline_through(camera: Camera, pixels: npt.ArrayLike, sd_px: float = 0.5) -
     J = np.column_stack([-_unit_across(rays, direction) @ np.array([first, second]).T, -np.ones(len(rays))])
     step = np.array([np.sqrt(abs(np.linalg.det(_steps(camera, p) @ _steps(camera, p).T))) ** 0.5 for p in points])
     weighted = J / (sd_px * step)[:, None]
-    return BallOutline(direction, half_angle, np.linalg.inv(weighted.T @ weighted))
+    return BallOutline(direction, half_angle, np.asarray(np.linalg.inv(weighted.T @ weighted), dtype=float))
 
 
 def _steps(camera: Camera, pixel: Array) -> Array:
@@ -286,4 +286,5 @@ def _covariance(J: Array, r: Array, used: list[npt.NDArray[np.intp]]) -> Array |
     scores = np.array([J[rows].T @ r[rows] for rows in used])
     share = len(used) / max(len(used) - len(STEPS), 1)
     grouped = share * inverse @ (scores.T @ scores) @ inverse
-    return grouped if np.trace(grouped[:3, :3]) > np.trace(white[:3, :3]) else white
+    chosen = grouped if np.trace(grouped[:3, :3]) > np.trace(white[:3, :3]) else white
+    return np.asarray(chosen, dtype=float)

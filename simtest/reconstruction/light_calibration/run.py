@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,13 @@ from simtest.calibration import Calibration
 from simtest.calibration.lights.mirrors import Mirrors
 from simtest.calibration.lights.result import LightCalibration, camera_covariance, judge
 from simtest.calibration.lights.search import MOST_LIGHTS, find_lights
-from simtest.calibration.priors import UNTOLD_OFFSET_MM
+from simtest.calibration.priors import UNTOLD_OFFSET_MM, Matrix
 from simtest.errors import InputError
-from simtest.geometry import Image
+from simtest.geometry import Array, Image
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_integer, check_number
 from simtest.reconstruction.choices import check_encoding, complete
+from simtest.reconstruction.image_io import is_sequence, open_source, read_picture
 from simtest.reconstruction.light_calibration.observations import (
     Circle,
     View,
@@ -83,6 +85,17 @@ class Calibrated:
     views: Views
     mirror: Ball | Plate
     calibration: Calibration
+
+
+def picture_readers(paths: Sequence[Path]) -> list[tuple[str, Callable[[], Image]]]:
+    """Return name and reader of each picture of files and folders; `InputError` where a folder holds none."""
+    found: list[tuple[str, Callable[[], Image]]] = []
+    for path in paths:
+        if is_sequence(path):
+            found += [(frame.name, frame.read) for frame in open_source(path).frames()]
+        else:
+            found.append((path.name, partial(read_picture, path)))
+    return found
 
 
 def calibrate_lights(
@@ -159,7 +172,7 @@ def _seen_by(views: Sequence[View], camera: Camera, other: Camera, mirror: Ball 
     return balls_of(moved, other, mirror.radius_mm)
 
 
-def _variations(calibration: Calibration) -> np.ndarray:
+def _variations(calibration: Calibration) -> Array:
     """Return the camera's independent errors of one standard deviation (see `camera_covariance`)."""
     prior = calibration.priors.camera
     rows = np.diag([prior.focal_sd, prior.centre_sd_px, prior.centre_sd_px])
@@ -185,14 +198,21 @@ def _scale_note(result: LightCalibration, ball: Ball) -> str:
 
 def with_lights(calibration: Calibration, result: LightCalibration) -> Calibration:
     """Return a calibration with the measured lights that travel with the camera."""
-    positions = tuple(tuple(round(float(v), 5) for v in light.position_mm) for light in result.own)
-    matrices = tuple(
-        tuple(tuple(float(f"{v:.10g}") for v in row) for row in (light.covariance_mm2 + light.covariance_mm2.T) / 2)
-        for light in result.own
-    )
+    positions = tuple(_triple(light.position_mm.round(5)) for light in result.own)
+    matrices = tuple(_matrix((light.covariance_mm2 + light.covariance_mm2.T) / 2) for light in result.own)
     if not positions:
         return calibration
     told = replace(
         calibration.priors, lights_mm=positions, lights_covariance_mm2=matrices, light_offset_mm=UNTOLD_OFFSET_MM
     )
     return replace(calibration, priors=told)
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    x, y, z = (float(f"{value:.10g}") for value in values)
+    return x, y, z
+
+
+def _matrix(values: Array) -> Matrix:
+    first, second, third = (_triple(row) for row in values)
+    return first, second, third
