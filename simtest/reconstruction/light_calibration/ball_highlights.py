@@ -24,7 +24,7 @@ LEAST_SHARE = 0.15
 CENTRE_FLOOR_PX = 0.015
 """Error of a centre that stays however little noise there is: pixels, coding, the shape of a spot; an axis."""
 
-LONGEST = 2.0
+LONGEST = 1.35
 """A longer spot, by its axis ratio, is several highlights that touch, or a reflected lamp or window."""
 
 HALF = 0.5

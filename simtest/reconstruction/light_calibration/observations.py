@@ -14,7 +14,7 @@ from simtest.geometry import Array, Image, Mask
 from simtest.geometry.camera import Camera
 from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
 from simtest.reconstruction.light_calibration.ball_search import find_ball, trace_outline
-from simtest.reconstruction.light_calibration.outline import BallOutline, refine_outline
+from simtest.reconstruction.light_calibration.outline import BallOutline, has_dark_ring, refine_outline
 from simtest.runtime.resources import shown
 
 OUTLINE_FLOOR_PX = 0.02
@@ -26,8 +26,8 @@ LIGHT_MM = 4.0
 SHADOW = 1.5
 """Standard deviation of the outline's error by that strip, in widths of it."""
 
-WIDEST = 0.8
-"""Longest highlight, as a share of the ball's radius."""
+WIDEST, LEAST_WIDEST_PX = 0.2, 12.0
+"""Longest highlight, as a share of the ball's radius, but at least so many px."""
 
 WIDEST_ON_PLATE = 0.06
 """Longest highlight on a plate, as a share of the picture's longer side."""
@@ -116,7 +116,8 @@ def read_balls(
             continue
         inside = _inside(camera, outline)
         radius_px = float(np.sqrt(inside.sum() / np.pi))
-        found.views.append(View(name, intensity, measure_highlights(intensity, inside, WIDEST * radius_px), outline))
+        widest = max(WIDEST * radius_px, LEAST_WIDEST_PX)
+        found.views.append(View(name, intensity, measure_highlights(intensity, inside, widest), outline))
     return found
 
 
@@ -170,7 +171,13 @@ def _outline(intensity: Array, camera: Camera, circle: Circle | None) -> BallOut
         if searched is None:
             return "no edge of a ball near the outline that is told"
     outline = refine_outline(intensity, camera, searched[0])
-    return outline if outline is not None else "too little of the ball's outline shows an edge"
+    if outline is None:
+        return "too little of the ball's outline shows an edge"
+    if has_dark_ring(intensity, camera, outline):
+        return (
+            "a dark ring inside the outline: the ball's shadow on the wall hides its edge; light the wall by the room"
+        )
+    return outline
 
 
 def _inside(camera: Camera, outline: BallOutline) -> Mask:

@@ -11,7 +11,9 @@ the square root the outline is not drawn inwards where the ball grows dark towar
 """
 
 from dataclasses import dataclass
+from functools import cache
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -27,6 +29,17 @@ BAND_PX = 5.0
 BESIDE_PX = 2.0
 """So far from the outline a blurred edge has ended."""
 
+MOST_PIXELS = 4000
+"""Of the band; of more pixels every second or third one is used."""
+
+RING_FROM_PX, RING_DEPTH, RING_LEAST_PX = 2.5, 0.15, 10.0
+"""A dark ring is searched from here inside the outline to this share of its radius, but at least so far, px."""
+
+RING_STEPS = np.linspace(0.85, 1.0, 61)
+RING_WIDTH_PX = 2.0
+RING_GAIN = 4.0
+"""A ring is told where the ball's shading begins so far inside the outline, and explains the profile so much better."""
+
 LEAST_SECTORS = 8
 LEAST_PIXELS = 14
 LEAST_RADIUS_PX = 6.0
@@ -39,18 +52,16 @@ STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3])
 """Steps of the parameters: two turns and the half-angle in px, and the logarithm of the blur."""
 
 _REACH = 6.0
-_GRID = np.linspace(-_REACH, 40.0, 2301)
+_GRID = np.linspace(-_REACH, 40.0, 921)
 
 
+@cache
 def _blurred_root() -> Array:
     """Return the square root of max(x, 0), blurred by a Gaussian of deviation 1, on the grid."""
     # Substituted u^2 = x, so that the root's infinite slope does no harm.
-    u = np.linspace(0.0, 8.0, 4001)
+    u = np.linspace(0.0, 8.0, 1601)
     kernel = np.exp(-((_GRID[:, None] - u[None] ** 2) ** 2) / 2) / np.sqrt(2 * np.pi)
     return np.asarray(np.trapezoid(2 * u**2 * kernel, u, axis=1))
-
-
-_ROOT = _blurred_root()
 
 
 @dataclass(frozen=True)
@@ -110,13 +121,10 @@ def outline_through(camera: Camera, pixels: npt.ArrayLike, sd_px: float = 0.5) -
     direction, half_angle = m / length, float(np.arccos(1 / length))
     first, second = basis_across(direction)
     J = np.column_stack([-_unit_across(rays, direction) @ np.array([first, second]).T, -np.ones(len(rays))])
-    step = np.array([np.sqrt(abs(np.linalg.det(_steps(camera, p) @ _steps(camera, p).T))) ** 0.5 for p in points])
+    pixel = camera.unproject(points + [1.0, 0.0]) - rays, camera.unproject(points + [0.0, 1.0]) - rays
+    step = np.sqrt(np.linalg.norm(np.cross(*pixel), axis=1))
     weighted = J / (sd_px * step)[:, None]
     return BallOutline(direction, half_angle, np.asarray(np.linalg.inv(weighted.T @ weighted), dtype=float))
-
-
-def _steps(camera: Camera, pixel: Array) -> Array:
-    return camera.step_of_pixels(pixel)
 
 
 def _unit_across(rays: Array, direction: Array) -> Array:
@@ -182,9 +190,10 @@ def _band(intensity: Array, camera: Camera, outline: BallOutline) -> _Band | Non
     kept = rays[near]
     first, second = basis_across(outline.direction)
     phase = np.arctan2(kept @ second, kept @ first)
+    every = max(1, len(kept) // MOST_PIXELS)
     sector = np.floor((phase / (2 * np.pi) + 0.5) * SECTORS).astype(np.intp) % SECTORS
     values = np.asarray(intensity, dtype=float)[low[1] : high[1], low[0] : high[0]][near]
-    return _Band(kept, values, pixel[near], sector)
+    return _Band(kept[::every], values[::every], pixel[near][::every], sector[::every])
 
 
 def _angles(rays: Array, direction: Array) -> Array:
@@ -251,7 +260,7 @@ def _projected(s: Array, values: Array, blur: float, weights: Array, used: list[
     depth = -s / blur
     inside = ndtr(depth)
     ramp = depth * inside + np.exp(-(depth**2) / 2) / np.sqrt(2 * np.pi)
-    root = np.interp(depth, _GRID, _ROOT)
+    root = np.interp(depth, _GRID, _blurred_root())
     columns = np.stack([np.ones_like(s), inside, ramp, ramp - depth, root], axis=1)
     left = np.zeros(len(s))
     for rows in used:
@@ -288,3 +297,34 @@ def _covariance(J: Array, r: Array, used: list[npt.NDArray[np.intp]]) -> Array |
     grouped = share * inverse @ (scores.T @ scores) @ inverse
     chosen = grouped if np.trace(grouped[:3, :3]) > np.trace(white[:3, :3]) else white
     return np.asarray(chosen, dtype=float)
+
+
+def has_dark_ring(intensity: Array, camera: Camera, outline: BallOutline) -> bool:
+    """Return whether a dark ring lies between an outline and where a matt ball's shading begins.
+
+    Lights nearer to the ball than the camera, or beside it, cast a shadow on a near wall that is larger than the ball.
+    Its edge is then stronger than the ball's own. A ball that is lit from the camera has the brightness
+    sqrt(1 - (r / q)^2) at the share r of the outline's radius, with q = 1 where the outline is the ball's.
+    """
+    border = outline.pixels(camera, 96)
+    middle = border.mean(axis=0)
+    radius_px = float(np.linalg.norm(border - middle, axis=1).mean())
+    depth = min(max(RING_DEPTH * radius_px, RING_LEAST_PX), 0.5 * radius_px)
+    shares = 1 - np.arange(RING_FROM_PX, depth, 0.5) / radius_px
+    if len(shares) < 8:
+        return False
+    at = (middle + shares[:, None, None] * (border - middle) - 0.5).astype(np.float32)
+    seen = cv2.remap(np.asarray(intensity, np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+    profile = np.median(seen, axis=1)
+    noise = float(np.median(np.abs(np.diff(seen, axis=0)))) / np.sqrt(len(border))
+    left = []
+    for q in RING_STEPS:
+        shading = np.sqrt(np.maximum(1 - (shares / q) ** 2, 0))
+        A = np.stack([np.ones_like(shares), shading], axis=1)
+        amplitudes, *_ = np.linalg.lstsq(A, profile, rcond=None)
+        # A rim that is brighter than the middle is no shading.
+        left.append(np.sum((profile - A @ amplitudes) ** 2) if amplitudes[1] > 0 else np.inf)
+    best = int(np.argmin(left))
+    floor = len(shares) * noise**2
+    gap_px = (1 - RING_STEPS[best]) * radius_px
+    return bool(gap_px > RING_WIDTH_PX and left[-1] + floor > RING_GAIN * (left[best] + floor))
