@@ -15,8 +15,6 @@ from simtest.reconstruction.light_calibration.run import Ball, Calibrated, calib
 from studies.light_calibration.plantings import Planting, plant
 
 WITHIN_MM = 0.2
-FAR_MM = 1.5
-"""A measured light farther from every planted one is none of them."""
 
 
 def measured(planting: Planting, told_radius: float | None = None, lights: Any = None) -> Calibrated:
@@ -74,9 +72,9 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
         good = ((np.abs(errors) <= np.maximum(halves, WITHIN_MM)).all(axis=1)).mean()
         lines.append(
             f"{name}: {len(lights)} lights, error median {np.median(length):.3f}, "
-            f"95 % {np.quantile(length, 0.95):.3f}, largest {length.max():.3f} mm; within 0.2 mm {np.mean(length <= WITHIN_MM):.1%}; within 0.2 mm or the "
-            f"interval {good:.1%}; intervals cover {inside.mean():.1%} of {inside.size} coordinates, "
-            f"95 % regions {share:.1%}"
+            f"95 % {np.quantile(length, 0.95):.3f}, largest {length.max():.3f} mm; "
+            f"within 0.2 mm {np.mean(length <= WITHIN_MM):.1%}; within 0.2 mm or the interval {good:.1%}; "
+            f"intervals cover {inside.mean():.1%} of {inside.size} coordinates, 95 % regions {share:.1%}"
         )
     return lines
 

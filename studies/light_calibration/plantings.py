@@ -11,7 +11,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from studies.light_calibration.pictures import Floats, Look, picture_of_ball
 
-WIDTH, HEIGHT = 800, 640
+WIDTH, HEIGHT = 640, 512
 LENSES = ("pinhole", "brown_conrady", "kannala_brandt")
 VIEWS = 8
 APART_MM = 3.0
@@ -50,7 +50,7 @@ def plant(seed: int, count: int | None = None, **look: float) -> Planting:
     lights = _lights(rng, int(rng.integers(1, 5)) if count is None else count)
     radius = float(rng.uniform(3.0, 10.0))
     drawn = {
-        "diffuse": float(rng.uniform(0.05, 0.4)), "specular": float(rng.uniform(0.5, 3.0)),
+        "diffuse": float(rng.uniform(0.05, 0.4)), "specular": float(10 ** rng.uniform(0.6, 1.6)),
         "exponent": float(10 ** rng.uniform(3.3, 4.5)), "room": float(rng.uniform(0.6, 0.95)),
         "wall_mm": radius * float(rng.uniform(2.0, 6.0)),
         "blur_px": float(rng.uniform(0.5, 1.0)), "noise": float(rng.uniform(0.002, 0.015)),

@@ -121,7 +121,8 @@ def outline_through(camera: Camera, pixels: npt.ArrayLike, sd_px: float = 0.5) -
     direction, half_angle = m / length, float(np.arccos(1 / length))
     first, second = basis_across(direction)
     J = np.column_stack([-_unit_across(rays, direction) @ np.array([first, second]).T, -np.ones(len(rays))])
-    pixel = camera.unproject(points + [1.0, 0.0]) - rays, camera.unproject(points + [0.0, 1.0]) - rays
+    along, down = np.eye(2)
+    pixel = camera.unproject(points + along) - rays, camera.unproject(points + down) - rays
     step = np.sqrt(np.linalg.norm(np.cross(*pixel), axis=1))
     weighted = J / (sd_px * step)[:, None]
     return BallOutline(direction, half_angle, np.asarray(np.linalg.inv(weighted.T @ weighted), dtype=float))
