@@ -3,7 +3,7 @@
 Nothing of the code that is tested is used but the camera's sightlines.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,9 @@ from scipy.ndimage import gaussian_filter
 from simtest.geometry.camera import Camera
 
 Floats = npt.NDArray[np.float64]
+
+NARROWEST_PX = 0.45
+"""Least standard deviation of a highlight before the blur."""
 
 SAMPLES = 2
 """Rays a pixel along each axis, at the ball."""
@@ -63,6 +66,9 @@ def picture_of_ball(
     linear += room
     # the ball's part again, with several rays a pixel
     middle = camera.project(centre)
+    radius_px = radius / np.linalg.norm(centre) * max(camera.fx, camera.fy)
+    # A lobe that is narrower than the rays lie apart would be sampled by chance; lenses blur it more.
+    look = replace(look, exponent=min(look.exponent, (radius_px / NARROWEST_PX) ** 2 / 4))
     reach = (
         1.3 * radius / np.linalg.norm(centre) * max(camera.fx, camera.fy) / max(centre[2] / np.linalg.norm(centre), 0.3)
     )

@@ -65,7 +65,7 @@ def nearest_errors(result: LightCalibration, lights: Array) -> Array:
 
 def test_mirror_points_obey_the_mirror_law() -> None:
     rng = np.random.default_rng(4)
-    centres = rng.normal(0, 8, (200, 3)) + [0, 0, 40]
+    centres = rng.normal(0, 8, (200, 3)) + np.array([0.0, 0.0, 40.0])
     radii, lights = rng.uniform(3, 10, 200), rng.uniform(-8, 8, (200, 3))
     points = mirror_points(centres, radii, lights)
     normals = (points - centres) / radii[:, None]
@@ -105,7 +105,8 @@ def test_two_lights_among_stray_highlights(camera: Camera, kind: str) -> None:
     mirrors = balls() if kind == "ball" else plates()
     highlights, planted = seen(mirrors, LIGHTS, stray=1, camera=camera)
     result = measured(mirrors, highlights, camera)
-    assert len(result.own) == 2 and not result.problems
+    assert len(result.own) == 2
+    assert not result.problems
     assert (result.source[planted < 0] >= 0).mean() < 0.2
     assert (nearest_errors(result, LIGHTS) < 16.3).all()  # chi-squared, 3 degrees of freedom, alpha = 0.001 each
 

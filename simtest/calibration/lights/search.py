@@ -42,6 +42,9 @@ GATE = chi_squared.quantile(0.999, 2)
 LEAST_SHARE = 0.6
 """A light must explain a highlight in this share of the pictures."""
 
+PARALLEL = 0.02
+"""Rays at a smaller angle, rad, count as parallel."""
+
 FIRST_STEPS = 5
 ROUNDS = 6
 DISTINCT = chi_squared.quantile(0.9999, 3)
@@ -163,6 +166,9 @@ def _nearest_points(p: Array, u: Array, q: Array, v: Array) -> Array:
     square = np.maximum(1 - cosine**2, 1e-9)
     a, b = np.sum(u * w, axis=1), np.sum(v * w, axis=1)
     middle = (p + ((cosine * b - a) / square)[:, None] * u + q + ((b - cosine * a) / square)[:, None] * v) / 2
+    # Rays that are all but parallel meet nowhere in particular: the point nearest to the camera, which the prior takes.
+    nearest = p - np.sum(p * u, axis=1)[:, None] * u
+    middle = np.where((square > PARALLEL**2)[:, None], middle, nearest)
     length = np.linalg.norm(middle, axis=1, keepdims=True)
     return np.asarray(middle * np.minimum(1.0, 2 * REACH_MM / np.maximum(length, 1e-9)))
 

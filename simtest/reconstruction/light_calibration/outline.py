@@ -37,7 +37,7 @@ RING_FROM_PX, RING_DEPTH, RING_LEAST_PX = 2.5, 0.15, 10.0
 
 RING_STEPS = np.linspace(0.85, 1.0, 61)
 RING_WIDTH_PX = 2.0
-RING_GAIN = 4.0
+RING_GAIN = 2.0
 """A ring is told where the ball's shading begins so far inside the outline, and explains the profile so much better."""
 
 LEAST_SECTORS = 8
@@ -317,7 +317,7 @@ def has_dark_ring(intensity: Array, camera: Camera, outline: BallOutline) -> boo
     at = (middle + shares[:, None, None] * (border - middle) - 0.5).astype(np.float32)
     seen = cv2.remap(np.asarray(intensity, np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
     profile = np.median(seen, axis=1)
-    noise = float(np.median(np.abs(np.diff(seen, axis=0)))) / np.sqrt(len(border))
+    noise = float(np.median(np.abs(np.diff(seen, axis=1)))) / np.sqrt(len(border))
     left = []
     for q in RING_STEPS:
         shading = np.sqrt(np.maximum(1 - (shares / q) ** 2, 0))
@@ -328,4 +328,6 @@ def has_dark_ring(intensity: Array, camera: Camera, outline: BallOutline) -> boo
     best = int(np.argmin(left))
     floor = len(shares) * noise**2
     gap_px = (1 - RING_STEPS[best]) * radius_px
-    return bool(gap_px > RING_WIDTH_PX and left[-1] + floor > RING_GAIN * (left[best] + floor))
+    return bool(
+        np.isfinite(left[-1]) and gap_px > RING_WIDTH_PX and left[-1] + floor > RING_GAIN * (left[best] + floor)
+    )
