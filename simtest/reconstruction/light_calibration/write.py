@@ -24,7 +24,8 @@ MARGIN = 0.15
 BRIGHT = 0.999
 """Share of the pixels that are darker than the picture's white on the page."""
 
-MEASURED, PREDICTED, OUTLINE = palette.LIGHT, palette.TRUTH, palette.NEUTRAL
+MEASURED = palette.LIGHT
+PREDICTED, OUTLINE = (palette.ESTIMATOR_COLOURS[name] for name in ("circle_pose", "brightest_point"))
 
 
 def write_calibration(made: Calibrated, out: Path, command: str = "") -> list[Path]:
