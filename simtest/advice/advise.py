@@ -163,6 +163,7 @@ def _median_radius(results: pl.DataFrame) -> float | None:
 
 def _commands(out: Path) -> dict[str, str]:
     """Return the commands that make the figures again; a run that is kept is not rendered anew."""
+
     def words(*parts: object) -> str:
         return shlex.join(["simtest", *map(str, parts)])
 
@@ -171,5 +172,3 @@ def _commands(out: Path) -> dict[str, str]:
         "break_points": words("validate", out / BREAKS, "--out", out / BREAKS_RUN),
         "picture": words("render", out / SCENE, "--out", out / "frame"),
     }
-
-

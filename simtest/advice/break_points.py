@@ -17,18 +17,21 @@ from simtest.advice.plan import Question, seen_through
 from simtest.advice.scope import ends
 from simtest.spec import Experiment
 from simtest.validation import laws
+from simtest.validation.guide import LEAST_ANSWERED
 from simtest.validation.situations import SMALL_SPOT_PX
 
 NEAREST_MM = 3.0
 """A break-point nearer than this is not rendered: no endoscope works there."""
 
-STREAK_KD = -0.9
-"""d k at which abs(1 + d k) = 0.1: `curved` answers no flatter misfit, and isophotes become streaks."""
+STREAK_KD, BEYOND_KD = -0.9, -0.92
+"""d k at which abs(1 + d k) = 0.1, below which `curved` refuses; and where that is rendered."""
 
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
 """Mean angle between a glint's normal and the base's, in slopes an axis (theory.md 7.4)."""
 
 FRAMES, ROUGH_FRAMES = 3, 8
+
+_HALVINGS = 60
 
 CONFIRMED_DEG, CONFIRMED_SHARE = 0.3, 0.15
 """A render confirms a law where it differs by less than either, or where its interval holds the law's value."""
@@ -52,10 +55,10 @@ class BreakPoint:
         Where it breaks, by the law.
     law : str
         The law, in words and symbols.
-    expected : float
-        What the law gives there, of `measures`.
+    expected : float or None
+        Error that the law gives there, deg; None where it says that the method refuses.
     measures : str
-        Column of the results: ``error_fine_deg``, ``error_base_deg``, or ``radius`` of a spot, px.
+        Column of the results: ``error_fine_deg`` or ``error_base_deg``.
     also : str
         The same in other terms, such as the offset over the distance.
     group : dict
@@ -69,7 +72,7 @@ class BreakPoint:
     unit: str
     value: float
     law: str
-    expected: float
+    expected: float | None
     measures: str
     also: str
     group: dict[str, Any]
@@ -80,7 +83,7 @@ class Confirmed:
     """A break-point with what renders there gave."""
 
     point: BreakPoint
-    rendered: MeanError  # deg, or px where a radius is measured
+    rendered: MeanError
     asked: int  # highlights
     answered: int
 
@@ -88,7 +91,9 @@ class Confirmed:
     def verdict(self) -> str:
         """Whether the render agrees with the law."""
         mean, expected = self.rendered.mean_deg, self.point.expected
-        if mean is None:
+        if expected is None and self.asked:
+            return "confirmed" if self.answered < LEAST_ANSWERED * self.asked else "differs"
+        if mean is None or expected is None:
             return "no answer" if self.asked else "no highlight"
         low, high = self.rendered.interval_deg
         near = abs(mean - expected) <= max(CONFIRMED_DEG, CONFIRMED_SHARE * expected)
@@ -138,7 +143,7 @@ def _group(question: Question, key: str, surface: dict[str, Any], **changed: Any
 
 
 def _offset_ignored(question: Question) -> BreakPoint | None:
-    """The distance at which a method that ignores the light's offset errs by the bound."""
+    """Find the distance at which a method that ignores the light's offset errs by the bound."""
     offset = float(np.mean(question.scope.offsets_mm))
     ratio = math.tan(2 * math.radians(question.bound_deg))
     if offset / ratio < NEAREST_MM:
@@ -153,39 +158,47 @@ def _offset_ignored(question: Question) -> BreakPoint | None:
 
 
 def _distance_unknown(question: Question) -> BreakPoint | None:
-    """The distance below which a bisector that knows the range alone errs by the bound."""
+    """Find the distance below which a bisector that knows the range alone errs by the bound."""
     offset = float(np.mean(question.scope.offsets_mm))
     if not offset:
         return None
     # The told distance is the middle of the range.
-    middle, bound = question.middle_mm, math.radians(question.bound_deg)
-    distance = round(1 / (1 / middle + 2 * bound / offset), 3)
-    if distance < NEAREST_MM:
+    middle = question.middle_mm
+
+    def law_deg(distance: float) -> float:
+        point = np.array([0.0, 0.0, distance])
+        return float(np.degrees(laws.bisector_residual(point, np.array([offset, 0.0, 0.0]), middle / distance - 1)))
+
+    # The error falls from the nearest distance to the middle.
+    low, high = NEAREST_MM, middle
+    if law_deg(low) < question.bound_deg:
         return None
-    point = np.array([0.0, 0.0, distance])
-    law = laws.bisector_residual(point, np.array([offset, 0.0, 0.0]), middle / distance - 1)
+    for _ in range(_HALVINGS):
+        half = (low + high) / 2
+        low, high = (half, high) if law_deg(half) > question.bound_deg else (low, half)
+    distance = round(low, 3)
     return BreakPoint(
         "distance-unknown", "bisector, told the range of the distance alone", "bisector", "distance", "mm", distance,
-        "eps / 2 * abs(1 / d - 1 / middle)", float(np.degrees(law)), "error_fine_deg",
+        "eps / 2 * abs(1 / d - 1 / middle)", law_deg(distance), "error_fine_deg",
         f"eps/d = {offset / distance:.3g}, middle = {middle:g} mm",
         _group(question, "distance-unknown", {"type": "plane", "distance_mm": distance}),
     )  # fmt: skip
 
 
 def _streak(question: Question) -> BreakPoint:
-    """The curvature at which a concave wall's isophotes become streaks."""
+    """Find the curvature at which a concave wall's isophotes become streaks."""
     middle = question.middle_mm
-    surface = {"type": "cylinder", "side": "inside", "distance_mm": middle, "radius_mm": round(-middle / STREAK_KD, 3)}
+    surface = {"type": "cylinder", "side": "inside", "distance_mm": middle, "radius_mm": round(-middle / BEYOND_KD, 3)}
     group = _group(question, "curvature", surface, rig={"preset": "colocated"}) | {"isolated": False}
     return BreakPoint(
-        "curvature", "a wall seen from near its centre of curvature: streaks", "cone_axis", "d k", "", STREAK_KD,
-        "abs(1 + d k) = 0.1; the light at the camera", 0.0, "error_fine_deg",
-        f"a concave radius of {-middle / STREAK_KD:.3g} mm at {middle:g} mm", group,
+        "curvature", "a wall seen from near its centre of curvature: a streak", "curved", "d k", "", STREAK_KD,
+        "curved refuses where abs(1 + d k) < 0.1", None, "error_fine_deg",
+        f"a concave radius of {-middle / STREAK_KD:.3g} mm at {middle:g} mm; rendered at {BEYOND_KD:g}", group,
     )  # fmt: skip
 
 
 def _relief(question: Question) -> BreakPoint:
-    """The slope at which a single glint's normal is off the base's by the bound."""
+    """Find the slope at which a single glint's normal is off the base's by the bound."""
     slope = round(question.bound_deg / RAYLEIGH_MEAN, 3)
     wave = wavelength_mm(question)
     surface = {"type": "plane", "distance_mm": question.middle_mm,

@@ -25,7 +25,6 @@ LEAST_PART_DEG = 1e-6
 STRATUM = "surface.distance_mm"
 
 
-
 @dataclass(frozen=True)
 class MeanError:
     """The mean error of a method's answers, deg, with its 95 % interval; None where too little was answered."""
