@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 from simtest.advice.break_points import (
@@ -18,10 +19,10 @@ from simtest.advice.break_points import (
 )
 from simtest.advice.figures import Found, read_results
 from simtest.advice.plan import Question, main_experiment, write_experiment
-from simtest.runtime.arrays import Image
+from simtest.pages.sheet import Pixels
 from simtest.runtime.engines import make_engine
 from simtest.runtime.files import make_folder, write_atomically
-from simtest.simulation.camera_chain import to_uint8
+from simtest.simulation.camera_chain import displayed
 from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import Experiment, load_scene
 from simtest.spec.toml_files import toml_tables
@@ -62,7 +63,7 @@ class Advised:
     breaks: list[Confirmed]
     spots: SpotSize
     spot_radius_px: float | None
-    picture: Image
+    picture: Pixels
     commands: dict[str, str]
     drawn: dict[str, tuple[float, float]]
 
@@ -115,7 +116,7 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
     # The frame first: what cannot be rendered is found before the long part.
     scene = write_scene(question, main, out / SCENE)
     frame = make_frame(load_scene(scene))
-    picture = to_uint8(frame.image)
+    picture = np.asarray(np.round(255 * displayed(frame.image, frame.scene.sensor)), dtype=np.uint8)
     runs = run_experiments(
         [(main, out / RUN), (tests, out / BREAKS_RUN)], "", None, progress, make_engine(workers=workers)
     )
@@ -149,7 +150,7 @@ def write_scene(question: Question, main: Experiment, path: Path) -> Path:
     return path
 
 
-def _write_picture(path: Path, picture: Image) -> None:
+def _write_picture(path: Path, picture: Pixels) -> None:
     from simtest.pages import pixels
 
     content = pixels.png(picture)

@@ -164,9 +164,8 @@ def _answers(name: str, target: str, rows: pl.DataFrame) -> MethodAnswers:
     answered = own.filter(pl.col("status") == "ok")
     missed = own.filter(pl.col("status") == "missed").height
     parts = {column: _root_mean_square(answered, column) for column in answered.columns if column.startswith("budget_")}
-    budget = {
-        column.removeprefix("budget_").removesuffix("_deg"): value for column, value in parts.items() if value and value > LEAST_PART_DEG
-    }  # fmt: skip
+    told = {name: value for name, value in parts.items() if value and value > LEAST_PART_DEG}
+    budget = {name.removeprefix("budget_").removesuffix("_deg"): value for name, value in told.items()}
     return MethodAnswers(
         name, target, own.height, answered.height, own.height - answered.height - missed, missed,
         mean_error(answered, "error_fine_deg"), mean_error(answered, "error_base_deg"), _stated(answered), budget,

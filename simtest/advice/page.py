@@ -92,9 +92,8 @@ def distance_chart(found: Advised) -> Chart:
             Mark(at, ignored, SERIES[1], "law: offset ignored", line="dash", hover="{x} mm: {y} deg"),
             Mark(at, known, SERIES[2], "law: bisector, range known", line="dot", hover="{x} mm: {y} deg"),
         ]
-    marks.append(
-        Mark([at[0], at[-1]], [asked.bound_deg] * 2, SERIES[5], f"bound, {asked.bound_deg:g} deg", line="dashdot")
-    )
+    bound = f"bound, {asked.bound_deg:g} deg"
+    marks.append(Mark([at[0], at[-1]], [asked.bound_deg] * 2, SERIES[5], bound, line="dashdot"))
     for colour, choice in zip((SERIES[0], SERIES[3]), found.found.choices, strict=False):
         rows = [(d, each) for d, each in sorted(choice.by_distance.items()) if each.mean_deg is not None and d > 0]
         if not rows or choice.best is None:

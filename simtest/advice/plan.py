@@ -144,11 +144,8 @@ def main_experiment(question: Question) -> Experiment:
     """Return the experiment whose results are the expected errors; its name is that of its file."""
     told = seen_through(question)
     if question.mesh is None:
-        around, pool = (
-            wall(question.kind, question.scope.relief, question.view_mm),
-            {"surface.distance_mm": distances_of(question)},
-        )
-        count = question.per_distance
+        around, count = wall(question.kind, question.scope.relief, question.view_mm), question.per_distance
+        pool: dict[str, Any] = {"surface.distance_mm": distances_of(question)}
     else:
         held, drawn = rough(question.kind, question.scope.relief)
         surface = {"type": "anatomy", "path": str(question.mesh.resolve())}

@@ -32,7 +32,7 @@ def advise(
     /,
     *,
     out: Out,
-    organ: Annotated[str, Parameter(help="colon, stomach, liver, gallbladder, or plane: a flat wet phantom.")] = "colon",
+    organ: Annotated[str, Parameter(help="colon, stomach, liver, gallbladder, or plane (a phantom).")] = "colon",
     distances: Annotated[
         tuple[float, ...],
         Parameter(help="Nearest and farthest distance of the wall, mm: 20,60.", converter=_numbers, n_tokens=1),
