@@ -74,6 +74,8 @@ class Question:
         if self.organ not in ORGANS:
             known = ", ".join(ORGANS)
             raise InputError(f"--organ {shown(self.organ)}: unknown; organs: {known}{suggestion(self.organ, ORGANS)}")
+        if self.mesh is not None and not self.mesh.is_file():
+            raise InputError(f"--mesh {shown(self.mesh)}: no such file; must be a mesh, mm: PLY, OBJ, STL or VTK")
         near, far = self.distances_mm
         for value in (near, far):
             check_number("--distances", value, above=0)
