@@ -136,18 +136,28 @@ def write_scene(question: Question, main: Experiment, path: Path) -> Path:
     if question.mesh is not None:
         surface: dict[str, Any] = dict(group.set["surface"])
     else:
-        shipped = load_scene(question.kind.scene).model_dump(mode="json", exclude_unset=True)["surface"]
-        surface = group.set["surface"] if question.kind.smooth or question.scope.relief else shipped
-        if surface.get("type") == "quadric":
-            surface = {**surface, "distance_mm": question.middle_mm}
+        surface = _organ_surface(question, group.set["surface"])
     settings = {**group.set, "surface": surface}
-    # A film has a level only where a relief has valleys.
+    # The colours of the frames that are measured have no vessels.
     settings.pop("reflectance.albedo", None)
     described = load_scene(question.kind.scene, settings)
     tables = described.model_dump(mode="json", exclude_unset=True, exclude_none=True)
     named = {key: value for key, value in tables.items() if isinstance(value, dict)}
     write_atomically(path, lambda part: part.write_text(toml_tables(named), encoding="utf-8"))
     return path
+
+
+def _organ_surface(question: Question, wall: dict[str, Any]) -> dict[str, Any]:
+    """Return the organ's surface, with the relief of the walls that are measured where one is stated."""
+    if question.kind.smooth:
+        return {**wall, "distance_mm": question.middle_mm}
+    surface = load_scene(question.kind.scene).model_dump(mode="json", exclude_unset=True)["surface"]
+    if question.scope.relief is not None:
+        surface.pop("relief", None)
+        surface |= {key: value for key, value in wall.items() if key == "relief"}
+    if surface["type"] == "quadric":
+        surface["distance_mm"] = question.middle_mm
+    return dict(surface)
 
 
 def _write_picture(path: Path, picture: Pixels) -> None:

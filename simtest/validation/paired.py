@@ -130,7 +130,8 @@ def is_above_zero(differences: Array, settings: Array, frames: Array, certain: N
     mean = float(np.mean(differences))
     if certain.all():
         return mean > 0
-    half = half_width(*(each[~certain] for each in (differences, settings, frames)), total=len(differences))
+    drawn = ~certain
+    half = half_width(differences[drawn], settings[drawn], frames[drawn], len(differences))
     return half is not None and mean - half > 0
 
 

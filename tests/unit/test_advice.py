@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 import simtest
-from simtest.advice.advise import BREAKS, MAIN, RUN, advise
+from simtest.advice.advise import BREAKS, MAIN, RUN, advise, write_scene
 from simtest.advice.break_points import break_experiment, break_points, spot_size
 from simtest.advice.figures import mean_error, read_results
 from simtest.advice.organs import ORGANS, wall
@@ -239,3 +239,27 @@ def test_every_figure_runs_again_and_the_page_prints_how(tmp_path):
     kept = (out / RUN / "results.parquet").stat().st_mtime_ns
     advise(found.question, out)
     assert (out / RUN / "results.parquet").stat().st_mtime_ns == kept
+
+
+@pytest.mark.parametrize("organ", ORGANS)
+@pytest.mark.parametrize("relief", ["", "[relief]\nslope_deg = 0.0\n", "[relief]\nslope_deg = 2.0\n"])
+def test_the_picture_has_a_sound_scene_for_each_organ_and_relief(tmp_path, organ, relief):
+    question = Question(read_scope(written(tmp_path, CAMERA + relief)), organ)
+    scene = simtest.load_scene(write_scene(question, main_experiment(question), tmp_path / "scene.toml"))
+    smooth = relief.endswith("= 0.0\n") or (organ == "plane" and not relief)
+    assert (scene.surface.relief is None) == smooth
+    assert (scene.camera.width, scene.camera.height) == (96, 72)
+    assert scene.sensor.preset == ORGANS[organ].sensor
+
+
+def test_a_mesh_takes_the_place_of_the_wall(tmp_path):
+    mesh = tmp_path / "organ.ply"
+    mesh.write_bytes(b"")
+    question = Question(read_scope("laparoscope"), "liver", (40.0, 80.0), mesh, frames=16)
+    read = write_experiment(main_experiment(question), tmp_path / MAIN)
+    (group,) = read.groups
+    assert group.set["surface"]["path"] == str(mesh)
+    assert len(group.pool[0]["surface.viewpoint"]) == 16
+    assert "surface.tilt_deg" not in group.random
+    scene = simtest.load_scene(write_scene(question, read, tmp_path / "scene.toml"))
+    assert scene.surface.type == "anatomy"
