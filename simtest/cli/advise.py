@@ -35,7 +35,10 @@ def advise(
     organ: Annotated[str, Parameter(help="colon, stomach, liver, gallbladder, or plane (a phantom).")] = "colon",
     distances: Annotated[
         tuple[float, ...],
-        Parameter(help="Nearest and farthest distance of the wall, mm: 20,60.", converter=_numbers, n_tokens=1),
+        Parameter(
+            help="Nearest and farthest distance of the wall, mm: 20,60.",
+            converter=_numbers, n_tokens=1, allow_leading_hyphen=True,
+        ),
     ] = (20.0, 60.0),
     mesh: Annotated[
         Path | None,
@@ -51,7 +54,7 @@ def advise(
         list[tuple[float, ...]] | None,
         Parameter(
             name="--light", negative="", help="Position x,y,z of a light, camera frame, mm; may be repeated.",
-            converter=_positions, n_tokens=1,
+            converter=_positions, n_tokens=1, allow_leading_hyphen=True,
         ),
     ] = None,
     bound: Annotated[float, Parameter(help="Error beyond which a method counts as broken, deg.")] = 5.0,
