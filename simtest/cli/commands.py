@@ -24,6 +24,7 @@ COMMANDS = {
     "view": "Show a scene in 3D: curvature, camera, lights, true and estimated normals.",
     "export": "Write a scene as files that Mitsuba itself loads.",
     "reconstruct": "Reconstruct the normals at the specularities of a picture, a folder or a video.",
+    "twin": "Render twins of a picture's highlights, and measure the error at each.",
     "realism": "Measure how far generated frames are from real ones.",
     "fit": "Fit the ranges of a dataset recipe to real frames.",
     "core": "Check a reconstruction core that runs as a command of its own.",

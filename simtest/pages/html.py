@@ -16,7 +16,15 @@ TEMPLATES = [
     _PACKAGE / "pages" / "templates",
     *(
         _PACKAGE / room
-        for room in ("report", "realism", "reconstruction", "nightly/page", "bench", "dataset/scoring/dense")
+        for room in (
+            "report",
+            "realism",
+            "reconstruction",
+            "nightly/page",
+            "bench",
+            "dataset/scoring/dense",
+            "advice/twin",
+        )
     ),
 ]
 
