@@ -43,7 +43,7 @@ SEED = 7703
 
 FRAMES, TWIN_FRAMES, PER_FRAME = 12, 16, 40
 
-RANGES_MM = (Uniform(8.0, 60.0), Uniform(8.0, 80.0), Uniform(30.0, 150.0), Uniform(30.0, 80.0))
+RANGES_MM = (Uniform(8.0, 80.0), Uniform(8.0, 80.0), Uniform(30.0, 150.0), Uniform(30.0, 80.0))
 """Working range that a user would tell, by family: colonoscope in a colon, in a stomach, laparoscope at liver and
 gallbladder."""
 
@@ -198,11 +198,13 @@ def _rows(index: int, session: Session, view: RenderedView, family: int, twin_fr
 def _row(index: int, family: int, each: SpotTwins, truth: ScoredSpot) -> Row:
     twins, nothing = each.twins, float("nan")
     return {
-        "frame": index, "family": family, "radius": each.spot.radius_px, "near": float(truth.kind == "near_miss"), "false": float(truth.kind == "false"),
+        "frame": index, "family": family, "radius": each.spot.radius_px,
+        "near": float(truth.kind == "near_miss"), "false": float(truth.kind == "false"),
         "error": truth.error_deg, "base_error": truth.base_error_deg,
         "held": nothing if truth.held is None else float(truth.held),
         "stated": nothing if each.stated_deg is None else each.stated_deg,
-        "twin_rms": twins.rms_deg, "twin_base": twins.base_rms_deg, "twin_near": twins.near_misses, "twin_false": twins.false,
+        "twin_rms": twins.rms_deg, "twin_base": twins.base_rms_deg, "twin_near": twins.near_misses,
+        "twin_false": twins.false,
         "twin_glint": twins.glint_rms_deg, "twin_near_rms": twins.near_rms_deg,
         "coverage": nothing if twins.coverage is None else twins.coverage, "unlikeness": twins.unlikeness,
     }  # fmt: skip

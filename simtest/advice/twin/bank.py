@@ -90,12 +90,14 @@ def make_bank(
     # Frames of one patch come one after the other, since its kernels and its mesh then stay.
     used = min(len(pool), max(count // FRAMES_PER_PATCH, 1))
     order = (np.sort(np.arange(count) % used) + seed) % len(pool)
+    # Even shares of the distances, in any order.
+    shares = (from_integer(seed).permutation(count) + 0.5) / count
     session, at = None, -1
     for number, patch in enumerate(order.tolist()):
         if patch != at:
             session, at = None, patch
         rng = from_integer(seed * 100_003 + number)
-        scene = draws.draw(rng, pool[patch], pixels)
+        scene = draws.draw(rng, pool[patch], pixels, float(shares[number]))
         if scene is not None:
             try:
                 with warnings.catch_warnings():

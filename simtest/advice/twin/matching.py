@@ -1,7 +1,8 @@
 """Weighs the highlights of a bank by their likeness to a real one, and measures error and coverage of those alike.
 
-A real highlight's twins are the bank's highlights weighted by a Gaussian kernel over their features (`FEATURES`). The
-kernel is as narrow as leaves `TWINS` effective ones: the weights' squared sum over the sum of their squares.
+A real highlight's twins are the bank's highlights weighted by a Gaussian kernel over their features (`FEATURES`), over
+the number of highlights in their frame: a frame is one draw of distance, lights and relief, and what its number of
+highlights tells is among the features. The kernel is as narrow as leaves `TWINS` effective ones: the weights' squared sum over the sum of their squares.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from simtest.runtime.seeds import from_integer
 TWINS = 40.0
 """Effective number of twins of a highlight."""
 
-SCALES = dict(zip(FEATURES, (0.15, 0.15, 0.4, 0.3, 0.3, 0.4, 0.03, 0.3), strict=True))
+SCALES = dict(zip(FEATURES, (0.15, 0.15, 0.4, 0.3, 0.3, 0.4, 0.03, 0.3, 0.15, 0.25), strict=True))
 """How much of each feature is one unit of unlikeness."""
 
 OTHER_ESTIMATOR = 4.0
@@ -93,6 +94,8 @@ class Matcher:
 
     def __init__(self, spots: Sequence[tuple[int, ScoredSpot]]) -> None:
         self._frames = np.array([frame for frame, _ in spots])
+        # Each frame is one draw of what was not told, however many highlights it shows.
+        self._shares = 1 / np.bincount(self._frames)[self._frames]
         held = [spot.held for _, spot in spots]
         self._features = np.array([spot.spot.features for _, spot in spots])
         self._estimators = np.array([spot.spot.estimator for _, spot in spots])
@@ -106,9 +109,9 @@ class Matcher:
     def find(self, spot: Spot) -> Twins:
         """Measure the twins of a highlight."""
         squared = self._unlikeness(spot)
-        whole = _weights(squared, TWINS)
+        whole = _weights(squared, self._shares, TWINS)
         # A false detection has no normal that is its own.
-        weights = whole * self._real
+        weights = _weights(np.where(self._real, squared, np.inf), self._shares, TWINS)
         near, glint = weights * self._near, weights * ~self._near
         stated = weights * self._stated
         return Twins(
@@ -118,12 +121,12 @@ class Matcher:
             base_interval_deg=self._interval(weights, self._base_errors),
             coverage=float(stated @ self._held / stated.sum()) if stated.sum() > 0 else None,
             near_misses=float(near.sum() / weights.sum()),
-            false=1 - float(weights.sum() / whole.sum()),
+            false=float(whole @ ~self._real / whole.sum()),
             glint_rms_deg=_rms(glint, self._errors),
             near_rms_deg=_rms(near, self._errors),
             p95_deg=_quantile(weights, self._errors, 0.95),
             effective=float(weights.sum() ** 2 / np.square(weights).sum()),
-            unlikeness=float(np.sqrt(whole @ squared / whole.sum())),
+            unlikeness=float(np.sqrt(weights @ np.where(self._real, squared, 0.0) / weights.sum())),
             best=np.argsort(np.where(self._real, squared, np.inf), kind="stable")[:12],
         )
 
@@ -149,19 +152,19 @@ class Matcher:
         return float(low), float(high)
 
 
-def _weights(squared: Array, wanted: float) -> Array:
-    """Return Gaussian weights of squared distances, as narrow as leaves an effective number, shape (N,)."""
+def _weights(squared: Array, shares: Array, wanted: float) -> Array:
+    """Return shares times Gaussian weights of squared distances, as narrow as leaves an effective number, shape (N,)."""
     low, high = 1e-3, WIDEST
     shifted = squared - squared.min()
     # Bisection in the logarithm of the width: a wider kernel holds more.
     for _ in range(50):
         width = float(np.sqrt(low * high))
-        weights = np.exp(-shifted / (2 * width**2))
+        weights = shares * np.exp(-shifted / (2 * width**2))
         if weights.sum() ** 2 / np.square(weights).sum() < wanted:
             low = width
         else:
             high = width
-    return np.asarray(np.exp(-shifted / (2 * high**2)))
+    return np.asarray(shares * np.exp(-shifted / (2 * high**2)))
 
 
 def _rms(weights: Array, errors: Array) -> float:

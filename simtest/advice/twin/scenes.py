@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from simtest.advice.twin.patches import TissuePatch, look_at
-from simtest.calibration import Calibration, CameraPrior, Distribution
+from simtest.calibration import Calibration, CameraPrior, Distribution, LogUniform, Uniform
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.geometry.angular_profile import AngularProfile
@@ -87,8 +87,10 @@ class SceneDraws:
         self._calibration, self._look = calibration, look
         self._base = read_toml(find(look.organ, "scenes"))
 
-    def draw(self, rng: np.random.Generator, patch: TissuePatch, pixels: Array) -> Scene | None:
+    def draw(self, rng: np.random.Generator, patch: TissuePatch, pixels: Array, share: float) -> Scene | None:
         """Draw a scene that shows a patch at one of some pixels, shape (N, 2), px.
+
+        `share`, in (0, 1), is the quantile of its distance, so that the distances of a bank are even.
 
         Returns
         -------
@@ -99,7 +101,7 @@ class SceneDraws:
         for _ in range(TRIES):
             pixel = pixels[int(rng.integers(len(pixels)))]
             sightline = self._calibration.camera.unproject(pixel)
-            distance = _drawn(priors.distance, rng)
+            distance = _distance(priors.distance, share)
             moved = look_at(patch, rng, sightline, distance) if np.isfinite(sightline).all() else None
             if moved is None:
                 continue
@@ -183,6 +185,16 @@ def _profile(profile: AngularProfile) -> dict[str, Any]:
     if profile.angles:
         return {"type": "table", "angle_deg": np.degrees(profile.angles).tolist(), "value": list(profile.values)}
     return {"type": "cosine", "power": profile.power}
+
+
+def _distance(prior: Distribution, share: float) -> float:
+    """Return the distance below which a share of the draws lies, mm.
+
+    Of a range the ends alone are known, and errors go with 1 / distance: it is drawn evenly in the logarithm.
+    """
+    if isinstance(prior, Uniform) and prior.low > 0:
+        prior = LogUniform(prior.low, prior.high)
+    return float(prior.quantile(np.array(share)))
 
 
 def _drawn(prior: Distribution, rng: np.random.Generator) -> float:

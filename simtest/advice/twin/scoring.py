@@ -24,6 +24,8 @@ from simtest.validation.metrics import mahalanobis2
 NEIGHBOUR = 3
 """How crowded the surroundings are: the distance to this neighbour."""
 
+LEAST_RADIUS_PX = 0.3
+
 ALONE_PX = 500.0
 """Distance of neighbours that a frame does not have."""
 
@@ -99,10 +101,14 @@ class ScoredSpot:
         return self.kind == "near_miss"
 
 
-FEATURES = ("radius", "axis_ratio", "peak", "clipped", "own_deviation", "crowding", "residual", "off_axis")
+FEATURES = (
+    "radius", "axis_ratio", "peak", "clipped", "own_deviation", "crowding", "residual", "off_axis", "frame_radius",
+    "frame_crowding",
+)  # fmt: skip
 """Names of the features of a spot. radius, peak, own_deviation and crowding are natural logarithms: of the radius at
 half height, px; of the specular peak over full scale; of the deviation by the highlight's own parts of the budget, deg;
-of the distance to the third neighbour, px. off_axis is the sightline's angle from the optical axis, rad."""
+of the distance to the third neighbour, px. off_axis is the sightline's angle from the optical axis, rad. The last two
+are the frame's medians of radius and crowding: together its highlights tell more of the distance than one does."""
 
 
 def usable_spots(made: Reconstruction) -> list[Spot]:
@@ -116,11 +122,14 @@ def usable_spots(made: Reconstruction) -> list[Spot]:
         if best is not None and isinstance(estimate, Estimate) and estimate.cloud is None:
             chosen.append((index, specularity, highlight, best, estimate))
     peaks = np.array([peak_px(each[1]) for each in chosen]).reshape(-1, 2)
+    radii = [_radius_px(specularity, highlight) for _, specularity, highlight, *_ in chosen]
+    crowding = [_crowding_px(peaks, number) for number in range(len(chosen))]
+    of_frame = np.median(np.log(np.maximum([radii, crowding], LEAST_RADIUS_PX)), axis=1) if chosen else np.empty(2)
     spots = []
     for number, (index, specularity, highlight, best, estimate) in enumerate(chosen):
-        radius = _radius_px(specularity, highlight)
-        features = _features(radius, specularity, highlight, estimate, peaks, number)
-        spots.append(Spot(index, peaks[number], radius, best, estimate, features))
+        own = _features(radii[number], crowding[number], specularity, highlight, estimate)
+        features = np.concatenate([own, of_frame])
+        spots.append(Spot(index, peaks[number], radii[number], best, estimate, features))
     return spots
 
 
@@ -181,19 +190,19 @@ def _radius_px(specularity: Specularity, highlight: Highlight | None) -> float:
 
 
 def _features(
-    radius: float, specularity: Specularity, highlight: Highlight | None, estimate: Estimate, peaks: Array, number: int
+    radius: float, crowding: float, specularity: Specularity, highlight: Highlight | None, estimate: Estimate
 ) -> Array:
-    """Return the features of a spot, shape (F,); NaN where it does not show one."""
+    """Return the features of a spot but for those of its frame; NaN where it does not show one."""
     ratio = estimate.axis_ratio if highlight is None else highlight.axis_ratio
     peak = specularity.region.contrast
     residual = None if highlight is None else highlight.residual
     values: Sequence[float | None] = (
-        math.log(max(radius, 0.3)),
+        math.log(max(radius, LEAST_RADIUS_PX)),
         ratio,
         None if not peak or peak <= 0 else math.log(peak),
         0.0 if highlight is None else highlight.clipped,
         math.log(own_deviation_deg(estimate)),
-        math.log(_crowding_px(peaks, number)),
+        math.log(crowding),
         residual,
         math.acos(float(np.clip(-estimate.normal[2], -1, 1))),
     )

@@ -14,8 +14,8 @@ FILES = ("twin.json", "twin.csv", "index.html")
 
 COLUMNS = (
     "specularity", "x_px", "y_px", "radius_px", "estimator", "stated_deg", "twin_rms_deg", "twin_low_deg",
-    "twin_high_deg", "twin_p95_deg", "coverage", "near_misses", "false", "glint_rms_deg", "near_rms_deg", "base_rms_deg",
-    "base_low_deg", "base_high_deg", "twins", "unlikeness", "covered",
+    "twin_high_deg", "twin_p95_deg", "coverage", "near_misses", "false", "glint_rms_deg", "near_rms_deg",
+    "base_rms_deg", "base_low_deg", "base_high_deg", "twins", "unlikeness", "covered",
 )  # fmt: skip
 
 
@@ -101,7 +101,7 @@ def _row(each: SpotTwins) -> tuple[object, ...]:
     x, y = spot.peak_px.tolist()
     return (
         spot.index, round(x, 3), round(y, 3), spot.radius_px, spot.estimator, each.stated_deg, twins.rms_deg,
-        *twins.interval_deg, twins.p95_deg, twins.coverage, twins.near_misses, twins.false, _finite(twins.glint_rms_deg),
-        _finite(twins.near_rms_deg), twins.base_rms_deg, *twins.base_interval_deg, twins.effective, twins.unlikeness,
-        int(twins.is_covered),
+        *twins.interval_deg, twins.p95_deg, twins.coverage, twins.near_misses, twins.false,
+        _finite(twins.glint_rms_deg), _finite(twins.near_rms_deg), twins.base_rms_deg, *twins.base_interval_deg,
+        twins.effective, twins.unlikeness, int(twins.is_covered),
     )  # fmt: skip
