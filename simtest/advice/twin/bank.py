@@ -93,16 +93,18 @@ def make_bank(
     # Even shares of the distances, in any order.
     shares = (from_integer(seed).permutation(count) + 0.5) / count
     session, at = None, -1
-    for number, patch in enumerate(order.tolist()):
-        if patch != at:
-            session, at = None, patch
+    for number, first in enumerate(order.tolist()):
         rng = from_integer(seed * 100_003 + number)
-        scene = draws.draw(rng, pool[patch], pixels, float(shares[number]))
+        # A patch that bends around a camera so far away has no view: another one then.
+        tried = ((first + step) % len(pool) for step in range(len(pool)))
+        drawn = ((patch, draws.draw(rng, pool[patch], pixels, float(shares[number]))) for patch in tried)
+        patch, scene = next(((patch, scene) for patch, scene in drawn if scene is not None), (at, None))
         if scene is not None:
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
-                    session = session or Session(scene, COLOUR)
+                    session = session if session is not None and patch == at else Session(scene, COLOUR)
+                    at = patch
                     view = render_view(session, scene)
                     made.append(_scored_frame(session, view, reconstructs, seen, grey))
             except SimtestError:

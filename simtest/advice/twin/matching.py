@@ -2,7 +2,8 @@
 
 A real highlight's twins are the bank's highlights weighted by a Gaussian kernel over their features (`FEATURES`), over
 the number of highlights in their frame: a frame is one draw of distance, lights and relief, and what its number of
-highlights tells is among the features. The kernel is as narrow as leaves `TWINS` effective ones: the weights' squared sum over the sum of their squares.
+highlights tells is among the features. The kernel is as narrow as leaves `TWINS` effective ones: the weights' squared
+sum over the sum of their squares.
 """
 
 from collections.abc import Sequence
@@ -153,7 +154,7 @@ class Matcher:
 
 
 def _weights(squared: Array, shares: Array, wanted: float) -> Array:
-    """Return shares times Gaussian weights of squared distances, as narrow as leaves an effective number, shape (N,)."""
+    """Return shares times Gaussian weights of squared distances, shape (N,): as narrow as leaves an effective number."""
     low, high = 1e-3, WIDEST
     shifted = squared - squared.min()
     # Bisection in the logarithm of the width: a wider kernel holds more.

@@ -32,7 +32,7 @@ MEAN_LEVELS = (0.1, 0.8)
 SAMPLES = 4
 """Rays of a pixel."""
 
-TRIES = 30
+TRIES = 10
 """Draws of a view before a frame is given up."""
 
 
