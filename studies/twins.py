@@ -3,31 +3,34 @@
     python -m studies.twins [FRAMES] [TWIN_FRAMES] [ROWS.json]
 
 Frames are those of the recipe `endoscopy` with a seed of this study alone: colon, stomach, liver and gallbladder
-through three camera chains. What crosses to the twins is the picture in 8 bits and what a user would tell: the camera,
-the rig's nominal light positions, and the organ's working range. A highlight is scored by the harness's own matching:
-against the fine normal at the matched highlight point (a glint), or at the point that the estimate looks at where no
-lit highlight point lies inside its isophote but the noise-free frame shows a highlight (a near miss). Detections that
-show no highlight are counted, and stand in no error. At most `PER_FRAME` highlights of a frame count, drawn at random,
-so that no frame rules. ROWS.json is written after each frame.
+through three camera chains. What crosses to the twins is the picture in 8 bits and what a user would tell of the scope:
+the camera, the rig's nominal light positions, and a working range. The frames of one scope share a bank, whose frames
+take turns with the pictures; `simtest twin` makes one for its picture alone.
+
+A highlight is scored by the harness's own matching: against the fine normal at the matched highlight point (a glint),
+or at the point that the estimate looks at where no lit highlight point lies inside its isophote but the noise-free
+frame shows a highlight (a near miss). Detections that show no highlight are counted, and stand in no error. At most
+`PER_FRAME` highlights of a frame count, drawn at random, so that no frame rules.
 """
 
 import json
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.measuring import print_markdown
-from simtest.advice.twin.bank import all_spots, make_bank
+from simtest.advice.twin.bank import Subject, all_spots, make_bank
 from simtest.advice.twin.matching import RESAMPLED
 from simtest.advice.twin.run import SpotTwins, match_spots
 from simtest.advice.twin.scenes import SceneDraws, look_of
 from simtest.advice.twin.scoring import ScoredSpot, score, usable_spots
 from simtest.calibration import Calibration, Priors, Uniform
 from simtest.dataset.plan import Plan
-from simtest.errors import InputError, SimtestError
+from simtest.errors import SimtestError
 from simtest.geometry import Camera
 from simtest.reconstruction.choices import complete
 from simtest.reconstruction.found import Reconstruction
@@ -41,11 +44,16 @@ from simtest.spec.dataset_recipe import load_dataset
 SEED = 7703
 """Of the frames; nothing was tuned on them."""
 
-FRAMES, TWIN_FRAMES, PER_FRAME = 12, 16, 40
+FRAMES, TWIN_FRAMES, PER_FRAME = 12, 24, 40
 
-RANGES_MM = (Uniform(8.0, 80.0), Uniform(8.0, 80.0), Uniform(30.0, 150.0), Uniform(30.0, 80.0))
-"""Working range that a user would tell, by family: colonoscope in a colon, in a stomach, laparoscope at liver and
-gallbladder."""
+FEWER = {"colonoscope": 1, "laparoscope": 2}
+"""Twin frames are divided by this: with eight lights a frame takes several times as long."""
+
+SCOPES = {"colonoscope": (0, 1), "laparoscope": (2, 3)}
+"""Families of the recipe by scope: colon and stomach, liver and gallbladder."""
+
+RANGES_MM = {"colonoscope": Uniform(8.0, 80.0), "laparoscope": Uniform(30.0, 150.0)}
+"""Working range that a user would tell."""
 
 TRIES, COLOUR = 4, "llvm_ad_rgb"
 
@@ -61,9 +69,9 @@ def main(arguments: Sequence[str]) -> int:
         int(arguments[i]) if len(arguments) > i else default for i, default in ((0, FRAMES), (1, TWIN_FRAMES))
     )
     rows: list[Row] = []
-    for number, own in enumerate(_frames(frames, twin_frames)):
-        rows += own
-        print(f"frame {number}: {len(own)} highlights, {len(rows)} so far", file=sys.stderr, flush=True)
+    pictures = _pictures(frames)
+    for scope in SCOPES:
+        rows += _rows([each for each in pictures if each.scope == scope], scope, twin_frames)
         if len(arguments) > 2:
             Path(arguments[2]).write_text(json.dumps(rows), encoding="ascii")
     return report(rows)
@@ -137,14 +145,33 @@ def _weighted_rms(values: Array, weights: Array) -> float:
 # Frames ---------------------------------------------------------------------------------------------------------------
 
 
-def _frames(count: int, twin_frames: int) -> Iterator[list[Row]]:
-    """Yield the rows of each frame."""
+@dataclass(frozen=True)
+class Scored:
+    """A frame that is taken as real: its number, scope and picture, what a user tells, and the truth for later."""
+
+    number: int
+    scope: str
+    picture: Image
+    told: Calibration
+    truth: Sequence[ScoredSpot]
+
+
+def _pictures(count: int) -> list[Scored]:
+    """Render the frames, and score their highlights."""
     update = {"seed": SEED, "samples": count, "samples_per_anatomy": 1}
-    plan = Plan(load_dataset("endoscopy").model_copy(update=update))
-    for index in range(count):
-        made = _rendered(plan, index)
-        if made is not None:
-            yield _rows(index, *made, twin_frames)
+    plan, pictures = Plan(load_dataset("endoscopy").model_copy(update=update)), []
+    for number in range(count):
+        made = _rendered(plan, number)
+        if made is None:
+            continue
+        session, view, family = made
+        scope = next(name for name, families in SCOPES.items() if family in families)
+        picture = np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
+        calibration = told(view, scope)
+        truth = score(session, view, run_picture(picture, calibration)[0])
+        print(f"frame {number}, {view.scene.name}: {len(truth)} usable highlights", file=sys.stderr, flush=True)
+        pictures.append(Scored(number, scope, picture, calibration, truth))
+    return pictures
 
 
 def _rendered(plan: Plan, index: int) -> tuple[Session, RenderedView, int] | None:
@@ -161,44 +188,48 @@ def _rendered(plan: Plan, index: int) -> tuple[Session, RenderedView, int] | Non
     return None
 
 
-def told(view: RenderedView, family: int) -> Calibration:
+def told(view: RenderedView, scope: str) -> Calibration:
     """Return what a user would tell of a frame's camera."""
     camera, lights = view.calibration.camera, view.calibration.priors.lights_mm
     plain = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    return Calibration(plain, priors=Priors(lights_mm=lights, distance_mm=RANGES_MM[family]))
+    return Calibration(plain, priors=Priors(lights_mm=lights, distance_mm=RANGES_MM[scope]))
 
 
-def _rows(index: int, session: Session, view: RenderedView, family: int, twin_frames: int) -> list[Row]:
-    """Return the rows of a frame: the truth of its highlights beside what their twins measure."""
-    # Only this picture and `told` cross to the twins.
-    picture = np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
-    calibration = told(view, family)
+def _rows(pictures: Sequence[Scored], scope: str, twin_frames: int) -> list[Row]:
+    """Return the rows of a scope's frames: the truth of their highlights beside what their twins measure."""
+    found = [each for each in pictures if each.truth]
+    if not found:
+        return []
+    calibration, count = found[0].told, max(twin_frames // FEWER[scope], 1)
 
     def reconstructs(values: Image) -> Reconstruction:
         return run_picture(values, calibration)[0]
 
-    made = reconstructs(picture)
-    spots, truth = usable_spots(made), {each.spot.index: each for each in score(session, view, made)}
-    if not truth:
-        return []
+    def say(done: int, total: int, what: str) -> None:
+        print(f"{scope}: {what}, {done} of {total}", file=sys.stderr, flush=True)
+
+    # Only pictures and what was told cross to the twins.
+    bank = make_bank([_subject(each) for each in found], reconstructs, count, SEED, say)
+    rows = []
+    for each in found:
+        chosen = from_integer(SEED + each.number).permutation(len(each.truth))[:PER_FRAME].tolist()
+        twins = match_spots([each.truth[i].spot for i in chosen], all_spots(bank), scope, count)
+        rows += [_row(each.number, found_twins, each.truth[i]) for found_twins, i in zip(twins, chosen, strict=True)]
+    return rows
+
+
+def _subject(each: Scored) -> Subject:
+    """Return what the bank is told of a picture; its highlights are detected anew."""
+    made = run_picture(each.picture, each.told)[0]
+    peaks = np.array([spot.peak_px for spot in usable_spots(made)])
     seen = made.detection.view.seen
-    draws = SceneDraws(complete(calibration, None), look_of(picture, seen))
-    peaks = np.array([spot.peak_px for spot in spots])
-    bank = make_bank(draws, reconstructs, peaks, seen, False, twin_frames, seed=index)
-    scored = [spot for spot in spots if spot.index in truth]
-    order = from_integer(SEED + index).permutation(len(scored))[:PER_FRAME]
-    try:
-        twins = match_spots([scored[i] for i in order], all_spots(bank), f"frame {index}", twin_frames)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return []
-    return [_row(index, family, each, truth[each.spot.index]) for each in twins]
+    return Subject(SceneDraws(complete(each.told, None), look_of(each.picture, seen)), peaks, seen)
 
 
-def _row(index: int, family: int, each: SpotTwins, truth: ScoredSpot) -> Row:
+def _row(frame: int, each: SpotTwins, truth: ScoredSpot) -> Row:
     twins, nothing = each.twins, float("nan")
     return {
-        "frame": index, "family": family, "radius": each.spot.radius_px,
+        "frame": frame, "radius": each.spot.radius_px,
         "near": float(truth.kind == "near_miss"), "false": float(truth.kind == "false"),
         "error": truth.error_deg, "base_error": truth.base_error_deg,
         "held": nothing if truth.held is None else float(truth.held),

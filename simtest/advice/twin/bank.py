@@ -54,12 +54,31 @@ def frames_for(pixels: int) -> int:
     return int(np.clip(FRAMES * USUAL_PX / max(pixels, 1), FEWEST_FRAMES, FRAMES))
 
 
+@dataclass(frozen=True)
+class Subject:
+    """A real picture that a bank is rendered for.
+
+    Parameters
+    ----------
+    draws : SceneDraws
+        Draws the scenes.
+    pixels : ndarray, shape (N, 2)
+        Peaks of its highlights, px: the patches stand where they are.
+    seen : ndarray of bool, shape (H, W), optional
+        Pixels of its view; twins are black outside of it too.
+    grey : bool
+        Whether it has no colours: twins are their luma then.
+    """
+
+    draws: SceneDraws
+    pixels: Array
+    seen: Mask | None = None
+    grey: bool = False
+
+
 def make_bank(
-    draws: SceneDraws,
+    subjects: Sequence[Subject],
     reconstructs: Reconstructs,
-    pixels: Array,
-    seen: Mask | None,
-    grey: bool,
     count: int,
     seed: int = 0,
     progress: Progress | None = None,
@@ -68,16 +87,10 @@ def make_bank(
 
     Parameters
     ----------
-    draws : SceneDraws
-        Draws the scenes.
+    subjects : sequence of Subject
+        The real picture, or several of one camera and rig, which take turns.
     reconstructs : Callable
-        The same reconstruction as the real picture's.
-    pixels : ndarray, shape (N, 2)
-        Peaks of the real highlights, px: the patches stand where they are.
-    seen : ndarray of bool, shape (H, W), optional
-        Pixels of the real picture's view; twins are black outside of it too.
-    grey : bool
-        Whether the real picture has no colours: twins are their luma then.
+        The same reconstruction as theirs.
     count : int
         Frames.
     seed : int
@@ -94,10 +107,11 @@ def make_bank(
     shares = (from_integer(seed).permutation(count) + 0.5) / count
     session, at = None, -1
     for number, first in enumerate(order.tolist()):
-        rng = from_integer(seed * 100_003 + number)
+        rng, subject = from_integer(seed * 100_003 + number), subjects[number % len(subjects)]
         # A patch that bends around a camera so far away has no view: another one then.
         tried = ((first + step) % len(pool) for step in range(len(pool)))
-        drawn = ((patch, draws.draw(rng, pool[patch], pixels, float(shares[number]))) for patch in tried)
+        share = float(shares[number])
+        drawn = ((patch, subject.draws.draw(rng, pool[patch], subject.pixels, share)) for patch in tried)
         patch, scene = next(((patch, scene) for patch, scene in drawn if scene is not None), (at, None))
         if scene is not None:
             try:
@@ -106,7 +120,7 @@ def make_bank(
                     session = session if session is not None and patch == at else Session(scene, COLOUR)
                     at = patch
                     view = render_view(session, scene)
-                    made.append(_scored_frame(session, view, reconstructs, seen, grey))
+                    made.append(_scored_frame(session, view, reconstructs, subject))
             except SimtestError:
                 # Such as a camera or a light that a drawn view puts inside the tissue: it gives no frame.
                 session = None
@@ -115,14 +129,12 @@ def make_bank(
     return made
 
 
-def _scored_frame(
-    session: Session, view: RenderedView, reconstructs: Reconstructs, seen: Mask | None, grey: bool
-) -> BankFrame:
+def _scored_frame(session: Session, view: RenderedView, reconstructs: Reconstructs, subject: Subject) -> BankFrame:
     """Take one picture of a rendered view, reconstruct and score it."""
     picture = view.frame(view.scene.sensor.seed)
-    if grey:
+    if subject.grey:
         picture = luma(picture)
-    if seen is not None:
+    if (seen := subject.seen) is not None:
         picture = np.where(seen if picture.ndim == 2 else seen[..., None], picture, np.float32(0))
     spots = score(session, view, reconstructs(picture))
     return BankFrame(np.asarray(np.rint(255 * np.clip(picture, 0, 1)), dtype=np.uint8), spots)

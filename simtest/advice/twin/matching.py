@@ -154,7 +154,7 @@ class Matcher:
 
 
 def _weights(squared: Array, shares: Array, wanted: float) -> Array:
-    """Return shares times Gaussian weights of squared distances, shape (N,): as narrow as leaves an effective number."""
+    """Return shares times Gaussian weights of squared distances, shape (N,), as narrow as leave an effective number."""
     low, high = 1e-3, WIDEST
     shifted = squared - squared.min()
     # Bisection in the logarithm of the width: a wider kernel holds more.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from simtest.advice.twin.bank import BankFrame, Progress, all_spots, frames_for, make_bank
+from simtest.advice.twin.bank import BankFrame, Progress, Subject, all_spots, frames_for, make_bank
 from simtest.advice.twin.matching import Matcher, Twins
 from simtest.advice.twin.scenes import Look, SceneDraws, look_of
 from simtest.advice.twin.scoring import ScoredSpot, Spot, SpotKind, usable_spots
@@ -172,7 +172,8 @@ def twins_of(
     look = look_of(picture, view.seen)
     peaks: Array = np.array([spot.peak_px for spot in spots])
     count = frames_for(picture.shape[0] * picture.shape[1]) if frames is None else frames
-    bank = make_bank(SceneDraws(known, look), reconstructs, peaks, view.seen, picture.ndim == 2, count, seed, progress)
+    subject = Subject(SceneDraws(known, look), peaks, view.seen, picture.ndim == 2)
+    bank = make_bank([subject], reconstructs, count, seed, progress)
     matched = match_spots(spots, all_spots(bank), name, count)
     return matched, bank, look, [*choices.assumed, *DRAWN]
 
