@@ -33,8 +33,8 @@ WIDEST = 64.0
 RESAMPLED, BOUNDS = 400, (0.025, 0.975)
 """Bootstrap samples of the bank's frames for an interval, and the shares that it leaves out."""
 
-UNLIKE = 3.0
-"""Mean unlikeness of twins above which they are called so: outside of what the bank covers."""
+UNLIKE = 2.0
+"""Unlikeness of twins above which they are called so: outside of what the bank covers."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Twins:
     effective : float
         Effective number of twins.
     unlikeness : float
-        Their weighted mean unlikeness, in units of `SCALES`.
+        Root mean square over twins and features of how far they are from the highlight, in units of `SCALES`.
     best : ndarray of int
         The likest in the bank, the first first.
     """
@@ -127,7 +127,7 @@ class Matcher:
             near_rms_deg=_rms(near, self._errors),
             p95_deg=_quantile(weights, self._errors, 0.95),
             effective=float(weights.sum() ** 2 / np.square(weights).sum()),
-            unlikeness=float(np.sqrt(weights @ np.where(self._real, squared, 0.0) / weights.sum())),
+            unlikeness=float(np.sqrt(weights @ np.where(self._real, squared, 0.0) / weights.sum() / len(FEATURES))),
             best=np.argsort(np.where(self._real, squared, np.inf), kind="stable")[:12],
         )
 
