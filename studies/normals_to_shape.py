@@ -19,7 +19,9 @@ import cv2
 import numpy as np
 
 from benchmarks.measuring import print_markdown
+from simtest.calibration import Calibration
 from simtest.errors import Failure
+from simtest.estimators.protocol import Target
 from simtest.estimators.shading_maps import shading_maps
 from simtest.geometry import Camera
 from simtest.reconstruction.completion import CoarseError, complete
@@ -105,6 +107,7 @@ def load_view(session: Session | None, scene: Scene, seed: int) -> tuple[View, S
     sources = {
         "fine": _measured(picture, view.calibration, "fine"),
         "base": _measured(picture, view.calibration, "base"),
+        "cloud": _measured(picture, view.calibration, "base", ["cloud"]),
         "exact": _exact(random, normals),
     }
     return View(camera, camera.unproject(camera.pixel_centres()), normals, maps, sources), session
@@ -124,10 +127,10 @@ def _blur(values: Array, mask: Mask) -> Array:
     return np.asarray(np.where(mask, cv2.GaussianBlur(filled, (0, 0), BLUR_PX) / np.maximum(weight, 1e-9), np.nan))
 
 
-def _measured(image: Array, calibration: object, target: str) -> Normals:
-    """Return the best normal of each highlight that states an uncertainty."""
+def _measured(image: Array, calibration: Calibration, target: Target, names: list[str] | None = None) -> Normals:
+    """Return the best normal of each highlight, by the default estimators or those named, with its covariance."""
     rows = []
-    for spot in reconstruct(image, calibration, None, target=target):  # type: ignore[arg-type]
+    for spot in reconstruct(image, calibration, names, target=target):
         name, _ = best_of(spot.estimates)
         best = None if name is None else spot.estimates[name]
         if best is not None and not isinstance(best, Failure) and best.covariance is not None:
