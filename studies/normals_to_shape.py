@@ -110,6 +110,8 @@ def load_view(session: Session | None, scene: Scene, seed: int) -> tuple[View, S
         "cloud": _measured(picture, view.calibration, "base", ["cloud"]),
         "exact": _exact(random, normals),
     }
+    # Shading has no answer where a frame holds no matt pixel.
+    maps = {kind: held for kind, held in maps.items() if np.isfinite(held).any()}
     return View(camera, camera.unproject(camera.pixel_centres()), normals, maps, sources), session
 
 
