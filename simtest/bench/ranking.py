@@ -5,9 +5,10 @@ another only where three things agree:
 
 1. **The score.** The mean error in which each highlight counts at most `CAP_DEG`, and a refused or missed one counts
    `CAP_DEG`. It is 10 deg times (1 - a), a the area under the recall curve up to 10 deg as a share of the whole, as
-   image matching and pose estimation measure it. Errors beyond the cap are alike in use: the plain reverse of the sightline is that good
-   already, since a light in the scope's tip leaves a highlight's normal within about 10 deg of it. A penalty of 90 deg
-   would rank cores by how many highlights are missed, which is chance where all use the same detector.
+   image matching and pose estimation measure it. Errors beyond the cap are alike in use: the plain reverse of the
+   sightline is that good already, since a light in the scope's tip leaves a highlight's normal within about 10 deg of
+   it. A penalty of 90 deg would rank cores by how many highlights are missed, which is chance where all use the same
+   detector.
 2. **The test.** Both cores saw the same scenes, so the difference is taken scene by scene: what both miss cancels. The
    standard error is that of the difference of two ratio estimators over scenes, with the cases as strata (Cochran 1977,
    sections 2.11, 5.6 and 6.11), and its degrees of freedom are Satterthwaite's. The level is Bonferroni's over all

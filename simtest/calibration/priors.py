@@ -18,6 +18,12 @@ from simtest.runtime.short_repr import short_repr
 
 MAX_LIGHTS = 32
 
+Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+"""Rows of a matrix, shape (3, 3)."""
+
+ROUNDING = 1e-9
+"""Rounding of a covariance that is written in decimals, as a share of its largest entry."""
+
 UNTOLD_OFFSET_MM = Uniform(0.0, 6.0)
 """Distance of a light from the camera across the optical axis, mm, where no rig is told; every azimuth is as likely."""
 
@@ -98,11 +104,13 @@ class Priors:
         Slope of the relief an axis, rad: how far a single highlight may be off the base's normal (theory.md 7.4).
     plane : bool
         Whether the surface is known to be a plane, as `circle_pose` takes it to be.
+    lights_covariance_mm2 : tuple
+        Covariance of each light's position, three rows of three numbers a light, mm^2; empty: the positions are exact.
 
     Raises
     ------
     InputError
-        If a light is no finite position, or a distribution is none or does not lie above 0.
+        If a light is no finite position, a covariance is none, or a distribution is none or does not lie above 0.
     """
 
     lights_mm: tuple[tuple[float, float, float], ...] = ()
@@ -113,6 +121,7 @@ class Priors:
     falloff_power: Distribution | None = UNTOLD_FALLOFF_POWER
     relief_slope: Distribution = UNTOLD_SLOPE_RAD
     plane: bool = False
+    lights_covariance_mm2: tuple[Matrix, ...] = ()
 
     __repr__ = short_repr
 
@@ -121,6 +130,7 @@ class Priors:
             len(light) == 3 and np.isfinite(light).all() for light in self.lights_mm
         ):
             raise InputError(f"lights_mm: must be at most {MAX_LIGHTS} positions of three finite numbers, mm")
+        check_light_covariances(self.lights_covariance_mm2, len(self.lights_mm))
         for name in ("distance_mm", "lobe_curvature"):
             if (prior := getattr(self, name)) is not None:
                 check_distribution(name, prior, above=0)
@@ -134,10 +144,35 @@ class Priors:
         """Nominal positions of the lights, shape (L, 3), camera frame, mm."""
         return np.array(self.lights_mm, dtype=float).reshape(-1, 3)
 
+    @cached_property
+    def lights_covariance(self) -> Array | None:
+        """Covariances of the lights' positions, shape (L, 3, 3), mm^2; None where the positions are exact."""
+        if not self.lights_covariance_mm2:
+            return None
+        covariances = np.array(self.lights_covariance_mm2, dtype=float)
+        return covariances if covariances.any() else None
+
     @property
     def distance(self) -> Distribution:
         """The told working distance along the sightline, mm, or else the working range of endoscopes."""
         return UNTOLD_DISTANCE_MM if self.distance_mm is None else self.distance_mm
+
+
+def check_light_covariances(covariances: tuple[Matrix, ...], count: int) -> None:
+    """Raise `InputError` where covariances of light positions, mm^2, are not one for each of `count` lights."""
+    name = "lights_covariance_mm2"
+    if not covariances:
+        return
+    if len(covariances) != count:
+        raise InputError(f"{name}: {len(covariances)} matrices; must be one for each of the {count} lights_mm")
+    for matrix in covariances:
+        # Rows of other lengths make no array.
+        if len(matrix) != 3 or any(len(row) != 3 for row in matrix) or not np.isfinite(np.array(matrix)).all():
+            raise InputError(f"{name}: each must be three rows of three finite numbers, mm^2")
+        values = np.array(matrix, dtype=float)
+        slack = ROUNDING * float(np.abs(values).max())
+        if not np.allclose(values, values.T, rtol=0.0, atol=slack) or np.linalg.eigvalsh(values)[0] < -slack:
+            raise InputError(f"{name}: {values.tolist()} is no covariance; must be symmetric, no eigenvalue below 0")
 
 
 NO_PRIORS = Priors()

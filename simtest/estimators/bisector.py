@@ -12,7 +12,7 @@ from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget, line_covariance
 from simtest.estimators.highlight_fit import HighlightAxis, fit_highlight, fit_highlights
 from simtest.estimators.light_assignment import light_of_highlight
-from simtest.estimators.prior_parts import add_camera_and_falloff
+from simtest.estimators.prior_parts import add_camera_and_falloff, told_light_part
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
@@ -83,6 +83,8 @@ class Bisector:
         budget = _budget(family, order[0], priors.distance, normal)
         if budget is not None and own is None:
             budget = {**budget, "light_offset": _light_part(family, order, priors.distance, normal)}
+        if budget is not None and priors.lights_covariance is not None:
+            budget = _with_light_error(budget, found[0], order[0], own, priors)
         estimate = Estimate(
             normal=normal,
             candidates=candidates,
@@ -156,6 +158,21 @@ def _light_part(family: HighlightAxis, lights: Sequence[Array], distance: Distri
     first, *single = (_normals(family, light, distances)[0] for light in lights)
     moved = np.concatenate([normals - first for normals in single]) @ basis_across(normal).T
     return np.asarray(moved.T @ moved / len(moved))
+
+
+def _with_light_error(
+    budget: Budget, found: tuple[Array, Array], light: Array, own: int | None, priors: Priors
+) -> Budget:
+    """Add what the told covariance of the lights' positions does to the part ``light_offset``."""
+    assert priors.lights_covariance is not None
+    # The mean of lights whose errors are alike, as a wrong scale makes them, is as uncertain as one of them.
+    covariance = priors.lights_covariance.mean(axis=0) if own is None else priors.lights_covariance[own]
+    distances = np.array([_middle(priors.distance)])
+    if not _is_narrow(priors.distance):
+        distances = priors.distance.quantile(DISTANCES)
+    normal, sightline = found
+    part = told_light_part(sightline, normal, light, covariance, distances)
+    return {**budget, "light_offset": budget.get("light_offset", 0.0) + part}
 
 
 def _distance_part(family: HighlightAxis, light: Array, distance: Distribution, across: Array) -> Array:

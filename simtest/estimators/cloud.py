@@ -23,7 +23,7 @@ from simtest.estimators.cloud_mixture import (
 from simtest.estimators.cloud_shading import DiffuseLight
 from simtest.estimators.cloud_shape import LOBE_RAD2, CloudShape, slope_of
 from simtest.estimators.cloud_spots import find_spots
-from simtest.estimators.prior_parts import add_camera_and_falloff, light_offset_part
+from simtest.estimators.prior_parts import add_camera_and_falloff, light_offset_part, mean_light_part
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Array, Camera, chi_squared
 from simtest.geometry.vectors import basis_across
@@ -263,6 +263,8 @@ def _budget(cloud: Cloud, parts: dict[str, Array], priors: Priors) -> Budget:
         middle = half @ priors.lights.mean(axis=0) / 2
         moves = np.outer(1 / priors.distance.quantile(SHARES) - 1 / priors.distance.mean, turn @ middle)
         budget["distance"] = equivalent_covariance(moves)
+    if (part := mean_light_part(normal, priors)) is not None:
+        budget["light_offset"] = budget.get("light_offset", 0.0) + part
     return budget
 
 

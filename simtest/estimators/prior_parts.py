@@ -34,6 +34,9 @@ lights points that miss the light: by this much an axis on wet tissue (lobes of 
 where the slope is well above the second angle; a smooth surface has one highlight. Fitted to 1,125 detected highlights
 of rough planes; theory.md 7.4 has the same excess of visible highlights."""
 
+STEP_MM = 1e-3
+"""Step of a light's position, mm, for the differences of the normal."""
+
 SHARES = (np.arange(64) + 0.5) / 64
 """At these shares a prior of one number is sampled."""
 
@@ -44,10 +47,10 @@ def add_untold_parts(
     """Add what nobody told to the budget of a normal that is a reversed sightline.
 
     Where no light is told, it lies somewhere beside the camera: part ``light_offset``. Where lights are told, and all
-    at the camera, there is no such part. Where one is told elsewhere, half its angle at the surface is a known error of
-    a reversed sightline, not a random one: the estimate gets the flag ``light_offset`` and states no uncertainty;
-    `bisector` answers instead. Parts ``camera`` and ``response`` follow where the priors leave the camera's geometry or
-    the falloff open.
+    at the camera, there is no such part, unless their positions are told with a covariance. Where one is told
+    elsewhere, half its angle at the surface is a known error of a reversed sightline, not a random one: the estimate
+    gets the flag ``light_offset`` and states no uncertainty; `bisector` answers instead. Parts ``camera`` and
+    ``response`` follow where the priors leave the camera's geometry or the falloff open.
 
     Parameters
     ----------
@@ -61,7 +64,10 @@ def add_untold_parts(
         The highlight's isophotes or spot: their moments say how far a falloff moves the peak.
     """
     if priors.lights_mm:
-        return add_camera_and_falloff(_with_told_lights(estimate, priors), camera, priors, family)
+        judged = _with_told_lights(estimate, priors)
+        if judged.budget is not None and (part := mean_light_part(judged.normal, priors)) is not None:
+            judged = judged.with_parts(light_offset=part)
+        return add_camera_and_falloff(judged, camera, priors, family)
     if estimate.budget is None:
         return estimate
     light = light_offset_part(estimate.normal, priors)
@@ -94,6 +100,46 @@ def light_offset_part(normal: Array, priors: Priors) -> Array:
     """Return the covariance of a reversed sightline by a light that nobody told, shape (2, 2), rad^2."""
     table = light_table(priors.light_offset_mm, priors.distance)
     return table.covariance(normal, basis_across(normal))
+
+
+def told_light_part(sightline: Array, normal: Array, light: Array, covariance: Array, distances: Array) -> Array:
+    """Return the covariance of a normal that bisects the directions to the camera and to a light told with a spread.
+
+    The normal turns by half the angle by which the light moves, as seen from the surface (theory.md section 3, item 1).
+
+    Parameters
+    ----------
+    sightline, normal, light : ndarray, shape (3,)
+        Unit sightline and unit normal, camera frame; nominal position of the light, mm.
+    covariance : ndarray, shape (3, 3)
+        Of the light's position, mm^2.
+    distances : ndarray, shape (D,)
+        Distances of the surface along the sightline, mm, each as likely; the part is the mean over them.
+
+    Returns
+    -------
+    ndarray, shape (2, 2)
+        rad^2, in the basis ``tangent_basis(normal)``.
+    """
+    across = basis_across(normal)
+    position = distances[:, None] * sightline
+    # central differences over a thousandth of a mm
+    steps = STEP_MM * np.eye(3)[:, None, :]
+    moved = bisect(position, light + steps) - bisect(position, light - steps)
+    J = moved @ across.T / (2 * STEP_MM)  # (3, D, 2)
+    return np.asarray(np.einsum("ida,ij,jdb->ab", J, covariance, J) / len(distances))
+
+
+def mean_light_part(normal: Array, priors: Priors) -> Array | None:
+    """Return `told_light_part` of a normal for the lights' mean position; None where the positions are exact.
+
+    Errors of the lights are taken to be alike, as a wrong scale makes them. The sightline is the reversed normal, which
+    changes the part by less than the square of the light's angle.
+    """
+    if priors.lights_covariance is None:
+        return None
+    light, covariance = priors.lights.mean(axis=0), priors.lights_covariance.mean(axis=0)
+    return told_light_part(-normal, normal, light, covariance, priors.distance.quantile(SHARES))
 
 
 def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array:

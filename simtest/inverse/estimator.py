@@ -13,7 +13,7 @@ from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
 from simtest.estimators.highlight_fit import fit_small
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
 from simtest.estimators.photometric import HighlightPixels, highlight_pixels
-from simtest.estimators.prior_parts import add_camera_and_falloff, light_offset_part
+from simtest.estimators.prior_parts import add_camera_and_falloff, light_offset_part, mean_light_part
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
@@ -156,15 +156,17 @@ def _budget(fitted: LobeFit[RenderedQuadric], priors: Priors) -> Budget:
     noise = J @ fitted.covariance[:2, :2] @ J.T
     if not priors.lights_mm:
         return {"noise": noise, "light_offset": light_offset_part(model.normal, priors)}
+    told = mean_light_part(model.normal, priors)
+    known = {"noise": noise} if told is None else {"noise": noise, "light_offset": told}
     distances = priors.distance.quantile(DISTANCES)
     if isinstance(priors.distance, Normal):
         # The derivative, which the ends of a wide normal distribution would bend.
         distances = model.distance * np.array([1.0, 1 + STEP])
     moves = bisect(distances[:, None] * model.sightline, model.light) @ across.T
     if not isinstance(priors.distance, Normal):
-        return {"noise": noise, "distance": line_covariance(moves)}
+        return {**known, "distance": line_covariance(moves)}
     by_distance = (moves[1] - moves[0]) / (STEP * model.distance) * priors.distance.sd
-    return {"noise": noise, "distance": np.outer(by_distance, by_distance)}
+    return {**known, "distance": np.outer(by_distance, by_distance)}
 
 
 def _curvature(model: RenderedQuadric, priors: Priors) -> EstimatedCurvature:

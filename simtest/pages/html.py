@@ -16,7 +16,16 @@ TEMPLATES = [
     _PACKAGE / "pages" / "templates",
     *(
         _PACKAGE / room
-        for room in ("report", "realism", "reconstruction", "nightly/page", "bench", "dataset/scoring/dense")
+        for room in (
+            "report",
+            "advice",
+            "advice/twin",
+            "realism",
+            "reconstruction",
+            "nightly/page",
+            "bench",
+            "dataset/scoring/dense",
+        )
     ),
 ]
 

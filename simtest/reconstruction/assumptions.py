@@ -5,6 +5,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from simtest.calibration import Calibration, CameraPrior, Distribution, Priors
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
 from simtest.errors import InputError
@@ -97,6 +99,14 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
                 LIGHT, f"{priors.light_offset_mm} mm beside the camera, in any direction across the optical axis",
                 "[rig] lights_mm or light_offset_mm in a calibration file",
                 priors.light_offset_mm != UNTOLD_OFFSET_MM,
+            )
+        )  # fmt: skip
+    if priors.lights_covariance is not None:
+        worst = float(np.sqrt(np.linalg.eigvalsh(priors.lights_covariance)[:, -1].max()))
+        made.append(
+            Assumption(
+                "light positions", f"as stated, normal, ± {worst:.2g} mm along the least certain axis",
+                "[rig] lights_mm and lights_covariance_mm2 in a calibration file", True,
             )
         )  # fmt: skip
     if priors.distance.sd > 0:

@@ -60,7 +60,7 @@ PARTS = {
     "noise": "the sensor's noise",
     "resolution": "pixel size, smoothing, blur and coding, as seen in the fit's residuals",
     "shape": "drift of the centre over the isovalues, where the curvature changes inside the highlight",
-    "light_offset": "the light's unknown position beside the camera",
+    "light_offset": "the light's position beside the camera, unknown or told with a spread",
     "camera": "focal length, principal point and distortion, where they are guesses",
     "distance": "the unknown distance of the surface",
     "response": "unknown response, sharpening and falloff",

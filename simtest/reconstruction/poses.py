@@ -1,6 +1,6 @@
 """Poses of the camera over the frames of a sequence, from a file.
 
-It is views.json, a list of matrices, a TUM trajectory, or a file of COLMAP or NeRF.
+It is views.json, a list of matrices, a TUM trajectory, a file of COLMAP or NeRF, or that of a public data set.
 
 docs/howto/motion.md describes the formats.
 """
@@ -16,6 +16,8 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.estimators.two_views import PoseError
+from simtest.geometry.quaternions import rotation_of
+from simtest.reconstruction.dataset_poses import dataset_poses
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import require_plain
 from simtest.runtime.resources import close_names, shown
@@ -111,8 +113,11 @@ def read_poses(path: Path) -> Poses:
     except UnicodeDecodeError as error:
         raise InputError(f"{where}: no text (byte {error.start}); must be JSON or a TUM trajectory") from error
     is_json = path.suffix.lower() == ".json"
-    foreign = _is_foreign(text, is_json)
-    if foreign:
+    of_dataset = None if is_json else dataset_poses(path, text, where)
+    foreign = of_dataset is None and _is_foreign(text, is_json)
+    if of_dataset is not None:
+        poses, names, settings = _from_dataset(of_dataset, where)
+    elif foreign:
         poses, names, settings = _from_others(path, text, is_json, where)
     else:
         poses, names, settings = _from_json(text, where) if is_json else _from_tum(text, where)
@@ -139,6 +144,10 @@ def read_poses(path: Path) -> Poses:
 
 
 Read = tuple[list[Array], list[str], dict[str, Any]]
+
+
+def _from_dataset(found: list[Array], where: str) -> Read:
+    return [_matrix(T.tolist(), f"{where}: pose {number}") for number, T in enumerate(found)], [], {"unit": "mm"}
 
 
 def _unit_mm(unit: object, where: str) -> float:
@@ -295,22 +304,7 @@ def _from_tum(text: str, where: str) -> Read:
             values = []
         if len(values) != 8 or not np.isfinite(values).all():
             raise InputError(f"{at}: {shown(line.strip(), 60)}; must be 8 numbers: time tx ty tz qx qy qz qw")
-        length = float(np.linalg.norm(values[4:]))
-        if abs(length - 1) > 0.01:
-            raise InputError(f"{at}: quaternion of length {length:.3g}; must be 1")
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = _of_quaternion(np.array(values[4:]) / length), values[1:4]
+        T[:3, :3], T[:3, 3] = rotation_of(np.roll(values[4:], 1), at), values[1:4]
         poses.append(T)
     return poses, [], settings
-
-
-def _of_quaternion(q: Array) -> Array:
-    """Return the rotation of a unit quaternion x, y, z, w."""
-    x, y, z, w = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -17,7 +17,13 @@ from simtest.calibration import (
     exactly,
 )
 from simtest.calibration.calibration import OPTICAL_AXIS
-from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
+from simtest.calibration.priors import (
+    UNTOLD_FALLOFF_POWER,
+    UNTOLD_OFFSET_MM,
+    UNTOLD_SLOPE_RAD,
+    Matrix,
+    check_light_covariances,
+)
 from simtest.geometry import Camera
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.falloff import CosineProfile, Profile, TableProfile
@@ -71,6 +77,12 @@ class RigCalibration(Spec):
     lights_mm: tuple[tuple[LightCoordinate, LightCoordinate, LightCoordinate], ...] = Field(
         (), max_length=32, description="positions of the lights, camera frame, mm; default not known"
     )
+    lights_covariance_mm2: tuple[Matrix, ...] = Field(
+        (),
+        max_length=32,
+        description="covariance of each light's position, a 3 x 3 matrix a light, mm^2, as `simtest calibrate light` "
+        "writes it; default: the positions are exact",
+    )
     distance_mm: Millimetres | None = Field(
         None, description="working distance along the sightline, mm: measured, or the middle of what is expected"
     )
@@ -92,6 +104,7 @@ class RigCalibration(Spec):
             raise ValueError("distance_range_mm and distance_mm exclude each other; give one of them")
         if self.light_offset_mm is not None and self.lights_mm:
             raise ValueError("light_offset_mm and lights_mm exclude each other; give one of them")
+        check_light_covariances(self.lights_covariance_mm2, len(self.lights_mm))
         _check_interval("distance_range_mm", self.distance_range_mm, above=0.0)
         _check_interval("light_offset_mm", self.light_offset_mm)
         return self
@@ -223,6 +236,7 @@ class CalibrationSpec(Spec):
             camera=CameraPrior(told.focal_sd, told.centre_sd_px, told.distortion_sd),
             falloff_power=_distribution(told.falloff_power) or (None if states_falloff else UNTOLD_FALLOFF_POWER),
             relief_slope=_distribution(slopes, math.radians(1.0)) or UNTOLD_SLOPE_RAD,
+            lights_covariance_mm2=rig.lights_covariance_mm2,
         )
 
 

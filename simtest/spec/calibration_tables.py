@@ -76,7 +76,10 @@ def _profile(profile: AngularProfile) -> dict[str, Any]:
 
 
 def _rig(priors: Priors) -> dict[str, Any]:
-    rig: dict[str, Any] = {"lights_mm": priors.lights_mm or None}
+    rig: dict[str, Any] = {
+        "lights_mm": priors.lights_mm or None,
+        "lights_covariance_mm2": priors.lights_covariance_mm2 or None,
+    }
     if isinstance(priors.distance_mm, Normal):
         rig |= {"distance_mm": priors.distance_mm.mean, "distance_sd_mm": priors.distance_mm.sd or None}
     else:

@@ -145,11 +145,14 @@ def guide_of(results: pl.DataFrame, conditions: Mapping[str, Mapping[str, object
     left = [str(name) for name in results["setting"].unique(maintain_order=True) if name not in held]
     seen = true.filter(pl.col("target").fill_null("fine") == "fine") if "target" in true.columns else true
     counts = (seen.select(key).n_unique() for key in ([*FRAME, "true_id"], [*FRAME]))
-    return Guide(shared, tuple(advice for each in found for advice in _advice(each, true)), tuple(left), *counts)
+    return Guide(shared, tuple(advice for each in found for advice in advice_of(each, true)), tuple(left), *counts)
 
 
-def _advice(situation: Situation, true: pl.DataFrame) -> list[Advice]:
-    """Return what is said of the fine surface's normals, and of the base's, as far as there are methods for them."""
+def advice_of(situation: Situation, true: pl.DataFrame) -> list[Advice]:
+    """Return what is said of the fine surface's normals, and of the base's, as far as there are methods for them.
+
+    `true` are the rows of true highlights; those of other situations' settings are left out.
+    """
     rows = true.filter(pl.col("setting").is_in(situation.settings))
     targets = targets_of(rows)
     made = []

@@ -130,21 +130,42 @@ def is_above_zero(differences: Array, settings: Array, frames: Array, certain: N
     mean = float(np.mean(differences))
     if certain.all():
         return mean > 0
-    values, setting, frame = (each[~certain] for each in (differences, settings, frames))
-    count, kinds = len(np.unique(frame)), len(np.unique(setting))
+    drawn = ~certain
+    half = half_width(differences[drawn], settings[drawn], frames[drawn], len(differences))
+    return half is not None and mean - half > 0
+
+
+def half_width(values: Array, settings: Array, frames: Array, total: int | None = None) -> float | None:
+    """Compute half the 95 % interval of the mean of values whose frames are the independent units.
+
+    Parameters
+    ----------
+    values : ndarray
+        Of each highlight.
+    settings, frames : ndarray
+        Number of the setting and of the frame of each.
+    total : int, optional
+        Values that the mean is over, where further ones have no spread; default these.
+
+    Returns
+    -------
+    float or None
+        None for a single frame.
+    """
+    count, kinds = len(np.unique(frames)), len(np.unique(settings))
     freedom = count - kinds
     if freedom:
-        totals, sizes = np.bincount(setting, values), np.bincount(setting)
-        residuals = values - (totals / np.maximum(sizes, 1))[setting]
+        totals, sizes = np.bincount(settings, values), np.bincount(settings)
+        residuals = values - (totals / np.maximum(sizes, 1))[settings]
     else:
         # One frame a setting: no spread within any is seen, so that between them has to do.
         residuals, freedom = values - float(np.mean(values)), count - 1
     if not freedom:
-        return False
+        return None
     # Highlights of one frame are no draws of their own: residuals are summed before they are squared.
-    sums = np.bincount(frame, residuals)
-    deviation = math.sqrt(count / freedom * float(np.sum(sums**2))) / len(differences)
-    return mean - student_t.quantile((1 + CONFIDENCE) / 2, freedom) * deviation > 0
+    sums = np.bincount(frames, residuals)
+    deviation = math.sqrt(count / freedom * float(np.sum(sums**2))) / (total or len(values))
+    return student_t.quantile((1 + CONFIDENCE) / 2, freedom) * deviation
 
 
 def median_interval(values: Array, settings: Array, frames: Array) -> Interval:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -82,19 +83,27 @@ class RoughTruth:
     clouds: Mapping[int, Cloud] = field(default_factory=dict)
     is_rough: bool = False
 
+    @cached_property
+    def _peaks_px(self) -> Array:
+        """Peaks of the visible highlights, px, shape (V, 2): thousands of missed glints are held against them."""
+        return np.array([spot.peak_px for spot in self.visible], dtype=float).reshape(-1, 2)
+
+    @cached_property
+    def _shown(self) -> int:
+        """Visible highlights above the noise, of the surface: what shines on an instrument is no missing answer."""
+        return len(shown([spot for spot in self.visible if spot.instrument is None]))
+
     def filled(self, row: ResultRow, specularity: int | None, truth: TrueHighlight | None) -> ResultRow:
         """Fill the columns of a detection's row, or of that of a truth which no detection found."""
         number = None if specularity is None else self.seen.get(specularity)
         if number is None and specularity is None and truth is not None:
             # The spot in which the missed glint shines.
-            near = [np.linalg.norm(spot.peak_px - truth.bp_px) for spot in self.visible]
-            number = int(np.argmin(near)) if near and min(near) < MISSED_PX else None
+            near = np.hypot(*(self._peaks_px - truth.bp_px).T)
+            number = int(np.argmin(near)) if len(near) and near.min() < MISSED_PX else None
         snr = None if number is None else self.visible[number].peak_snr
         row = replace(row, visible_id=number, visible_snr=snr if snr is not None and np.isfinite(snr) else None)
         if self.is_rough:
-            # Of the surface: what shines on an instrument is no answer that is missing.
-            own = [spot for spot in self.visible if spot.instrument is None]
-            row = replace(row, frame_visible=len(shown(own)))
+            row = replace(row, frame_visible=self._shown)
         if truth is not None:
             row = replace(row, cloud=truth.cloud)
         elif number is not None:

@@ -78,13 +78,13 @@ def test_the_mean_of_what_is_seen_is_biased_and_the_estimate_is_not():
 
 @pytest.mark.slow
 def test_stated_regions_hold_the_truth():
-    """95 % regions of 200 films hold 91.5 to 98.5 %: beyond, a binomial of 95 % lies with less than 5 % together."""
-    rng, inside = np.random.default_rng(11), []
+    """95 % regions of 200 films hold 92 to 98 %: a binomial of 95 % lies outside with 3.3 %."""
+    rng, inside = np.random.default_rng(101), []
     for _ in range(200):
         normal = tilted(rng.uniform(0, 15), rng.uniform(-3, 3))
         found = base_normal(sightings(rng, normal, 4.0, poses(10)), PLANE, RADIUS)
         inside.append(found.squared_mahalanobis(normal) < 5.991)
-    assert 0.915 <= np.mean(inside) <= 0.985
+    assert 0.92 <= np.mean(inside) <= 0.98
 
 
 def test_more_frames_and_slopes():

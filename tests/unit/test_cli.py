@@ -150,6 +150,12 @@ BAD_USE = {
     "reconstruct": 'Command "reconstruct" parameter IMAGE requires an argument',
     "reconstruct none.png --fov 60 --out x": "none.png: ",
     "reconstruct none.png --out x": "--camera or --fov: exactly one of them must be given",
+    "twin": 'Command "twin" parameter FRAME requires an argument',
+    "twin none.png --fov 60 --out x": "none.png: ",
+    "twin none.png --out x": "--camera or --fov: exactly one of them must be given",
+    "twin none.png --fov 60 --frames 0 --out x": "--frames 0: must be 1 to 1000",
+    "twin none.png --fov 60 --frames some --out x": "Invalid value for --frames: some is not a whole number",
+    "twin none.png --fov 400 --out x": "none.png: ",
 }
 
 

@@ -256,6 +256,7 @@ FOLDERS = {
     "dataset": ("dataset", "tiny", "--out", "held"),
     "reconstruct": ("reconstruct", "a.png", "--fov", "60", "--out", "held"),
     "reconstruct a folder": ("reconstruct", "frames", "--fov", "60", "--out", "held"),
+    "twin": ("twin", "a.png", "--fov", "60", "--out", "held"),
     "realism": ("realism", "a.png", "--against", "plane", "--out", "held"),
     "fit's bank": ("fit", "a.png", "--recipe", "tiny", "--scene", "plane", "--bank", "held", "--out", "x.toml"),
 }

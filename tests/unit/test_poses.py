@@ -160,3 +160,42 @@ def test_an_error_that_is_not_stated_is_assumed_not_zero(tmp_path):
     np.testing.assert_array_equal(read.world_from_camera[0, :3, 3], [2, 3, 4])
     path.write_text("# translation_error: 0\n# rotation_error_deg: 0\n1 2 3 4 0 0 0 1\n")
     assert (read_poses(path).error, read_poses(path).error_told) == (PoseError(0.0, 0.0), True)
+
+
+def test_the_poses_of_c3vd_have_their_translation_in_the_last_row(tmp_path):
+    path = tmp_path / "pose.txt"
+    path.write_text("\n".join(",".join(map(repr, T.T.ravel().tolist())) for T in TWO) + "\n")
+    np.testing.assert_allclose(read_poses(path).world_from_camera, TWO, atol=1e-12)
+
+
+def test_the_left_handed_poses_of_simcol3d_carry_points_where_the_engine_does(tmp_path):
+    # 30 deg about the engine's y axis, which points up: in its left-handed frame z turns towards x.
+    half = np.radians(15.0)
+    (tmp_path / "SavedPosition_S1.txt").write_text("1 2 3\n")
+    (tmp_path / "SavedRotationQuaternion_S1.txt").write_text(f"0 {np.sin(half)} 0 {np.cos(half)}\n")
+    T = read_poses(tmp_path / "SavedPosition_S1.txt").world_from_camera[0]
+    # A point 10 mm in front of the camera and 2 mm above it; up is -y for us.
+    x, y, z = 10.0 + 10 * np.sin(2 * half), 20.0 + 2.0, 30.0 + 10 * np.cos(2 * half)
+    np.testing.assert_allclose(T @ [0.0, -2.0, 10.0, 1.0], [x, -y, z, 1.0], atol=1e-12)
+
+
+DATASETS = {
+    "15 numbers": ("pose.txt", ",".join("1" * 16) + "\n" + ",".join("1" * 15), None, "line 2: .*; must be 16 numbers"),
+    "no rotation": ("pose.txt", ",".join(["2"] + ["0"] * 15), None, "pose 0: off a rotation"),
+    "column vectors": ("pose.txt", "1,0,0,5,0,1,0,0,0,0,1,0,0,0,0,1", None, "pose 0: off a rotation and a translation"),
+    "alone": ("SavedPosition_S1.txt", "1 2 3\n", None, "needs SavedRotationQuaternion_S1.txt beside it"),
+    "fewer": ("SavedPosition_S1.txt", "1 2 3\n1 2 3\n", "0 0 0 1\n", "2 positions, but .* has 1 rotations"),
+    "no unit": ("SavedPosition_S1.txt", "1 2 3\n", "0 0 0 2\n", "pose 0: quaternion of length 2; must be 1"),
+    "words": ("SavedPosition_S1.txt", "1 two 3\n", "0 0 0 1\n", "line 1: 1 two 3; must be 3 numbers"),
+}
+
+
+@pytest.mark.parametrize("what", DATASETS)
+def test_malformed_poses_of_data_sets_are_one_line(tmp_path, what):
+    name, text, other, message = DATASETS[what]
+    (tmp_path / name).write_text(text)
+    if other is not None:
+        (tmp_path / name.replace("SavedPosition_", "SavedRotationQuaternion_")).write_text(other)
+    with pytest.raises(InputError, match=message) as error:
+        read_poses(tmp_path / name)
+    assert "\n" not in str(error.value)

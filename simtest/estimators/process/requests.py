@@ -51,6 +51,8 @@ def priors_message(priors: Priors) -> dict[str, Any]:
         },
         "camera": priors.camera.deviations,
         "plane": priors.plane,
+        # A core that was written before this key existed gets the messages that it knows.
+        **({"lights_covariance_mm2": priors.lights_covariance_mm2} if priors.lights_covariance_mm2 else {}),
     }
 
 

@@ -1,0 +1,227 @@
+"""What the results of an advice's frames say: each method's error and answers, the best one, and its budget.
+
+Frames, not highlights, are the independent units, and the distances are strata (`simtest.validation.paired`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from simtest.runtime.arrays import Array
+from simtest.validation.guide import Advice, MethodFigures, advice_of
+from simtest.validation.paired import FRAME, distinct_frames, half_width, side_by_side, targets_of, units
+from simtest.validation.situations import Situation
+from simtest.validation.statistics import Interval
+
+WIDE = 0.15
+"""An interval that reaches farther from its mean than this share of it is called wide."""
+
+LEAST_PART_DEG = 1e-6
+"""A part of the budget below this is rounding."""
+
+STRATUM = "surface.distance_mm"
+
+
+@dataclass(frozen=True)
+class MeanError:
+    """The mean error of a method's answers, deg, with its 95 % interval; None where too little was answered."""
+
+    mean_deg: float | None
+    interval_deg: Interval
+    answers: int
+    frames: int
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether the interval is too wide to tell a difference of 15 %."""
+        low, high = self.interval_deg
+        if self.mean_deg is None or low is None or high is None:
+            return True
+        return high - self.mean_deg > WIDE * self.mean_deg
+
+
+@dataclass(frozen=True)
+class MethodAnswers:
+    """One method's answers: errors against both surfaces, and the terms of its budget, deg."""
+
+    estimator: str
+    target: str  # surface whose normal it states
+    asked: int  # detections that hold a true highlight; of a method of clouds, the base's highlights
+    answered: int
+    refused: int
+    missed: int
+    fine: MeanError
+    base: MeanError
+    stated_deg: float | None  # root mean square of the stated standard deviations
+    budget_deg: Mapping[str, float]  # the same of each part
+
+    @property
+    def own(self) -> MeanError:
+        """The error against the surface whose normal it states."""
+        return self.fine if self.target == "fine" else self.base
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean of another method's error minus the best one's over the highlights that both answered, deg."""
+
+    other: str
+    mean_deg: float
+    interval_deg: Interval
+    highlights: int
+    tied: bool  # whether the two cannot be told apart, or differ too little to matter
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which method to use for the normal of a surface."""
+
+    target: str
+    best: str | None  # None where nothing was answered
+    ties: tuple[str, ...]
+    next: Difference | None
+    by_distance: Mapping[float, MethodFigures]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found in an advice's frames.
+
+    Parameters
+    ----------
+    frames : int
+        Frames in all.
+    visible : int
+        Visible highlights that stand above the noise; on a smooth surface all true ones.
+    found : int
+        Those of them that the detector found.
+    detections, false : int
+        Detections, and those among them that show no highlight.
+    methods : list of MethodAnswers
+    choices : list of Choice
+        For the fine surface and, where a method states it, the base.
+    """
+
+    frames: int
+    visible: int
+    found: int
+    detections: int
+    false: int
+    methods: list[MethodAnswers]
+    choices: list[Choice]
+
+    def method(self, name: str) -> MethodAnswers:
+        """Return a method by name."""
+        return next(each for each in self.methods if each.estimator == name)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures as JSON."""
+        record = asdict(self)
+        for choice in record["choices"]:
+            choice["by_distance"] = {f"{at:g}": figures for at, figures in choice["by_distance"].items()}
+        return record
+
+
+def read_results(results: pl.DataFrame, frames: int) -> Found:
+    """Read the results of an advice's experiment, of so many frames."""
+    rows = results if STRATUM in results.columns else results.with_columns(pl.lit(0.0).alias(STRATUM))
+    rows = rows.with_columns(pl.format("{} mm", STRATUM).alias("setting"))
+    targets = targets_of(rows)
+    single = next((name for name, target in targets.items() if target == "fine"), None)
+    visible, found, detections, false = _counted(rows.filter(pl.col("estimator") == single))
+    methods = [_answers(name, target, rows) for name, target in targets.items()]
+    return Found(frames, visible, found, detections, false, methods, _choices(rows))
+
+
+def _counted(rows: pl.DataFrame) -> tuple[int, int, int, int]:
+    """Return visible highlights, those found, detections, and false ones, from the rows of one method."""
+    detected = rows.filter(pl.col("specularity").is_not_null())
+    if rows["frame_visible"].null_count() == rows.height:
+        # On a smooth surface a visible highlight is a true one.
+        true = rows.filter(pl.col("true_id").is_not_null())
+        hit = true.filter(pl.col("status") != "missed").height
+        return true.height, hit, detected.height, detected.filter(pl.col("true_id").is_null()).height
+    visible = rows.group_by(FRAME).agg(pl.col("frame_visible").max())["frame_visible"].sum()
+    hit = detected.drop_nulls("visible_id").unique([*FRAME, "visible_id"]).height
+    nothing = pl.col("visible_id").is_null() & pl.col("true_id").is_null()
+    return int(visible), hit, detected.height, detected.filter(nothing).height
+
+
+def _asked(rows: pl.DataFrame, target: str) -> pl.DataFrame:
+    """Return the rows of true highlights that a method was asked about.
+
+    A glint that no detection holds was asked of no method: most of a relief's glints are not even visible.
+    """
+    true = rows.filter(pl.col("true_id").is_not_null())
+    return true.filter(pl.col("specularity").is_not_null()) if target == "fine" else true
+
+
+def _answers(name: str, target: str, rows: pl.DataFrame) -> MethodAnswers:
+    own = _asked(rows.filter(pl.col("estimator") == name), target)
+    answered = own.filter(pl.col("status") == "ok")
+    missed = own.filter(pl.col("status") == "missed").height
+    parts = {column: _root_mean_square(answered, column) for column in answered.columns if column.startswith("budget_")}
+    told = {name: value for name, value in parts.items() if value and value > LEAST_PART_DEG}
+    budget = {name.removeprefix("budget_").removesuffix("_deg"): value for name, value in told.items()}
+    return MethodAnswers(
+        name, target, own.height, answered.height, own.height - answered.height - missed, missed,
+        mean_error(answered, "error_fine_deg"), mean_error(answered, "error_base_deg"), _stated(answered), budget,
+    )  # fmt: skip
+
+
+def mean_error(answered: pl.DataFrame, column: str) -> MeanError:
+    """Return the mean of a column of errors, deg, with the interval that its frames' spread gives."""
+    rows = answered.drop_nulls(column)
+    values = rows[column].to_numpy()
+    count = rows.select(FRAME).n_unique()
+    if not len(values):
+        return MeanError(None, (None, None), 0, 0)
+    mean, half = float(np.mean(values)), half_width(values, *units(rows))
+    interval: Interval = (None, None) if half is None else (max(mean - half, 0.0), mean + half)
+    return MeanError(mean, interval, len(values), count)
+
+
+def _root_mean_square(rows: pl.DataFrame, column: str) -> float | None:
+    values = rows[column].drop_nulls().to_numpy()
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
+
+
+def _stated(answered: pl.DataFrame) -> float | None:
+    """Return the root mean square of the stated standard deviations, both tangent directions together, deg."""
+    trace = answered.select((pl.col("cov_11") + pl.col("cov_22")).alias("trace")).drop_nulls()["trace"].to_numpy()
+    return float(np.degrees(np.sqrt(np.mean(trace)))) if len(trace) else None
+
+
+def _choices(rows: pl.DataFrame) -> list[Choice]:
+    """Return which method is best, for each surface whose normal a method states (`simtest.validation.guide`)."""
+    base = pl.col("target").fill_null("fine") == "base"
+    asked = pl.concat([_asked(rows.filter(~base), "fine"), _asked(rows.filter(base), "base")])
+    if asked.is_empty():
+        return []
+    situation = Situation("", "", tuple(map(str, asked["setting"].unique(maintain_order=True))))
+    return [_choice(advice, asked) for advice in advice_of(situation, asked)]
+
+
+def _choice(advice: Advice, asked: pl.DataFrame) -> Choice:
+    ties = (*advice.ties, *advice.unranked)
+    by_distance = {float(setting.split()[0]): figures for setting, figures in advice.by_setting.items()}
+    others = [name for name in advice.methods if name != advice.best and advice.methods[name].answered]
+    following = None
+    if advice.best is not None and others:
+        second = min(others, key=lambda name: advice.methods[name].mean_penalised_deg)
+        following = _difference(asked, advice.target, advice.best, second, second in ties)
+    return Choice(advice.target, advice.best, ties, following, by_distance)
+
+
+def _difference(asked: pl.DataFrame, target: str, best: str, other: str, tied: bool) -> Difference | None:
+    wide = distinct_frames(side_by_side(asked, {best: target, other: target})).wide
+    both = wide.drop_nulls([f"of {best}", f"of {other}"])
+    if both.is_empty():
+        return None
+    values: Array = both[f"of {other}"].to_numpy() - both[f"of {best}"].to_numpy()
+    mean, half = float(np.mean(values)), half_width(values, *units(both))
+    interval: Interval = (None, None) if half is None else (mean - half, mean + half)
+    return Difference(other, mean, interval, len(values), tied)

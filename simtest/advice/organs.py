@@ -1,0 +1,137 @@
+"""Surfaces before a scope: the wall of an organ at a stated distance, with what is drawn of its form and its relief.
+
+The wall is the quadric at the highlight, so that its distance can be set: its principal curvatures are drawn from those
+of the highlights of the generated anatomies (middle 80 %, `simtest validate mesh` with all highlight points), and its
+relief and film from the ranges of the dataset recipe `endoscopy`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from simtest.advice.scope import Interval, ReliefPrior, ends
+from simtest.runtime.resources import find
+from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.toml_files import read_toml
+
+MOST_TILT_DEG = 35.0
+"""The wall is tilted by up to so much against the picture's plane, towards any side."""
+
+RECIPE = "endoscopy"
+"""Dataset recipe whose ranges of relief and film are drawn from."""
+
+MESHES_IN_VIEW = 8.0
+"""Of the net of vessels that have no colour, over the nearest view: so few are grown at once, and some must be."""
+
+_DRAWN = ("surface.relief.bands", "reflectance.film")
+"""Keys of the recipe that matter to a normal; colours stay as in the scene."""
+
+
+@dataclass(frozen=True)
+class Organ:
+    """An organ.
+
+    Parameters
+    ----------
+    scene : str
+        Shipped scene whose tissue it is.
+    sensor : str
+        Preset of the sensor that usually looks at it.
+    k1_per_mm, k2_per_mm : (float, float)
+        Ranges of the principal curvatures, 1/mm, convex positive.
+    smooth : bool
+        Whether it has no relief unless one is stated.
+    """
+
+    scene: str
+    sensor: str
+    k1_per_mm: Interval
+    k2_per_mm: Interval
+    smooth: bool = False
+
+
+ORGANS: dict[str, Organ] = {
+    "colon": Organ("tissue_colon", "colonoscope_hd", (-0.12, 0.05), (-0.04, 0.16)),
+    "stomach": Organ("tissue_stomach", "colonoscope_hd", (-0.05, -0.026), (-0.026, 0.22)),
+    "liver": Organ("tissue_liver", "laparoscope_hd", (-0.045, 0.022), (0.016, 0.1)),
+    "gallbladder": Organ("tissue_gallbladder", "laparoscope_hd", (0.045, 0.07), (0.006, 0.016)),
+    "plane": Organ("tissue_gallbladder", "laparoscope_hd", (0.0, 0.0), (0.0, 0.0), smooth=True),
+}
+"""Organs by name; `plane` is a flat wet phantom."""
+
+
+@cache
+def _family(scene: str) -> tuple[Mapping[str, Any], Mapping[str, Interval]]:
+    """Return what the recipe sets and draws of a scene's relief and film."""
+    family = next(each for each in load_dataset(RECIPE).families if each.scene == scene)
+    drawn = {**family.per_anatomy, **family.per_sample}
+    held = {key: value for key, value in family.set.items() if key.startswith(_DRAWN)}
+    return held, {key: (d.ends[0], d.ends[1]) for key, d in drawn.items() if key.startswith(_DRAWN)}
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What an experiment sets and draws of the surface, by key path of a scene."""
+
+    set: dict[str, Any]
+    random: dict[str, Interval]
+
+
+def wall(organ: Organ, relief: ReliefPrior | None, view_mm: float) -> Surroundings:
+    """Return the wall of an organ, seen over `view_mm` at least; its distance is left to the experiment."""
+    held, drawn = rough(organ, relief)
+    held["reflectance.albedo"] = pale(organ, view_mm)
+    # A whole table in place of the scene's: an anatomy's keys are none of a quadric's.
+    bands = held.pop("surface.relief", None)
+    surface: dict[str, Any] = {"type": "quadric", "k1_per_mm": organ.k1_per_mm[0], "k2_per_mm": organ.k2_per_mm[0]}
+    if bands is not None:
+        surface["relief"] = bands
+    form: dict[str, Interval] = {"surface.tilt_deg": (0.0, MOST_TILT_DEG), "surface.azimuth_deg": (0.0, 360.0)}
+    if organ.k1_per_mm != organ.k2_per_mm:
+        form |= {"surface.spin_deg": (0.0, 180.0), "surface.k1_per_mm": organ.k1_per_mm}
+        form |= {"surface.k2_per_mm": organ.k2_per_mm}
+    return Surroundings({"surface": surface, **held}, {**form, **drawn})
+
+
+def rough(organ: Organ, relief: ReliefPrior | None) -> tuple[dict[str, Any], dict[str, Interval]]:
+    """Return what is set and what is drawn of relief and film; the relief is the whole table ``surface.relief``."""
+    base = read_toml(find(organ.scene, "scenes"))
+    changes, drawn = _family(organ.scene)
+    film = dict(base["reflectance"]["film"])
+    random = dict(drawn)
+    if is_smooth(organ, relief):
+        # Without valleys a film has no level.
+        film.pop("level", None)
+        return {"reflectance.film": film}, {"reflectance.film.alpha": random["reflectance.film.alpha"]}
+    held: dict[str, Any] = {"reflectance.film": film}
+    if relief is None:
+        bands = [dict(band) for band in base["surface"]["relief"]["bands"]]
+        for key, value in changes.items():
+            if key.startswith("surface.relief.bands."):
+                *_, number, name = key.split(".")
+                bands[int(number)][name] = value
+    else:
+        random = {key: value for key, value in random.items() if not key.startswith("surface.relief")}
+        bands = [{}]
+        for name in ("slope_deg", "wavelength_mm"):
+            low, high = ends(getattr(relief, name))
+            bands[0][name] = low
+            if high > low:
+                random[f"surface.relief.bands.0.{name}"] = (low, high)
+    held["surface.relief"] = {"bands": bands}
+    return held, random
+
+
+def pale(organ: Organ, view_mm: float) -> dict[str, Any]:
+    """Return the organ's colour without vessels: they take as long to grow as a frame, and lie below the film."""
+    spacing = min(max(view_mm / MESHES_IN_VIEW, 0.2), 50.0)
+    largest = min(spacing / 2, 5.0)
+    vessels = {"largest_mm": largest, "smallest_mm": largest / 2, "spacing_mm": spacing, "strength": 0.0}
+    preset = read_toml(find(organ.scene, "scenes"))["reflectance"]["albedo"]["preset"]
+    return {"preset": preset, "vessels": vessels}
+
+
+def is_smooth(organ: Organ, relief: ReliefPrior | None) -> bool:
+    """Return whether the wall has no relief."""
+    return organ.smooth if relief is None else ends(relief.slope_deg) == (0.0, 0.0)

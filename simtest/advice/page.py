@@ -1,0 +1,107 @@
+"""Writes an advice: advice.json, a figure as PNG, and one HTML file that needs nothing else."""
+
+from pathlib import Path
+
+import numpy as np
+
+from simtest.advice.advise import Advised
+from simtest.advice.figures import Choice
+from simtest.pages import chart_png, chart_web, pixels
+from simtest.pages.axes import Axis
+from simtest.pages.chart import Chart, Mark, Panel
+from simtest.pages.html import environment
+from simtest.pages.palette import SERIES
+from simtest.pages.style import number, symbols
+from simtest.runtime import provenance
+from simtest.runtime.files import make_folder, write_atomically, write_json
+from simtest.validation import laws
+from simtest.validation.statistics import Interval
+
+PAGE, RESULT = "index.html", "advice.json"
+
+PICTURE_HEIGHT_PX = 480
+
+_SURFACES = {"fine": "the fine surface", "base": "the organ below its relief"}
+
+
+def write_advice(found: Advised, out: Path, command: str = "") -> Path:
+    """Write an advice into a folder; return the page.
+
+    Parameters
+    ----------
+    found : Advised
+        What to write.
+    out : Path
+        Gets advice.json, index.html and figures/distance.png.
+    command : str
+        How the advice was called.
+    """
+    make_folder(out / "figures")
+    chart = distance_chart(found)
+    content = pixels.png(chart_png.draw([chart])[0])
+    write_atomically(out / "figures" / "distance.png", lambda part: part.write_bytes(content))
+    made_by = provenance.environment()
+    html = environment().get_template("advice.html.j2").render(
+        found=found, answers=[sentence(found, choice) for choice in found.found.choices] or [NOTHING],
+        chart=chart, picture=pixels.data_address(found.picture, PICTURE_HEIGHT_PX), command=command,
+        interval=interval, surfaces=_SURFACES,
+        parts=list(dict.fromkeys(name for each in found.found.methods for name in each.budget_deg)),
+        provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"], "python": made_by["python"]},
+        figures=chart_web.packed({chart.key: chart_web.figure(chart)}), plotly=chart_web.packed_plotly(),
+    )  # fmt: skip
+    write_json(out / RESULT, {**found.to_json(), "run": {"command": command, **made_by}})
+    write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
+    return out / PAGE
+
+
+NOTHING = "No highlight was found in the frames: there is nothing to compare the methods by."
+
+
+def sentence(found: Advised, choice: Choice) -> str:
+    """Return which method to use for a surface's normal, with the error to expect."""
+    surface = _SURFACES[choice.target]
+    if choice.best is None:
+        return f"For the normal of {surface} no method answered."
+    method = found.found.method(choice.best)
+    text = f"For the normal of {surface} use {choice.best}: mean error {number(method.own.mean_deg)} deg"
+    text += f" (95 % interval {interval(method.own.interval_deg)}), {method.answered} of {method.asked} answered."
+    if choice.ties:
+        text += f" It cannot be told from {', '.join(choice.ties)}."
+    if method.own.is_wide:
+        text += " The interval is wide: more frames (--frames) make it narrower."
+    return text
+
+
+def interval(ends: Interval) -> str:
+    """Write an interval."""
+    return "–" if ends[0] is None else f"{number(ends[0])} to {number(ends[1])}"
+
+
+def distance_chart(found: Advised) -> Chart:
+    """Describe the best methods' mean error over the distance, with the laws of the light's offset."""
+    asked = found.question
+    near, far = asked.distances_mm
+    at = np.geomspace(near / 1.3, far * 1.3, 60)
+    offset = float(np.mean(asked.scope.offsets_mm))
+    marks = []
+    if offset:
+        ignored = np.degrees(laws.offset_error(offset / at))
+        points = np.stack([np.zeros_like(at), np.zeros_like(at), at], axis=-1)
+        known = np.degrees(laws.bisector_residual(points, np.array([offset, 0.0, 0.0]), asked.middle_mm / at - 1))
+        marks += [
+            Mark(at, ignored, SERIES[1], "law: offset ignored", line="dash", hover="{x} mm: {y} deg"),
+            Mark(at, known, SERIES[2], "law: bisector, range known", line="dot", hover="{x} mm: {y} deg"),
+        ]
+    bound = f"bound, {asked.bound_deg:g} deg"
+    marks.append(Mark([at[0], at[-1]], [asked.bound_deg] * 2, SERIES[5], bound, line="dashdot"))
+    for colour, choice in zip((SERIES[0], SERIES[3]), found.found.choices, strict=False):
+        rows = [(d, each) for d, each in sorted(choice.by_distance.items()) if each.mean_deg is not None and d > 0]
+        if not rows or choice.best is None:
+            continue
+        x, y = [d for d, _ in rows], [float(each.mean_deg or 0.0) for _, each in rows]
+        told = [f"{choice.best}, {choice.target}\n{d:g} mm: {number(v)} deg, {each.answered} answers"
+                for v, (d, each) in zip(y, rows, strict=True)]  # fmt: skip
+        symbol = symbols(["fine", "base"])[choice.target]
+        marks.append(Mark(x, y, colour, f"{choice.best} ({choice.target})", symbol=symbol, size=9, hover=told))
+    panel = Panel(Axis("distance (mm)", "log"), Axis("mean error (deg)", "log"), tuple(marks))
+    return Chart("distance", "Mean error over the distance", (panel,), 420)

@@ -1,0 +1,194 @@
+"""A scope: camera, lights and sensor, by the name of a preset or from a TOML file."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from simtest.errors import InputError
+from simtest.geometry.camera import Camera
+from simtest.runtime.arrays import Array
+from simtest.runtime.resources import shown, suggestion
+from simtest.spec.camera_spec import SceneCamera, load_camera
+from simtest.spec.camera_tables import camera_table
+from simtest.spec.rig import Rig
+from simtest.spec.sensor import Sensor
+from simtest.spec.spec_model import Spec, validate
+from simtest.spec.toml_files import read_toml
+
+Table = dict[str, Any]
+"""A table as TOML holds it."""
+
+Interval = tuple[float, float]
+
+_COLONOSCOPE: Table = {
+    "camera": {"width": 640, "height": 480, "fx": 320.0, "fy": 320.0},
+    "sensor": {"preset": "colonoscope_hd", "vignetting": {"type": "cosine", "power": 2.0}},
+}
+_LAPAROSCOPE: Table = {
+    "camera": {"width": 640, "height": 480, "fx": 480.0, "fy": 480.0},
+    "sensor": {"preset": "laparoscope_hd", "vignetting": {"type": "cosine", "power": 2.0}},
+}
+
+
+def _rig(preset: str, radius_mm: float) -> Table:
+    source = {"type": "disc", "radius_mm": radius_mm}
+    return {"preset": preset, "each": {"source": source, "profile": {"type": "cosine", "power": 1.0}}}
+
+
+SCOPES: dict[str, Table] = {
+    "colocated": {**_COLONOSCOPE, "rig": {"preset": "colocated"}},
+    "colonoscope_2": {**_COLONOSCOPE, "rig": _rig("colonoscope_2", 0.9)},
+    "colonoscope_3": {**_COLONOSCOPE, "rig": _rig("colonoscope_3", 0.9)},
+    "laparoscope": {**_LAPAROSCOPE, "rig": _rig("laparoscope", 0.6)},
+}
+"""Scopes by the name of their rig's preset: the cameras of the shipped tissue scenes (scenes/tissue_*.toml)."""
+
+
+class ReliefPrior(Spec):
+    """What is known of the relief: each value a number, or the interval that it is drawn from."""
+
+    slope_deg: float | Interval = Field(description="slope an axis, deg; 0: smooth")
+    wavelength_mm: float | Interval = Field(2.0, description="mm")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "ReliefPrior":
+        for name, least, most in (("slope_deg", 0.0, 20.0), ("wavelength_mm", 0.02, 20.0)):
+            low, high = ends(getattr(self, name))
+            if not least <= low <= high <= most or (low == 0 and high > 0):
+                raise ValueError(
+                    f"{name} = {getattr(self, name)}: must be a number, or a lower and an upper end in this order, "
+                    f"{least:g} to {most:g}" + (", and 0 only as a number" if least == 0 else "")
+                )
+        return self
+
+
+class ScopeFile(Spec):
+    """A scope's file; all tables but the camera may be left out."""
+
+    camera: SceneCamera
+    rig: Rig = Rig()
+    sensor: Sensor | None = None
+    relief: ReliefPrior | None = None
+
+
+@dataclass(frozen=True)
+class Scope:
+    """A scope.
+
+    Parameters
+    ----------
+    name : str
+        Of the preset or the file.
+    tables : dict
+        The tables ``camera``, ``rig`` and ``sensor`` as a scene takes them; ``sensor`` may be absent.
+    relief : ReliefPrior, optional
+        What the file states of the relief.
+    """
+
+    name: str
+    tables: Table
+    relief: ReliefPrior | None = None
+    _spec: ScopeFile = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_spec", validate(ScopeFile, self.tables, self.name))
+
+    @property
+    def camera(self) -> Camera:
+        """The camera's geometry."""
+        return self._spec.camera.model()
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels per rad at the centre of the picture."""
+        step = self.camera.step_of_pixels(np.array([self.camera.width / 2, self.camera.height / 2]))
+        return float(1 / math.sqrt(np.linalg.norm(np.cross(*step))))
+
+    @property
+    def offsets_mm(self) -> Array:
+        """Distance of each light from the camera's centre, mm, shape (L,)."""
+        return np.asarray(np.linalg.norm(self._spec.rig.nominal_mm(), axis=1))
+
+    @property
+    def deepest_light_mm(self) -> float:
+        """How far the foremost light lies in front of the camera, mm; below 0 it lies behind."""
+        return float(self._spec.rig.nominal_mm()[:, 2].max())
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture, px."""
+        return self.camera.width, self.camera.height
+
+
+def ends(value: float | Interval) -> Interval:
+    """Return both ends of a value that is a number or an interval."""
+    return value if isinstance(value, tuple) else (value, value)
+
+
+def read_scope(
+    name: str,
+    camera: Path | None = None,
+    fov_deg: float | None = None,
+    lights_mm: Sequence[Sequence[float]] | None = None,
+) -> Scope:
+    """Read a scope.
+
+    Parameters
+    ----------
+    name : str
+        Of a preset (`SCOPES`), or a TOML file with the tables ``[camera]``, ``[rig]``, ``[sensor]`` and ``[relief]``.
+        In ``[rig]``, ``lights_mm`` may give the positions alone, as in a calibration file.
+    camera : Path, optional
+        Camera file that replaces the scope's camera.
+    fov_deg : float, optional
+        Horizontal field of view, deg: that of a pinhole of the scope's size, which replaces its camera.
+    lights_mm : sequence, optional
+        Positions of the lights, camera frame, mm, which replace the scope's.
+
+    Raises
+    ------
+    InputError
+        If there is no such scope, or something does not fit.
+    """
+    if camera is not None and fov_deg is not None:
+        raise InputError("--camera and --fov exclude each other; give one of them")
+    scope = _named(name)
+    tables = dict(scope.tables)
+    if camera is not None:
+        tables["camera"] = dict(camera_table(load_camera(camera)))
+    if fov_deg is not None:
+        tables["camera"] = dict(camera_table(Camera.from_fov(fov_deg, *scope.size)))
+    if lights_mm:
+        tables["rig"] = _listed(lights_mm, "--light")
+    return replace(scope, tables=tables)
+
+
+def _named(name: str) -> Scope:
+    if name in SCOPES:
+        return Scope(name, SCOPES[name])
+    path = Path(name).expanduser()
+    if not path.is_file():
+        known = ", ".join(SCOPES)
+        raise InputError(f"{shown(name)}: no such file or preset; presets: {known}{suggestion(name, SCOPES)}")
+    data = read_toml(path)
+    rig = data.get("rig")
+    if isinstance(rig, Mapping) and "lights_mm" in rig:
+        if len(rig) > 1:
+            other = next(key for key in rig if key != "lights_mm")
+            raise InputError(f"{path}: rig.{other}: must be left out where rig.lights_mm is given")
+        data["rig"] = _listed(rig["lights_mm"], f"{path}: rig.lights_mm")
+    read = validate(ScopeFile, data, str(path))
+    return Scope(path.stem, {key: value for key, value in data.items() if key != "relief"}, read.relief)
+
+
+def _listed(lights_mm: Any, where: str) -> Table:
+    """Return the rig of lights at some positions, of which each has its share of the power."""
+    sound = isinstance(lights_mm, Sequence) and 1 <= len(lights_mm) <= 32
+    if not sound or not all(isinstance(light, Sequence) and len(light) == 3 for light in lights_mm):
+        raise InputError(f"{where} = {shown(lights_mm, 80)}: must be 1 to 32 positions x, y, z, mm")
+    return {"lights": [{"position_mm": list(light), "power": 1 / len(lights_mm)} for light in lights_mm]}

@@ -1,0 +1,145 @@
+"""The bank of one picture: rendered frames as its camera may have taken them, and the scored highlights in them."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from simtest.advice.twin.patches import make_pool
+from simtest.advice.twin.scenes import SceneDraws
+from simtest.advice.twin.scoring import ScoredSpot, score
+from simtest.errors import SimtestError
+from simtest.reconstruction.found import Reconstruction
+from simtest.rendering import Session
+from simtest.runtime.arrays import Array, Image, Mask, Picture
+from simtest.runtime.seeds import from_integer
+from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.video_processor import luma
+
+COLOUR = "llvm_ad_rgb"
+
+USUAL_PX = 640 * 480
+FRAMES, FEWEST_FRAMES = 48, 12
+"""Frames of a bank for a picture of so many pixels or fewer, and of a large one: their time goes with the pixels."""
+
+FRAMES_PER_PATCH = 2
+"""Views of a patch, at least: another patch is another mesh."""
+
+Reconstructs = Callable[[Image], Reconstruction]
+"""The reconstruction of a picture, as encoded, with what the user told."""
+
+Progress = Callable[[int, int, str], None]
+"""Called with what is done, how much there is, and what is done now; may raise to stop."""
+
+
+@dataclass(frozen=True)
+class BankFrame:
+    """A rendered frame of the bank.
+
+    Parameters
+    ----------
+    picture : ndarray of uint8, shape (H, W) or (H, W, 3)
+        As encoded.
+    spots : list of ScoredSpot
+        The usable highlights in it.
+    """
+
+    picture: Picture
+    spots: list[ScoredSpot]
+
+
+def frames_for(pixels: int) -> int:
+    """Return how many frames the bank of a picture of so many pixels has."""
+    return int(np.clip(FRAMES * USUAL_PX / max(pixels, 1), FEWEST_FRAMES, FRAMES))
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A real picture that a bank is rendered for.
+
+    Parameters
+    ----------
+    draws : SceneDraws
+        Draws the scenes.
+    pixels : ndarray, shape (N, 2)
+        Peaks of its highlights, px: the patches stand where they are.
+    seen : ndarray of bool, shape (H, W), optional
+        Pixels of its view; twins are black outside of it too.
+    grey : bool
+        Whether it has no colours: twins are their luma then.
+    """
+
+    draws: SceneDraws
+    pixels: Array
+    seen: Mask | None = None
+    grey: bool = False
+
+
+def make_bank(
+    subjects: Sequence[Subject],
+    reconstructs: Reconstructs,
+    count: int,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> list[BankFrame]:
+    """Render a bank and score it.
+
+    Parameters
+    ----------
+    subjects : sequence of Subject
+        The real picture, or several of one camera and rig, which take turns.
+    reconstructs : Callable
+        The same reconstruction as theirs.
+    count : int
+        Frames.
+    seed : int
+        Of all draws.
+    progress : callable, optional
+        See `Progress`.
+    """
+    made: list[BankFrame] = []
+    pool = make_pool()
+    # Frames of one patch come one after the other, since its kernels and its mesh then stay.
+    used = min(len(pool), max(count // FRAMES_PER_PATCH, 1))
+    order = (np.sort(np.arange(count) % used) + seed) % len(pool)
+    # Even shares of the distances, in any order.
+    shares = (from_integer(seed).permutation(count) + 0.5) / count
+    session, at = None, -1
+    for number, first in enumerate(order.tolist()):
+        rng, subject = from_integer(seed * 100_003 + number), subjects[number % len(subjects)]
+        # A patch that bends around a camera so far away has no view: another one then.
+        tried = ((first + step) % len(pool) for step in range(len(pool)))
+        share = float(shares[number])
+        drawn = ((patch, subject.draws.draw(rng, pool[patch], subject.pixels, share)) for patch in tried)
+        patch, scene = next(((patch, scene) for patch, scene in drawn if scene is not None), (at, None))
+        if scene is not None:
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    session = session if session is not None and patch == at else Session(scene, COLOUR)
+                    at = patch
+                    view = render_view(session, scene)
+                    made.append(_scored_frame(session, view, reconstructs, subject))
+            except SimtestError:
+                # Such as a camera or a light that a drawn view puts inside the tissue: it gives no frame.
+                session = None
+        if progress:
+            progress(number + 1, count, "rendering twins")
+    return made
+
+
+def _scored_frame(session: Session, view: RenderedView, reconstructs: Reconstructs, subject: Subject) -> BankFrame:
+    """Take one picture of a rendered view, reconstruct and score it."""
+    picture = view.frame(view.scene.sensor.seed)
+    if subject.grey:
+        picture = luma(picture)
+    if (seen := subject.seen) is not None:
+        picture = np.where(seen if picture.ndim == 2 else seen[..., None], picture, np.float32(0))
+    spots = score(session, view, reconstructs(picture))
+    return BankFrame(np.asarray(np.rint(255 * np.clip(picture, 0, 1)), dtype=np.uint8), spots)
+
+
+def all_spots(bank: Sequence[BankFrame]) -> list[tuple[int, ScoredSpot]]:
+    """Return all scored highlights of a bank with the number of their frame."""
+    return [(number, spot) for number, frame in enumerate(bank) for spot in frame.spots]

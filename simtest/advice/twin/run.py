@@ -1,0 +1,192 @@
+"""Twins of one picture: reconstruct it, render a bank of frames like it, and measure the errors at highlights alike."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from simtest.advice.twin.bank import BankFrame, Progress, Subject, all_spots, frames_for, make_bank
+from simtest.advice.twin.matching import Matcher, Twins
+from simtest.advice.twin.scenes import Look, SceneDraws, look_of
+from simtest.advice.twin.scoring import ScoredSpot, Spot, SpotKind, usable_spots
+from simtest.calibration import Calibration
+from simtest.errors import InputError
+from simtest.reconstruction.assumptions import Assumption
+from simtest.reconstruction.choices import complete
+from simtest.reconstruction.found import Reconstruction
+from simtest.reconstruction.image_io import is_sequence, read_picture
+from simtest.reconstruction.picture import Options, read_calibration
+from simtest.reconstruction.pipeline import run_picture
+from simtest.reconstruction.ranking import deviation_deg
+from simtest.runtime.arrays import Array, Image
+from simtest.runtime.resources import shown
+
+LEAST_TWINS = 20
+"""A bank with fewer highlights measures nothing."""
+
+DRAWN = (
+    Assumption("relief, curvature and tilt of the tissue", "a pool of 16 patches; tilts up to 35 deg", "not yet told"),
+    Assumption("liquid film", "roughness 0.018 to 0.05, level -2 to 0.3", "not yet told"),
+    Assumption("light exits", "discs of 0.5 to 1.3 mm radius; lights of one power", "not yet told"),
+    Assumption("camera chain", "one of three presets, its sharpening, noise and coding drawn", "not yet told"),
+)
+"""What no frame shows and no file states of a twin; the ranges are those of `patches` and `scenes`."""
+
+
+@dataclass(frozen=True)
+class SpotTwins:
+    """A highlight of the real frame with what its twins measure.
+
+    Parameters
+    ----------
+    spot : Spot
+        The highlight.
+    stated_deg : float or None
+        RMS error that its best estimate states, deg.
+    twins : Twins
+        What the twins measure.
+    """
+
+    spot: Spot
+    stated_deg: float | None
+    twins: Twins
+
+
+@dataclass(frozen=True)
+class TwinResult:
+    """The twins of a picture.
+
+    Parameters
+    ----------
+    image : str
+        The picture's name.
+    picture : ndarray of float32, shape (H, W) or (H, W, 3)
+        As encoded.
+    spots : list of SpotTwins
+        Its usable highlights.
+    bank : list of BankFrame
+        The rendered frames.
+    bank_spots : list of (int, ScoredSpot)
+        The highlights in them, with the number of their frame.
+    look : Look
+        What the picture shows of tissue and exposure.
+    assumed : list of Assumption
+        What is not known exactly, and how it was drawn.
+    warnings : list of str
+        Of the calibration.
+    processor_s : float
+        Processor time of this process, s.
+    """
+
+    image: str
+    picture: Image
+    spots: list[SpotTwins]
+    bank: list[BankFrame]
+    bank_spots: list[tuple[int, ScoredSpot]]
+    look: Look
+    assumed: list[Assumption]
+    warnings: list[str]
+    processor_s: float
+
+    def share_of(self, kind: SpotKind) -> float:
+        """Return the share of one kind among all highlights of the bank."""
+        return float(np.mean([spot.kind == kind for _, spot in self.bank_spots]))
+
+    def rms_deg(self, of: str = "rms_deg") -> float:
+        """Return the root mean square over the highlights of one of their twins' RMS errors, deg."""
+        return float(np.sqrt(np.mean([getattr(each.twins, of) ** 2 for each in self.spots])))
+
+    @property
+    def coverage(self) -> float | None:
+        """Mean share of the twins' stated 95 % regions that hold the truth."""
+        told = [each.twins.coverage for each in self.spots if each.twins.coverage is not None]
+        return float(np.mean(told)) if told else None
+
+
+def twin_picture(
+    image: Path, options: Options, frames: int | None = None, seed: int = 0, progress: Progress | None = None
+) -> TwinResult:
+    """Measure the errors at a picture's highlights on rendered twins of them.
+
+    Parameters
+    ----------
+    image : Path
+        A single picture.
+    options : Options
+        As of `simtest reconstruct`; the twins are reconstructed alike.
+    frames : int, optional
+        Frames of the bank; default by the picture's size (`frames_for`).
+    seed : int
+        Of what is drawn.
+    progress : callable, optional
+        Called with frames rendered, frames in all, and what is done.
+
+    Raises
+    ------
+    InputError
+        If the picture or the calibration is malformed, the picture holds no usable highlight, or the bank none like
+        any.
+    BackendError
+        If the rendering backend cannot be used.
+    """
+    started = time.process_time()
+    if is_sequence(image):
+        raise InputError(f"{shown(image)}: is a folder or a film; twin takes one picture")
+    picture = read_picture(image)
+    calibration, warnings = read_calibration(options, picture)
+    found, bank, look, assumed = twins_of(picture, calibration, options, shown(image), frames, seed, progress)
+    spots = all_spots(bank)
+    return TwinResult(
+        image.name, picture, found, bank, spots, look, assumed, warnings, time.process_time() - started
+    )  # fmt: skip
+
+
+def twins_of(
+    picture: Image,
+    calibration: Calibration,
+    options: Options,
+    name: str = "picture",
+    frames: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[list[SpotTwins], list[BankFrame], Look, list[Assumption]]:
+    """Measure twins of a picture's usable highlights (see `twin_picture`); return them, the bank, look and priors."""
+
+    def reconstructs(values: Image) -> Reconstruction:
+        return run_picture(
+            values, calibration, options.encoding, options.detector, options.estimators, None, options.smoothing_px,
+            not options.every, options.target,
+        )[0]  # fmt: skip
+
+    made, choices = run_picture(
+        picture, calibration, options.encoding, options.detector, options.estimators, None, options.smoothing_px,
+        not options.every, options.target,
+    )  # fmt: skip
+    spots = usable_spots(made)
+    if not spots:
+        raise InputError(f"{name}: no usable highlight: none was found that has a normal of its own; try --all")
+    view = made.detection.view
+    known = complete(calibration, options.encoding)
+    look = look_of(picture, view.seen)
+    peaks: Array = np.array([spot.peak_px for spot in spots])
+    count = frames_for(picture.shape[0] * picture.shape[1]) if frames is None else frames
+    subject = Subject(SceneDraws(known, look), peaks, view.seen, picture.ndim == 2)
+    bank = make_bank([subject], reconstructs, count, seed, progress)
+    matched = match_spots(spots, all_spots(bank), name, count)
+    return matched, bank, look, [*choices.assumed, *DRAWN]
+
+
+def match_spots(
+    spots: Sequence[Spot], twins: Sequence[tuple[int, ScoredSpot]], name: str, frames: int
+) -> list[SpotTwins]:
+    """Return what the twins of each highlight measure; raise `InputError` where the bank is too small."""
+    known = sum(spot.kind != "false" for _, spot in twins)
+    if known < LEAST_TWINS:
+        raise InputError(
+            f"{name}: {known} usable highlights in {frames} rendered frames; needs {LEAST_TWINS} or more: "
+            "give more with --frames, or a calibration that is nearer to the scope"
+        )
+    matcher = Matcher(twins)
+    return [SpotTwins(spot, deviation_deg(spot.estimate), matcher.find(spot)) for spot in spots]

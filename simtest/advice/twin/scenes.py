@@ -1,0 +1,207 @@
+"""Draws the scene of one frame of the bank: what the user told as told, and everything else from its prior."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from simtest.advice.twin.patches import TissuePatch, look_at
+from simtest.calibration import Calibration, CameraPrior, Distribution, LogUniform, Uniform
+from simtest.errors import InputError
+from simtest.geometry import Camera
+from simtest.geometry.angular_profile import AngularProfile
+from simtest.geometry.vectors import angle_deg
+from simtest.runtime.arrays import Array, Image, Mask
+from simtest.runtime.resources import find
+from simtest.spec import Scene, apply_settings, read_toml, scene_from_dict
+from simtest.spec.camera_tables import camera_table
+
+ORGANS = ("tissue_colon", "tissue_stomach", "tissue_liver", "tissue_gallbladder")
+"""Shipped scenes whose colour and translucency tissue is given: that of the nearest colour."""
+
+CHAINS = ("colonoscope_hd", "laparoscope_hd", "old_sd")
+"""Camera chains that are drawn from; which one made a frame is not known."""
+
+RIGS = ((1, 0.3), (2, 0.3), (3, 0.2), (8, 0.2))
+"""Numbers of lights around the lens where nobody told the rig, with their shares."""
+
+MEAN_LEVELS = (0.1, 0.8)
+"""Mean values of a picture that an exposure can be set to."""
+
+SAMPLES = 4
+"""Rays of a pixel."""
+
+TRIES = 10
+"""Draws of a view before a frame is given up."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the frame itself shows of its tissue and exposure.
+
+    Parameters
+    ----------
+    organ : str
+        The shipped scene whose colour is nearest.
+    mean : float
+        Mean encoded value of the pixels that are seen.
+    """
+
+    organ: str
+    mean: float
+
+
+def look_of(picture: Image, seen: Mask | None) -> Look:
+    """Measure a picture as encoded, shape (H, W) or (H, W, 3); `seen`, shape (H, W), are the pixels of its view."""
+    values = picture.reshape(-1, *picture.shape[2:]) if seen is None else picture[seen]
+    mean = float(np.clip(values.mean(), *MEAN_LEVELS))
+    if picture.ndim == 2:
+        return Look(ORGANS[0], mean)
+    linear = np.median(values, axis=0).astype(float) ** 2.2 + 1e-3
+    bases = {organ: _base_colour(organ) for organ in ORGANS}
+    # Colour alone: the level is the exposure's.
+    away = {organ: float(angle_deg(base / np.linalg.norm(base), linear / np.linalg.norm(linear)))
+            for organ, base in bases.items()}  # fmt: skip
+    return Look(min(away, key=lambda organ: away[organ]), mean)
+
+
+def _base_colour(organ: str) -> Array:
+    albedo = scene_from_dict({**read_toml(find(organ, "scenes")), "name": organ}).albedo
+    assert albedo is not None
+    return np.array(albedo.base, dtype=float)
+
+
+class SceneDraws:
+    """Draws scenes as a user's frame may have been taken.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        What the user told; each draw has lights, distances and a camera from its priors.
+    look : Look
+        Of the frame.
+    """
+
+    def __init__(self, calibration: Calibration, look: Look) -> None:
+        self._calibration, self._look = calibration, look
+        self._base = read_toml(find(look.organ, "scenes"))
+
+    def draw(self, rng: np.random.Generator, patch: TissuePatch, pixels: Array, share: float) -> Scene | None:
+        """Draw a scene that shows a patch at one of some pixels, shape (N, 2), px.
+
+        `share`, in (0, 1), is the quantile of its distance, so that the distances of a bank are even.
+
+        Returns
+        -------
+        Scene or None
+            None where no view of the patch is possible, as where it is bent towards a camera that far away.
+        """
+        priors = self._calibration.priors
+        for _ in range(TRIES):
+            pixel = pixels[int(rng.integers(len(pixels)))]
+            sightline = self._calibration.camera.unproject(pixel)
+            distance = _distance(priors.distance, share)
+            moved = look_at(patch, rng, sightline, distance) if np.isfinite(sightline).all() else None
+            if moved is None:
+                continue
+            values = {
+                "surface": patch.surface, "rig": self._rig(rng), "reflectance.film": self._film(rng),
+                "sensor": self._sensor(rng), "render.samples_per_pixel": SAMPLES,
+                "camera": {**drawn_camera(self._calibration.camera, priors.camera, rng), "moved": moved},
+            }  # fmt: skip
+            try:
+                return _scene(self._base, values, self._look.organ)
+            except InputError:
+                # A drawn lens may fold, or a light lie in the tissue: another draw.
+                continue
+        return None
+
+    def _film(self, rng: np.random.Generator) -> dict[str, float]:
+        """Draw the liquid film: its lobe, and how far it fills the valleys."""
+        film = dict(self._base["reflectance"]["film"])
+        film["alpha"] = math.exp(rng.uniform(math.log(0.018), math.log(0.05)))
+        film["level"] = float(rng.uniform(-2.0, 0.3))
+        return film
+
+    def _rig(self, rng: np.random.Generator) -> dict[str, Any]:
+        """Return the lights: where they were told, or on a ring as the prior has it; their exits are drawn."""
+        priors = self._calibration.priors
+        source = {"type": "disc", "radius_mm": float(rng.uniform(0.5, 1.3))}
+        each = {"source": source, "profile": {"type": "cosine", "power": float(rng.uniform(0.0, 2.0))}}
+        if not self._calibration.emission.is_uniform:
+            each["profile"] = _profile(self._calibration.emission)
+        if priors.lights_mm:
+            return {"lights": [{"position_mm": list(light), **each} for light in priors.lights_mm]}
+        counts, shares = zip(*RIGS, strict=True)
+        count = int(rng.choice(counts, p=shares))
+        radius, azimuth = _drawn(priors.light_offset_mm, rng), float(rng.uniform(0, 360))
+        ring = [{"offset_mm": radius, "azimuth_deg": (azimuth + 360 * i / count) % 360} for i in range(count)]
+        return {"lights": [{**light, "power": 1 / count, **each} for light in ring]}
+
+    def _sensor(self, rng: np.random.Generator) -> dict[str, Any]:
+        """Draw a camera chain with the frame's mean level, its response where it was told."""
+        calibration = self._calibration
+        told = calibration.response
+        sensor: dict[str, Any] = {
+            "preset": CHAINS[int(rng.integers(len(CHAINS)))],
+            "point_spread_px": float(rng.uniform(0.55, 1.0)),
+            "exposure": {"average": float(np.clip(self._look.mean * rng.uniform(0.9, 1.1), *MEAN_LEVELS))},
+            "full_well": math.exp(rng.uniform(math.log(3000), math.log(40000))),
+            "vignetting": {"type": "cosine", "power": float(rng.uniform(0.0, 4.5))},
+            "sharpening": {
+                "radius_px": math.exp(rng.uniform(math.log(1.0), math.log(2.9))),
+                "amount": float(rng.uniform(0.3, 1.8)),
+            },
+            "coding": {"type": "jpeg", "quality": int(rng.integers(70, 96)), "chroma": "4:2:0"},
+            "seed": int(rng.integers(2**31)),
+        }  # fmt: skip
+        if told is not None and told.kind == "gamma":
+            sensor["response"] = {"type": "gamma", "gamma": told.gamma}
+        elif told is not None and told.kind == "table":
+            sensor["response"] = {"type": "table", "light": told.light, "value": told.value}
+        elif told is not None and told.kind == "linear":
+            sensor["response"] = {"type": "linear"}
+        if not calibration.vignetting.is_uniform:
+            sensor["vignetting"] = _profile(calibration.vignetting)
+        return sensor
+
+
+def drawn_camera(camera: Camera, prior: CameraPrior, rng: np.random.Generator) -> dict[str, Any]:
+    """Return the table of a camera about the told one, as far as its prior leaves it open."""
+    table: dict[str, Any] = dict(camera_table(camera))
+    scale = max(1 + prior.focal_sd * float(rng.standard_normal()), 0.3)
+    shift = prior.centre_sd_px * rng.standard_normal(2)
+    table |= {"fx": camera.fx * scale, "fy": camera.fy * scale}
+    table |= {"cx": camera.cx + float(shift[0]), "cy": camera.cy + float(shift[1])}
+    k1 = prior.distortion_sd * float(rng.standard_normal())
+    if camera.distortion is None and k1:
+        table["distortion"] = {"type": "brown_conrady", "k1": k1}
+    return table
+
+
+def _profile(profile: AngularProfile) -> dict[str, Any]:
+    """Return the table of a told profile."""
+    if profile.angles:
+        return {"type": "table", "angle_deg": np.degrees(profile.angles).tolist(), "value": list(profile.values)}
+    return {"type": "cosine", "power": profile.power}
+
+
+def _distance(prior: Distribution, share: float) -> float:
+    """Return the distance below which a share of the draws lies, mm.
+
+    Of a range the ends alone are known, and errors go with 1 / distance: it is drawn evenly in the logarithm.
+    """
+    if isinstance(prior, Uniform) and prior.low > 0:
+        prior = LogUniform(prior.low, prior.high)
+    return float(prior.quantile(np.array(share)))
+
+
+def _drawn(prior: Distribution, rng: np.random.Generator) -> float:
+    """Draw from a distribution."""
+    return float(prior.quantile(np.array(rng.uniform(1e-6, 1 - 1e-6))))
+
+
+def _scene(base: dict[str, Any], values: dict[str, Any], organ: str) -> Scene:
+    data = {**apply_settings(base, values, organ), "name": organ}
+    return scene_from_dict(data, organ)

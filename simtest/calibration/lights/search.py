@@ -1,0 +1,300 @@
+"""Which highlights belong to which light, and how many lights there are.
+
+candidates: every pair of highlights of two pictures, whose reflected rays meet near a point. growth: each candidate
+takes, picture by picture, the highlight that lies where it predicts one, and is corrected by it. choice: the candidate
+that explains most highlights becomes a light, its highlights are taken away, and so on.
+"""
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.calibration.lights.bundle import (
+    REACH_MM,
+    Bundle,
+    Highlights,
+    derivatives,
+    prediction,
+    solve,
+    with_error,
+)
+from simtest.calibration.lights.mirrors import Mirrors
+from simtest.geometry import Array, chi_squared
+from simtest.geometry.camera import Camera
+
+Labels = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+
+MOST_LIGHTS = 4
+PAIRS = 24
+"""Pairs of pictures whose highlights are combined: those whose mirrors lie farthest apart in the view."""
+
+MOST_CANDIDATES = 4000
+SLACK_PX = 0.3
+"""Error of a highlight's centre that the search allows beyond the stated one; the fit does not use it."""
+
+GATE = chi_squared.quantile(0.999, 2)
+"""Squared distance of a highlight from its expected pixel, in standard deviations, up to which it is taken."""
+
+LEAST_SHARE = 0.6
+"""A light must explain a highlight in this share of the pictures."""
+
+PARALLEL = 0.02
+"""Rays at a smaller angle, rad, count as parallel."""
+
+FIRST_STEPS = 5
+ROUNDS = 6
+DISTINCT = chi_squared.quantile(0.9999, 3)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Lights, and which one made each highlight.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        The fit.
+    source : ndarray of int, shape (N,)
+        Number of the light of each highlight; -1: none.
+    others : ndarray, shape (A, 3)
+        Positions, mm, that explain as many highlights as a light does and are none: the assignment is ambiguous.
+    """
+
+    bundle: Bundle
+    source: Labels
+    others: Array
+
+
+@dataclass
+class _Candidates:
+    """Positions (N, 3), covariances (N, 3, 3), the highlight taken in each picture (N, V), and chi-squared (N,)."""
+
+    lights: Array
+    covariances: Array
+    taken: Labels
+    chi2: Array
+
+    def only(self, kept: Mask) -> "_Candidates":
+        return _Candidates(self.lights[kept], self.covariances[kept], self.taken[kept], self.chi2[kept])
+
+
+def find_lights(camera: Camera, mirrors: Mirrors, highlights: Highlights, most: int = MOST_LIGHTS) -> Found | None:
+    """Find up to `most` lights that explain the highlights; None where there is none.
+
+    Highlights that no light explains are left out: a second reflection, a window, a lamp that does not move with the
+    camera.
+    """
+    loose = with_error(highlights, SLACK_PX)
+    candidates = _grow(camera, mirrors, loose, _candidates(camera, mirrors, loose))
+    least = max(2, math.ceil(LEAST_SHARE * len(mirrors)))
+    free = np.ones(len(highlights), dtype=bool)
+    starts: list[Array] = []
+    while len(starts) < most and len(candidates.lights):
+        counts = _counted(candidates, free)
+        best = int(np.lexsort((candidates.chi2, -counts))[0])
+        if counts[best] < least:
+            break
+        alone = _refined(camera, mirrors, loose, candidates.lights[best][None], free, 1)
+        if alone is None or (alone[1] >= 0).sum() < least:
+            candidates = candidates.only(np.arange(len(candidates.lights)) != best)
+            continue
+        starts.append(alone[0].lights[0])
+        free &= alone[1] < 0
+    if not starts:
+        return None
+    together = _refined(camera, mirrors, loose, np.array(starts), np.ones(len(highlights), dtype=bool), ROUNDS)
+    if together is None:
+        return None
+    bundle = solve(camera, mirrors, highlights, together[1], together[0].lights)
+    if bundle is None:
+        return None
+    return Found(bundle, together[1], _ambiguities(camera, mirrors, loose, candidates, bundle, together[1]))
+
+
+def _candidates(camera: Camera, mirrors: Mirrors, highlights: Highlights) -> _Candidates:
+    """Return positions where the reflected rays of two highlights of different pictures meet."""
+    first, second = _pairs(highlights, camera)
+    none = _Candidates(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, len(mirrors)), np.intp), np.empty(0))
+    if not len(first):
+        return none
+    ends = [mirrors.reflect(camera, highlights.view[k], highlights.pixels[k]) for k in (first, second)]
+    lights = _nearest_points(*ends[0], *ends[1])
+    # refine: both highlights' pixels, and the prior
+    covariances = np.empty((len(lights), 3, 3))
+    chi2 = np.zeros(len(lights))
+    for _ in range(FIRST_STEPS):
+        normal = np.broadcast_to(np.eye(3) / REACH_MM**2, covariances.shape).copy()
+        gradient = -lights / REACH_MM**2
+        chi2 = np.zeros(len(lights))
+        for k in (first, second):
+            residual, J, weights = _weighted(camera, mirrors, highlights, lights, highlights.view[k], k)
+            normal += np.swapaxes(J, 1, 2) @ weights @ J
+            gradient += np.einsum("nki,nkl,nl->ni", J, weights, residual)
+            chi2 += np.einsum("nk,nkl,nl->n", residual, weights, residual)
+        fine = np.asarray(np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(gradient).all(axis=1))
+        covariances = np.linalg.inv(np.where(fine[:, None, None], normal, np.eye(3)))
+        lights = np.where(fine[:, None], lights + np.einsum("nij,nj->ni", covariances, gradient), np.nan)
+    taken = np.full((len(lights), len(mirrors)), -1, dtype=np.intp)
+    rows = np.arange(len(lights))
+    taken[rows, highlights.view[first]], taken[rows, highlights.view[second]] = first, second
+    return _Candidates(lights, covariances, taken, chi2).only(np.isfinite(lights).all(axis=1) & (chi2 < GATE))
+
+
+def _pairs(highlights: Highlights, camera: Camera) -> tuple[Labels, Labels]:
+    """Return pairs of highlights of different pictures, of those pictures that differ most first."""
+    views = np.unique(highlights.view)
+    middles = {view: camera.unproject(highlights.pixels[highlights.view == view]).mean(axis=0) for view in views}
+    apart = sorted(combinations(views, 2), key=lambda pair: -float(np.linalg.norm(middles[pair[0]] - middles[pair[1]])))
+    # Every picture takes part, with the one that differs most from it.
+    chosen = list(dict.fromkeys(next(pair for pair in apart if view in pair) for view in views)) if apart else []
+    chosen += [pair for pair in apart[:PAIRS] if pair not in chosen]
+    first, second = list[int](), list[int]()
+    for a, b in chosen:
+        ones, others = np.flatnonzero(highlights.view == a), np.flatnonzero(highlights.view == b)
+        first += np.repeat(ones, len(others)).tolist()
+        second += np.tile(others, len(ones)).tolist()
+    return np.array(first[:MOST_CANDIDATES], np.intp), np.array(second[:MOST_CANDIDATES], np.intp)
+
+
+def _nearest_points(p: Array, u: Array, q: Array, v: Array) -> Array:
+    """Return the points midway between lines through p, q along u, v, shape (N, 3), at most twice the reach away."""
+    w, cosine = p - q, np.sum(u * v, axis=1)
+    square = np.maximum(1 - cosine**2, 1e-9)
+    a, b = np.sum(u * w, axis=1), np.sum(v * w, axis=1)
+    middle = (p + ((cosine * b - a) / square)[:, None] * u + q + ((b - cosine * a) / square)[:, None] * v) / 2
+    # Rays that are all but parallel meet nowhere in particular: the point nearest to the camera, which the prior takes.
+    nearest = p - np.sum(p * u, axis=1)[:, None] * u
+    middle = np.where((square > PARALLEL**2)[:, None], middle, nearest)
+    length = np.linalg.norm(middle, axis=1, keepdims=True)
+    return np.asarray(middle * np.minimum(1.0, 2 * REACH_MM / np.maximum(length, 1e-9)))
+
+
+def _weighted(
+    camera: Camera, mirrors: Mirrors, highlights: Highlights, lights: Array, view: Labels, measured: Labels
+) -> tuple[Array, Array, Array]:
+    """Return residuals (N, 2), derivatives by the light (N, 2, 3) and inverse covariances (N, 2, 2) of highlights."""
+    predicted, J, K = derivatives(camera, mirrors, view, lights, np.zeros(3))
+    spread = highlights.covariance[measured] + K @ np.swapaxes(K, 1, 2)
+    fine = np.asarray(np.isfinite(spread).all(axis=(1, 2)))
+    weights = np.linalg.inv(np.where(fine[:, None, None], spread, np.eye(2)))
+    return highlights.pixels[measured] - predicted, J, np.where(fine[:, None, None], weights, np.nan)
+
+
+def _grow(camera: Camera, mirrors: Mirrors, highlights: Highlights, held: _Candidates) -> _Candidates:
+    """Let every candidate take the highlight that it predicts in each further picture, and be corrected by it."""
+    for view in range(len(mirrors)):
+        own = np.flatnonzero(highlights.view == view)
+        asked = np.flatnonzero(held.taken[:, view] < 0)
+        if not len(own) or not len(asked):
+            continue
+        at = np.full(len(asked), view)
+        predicted, J, K = derivatives(camera, mirrors, at, held.lights[asked], np.zeros(3))
+        spread = J @ held.covariances[asked] @ np.swapaxes(J, 1, 2) + K @ np.swapaxes(K, 1, 2)
+        # the nearest highlight, in standard deviations
+        gaps = highlights.pixels[own][None] - predicted[:, None]
+        whole = spread[:, None] + highlights.covariance[own][None]
+        fine = np.asarray(np.isfinite(whole).all(axis=(2, 3)) & np.isfinite(gaps).all(axis=2))
+        inverse = np.linalg.inv(np.where(fine[..., None, None], whole, np.eye(2)))
+        squares = np.where(fine, np.einsum("nhi,nhij,nhj->nh", gaps, inverse, gaps), np.inf)
+        nearest = squares.argmin(axis=1)
+        rows = np.flatnonzero(squares[np.arange(len(asked)), nearest] < GATE)
+        if not len(rows):
+            continue
+        n, h = asked[rows], nearest[rows]
+        gain = held.covariances[n] @ np.swapaxes(J[rows], 1, 2) @ inverse[rows, h]
+        held.lights[n] += np.einsum("nij,nj->ni", gain, gaps[rows, h])
+        held.covariances[n] -= gain @ J[rows] @ held.covariances[n]
+        held.chi2[n] += squares[rows, h]
+        held.taken[n, view] = own[h]
+    return held
+
+
+def _counted(candidates: _Candidates, free: Mask) -> npt.NDArray[np.intp]:
+    """Return how many free highlights each candidate has taken."""
+    return np.asarray(((candidates.taken >= 0) & free[candidates.taken]).sum(axis=1), np.intp)
+
+
+def _refined(
+    camera: Camera, mirrors: Mirrors, highlights: Highlights, starts: Array, free: Mask, rounds: int
+) -> tuple[Bundle, Labels] | None:
+    """Assign highlights to lights and fit the lights, in turn, until the assignment stays."""
+    bundle: Bundle | None = Bundle(starts, np.eye(starts.size), np.zeros(3), 0.0, 0)
+    source = np.full(len(highlights), -1, dtype=np.intp)
+    for _ in range(max(rounds, 2)):
+        assert bundle is not None
+        assigned = assign(camera, mirrors, highlights, bundle, free)
+        if np.array_equal(assigned, source):
+            break
+        source = assigned
+        counts = np.bincount(source[source >= 0], minlength=len(starts))
+        if counts.min() < 1:
+            return None
+        bundle = solve(camera, mirrors, highlights, source, bundle.lights)
+        if bundle is None:
+            return None
+    assert bundle is not None
+    return bundle, source
+
+
+def assign(
+    camera: Camera, mirrors: Mirrors, highlights: Highlights, bundle: Bundle, free: npt.NDArray[np.bool_]
+) -> Labels:
+    """Return which light made each highlight, one highlight a light and picture at most; -1 where none did.
+
+    Of all assignments of a picture's highlights the one with the smallest sum of squared distances is taken, where a
+    highlight without a light costs `GATE`.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    source = np.full(len(highlights), -1, dtype=np.intp)
+    lights = np.arange(len(bundle.lights))
+    for view in np.unique(highlights.view):
+        own = np.flatnonzero((highlights.view == view) & free)
+        if not len(own):
+            continue
+        predicted, spread = prediction(camera, mirrors, bundle, np.full(len(lights), view), lights)
+        gaps = highlights.pixels[own][:, None] - predicted[None]
+        whole = spread[None] + highlights.covariance[own][:, None]
+        fine = np.asarray(np.isfinite(whole).all(axis=(2, 3)) & np.isfinite(gaps).all(axis=2))
+        inverse = np.linalg.inv(np.where(fine[..., None, None], whole, np.eye(2)))
+        squares = np.where(fine, np.einsum("hsi,hsij,hsj->hs", gaps, inverse, gaps), np.inf)
+        rows, columns = linear_sum_assignment(np.minimum(squares, GATE))
+        for row, column in zip(rows, columns, strict=True):
+            if squares[row, column] < GATE:
+                source[own[row]] = column
+    return source
+
+
+def _ambiguities(
+    camera: Camera, mirrors: Mirrors, highlights: Highlights, candidates: _Candidates, bundle: Bundle, source: Labels
+) -> Array:
+    """Return positions that explain at least as many highlights as some light does, and are no light."""
+    if not len(candidates.lights):
+        return np.empty((0, 3))
+    least = int(np.bincount(source[source >= 0]).min())
+    everything = np.ones(len(highlights), dtype=bool)
+    counts, found = _counted(candidates, everything), list[Array]()
+    for index in np.lexsort((candidates.chi2, -counts)):
+        if counts[index] < least:
+            break
+        light, spread = candidates.lights[index], candidates.covariances[index]
+        known = [(each, bundle.covariance_of(i)) for i, each in enumerate(bundle.lights)]
+        known += [(each, np.zeros((3, 3))) for each in found]
+        gaps = [(light - each) @ np.linalg.solve(spread + own, light - each) for each, own in known]
+        if min(gaps) < DISTINCT:
+            continue
+        alone = _refined(camera, mirrors, highlights, light[None], everything, 1)
+        if alone is None or (alone[1] >= 0).sum() < least or not _is_apart(alone[0], bundle):
+            continue
+        found.append(alone[0].lights[0])
+    return np.array(found).reshape(-1, 3)
+
+
+def _is_apart(alone: Bundle, bundle: Bundle) -> bool:
+    gaps = alone.lights[0] - bundle.lights
+    spreads = [alone.covariance + bundle.covariance_of(i) for i in range(len(gaps))]
+    return min(float(gap @ np.linalg.solve(spread, gap)) for gap, spread in zip(gaps, spreads, strict=True)) > DISTINCT

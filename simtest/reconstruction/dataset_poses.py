@@ -1,0 +1,76 @@
+"""Trajectories in the files of public data sets of colonoscopy: C3VD's pose.txt and SimCol3D's pair of text files.
+
+C3VD writes camera-to-world matrices for row vectors, 16 numbers a line, mm: the translation stands in the last row.
+SimCol3D writes tx ty tz, cm, into SavedPosition_NAME.txt and qx qy qz qw into SavedRotationQuaternion_NAME.txt, in the
+left-handed frame of its game engine, whose y axis points up.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from simtest.errors import InputError
+from simtest.geometry.quaternions import rotation_of
+from simtest.runtime.arrays import Array
+from simtest.runtime.files import require_plain
+from simtest.runtime.resources import shown
+
+POSITION, ROTATION = "SavedPosition_", "SavedRotationQuaternion_"
+"""Begins of the names of SimCol3D's files."""
+
+MM_PER_CM = 10.0
+
+DOWN = np.diag([1.0, -1.0, 1.0])
+"""From y up to y down, which makes the left-handed frame right-handed."""
+
+
+def dataset_poses(path: Path, text: str, where: str) -> list[Array] | None:
+    """Return the poses of a data set's file, world_from_camera, shape (4, 4), mm; None where it is none of them.
+
+    Raises
+    ------
+    InputError
+        If a line is malformed, or SimCol3D's other file is missing or of another length.
+    """
+    if path.name.startswith(POSITION):
+        return _simcol3d(path, text, where)
+    first = next((line for line in text.splitlines() if line.strip()), "")
+    return _c3vd(text, where) if len(first.split(",")) == 16 else None
+
+
+def _c3vd(text: str, where: str) -> list[Array]:
+    return [np.array(row).reshape(4, 4).T for row in _numbers(text, 16, ",", where)]
+
+
+def _simcol3d(path: Path, text: str, where: str) -> list[Array]:
+    other = path.with_name(ROTATION + path.name.removeprefix(POSITION))
+    try:
+        turned = require_plain(other, "record_bytes").read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        raise InputError(f"{where}: needs {shown(other.name)} beside it, which cannot be read") from None
+    at, of = _numbers(text, 3, None, where), _numbers(turned, 4, None, f"--poses {shown(other)}")
+    if len(at) != len(of):
+        raise InputError(f"{where}: {len(at)} positions, but {shown(other.name)} has {len(of)} rotations")
+    poses = []
+    for number, (position, (x, y, z, w)) in enumerate(zip(at, of, strict=True)):
+        T = np.eye(4)
+        T[:3, :3] = DOWN @ rotation_of((w, x, y, z), f"--poses {shown(other)}: pose {number}") @ DOWN
+        T[:3, 3] = DOWN @ position * MM_PER_CM
+        poses.append(T)
+    return poses
+
+
+def _numbers(text: str, count: int, separator: str | None, where: str) -> list[list[float]]:
+    """Return the numbers of each line that is not empty; raise `InputError` where there are not `count` of them."""
+    rows = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            row = [float(word) for word in line.split(separator)]
+        except ValueError:
+            row = []
+        if len(row) != count or not np.isfinite(row).all():
+            raise InputError(f"{where}: line {number}: {shown(line.strip(), 60)}; must be {count} numbers")
+        rows.append(row)
+    return rows

@@ -1,0 +1,252 @@
+"""What the pictures show: the ball or plate of each, and its highlights."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from simtest.calibration import Calibration
+from simtest.calibration.lights.bundle import Highlights
+from simtest.calibration.lights.mirrors import Balls, Plates
+from simtest.errors import InputError
+from simtest.geometry import Array, Image, Mask
+from simtest.geometry.camera import Camera
+from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
+from simtest.reconstruction.light_calibration.ball_search import find_ball, trace_outline
+from simtest.reconstruction.light_calibration.outline import BallOutline, has_dark_ring, refine_outline
+from simtest.runtime.resources import shown
+
+OUTLINE_FLOOR_PX = 0.02
+"""Error of an outline that stays however little noise there is, px: pixels are squares, lenses no Gaussians."""
+
+LIGHT_MM = 4.0
+"""Where a picture is dark behind the ball, a light so far beside the camera leaves a strip of the rim in its shadow."""
+
+SHADOW = 1.5
+"""Standard deviation of the outline's error by that strip, in widths of it."""
+
+WIDEST, LEAST_WIDEST_PX = 0.2, 12.0
+"""Longest highlight, as a share of the ball's radius, but at least so many px."""
+
+WIDEST_ON_PLATE = 0.06
+"""Longest highlight on a plate, as a share of the picture's longer side."""
+
+INSIDE = 0.97
+"""Highlights are searched within this share of the cone's half-angle."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A picture with its mirror and highlights.
+
+    Parameters
+    ----------
+    name : str
+        The picture's file.
+    intensity : ndarray, shape (H, W)
+        Linear light, falloff undone.
+    highlights : list of MeasuredHighlight
+        The brightest first.
+    outline : BallOutline, optional
+        Of the ball.
+    plane : tuple, optional
+        Of the plate: unit normal towards the camera, shape (3,), and n . x on it, mm.
+    """
+
+    name: str
+    intensity: Array
+    highlights: list[MeasuredHighlight]
+    outline: BallOutline | None = None
+    plane: tuple[Array, float] | None = None
+
+    @property
+    def usable(self) -> list[MeasuredHighlight]:
+        """Highlights without a problem."""
+        return [each for each in self.highlights if not each.problem]
+
+
+@dataclass
+class Views:
+    """The pictures that can be used, and why the others cannot."""
+
+    views: list[View] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+    def highlights(self) -> Highlights:
+        """Return the usable highlights of all pictures."""
+        rows = [(i, each) for i, view in enumerate(self.views) for each in view.usable]
+        return Highlights(
+            np.array([i for i, _ in rows], dtype=np.intp),
+            np.array([each.pixel for _, each in rows]).reshape(-1, 2),
+            np.array([each.covariance for _, each in rows]).reshape(-1, 2, 2),
+        )
+
+
+Circle = tuple[float, float, float]
+"""Centre and radius, px."""
+
+
+def read_balls(
+    pictures: Sequence[tuple[str, Callable[[], Image]]], calibration: Calibration, circles: dict[str, Circle]
+) -> Views:
+    """Read pictures of a ball.
+
+    Parameters
+    ----------
+    pictures : sequence of tuple
+        Name, and a function that reads the values in [0, 1] as they are encoded.
+    calibration : Calibration
+        Of the camera, with the response.
+    circles : dict
+        Rough outline of the ball by the picture's name, where it need not be searched.
+
+    Raises
+    ------
+    InputError
+        If a picture cannot be read, or has another size than the camera.
+    """
+    found = Views()
+    camera = calibration.camera
+    for name, read in pictures:
+        intensity = _linear(name, read(), calibration)
+        outline = _outline(intensity, camera, circles.get(name))
+        if isinstance(outline, str):
+            found.left_out[name] = outline
+            continue
+        inside = _inside(camera, outline)
+        radius_px = float(np.sqrt(inside.sum() / np.pi))
+        widest = max(WIDEST * radius_px, LEAST_WIDEST_PX)
+        found.views.append(View(name, intensity, measure_highlights(intensity, inside, widest), outline))
+    return found
+
+
+def read_plates(
+    pictures: Sequence[tuple[str, Callable[[], Image]]], calibration: Calibration, poses: Sequence[Array | None]
+) -> Views:
+    """Read pictures of a plate that lies in the plane z = 0 of the poses' world (`world_from_camera`, mm)."""
+    found, camera = Views(), calibration.camera
+    everywhere = camera.contains(camera.pixel_centres())
+    for (name, read), pose in zip(pictures, poses, strict=True):
+        if pose is None:
+            found.left_out[name] = "the file of poses does not name it"
+            continue
+        plane = _plane(pose)
+        if plane is None:
+            found.left_out[name] = "the camera is in the plate's plane, z = 0"
+            continue
+        intensity = _linear(name, read(), calibration)
+        widest = WIDEST_ON_PLATE * max(camera.width, camera.height)
+        found.views.append(View(name, intensity, measure_highlights(intensity, everywhere, widest), plane=plane))
+    return found
+
+
+def _plane(world_from_camera: Array) -> tuple[Array, float] | None:
+    """Return the plane z = 0 of the world in the camera's frame: its normal towards the camera, and n . x there."""
+    normal, height = world_from_camera[2, :3], float(world_from_camera[2, 3])
+    if abs(height) < 1e-6:
+        return None
+    side = 1.0 if height > 0 else -1.0
+    return side * normal / np.linalg.norm(normal), -abs(height) / float(np.linalg.norm(normal))
+
+
+def _linear(name: str, values: Image, calibration: Calibration) -> Array:
+    camera = calibration.camera
+    if values.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"{shown(name)}: {values.shape[1]} x {values.shape[0]} px; must be {camera.width} x {camera.height} px as "
+            "the calibration's camera"
+        )
+    return np.asarray(calibration.correct(np.asarray(values, dtype=np.float32)).intensity, dtype=float)
+
+
+def _outline(intensity: Array, camera: Camera, circle: Circle | None) -> BallOutline | str:
+    """Return a ball's outline, or why there is none."""
+    if circle is None:
+        searched = find_ball(intensity, camera)
+        if searched is None:
+            return "no ball found; tell its outline with --outlines"
+    else:
+        searched = trace_outline(intensity, camera, np.array(circle[:2]), circle[2])
+        if searched is None:
+            return "no edge of a ball near the outline that is told"
+    outline = refine_outline(intensity, camera, searched[0])
+    if outline is None:
+        return "too little of the ball's outline shows an edge"
+    if has_dark_ring(intensity, camera, outline):
+        return (
+            "a dark ring inside the outline: the ball's shadow on the wall hides its edge; light the wall by the room"
+        )
+    return outline
+
+
+def _inside(camera: Camera, outline: BallOutline) -> Mask:
+    border = outline.pixels(camera, 180)
+    low, high = np.floor(border.min(axis=0)).astype(int), np.ceil(border.max(axis=0)).astype(int)
+    low, high = np.clip(low, 0, [camera.width, camera.height]), np.clip(high, 0, [camera.width, camera.height])
+    inside = np.zeros((camera.height, camera.width), dtype=bool)
+    x, y = (np.arange(a, b) + 0.5 for a, b in zip(low, high, strict=True))
+    cosine = camera.unproject(np.stack(np.meshgrid(x, y), axis=-1)) @ outline.direction
+    inside[low[1] : high[1], low[0] : high[0]] = cosine > np.cos(INSIDE * outline.half_angle)
+    return inside
+
+
+def balls_of(views: Sequence[View], camera: Camera, radius_mm: float) -> Balls:
+    """Return the balls of pictures, with the errors of their outlines."""
+    centres, factors = [], []
+    for view in views:
+        assert view.outline is not None
+        centre, covariance = with_floor(view.outline, camera, radius_mm).centre_mm(radius_mm)
+        centres.append(centre)
+        factors.append(np.linalg.cholesky(covariance))
+    return Balls(np.array(centres), np.array(factors), np.full(len(views), radius_mm))
+
+
+def with_floor(outline: BallOutline, camera: Camera, radius_mm: float) -> BallOutline:
+    """Return an outline with the errors that its fit cannot see: of pixels, and of a shadow at a dark background."""
+    pixel = float(np.linalg.norm(camera.step_of_pixels(camera.project(outline.direction))) / np.sqrt(2))
+    distance = radius_mm / np.sin(outline.half_angle)
+    strip = outline.dark_share * outline.half_angle * (LIGHT_MM / distance) ** 2 / 2
+    error = np.diag([SHADOW * strip, SHADOW * strip, SHADOW * strip]) ** 2 + (OUTLINE_FLOOR_PX * pixel) ** 2 * np.eye(3)
+    return replace(outline, covariance=outline.covariance + error)
+
+
+def plates_of(views: Sequence[View], sd_mm: float, sd_rad: float) -> Plates:
+    """Return the plates of pictures; their poses are uncertain by a turn about each tangent axis, and along z."""
+    planes = [view.plane for view in views if view.plane is not None]
+    factor = np.diag([sd_rad, sd_rad, sd_mm])
+    return Plates(
+        np.array([normal for normal, _ in planes]),
+        np.array([offset for _, offset in planes]),
+        np.broadcast_to(factor, (len(planes), 3, 3)).copy(),
+    )
+
+
+def circles_of(path: Path) -> dict[str, Circle]:
+    """Read rough outlines: lines of name, x, y, radius, px, separated by commas; a header line is skipped."""
+    import csv
+
+    from simtest.runtime.limits import check_file
+
+    check_file(path, "record_bytes", "a file of outlines (name,x,y,radius)")
+    found: dict[str, Circle] = {}
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
+    except (UnicodeDecodeError, OSError) as error:
+        raise InputError(f"--outlines {shown(path)}: cannot be read as text ({type(error).__name__})") from error
+    for number, row in enumerate(rows, 1):
+        if not row or (number == 1 and [cell.strip() for cell in row] == ["name", "x", "y", "radius"]):
+            continue
+        try:
+            name, (x, y, radius) = row[0].strip(), (float(cell) for cell in row[1:])
+            if not (np.isfinite([x, y, radius]).all() and radius > 0):
+                raise ValueError
+        except ValueError:
+            text = shown(",".join(row), 60)
+            raise InputError(
+                f"--outlines {shown(path)}: line {number}: {text}: must be name,x,y,radius, px, radius > 0"
+            ) from None
+        found[name] = (x, y, radius)
+    if not found:
+        raise InputError(f"--outlines {shown(path)}: holds no outline; must be lines of name,x,y,radius in px")
+    return found

@@ -1,0 +1,333 @@
+"""The outline of a ball in a picture, and the ball's centre from it, for any lens.
+
+The sightlines that touch a ball form a circular cone about the direction c to its centre, with the half-angle a whose
+sine is radius over distance. So the outline is a circle on the unit sphere. A pixel's angle to c, less a, over the
+angle of a pixel, is its signed distance s from the outline.
+
+Across the outline the brightness is modelled as blurred by a Gaussian: a constant and a ramp outside, and inside a
+step, a ramp and a term with the square root of the depth below the outline, as a matt ball that is lit from the camera
+has it. Their amplitudes are fitted in each sector of the outline, direction, half-angle and blur over all of it. With
+the square root the outline is not drawn inwards where the ball grows dark towards it.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.errors import InputError
+from simtest.geometry import Array
+from simtest.geometry.camera import Camera
+from simtest.geometry.vectors import basis_across
+
+SECTORS = 24
+BAND_PX = 5.0
+"""Pixels up to so far from the outline are used, on both sides."""
+
+BESIDE_PX = 2.0
+"""So far from the outline a blurred edge has ended."""
+
+MOST_PIXELS = 4000
+"""Of the band; of more pixels every second or third one is used."""
+
+RING_FROM_PX, RING_DEPTH, RING_LEAST_PX = 2.5, 0.15, 10.0
+"""A dark ring is searched from here inside the outline to this share of its radius, but at least so far, px."""
+
+RING_STEPS = np.linspace(0.85, 1.0, 61)
+RING_WIDTH_PX = 2.0
+RING_GAIN = 2.0
+"""A ring is told where the ball's shading begins so far inside the outline, and explains the profile so much better."""
+
+LEAST_SECTORS = 8
+LEAST_PIXELS = 14
+LEAST_RADIUS_PX = 6.0
+"""A smaller outline has no band of its own inside."""
+
+BLUR_PX = (0.25, 3.0)
+ROUNDS = 12
+HUBER = 2.0
+STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3])
+"""Steps of the parameters: two turns and the half-angle in px, and the logarithm of the blur."""
+
+_REACH = 6.0
+_GRID = np.linspace(-_REACH, 40.0, 921)
+
+
+@cache
+def _blurred_root() -> Array:
+    """Return the square root of max(x, 0), blurred by a Gaussian of deviation 1, on the grid."""
+    # Substituted u^2 = x, so that the root's infinite slope does no harm.
+    u = np.linspace(0.0, 8.0, 1601)
+    kernel = np.exp(-((_GRID[:, None] - u[None] ** 2) ** 2) / 2) / np.sqrt(2 * np.pi)
+    return np.asarray(np.trapezoid(2 * u**2 * kernel, u, axis=1))
+
+
+@dataclass(frozen=True)
+class BallOutline:
+    """A ball's outline in a picture, and where the ball is if its radius is 1 mm.
+
+    Parameters
+    ----------
+    direction : ndarray, shape (3,)
+        Unit direction of the centre, camera frame.
+    half_angle : float
+        Of the cone that touches the ball, rad.
+    covariance : ndarray, shape (3, 3)
+        Of two turns of the direction in the basis ``basis_across(direction)``, and of the half-angle; rad^2.
+    blur_px : float
+        Fitted standard deviation of the blur, px; NaN of an outline that was given.
+    sectors : int
+        Sectors of the outline that were used.
+    dark_share : float
+        Share of these behind which the picture is darker than the ball.
+    """
+
+    direction: Array
+    half_angle: float
+    covariance: Array
+    blur_px: float = np.nan
+    sectors: int = 0
+    dark_share: float = 0.0
+
+    def centre_mm(self, radius_mm: float) -> tuple[Array, Array]:
+        """Return the centre, shape (3,), mm, and its covariance, shape (3, 3), mm^2."""
+        distance = radius_mm / np.sin(self.half_angle)
+        along = -distance / np.tan(self.half_angle)
+        J = np.column_stack([distance * basis_across(self.direction).T, along * self.direction])
+        return distance * self.direction, J @ self.covariance @ J.T
+
+    def pixels(self, camera: Camera, count: int = 72) -> Array:
+        """Return points of the outline, shape (count, 2), px."""
+        phase = np.linspace(0, 2 * np.pi, count, endpoint=False)
+        first, second = basis_across(self.direction)
+        circle = np.cos(phase)[:, None] * first + np.sin(phase)[:, None] * second
+        return camera.project(np.cos(self.half_angle) * self.direction + np.sin(self.half_angle) * circle)
+
+
+def outline_through(camera: Camera, pixels: npt.ArrayLike, sd_px: float = 0.5) -> BallOutline:
+    """Return the outline through points, shape (N, 2), px, N >= 3, each with an independent error of `sd_px`.
+
+    Sightlines u of the outline meet u . m = 1, with m along the ball's direction and of length 1 / cos(half-angle).
+    Raises `InputError` where the points lie on no such cone.
+    """
+    points = np.asarray(pixels, dtype=float)
+    rays = camera.unproject(points)
+    m: Array = np.asarray(np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0], dtype=float)
+    length = float(np.linalg.norm(m))
+    if not length > 1:
+        raise InputError(f"outline: {len(points)} points lie on no ball's outline; must be px on its edge")
+    direction, half_angle = m / length, float(np.arccos(1 / length))
+    first, second = basis_across(direction)
+    J = np.column_stack([-_unit_across(rays, direction) @ np.array([first, second]).T, -np.ones(len(rays))])
+    along, down = np.eye(2)
+    pixel = camera.unproject(points + along) - rays, camera.unproject(points + down) - rays
+    step = np.sqrt(np.linalg.norm(np.cross(*pixel), axis=1))
+    weighted = J / (sd_px * step)[:, None]
+    return BallOutline(direction, half_angle, np.asarray(np.linalg.inv(weighted.T @ weighted), dtype=float))
+
+
+def _unit_across(rays: Array, direction: Array) -> Array:
+    """Return the unit vectors from a direction towards rays, perpendicular to the direction."""
+    across = rays - (rays @ direction)[:, None] * direction
+    return np.asarray(across / np.linalg.norm(across, axis=1)[:, None])
+
+
+@dataclass(frozen=True)
+class _Band:
+    """Pixels near an outline: sightlines (N, 3), values (N,), and rad of a pixel across the outline (N,)."""
+
+    rays: Array
+    values: Array
+    pixel_rad: Array
+    sector: npt.NDArray[np.intp]
+
+
+def refine_outline(intensity: Array, camera: Camera, start: BallOutline) -> BallOutline | None:
+    """Fit the outline to the pixels around it; None where too little of it shows an edge.
+
+    Parameters
+    ----------
+    intensity : ndarray, shape (H, W)
+        Linear light.
+    start : BallOutline
+        Within about 3 px of the outline.
+    """
+    found = start
+    for _ in range(3):
+        # The band moves with the outline.
+        band = _band(intensity, camera, found)
+        if band is None:
+            return None
+        before, fitted = found, _fit(band, found)
+        if fitted is None:
+            return None
+        found = fitted
+        if abs(found.half_angle - before.half_angle) < 0.05 * float(np.median(band.pixel_rad)):
+            break
+    return found
+
+
+def _band(intensity: Array, camera: Camera, outline: BallOutline) -> _Band | None:
+    border = outline.pixels(camera, 180)
+    if not np.isfinite(border).all():
+        return None
+    reach = BAND_PX + 3
+    low = np.maximum(np.floor(border.min(axis=0) - reach).astype(int), 0)
+    high = np.minimum(np.ceil(border.max(axis=0) + reach).astype(int), [camera.width, camera.height])
+    if (high - low < 3).any():
+        return None
+    x, y = (np.arange(a, b) + 0.5 for a, b in zip(low, high, strict=True))
+    grid = np.stack(np.meshgrid(x, y), axis=-1)
+    rays = camera.unproject(grid)
+    angle = _angles(rays, outline.direction)
+    pixel = np.hypot(*np.gradient(angle))
+    with np.errstate(invalid="ignore"):
+        near = np.abs(angle - outline.half_angle) < BAND_PX * pixel
+    # The gradient at the window's border is one-sided; the window has room for that.
+    near[[0, -1]], near[:, [0, -1]] = False, False
+    near &= np.isfinite(rays).all(axis=-1) & camera.contains(grid)
+    kept = rays[near]
+    first, second = basis_across(outline.direction)
+    phase = np.arctan2(kept @ second, kept @ first)
+    every = max(1, len(kept) // MOST_PIXELS)
+    sector = np.floor((phase / (2 * np.pi) + 0.5) * SECTORS).astype(np.intp) % SECTORS
+    values = np.asarray(intensity, dtype=float)[low[1] : high[1], low[0] : high[0]][near]
+    return _Band(kept[::every], values[::every], pixel[near][::every], sector[::every])
+
+
+def _angles(rays: Array, direction: Array) -> Array:
+    sine = np.linalg.norm(np.cross(rays, direction), axis=-1)
+    return np.arctan2(sine, rays @ direction)
+
+
+def _fit(band: _Band, start: BallOutline) -> BallOutline | None:
+    """Fit direction, half-angle and blur by Gauss-Newton steps, the amplitudes projected out (see the module)."""
+    scale = float(np.median(band.pixel_rad))
+    used = [np.flatnonzero(band.sector == k) for k in range(SECTORS)]
+    used = [rows for rows in used if len(rows) >= LEAST_PIXELS]
+    if len(used) < LEAST_SECTORS:
+        return None
+    basis = basis_across(start.direction)
+    at = np.array([0.0, 0.0, 0.0, np.log(1.0 if np.isnan(start.blur_px) else start.blur_px)])
+    weights = np.ones(len(band.values))
+
+    def outline_at(p: Array) -> tuple[Array, float, float]:
+        turned = start.direction + scale * (p[:2] @ basis)
+        blur = float(np.clip(np.exp(p[3]), *BLUR_PX))
+        return turned / np.linalg.norm(turned), start.half_angle + scale * p[2], blur
+
+    def residuals(p: Array) -> Array:
+        direction, half_angle, blur = outline_at(p)
+        s = (_angles(band.rays, direction) - half_angle) / band.pixel_rad
+        return _projected(s, band.values, blur, weights, used)
+
+    r = residuals(at)
+    for _ in range(ROUNDS):
+        J = np.stack([(residuals(at + d) - residuals(at - d)) / (2 * d.sum()) for d in np.diag(STEPS)], axis=1)
+        step = np.linalg.lstsq(J, -r, rcond=None)[0]
+        step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
+        at = at + step
+        at[3] = np.clip(at[3], *np.log(BLUR_PX))
+        r = residuals(at)
+        if np.abs(step[:3]).max() < 1e-3:
+            break
+        # Sectors whose edge is another one, such as a shadow's, count less.
+        weights = _weights(r, weights, used)
+        r = residuals(at)
+    J = np.stack([(residuals(at + d) - residuals(at - d)) / (2 * d.sum()) for d in np.diag(STEPS)], axis=1)
+    covariance = _covariance(J, r, used)
+    outside = [_is_darker_outside(band, outline_at(at), rows) for rows in used]
+    if covariance is None or not np.abs(at[:3]).max() < 2 * BAND_PX:
+        return None
+    direction, half_angle, blur = outline_at(at)
+    return BallOutline(direction, half_angle, covariance[:3, :3] * scale**2, blur, len(used), float(np.mean(outside)))
+
+
+def _is_darker_outside(band: _Band, at: tuple[Array, float, float], rows: npt.NDArray[np.intp]) -> bool:
+    """Return whether a sector's pixels are darker outside the outline than inside, some px from it."""
+    direction, half_angle, _ = at
+    s = (_angles(band.rays[rows], direction) - half_angle) / band.pixel_rad[rows]
+    values = band.values[rows]
+    inside, outside = values[(s < -BESIDE_PX)], values[s > BESIDE_PX]
+    return bool(len(inside) and len(outside) and np.median(outside) < np.median(inside))
+
+
+def _projected(s: Array, values: Array, blur: float, weights: Array, used: list[npt.NDArray[np.intp]]) -> Array:
+    """Return the weighted residuals of the best amplitudes of each sector, shape (N,); 0 outside the sectors."""
+    from scipy.special import ndtr
+
+    depth = -s / blur
+    inside = ndtr(depth)
+    ramp = depth * inside + np.exp(-(depth**2) / 2) / np.sqrt(2 * np.pi)
+    root = np.interp(depth, _GRID, _blurred_root())
+    columns = np.stack([np.ones_like(s), inside, ramp, ramp - depth, root], axis=1)
+    left = np.zeros(len(s))
+    for rows in used:
+        A, y, w = columns[rows], values[rows], weights[rows]
+        Q, R = np.linalg.qr(A * w[:, None])
+        # A column that others explain adds nothing but rounding.
+        Q = Q[:, np.abs(np.diag(R)) > 1e-9]
+        left[rows] = w * y - Q @ (Q.T @ (w * y))
+    return left
+
+
+def _weights(r: Array, weights: Array, used: list[npt.NDArray[np.intp]]) -> Array:
+    """Return weights that limit the influence of sectors whose residuals are larger than usual."""
+    raw = r / np.maximum(weights, 1e-9)
+    sizes = np.array([np.sqrt(np.mean(raw[rows] ** 2)) for rows in used])
+    usual = max(float(np.median(sizes)), 1e-12)
+    made = np.zeros_like(weights)
+    for rows, size in zip(used, sizes, strict=True):
+        made[rows] = min(1.0, HUBER * usual / max(size, 1e-12))
+    return made
+
+
+def _covariance(J: Array, r: Array, used: list[npt.NDArray[np.intp]]) -> Array | None:
+    """Return the covariance of the parameters, in their units: the larger of white noise's and the sectors' own."""
+    normal = J.T @ J
+    if np.linalg.cond(normal) > 1e12:
+        return None
+    inverse = np.linalg.inv(normal)
+    count = sum(len(rows) for rows in used)
+    white = float(r @ r) / max(count - 5 * len(used) - len(STEPS), 1) * inverse
+    # Errors that go together within a sector, such as a texture behind the ball.
+    scores = np.array([J[rows].T @ r[rows] for rows in used])
+    share = len(used) / max(len(used) - len(STEPS), 1)
+    grouped = share * inverse @ (scores.T @ scores) @ inverse
+    chosen = grouped if np.trace(grouped[:3, :3]) > np.trace(white[:3, :3]) else white
+    return np.asarray(chosen, dtype=float)
+
+
+def has_dark_ring(intensity: Array, camera: Camera, outline: BallOutline) -> bool:
+    """Return whether a dark ring lies between an outline and where a matt ball's shading begins.
+
+    Lights nearer to the ball than the camera, or beside it, cast a shadow on a near wall that is larger than the ball.
+    Its edge is then stronger than the ball's own. A ball that is lit from the camera has the brightness
+    sqrt(1 - (r / q)^2) at the share r of the outline's radius, with q = 1 where the outline is the ball's.
+    """
+    border = outline.pixels(camera, 96)
+    middle = border.mean(axis=0)
+    radius_px = float(np.linalg.norm(border - middle, axis=1).mean())
+    depth = min(max(RING_DEPTH * radius_px, RING_LEAST_PX), 0.5 * radius_px)
+    shares = 1 - np.arange(RING_FROM_PX, depth, 0.5) / radius_px
+    if len(shares) < 8:
+        return False
+    at = (middle + shares[:, None, None] * (border - middle) - 0.5).astype(np.float32)
+    seen = cv2.remap(np.asarray(intensity, np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+    profile = np.median(seen, axis=1)
+    noise = float(np.median(np.abs(np.diff(seen, axis=1)))) / np.sqrt(len(border))
+    left = []
+    for q in RING_STEPS:
+        shading = np.sqrt(np.maximum(1 - (shares / q) ** 2, 0))
+        A = np.stack([np.ones_like(shares), shading], axis=1)
+        amplitudes, *_ = np.linalg.lstsq(A, profile, rcond=None)
+        # A rim that is brighter than the middle is no shading.
+        left.append(np.sum((profile - A @ amplitudes) ** 2) if amplitudes[1] > 0 else np.inf)
+    best = int(np.argmin(left))
+    floor = len(shares) * noise**2
+    gap_px = (1 - RING_STEPS[best]) * radius_px
+    return bool(
+        np.isfinite(left[-1]) and gap_px > RING_WIDTH_PX and left[-1] + floor > RING_GAIN * (left[best] + floor)
+    )

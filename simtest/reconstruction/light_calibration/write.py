@@ -1,0 +1,161 @@
+"""What `simtest calibrate light` writes: calibration.toml, lights.json and a page with every picture."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from simtest.calibration.lights.result import LightCalibration, MeasuredLight
+from simtest.pages import palette, pixels
+from simtest.pages.html import environment
+from simtest.reconstruction.light_calibration.observations import View
+from simtest.reconstruction.light_calibration.run import Ball, Calibrated
+from simtest.runtime import provenance
+from simtest.runtime.files import make_folder, write_atomically, write_json
+
+PAGE, RESULT, CALIBRATION = "index.html", "lights.json", "calibration.toml"
+SHOWN_PX = 360
+"""Height of a picture on the page."""
+
+MARGIN = 0.15
+"""Room around a ball, as a share of its outline."""
+
+BRIGHT = 0.999
+"""Share of the pixels that are darker than the picture's white on the page."""
+
+MEASURED = palette.LIGHT
+PREDICTED, OUTLINE = (palette.ESTIMATOR_COLOURS[name] for name in ("circle_pose", "brightest_point"))
+
+
+def write_calibration(made: Calibrated, out: Path, command: str = "") -> list[Path]:
+    """Write a result into a folder, which is made if need be, and return the files, the page last.
+
+    The calibration is written only if the result has no problem, and an earlier one is taken away.
+    """
+    from simtest.spec.calibration_file import save_calibration
+
+    make_folder(out)
+    files = []
+    if made.result.problems or not made.result.own:
+        (out / CALIBRATION).unlink(missing_ok=True)
+    else:
+        save_calibration(made.calibration, out / CALIBRATION)
+        files.append(out / CALIBRATION)
+    write_json(out / RESULT, {**result_json(made), "run": {"command": command, **provenance.environment()}})
+    html = _page(made, command)
+    write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
+    return [*files, out / RESULT, out / PAGE]
+
+
+def result_json(made: Calibrated) -> dict[str, Any]:
+    """Return a result as JSON: lengths in mm, camera frame; pixels with centres at integer + 0.5."""
+    result, views = made.result, made.views
+    mirror = made.mirror
+    about: dict[str, Any] = (
+        {"ball_radius_mm": mirror.radius_mm, "ball_radius_sd_mm": mirror.radius_sd_mm}
+        if isinstance(mirror, Ball)
+        else {"poses": str(mirror.poses), "plate_sd_mm": mirror.sd_mm, "plate_tilt_sd_deg": mirror.sd_deg}
+    )
+    pictures, row = [], 0
+    for number, view in enumerate(views.views):
+        shown = []
+        for each in view.highlights:
+            told: dict[str, Any] = {"measured_px": each.pixel.round(4).tolist()}
+            if each.problem:
+                told["left_out"] = each.problem
+            else:
+                source = int(result.source[row])
+                told |= _explained(result, number, source, row)
+                row += 1
+            shown.append(told)
+        pictures.append({"picture": view.name, **_mirror_json(view, mirror), "highlights": shown})
+    return {
+        **about,
+        "lights": [_light_json(light) for light in result.lights],
+        "residual_rms_px": result.rms_px, "chi2": result.chi2, "degrees_of_freedom": result.freedom,
+        "inflation": result.inflation, "notes": list(result.notes), "problems": list(result.problems),
+        "pictures": pictures,
+        "pictures_left_out": [{"picture": name, "reason": why} for name, why in views.left_out.items()],
+    }  # fmt: skip
+
+
+def _explained(result: LightCalibration, view: int, source: int, row: int) -> dict[str, Any]:
+    if source < 0:
+        return {"left_out": "no light explains it: a second reflection, a window or a lamp"}
+    return {
+        "light": source + 1,
+        "predicted_px": result.predicted_px[view, source].round(4).tolist(),
+        "residual_px": result.residuals_px[row].round(4).tolist(),
+    }
+
+
+def _light_json(light: MeasuredLight) -> dict[str, Any]:
+    half = light.half_widths_mm
+    return {
+        "position_mm": light.position_mm.round(5).tolist(),
+        "interval95_mm": np.stack([light.position_mm - half, light.position_mm + half], axis=1).round(5).tolist(),
+        "covariance_mm2": light.covariance_mm2.tolist(),
+        "pictures": light.pictures,
+        "on_the_tip": not light.is_foreign,
+    }
+
+
+def _mirror_json(view: View, mirror: object) -> dict[str, Any]:
+    if view.outline is not None and isinstance(mirror, Ball):
+        centre, covariance = view.outline.centre_mm(mirror.radius_mm)
+        return {"ball_centre_mm": centre.round(4).tolist(), "ball_centre_sd_mm": np.sqrt(np.diag(covariance)).tolist()}
+    assert view.plane is not None
+    return {"plate_normal": view.plane[0].tolist(), "plate_distance_mm": -view.plane[1]}
+
+
+def _page(made: Calibrated, command: str) -> str:
+    result = made.result
+    drawn, row = [], 0
+    for number, view in enumerate(made.views.views):
+        usable = len(view.usable)
+        rows = range(row, row + usable)
+        drawn.append((view, _drawn(made, view, number, rows), _worst(result, rows)))
+        row += usable
+    about = provenance.environment()
+    return environment().get_template("light.html.j2").render(
+        result=result, made=made, command=command, drawn=drawn,
+        lights=list(enumerate(result.lights, 1)),
+        colours={"measured centre": MEASURED, "predicted centre": PREDICTED, "outline of the ball": OUTLINE},
+        provenance={"commit": about["commit"] or "–", "simtest": about["version"], "python": about["python"]},
+    )  # fmt: skip
+
+
+def _worst(result: LightCalibration, rows: range) -> float | None:
+    sizes = [float(np.linalg.norm(result.residuals_px[row])) for row in rows if result.source[row] >= 0]
+    return max(sizes, default=None)
+
+
+def _drawn(made: Calibrated, view: View, number: int, rows: range) -> str:
+    """Return a picture with outline, measured and predicted highlights, as an address."""
+    camera, result = made.calibration.camera, made.result
+    border = None if view.outline is None else view.outline.pixels(camera, 180)
+    window = (0.0, float(camera.width), 0.0, float(camera.height))
+    if border is not None:
+        room = MARGIN * float(np.ptp(border, axis=0).max())
+        low = np.maximum(border.min(axis=0) - room, 0)
+        high = np.minimum(border.max(axis=0) + room, [camera.width, camera.height])
+        window = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+    part = view.intensity[int(window[2]) : int(np.ceil(window[3])), int(window[0]) : int(np.ceil(window[1]))]
+    white = max(float(np.quantile(part, BRIGHT)), 1e-9)
+    canvas = pixels.Canvas((view.intensity / white).astype(np.float32), window, SHOWN_PX)
+    if border is not None:
+        canvas.line(border, OUTLINE, 1, dashed=True)
+    for each in view.highlights:
+        canvas.cross(each.pixel, MEASURED, "#000000", 14, tilted=True)
+    for row in rows:
+        if (source := int(result.source[row])) >= 0:
+            point = result.predicted_px[number, source]
+            canvas.ring(point, PREDICTED, 10)
+            at = ((point - canvas.corner) * canvas.scale).round().astype(int)
+            place = (int(at[0]) + 12, int(at[1]) - 8)
+            cv2.putText(canvas.pixels, str(source + 1), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 3, cv2.LINE_AA)
+            cv2.putText(
+                canvas.pixels, str(source + 1), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA
+            )
+    return pixels.data_address(canvas.pixels)

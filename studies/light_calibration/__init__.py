@@ -1,0 +1,1 @@
+"""How well `simtest calibrate light` measures planted lights: `python -m studies.light_calibration`."""

@@ -1,0 +1,107 @@
+"""Plants lights, takes pictures of a ball, measures the lights, and prints how far and how surely they are found."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from simtest.calibration import Calibration, Response
+from simtest.calibration.lights.result import LightCalibration
+from simtest.errors import InputError
+from simtest.geometry import chi_squared
+from simtest.reconstruction.light_calibration.run import Ball, Calibrated, calibrate_lights
+from studies.light_calibration.plantings import Planting, plant
+from studies.light_calibration.points import about, measured_points
+
+WITHIN_MM = 0.2
+
+
+def measured(planting: Planting, told_radius: float | None = None, lights: Any = None) -> Calibrated:
+    """Return what the pictures of a planting say, the response told."""
+    calibration = Calibration(planting.camera, Response("gamma", planting.look.gamma))
+    radius = planting.radius_mm if told_radius is None else told_radius
+    return calibrate_lights(planting.pictures(lights), calibration, Ball(radius))
+
+
+def row(planting: Planting, with_pictures: bool) -> dict[str, Any]:
+    """Return one planting as a row of the table."""
+    told: dict[str, Any] = {
+        "seed": planting.seed, "lens": planting.lens, "planted": len(planting.lights), "radius_mm": planting.radius_mm,
+    }  # fmt: skip
+    try:
+        result = measured(planting).result if with_pictures else measured_points(planting)
+    except InputError as error:
+        return told | {"status": str(error), "lights": []}
+    if result is None:
+        return told | {"status": "no light found", "lights": []}
+    status = "doubtful" if result.problems else "ok"
+    own = {"found": len(result.own), "lights": compared(result, planting), "problems": list(result.problems)}
+    return told | {"status": status, **own, **about(result)}
+
+
+def compared(result: LightCalibration, planting: Planting) -> list[dict[str, Any]]:
+    """Return the errors of the lights that are found, each against a planted one, with what is stated of them."""
+    found = result.own
+    places = np.array([light.position_mm for light in found]).reshape(-1, 3)
+    gaps = np.linalg.norm(places[:, None] - planting.lights[None], axis=2)
+    rows = []
+    for i, j in zip(*linear_sum_assignment(gaps), strict=True):
+        error = places[i] - planting.lights[j]
+        rows.append({
+            "error_mm": error.tolist(), "half_mm": found[i].half_widths_mm.tolist(),
+            "mahalanobis2": float(error @ np.linalg.solve(found[i].covariance_mm2, error)),
+        })  # fmt: skip
+    return rows
+
+
+def summary(rows: list[dict[str, Any]]) -> list[str]:
+    """Return the table's lines."""
+    sure = [each for each in rows if each["status"] == "ok"]
+    right = [each for each in sure if each["found"] == each["planted"]]
+    lines = [
+        f"{len(rows)} rigs, {sum(each['planted'] for each in rows)} planted lights: {len(right)} rigs with the right "
+        f"number of lights, {len(sure) - len(right)} with another, {sum(e['status'] == 'doubtful' for e in rows)} told "
+        f"as doubtful, {len(rows) - len(sure) - sum(e['status'] == 'doubtful' for e in rows)} refused"
+    ]
+    for name, group in (("right number", right), ("every answer", sure)):
+        lights = [light for each in group for light in each["lights"]]
+        if not lights:
+            continue
+        errors = np.array([light["error_mm"] for light in lights])
+        halves = np.array([light["half_mm"] for light in lights])
+        length, inside = np.linalg.norm(errors, axis=1), np.abs(errors) <= halves
+        squares = np.array([light["mahalanobis2"] for light in lights])
+        share = float((squares <= chi_squared.quantile(0.95, 3)).mean())
+        good = ((np.abs(errors) <= np.maximum(halves, WITHIN_MM)).all(axis=1)).mean()
+        lines.append(
+            f"{name}: {len(lights)} lights, error median {np.median(length):.3f}, "
+            f"95 % {np.quantile(length, 0.95):.3f}, largest {length.max():.3f} mm; "
+            f"within 0.2 mm {np.mean(length <= WITHIN_MM):.1%}; within 0.2 mm or the interval {good:.1%}; "
+            f"intervals cover {inside.mean():.1%} of {inside.size} coordinates, 95 % regions {share:.1%}"
+        )
+    return lines
+
+
+def main() -> None:
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rigs", type=int, default=90)
+    parser.add_argument("--first", type=int, default=1000, help="seed of the first rig")
+    parser.add_argument("--out", type=Path, default=Path("out/light_calibration.jsonl"))
+    parser.add_argument("--points", action="store_true", help="without pictures: the solver alone, on drawn centres")
+    told = parser.parse_args()
+    told.out.parent.mkdir(parents=True, exist_ok=True)
+    rows = []
+    with told.out.open("w", encoding="utf-8") as file:
+        for seed in range(told.first, told.first + told.rigs):
+            rows.append(row(plant(seed), not told.points))
+            file.write(json.dumps(rows[-1]) + "\n")
+            file.flush()
+    print("\n".join(summary(rows)))
+
+
+if __name__ == "__main__":
+    main()

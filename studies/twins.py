@@ -1,0 +1,245 @@
+"""Twins against the truth: rendered tissue frames are taken as if they were real.
+
+    python -m studies.twins [FRAMES] [TWIN_FRAMES] [ROWS.json]
+
+Frames are those of the recipe `endoscopy` with a seed of this study alone: colon, stomach, liver and gallbladder
+through three camera chains. What crosses to the twins is the picture in 8 bits and what a user would tell of the scope:
+the camera, the rig's nominal light positions, and a working range. The frames of one scope share a bank, whose frames
+take turns with the pictures; `simtest twin` makes one for its picture alone.
+
+A highlight is scored by the harness's own matching: against the fine normal at the matched highlight point (a glint),
+or at the point that the estimate looks at where no lit highlight point lies inside its isophote but the noise-free
+frame shows a highlight (a near miss). Detections that show no highlight are counted, and stand in no error. At most
+`PER_FRAME` highlights of a frame count, drawn at random, so that no frame rules.
+"""
+
+import json
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measuring import print_markdown
+from simtest.advice.twin.bank import Subject, all_spots, make_bank
+from simtest.advice.twin.matching import RESAMPLED
+from simtest.advice.twin.run import SpotTwins, match_spots
+from simtest.advice.twin.scenes import SceneDraws, look_of
+from simtest.advice.twin.scoring import ScoredSpot, score, usable_spots
+from simtest.calibration import Calibration, Priors, Uniform
+from simtest.dataset.plan import Plan
+from simtest.errors import SimtestError
+from simtest.geometry import Camera
+from simtest.reconstruction.choices import complete
+from simtest.reconstruction.found import Reconstruction
+from simtest.reconstruction.pipeline import run_picture
+from simtest.rendering import Session
+from simtest.runtime.arrays import Array, Image, IntArray
+from simtest.runtime.seeds import from_integer
+from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.spec.dataset_recipe import load_dataset
+
+SEED = 7703
+"""Of the frames; nothing was tuned on them."""
+
+FRAMES, TWIN_FRAMES, PER_FRAME = 12, 24, 40
+
+FEWER = {"colonoscope": 1, "laparoscope": 2}
+"""Twin frames are divided by this: with eight lights a frame takes several times as long."""
+
+SCOPES = {"colonoscope": (0, 1), "laparoscope": (2, 3)}
+"""Families of the recipe by scope: colon and stomach, liver and gallbladder."""
+
+RANGES_MM = {"colonoscope": Uniform(8.0, 80.0), "laparoscope": Uniform(30.0, 150.0)}
+"""Working range that a user would tell."""
+
+TRIES, COLOUR = 4, "llvm_ad_rgb"
+
+LARGEST = 0.2
+"""Most that the twins' RMS error may be off the true one, as a share of it."""
+
+Row = dict[str, float]
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Measure, and print the tables; return 1 where a third of spot size is off by more than `LARGEST`."""
+    frames, twin_frames = (
+        int(arguments[i]) if len(arguments) > i else default for i, default in ((0, FRAMES), (1, TWIN_FRAMES))
+    )
+    rows: list[Row] = []
+    pictures = _pictures(frames)
+    for scope in SCOPES:
+        rows += _rows([each for each in pictures if each.scope == scope], scope, twin_frames)
+        if len(arguments) > 2:
+            Path(arguments[2]).write_text(json.dumps(rows), encoding="ascii")
+    return report(rows)
+
+
+def report(rows: Sequence[Row]) -> int:
+    """Print the tables of the rows; return 1 where a third of spot size is off by more than `LARGEST`."""
+    false, of_twins = (float(np.mean([row[name] for row in rows])) for name in ("false", "twin_false"))
+    print(f"false detections: {100 * false:.1f} % of {len(rows)}, of the twins {100 * of_twins:.1f} %\n")
+    rows = [row for row in rows if not row["false"]]
+    values = {name: np.array([row[name] for row in rows], dtype=float) for name in rows[0]}
+    thirds = np.array_split(np.argsort(values["radius"], kind="stable"), 3)
+    parts = [(f"radius {values['radius'][third].min():.1f} to {values['radius'][third].max():.1f} px", third)
+             for third in thirds]  # fmt: skip
+    parts.append(("all", np.arange(len(rows))))
+    heads = ["highlights", "n", "true RMS, deg", "twins' RMS, deg", "ratio (95 % interval)", "stated, deg",
+             "held, true", "held, twins", "near misses, true", "twins"]  # fmt: skip
+    print_markdown([heads, *(_line(name, values, part) for name, part in parts)])
+    print()
+    heads = ["highlights", "at a highlight point: true, deg", "twins", "near misses: true, deg", "twins",
+             "against the base: true, deg", "twins"]  # fmt: skip
+    print_markdown([heads, *(_split_line(name, values, part) for name, part in parts)])
+    ratios = [_ratio(values, part) for _, part in parts[:3]]
+    return int(max(abs(ratio - 1) for ratio in ratios) > LARGEST)
+
+
+def _line(name: str, values: dict[str, Array], part: IntArray) -> list[str]:
+    own = {key: each[part] for key, each in values.items()}
+    drawn = _resampled(own["frame"])
+    low, high = np.quantile([_ratio(own, chosen) for chosen in drawn], (0.025, 0.975))
+    return [
+        name, str(len(part)), f"{_rms(own['error']):.2f}", f"{_rms(own['twin_rms']):.2f}",
+        f"{_ratio(own, np.arange(len(part))):.2f} ({low:.2f} to {high:.2f})", f"{_rms(own['stated']):.2f}",
+        f"{100 * np.nanmean(own['held']):.0f} %", f"{100 * np.nanmean(own['coverage']):.0f} %",
+        f"{100 * np.mean(own['near']):.0f} %", f"{100 * np.mean(own['twin_near']):.0f} %",
+    ]  # fmt: skip
+
+
+def _split_line(name: str, values: dict[str, Array], part: IntArray) -> list[str]:
+    own = {key: each[part] for key, each in values.items()}
+    near, share = own["near"] > 0, own["twin_near"]
+    return [
+        name, f"{_rms(own['error'][~near]):.2f}", f"{_weighted_rms(own['twin_glint'], 1 - share):.2f}",
+        f"{_rms(own['error'][near]):.2f}", f"{_weighted_rms(own['twin_near_rms'], share):.2f}",
+        f"{_rms(own['base_error']):.2f}", f"{_rms(own['twin_base']):.2f}",
+    ]  # fmt: skip
+
+
+def _ratio(values: dict[str, Array], part: IntArray) -> float:
+    """Return the twins' RMS error over the true one."""
+    return _rms(values["twin_rms"][part]) / _rms(values["error"][part])
+
+
+def _resampled(frames: Array) -> Iterator[IntArray]:
+    """Yield bootstrap samples of rows by their frames: highlights of a frame share its light and distance."""
+    rng, numbers = from_integer(0), np.unique(frames)
+    rows = [np.flatnonzero(frames == number) for number in numbers]
+    for _ in range(RESAMPLED):
+        yield np.concatenate([rows[i] for i in rng.integers(len(rows), size=len(rows))])
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values)))) if len(values) else float("nan")
+
+
+def _weighted_rms(values: Array, weights: Array) -> float:
+    known = np.isfinite(values)
+    return float(np.sqrt(np.sum(weights[known] * values[known] ** 2) / np.sum(weights[known])))
+
+
+# Frames ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A frame that is taken as real: its number, scope and picture, what a user tells, and the truth for later."""
+
+    number: int
+    scope: str
+    picture: Image
+    told: Calibration
+    truth: Sequence[ScoredSpot]
+
+
+def _pictures(count: int) -> list[Scored]:
+    """Render the frames, and score their highlights."""
+    update = {"seed": SEED, "samples": count, "samples_per_anatomy": 1}
+    plan, pictures = Plan(load_dataset("endoscopy").model_copy(update=update)), []
+    for number in range(count):
+        made = _rendered(plan, number)
+        if made is None:
+            continue
+        session, view, family = made
+        scope = next(name for name, families in SCOPES.items() if family in families)
+        picture = np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
+        calibration = told(view, scope)
+        truth = score(session, view, run_picture(picture, calibration)[0])
+        print(f"frame {number}, {view.scene.name}: {len(truth)} usable highlights", file=sys.stderr, flush=True)
+        pictures.append(Scored(number, scope, picture, calibration, truth))
+    return pictures
+
+
+def _rendered(plan: Plan, index: int) -> tuple[Session, RenderedView, int] | None:
+    """Return a rendered frame and its family; None where no draw gives one."""
+    for attempt in range(TRIES):
+        drawn = plan.draw(index, attempt)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                session = Session(drawn.scene, COLOUR)
+                return session, render_view(session, drawn.scene), drawn.anatomy.family
+        except SimtestError as error:
+            print(f"frame {index}: {error}", file=sys.stderr)
+    return None
+
+
+def told(view: RenderedView, scope: str) -> Calibration:
+    """Return what a user would tell of a frame's camera."""
+    camera, lights = view.calibration.camera, view.calibration.priors.lights_mm
+    plain = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return Calibration(plain, priors=Priors(lights_mm=lights, distance_mm=RANGES_MM[scope]))
+
+
+def _rows(pictures: Sequence[Scored], scope: str, twin_frames: int) -> list[Row]:
+    """Return the rows of a scope's frames: the truth of their highlights beside what their twins measure."""
+    found = [each for each in pictures if each.truth]
+    if not found:
+        return []
+    calibration, count = found[0].told, max(twin_frames // FEWER[scope], 1)
+
+    def reconstructs(values: Image) -> Reconstruction:
+        return run_picture(values, calibration)[0]
+
+    def say(done: int, total: int, what: str) -> None:
+        print(f"{scope}: {what}, {done} of {total}", file=sys.stderr, flush=True)
+
+    # Only pictures and what was told cross to the twins.
+    bank = make_bank([_subject(each) for each in found], reconstructs, count, SEED, say)
+    rows = []
+    for each in found:
+        chosen = from_integer(SEED + each.number).permutation(len(each.truth))[:PER_FRAME].tolist()
+        twins = match_spots([each.truth[i].spot for i in chosen], all_spots(bank), scope, count)
+        rows += [_row(each.number, found_twins, each.truth[i]) for found_twins, i in zip(twins, chosen, strict=True)]
+    return rows
+
+
+def _subject(each: Scored) -> Subject:
+    """Return what the bank is told of a picture; its highlights are detected anew."""
+    made = run_picture(each.picture, each.told)[0]
+    peaks = np.array([spot.peak_px for spot in usable_spots(made)])
+    seen = made.detection.view.seen
+    return Subject(SceneDraws(complete(each.told, None), look_of(each.picture, seen)), peaks, seen)
+
+
+def _row(frame: int, each: SpotTwins, truth: ScoredSpot) -> Row:
+    twins, nothing = each.twins, float("nan")
+    return {
+        "frame": frame, "radius": each.spot.radius_px,
+        "near": float(truth.kind == "near_miss"), "false": float(truth.kind == "false"),
+        "error": truth.error_deg, "base_error": truth.base_error_deg,
+        "held": nothing if truth.held is None else float(truth.held),
+        "stated": nothing if each.stated_deg is None else each.stated_deg,
+        "twin_rms": twins.rms_deg, "twin_base": twins.base_rms_deg, "twin_near": twins.near_misses,
+        "twin_false": twins.false,
+        "twin_glint": twins.glint_rms_deg, "twin_near_rms": twins.near_rms_deg,
+        "coverage": nothing if twins.coverage is None else twins.coverage, "unlikeness": twins.unlikeness,
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

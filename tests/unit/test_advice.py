@@ -1,0 +1,265 @@
+"""`simtest advise`: what it reads, what it plans, what it reads out of results, and that its figures run again."""
+
+import json
+import math
+
+import numpy as np
+import polars as pl
+import pytest
+
+import simtest
+from simtest.advice.advise import BREAKS, MAIN, RUN, advise, write_scene
+from simtest.advice.break_points import break_experiment, break_points, spot_size
+from simtest.advice.figures import mean_error, read_results
+from simtest.advice.organs import ORGANS, wall
+from simtest.advice.page import write_advice
+from simtest.advice.plan import DISTANCES, Question, affordable, distances_of, main_experiment, write_experiment
+from simtest.advice.scope import SCOPES, read_scope
+from simtest.errors import InputError
+from simtest.validation import laws
+
+CAMERA = "[camera]\nwidth = 96\nheight = 72\nfx = 90.0\nfy = 90.0\n"
+
+
+def written(tmp_path, text):
+    path = tmp_path / "scope.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.parametrize("name", SCOPES)
+def test_every_preset_is_a_scope(name):
+    scope = read_scope(name)
+    assert scope.size == (640, 480)
+    assert len(scope.offsets_mm) >= 1
+
+
+def test_lights_and_field_of_view_replace_the_scopes():
+    scope = read_scope("laparoscope", fov_deg=60.0, lights_mm=[(0.0, 3.0, 0.0), (4.0, 0.0, -1.0)])
+    assert scope.camera.fx == pytest.approx(320 / math.tan(math.radians(30)))
+    assert scope.offsets_mm == pytest.approx([3.0, math.sqrt(17)])
+    assert scope.focal_px == pytest.approx(scope.camera.fx)
+
+
+def test_positions_may_stand_as_in_a_calibration_file(tmp_path):
+    scope = read_scope(written(tmp_path, CAMERA + "[rig]\nlights_mm = [[2.0, 0.0, 0.0]]\n"))
+    assert scope.offsets_mm == pytest.approx([2.0])
+
+
+MALFORMED = [
+    ("", "camera"),
+    ("camera = 3\n", "camera"),
+    ("[camera]\nwidth = -4\n", "camera.width = -4"),
+    (CAMERA + "[lens]\nf = 1\n", "lens"),
+    (CAMERA + "[rig]\npreset = 'colonoscop'\n", "rig.preset = 'colonoscop'"),
+    (CAMERA + "[rig]\nlights_mm = [[1.0, 2.0]]\n", "rig.lights_mm"),
+    (CAMERA + "[rig]\nlights_mm = 'ring'\n", "rig.lights_mm"),
+    (CAMERA + "[rig]\nlights_mm = []\n", "rig.lights_mm"),
+    (CAMERA + "[rig]\nlights_mm = [['a', 'b', 'c']]\n", "position_mm"),
+    (CAMERA + "[rig]\npreset = 'laparoscope'\nlights_mm = [[1.0, 2.0, 0.0]]\n", "rig.preset"),
+    (CAMERA + "[sensor]\npreset = 'eye'\n", "sensor.preset = 'eye'"),
+    (CAMERA + "[relief]\nslope_deg = -1.0\n", "slope_deg = -1"),
+    (CAMERA + "[relief]\nslope_deg = [4.0, 2.0]\n", "slope_deg"),
+    (CAMERA + "[relief]\nslope_deg = [0.0, 2.0]\n", "slope_deg"),
+    (CAMERA + "[relief]\nslope_deg = 2.0\nwavelength_mm = 50.0\n", "wavelength_mm"),
+    (CAMERA + "[relief]\nslope_deg = 'steep'\n", "slope_deg"),
+    ("[camera\n", "TOML"),
+]
+
+
+@pytest.mark.parametrize(("text", "named"), MALFORMED)
+def test_a_malformed_scope_is_refused_in_one_line(tmp_path, text, named):
+    with pytest.raises(InputError) as error:
+        read_scope(written(tmp_path, text))
+    assert "scope" in str(error.value)
+    assert named in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+QUESTIONS = [
+    ({"organ": "spleen"}, "--organ spleen: unknown; organs: colon"),
+    ({"organ": "live"}, "did you mean liver"),
+    ({"distances_mm": (-5.0, 20.0)}, "--distances = -5.0"),
+    ({"distances_mm": (60.0, 20.0)}, "--distances 60,20"),
+    ({"distances_mm": (20.0, math.nan)}, "--distances = nan"),
+    ({"distances_mm": (20.0, 9000.0)}, "500 mm"),
+    ({"bound_deg": 0.0}, "--bound = 0.0"),
+    ({"bound_deg": 60.0}, "--bound 60"),
+    ({"frames": 1}, "--frames 1"),
+]
+
+
+@pytest.mark.parametrize(("changed", "named"), QUESTIONS)
+def test_a_question_out_of_range_is_refused_in_one_line(changed, named):
+    with pytest.raises(InputError) as error:
+        Question(read_scope("colonoscope_2"), **changed)
+    assert named in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_light_inside_the_tissue_is_refused():
+    scope = read_scope("colonoscope_2", lights_mm=[(0.0, 0.0, 25.0)])
+    with pytest.raises(InputError, match="inside the tissue"):
+        Question(scope, distances_mm=(20.0, 60.0))
+
+
+def test_a_missing_mesh_and_an_unknown_preset_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file; must be a mesh"):
+        Question(read_scope("colonoscope_2"), mesh=tmp_path / "none.ply")
+    with pytest.raises(InputError, match="did you mean laparoscope"):
+        read_scope("laparoscop")
+    with pytest.raises(InputError, match="--camera and --fov exclude each other"):
+        read_scope("laparoscope", camera=tmp_path / "camera.toml", fov_deg=60.0)
+
+
+@pytest.mark.parametrize("organ", ORGANS)
+def test_the_plan_is_a_file_that_reads_back_as_the_same_experiment(tmp_path, organ):
+    question = Question(read_scope("laparoscope"), organ, (20.0, 60.0), frames=16, seed=3)
+    planned = main_experiment(question)
+    read = write_experiment(planned, tmp_path / MAIN)
+    assert read == planned
+    assert read.realisations * DISTANCES == 16
+    # All ends of what is drawn make sound scenes.
+    assert len(simtest.validation.cases.expand(read)) == DISTANCES
+
+
+def test_break_points_lie_where_the_laws_put_them(tmp_path):
+    question = Question(read_scope("colonoscope_2"), "colon", (20.0, 60.0), bound_deg=4.0)
+    points = {point.key: point for point in break_points(question)}
+    offset = points["light-offset"]
+    assert math.degrees(math.atan(4.0 / offset.value) / 2) == pytest.approx(4.0, abs=1e-3)
+    unknown = points["distance-unknown"]
+    at, light = np.array([0.0, 0.0, unknown.value]), np.array([4.0, 0.0, 0.0])
+    left = laws.bisector_residual(at, light, question.middle_mm / unknown.value - 1)
+    assert math.degrees(float(left)) == pytest.approx(4.0, abs=1e-3)
+    assert points["relief-slope"].value == pytest.approx(4.0 / math.sqrt(math.pi / 2), abs=1e-3)
+    experiment = break_experiment(question, list(points.values()))
+    assert write_experiment(experiment, tmp_path / BREAKS) == experiment
+
+
+def test_a_light_at_the_camera_has_no_break_points_of_offset():
+    keys = [point.key for point in break_points(Question(read_scope("colocated")))]
+    assert keys == ["curvature", "relief-slope"]
+
+
+def test_spots_shrink_with_relief_and_have_the_smooth_size_without():
+    rough = spot_size(Question(read_scope("colonoscope_2"), "colon"))
+    smooth = spot_size(Question(read_scope("colonoscope_2"), "plane"))
+    assert rough.relief_px < 0.2 * rough.smooth_px
+    assert smooth.relief_px == smooth.smooth_px
+    assert smooth.shapeless_beyond_mm == math.inf
+
+
+def test_larger_pictures_get_fewer_frames():
+    large = read_scope("colonoscope_2", camera=None)
+    assert affordable(large) % DISTANCES == 0
+    assert distances_of(Question(large, distances_mm=(20.0, 60.0)))[0] == 22.5
+
+
+def test_a_stated_relief_takes_the_place_of_the_organs(tmp_path):
+    scope = read_scope(written(tmp_path, CAMERA + "[relief]\nslope_deg = [1.0, 2.0]\n"))
+    around = wall(ORGANS["colon"], scope.relief, 20.0)
+    assert around.set["surface"]["relief"]["bands"] == [{"slope_deg": 1.0, "wavelength_mm": 2.0}]
+    assert around.random["surface.relief.bands.0.slope_deg"] == (1.0, 2.0)
+    assert "surface.relief.bands.1.slope_deg" not in around.random
+
+
+def results(errors, frame_of, status=None):
+    n = len(errors)
+    return pl.DataFrame({
+        "experiment": "experiment", "setting": "colon", "label": "colon", "realisation": frame_of,
+        "specularity": list(range(n)), "true_id": list(range(n)), "estimator": "cone_axis",
+        "status": status or ["ok"] * n, "target": "fine", "error_deg": errors, "error_fine_deg": errors,
+        "error_base_deg": [2 * e for e in errors], "visible_id": list(range(n)), "frame_visible": [10] * n,
+        "surface.distance_mm": [20.0 + 10 * (frame % 2) for frame in frame_of], "cov_11": 1e-4, "cov_22": 1e-4,
+        "eps_over_d": 0.1, "budget_noise_deg": 0.5, "budget_camera_deg": 0.0,
+    })  # fmt: skip
+
+
+def test_figures_of_known_errors():
+    found = read_results(results([1.0, 3.0, 2.0, 2.0, 4.0, 6.0], [0, 0, 1, 1, 2, 3]), 4)
+    method = found.method("cone_axis")
+    assert method.fine.mean_deg == pytest.approx(3.0)
+    assert method.base.mean_deg == pytest.approx(6.0)
+    assert method.budget_deg == {"noise": pytest.approx(0.5)}
+    assert method.stated_deg == pytest.approx(math.degrees(math.sqrt(2e-4)))
+    assert (found.visible, found.detections, found.false) == (40, 6, 0)
+    assert found.choices[0].best == "cone_axis"
+    assert set(found.choices[0].by_distance) == {20.0, 30.0}
+
+
+def test_refused_and_missed_are_counted_apart():
+    rows = results([1.0, 1.0, 1.0], [0, 1, 2], ["ok", "degenerate_conic", "missed"])
+    rows = rows.with_columns(
+        pl.when(pl.col("status") == "missed").then(None).otherwise("specularity").alias("specularity")
+    )
+    method = read_results(rows, 3).method("cone_axis")
+    # A glint that no detection holds was asked of no method.
+    assert (method.asked, method.answered, method.refused, method.missed) == (2, 1, 1, 0)
+
+
+def test_the_interval_of_a_mean_covers_it_where_frames_differ():
+    """alpha = 0.05 over 400 draws: at most 36 misses with a probability of 0.999; frames taken as one have far more."""
+    rng, misses, naive = np.random.default_rng(7), 0, 0
+    for _ in range(400):
+        frames = np.repeat(np.arange(24), 5)
+        values = 3.0 + rng.normal(0, 1.0, 24)[frames] + rng.normal(0, 0.3, len(frames))
+        rows = results(values.tolist(), frames.tolist())
+        low, high = mean_error(rows, "error_fine_deg").interval_deg
+        misses += not low <= 3.0 <= high
+        # Negative control: highlights as if they were independent.
+        half = 2 * values.std() / math.sqrt(len(values))
+        naive += abs(values.mean() - 3.0) > half
+    assert misses <= 36
+    assert naive > 60
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_every_figure_runs_again_and_the_page_prints_how(tmp_path):
+    scope = read_scope(written(tmp_path, CAMERA + "[rig]\nlights_mm = [[2.0, 0.0, 0.0]]\n"))
+    out = tmp_path / "out"
+    found = advise(Question(scope, "plane", (15.0, 30.0), frames=8), out)
+    page = write_advice(found, out, "simtest advise").read_text(encoding="utf-8")
+    record = json.loads((out / "advice.json").read_text(encoding="utf-8"))
+    for command in record["commands"].values():
+        assert command in page
+    # The command of the errors, with another folder: the same rows, so the same figures.
+    run = simtest.validate(out / MAIN, tmp_path / "again")
+    again = read_results(run.results, 8)
+    assert again == found.found
+    by_setting = run.summary["experiments"]["experiment"]["settings"]["plane"]
+    assert by_setting["curved"]["mean_deg"] == pytest.approx(found.found.method("curved").fine.mean_deg)
+    # A smooth plane under a light 2 mm beside the camera obeys the law of the offset.
+    law = np.mean([math.degrees(math.atan(2.0 / d) / 2) for d in distances_of(found.question)])
+    assert found.found.method("cone_axis").fine.mean_deg == pytest.approx(law, rel=0.1)
+    verdicts = {each.point.key: each.verdict for each in found.breaks}
+    assert verdicts["light-offset"] == "confirmed"
+    # Kept runs are not rendered anew.
+    kept = (out / RUN / "results.parquet").stat().st_mtime_ns
+    advise(found.question, out)
+    assert (out / RUN / "results.parquet").stat().st_mtime_ns == kept
+
+
+@pytest.mark.parametrize("organ", ORGANS)
+@pytest.mark.parametrize("relief", ["", "[relief]\nslope_deg = 0.0\n", "[relief]\nslope_deg = 2.0\n"])
+def test_the_picture_has_a_sound_scene_for_each_organ_and_relief(tmp_path, organ, relief):
+    question = Question(read_scope(written(tmp_path, CAMERA + relief)), organ)
+    scene = simtest.load_scene(write_scene(question, main_experiment(question), tmp_path / "scene.toml"))
+    smooth = relief.endswith("= 0.0\n") or (organ == "plane" and not relief)
+    assert (scene.surface.relief is None) == smooth
+    assert (scene.camera.width, scene.camera.height) == (96, 72)
+    assert scene.sensor.preset == ORGANS[organ].sensor
+
+
+def test_a_mesh_takes_the_place_of_the_wall(tmp_path):
+    mesh = tmp_path / "organ.ply"
+    mesh.write_bytes(b"")
+    question = Question(read_scope("laparoscope"), "liver", (40.0, 80.0), mesh, frames=16)
+    read = write_experiment(main_experiment(question), tmp_path / MAIN)
+    (group,) = read.groups
+    assert group.set["surface"]["path"] == str(mesh)
+    assert len(group.pool[0]["surface.viewpoint"]) == 16
+    assert "surface.tilt_deg" not in group.random
+    scene = simtest.load_scene(write_scene(question, read, tmp_path / "scene.toml"))
+    assert scene.surface.type == "anatomy"

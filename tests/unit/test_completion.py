@@ -1,0 +1,146 @@
+"""Depth completion: normals are linear in log distance, and correct a coarse map where they stand."""
+
+import numpy as np
+import pytest
+
+from simtest.errors import InputError
+from simtest.geometry import BrownConrady, Camera, KannalaBrandt
+from simtest.reconstruction.completion import CoarseError, complete, log_distance_gradients
+
+CENTRE, RADIUS = np.array([3.0, -2.0, 40.0]), 25.0
+LENSES = {"pinhole": None, "Brown-Conrady": BrownConrady(-0.15, 0.03), "fisheye": KannalaBrandt(0.02, -0.01, 0.0, 0.0)}
+ERROR = CoarseError(0.05, 40.0)
+SURE = np.full((1, 2, 2), 0.0) + np.radians(0.1) ** 2 * np.eye(2)
+
+
+def camera(lens="pinhole"):
+    return Camera(80, 64, 70.0, 70.0, 40.0, 32.0, distortion=LENSES[lens])
+
+
+def ball(lens="pinhole", pixels=None):
+    """Return the distance and normals of a ball that fills the frame."""
+    rays = camera(lens).unproject(camera(lens).pixel_centres() if pixels is None else pixels)
+    along = rays @ CENTRE
+    # seen from inside, so that every ray meets it
+    distance = along + np.sqrt(along**2 - CENTRE @ CENTRE + (RADIUS + 30) ** 2)
+    return distance, (CENTRE - rays * distance[..., None]) / (RADIUS + 30)
+
+
+def field(seed):
+    """Return an error of the kind that `ERROR` states: a Gaussian field of that size and length."""
+    import scipy.ndimage
+
+    noise = np.random.default_rng(seed).normal(size=(64, 80))
+    smooth = scipy.ndimage.gaussian_filter(noise, 10.0, mode="wrap")
+    return 0.05 * smooth / smooth.std()
+
+
+def spots(seed, count):
+    """Return pixel centres inside the frame, the ball's normals there, and covariances."""
+    random = np.random.default_rng(seed)
+    pixels = np.stack([random.integers(3, 77, count), random.integers(3, 61, count)], axis=1) + 0.5
+    return pixels, ball(pixels=pixels)[1], np.repeat(SURE, count, axis=0)
+
+
+def gradient_error(distance, truth):
+    """Return the RMS error of the gradient of log distance, per px."""
+    off = np.log(distance) - np.log(truth)
+    return float(np.sqrt(np.mean(np.gradient(off, axis=0) ** 2 + np.gradient(off, axis=1) ** 2)))
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_normal_fixes_the_gradient_of_log_distance(lens):
+    pixels = np.array([[40.5, 32.5], [12.5, 50.5], [70.5, 9.5]])
+    normals = ball(lens, pixels)[1]
+    found, _ = log_distance_gradients(camera(lens), pixels, normals, np.repeat(SURE, 3, axis=0))
+    step = 1e-3
+    for axis in (0, 1):
+        ahead, behind = (np.log(ball(lens, pixels + sign * step * np.eye(2)[axis])[0]) for sign in (1, -1))
+        # The sightline's own derivative is taken over one pixel.
+        assert np.abs(found[:, axis] - (ahead - behind) / (2 * step)).max() < 2e-5
+
+
+def test_the_covariance_is_that_of_gradients_of_drawn_normals():
+    pixels, normals, _ = spots(3, 1)
+    covariance = np.radians([[2.0, 0.0], [0.0, 1.0]]) ** 2
+    from simtest.geometry.vectors import tangent_basis
+
+    first, second = (basis[0] for basis in tangent_basis(normals))
+    random = np.random.default_rng(5)
+    turns = random.multivariate_normal([0, 0], covariance, size=4000)
+    drawn = normals[0] + turns[:, :1] * first + turns[:, 1:] * second
+    gradients, _ = log_distance_gradients(camera(), np.repeat(pixels, 4000, 0), drawn, np.repeat(SURE, 4000, 0))
+    _, (stated,) = log_distance_gradients(camera(), pixels, normals, covariance[None])
+    # 4000 draws tell a variance to 2.2 %, one standard deviation; 5 of them and the floor.
+    assert np.abs(np.cov(gradients.T) / np.trace(stated) - stated / np.trace(stated)).max() < 0.12
+
+
+def test_without_normals_nothing_changes():
+    coarse = ball()[0] * np.exp(field(1))
+    none = np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 2, 2))
+    assert np.allclose(complete(coarse, camera(), *none, ERROR), coarse, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_many_normals_undo_the_error_and_vague_ones_leave_it(seed):
+    truth = ball()[0]
+    coarse = truth * np.exp(field(seed))
+    pixels, normals, sure = spots(seed, 80)
+    before = gradient_error(coarse, truth)
+    assert gradient_error(complete(coarse, camera(), pixels, normals, sure, ERROR), truth) < 0.35 * before
+    vague = complete(coarse, camera(), pixels, normals, 1e6 * sure, ERROR)
+    assert gradient_error(vague, truth) > 0.8 * before
+
+
+def test_more_normals_help_more():
+    truth = ball()[0]
+    left = []
+    for count in (0, 5, 20, 80):
+        errors = []
+        for seed in range(4):
+            coarse = truth * np.exp(field(100 + seed))
+            pixels, normals, sure = spots(100 + seed, count)
+            errors.append(gradient_error(complete(coarse, camera(), pixels, normals, sure, ERROR), truth))
+        left.append(np.mean(errors))
+    assert left[0] > left[1] > left[2] > left[3]
+
+
+def test_mirrored_normals_harm():
+    truth = ball()[0]
+    coarse = truth * np.exp(field(21))
+    pixels, normals, sure = spots(21, 80)
+    # the negative control: normals of another surface
+    wrong = complete(coarse, camera(), pixels, normals * [-1, -1, 1], sure, ERROR)
+    assert gradient_error(wrong, truth) > gradient_error(coarse, truth)
+
+
+def test_unknown_pixels_stay_unknown():
+    coarse = ball()[0] * np.exp(field(31))
+    coarse[20:30, 20:40] = np.nan
+    pixels, normals, sure = spots(31, 20)
+    made = complete(coarse, camera(), pixels, normals, sure, ERROR)
+    assert (np.isnan(made) == np.isnan(coarse)).all()
+
+
+WRONG = {
+    "another size": (lambda a: {**a, "distance_mm": np.ones((5, 6))}, "must be of the camera's size, 80 x 64"),
+    "negative": (lambda a: {**a, "distance_mm": -a["distance_mm"]}, "distance_mm: must be positive"),
+    "unknown": (lambda a: {**a, "distance_mm": np.full((64, 80), np.nan)}, "known somewhere"),
+    "two columns": (lambda a: {**a, "normals": a["normals"][:, :2]}, r"normals has shape \(5, 2\); must be \(5, 3\)"),
+    "NaN": (lambda a: {**a, "covariances": np.full((5, 2, 2), np.nan)}, "covariances has shape .* all finite"),
+    "singular": (lambda a: {**a, "covariances": np.zeros((5, 2, 2))}, "covariances: must be positive definite"),
+    "share": (lambda a: {**a, "error": CoarseError(0.0, 10.0)}, "share = 0: must be 0.0001 to 1"),
+    "length": (lambda a: {**a, "error": CoarseError(0.1, 1.0)}, "length_px = 1: must be 2 to 10000 px"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_malformed_input_is_refused(what):
+    pixels, normals, sure = spots(1, 5)
+    sound = {
+        "distance_mm": ball()[0], "camera": camera(), "pixels": pixels, "normals": normals, "covariances": sure,
+        "error": ERROR,
+    }  # fmt: skip
+    change, message = WRONG[what]
+    with pytest.raises(InputError, match=message):
+        complete(**change(sound))

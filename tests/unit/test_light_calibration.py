@@ -1,0 +1,226 @@
+"""`simtest calibrate light`: outlines and highlights in pictures, files that it writes, and refused input."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+import simtest
+from simtest.calibration import Calibration, Response
+from simtest.errors import InputError
+from simtest.geometry import Array
+from simtest.geometry.camera import Camera
+from simtest.reconstruction.light_calibration.ball_highlights import measure_highlights
+from simtest.reconstruction.light_calibration.observations import circles_of, with_floor
+from simtest.reconstruction.light_calibration.outline import (
+    BallOutline,
+    has_dark_ring,
+    outline_through,
+    refine_outline,
+)
+from simtest.reconstruction.light_calibration.run import Ball, Plate, calibrate_lights
+from simtest.reconstruction.light_calibration.write import write_calibration
+from simtest.spec.calibration_file import load_calibration
+from studies.light_calibration.pictures import Look, picture_of_ball
+
+CAMERA = Camera(240, 200, 180.0, 180.0, 121.0, 99.0)
+RADIUS = 5.0
+LIGHTS = np.array([[4.0, 0.5, 0.3], [-3.5, 1.5, -0.4]])
+LOOK = Look(diffuse=0.2, specular=8.0, exponent=1500.0, wall_mm=25.0, noise=0.004, room=0.8)
+CENTRE = np.array([2.0, -1.0, 24.0])
+
+
+def linear(centre: Array = CENTRE, look: Look = LOOK, lights: Array = LIGHTS) -> Array:
+    picture = picture_of_ball(CAMERA, centre, RADIUS, lights, look, np.random.default_rng(5))
+    return np.asarray(picture, dtype=float) ** look.gamma
+
+
+def outline_of(centre: Array, shift_px: float = 0.0) -> BallOutline:
+    distance = float(np.linalg.norm(centre))
+    half_angle = float(np.arcsin(RADIUS / distance)) + shift_px / CAMERA.fx
+    return BallOutline(centre / distance, half_angle, 1e-8 * np.eye(3))
+
+
+def test_outline_gives_the_centre_within_its_error() -> None:
+    found = refine_outline(linear(), CAMERA, outline_of(CENTRE, 1.5))
+    assert found is not None
+    centre, covariance = with_floor(found, CAMERA, RADIUS).centre_mm(RADIUS)
+    gap = centre - CENTRE
+    assert gap @ np.linalg.solve(covariance, gap) < 16.3  # chi-squared, 3 degrees of freedom, alpha = 0.001
+    assert np.linalg.norm(gap) < 0.1
+
+
+def test_outline_through_points_is_the_ball_s() -> None:
+    true = outline_of(CENTRE)
+    traced = outline_through(CAMERA, true.pixels(CAMERA, 12))
+    np.testing.assert_allclose(traced.centre_mm(RADIUS)[0], CENTRE, atol=1e-9)
+
+
+def test_shadow_around_the_ball_is_told_from_its_edge() -> None:
+    # A matt ball whose shading begins well inside the outline that is asked about.
+    picture = linear(look=Look(diffuse=0.5, specular=0.0, noise=0.002, room=0.0, wall_albedo=0.0))
+    assert not has_dark_ring(picture, CAMERA, outline_of(CENTRE))
+    assert has_dark_ring(picture, CAMERA, outline_of(CENTRE, 4.0))
+
+
+def test_highlights_are_where_the_mirror_law_says() -> None:
+    from simtest.calibration.lights.mirrors import mirror_points
+
+    inside = CAMERA.unproject(CAMERA.pixel_centres()) @ (CENTRE / np.linalg.norm(CENTRE)) > np.cos(0.95 * 0.2)
+    found = measure_highlights(linear(), inside, 12.0)
+    expected = CAMERA.project(mirror_points(np.repeat(CENTRE[None], 2, 0), np.full(2, RADIUS), LIGHTS))
+    usable = [each for each in found if not each.problem]
+    assert len(usable) == 2
+    gaps = [min(np.linalg.norm(each.pixel - point) for each in usable) for point in expected]
+    assert max(gaps) < 0.1
+
+
+def test_touching_highlights_are_left_out() -> None:
+    close = np.array([[1.6, 0.0, 0.0], [-1.2, 0.0, 0.0]])
+    inside = CAMERA.unproject(CAMERA.pixel_centres()) @ (CENTRE / np.linalg.norm(CENTRE)) > np.cos(0.95 * 0.2)
+    found = measure_highlights(linear(lights=close), inside, 12.0)
+    assert found
+    assert all(each.problem for each in found)
+
+
+def pictures(count: int = 5) -> list[tuple[str, Callable[[], npt.NDArray[np.float32]]]]:
+    rng = np.random.default_rng(12)
+    made = []
+    for i in range(count):
+        centre = CAMERA.unproject(np.array([rng.uniform(85, 155), rng.uniform(80, 120)])) * rng.uniform(20, 27)
+        values = picture_of_ball(CAMERA, centre, RADIUS, LIGHTS, LOOK, np.random.default_rng([5, i]))
+        made.append((f"{i}.png", lambda values=values: values))
+    return made
+
+
+@pytest.mark.slow
+def test_lights_are_found_and_written(tmp_path: Path) -> None:
+    calibration = Calibration(CAMERA, Response("gamma", 2.2))
+    made = calibrate_lights(pictures(), calibration, Ball(RADIUS, 0.01))
+    files = write_calibration(made, tmp_path)
+    assert [file.name for file in files] == ["calibration.toml", "lights.json", "index.html"]
+    priors = load_calibration(tmp_path / "calibration.toml").priors
+    assert len(priors.lights_mm) == 2
+    assert priors.lights_covariance is not None
+    for light in LIGHTS:
+        gaps = priors.lights - light
+        nearest = int(np.linalg.norm(gaps, axis=1).argmin())
+        gap = gaps[nearest]
+        assert gap @ np.linalg.solve(priors.lights_covariance[nearest], gap) < 16.3
+        assert np.linalg.norm(gap[:2]) < 0.2
+    told = json.loads((tmp_path / "lights.json").read_text())
+    assert len(told["lights"]) == 2
+    assert "Positions of the lights" in (tmp_path / "index.html").read_text()
+
+
+def write_inputs(folder: Path) -> None:
+    values = np.full((200, 240), 128, np.uint8)
+    for name in ("0.png", "1.png"):
+        cv2.imwrite(str(folder / name), values)
+    cv2.imwrite(str(folder / "small.png"), values[:100])
+    simtest.save_calibration(Calibration(CAMERA), folder / "scope.toml")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], "--ball-radius or --plate"),
+        (["--ball-radius", "5", "--plate", "poses.json"], "exactly one"),
+        (["--ball-radius", "0"], "--ball-radius = 0"),
+        (["--ball-radius", "-2"], "--ball-radius = -2"),
+        (["--ball-radius", "nan"], "--ball-radius"),
+        (["--ball-radius", "5", "--ball-radius-sd", "6"], "less than the radius"),
+        (["--ball-radius", "5", "--ball-radius-sd", "-1"], "--ball-radius-sd"),
+        (["--ball-radius", "5", "--most", "5"], "--most"),
+        (["--ball-radius", "5", "--most", "0"], "--most"),
+        (["--ball-radius", "5", "--outlines", "none.csv"], "none.csv"),
+        (["--plate", "none.json"], "none.json"),
+        (["--plate", "poses.json", "--outlines", "o.csv"], "need --ball-radius"),
+        (["--plate", "poses.json", "--plate-sd", "0"], "--plate-sd"),
+        (["--ball-radius", "5"], "0 of 2 pictures can be used; must be at least 2"),
+    ],
+)
+def test_refused_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], words: str) -> None:
+    from simtest.cli.calibrate import calibrate
+
+    write_inputs(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    call = ["light", "0.png", "1.png", "--camera", "scope.toml", "--out", "out", *options]
+    with pytest.raises(InputError) as caught:
+        calibrate(call, exit_on_error=False, print_error=False, result_action="return_value")
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_picture_of_another_size_is_named(tmp_path: Path) -> None:
+    write_inputs(tmp_path)
+    small = [("small.png", lambda: np.zeros((100, 240), np.float32))]
+    with pytest.raises(InputError, match=r"small\.png: 240 x 100 px; must be 240 x 200"):
+        calibrate_lights(small, Calibration(CAMERA), Ball(RADIUS))
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "name,x,y,radius\n", "a.png,1,2\n", "a.png,1,2,-3\n", "a.png,1,2,nan\n", "a.png,x,2,3\n", "a.png,1,2,3,4\n"],
+)
+def test_malformed_outlines(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "outlines.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match="--outlines") as caught:
+        circles_of(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_outlines_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "outlines.csv"
+    path.write_text("name,x,y,radius\na.png, 1.5,2,3\n")
+    assert circles_of(path) == {"a.png": (1.5, 2.0, 3.0)}
+
+
+@pytest.mark.slow
+def test_plate_with_poses(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    rows = []
+    names = []
+    for i in range(6):
+        pose = np.eye(4)
+        tilt = rng.normal(0, 0.12, 2)
+        pose[:3, :3] = cv2.Rodrigues(np.array([np.pi + tilt[0], tilt[1], 0.0]))[0]
+        pose[:3, 3] = [0.0, 0.0, rng.uniform(25, 45)]
+        rows.append(pose)
+        names.append(f"{i}.png")
+    poses = tmp_path / "poses.json"
+    poses.write_text(
+        json.dumps(
+            {
+                "unit": "mm",
+                "frames": [{"name": n, "world_from_camera": p.tolist()} for n, p in zip(names, rows, strict=True)],
+            }
+        )
+    )
+    made = calibrate_lights(
+        [(name, lambda pose=pose: plate_picture(pose)) for name, pose in zip(names, rows, strict=True)],
+        Calibration(CAMERA, Response("linear")),
+        Plate(poses, 0.02, 0.02),
+    )
+    for light in LIGHTS:
+        own = min(made.result.own, key=lambda each: float(np.linalg.norm(each.position_mm - light)))
+        gap = own.position_mm - light
+        assert gap @ np.linalg.solve(own.covariance_mm2, gap) < 16.3
+
+
+def plate_picture(pose: Array) -> npt.NDArray[np.float32]:
+    """Return a picture of a mirror in the plane z = 0 that shows the lights as spots of 1.5 px."""
+    camera_from_world = np.linalg.inv(pose)
+    grid = CAMERA.pixel_centres()
+    values = np.full(grid.shape[:2], 0.1)
+    for light in LIGHTS:
+        world = pose[:3, :3] @ light + pose[:3, 3]
+        mirrored = camera_from_world[:3, :3] @ (world * [1, 1, -1]) + camera_from_world[:3, 3]
+        gap = grid - CAMERA.project(mirrored)
+        values += 0.6 * np.exp(-np.sum(gap**2, axis=-1) / (2 * 1.5**2))
+    return values.astype(np.float32)

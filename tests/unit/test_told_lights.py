@@ -1,0 +1,84 @@
+"""Lights whose positions are told with a covariance: files, messages to cores, and the budget's part light_offset."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import simtest
+from simtest.calibration import Priors, exactly
+from simtest.errors import InputError
+from simtest.estimators.prior_parts import mean_light_part, told_light_part
+from simtest.estimators.process.requests import priors_message
+from simtest.geometry import Array
+from simtest.geometry.vectors import basis_across, bisect
+from simtest.spec.calibration_file import load_calibration, save_calibration
+
+COVARIANCE = ((0.04, 0.01, 0.0), (0.01, 0.09, -0.02), (0.0, -0.02, 0.25))
+
+
+def _moves(count: int, light: Array, sightline: Array, distance: float, scale: float = 1.0) -> Array:
+    """Return normals of lights that are drawn about `light`, in the tangent basis of the nominal normal."""
+    drawn = np.random.default_rng(3).multivariate_normal(light, scale * np.array(COVARIANCE), count)
+    position = distance * sightline
+    normal = bisect(position, light)
+    return bisect(np.broadcast_to(position, drawn.shape), drawn) @ basis_across(normal).T
+
+
+def test_part_is_the_covariance_of_normals_whose_light_is_drawn() -> None:
+    light, sightline = np.array([4.0, -1.0, 0.5]), np.array([0.2, -0.1, 0.97])
+    sightline /= np.linalg.norm(sightline)
+    normal = bisect(30.0 * sightline, light)
+    part = told_light_part(sightline, normal, light, np.array(COVARIANCE), np.array([30.0]))
+    moves = _moves(40_000, light, sightline, 30.0)
+    np.testing.assert_allclose(part, np.cov(moves.T), rtol=0.04, atol=0.01 * np.trace(part))
+    # A light that is nine times as uncertain moves it by nine times the variance: the comparison would tell.
+    wide = np.cov(_moves(40_000, light, sightline, 30.0, 9.0).T)
+    assert np.trace(wide) > 8 * np.trace(part)
+
+
+def test_exact_positions_have_no_part() -> None:
+    assert mean_light_part(np.array([0.0, 0.0, -1.0]), Priors(lights_mm=((1.0, 0.0, 0.0),))) is None
+    zero = Priors(lights_mm=((1.0, 0.0, 0.0),), lights_covariance_mm2=(((0.0, 0.0, 0.0),) * 3,))
+    assert mean_light_part(np.array([0.0, 0.0, -1.0]), zero) is None
+
+
+def test_file_reads_back(tmp_path: Path) -> None:
+    priors = Priors(((4.0, 0.0, 0.0),), exactly(30.0), lights_covariance_mm2=(COVARIANCE,))
+    calibration = simtest.Calibration(simtest.Camera.from_fov(70.0, 64, 48), priors=priors)
+    path = tmp_path / "scope.toml"
+    save_calibration(calibration, path)
+    assert load_calibration(path).priors == priors
+
+
+def test_cores_are_told_only_what_is_stated() -> None:
+    exact = Priors(lights_mm=((4.0, 0.0, 0.0),))
+    assert "lights_covariance_mm2" not in priors_message(exact)
+    told = Priors(lights_mm=((4.0, 0.0, 0.0),), lights_covariance_mm2=(COVARIANCE,))
+    assert priors_message(told)["lights_covariance_mm2"] == (COVARIANCE,)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("[]\nlights_mm = []", None),
+        ("[[[1, 0, 0], [0, 1, 0], [0, 0, 1]]]", "1 matrices; must be one for each of the 2"),
+        ("[[[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[1, 2, 0], [0, 1, 0], [0, 0, 1]]]", "is no covariance"),
+        ("[[[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[1, 2, 0], [2, 1, 0], [0, 0, 1]]]", "is no covariance"),
+        ("[[[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[1, 0], [0, 1], [0, 0]]]", "lights_covariance_mm2"),
+        ("[[[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[1, 0, 0], [0, inf, 0], [0, 0, 1]]]", "lights_covariance_mm2"),
+        ('"0.1"', "lights_covariance_mm2"),
+    ],
+)
+def test_malformed_covariances(tmp_path: Path, value: str, words: str | None) -> None:
+    path = tmp_path / "scope.toml"
+    lights = "" if words is None else "lights_mm = [[1, 0, 0], [0, 1, 0]]\n"
+    path.write_text(
+        f"[camera]\nwidth = 64\nheight = 48\nfx = 50.0\nfy = 50.0\n[rig]\n{lights}lights_covariance_mm2 = {value}\n"
+    )
+    if words is None:
+        assert load_calibration(path).priors.lights_covariance is None
+        return
+    with pytest.raises(InputError, match=words) as caught:
+        load_calibration(path)
+    assert "\n" not in str(caught.value)
