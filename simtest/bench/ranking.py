@@ -4,14 +4,16 @@ A ranking is a claim about scenes that were not drawn: another set of seeds must
 another only where three things agree:
 
 1. **The score.** The mean error in which each highlight counts at most `CAP_DEG`, and a refused or missed one counts
-   `CAP_DEG`. It is 10 deg times one less the area under the recall curve up to 10 deg, as image matching and pose
-   estimation measure it. Errors beyond the cap are alike in use: the plain reverse of the sightline is that good
-   already, since a light in the scope's tip leaves a highlight's normal within about 10 deg of it. A penalty of 90 deg
-   would rank cores by how many highlights are missed, which is chance where all use the same detector.
+   `CAP_DEG`. It is 10 deg times (1 - a), a the area under the recall curve up to 10 deg as a share of the whole, as
+   image matching and pose estimation measure it. Errors beyond the cap are alike in use: the plain reverse of the
+   sightline is that good already, since a light in the scope's tip leaves a highlight's normal within about 10 deg of
+   it. A penalty of 90 deg would rank cores by how many highlights are missed, which is chance where all use the same
+   detector.
 2. **The test.** Both cores saw the same scenes, so the difference is taken scene by scene: what both miss cancels. The
    standard error is that of the difference of two ratio estimators over scenes, with the cases as strata (Cochran 1977,
    sections 2.11, 5.6 and 6.11), and its degrees of freedom are Satterthwaite's. The level is Bonferroni's over all
-   pairs of a table: at most `ALPHA` of all tables of one part hold any order that new scenes would not confirm.
+   pairs of a table: `ALPHA` is the stated risk that a table of one part holds any order that new scenes would not
+   confirm.
 3. **The margin.** The difference must exceed what a verification lets both figures move, 5 % of each and 0.001 deg
    (`simtest.bench.compare`). What is smaller, a run on another processor may turn round.
 
@@ -79,7 +81,12 @@ def rank(parts: Sequence[Part], alpha: float = ALPHA) -> Ranking:
     parts : sequence
         For each part, what each core's scenes sum up to. A part must hold a highlight for each core.
     alpha : float
-        Risk of the whole table.
+        Stated risk of the whole table, 0 to 1.
+
+    Returns
+    -------
+    Ranking
+        Of the cores, in the order of each part.
     """
     from scipy.special import stdtrit
 

@@ -51,8 +51,9 @@ class Sighting:
         Told pose, mm.
     sightlines : ndarray, shape (N, 3)
         Unit sightlines of its highlights, camera frame.
-    seen : callable, optional
-        Returns which directions of the camera frame, shape (M, 3), lie in the frame's view; default all.
+    in_view : callable, optional
+        Takes unit directions of the camera frame, shape (M, 3), and returns which lie in the frame's view, a mask of
+        shape (M,); default all.
     """
 
     world_from_camera: Array
@@ -96,6 +97,8 @@ class FineMap:
 class PatchNormal:
     """The base's normal over a patch.
 
+    The covariance is a jackknife's over tissue cells, widened by Hotelling's 95 % quantile for so many cells.
+
     Parameters
     ----------
     normal : ndarray, shape (3,)
@@ -126,7 +129,18 @@ class PatchNormal:
 def fine_map(sightings: Sequence[Sighting], plane: Plane) -> FineMap:
     """Return the fine normals that the highlights of frames show, with the light at the camera.
 
-    Each lies where its ray meets the plane, and is the reverse of its sightline.
+    Parameters
+    ----------
+    sightings : sequence of Sighting
+        Highlights of the frames, with told poses.
+    plane : Plane
+        Where the base lies, coarsely.
+
+    Returns
+    -------
+    FineMap
+        Each normal is the reverse of its sightline, and lies where the sightline meets the plane. Highlights whose
+        sightline does not meet it are left out.
     """
     positions, normals, frames = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, dtype=np.int64)]
     for number, sighting in enumerate(sightings):
@@ -151,9 +165,9 @@ def base_normal(
     sightings : sequence of Sighting
         Highlights of the frames, with told poses.
     plane : Plane
-        Where the base lies, coarsely.
+        Where the base lies, coarsely; its point is the middle of the patch.
     radius_mm : float
-        Of the patch.
+        Of the patch, mm.
     pose_sd : tuple of float
         Standard deviations of the told poses, each frame's own: of the centre along each axis, mm, and of the turn
         about each axis, rad.

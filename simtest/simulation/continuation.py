@@ -41,7 +41,10 @@ ANOTHER = 0.02
 """A ray that ends off the expected point by more than this share of the distance meets another part of the surface."""
 
 REACHED, MERGED, HIDDEN, OFF = "", "merged", "hidden", "off the surface"
-"""How a continuation ends: at the end of the motion, at a fold, behind another part of the surface, or beyond it."""
+"""How a continuation ends: at the end of the motion, at a fold, behind another part of the surface, or beyond it.
+
+A fold is inferred: `MERGED` is the end of all that cannot be followed in steps of `LEAST_STEP` for no other reason.
+"""
 
 
 @dataclass(frozen=True)
@@ -201,7 +204,12 @@ def follow(surface: SurfaceInTime, motion: Motion, positions: Array, lights: Int
     positions : ndarray, shape (N, 3)
         Highlight points at the first frame, world frame, mm.
     lights : ndarray of int, shape (N,)
-        The light of each.
+        Index of the light of each.
+
+    Returns
+    -------
+    Continued
+        Where each point is at the second frame, or where and why its continuation ended before.
     """
     count = len(positions)
     position, share, step = np.array(positions, dtype=float), np.zeros(count), np.ones(count)

@@ -113,6 +113,11 @@ def flow_between(session: Session, first: SeenSurface, second: SeenSurface, move
         The frames, in either order of time.
     moved : callable, optional
         See `Moved`, from the first frame's moment to the second's; default points stay.
+
+    Returns
+    -------
+    Flow
+        At the pixels of the first frame.
     """
     size = first.position.shape[:2]
     points = first.position.reshape(-1, 3)

@@ -92,7 +92,7 @@ def write_trajectory(trajectory: Trajectory, camera: Camera, folder: Path) -> tu
     files : list of Path
         What was written.
     left_out : list of str
-        Why a format was not: it lacks the camera's lens.
+        Why a format was not: it lacks the camera's lens, or its file cannot be written.
     """
     files: list[Path] = []
     left_out: list[str] = []

@@ -93,7 +93,7 @@ def _camera(words: Sequence[str], at: str) -> Table:
 
 
 def read_images(path: Path) -> Poses:
-    """Read the poses of images.txt; raise `InputError` where it is malformed."""
+    """Read world_from_camera of each image of images.txt, in its unit; raise `InputError` where it is malformed."""
     where = shown(path)
     poses: list[tuple[str, Array]] = []
     # Each image has two lines, of which the second, its points, may be empty.
@@ -144,7 +144,7 @@ def cameras_text(camera: Camera) -> str:
 
 
 def images_text(poses: Poses) -> str:
-    """Return poses as the text of images.txt, all of camera 1, without points."""
+    """Return poses, whose lengths must be mm, as the text of images.txt, all of camera 1, without points."""
     lines = [
         "# Image list with two lines of data per image:",
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",

@@ -30,7 +30,7 @@ def read_cameras(path: Path) -> dict[str, Table]:
 
 
 def read_poses(path: Path) -> Poses:
-    """Return where the cameras of a chain are: cam0_from_camera, lengths mm, named by camera."""
+    """Return where the cameras of a chain are: cam0_from_camera, shape (4, 4), lengths mm, named by camera."""
     made: list[tuple[str, Array]] = []
     first_from_camera = np.eye(4)
     for i, (name, data) in enumerate(_chain(path).items()):

@@ -35,11 +35,21 @@ def scaramuzza_table(
 
     Parameters
     ----------
-    size : width and height, px
-    centre : cx, cy, px, pixel centres at integer + 0.5
-    mapping : a0, a2, a3, a4
-    stretch : c, d, e of the matrix ((c, d), (e, 1))
-    where : file, for messages
+    size : sequence of float
+        Width and height, px.
+    centre : sequence of float
+        cx and cy, px, pixel centres at integer + 0.5.
+    mapping : sequence of float
+        a0, a2, a3, a4 for radii in px: px, 1/px, 1/px^2, 1/px^3.
+    stretch : sequence of float
+        c, d, e of the matrix ((c, d), (e, 1)).
+    where : str
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        If a0 is not positive.
     """
     a0, a2, a3, a4 = mapping
     if not a0 > 0:

@@ -65,7 +65,13 @@ def read_cameras(path: Path) -> dict[str, Table]:
 
 
 def read_poses(path: Path) -> Poses:
-    """Read the poses of the frames, by file_path, with OpenCV's camera axes."""
+    """Read world_from_camera of the frames, by file_path, with OpenCV's camera axes, in the file's unit of length.
+
+    Raises
+    ------
+    InputError
+        If the file is malformed, or a frame has no pose.
+    """
     data, where = read_json(path), shown(path)
     made: list[tuple[str, Array]] = []
     for i, frame in enumerate(_frames(data, where)):
@@ -136,7 +142,7 @@ def _lens(data: Mapping[str, Any], told: Mapping[str, float], where: str) -> Tab
 
 
 def transforms_text(camera: Camera, poses: Poses | None = None) -> str:
-    """Return a camera, and poses of its frames, as the text of transforms.json.
+    """Return a camera, and poses of its frames, whose lengths must be mm, as the text of transforms.json.
 
     Raises `InputError` if the camera has a skew, or a lens that the format lacks.
     """

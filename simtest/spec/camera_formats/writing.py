@@ -42,7 +42,8 @@ def write_camera(camera: Camera, path: str | Path, format: str | None = None, po
     format : str, optional
         One of `FORMATS`; default the first that the suffix fits.
     poses : list of (str, ndarray), optional
-        Names of frames and their world_from_camera, shape (4, 4), OpenCV axes.
+        Names of frames and their world_from_camera, shape (4, 4), OpenCV axes, mm. Lengths are written as they are,
+        and both formats state mm.
 
     Raises
     ------

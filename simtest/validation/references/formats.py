@@ -1,6 +1,7 @@
 """What the maps of public data sets of endoscopy mean: unit, direction, axes, and which values stand for none.
 
-Everything here is stated by a data set's own files or loaders. What they leave open is None, and the user must say it.
+Units and directions are those that a data set's own files or loaders state. A unit that they leave open is None, and
+the user must state it.
 """
 
 from dataclasses import dataclass
@@ -28,12 +29,12 @@ class MapFormat:
     channels : int
         Of a depth map; several are equal in the first three, a fourth is not read.
     normals : str, optional
-        End of the name of a normal map, which has three channels of 16 bits, -1 to 1 over the whole range and 0 where
-        there is none. It stands beside the depth map, whose name ends in `depths`.
+        End of the file name of a normal map, None where the data set has none. Such a map has three channels of 16
+        bits, -1 to 1 over the whole range; all three are 0 where there is no normal. It stands beside the depth map.
     normal_axes : str
         The camera's axes that red, green and blue hold (`simtest.geometry.axes`).
     depths : str
-        End of the name of a depth map.
+        End of the file name of a depth map.
     cautions : tuple of str
         What a user must know of the maps.
     """

@@ -45,6 +45,11 @@ def load_map_reference(path: Path, name: str, camera: Camera, scale_mm: float | 
     scale_mm : float, optional
         mm of one count, where the data set does not tell.
 
+    Returns
+    -------
+    DepthReference
+        Unit normals in the camera frame, and what a user must know of the maps.
+
     Raises
     ------
     InputError
