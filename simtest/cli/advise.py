@@ -37,7 +37,7 @@ def advise(
         tuple[float, ...],
         Parameter(
             help="Nearest and farthest distance of the wall, mm: 20,60.",
-            converter=_numbers, n_tokens=1, allow_leading_hyphen=True,
+            negative="", converter=_numbers, n_tokens=1, allow_leading_hyphen=True,
         ),
     ] = (20.0, 60.0),
     mesh: Annotated[

@@ -10,6 +10,8 @@ from simtest.cli.options import AsJson, named_path
 if TYPE_CHECKING:
     from typing import Any
 
+    from simtest.runtime.arrays import Array
+
 camera = App(name="camera", help="Show what a camera file means, or convert it to another program's format.")
 
 ViewRadius = Annotated[
@@ -103,7 +105,6 @@ def convert(
     from simtest.errors import InputError
     from simtest.runtime.locks import exclusive_file
     from simtest.spec.calibration_file import load_calibration, save_calibration
-    from simtest.spec.camera_formats import read_poses
     from simtest.spec.camera_spec import load_camera, save_camera
 
     if photometric is not None and (to or out.suffix.lower().removeprefix(".")) != "toml":
@@ -112,6 +113,16 @@ def convert(
         if photometric is not None:
             save_calibration(load_calibration(file, photometric, view_radius), out)
         else:
-            frames = None if poses is None else read_poses(poses)
-            save_camera(load_camera(file, view_radius), out, to, frames)
+            save_camera(load_camera(file, view_radius), out, to, None if poses is None else _frames(poses))
     print_files([out], as_json)
+
+
+def _frames(poses: Path) -> "list[tuple[str, Array]]":
+    """Read the poses of named frames, mm."""
+    from simtest.errors import InputError
+    from simtest.reconstruction.poses import read_poses
+
+    found = read_poses(poses)
+    if not found.names:
+        raise InputError(f"--poses {poses}: names no frames; must do so, as images.txt does")
+    return list(zip(found.names, found.world_from_camera, strict=True))

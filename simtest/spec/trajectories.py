@@ -15,7 +15,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.quaternions import quaternion_of
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
-from simtest.spec.camera_formats import write_camera
+from simtest.spec.camera_formats.writing import file_contents, write_files
 
 TUM, TRANSFORMS, COLMAP = "trajectory.txt", "transforms.json", "colmap"
 """Files of a trajectory: TUM's, NeRF's, and the folder of COLMAP's."""
@@ -92,7 +92,12 @@ def write_trajectory(trajectory: Trajectory, camera: Camera, folder: Path) -> tu
     files : list of Path
         What was written.
     left_out : list of str
-        Why a format was not: it lacks the camera's lens, or its file cannot be written.
+        Why a format was not: it lacks the camera's lens.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
     """
     files: list[Path] = []
     left_out: list[str] = []
@@ -102,11 +107,12 @@ def write_trajectory(trajectory: Trajectory, camera: Camera, folder: Path) -> tu
     for path, format in ((folder / TRANSFORMS, "transforms"), (folder / COLMAP / "cameras.txt", "colmap")):
         make_folder(path.parent)
         try:
-            write_camera(camera, path, format, trajectory.poses)
+            contents = file_contents(camera, path, format, trajectory.poses)
         except InputError as error:
             left_out.append(f"{path.relative_to(folder)}: {error}")
-        else:
-            files.append(path)
+            continue
+        write_files(contents)
+        files.append(path)
     return files, left_out
 
 

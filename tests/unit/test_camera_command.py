@@ -89,6 +89,22 @@ def test_convert(here, tmp_path):
     assert load_camera(tmp_path / "c.toml").view_mask.radius == 200
 
 
+def test_converted_poses_are_in_the_unit_that_the_new_file_states(here, tmp_path):
+    save_camera(FISHEYE, tmp_path / "a.toml")
+    images = "1 1 0 0 0 -0.01 0.02 -0.03 1 0.png\n\n"
+    (tmp_path / "images.txt").write_text(f"# unit: m\n{images}")
+    assert here("convert", "a.toml", "--out", "t.json", "--to", "transforms", "--poses", "images.txt")[0] == 0
+    assert json.loads((tmp_path / "t.json").read_text())["unit"] == "mm"
+    np.testing.assert_allclose(read_poses(tmp_path / "t.json")[0][1][:3, 3], [10.0, -20.0, 30.0], atol=1e-12)
+    # A unit that nobody states is not made up, and neither are names of frames.
+    (tmp_path / "images.txt").write_text(images)
+    refused = here("convert", "a.toml", "--out", "t.json", "--to", "transforms", "--poses", "images.txt")
+    assert "its unit of length is arbitrary; state it" in refused[2][0]
+    (tmp_path / "tum.txt").write_text("0 0 0 0 0 0 0 1\n")
+    refused = here("convert", "a.toml", "--out", "t.json", "--to", "transforms", "--poses", "tum.txt")
+    assert "--poses tum.txt: names no frames" in refused[2][0]
+
+
 def test_convert_with_photometry(here, tmp_path):
     save_camera(FISHEYE, tmp_path / "a.yml")
     (tmp_path / "p.xml").write_text(PHOTOMETRY)
@@ -108,7 +124,7 @@ def test_convert_with_photometry(here, tmp_path):
             ("convert", "a.toml", "--out", "b.yml", "--photometric", "p.xml"),
             "needs --to toml; no other format holds it",
         ),
-        (("convert", "a.toml", "--out", "b.yml", "--poses", "p.xml"), "holds no poses; must be COLMAP's images.txt"),
+        (("convert", "a.toml", "--out", "b.yml", "--poses", "p.xml"), "--poses p.xml: line 1: "),
         (("convert", "a.toml#3", "--out", "b.yml"), "a.toml#3: "),
         (("convert", "a.toml", "--out", "b.toml", "--view-radius", "-1"), "view_mask.radius = -1"),
     ],

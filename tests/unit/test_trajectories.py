@@ -115,3 +115,10 @@ def test_colmap_reads_the_export(tmp_path):
         np.testing.assert_allclose(
             model.cameras[image.camera_id].img_from_cam(pose * world), CAMERA.project(point), atol=1e-9
         )
+
+
+def test_a_file_that_cannot_be_written_is_no_lens_that_a_format_lacks(tmp_path):
+    (tmp_path / "colmap" / "cameras.txt").mkdir(parents=True)
+    held = Trajectory(["0.png"], np.eye(4)[None])
+    with pytest.raises(InputError, match=r"cameras.txt"):
+        write_trajectory(held, Camera(64, 48, 50.0, 50.0, 32.0, 24.0), tmp_path)

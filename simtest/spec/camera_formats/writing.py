@@ -1,5 +1,6 @@
 """Writes cameras, and poses where a format holds them, into the files of other programs."""
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
@@ -63,15 +64,20 @@ def write_camera(camera: Camera, path: str | Path, format: str | None = None, po
         raise InputError(f"{shown(path)}: {chosen} needs a file name that ends in {', '.join(SUFFIXES[chosen])}")
     if poses is not None and chosen not in WITH_POSES:
         raise InputError(f"{shown(path)}: {chosen} holds no poses; must be one of {', '.join(WITH_POSES)}")
-    for file, data in _contents(camera, path, chosen, poses).items():
+    write_files(file_contents(camera, path, chosen, poses))
+
+
+def write_files(files: Mapping[Path, bytes]) -> None:
+    """Write files whole or not at all; raise `InputError` for one that cannot be written."""
+    for file, data in files.items():
         try:
             write_atomically(file, partial(Path.write_bytes, data=data))
         except OSError as error:
             raise cannot_write(error, shown(file), file) from error
 
 
-def _contents(camera: Camera, path: Path, format: str, poses: Poses | None) -> dict[Path, bytes]:
-    """Return what goes into each file."""
+def file_contents(camera: Camera, path: Path, format: str, poses: Poses | None) -> dict[Path, bytes]:
+    """Return what goes into each file; raise `InputError` if the format lacks the camera's lens."""
     # Imported on demand: OpenCV and SciPy are slow to load.
     if format == "toml":
         return {path: camera_toml(camera).encode()}
