@@ -28,9 +28,9 @@ CROWD = 3
 """A frame with more highlights than this for each light shows relief: a smooth patch shows one for each."""
 
 NEAR_MISS = np.radians(0.9)
-"""Standard deviation of an axis, rad, that a highlight has in such a frame under several lights. About one spot in three
-is a near miss, where the normal nowhere bisects light and camera (theory.md 7.1b); it is off by about the lobe's width
-and looks like the others. Fitted to 435 spots of rendered colons and stomachs under two lights."""
+"""Standard deviation of an axis, rad, that a highlight has in such a frame under several lights. About one spot in
+three is a near miss, where the normal nowhere bisects light and camera (theory.md 7.1b); it is off by about the lobe's
+width and looks like the others. Fitted to 435 spots of rendered colons and stomachs under two lights."""
 
 DISTANCES = (np.arange(32) + 0.5) / 32
 """Shares of a prior on the distance at which the normal's moves are computed."""
@@ -70,9 +70,10 @@ class Bisector:
         lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
         lights' mean position is used, flagged ``ambiguous_light``, and the part ``light_offset`` of the budget is the
         mean square of what the single lights would give, over the distances. Where the frame shows relief under several
-        lights, the part ``shape`` holds that the highlight may be a near miss (`NEAR_MISS`). Fails as `cone_axis` does, and with
-        ``not_known`` without lights. In a highlight too small for isophotes s is the sightline of its centre, flagged
-        ``unresolved``, and no axis ratio is stated.
+        lights, the part ``shape`` holds that the highlight may be a near miss (`NEAR_MISS`).
+
+        Fails as `cone_axis` does, and with ``not_known`` without lights. In a highlight too small for isophotes s is
+        the sightline of its centre, flagged ``unresolved``, and no axis ratio is stated.
         """
         if not priors.lights_mm:
             return Failure(Reason.NOT_KNOWN, "needs the lights' positions")

@@ -13,8 +13,8 @@ CLEAR = 2.0
 """The next best light must fit this many times worse for the choice to be clear."""
 
 ALONE = 3.0
-"""With two lights, the third nearest highlight must lie this many times farther away than the second. Rough tissue shows
-many highlights: its neighbours lie along the lights' line by chance 16 times in 100, and half of them on the wrong side."""
+"""With two lights, the second nearest of the other highlights must lie this many times farther away than the nearest.
+On rough tissue the nearest lies along the lights' line by chance 16 times in 100, half of them on the wrong side."""
 
 
 def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
