@@ -12,6 +12,10 @@ LARGEST_MISFIT = 0.25
 CLEAR = 2.0
 """The next best light must fit this many times worse for the choice to be clear."""
 
+ALONE = 3.0
+"""With two lights, the second nearest of the other highlights must lie this many times farther away than the nearest.
+On rough tissue the nearest lies along the lights' line by chance 16 times in 100, half of them on the wrong side."""
+
 
 def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     """Return the index of the light that made a highlight; None where that is not clear.
@@ -20,11 +24,17 @@ def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     turns by half the light's angle, the normal turns against the sightline by M. M is the root of the lobe's H up to a
     factor, which is fitted. It is taken as positive: no surface that is concave beyond its centre of curvature. Of the
     frame's other highlights, which the patch names, the nearest are used, one for each other light.
+
+    Two lights have a single offset, of which only the direction tells anything. There the pair must also stand alone
+    (`ALONE`). Three lights or more have an arrangement, which neighbours meet by chance three times in 100 or less.
     """
     if len(priors.lights_mm) == 1:
         return 0
     # observed offsets, turned by M into those of the lights up to a factor
-    others = _other_peaks(family)[: len(priors.lights_mm) - 1]
+    peaks = _other_peaks(family)
+    others = peaks[: len(priors.lights_mm) - 1]
+    if len(priors.lights_mm) == 2 and not _stand_alone(peaks):
+        return None
     values, vectors = np.linalg.eigh(family.moments)
     if not len(others) or values[0] <= 0:
         return None
@@ -36,6 +46,12 @@ def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     first, second = np.argsort(misfits, kind="stable")[:2]
     clear = misfits[first] < LARGEST_MISFIT and misfits[second] > max(CLEAR * misfits[first], LARGEST_MISFIT)
     return int(first) if clear else None
+
+
+def _stand_alone(peaks: Array) -> bool:
+    """Return whether the first of other peaks, nearest first, shape (K, 2), is far nearer than the second."""
+    gaps = np.linalg.norm(peaks[:2], axis=1)
+    return len(gaps) < 2 or bool(gaps[1] > ALONE * gaps[0])
 
 
 def _misfit(seen: Array, offsets: Array) -> float:

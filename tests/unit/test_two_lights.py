@@ -1,0 +1,72 @@
+"""Highlights under several lights that the frame may not tell apart: who chooses, and what the budget says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from simtest.calibration import Priors, exactly
+from simtest.estimators.bisector import CROWD, NEAR_MISS, bisector
+from simtest.estimators.highlight_fit import fit_highlight
+from simtest.estimators.light_assignment import ALONE, light_of_highlight
+from simtest.geometry import Camera
+from tests.unit.core_helpers import PATCH
+
+CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
+LIGHTS = ((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
+PRIORS = Priors(LIGHTS, exactly(20.0), falloff_power=None)
+
+
+def among(offsets):
+    """Return the highlight at the image's centre, with others at offsets from its peak, px."""
+    return replace(PATCH, others_px=tuple((x, y) for x, y in PATCH.peak_px + np.reshape(offsets, (-1, 2))))
+
+
+@pytest.mark.parametrize(
+    ("others", "light"),
+    [
+        ([(-60, 0)], 0),
+        ([(60, 0)], 1),
+        ([(-60, 0), (0, 200)], 0),
+        ([(-60, 0), (0, 150)], None),
+        ([(0, 60)], None),
+        ([], None),
+    ],
+    ids=["its light on the right", "on the left", "far from a third", "one of many", "across the line", "no other"],
+)
+def test_a_pair_tells_two_lights_only_where_it_stands_alone(others, light):
+    patch = among(others)
+    assert light_of_highlight(fit_highlight(patch, CAMERA, (0.3, 0.5, 0.7)), PRIORS) == light
+    found = bisector.estimate(patch, CAMERA, PRIORS)
+    assert ("ambiguous_light" in found.flags) == (light is None)
+    assert ("light_offset" in found.budget) == (light is None)
+    assert len(found.candidates) == (1 if light is not None else 3)
+
+
+def test_neighbours_on_rough_tissue_seldom_choose_one_of_two_lights(monkeypatch):
+    # Highlights strewn at random tell nothing of the lights, so half of what they choose is wrong.
+    fields = 500 * np.random.default_rng(7).random((400, 30, 2)) - 250
+    fitted = fit_highlight(PATCH, CAMERA, (0.5,))
+
+    def chosen():
+        families = [replace(fitted, patch=among(offsets)) for offsets in fields]
+        return np.mean([light_of_highlight(family, PRIORS) is not None for family in families])
+
+    # A sixth of the neighbours lies along the lights' line; a ninth of those stands alone. Bound: 3 deviations above.
+    assert chosen() < 1 / 6 / ALONE**2 + 3 * np.sqrt(1 / 6 / ALONE**2 / len(fields))
+    # Negative control: the same fields choose where nothing stands alone.
+    monkeypatch.setattr("simtest.estimators.light_assignment.ALONE", 1.0)
+    assert chosen() > 0.11
+
+
+def test_many_highlights_under_several_lights_may_be_near_misses():
+    ring = [(80 + 20 * i, 60 - 35 * i) for i in range(3 * CROWD)]
+
+    def part(count, lights=LIGHTS):
+        found = bisector.estimate(among(ring[:count]), CAMERA, replace(PRIORS, lights_mm=lights))
+        return found.budget.get("shape", np.zeros((2, 2)))
+
+    few, many = part(CROWD * 2 - 1), part(CROWD * 2)
+    assert many - few == pytest.approx(NEAR_MISS**2 * np.eye(2), rel=1e-6, abs=1e-12)
+    # Negative control: one light has no such part, however many highlights there are.
+    assert np.array_equal(part(3 * CROWD, LIGHTS[:1]), part(0, LIGHTS[:1]))
