@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from simtest.calibration import Priors
 from simtest.errors import Failure, InputError
@@ -70,11 +71,22 @@ def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[st
                 "before it"
             )
         # Raises where the name is not clear.
-        short, given = _core(name) if is_core(name) else (name, ESTIMATORS.load(name))
+        short, given = _core(name) if is_core(name) else (name, _installed(name))
         if short in loaded:
             raise InputError(f"estimator {short!r}: given twice")
         loaded[short] = as_estimator(name, given)
     return loaded
+
+
+def _installed(name: str) -> object:
+    """Return an installed estimator; where there is none, but a file of its name, the error says how that is run."""
+    try:
+        return ESTIMATORS.load(name)
+    except InputError as error:
+        if name in ESTIMATORS.names() or not Path(name).is_file():
+            raise
+        how = f"python {name}" if name.endswith(".py") else f"./{name}"
+        raise InputError(f"{error}; the file {shown(name, 80)} is run by 'command: {how}'") from error
 
 
 def _core(name: str) -> tuple[str, object]:

@@ -13,6 +13,7 @@ from simtest.reconstruction.assumptions import Extent, calibration_of_round_view
 from simtest.reconstruction.borders import border_note
 from simtest.reconstruction.choices import AUTO
 from simtest.reconstruction.description import PictureRecord, describe
+from simtest.reconstruction.picture_values import check_size
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Image
 from simtest.runtime.resources import shown
@@ -135,6 +136,10 @@ def reconstruct_values(
     Raises `InputError` if the picture's size is not the camera's, an estimator is unknown, or the detector does not fit
     the picture.
     """
+    try:
+        check_size(picture, calibration.camera)
+    except InputError as error:
+        raise InputError(f"{shown(name)}: {error}") from error
     # linear light, detect, estimate
     made, choices = run_picture(
         picture, calibration, options.encoding, options.detector, options.estimators, options.roi, options.smoothing_px,

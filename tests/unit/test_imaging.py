@@ -157,7 +157,7 @@ def test_a_camera_of_another_size(shot, tmp_path):
     (tmp_path / "camera.toml").write_text("width = 640\nheight = 480\nfx = 500.0\nfy = 500.0\n")
     told(
         lambda: reconstruct_picture(shot, tmp_path / "o", Options(tmp_path / "camera.toml")),
-        "320 x 240 px: must be 640 x 480, the size of the camera's calibration",
+        f"{shot.name}: frame is 320 x 240 px: must be 640 x 480, the size of the camera's calibration",
     )
 
 

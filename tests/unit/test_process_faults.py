@@ -12,7 +12,7 @@ from simtest.calibration import NO_PRIORS, Calibration, Frame
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.dispatch import run, run_in_frame
-from simtest.estimators.process.command import CoreCommand
+from simtest.estimators.process.command import CoreCommand, parse_core
 from simtest.estimators.process.core import MAX_FAULTS, Core
 from simtest.estimators.process.estimator import ProcessEstimator, ProcessFrameEstimator
 from simtest.estimators.process.wire import CoreFault
@@ -166,6 +166,15 @@ def test_standard_error_is_drained_and_its_end_alone_is_kept(folder):
     assert isinstance(answer_of(core), Estimate)
     assert len(core._child._stderr) <= 4096
     core.close()
+
+
+def test_last_words_that_are_cut_begin_with_a_whole_word(folder):
+    program = "import sys; sys.exit('first ' + 'word ' * 100 + 'last')"
+    with pytest.raises(CoreFault) as caught:
+        Core(parse_core(f'command: {sys.executable} -c "{program}"')).start()
+    said = str(caught.value).partition("last words: ")[2]
+    assert said.startswith("...word word ")
+    assert said.endswith("word last")
 
 
 @pytest.mark.parametrize("fault", ["exit_after", "flood_after"])

@@ -71,10 +71,18 @@ def test_a_program_that_is_no_program_is_refused_in_one_line(folder):
     garbage = folder / "garbage"
     garbage.write_bytes(b"\x7fELF garbage")
     garbage.chmod(0o755)
-    with pytest.raises(InputError, match="cannot be started"):
+    with pytest.raises(InputError, match=r"cannot be started .*; must be a compiled program, or a script with #!"):
         load_estimators(["command: ./garbage"])
     with pytest.raises(InputError, match="the core ended with exit code 0"):
         load_estimators(["command: ./program"])
+
+
+@pytest.mark.parametrize(("name", "how"), [("program", "./program"), ("script.py", "python script.py")])
+def test_a_file_that_is_named_as_an_estimator_is_answered_with_how_it_is_run(folder, name, how):
+    with pytest.raises(InputError, match=f"'{name}': not installed; .*; the file {name} is run by 'command: {how}'$"):
+        load_estimators([name])
+    (folder / "cone_axis").write_text("")
+    assert list(load_estimators(["cone_axis"])) == ["cone_axis"]
 
 
 def test_nothing_is_made_before_the_core_has_greeted(folder):

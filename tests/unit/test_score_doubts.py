@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 
 from simtest.dataset.scoring.answers import Answer
-from simtest.dataset.scoring.doubts import reversed_axes, stray_rows
+from simtest.dataset.scoring.doubts import reversed_axes, stray_rows, wide_regions
 from simtest.dataset.scoring.record import ExportedFrame, Record
 from simtest.errors import Failure, Reason
 
@@ -65,3 +65,28 @@ def test_reversed_axes_are_told(signs, axis):
 def test_errors_alone_are_no_reversal(error_deg, seed):
     assert reversed_axes(results(error_deg, seed=seed)) == []
     assert reversed_axes(results(error_deg, signs=(1, -1, 1), count=4, seed=seed)) == []
+
+
+def stated(error_deg, sd_rad, count=40):
+    errors = np.abs(np.random.default_rng(0).normal(0, error_deg, count))
+    rows = {"estimator": ["mine"] * count, "status": ["ok"] * count, "error_deg": errors}
+    return pl.DataFrame(rows | {name: np.full(count, sd_rad**2) for name in ("cov_11", "cov_22")})
+
+
+def test_covariances_in_square_degrees_are_told():
+    (said,) = wide_regions(stated(1.0, 1.0))
+    assert said.startswith("mine: the covariances state a standard deviation of 57.3 deg in the median, and the median")
+    assert "must be in rad^2" in said
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("sd_deg", [0.2, 1.0, 10.0])
+def test_wide_covariances_alone_are_no_mistake(sd_deg):
+    assert wide_regions(stated(1.0, np.radians(sd_deg))) == []
+    # what a method states of frames without noise
+    assert wide_regions(stated(0.001, np.radians(0.2))) == []
+    assert wide_regions(stated(1.0, 1.0, count=4)) == []
+
+
+def test_answers_without_covariances_are_no_mistake():
+    assert wide_regions(stated(1.0, 1.0).with_columns(cov_11=pl.lit(None, pl.Float64))) == []

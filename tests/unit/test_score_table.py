@@ -321,6 +321,16 @@ def test_scenes_that_changed_are_refused(sensor, tmp_path, table):
 def test_a_run_without_an_export_is_refused(sensor, tmp_path, table):
     with pytest.raises(InputError, match=r"export.json: .*nothing was exported: give the command again with --export"):
         score_table(table, tmp_path, tmp_path / "out")
+    with pytest.raises(InputError, match=r"missing: no such folder; must be the folder of the run or dataset whose"):
+        score_table(table, tmp_path / "missing", tmp_path / "out")
+    with pytest.raises(InputError, match=r"\.csv: is a file; must be the folder of the run or dataset whose frames"):
+        score_table(table, table, tmp_path / "out")
+    (tmp_path / "frames" / "cameras").mkdir(parents=True)
+    (tmp_path / "frames" / "frames.csv").write_text("")
+    with pytest.raises(
+        InputError, match=r"frames: holds the exported frames \(frames.csv\); must be the folder of the"
+    ):
+        score_table(table, tmp_path / "frames", tmp_path / "out")
     (tmp_path / "export.json").write_text('{"format": "mine"}')
     with pytest.raises(InputError, match=r"export.json: no record of an export"):
         score_table(table, tmp_path, tmp_path / "out")

@@ -1,4 +1,4 @@
-"""Mistakes that a whole table of answers gives away: pixels or axes counted in another way than simtest's."""
+"""Mistakes that a whole table of answers gives away: pixels, axes or units other than simtest's."""
 
 from collections.abc import Mapping
 
@@ -20,6 +20,12 @@ CLEARLY = 0.5
 
 LEAST_GAIN_DEG = 1.0
 """... and takes away more than this."""
+
+FAR_TOO_WIDE = 20.0
+"""A standard deviation so many times the error is doubted; one in degrees is 57 times too large ..."""
+
+LEAST_WIDE_DEG = 5.0
+"""... and one below this is not, since a method may state the resolution of its frames."""
 
 REVERSALS: Mapping[str, tuple[int, int]] = {"x": (-1, 1), "y": (1, -1), "x and y": (-1, -1)}
 """Signs of normal_x and normal_y. With z reversed a normal faces away, which is refused row by row."""
@@ -58,6 +64,23 @@ def reversed_axes(results: pl.DataFrame) -> list[str]:
             found.append(
                 f"{name}: with {axis} of the normals reversed the median error is {errors[axis]:.3g} deg, not "
                 f"{as_given:.3g}; axes must be x to the right, y down, z forward"
+            )
+    return found
+
+
+def wide_regions(results: pl.DataFrame) -> list[str]:
+    """Return a warning for each method that states a far greater uncertainty than its errors have, as deg^2 do."""
+    rows = results.filter(pl.col("status") == "ok").drop_nulls(["cov_11", "cov_22", "error_deg"])
+    found = []
+    for (name,), own in rows.group_by("estimator", maintain_order=True):
+        stated = np.degrees(np.sqrt((own["cov_11"].to_numpy() + own["cov_22"].to_numpy()) / 2))
+        errors = own["error_deg"].to_numpy()
+        if own.height < LEAST_ROWS or np.median(stated) < LEAST_WIDE_DEG:
+            continue
+        if np.median(errors / stated) < 1 / FAR_TOO_WIDE:
+            found.append(
+                f"{name}: the covariances state a standard deviation of {np.median(stated):.3g} deg in the median, and "
+                f"the median error is {np.median(errors):.3g} deg; must be in rad^2 (1 deg^2 is 0.000305 rad^2)"
             )
     return found
 

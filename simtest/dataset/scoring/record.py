@@ -180,6 +180,16 @@ def read_summary(folder: Path) -> Mapping[str, str]:
 def read_record(folder: Path) -> Record:
     """Read export.json of a run or dataset; raise `InputError` where there is none, or one that cannot be used."""
     path = Path(folder) / EXPORT
+    if not path.parent.is_dir():
+        what = "is a file" if path.parent.exists() else "no such folder"
+        raise InputError(
+            f"{shown(folder)}: {what}; must be the folder of the run or dataset whose frames were exported"
+        )
+    if not path.is_file() and (path.parent / "frames.csv").is_file() and (path.parent / "cameras").is_dir():
+        raise InputError(
+            f"{shown(folder)}: holds the exported frames (frames.csv); must be the folder of the run or dataset that "
+            "they were exported from, which holds export.json"
+        )
     again = "give the command again with --export DIR" if not (path.parent / MANIFEST).is_file() else (
         f"give simtest dataset export {shown(folder)} --out DIR"
     )  # fmt: skip

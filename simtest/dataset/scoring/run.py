@@ -12,7 +12,7 @@ import polars as pl
 
 from simtest.conventions import ON_INSTRUMENT
 from simtest.dataset.scoring.answers import Answer, TableEstimator
-from simtest.dataset.scoring.doubts import reversed_axes, stray_rows
+from simtest.dataset.scoring.doubts import reversed_axes, stray_rows, wide_regions
 from simtest.dataset.scoring.record import Record, Source, check_frame, open_source, read_record
 from simtest.dataset.scoring.table import Answers, check_name, read_answers
 from simtest.dataset.scoring.views import CaseViews, ShardViews, Shown, Views
@@ -121,7 +121,7 @@ def score_table(
             remove_folder(out / "gallery")
             (out / "gallery").mkdir(parents=True)
             results = _results(source, record, answers, out, engine or make_engine(), progress)
-            for doubt in filter(None, [stray_rows(answers, record), *reversed_axes(results)]):
+            for doubt in filter(None, [stray_rows(answers, record), *reversed_axes(results), *wide_regions(results)]):
                 warnings.warn(f"{shown(table)}: {doubt}", stacklevel=2)
             made = _run_record(source, record.fingerprint, (table, on / EXPORT), command, started, clock)
             described = {each: f"Answers of {table.name}, made elsewhere." for each in answers}

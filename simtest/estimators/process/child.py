@@ -3,6 +3,7 @@
 import contextlib
 import fcntl
 import os
+import re
 import select
 import shutil
 import signal
@@ -259,7 +260,11 @@ class Child:
             if not self._stderr_open or not _is_readable(self._pipes[2]):
                 break
             self._drain()
-        text = self._stderr.replace(self.folder.encode(), b".")[-SHOWN_STDERR:]
+        text = self._stderr.replace(self.folder.encode(), b".")
+        if len(text) > SHOWN_STDERR:
+            # Three bytes less, and from the next word on: what is cut off shows.
+            kept = text[-SHOWN_STDERR + 3 :]
+            text = b"..." + (re.sub(rb"^\S*\s+", b"", kept) or kept)
         return f"; its last words: {excerpt(text, SHOWN_STDERR)}" if text.strip() else ""
 
 

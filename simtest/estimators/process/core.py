@@ -1,6 +1,7 @@
 """A core: its greeting, its requests, and what becomes of it when it breaks down."""
 
 import atexit
+import errno
 import itertools
 import os
 import threading
@@ -159,7 +160,10 @@ class Core:
             try:
                 self._child = Child.start(self.command.arguments, self.command.variables())
             except OSError as error:
-                raise CoreFault(Reason.CORE_DIED, f"cannot be started ({error.strerror or error})") from error
+                what = f"cannot be started ({error.strerror or error})"
+                if error.errno == errno.ENOEXEC:
+                    what += "; must be a compiled program, or a script with #! in its first line"
+                raise CoreFault(Reason.CORE_DIED, what) from error
             greeting = {"type": "hello", "protocol": PROTOCOL, "simtest": provenance.version()}
             try:
                 hello = hello_of(self._child.exchange(encode(greeting, {}), self.command.start_limit_s).header)
