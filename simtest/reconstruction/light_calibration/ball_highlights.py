@@ -99,8 +99,8 @@ def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px
         foot = float(around[row, column] + FOOT * above[row, column])
         bright = (smooth > foot) & inside
         blob = _region(bright, row, column)
-        window = blob | (_widened(blob) & ~_widened(bright & ~blob) & inside)
-        spots = _separated(values, blob, window, noise, float(around[row, column]), widest_px)
+        around_blob = blob | (_widened(blob) & ~_widened(bright & ~blob) & inside)
+        spots = _separated(values, blob, around_blob, noise, float(around[row, column]), widest_px)
         if spots is not None and len(spots.centres) > 1:
             found += _several(spots, corner, blob & ~claimed)
             claimed |= blob

@@ -116,7 +116,7 @@ def _blob(values: Array, where: npt.NDArray[np.bool_], noise: float, base: float
     clipped = light > CLIPPED * light.max()
     ceiling = float(np.median(light[clipped]))
     sd = np.sqrt(max(noise, 1e-6) ** 2 + (MISFIT * np.maximum(light - base, 0)) ** 2)
-    return _Blob(np.stack([columns, rows], axis=1) + 0.5, light, sd, clipped, ceiling)
+    return _Blob(np.stack([columns + 0.5, rows + 0.5], axis=1).astype(np.float64), light, sd, clipped, ceiling)
 
 
 def _count(unknown: Array) -> int:
