@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,8 +15,8 @@ from simtest.calibration import Calibration, Response
 from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.camera import Camera
-from simtest.reconstruction.light_calibration.ball_highlights import measure_highlights
-from simtest.reconstruction.light_calibration.observations import circles_of, with_floor
+from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
+from simtest.reconstruction.light_calibration.observations import View, circles_of, with_floor, without_merged
 from simtest.reconstruction.light_calibration.outline import (
     BallOutline,
     has_dark_ring,
@@ -79,12 +80,60 @@ def test_highlights_are_where_the_mirror_law_says() -> None:
     assert max(gaps) < 0.1
 
 
-def test_touching_highlights_are_left_out() -> None:
-    close = np.array([[1.6, 0.0, 0.0], [-1.2, 0.0, 0.0]])
-    inside = CAMERA.unproject(CAMERA.pixel_centres()) @ (CENTRE / np.linalg.norm(CENTRE)) > np.cos(0.95 * 0.2)
-    found = measure_highlights(linear(lights=close), inside, 12.0)
+INSIDE = CAMERA.unproject(CAMERA.pixel_centres()) @ (CENTRE / np.linalg.norm(CENTRE)) > np.cos(0.95 * 0.2)
+
+
+@pytest.mark.parametrize("lights", [[[1.6, 0.0], [-1.2, 0.0]], [[1.7, 0.9], [-1.7, 0.9], [0.0, -1.6]]])
+def test_touching_highlights_are_separated(lights: list[list[float]]) -> None:
+    from simtest.calibration.lights.mirrors import mirror_points
+
+    close = np.array([[x, y, 0.0] for x, y in lights])
+    found = measure_highlights(linear(lights=close), INSIDE, 12.0)
+    count = len(close)
+    expected = CAMERA.project(mirror_points(np.repeat(CENTRE[None], count, 0), np.full(count, RADIUS), close))
+    assert [each.problem for each in found] == [""] * count
+    for point in expected:
+        own = min(found, key=lambda each: float(np.linalg.norm(each.pixel - point)))
+        assert np.linalg.norm(own.pixel - point) < 0.1
+        gap = own.pixel - point
+        assert gap @ np.linalg.solve(own.covariance, gap) < 16  # alpha = 0.0003 each
+    # a spot alone stays one
+    assert len(measure_highlights(linear(lights=close[:1]), INSIDE, 12.0)) == 1
+
+
+def test_clipped_spot_stays_one() -> None:
+    """Of a clipped spot only few pixels may reach full scale."""
+    grid = CAMERA.pixel_centres()
+    for offset in (0.0, 0.3, 0.5):
+        square = np.sum((grid - [120 + offset, 100.0]) ** 2, axis=-1)
+        values = np.minimum(0.2 + 1.4 * np.exp(-square / 2), 1.0)
+        values += np.random.default_rng(3).normal(0, 0.004, values.shape)
+        found = measure_highlights(np.minimum(values, 1.0), np.ones(values.shape, dtype=bool), 12.0)
+        assert [each.problem for each in found] == [""]
+        assert np.linalg.norm(found[0].pixel - [120 + offset, 100.0]) < 0.1
+
+
+def test_long_reflection_is_left_out() -> None:
+    """A lamp or window that no spots of one profile explain."""
+    grid = CAMERA.pixel_centres()
+    bar = (np.abs(grid[..., 0] - 120) < 12) & (np.abs(grid[..., 1] - 100) < 1.5)
+    values = cv2.GaussianBlur(0.2 + 0.6 * bar, (0, 0), 0.8)
+    values += np.random.default_rng(3).normal(0, 0.004, values.shape)
+    found = measure_highlights(values, np.ones(values.shape, dtype=bool), 40.0)
     assert found
     assert all(each.problem for each in found)
+
+
+def test_spot_wider_than_on_a_larger_ball_is_left_out() -> None:
+    near, far, spread = 14.0, 12.0, 1e-8 * np.eye(3)
+    views = [
+        View(name, np.zeros((1, 1)), [MeasuredHighlight(np.zeros(2), np.eye(2), width_px=width)],
+             BallOutline(np.array([0.0, 0.0, 1.0]), float(np.radians(angle)), spread))
+        for name, angle, width in (("a", near, 1.2), ("b", far, 1.25), ("c", far, 1.6))
+    ]  # fmt: skip
+    assert [bool(view.usable) for view in without_merged(views)] == [True, True, False]
+    # On the larger ball a wide spot may be one.
+    assert without_merged([views[2], replace(views[0], outline=views[1].outline)])[1].usable
 
 
 def pictures(count: int = 5) -> list[tuple[str, Callable[[], npt.NDArray[np.float32]]]]:

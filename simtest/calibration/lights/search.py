@@ -40,7 +40,13 @@ GATE = chi_squared.quantile(0.999, 2)
 """Squared distance of a highlight from its expected pixel, in standard deviations, up to which it is taken."""
 
 LEAST_SHARE = 0.6
-"""A light must explain a highlight in this share of the pictures."""
+"""A light must explain a highlight in this share of the pictures that show any."""
+
+LEAST_PICTURES = 3
+"""And in so many pictures, if there are as many."""
+
+MERGED_PX = 3.0
+"""Two lights that are expected so near to each other, with one highlight, have merged: it is neither's."""
 
 PARALLEL = 0.02
 """Rays at a smaller angle, rad, count as parallel."""
@@ -90,7 +96,8 @@ def find_lights(camera: Camera, mirrors: Mirrors, highlights: Highlights, most: 
     """
     loose = with_error(highlights, SLACK_PX)
     candidates = _grow(camera, mirrors, loose, _candidates(camera, mirrors, loose))
-    least = max(2, math.ceil(LEAST_SHARE * len(mirrors)))
+    shown = len(np.unique(highlights.view))
+    least = max(min(LEAST_PICTURES, max(len(mirrors), 2)), math.ceil(LEAST_SHARE * shown))
     free = np.ones(len(highlights), dtype=bool)
     starts: list[Array] = []
     while len(starts) < most and len(candidates.lights):
@@ -109,10 +116,32 @@ def find_lights(camera: Camera, mirrors: Mirrors, highlights: Highlights, most: 
     together = _refined(camera, mirrors, loose, np.array(starts), np.ones(len(highlights), dtype=bool), ROUNDS)
     if together is None:
         return None
-    bundle = solve(camera, mirrors, highlights, together[1], together[0].lights)
+    source = _without_merged(camera, mirrors, loose, *together)
+    bundle = solve(camera, mirrors, highlights, source, together[0].lights)
     if bundle is None:
         return None
-    return Found(bundle, together[1], _ambiguities(camera, mirrors, loose, candidates, bundle, together[1]))
+    return Found(bundle, source, _ambiguities(camera, mirrors, loose, candidates, bundle, source))
+
+
+def _without_merged(camera: Camera, mirrors: Mirrors, highlights: Highlights, bundle: Bundle, source: Labels) -> Labels:
+    """Return the assignment without highlights that lie where a light without a highlight of its own is expected too.
+
+    The lights' images have merged there, and the centre is that of both. A light that would keep fewer than two
+    highlights keeps all.
+    """
+    kept = source.copy()
+    lights = np.arange(len(bundle.lights))
+    for view in np.unique(highlights.view):
+        own = np.flatnonzero((highlights.view == view) & (source >= 0))
+        unseen = np.setdiff1d(lights, source[own])
+        predicted, _ = prediction(camera, mirrors, bundle, np.full(len(lights), view), lights)
+        for row in own:
+            gaps = np.linalg.norm(predicted[unseen] - highlights.pixels[row], axis=1)
+            if (gaps < MERGED_PX).any():
+                kept[row] = -1
+    counts = np.bincount(kept[kept >= 0], minlength=len(lights))
+    few = np.isin(source, np.flatnonzero(counts < 2))
+    return np.where(few, source, kept)
 
 
 def _candidates(camera: Camera, mirrors: Mirrors, highlights: Highlights) -> _Candidates:

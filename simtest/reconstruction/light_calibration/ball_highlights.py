@@ -1,15 +1,18 @@
 """The highlights on a ball or plate in a picture, each with its centre and the covariance of that."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry import Array
+from simtest.reconstruction.light_calibration.touching import MOST_SD_PX, Spots, separate
 
 Peaks = npt.NDArray[np.intp]
 """Row and column of each peak, shape (K, 2)."""
+
+Mask = npt.NDArray[np.bool_]
 
 SMOOTHING_PX = 0.7
 MOST = 12
@@ -28,6 +31,13 @@ LONGEST = 1.35
 """A longer spot, by its axis ratio, is several highlights that touch, or a reflected lamp or window."""
 
 HALF = 0.5
+FOOT = 0.25
+"""Spots that meet above this share of a spot's height are one blob."""
+
+ROOM_PX = 3
+"""Pixels around a blob that its fit sees too."""
+
+TOUCH = "several highlights that touch"
 
 MOST_OPENED_PX = 200.0
 """Largest window for the brightness that surrounds a highlight."""
@@ -45,11 +55,14 @@ class MeasuredHighlight:
         Of the centre, px^2.
     problem : str
         Why it is not used; empty: it is.
+    width_px : float
+        Radius at half height, px; 0: not known.
     """
 
     pixel: Array
     covariance: Array
     problem: str = ""
+    width_px: float = 0.0
 
 
 def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px: float) -> list[MeasuredHighlight]:
@@ -81,12 +94,51 @@ def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px
     peaks = peaks[np.argsort(-above[tuple(peaks.T)], kind="stable")]
     found, claimed = list[MeasuredHighlight](), np.zeros(values.shape, dtype=bool)
     for row, column in peaks:
-        if claimed[row, column] or len(found) == MOST:
+        if claimed[row, column] or len(found) >= MOST:
+            continue
+        foot = float(around[row, column] + FOOT * above[row, column])
+        bright = (smooth > foot) & inside
+        blob = _region(bright, row, column)
+        around_blob = blob | (_widened(blob) & ~_widened(bright & ~blob) & inside)
+        spots = _separated(values, blob, around_blob, noise, float(around[row, column]), widest_px)
+        if spots is not None and len(spots.centres) > 1:
+            found += _several(spots, corner, blob & ~claimed)
+            claimed |= blob
             continue
         level = float(around[row, column] + HALF * above[row, column])
         region = _region(smooth > level, row, column) & inside
         claimed |= region
-        found.append(_measured(values, region, level, noise, corner, peaks, smooth, widest_px))
+        single = _measured(values, region, level, noise, corner, peaks, smooth, widest_px)
+        found.append(single if spots is None else replace(single, width_px=spots.width_px))
+    return found
+
+
+def _separated(values: Array, blob: Mask, window: Mask, noise: float, base: float, widest_px: float) -> Spots | None:
+    """Return the spots in the window of a blob; None where it reaches the outline, or no small spots explain it."""
+    if np.concatenate([blob[0], blob[-1], blob[:, 0], blob[:, -1]]).any() or blob.sum() > MOST * widest_px**2:
+        return None
+    spots = separate(values, window, noise, base)
+    return spots if spots is not None and 2 * spots.width_px < widest_px else None
+
+
+def _widened(mask: Mask) -> Mask:
+    square = np.ones((2 * ROOM_PX + 1, 2 * ROOM_PX + 1), np.uint8)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), square) > 0)
+
+
+def _several(spots: Spots, corner: Array, blob: Mask) -> list[MeasuredHighlight]:
+    """Return the spots of a blob as highlights; one that is not well known has that as its problem.
+
+    Spots outside the blob are neighbours at whose edge its window ends. They have a blob of their own.
+    """
+    found = []
+    for centre, covariance in zip(spots.centres, spots.covariances, strict=True):
+        column, row = np.clip(centre.astype(int), 0, [blob.shape[1] - 1, blob.shape[0] - 1])
+        if not blob[row, column]:
+            continue
+        poor = float(np.linalg.eigvalsh(covariance)[1]) > MOST_SD_PX**2
+        floor = CENTRE_FLOOR_PX**2 * np.eye(2)
+        found.append(MeasuredHighlight(centre + corner, covariance + floor, TOUCH if poor else "", spots.width_px))
     return found
 
 
@@ -138,7 +190,7 @@ def _problem(region: npt.NDArray[np.bool_], peaks: Peaks, smooth: Array, spread:
     several = [smooth[r, c] for r, c in peaks if region[r, c]]
     # A flat, clipped top has many equal maxima.
     if len(several) > 1 and _is_split(smooth, region, np.array(several)):
-        return "several highlights that touch"
+        return TOUCH
     small, large = np.linalg.eigvalsh(spread)
     return "long: several highlights that touch, or a lamp" if large > LONGEST**2 * small else ""
 

@@ -32,6 +32,9 @@ WIDEST, LEAST_WIDEST_PX = 0.2, 12.0
 WIDEST_ON_PLATE = 0.06
 """Longest highlight on a plate, as a share of the picture's longer side."""
 
+WIDER = 1.08
+"""A spot that is wider by this factor than spots on a ball that looks larger is several highlights that merge."""
+
 INSIDE = 0.97
 """Highlights are searched within this share of the cone's half-angle."""
 
@@ -118,7 +121,28 @@ def read_balls(
         radius_px = float(np.sqrt(inside.sum() / np.pi))
         widest = max(WIDEST * radius_px, LEAST_WIDEST_PX)
         found.views.append(View(name, intensity, measure_highlights(intensity, inside, widest), outline))
-    return found
+    return replace(found, views=without_merged(found.views))
+
+
+def without_merged(views: Sequence[View]) -> list[View]:
+    """Return the views of balls with those spots marked that are too wide for a single highlight.
+
+    The blur of the lens is the same in all pictures, and the lobe on the ball scales with the ball's size in the
+    picture. So a spot is at most as wide as one on a ball that looks larger.
+    """
+    angles = np.array([0.0 if view.outline is None else view.outline.half_angle for view in views])
+    narrow = np.array([np.median([h.width_px for h in v.usable if h.width_px] or [np.inf]) for v in views])
+    marked = []
+    for view, angle in zip(views, angles, strict=True):
+        most = WIDER * float(narrow[angles >= angle].min(initial=np.inf))
+        marked.append(replace(view, highlights=[_if_narrow(each, most) for each in view.highlights]))
+    return marked
+
+
+def _if_narrow(highlight: MeasuredHighlight, most_px: float) -> MeasuredHighlight:
+    if highlight.problem or highlight.width_px <= most_px:
+        return highlight
+    return replace(highlight, problem="wider than on a ball that looks larger: several highlights that merge")
 
 
 def read_plates(
