@@ -160,3 +160,12 @@ def test_an_error_that_is_not_stated_is_assumed_not_zero(tmp_path):
     np.testing.assert_array_equal(read.world_from_camera[0, :3, 3], [2, 3, 4])
     path.write_text("# translation_error: 0\n# rotation_error_deg: 0\n1 2 3 4 0 0 0 1\n")
     assert (read_poses(path).error, read_poses(path).error_told) == (PoseError(0.0, 0.0), True)
+
+
+def test_marks_of_encoding_and_numbers_of_opencv_are_read(tmp_path):
+    lines = "# unit: mm\n1 1 0 0 0 0 0 0 1 a.png\n\n"
+    rows = "[[1., 0, 0, 2.], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    nerf = f'{{"unit": "mm", "frames": [{{"file_path": "a.png", "transform_matrix": {rows}}}]}}'
+    for name, text in {"images.txt": lines, "tum.txt": "0 0 0 0 0 0 0 1\n", "t.json": nerf}.items():
+        (tmp_path / name).write_text("\ufeff" + text, encoding="utf-8")
+        assert len(read_poses(tmp_path / name).world_from_camera) == 1
