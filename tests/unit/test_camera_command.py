@@ -125,7 +125,7 @@ def test_what_is_refused_in_one_line(here, tmp_path, arguments, said):
 def test_convert_never_replaces_the_points_of_a_model(here, tmp_path):
     save_camera(FISHEYE, tmp_path / "cameras.txt", poses=[("a.png", np.eye(4))])
     save_camera(FISHEYE, tmp_path / "cameras.txt", poses=[("a.png", np.eye(4))])
-    held = "# 3D point list with one line of data per point:\n1 0 0 1 0 0 0 1 1 0\n"
+    held = "# mine\n1 0 0 1 0 0 0 1 1 0\n"
     (tmp_path / "points3D.txt").write_text(held)
     images = (tmp_path / "images.txt").read_text()
     code, _, err = here("convert", "cameras.txt", "--out", "cameras.txt", "--poses", "images.txt")

@@ -29,6 +29,9 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
 BESIDE = ("images.txt", "points3D.txt")
 """Files of COLMAP beside its cameras.txt."""
 
+HEAD_BYTES = 10_000
+"""Of a list of points, whose comments stand first."""
+
 WITH_POSES = ("colmap", "transforms")
 """Formats that hold poses."""
 
@@ -86,7 +89,7 @@ def _contents(camera: Camera, path: Path, format: str, poses: Poses | None) -> d
         if poses is not None:
             images, points = (path.with_name(name) for name in BESIDE)
             files |= {images: images_text(poses).encode(), points: POINTS_TEXT.encode()}
-            _check_no_points(points, len(files[points]))
+            _check_no_points(points)
         return files
     if format == "transforms":
         from simtest.spec.camera_formats.transforms import transforms_text
@@ -101,11 +104,12 @@ def _contents(camera: Camera, path: Path, format: str, poses: Poses | None) -> d
     return {path: (ros_text(camera) if format == "ros" else opencv_text(camera, path.suffix.lower())).encode()}
 
 
-def _check_no_points(points: Path, size: int) -> None:
-    """Raise `InputError` where a model's own points would give way to an empty list, of `size` bytes."""
+def _check_no_points(path: Path) -> None:
+    """Raise `InputError` where a model's own points would give way to an empty list."""
     try:
-        held = points.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
     except OSError:
         return
-    if held > size:
-        raise InputError(f"{shown(points)}: exists and holds points; poses must go to a folder without them")
+    if any(line.strip() and not line.startswith(b"#") for line in head.splitlines()):
+        raise InputError(f"{shown(path)}: exists and holds points; poses must go to a folder without them")
