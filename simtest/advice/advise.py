@@ -19,6 +19,7 @@ from simtest.advice.break_points import (
 )
 from simtest.advice.figures import Found, read_results
 from simtest.advice.plan import Question, main_experiment, write_experiment
+from simtest.errors import InputError
 from simtest.pages.sheet import Pixels
 from simtest.runtime.engines import make_engine
 from simtest.runtime.files import make_folder, write_atomically
@@ -109,17 +110,21 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
     BackendError
         If the rendering backend cannot be used.
     """
+    engine = make_engine(workers=workers)
     make_folder(out)
-    main = write_experiment(main_experiment(question), out / MAIN)
     points = break_points(question)
-    tests = write_experiment(break_experiment(question, points), out / BREAKS)
-    # The frame first: what cannot be rendered is found before the long part.
-    scene = write_scene(question, main, out / SCENE)
-    frame = make_frame(load_scene(scene))
+    written = [path for path in (out / MAIN, out / BREAKS, out / SCENE) if not path.exists()]
+    try:
+        main = write_experiment(main_experiment(question), out / MAIN)
+        tests = write_experiment(break_experiment(question, points), out / BREAKS)
+        # The frame first: what cannot be rendered is found before the long part.
+        frame = make_frame(load_scene(write_scene(question, main, out / SCENE)))
+    except InputError:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise
     picture = np.asarray(np.round(255 * displayed(frame.image, frame.scene.sensor)), dtype=np.uint8)
-    runs = run_experiments(
-        [(main, out / RUN), (tests, out / BREAKS_RUN)], "", None, progress, make_engine(workers=workers)
-    )
+    runs = run_experiments([(main, out / RUN), (tests, out / BREAKS_RUN)], "", None, progress, engine)
     results = runs[0].results
     count = sum(len(next(iter(table.values()))) for group in main.groups for table in group.pool) * main.realisations
     _write_picture(out / FRAME, picture)

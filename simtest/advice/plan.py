@@ -12,7 +12,7 @@ import numpy as np
 from simtest.advice.organs import ORGANS, Organ, Surroundings, rough, wall
 from simtest.advice.scope import Interval, Scope
 from simtest.errors import InputError
-from simtest.geometry.checks import check_number
+from simtest.geometry.checks import check_integer, check_number
 from simtest.runtime.files import write_atomically
 from simtest.runtime.resources import shown, suggestion
 from simtest.spec import Experiment, load_experiment
@@ -33,6 +33,7 @@ SAMPLES = 4
 
 FARTHEST_MM = 500.0
 MOST_BOUND_DEG = 30.0
+MOST_SEED = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ class Question:
                 "the nearest distance must be larger"
             )
         check_number("--bound", self.bound_deg, above=0)
+        check_integer("--seed", self.seed, 0, MOST_SEED)
         if self.bound_deg > MOST_BOUND_DEG:
             raise InputError(f"--bound {self.bound_deg:g}: must be at most {MOST_BOUND_DEG:g} deg")
         if self.frames is not None and not DISTANCES <= self.frames <= 10_000:

@@ -24,6 +24,9 @@ Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[flo
 ROUNDING = 1e-9
 """Rounding of a covariance that is written in decimals, as a share of its largest entry."""
 
+MOST_COVARIANCE_MM2 = 1e6
+"""Of a light, which is within 1000 mm of the camera along each axis."""
+
 UNTOLD_OFFSET_MM = Uniform(0.0, 6.0)
 """Distance of a light from the camera across the optical axis, mm, where no rig is told; every azimuth is as likely."""
 
@@ -170,6 +173,8 @@ def check_light_covariances(covariances: tuple[Matrix, ...], count: int) -> None
         if len(matrix) != 3 or any(len(row) != 3 for row in matrix) or not np.isfinite(np.array(matrix)).all():
             raise InputError(f"{name}: each must be three rows of three finite numbers, mm^2")
         values = np.array(matrix, dtype=float)
+        if np.abs(values).max() > MOST_COVARIANCE_MM2:
+            raise InputError(f"{name}: {values.tolist()}: must be at most {MOST_COVARIANCE_MM2:g} mm^2")
         slack = ROUNDING * float(np.abs(values).max())
         if not np.allclose(values, values.T, rtol=0.0, atol=slack) or np.linalg.eigvalsh(values)[0] < -slack:
             raise InputError(f"{name}: {values.tolist()} is no covariance; must be symmetric, no eigenvalue below 0")

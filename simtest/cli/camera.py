@@ -109,6 +109,8 @@ def convert(
 
     if photometric is not None and (to or out.suffix.lower().removeprefix(".")) != "toml":
         raise InputError(f"--photometric {photometric}: needs --to toml; no other format holds it")
+    if photometric is not None and poses is not None:
+        raise InputError("--photometric and --poses exclude each other; no format holds both")
     with exclusive_file(out):
         if photometric is not None:
             save_calibration(load_calibration(file, photometric, view_radius), out)

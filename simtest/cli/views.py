@@ -16,7 +16,11 @@ def views(
     out: Out,
     count: Annotated[int, Parameter(help="Views wanted, 1 to 1000.", converter=whole_number)] = 50,
     along: Annotated[
-        str | None, Parameter(help="First,last share of the camera path: a sequence of views in order, none left out.")
+        str | None,
+        Parameter(
+            help="First,last share of the camera path: a sequence of views in order, none left out.",
+            allow_leading_hyphen=True,
+        ),
     ] = None,
     fps: Annotated[float | None, Parameter(help="Frames a second of the sequence; default 25.")] = None,
     labels: Annotated[

@@ -107,7 +107,7 @@ def read_poses(path: Path) -> Poses:
     """Read a file of poses; raise `InputError`, one line, where it is malformed."""
     where = f"--poses {shown(path)}"
     try:
-        text = require_plain(path, "record_bytes").read_text(encoding="utf-8")
+        text = require_plain(path, "record_bytes").read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(f"{where}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
@@ -230,6 +230,7 @@ def _is_foreign(text: str, is_json: bool) -> bool:
 def _from_others(path: Path, text: str, is_json: bool, where: str) -> Read:
     """Read the poses of another program's file, and the settings that it states."""
     from simtest.spec.camera_formats import read_poses as read_foreign
+    from simtest.spec.camera_formats.common import parse_json
 
     try:
         found = read_foreign(path)
@@ -237,7 +238,7 @@ def _from_others(path: Path, text: str, is_json: bool, where: str) -> Read:
         raise InputError(f"--poses {error}") from None
     settings: dict[str, Any] = {}
     if is_json:
-        table = json.loads(text)
+        table = parse_json(text)
         for key in table:
             _check_setting(key, where)
         settings = {key: table[key] for key in SETTINGS if key in table}

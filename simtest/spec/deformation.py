@@ -9,6 +9,9 @@ from simtest.spec.spec_model import Coordinate, Spec
 
 MOST_DEFORMATIONS = 4
 
+SHORTEST = 1e-6
+"""Least length of a direction that is given."""
+
 MAX_STRETCH = 0.9
 """Lipschitz bound that a displacement must stay below.
 
@@ -46,7 +49,7 @@ class _Periodic(Spec):
     @model_validator(mode="after")
     def _invertible(self) -> "_Periodic":
         for name in ("axis", "direction", "along"):
-            if name in type(self).model_fields and not any(getattr(self, name)):
+            if name in type(self).model_fields and math.hypot(*getattr(self, name)) < SHORTEST:
                 raise ValueError(f"{name} = {list(getattr(self, name))}: must have a length")
         if self.stretch >= MAX_STRETCH:
             raise ValueError(

@@ -24,13 +24,15 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{shown(path)}: not valid TOML: {error}") from error
 
 
-def read_text(path: Path, kind: str) -> str:
+def read_text(path: Path, kind: str, limit: str = "text_bytes") -> str:
     """Read a text file of moderate size; `kind` is what it should be, for messages, such as "TOML".
+
+    `limit` names the limit of its size.
 
     Raises `InputError` if it is missing, no plain file, too large or not UTF-8.
     """
     name = shown(path)
-    check_file(path, "text_bytes", f"a {kind} file")
+    check_file(path, limit, f"a {kind} file")
     try:
         # Editors on Windows begin a file with a mark of its encoding.
         return path.read_text(encoding="utf-8-sig")

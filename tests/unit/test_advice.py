@@ -86,6 +86,7 @@ QUESTIONS = [
     ({"bound_deg": 0.0}, "--bound = 0.0"),
     ({"bound_deg": 60.0}, "--bound 60"),
     ({"frames": 1}, "--frames 1"),
+    ({"seed": -1}, "--seed = -1"),
 ]
 
 
@@ -95,6 +96,15 @@ def test_a_question_out_of_range_is_refused_in_one_line(changed, named):
         Question(read_scope("colonoscope_2"), **changed)
     assert named in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_what_is_refused_leaves_no_files(tmp_path):
+    (tmp_path / "large.toml").write_text("[camera]\nwidth = 16000\nheight = 16000\nfov_deg = 70.0\n")
+    for scope, workers, said in (("large.toml", 1, "frame_pixels"), (None, 0, "workers = 0")):
+        question = Question(read_scope("colonoscope_2" if scope is None else str(tmp_path / scope)))
+        with pytest.raises(InputError, match=said):
+            advise(question, tmp_path / "out", workers=workers)
+        assert not list(tmp_path.glob("out/*"))
 
 
 def test_a_light_inside_the_tissue_is_refused():

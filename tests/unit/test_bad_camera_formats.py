@@ -107,6 +107,22 @@ CAMERAS = {
         transforms(frames=[{"fl_x": 3}]),
         "frames[0]: file_path = None: must name a picture",
     ),
+    "transforms: list of models": (
+        "t.json",
+        transforms(camera_model=["OPENCV"]),
+        "camera_model = ['OPENCV']: simtest lacks it",
+    ),
+    "transforms: fisheye": ("t.json", transforms(is_fisheye="no"), "is_fisheye = 'no': must be true or false"),
+    "transforms: twice": (
+        "t.json",
+        '{"w": 64, "h": 48, "fl_x": 50.0, "fl_x": 60.0}',
+        "not valid JSON: fl_x is given twice",
+    ),
+    "transforms: two cameras of a frame": (
+        "t.json",
+        transforms(frames=[{"file_path": "a", "fl_x": 300}, {"file_path": "a", "fl_x": 400}]),
+        "frames[1]: file_path a has two cameras; must have one",
+    ),
     # Kalibr
     "kalibr: model": (
         "c.yaml",
@@ -144,6 +160,8 @@ CAMERAS = {
     # C3VD
     "c3vd: missing": ("c.ini", swap(C3VD, "a4 =", "a5 ="), "a4: missing"),
     "c3vd: no number": ("c.ini", swap(C3VD, "769.2", "f"), "a0 = 'f': must be a finite number"),
+    "c3vd: no number of others": ("c.ini", swap(C3VD, "769.2", "7_69"), "a0 = '7_69': must be a finite number"),
+    "c3vd: huge": ("c.ini", swap(C3VD, "769.2", "1e300"), "a0 = 1e+300: must be at most 1e+06 px"),
     "c3vd: a1": ("c.ini", swap(C3VD, "a1 = 0.0", "a1 = 0.5"), "a1 = 0.5: must be 0"),
     "c3vd: backwards": ("c.ini", swap(C3VD, "769.2", "-769.2"), "a0 = -769.2: must be > 0, since z points along"),
     "c3vd: twice": ("c.ini", C3VD + "a0 = 1\n", "line 13: a0 is given twice"),
@@ -211,6 +229,17 @@ POSES = {
         transforms(frames=[{"file_path": "a", "transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]),
         "rotation",
     ),
+    "transforms: huge": (
+        "t.json",
+        transforms(frames=[{"file_path": "a", "transform_matrix": np.diag([1e200, 1, 1, 1]).tolist()}]),
+        "transform_matrix: holds 1e+200; must be at most 1e+09",
+    ),
+    "transforms: twice": (
+        "t.json",
+        transforms(frames=[{"file_path": "a", "transform_matrix": np.eye(4).tolist()}] * 2),
+        "names a twice; must give each frame one pose",
+    ),
+    "colmap: far": ("images.txt", "1 1 0 0 0 0 1e308 0 1 a\n\n", "a: a position beyond 1e+09; must be within it"),
     "transforms: none": ("t.json", transforms(), "holds no pose; must hold one for each frame"),
     "kalibr: chain": ("c.yaml", KALIBR + KALIBR.replace("cam0", "cam1"), "cam1: T_cn_cnm1: missing"),
     "vicalib": ("g.xml", VICALIB, "Vicalib XML holds no poses; must be COLMAP's images.txt, transforms.json or"),
@@ -266,6 +295,8 @@ def test_what_two_files_state_is_refused(tmp_path):
 
 MATLAB_BAD = {
     "polynomial": ({"MappingCoefficients": np.zeros(3)}, "MappingCoefficients = "),
+    "size": ({"ImageSize": np.array([1080.0, np.nan])}, "ImageSize = nan: must be a whole number"),
+    "part of a pixel": ({"ImageSize": np.array([1080.0, 640.5])}, "ImageSize = 640.5: must be a whole number"),
     "backwards": ({"MappingCoefficients": np.array([-769.0, 0, 0, 0])}, "a0 = -769: must be > 0"),
     "centre": ({"DistortionCenter": np.zeros(3)}, "DistortionCenter = "),
     "stretch": ({"StretchMatrix": np.array([[1.0, 0.0], [0.0, 2.0]])}, "must have 1 in its last corner"),
@@ -281,3 +312,25 @@ def test_malformed_fisheyes_of_matlab(tmp_path, case):
     assert load_camera(path).fx == 769
     savemat(path, {"s": {**MATLAB, **change}})
     refused(lambda: load_camera(path), path, fragment)
+
+
+def test_files_that_programs_write_may_be_larger(tmp_path):
+    path = tmp_path / "images.txt"
+    points = " ".join(["100.25 200.25 -1"] * 1200)
+    path.write_text("".join(f"{i} 1 0 0 0 0 0 0 1 f{i}.png\n{points}\n" for i in range(60)))
+    assert path.stat().st_size > 1e6
+    assert len(read_poses(path)) == 60
+
+
+def test_names_of_frames_are_kept_where_numbers_are_mended(tmp_path):
+    path = tmp_path / "t.json"
+    path.write_text(transforms(frames=[{"file_path": "take 1. png", "transform_matrix": np.eye(4).tolist()}]))
+    assert read_poses(path)[0][0] == "take 1. png"
+    path.write_text(path.read_text().replace("take 1. png", "a").replace("500.0,", "500.,"))
+    assert load_camera(path).fx == 500
+
+
+def test_what_tells_the_format_may_stand_last(tmp_path):
+    path = tmp_path / "t.json"
+    path.write_text(json.dumps({"note": ["x"] * 8000, **TRANSFORMS}))
+    assert load_camera(path).fx == 500

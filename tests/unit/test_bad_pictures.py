@@ -14,13 +14,16 @@ from tests.refusals import refused
 
 CALIBRATION = "width = 32\nheight = 24\nfx = 40\nfy = 40\n"
 CAMERAS = {
-    "missing key": (CALIBRATION.replace("fy = 40\n", ""), "fy: missing; a camera needs width, height, fx, fy"),
+    "missing key": (
+        CALIBRATION.replace("fy = 40\n", ""),
+        "fy: missing; a camera needs width, height, and fx and fy or fov_deg",
+    ),
     "text": ("a calibration", "not valid TOML"),
     "NaN": (CALIBRATION.replace("fx = 40", "fx = nan"), "fx = nan: must be a finite number"),
     "in quotes": (CALIBRATION.replace("fx = 40", 'fx = "40"'), "fx = '40': must be a number"),
     "singular": (CALIBRATION.replace("fy = 40", "fy = 0"), "fy = 0: must be greater than"),
     "fractional": (CALIBRATION.replace("32", "32.5"), "width = 32.5: must be a valid integer"),
-    "unknown key": (CALIBRATION + "fov = 60", "fov = 60: unknown key; allowed: width, height"),
+    "unknown key": (CALIBRATION + "fov = 60", "fov = 60: unknown key; allowed: fov_deg, width, height"),
     "no table": ("camera = 5", "width: missing"),
     "table without keys": ("[camera]\nwidth = 32", "height: missing"),
 }

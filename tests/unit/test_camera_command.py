@@ -136,3 +136,34 @@ def test_what_is_refused_in_one_line(here, tmp_path, arguments, said):
     assert (code, out, len(lines)) == (2, "", 1)
     assert said in lines[0]
     assert {path.name for path in tmp_path.iterdir()} == {"a.toml", "p.xml"}
+
+
+def test_convert_never_replaces_the_points_of_a_model(here, tmp_path):
+    save_camera(FISHEYE, tmp_path / "cameras.txt", poses=[("a.png", np.eye(4))])
+    save_camera(FISHEYE, tmp_path / "cameras.txt", poses=[("a.png", np.eye(4))])
+    held = "# mine\n1 0 0 1 0 0 0 1 1 0\n"
+    (tmp_path / "points3D.txt").write_text(held)
+    images = (tmp_path / "images.txt").read_text()
+    code, _, err = here("convert", "cameras.txt", "--out", "cameras.txt", "--poses", "images.txt")
+    assert (code, len(err)) == (2, 1)
+    assert "points3D.txt: exists and holds points" in err[0]
+    assert (tmp_path / "points3D.txt").read_text() == held
+    assert (tmp_path / "images.txt").read_text() == images
+
+
+@pytest.mark.parametrize("name", ["images.txt", "points3D.txt"])
+def test_no_camera_is_written_under_the_name_of_poses(here, tmp_path, name):
+    save_camera(FISHEYE, tmp_path / "cameras.txt", poses=[("a.png", np.eye(4))])
+    (tmp_path / "to").mkdir()
+    code, _, err = here("convert", "cameras.txt", "--out", f"to/{name}", "--poses", "images.txt")
+    assert (code, len(err)) == (2, 1)
+    assert "must be cameras.txt" in err[0]
+    assert not (tmp_path / "to" / name).exists()
+
+
+def test_photometry_and_poses_exclude_each_other(here, tmp_path):
+    save_camera(FISHEYE, tmp_path / "cameras.txt", poses=[("a.png", np.eye(4))])
+    (tmp_path / "p.xml").write_text(PHOTOMETRY)
+    code, _, err = here("convert", "cameras.txt", "--out", "c.toml", "--photometric", "p.xml", "--poses", "images.txt")
+    assert (code, len(err)) == (2, 1)
+    assert "--photometric and --poses exclude each other" in err[0]

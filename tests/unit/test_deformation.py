@@ -220,6 +220,7 @@ DENT_TABLE = {"type": "dent", "amplitude_mm": 1.0, "period_s": 2.0, "direction":
 BAD = {
     "folds": ({"amplitude_mm": 9.0}, r"amplitude_mm = 9: .* by up to 1\.09 of .* below 0\.9: .* radius_mm"),
     "no direction": ({"direction": [0, 0, 0]}, r"direction = \[0\.0, 0\.0, 0\.0\]: must have a length"),
+    "hardly a direction": ({"direction": [1e-300, 0, 0]}, r"direction = \[1e-300, 0\.0, 0\.0\]: must have a length"),
     "no period": ({"period_s": 0.0}, r"period_s = 0\.0: must be .* 0\.001"),
     "text": ({"amplitude_mm": "1"}, r"amplitude_mm = '1': must be a number"),
     "unknown": ({"speed": 1.0}, r"speed = 1\.0: unknown key; allowed: amplitude_mm"),

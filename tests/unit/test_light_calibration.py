@@ -214,7 +214,18 @@ def test_picture_of_another_size_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "name,x,y,radius\n", "a.png,1,2\n", "a.png,1,2,-3\n", "a.png,1,2,nan\n", "a.png,x,2,3\n", "a.png,1,2,3,4\n"],
+    [
+        "",
+        "name,x,y,radius\n",
+        "a.png,1,2\n",
+        "a.png,1,2,-3\n",
+        "a.png,1,2,nan\n",
+        "a.png,x,2,3\n",
+        "a.png,1,2,3,4\n",
+        "a.png,1e300,1e300,1e300\n",
+        "a.png,1,2,3\na.png,4,5,6\n",
+        "a" * 200_000,
+    ],
 )
 def test_malformed_outlines(tmp_path: Path, text: str) -> None:
     path = tmp_path / "outlines.csv"
@@ -226,7 +237,8 @@ def test_malformed_outlines(tmp_path: Path, text: str) -> None:
 
 def test_outlines_are_read(tmp_path: Path) -> None:
     path = tmp_path / "outlines.csv"
-    path.write_text("name,x,y,radius\na.png, 1.5,2,3\n")
+    # Spreadsheets begin a file with a mark of its encoding.
+    path.write_text("\ufeffname,x,y,radius\na.png, 1.5,2,3\n", encoding="utf-8")
     assert circles_of(path) == {"a.png": (1.5, 2.0, 3.0)}
 
 

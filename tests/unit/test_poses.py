@@ -199,3 +199,12 @@ def test_malformed_poses_of_data_sets_are_one_line(tmp_path, what):
     with pytest.raises(InputError, match=message) as error:
         read_poses(tmp_path / name)
     assert "\n" not in str(error.value)
+
+
+def test_marks_of_encoding_and_numbers_of_opencv_are_read(tmp_path):
+    lines = "# unit: mm\n1 1 0 0 0 0 0 0 1 a.png\n\n"
+    rows = "[[1., 0, 0, 2.], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    nerf = f'{{"unit": "mm", "frames": [{{"file_path": "a.png", "transform_matrix": {rows}}}]}}'
+    for name, text in {"images.txt": lines, "tum.txt": "0 0 0 0 0 0 0 1\n", "t.json": nerf}.items():
+        (tmp_path / name).write_text("\ufeff" + text, encoding="utf-8")
+        assert len(read_poses(tmp_path / name).world_from_camera) == 1

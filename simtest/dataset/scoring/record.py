@@ -202,9 +202,9 @@ def read_record(folder: Path) -> Record:
     try:
         return Record.model_validate_json(text)
     except ValidationError as error:
-        what = error.errors()[0]
-        where = ".".join(map(str, what["loc"])) or "whole"
-        raise InputError(f"{shown(path)}: no record of an export ({where}: {what['msg']}); {again}") from error
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "whole"
+        raise InputError(f"{shown(path)}: no record of an export ({where}: {first['msg']}); {again}") from error
 
 
 def open_source(folder: Path, record: Record) -> Source:

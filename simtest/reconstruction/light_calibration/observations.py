@@ -35,6 +35,9 @@ WIDEST_ON_PLATE = 0.06
 WIDER = 1.08
 """A spot that is wider by this factor than spots on a ball that looks larger is several highlights that merge."""
 
+FARTHEST_PX = 1e5
+"""Largest number of a rough outline, px."""
+
 INSIDE = 0.97
 """Highlights are searched within this share of the cone's half-angle."""
 
@@ -255,21 +258,24 @@ def circles_of(path: Path) -> dict[str, Circle]:
     check_file(path, "record_bytes", "a file of outlines (name,x,y,radius)")
     found: dict[str, Circle] = {}
     try:
-        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
-    except (UnicodeDecodeError, OSError) as error:
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (UnicodeDecodeError, OSError, csv.Error) as error:
         raise InputError(f"--outlines {shown(path)}: cannot be read as text ({type(error).__name__})") from error
     for number, row in enumerate(rows, 1):
         if not row or (number == 1 and [cell.strip() for cell in row] == ["name", "x", "y", "radius"]):
             continue
         try:
             name, (x, y, radius) = row[0].strip(), (float(cell) for cell in row[1:])
-            if not (np.isfinite([x, y, radius]).all() and radius > 0):
+            if not (max(abs(x), abs(y), radius) <= FARTHEST_PX and radius > 0):
                 raise ValueError
         except ValueError:
             text = shown(",".join(row), 60)
             raise InputError(
-                f"--outlines {shown(path)}: line {number}: {text}: must be name,x,y,radius, px, radius > 0"
+                f"--outlines {shown(path)}: line {number}: {text}: must be name,x,y,radius, px, radius > 0, all "
+                f"within {FARTHEST_PX:g}"
             ) from None
+        if name in found:
+            raise InputError(f"--outlines {shown(path)}: line {number}: {shown(name, 60)} is given twice")
         found[name] = (x, y, radius)
     if not found:
         raise InputError(f"--outlines {shown(path)}: holds no outline; must be lines of name,x,y,radius in px")

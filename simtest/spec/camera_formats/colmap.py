@@ -98,7 +98,7 @@ def read_images(path: Path) -> Poses:
     poses: list[tuple[str, Array]] = []
     # Each image has two lines, of which the second, its points, may be empty.
     points_follow = False
-    for count, line in enumerate(read_text(path, "pose").splitlines(), 1):
+    for count, line in enumerate(read_text(path, "pose", "record_bytes").splitlines(), 1):
         if points_follow:
             points_follow = False
             if len(line.split()) % 3:

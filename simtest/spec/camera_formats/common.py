@@ -22,6 +22,9 @@ Table = dict[str, Any]
 Poses = Sequence[tuple[str, Array]]
 """Names of frames, and their world_from_camera, shape (4, 4): OpenCV axes, in the file's unit of length."""
 
+LARGEST = 1e9
+"""Largest number of a transform, in the file's unit of length."""
+
 ROUNDED = 1e-3
 """How far a matrix may be from a rotation: files hold rounded numbers."""
 
@@ -31,10 +34,10 @@ MOST_SHOWN = 12
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object; raise `InputError` where the file holds none."""
-    where, text = shown(path), read_text(path, "camera")
+    # Programs write these files, too, with a pose for each of many frames.
+    where, text = shown(path), read_text(path, "camera", "record_bytes")
     try:
-        # OpenCV has long written 1. for 1.0, which is no JSON.
-        data = json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text))
+        data = parse_json(text)
     except RecursionError:
         raise InputError(f"{where}: not valid JSON: nested too deeply") from None
     except ValueError as error:
@@ -42,6 +45,24 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise InputError(f"{where}: holds a {type(data).__name__}; must be an object of keys and values")
     return data
+
+
+def parse_json(text: str) -> Any:
+    """Parse JSON in which no key is given twice; raise `ValueError` or `RecursionError` where it is malformed."""
+    try:
+        return json.loads(text, object_pairs_hook=_once)
+    except json.JSONDecodeError:
+        # OpenCV has long written 1. for 1.0, which is no JSON. Names of files may hold the same, so this comes second.
+        return json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text), object_pairs_hook=_once)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object's keys and values."""
+    made = dict(pairs)
+    if len(made) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"{next(key for key in keys if keys.count(key) > 1)[:40]} is given twice")
+    return made
 
 
 def read_xml(path: Path) -> ElementTree.Element:
@@ -59,7 +80,9 @@ def read_xml(path: Path) -> ElementTree.Element:
 def number(value: Any, where: str, name: str, whole: bool = False) -> float:
     """Return a finite number, given as one or as text; raise `InputError` for anything else."""
     try:
-        found = math.nan if isinstance(value, bool) else float(value)
+        # Python alone reads 1_000 as a number.
+        wrong = isinstance(value, bool) or (isinstance(value, str) and "_" in value)
+        found = math.nan if wrong else float(value)
     except (TypeError, ValueError, OverflowError):
         found = math.nan
     if not math.isfinite(found) or (whole and found != round(found)):
@@ -86,6 +109,8 @@ def rigid(rows: Any, where: str, name: str) -> Array:
     T = np.eye(4)
     T[: len(rows)] = [numbers(row, where, f"{name}[{i}]", 4) for i, row in enumerate(rows)]
     R = T[:3, :3]
+    if not np.abs(T).max() <= LARGEST:
+        raise InputError(f"{where}: {name}: holds {np.abs(T).max():.3g}; must be at most {LARGEST:g}")
     if not np.allclose(R @ R.T, np.eye(3), atol=ROUNDED) or np.linalg.det(R) < 0:
         raise InputError(f"{where}: {name}: must begin with a rotation; R R^T is {shown((R @ R.T).round(3).tolist())}")
     if not np.allclose(T[3], [0, 0, 0, 1]):

@@ -8,9 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
+
 from simtest.errors import InputError
 from simtest.runtime.resources import shown
-from simtest.spec.camera_formats.common import Poses, Table, chosen
+from simtest.spec.camera_formats.common import LARGEST, Poses, Table, chosen
 from simtest.spec.toml_files import read_text
 
 Kind = Literal[
@@ -86,11 +88,13 @@ def recognise(path: str | Path) -> Kind:
     if suffix == ".bin":
         how = "colmap model_converter --output_type TXT writes text files"
         raise InputError(f"{shown(path)}: binary models are not read; {how}")
-    head = read_text(path, "camera")[:HEAD]
+    text = read_text(path, "camera", "record_bytes")
+    head = text[:HEAD]
     if head.lstrip().startswith("<"):
         return _first(_XML_KINDS, head, "opencv")
     if head.lstrip().startswith("{"):
-        return _first(_JSON_KINDS, head, "opencv")
+        # Keys have no order: what tells the format may stand last.
+        return _first(_JSON_KINDS, text, "opencv")
     if suffix in OPENCV_SUFFIXES:
         return _first(_YAML_KINDS, head, "opencv")
     return _first((*_TEXT_KINDS, *_YAML_KINDS), head, "toml")
@@ -197,4 +201,11 @@ def read_poses(path: str | Path) -> Poses:
         raise InputError(f"{shown(path)}: {NAMES[kind]} holds no poses; must be {must}")
     if not poses:
         raise InputError(f"{shown(path)}: holds no pose; must hold one for each frame")
+    seen: set[str] = set()
+    for name, pose in poses:
+        if name in seen:
+            raise InputError(f"{shown(path)}: names {shown(name, 60)} twice; must give each frame one pose")
+        if not np.abs(pose).max() <= LARGEST:
+            raise InputError(f"{shown(path)}: {shown(name, 60)}: a position beyond {LARGEST:g}; must be within it")
+        seen.add(name)
     return poses

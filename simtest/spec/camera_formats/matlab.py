@@ -17,7 +17,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Mei, Scaramuzza
 from simtest.runtime.limits import check_file
 from simtest.runtime.resources import shown
-from simtest.spec.camera_formats.common import Table, mask_of_text, mask_text
+from simtest.spec.camera_formats.common import Table, mask_of_text, mask_text, number
 from simtest.spec.camera_formats.omnidirectional import scaramuzza_table
 
 HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
@@ -64,7 +64,9 @@ def read_matlab(path: Path) -> Table:
 def _fisheye(fields: Mapping[str, Any], where: str) -> Table:
     """Return a fisheyeIntrinsics: Scaramuzza's model with x before y."""
     mapping = _array(fields, "MappingCoefficients", 4, where).tolist()
-    height, width = _array(fields, "ImageSize", 2, where).tolist()
+    height, width = (
+        number(value, where, "ImageSize", whole=True) for value in _array(fields, "ImageSize", 2, where).tolist()
+    )
     x, y = _array(fields, "DistortionCenter", 2, where).tolist()
     c, d, e, one = _array(fields, "StretchMatrix", 4, where).tolist() if "StretchMatrix" in fields else (1, 0, 0, 1)
     if one != 1:

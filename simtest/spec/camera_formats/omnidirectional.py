@@ -20,6 +20,9 @@ from simtest.spec.camera_formats.common import Table, number, numbers, read_json
 from simtest.spec.toml_files import read_text
 
 C3VD_KEYS = ("width", "height", "cx", "cy", "a0", "a2", "a3", "a4", "c", "d", "e")
+LONGEST = 1e6
+"""Of a focal length, px."""
+
 MOST_APART = 5.0
 """px by which OCamCalib's two polynomials may differ; the inverse one is a fit to the other."""
 
@@ -54,6 +57,8 @@ def scaramuzza_table(
     a0, a2, a3, a4 = mapping
     if not a0 > 0:
         raise InputError(f"{where}: a0 = {a0:g}: must be > 0, since z points along the viewing direction")
+    if not a0 <= LONGEST:
+        raise InputError(f"{where}: a0 = {a0:g}: must be at most {LONGEST:g} px")
     lens = {"k2": a2 * a0, "k3": a3 * a0**2, "k4": a4 * a0**3, **dict(zip("cde", stretch, strict=True))}
     return {
         "width": int(size[0]), "height": int(size[1]), "fx": a0, "fy": a0, "cx": centre[0], "cy": centre[1],

@@ -4,8 +4,6 @@ For both the centre of the first pixel is (0, 0), for simtest (0.5, 0.5): the pr
 import and loses it on export.
 """
 
-import json
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Mei, Scaramuzza
 from simtest.runtime.resources import shown
-from simtest.spec.camera_formats.common import Table
+from simtest.spec.camera_formats.common import Table, parse_json
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
 from simtest.spec.toml_files import read_text
 
@@ -83,7 +81,7 @@ def _parse(path: Path) -> Mapping[str, Any]:
     text, where = read_text(path, "camera"), shown(path)
     kind = {".json": "JSON", ".xml": "XML"}.get(path.suffix.lower()) or ("XML" if text.startswith("<") else "YAML")
     try:
-        data = {"JSON": _parse_json, "XML": _parse_xml, "YAML": parse_yaml}[kind](text)
+        data = {"JSON": parse_json, "XML": _parse_xml, "YAML": parse_yaml}[kind](text)
     except RecursionError:
         raise InputError(f"{where}: not valid {kind}: nested too deeply") from None
     except (ValueError, ElementTree.ParseError) as error:
@@ -91,11 +89,6 @@ def _parse(path: Path) -> Mapping[str, Any]:
     if not isinstance(data, Mapping) or not data:
         raise InputError(f"{where}: holds no keys; must be a calibration of OpenCV or ROS")
     return data
-
-
-def _parse_json(text: str) -> Any:
-    # OpenCV has long written 1. for 1.0, which is no JSON.
-    return json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text))
 
 
 def _parse_xml(text: str) -> Any:

@@ -59,9 +59,12 @@ def read_cameras(path: Path) -> dict[str, Table]:
     own = [frame for frame in frames if set(frame) & set(INTRINSICS)]
     if not own:
         return {"": _camera(data, where)}
-    return {
-        _name(frame, where, i): _camera({**data, **frame}, f"{where}: frames[{i}]") for i, frame in enumerate(frames)
-    }
+    cameras: dict[str, Table] = {}
+    for i, frame in enumerate(frames):
+        name, camera = _name(frame, where, i), _camera({**data, **frame}, f"{where}: frames[{i}]")
+        if cameras.setdefault(name, camera) != camera:
+            raise InputError(f"{where}: frames[{i}]: file_path {shown(name, 60)} has two cameras; must have one")
+    return cameras
 
 
 def read_poses(path: Path) -> Poses:
@@ -126,13 +129,16 @@ def _focal(told: Mapping[str, float], focal: str, angle: str, extent: int, where
 def _lens(data: Mapping[str, Any], told: Mapping[str, float], where: str) -> Table | None:
     """Return the lens as a table; None for a pinhole."""
     model = data.get("camera_model")
-    if model is not None and model not in MODELS:
+    if model is not None and (not isinstance(model, str) or model not in MODELS):
         hint = suggestion(model, MODELS) if isinstance(model, str) else ""
         raise InputError(
             f"{where}: camera_model = {shown(repr(model), 40)}: simtest lacks it; must be one of "
             f"{', '.join(MODELS)}{hint}"
         )
-    fisheye = bool(data.get("is_fisheye")) if model is None else MODELS[model]
+    told_fisheye = data.get("is_fisheye", False)
+    if told_fisheye not in (False, True, None):
+        raise InputError(f"{where}: is_fisheye = {shown(repr(told_fisheye), 40)}: must be true or false")
+    fisheye = bool(told_fisheye) if model is None else MODELS[model]
     if fisheye:
         return {"type": "kannala_brandt", **{key: told.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")}}
     if told.get("k4"):

@@ -27,6 +27,12 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
 }
 """Suffixes of the files of each format; the first format that has a suffix is its default."""
 
+BESIDE = ("images.txt", "points3D.txt")
+"""Files of COLMAP beside its cameras.txt."""
+
+HEAD_BYTES = 10_000
+"""Of a list of points, whose comments stand first."""
+
 WITH_POSES = ("colmap", "transforms")
 """Formats that hold poses."""
 
@@ -62,6 +68,8 @@ def write_camera(camera: Camera, path: str | Path, format: str | None = None, po
         )
     if suffix not in SUFFIXES[chosen]:
         raise InputError(f"{shown(path)}: {chosen} needs a file name that ends in {', '.join(SUFFIXES[chosen])}")
+    if chosen == "colmap" and path.name in BESIDE:
+        raise InputError(f"{shown(path)}: COLMAP keeps no camera under this name; must be cameras.txt")
     if poses is not None and chosen not in WITH_POSES:
         raise InputError(f"{shown(path)}: {chosen} holds no poses; must be one of {', '.join(WITH_POSES)}")
     write_files(file_contents(camera, path, chosen, poses))
@@ -86,8 +94,9 @@ def file_contents(camera: Camera, path: Path, format: str, poses: Poses | None) 
 
         files = {path: cameras_text(camera).encode()}
         if poses is not None:
-            files[path.with_name("images.txt")] = images_text(poses).encode()
-            files[path.with_name("points3D.txt")] = POINTS_TEXT.encode()
+            images, points = (path.with_name(name) for name in BESIDE)
+            files |= {images: images_text(poses).encode(), points: POINTS_TEXT.encode()}
+            _check_no_points(points)
         return files
     if format == "transforms":
         from simtest.spec.camera_formats.transforms import transforms_text
@@ -100,3 +109,14 @@ def file_contents(camera: Camera, path: Path, format: str, poses: Poses | None) 
     from simtest.spec.camera_formats.opencv import opencv_text, ros_text
 
     return {path: (ros_text(camera) if format == "ros" else opencv_text(camera, path.suffix.lower())).encode()}
+
+
+def _check_no_points(path: Path) -> None:
+    """Raise `InputError` where a model's own points would give way to an empty list."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError:
+        return
+    if any(line.strip() and not line.startswith(b"#") for line in head.splitlines()):
+        raise InputError(f"{shown(path)}: exists and holds points; poses must go to a folder without them")
