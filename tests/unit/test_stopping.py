@@ -194,7 +194,8 @@ def test_files_that_are_saved_tell_a_full_disk(tmp_path, monkeypatch, save):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("pathlib.Path.write_text", full)
+    for write in ("write_text", "write_bytes"):
+        monkeypatch.setattr(f"pathlib.Path.{write}", full)
     with pytest.raises(SimtestError, match=r"c\.toml: cannot be written") as caught:
         save(tmp_path / "c.toml")
     assert not isinstance(caught.value, InputError)

@@ -9,6 +9,7 @@ import numpy as np
 from simtest.advice.twin.patches import make_pool
 from simtest.advice.twin.scenes import SceneDraws
 from simtest.advice.twin.scoring import ScoredSpot, score
+from simtest.dataset.maker import colour_variant
 from simtest.errors import SimtestError
 from simtest.reconstruction.found import Reconstruction
 from simtest.rendering import Session
@@ -16,8 +17,6 @@ from simtest.runtime.arrays import Array, Image, Mask, Picture
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.video_processor import luma
-
-COLOUR = "llvm_ad_rgb"
 
 USUAL_PX = 640 * 480
 FRAMES, FEWEST_FRAMES = 48, 12
@@ -117,7 +116,7 @@ def make_bank(
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
-                    session = session if session is not None and patch == at else Session(scene, COLOUR)
+                    session = session if session is not None and patch == at else Session(scene, colour_variant())
                     at = patch
                     view = render_view(session, scene)
                     made.append(_scored_frame(session, view, reconstructs, subject))
