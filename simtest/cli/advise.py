@@ -65,7 +65,7 @@ def advise(
     workers: Annotated[int, Parameter(help="Processes that work at once.", converter=whole_number)] = 2,
     as_json: AsJson = False,
 ) -> None:  # fmt: skip
-    """Say what a scope and its lights can reach before an organ: best method, expected error, break-points.
+    """Measure what a scope and its lights can reach before an organ: best method, expected error, break-points.
 
     Every figure is measured on frames rendered for the purpose; the page prints the command behind each.
 

@@ -247,7 +247,7 @@ def _seeds(suite: "Suite", sealed: Path | None) -> "Seeds":
 
 @contextmanager
 def _told_when_stopped(kept: str) -> Iterator[None]:
-    """Say what a stop leaves, where it is not that the same command goes on."""
+    """Raise a KeyboardInterrupt that states what was kept, where the same command does not go on."""
     try:
         yield
     except KeyboardInterrupt:

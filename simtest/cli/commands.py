@@ -25,7 +25,7 @@ COMMANDS = {
     "export": "Write a scene as files that Mitsuba itself loads.",
     "reconstruct": "Reconstruct the normals at the specularities of a picture, a folder or a video.",
     "calibrate": "Measure the positions of the lights from pictures of a ball or plate.",
-    "advise": "Say what a scope and its lights can reach: method, expected error, break-points.",
+    "advise": "Measure what a scope and its lights can reach: method, expected error, break-points.",
     "twin": "Render twins of a picture's highlights, and measure the error at each.",
     "realism": "Measure how far generated frames are from real ones.",
     "fit": "Fit the ranges of a dataset recipe to real frames.",

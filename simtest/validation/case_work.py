@@ -98,7 +98,7 @@ class _Bar:
             self._show(self._name)
 
     def end(self) -> None:
-        """Tell that all is done."""
+        """Show that all is done."""
         self._done = self._total
         self._show("done")
 
