@@ -25,9 +25,9 @@ ESTIMATORS = ("curved", "cone_axis", "brightest_point", "bisector", "cloud")
 DISTANCES = 8
 """Distances at which the wall stands: the middles of so many equal parts of the range."""
 
-LEAST_FRAMES, MOST_FRAMES = 32, 80
+LEAST_FRAMES, MOST_FRAMES = 32, 128
 
-BUDGET_S, FRAME_S, MEGAPIXEL_S = 120.0, 1.0, 4.0
+BUDGET_S, FRAME_S, MEGAPIXEL_S = 150.0, 0.6, 5.0
 """Processor time of the frames, and of one: about so much, and so much more for each million pixels."""
 
 FIRST_VIEWPOINT = 1000
