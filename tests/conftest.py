@@ -15,6 +15,7 @@ settings.load_profile("untimed")
 # Tests change constants and functions that the key of a kept array does not know of.
 os.environ["SIMTEST_CACHE"] = "off"
 
+
 def _without_waiting(descriptor):
     """Stand in for `os.fsync`: refuse what is no open file, and do not wait for the disk.
 
