@@ -3,24 +3,19 @@
 python -m simtest.surfaces.vtk_file MESH.vtk OUT.npz
 """
 
-import signal
-import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from simtest.errors import InputError, SimtestError
+from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.machine_errors import disk_problem, machine_problem
-from simtest.runtime.resources import shown
+from simtest.runtime.reader_process import limit_memory, read_apart, serve
 
-TIMEOUT_S = 300
-REFUSED = 3
-"""Exit code of a file that is refused; the last line of the output says why."""
-FAILED = 4
-"""Exit code where the machine lacks memory or room on its disk; the last line of the output says which."""
+MEMORY_BYTES, MEMORY_PER_BYTE = 4e9, 40
+"""What VTK may take, in all and for each byte of the file.
+
+A point takes at least 6 bytes of a file, and a few arrays of 24 bytes in memory; a face likewise."""
 
 
 def read_vtk(path: Path) -> tuple[Array, IntArray]:
@@ -39,24 +34,13 @@ def read_vtk(path: Path) -> tuple[Array, IntArray]:
     SimtestError
         If memory, or the disk of temporary files, does not hold it.
     """
-    with tempfile.TemporaryDirectory() as scratch:
-        made = Path(scratch) / "mesh.npz"
-        # -P: no file of the current folder may stand in for a package.
-        command = [sys.executable, "-P", "-m", "simtest.surfaces.vtk_file", str(path.absolute()), str(made)]
-        try:
-            child = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            raise InputError(f"{shown(path)}: not read within {TIMEOUT_S} s; must be a smaller VTK mesh") from None
-        if child.returncode == 0:
-            with np.load(made, allow_pickle=False) as arrays:
-                return arrays["vertices"], arrays["faces"]
-    # What the machine did is no damage of the file.
-    if child.returncode == -signal.SIGKILL:
-        raise SimtestError(f"{shown(path)}: VTK was killed while it read the file, mostly for want of memory")
-    if child.returncode == FAILED:
-        raise SimtestError(f"{shown(path)}: {(child.stdout.strip().splitlines() or ['not read'])[-1]}")
-    said = (child.stdout.strip().splitlines() or [""])[-1] if child.returncode == REFUSED else ""
-    raise InputError(f"{shown(path)}: {said or 'damaged: VTK breaks down over its points or cells'}")
+    breakdown = "damaged: VTK breaks down over its points or cells"
+    return read_apart(path, "simtest.surfaces.vtk_file", _load, "VTK", breakdown)
+
+
+def _load(made: Path) -> tuple[Array, IntArray]:
+    with np.load(made, allow_pickle=False) as arrays:
+        return arrays["vertices"], arrays["faces"]
 
 
 def _triangles(path: str) -> tuple[Array, IntArray]:
@@ -86,27 +70,16 @@ def check_indices(indices: IntArray, count: int, where: str = "") -> None:
         raise InputError(f"{where}a face names vertex {wrong}; allowed: 0 to {count - 1}")
 
 
+def _store(mesh: tuple[Array, IntArray], out: str) -> None:
+    with open(out, "wb") as file:
+        np.savez(file, vertices=mesh[0], faces=mesh[1])
+
+
 def main() -> int:
     """Read a file and store its arrays; print why that cannot be."""
-    try:
-        vertices, faces = _triangles(sys.argv[1])
-    except InputError as error:
-        print(error)
-        return REFUSED
-    except MemoryError as error:
-        print(machine_problem(error))
-        return FAILED
-    except Exception as error:
-        # The reader raises whatever it runs into; the file is at fault.
-        print(f"not a readable VTK mesh ({' '.join(str(error).split())[:160] or type(error).__name__})")
-        return REFUSED
-    try:
-        np.savez(sys.argv[2], vertices=vertices, faces=faces)
-    except OSError as error:
-        print(f"its triangles cannot be stored ({disk_problem(error, Path(sys.argv[2])) or error})")
-        return FAILED
-    return 0
+    return serve(_triangles, _store, "VTK mesh", "its triangles")
 
 
 if __name__ == "__main__":
+    limit_memory(MEMORY_BYTES + MEMORY_PER_BYTE * Path(sys.argv[1]).stat().st_size)
     sys.exit(main())

@@ -113,6 +113,26 @@ CAMERAS = {
         "camera_model = ['OPENCV']: simtest lacks it",
     ),
     "transforms: fisheye": ("t.json", transforms(is_fisheye="no"), "is_fisheye = 'no': must be true or false"),
+    "transforms: two focal lengths": (
+        "t.json",
+        transforms(camera_angle_x=1.2),
+        "fl_x = 500 and camera_angle_x, which says 467.743 px: must agree within 0.1 %; give one of them",
+    ),
+    "transforms: two focal lengths along y": (
+        "t.json",
+        transforms(fl_y=500.0, camera_angle_y=1.0, frames=[{"file_path": "a", "fl_x": 300}]),
+        "frames[0]: fl_y = 500 and camera_angle_y, which says 439.3",
+    ),
+    "transforms: angle beside a focal length": (
+        "t.json",
+        transforms(camera_angle_x=0),
+        "camera_angle_x = 0: must be 0",
+    ),
+    "transforms: a fisheye and none": (
+        "t.json",
+        transforms(camera_model="OPENCV", is_fisheye=True),
+        "is_fisheye = True: does not fit camera_model = 'OPENCV'",
+    ),
     "transforms: twice": (
         "t.json",
         '{"w": 64, "h": 48, "fl_x": 50.0, "fl_x": 60.0}',
@@ -139,6 +159,16 @@ CAMERAS = {
         "c.yml",
         "image_width: 64\nimage_height: 48\nK: [50, 0, 32, 0, 50, 24, 0, 0, 1]\nxi: [-0.5]\nD: [0, 0, 0, 0]\n",
         "distortion.xi = -0.5",
+    ),
+    "opencv: mirror and fisheye": (
+        "c.yml",
+        "image_width: 64\nimage_height: 48\nK: [50, 0, 32, 0, 50, 24, 0, 0, 1]\nxi: [0.5]\ndistortion_model: fisheye\n",
+        "xi: given beside a fisheye model",
+    ),
+    "opencv: two sizes": (
+        "c.yml",
+        "image_size: [64, 48]\nimage_height: 40\nK: [50, 0, 32, 0, 50, 24, 0, 0, 1]\n",
+        "image_height = 40: does not fit image_size, which says 48",
     ),
     "kalibr: distortion": ("c.yaml", swap(KALIBR, "radtan", "fov"), "distortion_model = 'fov': simtest lacks it"),
     "kalibr: coefficients": ("c.yaml", swap(KALIBR, ", 0.0]", "]"), "distortion_coeffs: 3 values; must be 4"),
@@ -304,6 +334,7 @@ MATLAB_BAD = {
 }
 
 
+@pytest.mark.usefixtures("matlab_here")
 @pytest.mark.parametrize("case", MATLAB_BAD)
 def test_malformed_fisheyes_of_matlab(tmp_path, case):
     change, fragment = MATLAB_BAD[case]
@@ -333,4 +364,17 @@ def test_names_of_frames_are_kept_where_numbers_are_mended(tmp_path):
 def test_what_tells_the_format_may_stand_last(tmp_path):
     path = tmp_path / "t.json"
     path.write_text(json.dumps({"note": ["x"] * 8000, **TRANSFORMS}))
+    assert load_camera(path).fx == 500
+
+
+def test_two_statements_of_one_focal_length_may_be_rounded(tmp_path):
+    path = tmp_path / "t.json"
+    angle = 2 * np.arctan(640 / 2 / 500)
+    path.write_text(transforms(camera_angle_x=round(angle, 4)))
+    assert load_camera(path).fx == 500
+    # A frame's own focal length replaces the angle of the others.
+    path.write_text(transforms(camera_angle_x=angle, frames=[{"file_path": "a", "fl_x": 300}, {"file_path": "b"}]))
+    assert (load_camera(f"{path}#a").fx, load_camera(f"{path}#b").fx) == (300, 500)
+    # The angle of a fisheye is another law's.
+    path.write_text(transforms(camera_angle_x=1.28, camera_model="OPENCV_FISHEYE"))
     assert load_camera(path).fx == 500

@@ -2,6 +2,7 @@
 
 import json
 import struct
+import sys
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.io import savemat
 
 from simtest import BrownConrady, Camera, InputError, KannalaBrandt, ViewMask, load_camera, save_camera
 from simtest.spec import scene_from_dict
-from simtest.spec.camera_formats import plain_yaml
+from simtest.spec.camera_formats import matlab_struct, plain_yaml
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
 
 PINHOLE = Camera(640, 480, 500.1, 430.3, 331.2, 225.7)
@@ -399,6 +400,7 @@ def matlab(tmp_path, data):
     return load_camera(tmp_path / "c.mat")
 
 
+@pytest.mark.usefixtures("matlab_here")
 def test_matlab_structs(tmp_path):
     assert matlab(tmp_path, {"s": STRUCT}) == MATLAB
     assert matlab(tmp_path, {"params": STRUCT, "note": "text", "x": 5.0}) == MATLAB
@@ -406,6 +408,9 @@ def test_matlab_structs(tmp_path):
     newer = {key: value for key, value in STRUCT.items() if key != "IntrinsicMatrix"}
     newer["K"] = STRUCT["IntrinsicMatrix"].T
     assert matlab(tmp_path, {"s": newer}) == MATLAB
+    assert (
+        matlab(tmp_path, {"s": {**STRUCT, "FocalLength": [500.0, 480.0], "PrincipalPoint": [321.0, 241.0]}}) == MATLAB
+    )
     plain = {**STRUCT, "RadialDistortion": np.zeros(2), "TangentialDistortion": np.zeros(2)}
     assert matlab(tmp_path, {"s": plain}).distortion is None
     # MATLAB's first pixel is (1, 1): OpenCV's c is 1 less, and half a pixel less than simtest's.
@@ -425,10 +430,23 @@ MATLAB_BAD = {
     "missing": ({"s": {k: v for k, v in STRUCT.items() if k != "RadialDistortion"}}, "RadialDistortion: missing"),
     "text": ({"s": {**STRUCT, "TangentialDistortion": "ab"}}, "TangentialDistortion = 'ab': must be 2 numbers"),
     "not transposed": ({"s": {**STRUCT, "IntrinsicMatrix": STRUCT["IntrinsicMatrix"].T}}, "must be triangular"),
+    "two focal lengths": (
+        {"s": {**STRUCT, "FocalLength": [500.0, 500.0]}},
+        "FocalLength(2) = 500 and IntrinsicMatrix, ",
+    ),
+    "two centres": (
+        {"s": {**STRUCT, "PrincipalPoint": [320.0, 241.0]}},
+        "PrincipalPoint(1) = 320 and IntrinsicMatrix, ",
+    ),
+    "two matrices": (
+        {"s": {**STRUCT, "K": np.array([[500.0, 3, 321], [0, 480, 214], [0, 0, 1]])}},
+        "IntrinsicMatrix(3,2) = 241 and K, which says 214 px: must agree within 0.1 %; give one of them",
+    ),
     "fisheye": ({"s": {"MappingCoefficients": np.zeros(4)}}, "ImageSize: missing"),
 }
 
 
+@pytest.mark.usefixtures("matlab_here")
 @pytest.mark.parametrize("case", MATLAB_BAD)
 def test_matlab_structs_that_are_none(tmp_path, case):
     data, fragment = MATLAB_BAD[case]
@@ -464,6 +482,28 @@ def test_matlab_objects_and_new_files(tmp_path):
         path.write_bytes(junk)
         with pytest.raises(InputError, match=r"c\.mat: "):
             load_camera(path)
+
+
+DAMAGES = {
+    # a byte of STRUCT's file, its new value, and what is said
+    "crash": (297, 220, "a damaged MATLAB file: SciPy breaks down over it; in MATLAB: "),
+    "8 GiB": (163, 64, "a damaged MATLAB file: Unable to allocate 8.00 GiB"),
+}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems set no such limit of memory")
+@pytest.mark.parametrize("case", DAMAGES)
+def test_damaged_matlab_files_end_neither_the_process_nor_its_memory(tmp_path, case):
+    index, value, fragment = DAMAGES[case]
+    path = tmp_path / "c.mat"
+    savemat(path, {"s": {key: value for key, value in STRUCT.items() if key != "WorldUnits"}})
+    assert matlab_struct.struct_of(str(path))["ImageSize"] == [480.0, 640.0]
+    damaged = bytearray(path.read_bytes())
+    damaged[index] = value
+    path.write_bytes(damaged)
+    with pytest.raises(InputError) as caught:
+        load_camera(path)
+    assert str(caught.value).startswith(f"{path}: {fragment}")
 
 
 # simtest's own ---------------------------------------------------------------------------------------------------

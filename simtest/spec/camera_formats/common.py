@@ -28,6 +28,9 @@ LARGEST = 1e9
 ROUNDED = 1e-3
 """How far a matrix may be from a rotation: files hold rounded numbers."""
 
+ALIKE = 1e-3
+"""Share by which two statements of one quantity may differ: files hold rounded numbers."""
+
 MOST_SHOWN = 12
 """Cameras of a file that a message lists."""
 
@@ -100,6 +103,15 @@ def numbers(values: Any, where: str, name: str, counts: int | Sequence[int]) -> 
         said = " or ".join(str(count) for count in allowed)
         raise InputError(f"{where}: {name}: {len(values)} values; must be {said}")
     return [number(value, where, name) for value in values]
+
+
+def check_alike(where: str, names: tuple[str, str], told: float, other: float, unit: str = "px") -> None:
+    """Raise `InputError` where two keys of a file, both as the first one's quantity, differ by more than rounding."""
+    if not abs(told - other) <= ALIKE * max(abs(told), abs(other)):
+        raise InputError(
+            f"{where}: {names[0]} = {told:g} and {names[1]}, which says {other:g} {unit}: must agree within "
+            f"{100 * ALIKE:g} %; give one of them"
+        )
 
 
 def rigid(rows: Any, where: str, name: str) -> Array:

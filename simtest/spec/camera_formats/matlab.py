@@ -4,7 +4,6 @@ For MATLAB the centre of the first pixel is (1, 1), for simtest (0.5, 0.5): the 
 """
 
 import io
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,13 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Mei, Scaramuzza
-from simtest.runtime.limits import check_file
 from simtest.runtime.resources import shown
-from simtest.spec.camera_formats.common import Table, mask_of_text, mask_text, number
+from simtest.spec.camera_formats.common import Table, check_alike, mask_of_text, mask_text, number
+from simtest.spec.camera_formats.matlab_struct import HOW, read_struct
 from simtest.spec.camera_formats.omnidirectional import scaramuzza_table
 
-HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
+PARAMETERS = ((1, 1), (1, 3), (2, 2), (2, 3))
+"""Rows and columns of fx, cx, fy, cy in K, as MATLAB counts."""
 
 
 def read_cameras(path: Path) -> dict[str, Table]:
@@ -40,11 +40,12 @@ def read_matlab(path: Path) -> Table:
     InputError
         If the file is missing, malformed, of version 7.3, or holds a cameraParameters object instead of a struct.
     """
-    where, fields = shown(path), _struct(path)
+    where, fields = shown(path), read_struct(path)
     mask = mask_of_text(fields["ViewMask"], where) if "ViewMask" in fields else None
     if "MappingCoefficients" in fields:
         return _fisheye(fields, where) | {"view_mask": mask}
     matrix = _matrix(fields, "K", where) if "K" in fields else _matrix(fields, "IntrinsicMatrix", where).T
+    _check_repeated(fields, matrix, where)
     # upper triangular
     if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise InputError(f"{where}: IntrinsicMatrix or K = {matrix.tolist()}: must be triangular with 1 in its corner")
@@ -61,6 +62,23 @@ def read_matlab(path: Path) -> Table:
     }  # fmt: skip
 
 
+def _check_repeated(fields: Mapping[str, Any], matrix: Any, where: str) -> None:
+    """Raise `InputError` where other fields do not repeat what the camera matrix says."""
+    (fx, _, cx), (_, fy, cy), _ = matrix
+    name = "K" if "K" in fields else "IntrinsicMatrix"
+    said = [
+        (f"{field}({index})", told, other)
+        for field, own in (("FocalLength", (fx, fy)), ("PrincipalPoint", (cx, cy)))
+        if field in fields
+        for index, (told, other) in enumerate(zip(_array(fields, field, 2, where), own, strict=True), 1)
+    ]
+    if name == "K" and "IntrinsicMatrix" in fields:
+        other = _matrix(fields, "IntrinsicMatrix", where)
+        said += [(f"IntrinsicMatrix({c},{r})", other[c - 1, r - 1], matrix[r - 1, c - 1]) for r, c in PARAMETERS]
+    for field, told, own in said:
+        check_alike(where, (field, name), float(told), float(own))
+
+
 def _fisheye(fields: Mapping[str, Any], where: str) -> Table:
     """Return a fisheyeIntrinsics: Scaramuzza's model with x before y."""
     mapping = _array(fields, "MappingCoefficients", 4, where).tolist()
@@ -72,59 +90,6 @@ def _fisheye(fields: Mapping[str, Any], where: str) -> Table:
     if one != 1:
         raise InputError(f"{where}: StretchMatrix = {[[c, d], [e, one]]}: must have 1 in its last corner")
     return scaramuzza_table((width, height), (x - PIXEL_CENTRE, y - PIXEL_CENTRE), mapping, (c, d, e), where)
-
-
-def _struct(path: Path) -> Mapping[str, Any]:
-    """Return the fields of the one struct in the file that is a calibration."""
-    # Imported here: slow to load, and most cameras come from other files.
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
-
-    where = shown(path)
-    try:
-        check_file(path, "matlab_bytes", "a .mat file")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about variables that are no calibration
-            data = loadmat(str(path), simplify_cells=True)
-    except InputError:
-        raise
-    except NotImplementedError as error:
-        raise InputError(f"{where}: MATLAB 7.3 files (HDF5) are not read; {HOW}") from error
-    except OSError as error:
-        raise InputError(f"{where}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:
-        # SciPy raises whatever its parser runs into.
-        told = shown(error, 80) if str(error).strip() else type(error).__name__
-        head = _head(path)
-        kind = (
-            "a damaged MATLAB file" if head.startswith(b"MATLAB") else f"no MATLAB file (it begins with {head[:8]!r})"
-        )
-        raise InputError(f"{where}: {kind}: {told}; {HOW}") from error
-    # The variables themselves may be the fields of the struct.
-    nested = {name: value["Intrinsics"] for name, value in data.items() if _holds_intrinsics(value)}
-    found = {name: value for name, value in {"": data, **data, **nested}.items() if _is_calibration(value)}
-    if len(found) == 1:
-        return next(iter(found.values()))
-    if len(found) > 1:
-        raise InputError(f"{where}: holds {len(found)} calibrations ({', '.join(found)}); must be one")
-    if any(isinstance(value, MatlabOpaque | MatlabObject | MatlabFunction) for value in data.values()):
-        raise InputError(f"{where}: holds an object, which only MATLAB can read; {HOW}")
-    names = [name for name in data if not name.startswith("__")]
-    raise InputError(f"{where}: holds no struct with IntrinsicMatrix or K (but {shown(names, 80)}); {HOW}")
-
-
-def _head(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(16)
-
-
-def _is_calibration(value: Any) -> bool:
-    return isinstance(value, Mapping) and bool({"IntrinsicMatrix", "K", "MappingCoefficients"} & set(value))
-
-
-def _holds_intrinsics(value: Any) -> bool:
-    """Return whether a variable is a struct of fisheyeParameters, which holds its intrinsics as a struct."""
-    return isinstance(value, Mapping) and isinstance(value.get("Intrinsics"), Mapping)
 
 
 def _matrix(fields: Mapping[str, Any], name: str, where: str) -> Any:

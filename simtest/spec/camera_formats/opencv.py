@@ -168,6 +168,12 @@ def _size(data: Mapping[str, Any], where: str) -> tuple[Any, Any]:
     name, both = _one_of(data, SIZE_NAMES, where)
     if name is not None:
         width, height = _numbers(both, where, name, (2,))
+        for names, told in ((WIDTH_NAMES, width), (HEIGHT_NAMES, height)):
+            other, value = _one_of(data, names, where)
+            if other is not None and value != told:
+                raise InputError(
+                    f"{where}: {other} = {shown(repr(value), 40)}: does not fit {name}, which says {told:g}"
+                )
         return width, height
     found = []
     for names in (WIDTH_NAMES, HEIGHT_NAMES):
@@ -193,12 +199,14 @@ def _check_whole(data: Mapping[str, Any], where: str) -> None:
 def _lens(data: Mapping[str, Any], where: str) -> dict[str, str | float] | None:
     """Return the lens as the table of a `DistortionSpec`; None for a pinhole."""
     name, value = _one_of(data, LENS_NAMES, where)
+    fisheye, model = _is_fisheye(data, where), data.get("distortion_model") or ""
     if "xi" in data:
+        if fisheye:
+            raise InputError(f"{where}: xi: given beside a fisheye model; only one of them is allowed")
         # The omnidir module's mirror; without it the other numbers mean another lens.
         (xi,) = _numbers(data["xi"] if not isinstance(data["xi"], int | float) else [data["xi"]], where, "xi", (1,))
         told = [0.0] * 4 if name is None else _numbers(value, where, name, (4,))
         return {"type": "mei", "xi": xi, **dict(zip(("k1", "k2", "p1", "p2"), told, strict=True))}
-    fisheye, model = _is_fisheye(data, where), data.get("distortion_model") or ""
     if name is None:
         _check_no_other_lens(data, where)
     # no coefficients

@@ -17,7 +17,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from simtest.runtime.arrays import Array
 from simtest.runtime.resources import shown, suggestion
-from simtest.spec.camera_formats.common import Poses, Table, mask_table, number, read_json, rigid
+from simtest.spec.camera_formats.common import Poses, Table, check_alike, mask_table, number, read_json, rigid
 
 MODELS = {
     "SIMPLE_PINHOLE": False, "PINHOLE": False, "SIMPLE_RADIAL": False, "RADIAL": False, "OPENCV": False,
@@ -42,6 +42,9 @@ INTRINSICS = (
     "p2",
 )
 
+FOCAL_KEYS = (("fl_x", "camera_angle_x"), ("fl_y", "camera_angle_y"))
+"""Two keys for one focal length, along x and y."""
+
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera axes from OpenCV's; its own inverse."""
 
@@ -61,7 +64,7 @@ def read_cameras(path: Path) -> dict[str, Table]:
         return {"": _camera(data, where)}
     cameras: dict[str, Table] = {}
     for i, frame in enumerate(frames):
-        name, camera = _name(frame, where, i), _camera({**data, **frame}, f"{where}: frames[{i}]")
+        name, camera = _name(frame, where, i), _camera(_of_frame(data, frame), f"{where}: frames[{i}]")
         if cameras.setdefault(name, camera) != camera:
             raise InputError(f"{where}: frames[{i}]: file_path {shown(name, 60)} has two cameras; must have one")
     return cameras
@@ -92,6 +95,13 @@ def _frames(data: Mapping[str, Any], where: str) -> list[Mapping[str, Any]]:
     return frames
 
 
+def _of_frame(data: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the file's keys with those of a frame in their place: a focal length also replaces the file's angle."""
+    told = {key for key in frame if frame[key] is not None}
+    replaced = {key for pair in FOCAL_KEYS for key in pair if told & set(pair)}
+    return {key: value for key, value in data.items() if key not in replaced} | dict(frame)
+
+
 def _name(frame: Mapping[str, Any], where: str, index: int) -> str:
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
@@ -107,23 +117,30 @@ def _camera(data: Mapping[str, Any], where: str) -> Table:
             raise InputError(f"{where}: {key}: missing; a camera needs the size of its pictures, px")
         number(told[key], where, key, whole=True)
     width, height = int(told["w"]), int(told["h"])
-    fx = _focal(told, "fl_x", "camera_angle_x", width, where)
-    fy = fx if not {"fl_y", "camera_angle_y"} & set(told) else _focal(told, "fl_y", "camera_angle_y", height, where)
+    lens = _lens(data, told, where)
+    # The angle that a fisheye spans does not follow from its focal length alone.
+    both = lens is None or lens["type"] != "kannala_brandt"
+    fx = _focal(told, FOCAL_KEYS[0], width, where, both)
+    fy = fx if not set(FOCAL_KEYS[1]) & set(told) else _focal(told, FOCAL_KEYS[1], height, where, both)
     return {
         "width": width, "height": height, "fx": fx, "fy": fy, "cx": told.get("cx", width / 2),
-        "cy": told.get("cy", height / 2), "distortion": _lens(data, told, where), "view_mask": data.get("view_mask"),
+        "cy": told.get("cy", height / 2), "distortion": lens, "view_mask": data.get("view_mask"),
     }  # fmt: skip
 
 
-def _focal(told: Mapping[str, float], focal: str, angle: str, extent: int, where: str) -> float:
-    """Return a focal length, px, given itself or by the angle, rad, that the picture spans."""
-    if focal in told:
-        return told[focal]
+def _focal(told: Mapping[str, float], keys: tuple[str, str], extent: int, where: str, both: bool) -> float:
+    """Return a focal length, px, given itself or by the angle, rad, that the picture spans; compare these if `both`."""
+    focal, angle = keys
     if angle not in told:
-        raise InputError(f"{where}: {focal}: missing; must be given, or {angle}")
+        if focal not in told:
+            raise InputError(f"{where}: {focal}: missing; must be given, or {angle}")
+        return told[focal]
     if not 0 < told[angle] < math.pi:
         raise InputError(f"{where}: {angle} = {told[angle]:g}: must be 0 to pi, rad")
-    return extent / 2 / math.tan(told[angle] / 2)
+    spanned = extent / 2 / math.tan(told[angle] / 2)
+    if focal in told and both:
+        check_alike(where, keys, told[focal], spanned)
+    return told.get(focal, spanned)
 
 
 def _lens(data: Mapping[str, Any], told: Mapping[str, float], where: str) -> Table | None:
@@ -139,6 +156,8 @@ def _lens(data: Mapping[str, Any], told: Mapping[str, float], where: str) -> Tab
     if told_fisheye not in (False, True, None):
         raise InputError(f"{where}: is_fisheye = {shown(repr(told_fisheye), 40)}: must be true or false")
     fisheye = bool(told_fisheye) if model is None else MODELS[model]
+    if told_fisheye is not None and "is_fisheye" in data and bool(told_fisheye) != fisheye:
+        raise InputError(f"{where}: is_fisheye = {told_fisheye}: does not fit camera_model = {model!r}")
     if fisheye:
         return {"type": "kannala_brandt", **{key: told.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")}}
     if told.get("k4"):
