@@ -1,7 +1,7 @@
 """How a surface deforms in time: peristalsis, breathing, the dent of a probe."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -40,6 +40,11 @@ class _Periodic(Spec):
     def share(self, time_s: float) -> float:
         """Return (1 - cos)/2 of the cycle: 0 at rest, 1 at the middle of the period."""
         return (1 - math.cos(2 * math.pi * self.cycles(time_s))) / 2
+
+    def scaled(self, share: float) -> Self:
+        """Return the same deformation with a share, 0 to 1, of its amplitude and turn."""
+        amounts = {name: share * getattr(self, name) for name in ("amplitude_mm", "turn_deg") if hasattr(self, name)}
+        return self.model_copy(update=amounts)
 
     @property
     def stretch(self) -> float:

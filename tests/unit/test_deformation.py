@@ -8,7 +8,7 @@ from simtest.spec import scene_from_dict
 from simtest.spec.deformation import MAX_STRETCH, Breathing, Dent, Peristalsis
 from simtest.surfaces import RayHits, make_surface
 from simtest.surfaces.deformation import DeformationAt
-from simtest.surfaces.deformed import DeformedSurface
+from simtest.surfaces.deformed import DeformedSurface, stays_in_free_space
 from simtest.surfaces.model import shape_operator
 
 PERISTALSIS = Peristalsis(
@@ -214,6 +214,19 @@ def test_camera_in_the_deformed_wall_is_refused():
     assert surface.clearance(inside)[0] < 0
     assert isinstance(surface, DeformedSurface)
     assert surface.at_rest.clearance(inside)[0] > 0
+
+
+@pytest.mark.parametrize("along", [(0, 0, 1), (1, 0, 0)])
+def test_a_body_that_passes_over_the_camera_is_seen(along):
+    """A small ball moves 100 mm: past the camera, or right over it to free space behind."""
+    ball = make_surface(scene_from_dict({"surface": {"type": "sphere", "distance_mm": 20.0, "radius_mm": 3.0}}).surface)
+    camera = ball.model_from_camera[:3, 3]
+    moving = Breathing(amplitude_mm=100.0, period_s=2.0, direction=along, warp=0.0)
+    for time_s in (0.0, 1.0):
+        there = DeformationAt([moving], time_s).at_rest(camera[None])
+        assert ball.clearance(there)[0] > 10
+    assert stays_in_free_space(ball, [moving], 0.0, camera)
+    assert stays_in_free_space(ball, [moving], 1.0, camera) == (along == (1, 0, 0))
 
 
 DENT_TABLE = {"type": "dent", "amplitude_mm": 1.0, "period_s": 2.0, "direction": [0, 0, 1], "radius_mm": 5.0}

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 
@@ -84,7 +85,8 @@ def test_a_failed_moment_leaves_the_session_where_it_was():
     press = {**DENT, "amplitude_mm": 30.0, "radius_mm": 30.0, "direction": [0, 0, 1]}
     session = Session(scene(0.0, deformation=(press,)))
     before = session.frame().radiance.total
-    with pytest.raises(Exception, match="inside the wall"):
+    told = r"deformation: the camera lies .* mm inside the wall at time_s = 1; .*: lower amplitude_mm or turn_deg, or"
+    with pytest.raises(InputError, match=told):
         session.update(scene(1.0, deformation=(press,)))
     assert np.array_equal(session.frame().radiance.total, before)
 
