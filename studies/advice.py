@@ -1,20 +1,26 @@
 """How well `simtest advise` predicts: its mean errors against separate validations of rigs that it was not made with.
 
-    python -m studies.advice studies/advice_rigs.toml OUT [--frames N] [--again M] [--rig NAME]...
+    python -m studies.advice studies/advice_rigs.toml OUT [--frames N] [--blocks B] [--rig NAME]...
 
-Each rig is asked about once with N frames; then its experiment runs again with another seed and M frames. Both figures
-are of the method that the advice calls best. OUT/advice.json grows by a rig at a time; what stands there is kept.
+Each rig is asked about once, with the default number of frames or N. Then its experiment runs again in B blocks of
+`BLOCK` frames, each with a seed of its own; the first block of all rigs comes before the second. Both figures are of the
+method that the advice calls best. Break-points are left out. OUT/advice.json grows by a run at a time, and finished
+runs are kept.
 """
 
 import argparse
 import json
+import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from simtest.advice.advise import MAIN, advise
-from simtest.advice.figures import MeanError, read_results
-from simtest.advice.plan import DISTANCES, Question
+import polars as pl
+
+from simtest.advice.advise import MAIN
+from simtest.advice.figures import Found, MeanError, read_results
+from simtest.advice.plan import DISTANCES, Question, main_experiment, write_experiment
 from simtest.advice.scope import read_scope
 from simtest.runtime.files import write_json
 from simtest.spec import load_experiment
@@ -25,44 +31,80 @@ AGREES = 0.15
 """The figures agree where they differ by at most this share of the validation's."""
 
 AGAIN_SEED = 20261123
+"""Seed of the first block of the validations; those of further ones follow."""
+
+BLOCK = 48
+"""Frames of a block."""
+
+NUMBERS = 1_000_000
+"""Frames of different blocks have numbers so far apart."""
 
 
-def study(name: str, rig: dict[str, Any], out: Path, frames: int, again: int) -> dict[str, Any]:
-    """Ask about one rig and validate the answer; return both figures."""
+def ask(name: str, rig: dict[str, Any], out: Path, frames: int | None) -> pl.DataFrame:
+    """Render the frames of one rig's advice, with `MAIN` beside them; return their rows."""
     out.mkdir(parents=True, exist_ok=True)
-    tables = {key: rig[key] for key in ("camera", "rig", "sensor", "relief") if key in rig}
     file = out / f"{name}.toml"
+    tables = {key: rig[key] for key in ("camera", "rig", "sensor", "relief") if key in rig}
     file.write_text(toml_tables(tables), encoding="utf-8")
     near, far = rig["distances_mm"]
     question = Question(read_scope(str(file)), rig["organ"], (near, far), frames=frames, seed=rig.get("seed", 1))
+    planned = write_experiment(main_experiment(question), out / MAIN)
+    return run_experiment(planned, out / "advice").results
+
+
+def validate(out: Path, block: int) -> pl.DataFrame:
+    """Run the experiment of an advice again with the seed of a block; return its rows."""
+    changed = {"seed": AGAIN_SEED + block, "realisations": BLOCK // DISTANCES}
+    run = run_experiment(load_experiment(out / MAIN, changed), out / f"again_{block}")
+    return run.results.with_columns(pl.col("realisation") + NUMBERS * block)
+
+
+def timed(record: dict[str, Any], key: str, run: Callable[[], pl.DataFrame]) -> pl.DataFrame:
+    """Return the rows of a run; keep in the record the processor time that it took when it was rendered."""
     clock = time.process_time()
-    answer = advise(question, out / "advice").found
-    spent = time.process_time() - clock
-    # The same experiment, other seed, more frames.
-    changed = {"seed": AGAIN_SEED, "realisations": max(1, again // DISTANCES)}
-    run = run_experiment(load_experiment(out / "advice" / MAIN, changed), out / "again")
-    seen = read_results(run.results, again // DISTANCES * DISTANCES)
-    rows = []
+    rows = run()
+    record["process_time_s"].setdefault(key, round(time.process_time() - clock, 1))
+    return rows
+
+
+def compare(record: dict[str, Any], asked: pl.DataFrame, again: list[pl.DataFrame]) -> None:
+    """Write into a rig's record both figures of the best methods."""
+    answer, seen = _read(asked), _read(pl.concat(again)) if again else None
+    record["frames"] = {"predicted": answer.frames, "validated": 0 if seen is None else seen.frames}
+    record["figures"] = []
     for choice in answer.choices:
         if choice.best is None:
             continue
-        told, measured = answer.method(choice.best).own, seen.method(choice.best).own
-        rows.append({"target": choice.target, "method": choice.best, "predicted": vars(told),
-                     "validated": vars(measured), **_compared(told, measured)})  # fmt: skip
-    return {"rig": name, "process_time_s": round(spent, 1), "figures": rows}
+        told = answer.method(choice.best).own
+        measured = MeanError(None, (None, None), 0, 0) if seen is None else seen.method(choice.best).own
+        record["figures"].append({
+            "target": choice.target, "method": choice.best, "predicted": vars(told), "validated": vars(measured),
+            **_compared(told, measured),
+        })  # fmt: skip
 
 
-def _compared(told: MeanError, measured: MeanError) -> dict[str, float | bool | None]:
-    """Return by how much the prediction is off, as a share of the validation, and whether their intervals meet."""
+def _read(rows: pl.DataFrame) -> Found:
+    """Read rows; frames without any highlight have none, so the count is that of the frames with some."""
+    return read_results(rows, rows.select("surface.distance_mm", "realisation").n_unique())
+
+
+def _compared(told: MeanError, measured: MeanError) -> dict[str, Any]:
+    """Return the prediction over the validation with its 95 % interval, from the relative widths of both."""
     if told.mean_deg is None or measured.mean_deg is None:
-        return {"off": None, "agrees": None, "intervals_meet": None}
-    off = told.mean_deg / measured.mean_deg - 1
-    ends = [end for each in (told, measured) for end in each.interval_deg]
-    meet = None
-    if all(end is not None for end in ends):
-        (low, high), (low_again, high_again) = told.interval_deg, measured.interval_deg
-        meet = low <= high_again and low_again <= high  # type: ignore[operator]
-    return {"off": off, "agrees": abs(off) <= AGREES, "intervals_meet": meet}
+        return {"ratio": None, "ratio_interval": (None, None), "agrees": None}
+    ratio = told.mean_deg / measured.mean_deg
+    widths = [_relative_width(each) for each in (told, measured)]
+    interval: tuple[float | None, float | None] = (None, None)
+    if None not in widths:
+        factor = math.exp(math.hypot(*[width for width in widths if width is not None]))
+        interval = ratio / factor, ratio * factor
+    return {"ratio": ratio, "ratio_interval": interval, "agrees": abs(ratio - 1) <= AGREES}
+
+
+def _relative_width(figure: MeanError) -> float | None:
+    """Return half of an interval over its mean."""
+    high = figure.interval_deg[1]
+    return None if high is None or not figure.mean_deg else high / figure.mean_deg - 1
 
 
 def main() -> None:
@@ -70,28 +112,48 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("rigs", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--frames", type=int, default=48)
-    parser.add_argument("--again", type=int, default=96)
+    parser.add_argument("--frames", type=int)
+    parser.add_argument("--blocks", type=int, default=2)
     parser.add_argument("--rig", action="append", dest="names")
     told = parser.parse_args()
     rigs = read_toml(told.rigs)
-    record = told.out / "advice.json"
-    done = json.loads(record.read_text(encoding="utf-8")) if record.is_file() else []
-    for name in told.names or rigs:
-        if any(each["rig"] == name for each in done):
-            continue
-        made = study(name, rigs[name], told.out / name, told.frames, told.again)
-        done.append(made)
-        write_json(record, done)
-        for row in made["figures"]:
-            print(name, row["target"], row["method"], "predicted", _text(row["predicted"]), "validated",
-                  _text(row["validated"]), "off", row["off"], flush=True)  # fmt: skip
+    file = told.out / "advice.json"
+    done = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    # All predictions first, then a block of validations of each rig after the other.
+    for blocks in range(told.blocks + 1):
+        for name in told.names or rigs:
+            record = done.setdefault(name, {"process_time_s": {}})
+            folder = told.out / name
+            rows = timed(record, "predicted", lambda: ask(name, rigs[name], folder, told.frames))
+            again = [timed(record, f"again_{b}", lambda b=b: validate(folder, b)) for b in range(blocks)]  # type: ignore[misc]
+            compare(record, rows, again)
+            write_json(file, done)
+            print(_text(name, record), flush=True)
 
 
-def _text(figure: dict[str, Any]) -> str:
-    low, high = figure["interval_deg"]
-    interval = "" if low is None else f" ({low:.3g} to {high:.3g})"
-    return "–" if figure["mean_deg"] is None else f"{figure['mean_deg']:.3g}{interval}, n = {figure['answers']}"
+def _text(name: str, record: dict[str, Any]) -> str:
+    """Return a rig's figures as rows of a table."""
+    spent = record["process_time_s"]
+    again = sum(seconds for key, seconds in spent.items() if key != "predicted")
+    lines = []
+    for row in record["figures"]:
+        ratio = "–" if row["ratio"] is None else f"{row['ratio']:.2f} {_interval(row['ratio_interval'])}"
+        lines.append(
+            f"| `{name}` | {row['target']} | `{row['method']}` | {_figure(row['predicted'])} | "
+            f"{_figure(row['validated'])} | {ratio} | {spent['predicted']:.0f} / {again:.0f} |"
+        )
+    return "\n".join(lines) or f"| `{name}` | no method answered |"
+
+
+def _figure(figure: dict[str, Any]) -> str:
+    if figure["mean_deg"] is None:
+        return "–"
+    return f"{figure['mean_deg']:.3g} {_interval(figure['interval_deg'])}, {figure['answers']} / {figure['frames']}"
+
+
+def _interval(ends: tuple[float | None, float | None]) -> str:
+    low, high = ends
+    return "" if low is None or high is None else f"({low:.3g} to {high:.3g})"
 
 
 if __name__ == "__main__":

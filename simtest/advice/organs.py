@@ -84,11 +84,14 @@ def wall(organ: Organ, relief: ReliefPrior | None, view_mm: float) -> Surroundin
     held["reflectance.albedo"] = pale(organ, view_mm)
     # A whole table in place of the scene's: an anatomy's keys are none of a quadric's.
     bands = held.pop("surface.relief", None)
-    surface: dict[str, Any] = {"type": "quadric", "k1_per_mm": organ.k1_per_mm[0], "k2_per_mm": organ.k2_per_mm[0]}
+    flat = organ.k1_per_mm == organ.k2_per_mm == (0.0, 0.0)
+    surface: dict[str, Any] = {"type": "plane"}
+    if not flat:
+        surface = {"type": "quadric", "k1_per_mm": organ.k1_per_mm[0], "k2_per_mm": organ.k2_per_mm[0]}
     if bands is not None:
         surface["relief"] = bands
     form: dict[str, Interval] = {"surface.tilt_deg": (0.0, MOST_TILT_DEG), "surface.azimuth_deg": (0.0, 360.0)}
-    if organ.k1_per_mm != organ.k2_per_mm:
+    if not flat:
         form |= {"surface.spin_deg": (0.0, 180.0), "surface.k1_per_mm": organ.k1_per_mm}
         form |= {"surface.k2_per_mm": organ.k2_per_mm}
     return Surroundings({"surface": surface, **held}, {**form, **drawn})

@@ -2,12 +2,13 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from simtest.cli.manners import MANNERS
-from simtest.cli.options import AsJson, Estimators, Out, named, named_path
+from simtest.cli.options import AsJson, Out, named_path
+from simtest.cli.picture_options import DEFAULTS, PictureOptions
 from simtest.cli.printing import MOST_ROWS, counted, print_files, print_json, print_table
 
 if TYPE_CHECKING:
@@ -25,47 +26,7 @@ MEANING = (
     "(docs/concepts/uncertainty.md)"
 )
 
-Calibrated = Annotated[
-    Path | None,
-    Parameter(help="Calibration: the camera and what else is known of it; TOML, or a file of OpenCV, ROS, MATLAB."),
-]
-FieldOfView = Annotated[
-    float | None,
-    Parameter(help="Field of view in deg across the whole picture, where there is no calibration; see --fov-of."),
-]
-FieldOfViewOf = Annotated[
-    Literal["width", "height", "diagonal", "view"],
-    Parameter(
-        help="What --fov spans: a side or the diagonal of the whole picture, or the round view found in it. "
-        "Makers of endoscopes mostly state the diagonal."
-    ),
-]
 Roi = Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")]
-Encoding = Annotated[
-    Literal["srgb", "linear"] | None,
-    Parameter(help="How the picture's values are encoded, where the calibration does not say; default srgb."),
-]
-DetectorName = Annotated[
-    str,
-    named(
-        "detectors",
-        help="colour: by the tissue's colour; peaks; or the name of another package's. "
-        "auto: by colour where there is any.",
-    ),
-]
-Smoothing = Annotated[float | None, Parameter(help="Smoothing in px; default 1 where found by colour, else 2.")]
-Target = Annotated[
-    Literal["fine", "base"],
-    Parameter(help="Whose normals: the fine surface's, or the base's, with the relief's slope in the uncertainty."),
-]
-Every = Annotated[
-    bool,
-    Parameter(
-        name="--all",
-        negative="",
-        help="Take peaks too that the border cuts or whose shape is not that of one point highlight.",
-    ),
-]
 Reference = Annotated[Path | None, Parameter(help="Mesh in mm, or depth map, that the normals are compared with.")]
 ReferenceFormat = Annotated[
     str | None, Parameter(help="Data set whose map the reference is: c3vd, simcol3d, ucl or endoslam.")
@@ -90,16 +51,8 @@ def reconstruct(
     /,
     *,
     out: Out,
-    camera: Calibrated = None,
-    fov: FieldOfView = None,
-    fov_of: FieldOfViewOf = "width",
-    estimators: Estimators = None,
+    known: PictureOptions = DEFAULTS,
     roi: Roi = None,
-    encoding: Encoding = None,
-    detector: DetectorName = "auto",
-    smoothing: Smoothing = None,
-    target: Target = "fine",
-    every: Every = False,
     reference: Reference = None,
     reference_format: ReferenceFormat = None,
     camera_from_model: Pose = None,
@@ -117,7 +70,7 @@ def reconstruct(
     """
     from simtest.errors import InputError
     from simtest.reconstruction.image_io import is_sequence
-    from simtest.reconstruction.picture import Options, parse_roi
+    from simtest.reconstruction.picture import parse_roi
 
     sequence = is_sequence(image)
     if sequence and (reference or reference_format or camera_from_model or depth):
@@ -125,8 +78,7 @@ def reconstruct(
     if poses and not sequence:
         raise InputError(f"{image}: --poses is for a folder or a film")
     box = None if roi is None else parse_roi(roi)
-    names = None if estimators is None else tuple(estimators)
-    options = Options(camera, fov, names, box, encoding, every, detector, smoothing, target, fov_of, poses)
+    options = known.checked(box, poses)
     if sequence:
         _sequence(image, out, options, as_json)
         return

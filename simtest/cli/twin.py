@@ -7,18 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import AsJson, Estimators, Out, Seed, named_path, whole_number
+from simtest.cli.options import AsJson, Out, Seed, named_path, whole_number
+from simtest.cli.picture_options import DEFAULTS, PictureOptions
 from simtest.cli.printing import MOST_ROWS, counted, print_files, print_table
-from simtest.cli.reconstruct import (
-    Calibrated,
-    DetectorName,
-    Encoding,
-    Every,
-    FieldOfView,
-    FieldOfViewOf,
-    Smoothing,
-    Target,
-)
 
 if TYPE_CHECKING:
     from simtest.advice.twin.run import SpotTwins, TwinResult
@@ -31,15 +22,7 @@ def twin(
     /,
     *,
     out: Out,
-    camera: Calibrated = None,
-    fov: FieldOfView = None,
-    fov_of: FieldOfViewOf = "width",
-    estimators: Estimators = None,
-    encoding: Encoding = None,
-    detector: DetectorName = "auto",
-    smoothing: Smoothing = None,
-    target: Target = "fine",
-    every: Every = False,
+    known: PictureOptions = DEFAULTS,
     frames: Annotated[
         int | None,
         Parameter(help="Rendered frames; default 48, fewer where the picture is large.", converter=whole_number),
@@ -59,14 +42,12 @@ def twin(
     from simtest.cli.progress import progress_bar
     from simtest.errors import InputError
     from simtest.geometry.checks import check_integer
-    from simtest.reconstruction.picture import Options
     from simtest.runtime.locks import exclusive_folder
 
     if frames is not None and not FEWEST <= frames <= MOST:
         raise InputError(f"--frames {frames}: must be {FEWEST} to {MOST}")
     check_integer("--seed", seed or 0, 0)
-    names = None if estimators is None else tuple(estimators)
-    options = Options(camera, fov, names, None, encoding, every, detector, smoothing, target, fov_of)
+    options = known.checked()
     command = shlex.join(["simtest", *sys.argv[1:]])
     with exclusive_folder(out):
         with progress_bar("writing the page") as progress:

@@ -84,6 +84,10 @@ class SegmentTable:
         return found
 
 
+NO_VESSELS = SegmentTable(1.0, np.zeros(3, dtype=np.uint32), np.zeros((1, 8), dtype=np.float32))
+"""The table of a surface without vessels."""
+
+
 def _chord(points: Array, rows: Array) -> tuple[Array, IntArray]:
     """Return the chord through one segment below each point, and 1 for a vein."""
     start, width, along, peak = rows[:, :3], rows[:, 3], rows[:, 4:7], rows[:, 7]
@@ -109,7 +113,7 @@ def make_table(segments: "Segments", blur_mm: float) -> SegmentTable:
     """Sort segments into the cells in which they are seen, through a depth that blurs by a standard deviation, mm."""
     width, peak = seen_profile(segments.radius, blur_mm)
     if not len(width):
-        return SegmentTable(1.0, np.zeros(3, dtype=np.uint32), np.zeros((1, 8), dtype=np.float32))
+        return NO_VESSELS
     cell_mm = CELL_PER_WIDTH * float(np.median(width))
     owner, cell = _cells(segments, width, cell_mm)
     slots = 1 << max(1, math.ceil(math.log2(len(owner) / LOAD)))

@@ -22,7 +22,7 @@ from simtest.runtime.kept_arrays import kept
 from simtest.spec.tissue_colour import TissueColour
 from simtest.surfaces.haemoglobin import TISSUE_SATURATION, blood_absorption, reach
 from simtest.surfaces.model import SurfaceModel
-from simtest.surfaces.segment_table import SegmentTable, make_table
+from simtest.surfaces.segment_table import NO_VESSELS, SegmentTable, make_table
 from simtest.surfaces.surface_samples import Patch, surface_patch
 from simtest.surfaces.vessels import grow_vessels, segments
 
@@ -123,7 +123,16 @@ class TissuePattern:
 
 def make_pattern(surface: SurfaceModel, spec: TissueColour) -> TissuePattern:
     """Make the pattern of a surface; the last few are cached."""
+    if not spec.vessels.strength:
+        # Mottling and capillaries fill space: without visible vessels all surfaces have the same pattern.
+        return _bare(spec)
     return _make(surface_patch(surface), spec)
+
+
+@lru_cache(maxsize=4)
+def _bare(spec: TissueColour) -> TissuePattern:
+    """Make the pattern without vessels."""
+    return _pattern(spec, NO_VESSELS)
 
 
 @lru_cache(maxsize=4)
@@ -151,13 +160,19 @@ def _unpacked(arrays: Mapping[str, AnyArray]) -> TissuePattern:
 
 def _grown(patch: Patch, spec: TissueColour) -> TissuePattern:
     """Make the pattern of a patch."""
-    net, mottle, grow = np.random.SeedSequence(spec.seed).spawn(3)
+    grow = np.random.SeedSequence(spec.seed).spawn(3)[2]
+    forest = grow_vessels(patch, spec.vessels, int(grow.generate_state(1)[0]))
+    return _pattern(spec, make_table(segments(forest), BLUR_PER_DEPTH * spec.vessels.depth_mm))
+
+
+def _pattern(spec: TissueColour, table: SegmentTable) -> TissuePattern:
+    """Make the pattern with the vessels of a table."""
+    net, mottle, _ = np.random.SeedSequence(spec.seed).spawn(3)
     blood = blood_absorption(TISSUE_SATURATION)
     # Relative to green
     root = np.sqrt(blood / blood[1])
     vessels = spec.vessels
     saturation = (vessels.arterial_saturation, vessels.venous_saturation)
-    forest = grow_vessels(patch, vessels, int(grow.generate_state(1)[0]))
     return TissuePattern(
         base=np.array(spec.base),
         mottling=_mottling(spec.mottling.wavelength_mm, np.random.Generator(np.random.SFC64(mottle))),
@@ -166,7 +181,7 @@ def _grown(patch: Patch, spec: TissueColour) -> TissuePattern:
         netted=spec.capillaries.strength * root,
         absorption=vessels.strength * np.stack([blood_absorption(s) for s in saturation]),
         share=np.exp(-vessels.depth_mm / reach(spec.blood)),
-        vessels=make_table(segments(forest), BLUR_PER_DEPTH * vessels.depth_mm),
+        vessels=table,
     )
 
 

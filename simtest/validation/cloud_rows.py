@@ -87,21 +87,21 @@ def cloud_rows(
     the index of the base's highlight point, as ``cloud``; the errors are against the base's normal there.
     """
     made = []
-    common = replace(common, target="base")
+    common = common.having(target="base")
     for name, estimates in found.items():
         taken: set[int] = set()
         for i, estimate in estimates:
             numbers = match_cloud(session, view, estimate)
             taken.update(numbers)
             row = _row(session, common, view, whole, numbers[0] if numbers else None)
-            row = estimate_row(replace(row, estimator=name, specularity=i), estimate)
+            row = estimate_row(row.having(estimator=name, specularity=i), estimate)
             made.append(_with_errors(session, row, estimate, [view.clouds[n] for n in numbers]) if numbers else row)
         status = MISSED if name not in failures else str(failures[name].reason)
         detail = None if name not in failures else failures[name].detail
         for number, cloud in whole.items():
             if number not in taken and cloud.visible >= LEAST_VISIBLE and view.clouds[number].lit:
                 row = _row(session, common, view, whole, number)
-                made.append(replace(row, estimator=name, status=status, flags=detail))
+                made.append(row.having(estimator=name, status=status, flags=detail))
     return made
 
 
@@ -110,7 +110,7 @@ def _row(
 ) -> ResultRow:
     """Return the row of a cloud before its estimate: scene, and the base's highlight point by number, if any."""
     centre = None if number is None else view.clouds[number]
-    row = replace(scene_row(session.scene, common, centre), true_id=number, cloud=number, target="base")
+    row = scene_row(session.scene, common, centre).having(true_id=number, cloud=number, target="base")
     own = None if number is None else whole.get(number)
     return row if own is None else filled_with_cloud(row, own)
 
@@ -125,8 +125,7 @@ def _with_errors(session: Session, row: ResultRow, estimate: Estimate, centres: 
     errors = angle_deg(estimate.candidates, truth)
     look = session.exact_points(estimate.look_px[None], fine=False)
     at_look = float(angle_deg(estimate.normal, look.normal_base[0])) if look.valid[0] else None
-    return replace(
-        row,
+    return row.having(
         truth_x=float(truth[0]),
         truth_y=float(truth[1]),
         truth_z=float(truth[2]),

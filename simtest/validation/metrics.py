@@ -1,7 +1,6 @@
 """Measures estimates against the truth: a row of results for each estimator at each detected or missed highlight."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -62,18 +61,18 @@ def rows(
     for i, specularity in enumerate(specularities):
         true_id = matched.get(i)
         truth = None if true_id is None else truths[true_id]
-        row = replace(scene_row(scene, common, truth), specularity=i, true_id=true_id)
+        row = scene_row(scene, common, truth).having(specularity=i, true_id=true_id)
         row = rough.filled(row, i, truth)
         if on_instrument is not None:
-            row = replace(row, swept={**row.swept, ON_INSTRUMENT: on_instrument[i]})
+            row = row.having(swept={**row.swept, ON_INSTRUMENT: on_instrument[i]})
         if not isinstance(patch := specularity.patch, Failure):
             bp_x, bp_y = patch.peak_px.tolist()
-            row = replace(row, bp_x_px=bp_x, bp_y_px=bp_y, saturated_share=patch.saturated_share(HIGHLIGHT_ISOVALUE))
+            row = row.having(bp_x_px=bp_x, bp_y_px=bp_y, saturated_share=patch.saturated_share(HIGHLIGHT_ISOVALUE))
         for name, result in specularity.estimates.items():
             if isinstance(result, Failure):
-                made.append(replace(row, estimator=name, status=str(result.reason), flags=result.detail))
+                made.append(row.having(estimator=name, status=str(result.reason), flags=result.detail))
                 continue
-            answered = estimate_row(replace(row, estimator=name), result)
+            answered = estimate_row(row.having(estimator=name), result)
             made.append(
                 answered
                 if truth is None
@@ -83,17 +82,16 @@ def rows(
     held = {(row.true_id, row.estimator) for row in made}
     for j, truth in enumerate(truths):
         if missing := [name for name in estimators if (j, name) not in held]:
-            row = replace(scene_row(scene, common, truth), true_id=j, status=unfound)
+            row = scene_row(scene, common, truth).having(true_id=j, status=unfound)
             row = rough.filled(row, None, truth)
-            made += [replace(row, estimator=name) for name in missing]
+            made += [row.having(estimator=name) for name in missing]
     return made
 
 
 def scene_row(scene: Scene, common: ResultRow, truth: HighlightPoint | None) -> ResultRow:
     """Fill in the scene and, unless the detection is false, the true highlight or the centre of the true cloud."""
     # Scene.
-    row = replace(
-        common,
+    row = common.having(
         # What was not answered would have been of the fine surface.
         target="fine",
         surface=scene.surface.label,
@@ -107,8 +105,7 @@ def scene_row(scene: Scene, common: ResultRow, truth: HighlightPoint | None) -> 
     # The light that made the highlight, at its true position.
     light = scene.rig.true_mm()[truth.light]
     truth_x, truth_y, truth_z = truth.normal.tolist()
-    return replace(
-        row,
+    return row.having(
         distance_mm=truth.distance,
         kd_min=truth.kd_min,
         kd_max=truth.kd_max,
@@ -131,8 +128,7 @@ def estimate_row(row: ResultRow, estimate: Estimate) -> ResultRow:
     normal_x, normal_y, normal_z = estimate.normal.tolist()
     covariance = estimate.covariance
     gains = None if estimate.curvature is None else estimate.curvature.gains
-    return replace(
-        row,
+    return row.having(
         status="ok",
         flags=",".join(estimate.flags),
         n_candidates=len(estimate.candidates),
@@ -192,8 +188,7 @@ def _error_row(
     error_look_deg = None if look_normal is None else float(angle_deg(estimate.normal, look_normal))
     curvature = curvature_errors(estimate, truth)
     smoothing_px = 0.0 if isinstance(patch, Failure) else patch.smoothing_px
-    return replace(
-        row,
+    return row.having(
         axis_ratio_seen_law=axis_ratio_seen(scene, estimate, truth, smoothing_px),
         error_deg=float(to_truth[0]),
         error_fine_deg=float(angle_deg(estimate.normal, truth.normal)),

@@ -1,7 +1,7 @@
 """What a row of results holds on a surface with relief: visible highlights, sizes, and clouds of glints."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -101,17 +101,17 @@ class RoughTruth:
             near = np.hypot(*(self._peaks_px - truth.bp_px).T)
             number = int(np.argmin(near)) if len(near) and near.min() < MISSED_PX else None
         snr = None if number is None else self.visible[number].peak_snr
-        row = replace(row, visible_id=number, visible_snr=snr if snr is not None and np.isfinite(snr) else None)
+        row = row.having(visible_id=number, visible_snr=snr if snr is not None and np.isfinite(snr) else None)
         if self.is_rough:
-            row = replace(row, frame_visible=self._shown)
+            row = row.having(frame_visible=self._shown)
         if truth is not None:
-            row = replace(row, cloud=truth.cloud)
+            row = row.having(cloud=truth.cloud)
         elif number is not None:
-            row = replace(row, cloud=self.visible[number].cloud)
+            row = row.having(cloud=self.visible[number].cloud)
         if truth is not None and self.is_rough:
             law = truth.radius_px if np.isfinite(truth.radius_px) else None
             alone = None if row.true_id is None else self.alone_px.get(row.true_id)
-            row = replace(row, pool=truth.pool, radius_px=alone, radius_law_px=law)
+            row = row.having(pool=truth.pool, radius_px=alone, radius_law_px=law)
         cloud = None if row.cloud is None else self.clouds.get(row.cloud)
         return row if cloud is None else filled_with_cloud(row, cloud)
 
@@ -124,8 +124,7 @@ def shown(visible: Sequence[VisibleHighlight]) -> list[VisibleHighlight]:
 def filled_with_cloud(row: ResultRow, cloud: Cloud) -> ResultRow:
     """Fill the columns of a cloud that is wholly in view."""
     covariance = cloud.covariance
-    return replace(
-        row,
+    return row.having(
         cloud_glints=cloud.glints,
         cloud_glints_law=cloud.glints_law,
         cloud_visible=cloud.visible,
