@@ -11,7 +11,6 @@ from functools import cached_property
 
 import numpy as np
 
-from simtest.errors import InputError
 from simtest.runtime.arrays import Array
 from simtest.spec.deformation import Deformation
 from simtest.surfaces.deformation import DeformationAt, MapJets
@@ -95,35 +94,24 @@ def stays_in_free_space(rest: SurfaceModel, parts: Sequence[Deformation], time_s
 
 
 class DeformedSurface(SurfaceModel):
-    """A meshed surface at one moment of its deformation; the camera stays where it is.
+    """A surface at one moment of its deformation; the camera stays where it is.
 
     Parameters
     ----------
     rest : SurfaceModel
-        The surface at rest, rendered as a mesh.
+        The surface at rest; it must be rendered as a mesh (see `graded_mesh` for analytic ones).
     deformation : DeformationAt
         Of the model frame.
-    label : str
-        The surface's name in errors.
 
     Attributes
     ----------
     rest, deformation
         The given ones.
-
-    Raises
-    ------
-    InputError
-        If the surface is rendered as an analytic shape.
     """
 
-    def __init__(self, rest: SurfaceModel, deformation: DeformationAt, label: str = "surface") -> None:
+    def __init__(self, rest: SurfaceModel, deformation: DeformationAt) -> None:
         mesh = rest.shape().mesh
-        if mesh is None:
-            raise InputError(
-                f"deformation: surface.type = {label}: only meshes deform; must be anatomy or quadric (a plane is a "
-                "quadric of curvatures 0)"
-            )
+        assert mesh is not None
         self.rest, self.deformation = rest, deformation
         self.solid, self.faceted = rest.solid, rest.faceted
         self.model_from_camera = rest.model_from_camera
@@ -137,8 +125,8 @@ class DeformedSurface(SurfaceModel):
 
     @property
     def at_rest(self) -> SurfaceModel:
-        """The surface before its deformation."""
-        return self.rest
+        """The surface before its deformation, in its closed form where it has one."""
+        return self.rest.at_rest
 
     def at_moment(self, deformation: DeformationAt) -> "DeformedSurface":
         """Return the same surface under the deformation of another moment."""
