@@ -2,10 +2,9 @@
 
     python -m studies.advice studies/advice_rigs.toml OUT [--frames N] [--blocks B] [--rig NAME]...
 
-Each rig is asked about once, with the default number of frames or N. Then its experiment runs again in B blocks of
-`BLOCK` frames, each with a seed of its own; the first block of all rigs comes before the second. Both figures are of the
-method that the advice calls best. Break-points are left out. OUT/advice.json grows by a run at a time, and finished
-runs are kept.
+Each rig is asked about once, with the default number of frames or N, and again in B blocks of `BLOCK` frames, each
+with a seed of its own; the first block of all rigs comes before the second. Both figures are of the method that the
+advice calls best. Break-points are left out. OUT/advice.json grows by a rig at a time, and finished runs are kept.
 """
 
 import argparse
@@ -13,6 +12,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,17 @@ import polars as pl
 
 from simtest.advice.advise import MAIN
 from simtest.advice.figures import Found, MeanError, read_results
-from simtest.advice.plan import DISTANCES, Question, main_experiment, write_experiment
+from simtest.advice.plan import Question, main_experiment, write_experiment
 from simtest.advice.scope import read_scope
 from simtest.runtime.files import write_json
-from simtest.spec import load_experiment
 from simtest.spec.toml_files import read_toml, toml_tables
 from simtest.validation.runner import run_experiment
 
 AGREES = 0.15
 """The figures agree where they differ by at most this share of the validation's."""
+
+SEED = 1
+"""Seed of the predictions."""
 
 AGAIN_SEED = 20261123
 """Seed of the first block of the validations; those of further ones follow."""
@@ -40,23 +42,22 @@ NUMBERS = 1_000_000
 """Frames of different blocks have numbers so far apart."""
 
 
-def ask(name: str, rig: dict[str, Any], out: Path, frames: int | None) -> pl.DataFrame:
-    """Render the frames of one rig's advice, with `MAIN` beside them; return their rows."""
+def ask(name: str, rig: dict[str, Any], out: Path, frames: int | None, seed: int) -> pl.DataFrame:
+    """Render the frames of one rig's advice; return their rows."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"{name}.toml"
     tables = {key: rig[key] for key in ("camera", "rig", "sensor", "relief") if key in rig}
     file.write_text(toml_tables(tables), encoding="utf-8")
     near, far = rig["distances_mm"]
-    question = Question(read_scope(str(file)), rig["organ"], (near, far), frames=frames, seed=rig.get("seed", 1))
+    question = Question(read_scope(str(file)), rig["organ"], (near, far), frames=frames, seed=seed)
     planned = write_experiment(main_experiment(question), out / MAIN)
-    return run_experiment(planned, out / "advice").results
+    return run_experiment(planned, out / "run").results
 
 
-def validate(out: Path, block: int) -> pl.DataFrame:
-    """Run the experiment of an advice again with the seed of a block; return its rows."""
-    changed = {"seed": AGAIN_SEED + block, "realisations": BLOCK // DISTANCES}
-    run = run_experiment(load_experiment(out / MAIN, changed), out / f"again_{block}")
-    return run.results.with_columns(pl.col("realisation") + NUMBERS * block)
+def validate(one: Callable[[Path, int, int], pl.DataFrame], out: Path, block: int) -> pl.DataFrame:
+    """Ask about a rig (`ask`) again with the seed of a block; return the rows."""
+    rows = one(out / f"again_{block}", BLOCK, AGAIN_SEED + block)
+    return rows.with_columns(pl.col("realisation") + NUMBERS * block)
 
 
 def timed(record: dict[str, Any], key: str, run: Callable[[], pl.DataFrame]) -> pl.DataFrame:
@@ -119,13 +120,13 @@ def main() -> None:
     rigs = read_toml(told.rigs)
     file = told.out / "advice.json"
     done = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    # All predictions first, then a block of validations of each rig after the other.
-    for blocks in range(told.blocks + 1):
+    # Each rig's prediction and a first block; then a further block of each rig after the other.
+    for blocks in range(1, told.blocks + 1):
         for name in told.names or rigs:
             record = done.setdefault(name, {"process_time_s": {}})
-            folder = told.out / name
-            rows = timed(record, "predicted", lambda: ask(name, rigs[name], folder, told.frames))
-            again = [timed(record, f"again_{b}", lambda b=b: validate(folder, b)) for b in range(blocks)]  # type: ignore[misc]
+            one = partial(ask, name, rigs[name])
+            rows = timed(record, "predicted", partial(one, told.out / name, told.frames, SEED))
+            again = [timed(record, f"again_{b}", partial(validate, one, told.out / name, b)) for b in range(blocks)]
             compare(record, rows, again)
             write_json(file, done)
             print(_text(name, record), flush=True)

@@ -18,7 +18,7 @@ from simtest.advice.break_points import (
     spot_size,
 )
 from simtest.advice.figures import Found, read_results
-from simtest.advice.plan import Question, main_experiment, write_experiment
+from simtest.advice.plan import Question, main_experiment, surroundings, write_experiment
 from simtest.errors import InputError
 from simtest.pages.sheet import Pixels
 from simtest.runtime.engines import make_engine
@@ -131,7 +131,7 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
     return Advised(
         question, read_results(results, count), confirm(points, runs[1].results), spot_size(question),
         _median_radius(results), picture, _commands(out),
-        {key: (d.low, d.high) for group in main.groups for key, d in group.random.items()},
+        surroundings(question).random,
     )  # fmt: skip
 
 

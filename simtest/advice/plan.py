@@ -15,18 +15,23 @@ from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
 from simtest.runtime.files import write_atomically
 from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.seeds import Stage, generator
 from simtest.spec import Experiment, load_experiment
 from simtest.spec.toml_files import toml_value
+from simtest.validation.cases import RELIEF_SEED
 
 ESTIMATORS = ("curved", "cone_axis", "brightest_point", "bisector", "cloud")
 
 DISTANCES = 8
 """Distances at which the wall stands: the middles of so many equal parts of the range."""
 
-LEAST_FRAMES, MOST_FRAMES = 32, 80
+LEAST_FRAMES, MOST_FRAMES = 32, 128
 
-BUDGET_S, FRAME_S, MEGAPIXEL_S = 120.0, 1.0, 4.0
+BUDGET_S, FRAME_S, MEGAPIXEL_S = 150.0, 0.6, 5.0
 """Processor time of the frames, and of one: about so much, and so much more for each million pixels."""
+
+FIRST_VIEWPOINT = 1000
+"""Number of a mesh's first viewpoint: scenes that are shown begin at 0."""
 
 SAMPLES = 4
 """Rays a pixel."""
@@ -144,30 +149,56 @@ def estimators_of(scope: Scope) -> tuple[str, ...]:
     return tuple(name for name in ESTIMATORS if not (at_camera and name == "bisector"))
 
 
+def surroundings(question: Question) -> Surroundings:
+    """Return what the frames set of the surface, and what is drawn for each of them."""
+    relief = question.scope.relief
+    if question.mesh is None:
+        return wall(question.kind, relief, question.view_mm)
+    held, drawn = rough(question.kind, relief)
+    surface = {"type": "anatomy", "path": str(question.mesh.resolve())}
+    if "surface.relief" in held:
+        surface["relief"] = held.pop("surface.relief")
+    return Surroundings({"surface": surface, **held}, drawn)
+
+
 def main_experiment(question: Question) -> Experiment:
     """Return the experiment whose results are the expected errors; its name is that of its file."""
-    told = seen_through(question)
+    around, frames = surroundings(question), question.per_distance * DISTANCES
+    pool: dict[str, Any] = {"surface.viewpoint": list(range(FIRST_VIEWPOINT, FIRST_VIEWPOINT + frames))}
     if question.mesh is None:
-        around, count = wall(question.kind, question.scope.relief, question.view_mm), question.per_distance
-        pool: dict[str, Any] = {"surface.distance_mm": distances_of(question)}
-    else:
-        held, drawn = rough(question.kind, question.scope.relief)
-        surface = {"type": "anatomy", "path": str(question.mesh.resolve())}
-        if "surface.relief" in held:
-            surface["relief"] = held.pop("surface.relief")
-        around, count = Surroundings({"surface": surface, **held}, drawn), 1
-        pool = {"surface.viewpoint": list(range(1000, 1000 + question.per_distance * DISTANCES))}
+        # Each distance once, then all again.
+        pool = {"surface.distance_mm": distances_of(question) * question.per_distance}
     group = {
         "scene": question.kind.scene, "label": question.mesh.stem if question.mesh else question.organ,
         # Whatever is found gets an answer, not isolated highlights alone.
         "isolated": False,
-        "set": {**around.set, **told}, "pool": [pool],
-        "random": {key: {"low": low, "high": high} for key, (low, high) in around.random.items()},
+        "set": {**around.set, **seen_through(question)}, "pool": [pool | drawn_values(question, around)],
     }  # fmt: skip
     return Experiment.model_validate({
-        "name": "experiment", "title": f"Advice: {question.title}", "realisations": count, "seed": question.seed,
+        "name": "experiment", "title": f"Advice: {question.title}", "realisations": 1, "seed": question.seed,
         "estimators": estimators_of(question.scope), "groups": [group],
     })  # fmt: skip
+
+
+def drawn_values(question: Question, around: Surroundings) -> dict[str, list[float]]:
+    """Return the drawn values of all frames by key path, in the order of `main_experiment`.
+
+    At each distance a value takes one number from each of as many equal parts of its range as there are frames: a Latin
+    hypercube [McKay, Beckman and Conover, Technometrics 21, 1979, 239], whose means vary less than those of independent
+    draws. Frames at one distance have reliefs of their own. Those of different distances that follow each other share
+    the noise that a relief is made of, but no wavelength, slope, form or pose: a noise takes as long as a small frame.
+    """
+    rng = generator(question.seed, "advice", "drawn", 0, Stage.SWEEP)
+    count = question.per_distance
+    values = {}
+    for key, (low, high) in around.random.items():
+        # Shape (frames at a distance, distances).
+        parts = rng.permuted(np.repeat(np.arange(count)[:, None], DISTANCES, axis=1), axis=0)
+        shares = (parts + rng.uniform(size=parts.shape)) / count
+        values[key] = [round(float(low + (high - low) * share), 9) for share in shares.ravel()]
+    if "relief" in around.set["surface"]:
+        values[RELIEF_SEED] = np.repeat(rng.integers(2**32, size=count), DISTANCES).tolist()
+    return values
 
 
 def seen_through(question: Question) -> dict[str, Any]:

@@ -311,25 +311,54 @@ def _drawn(spec: Relief) -> ReliefField:
     return ReliefField(bands, deviation, min(felt))
 
 
-def _make_band(spec: ReliefBand, branch: np.random.SeedSequence, diffusion_mm: float) -> BandField:
+@dataclass(frozen=True)
+class _Unscaled:
+    """A band before its slope and wavelength are set.
+
+    Parameters
+    ----------
+    turn : ndarray, shape (3, 3)
+        Of the lattice.
+    coefficients : ndarray, shape (NODES, NODES, NODES)
+        Of the B-splines.
+    slope, wave : float
+        What `_plane_statistics` measures.
+    """
+
+    turn: Array
+    coefficients: Array
+    slope: float
+    wave: float
+
+
+@lru_cache(maxsize=4)
+def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...]) -> _Unscaled:
+    """Draw a band from a branch of the relief's seed; reliefs of one seed differ in their scales alone."""
     # Imported here: slow to load, and smooth scenes have no relief.
     from scipy import ndimage
     from scipy.spatial.transform import Rotation
 
-    rng = np.random.Generator(np.random.SFC64(branch))
+    rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(entropy, spawn_key=spawn_key)))
     # A uniformly random rotation; by itself, as scipy changed the name of its generator's argument.
     turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
-    nodes = _shell_noise(rng, spec.width)
-    if spec.kind != "gaussian":
-        nodes = _shaped(nodes, spec.kind)
+    nodes = _shell_noise(rng, width)
+    if kind != "gaussian":
+        nodes = _shaped(nodes, kind)
     coefficients = ndimage.spline_filter(nodes, order=3, mode="grid-wrap")
-    # The spline's own slope and wavelength on a plane, in lattice cells; then scaled to those that are asked for.
-    slope, wave = _plane_statistics(BandField(np.eye(3), coefficients, coefficients), rng)
+    # The spline's own slope and wavelength on a plane, in lattice cells.
+    return _Unscaled(turn, coefficients, *_plane_statistics(BandField(np.eye(3), coefficients, coefficients), rng))
+
+
+def _make_band(spec: ReliefBand, branch: np.random.SeedSequence, diffusion_mm: float) -> BandField:
+    """Scale a band to the slope and wavelength that are asked for."""
+    assert isinstance(branch.entropy, int)
+    drawn = _unscaled(spec.kind, spec.width, branch.entropy, tuple(branch.spawn_key))
     # Stretch along the direction, so that the wavelength there is longer and the slope lower.
     axis = np.array(spec.direction) / np.linalg.norm(spec.direction)
     stretch = np.eye(3) + (1 / spec.anisotropy - 1) * np.outer(axis, axis)
-    lattice_from_model = (wave / spec.wavelength_mm) * turn @ stretch
-    coefficients *= np.radians(spec.slope_deg) / slope * (spec.wavelength_mm / wave)
+    lattice_from_model = (drawn.wave / spec.wavelength_mm) * drawn.turn @ stretch
+    height = np.radians(spec.slope_deg) / drawn.slope * (spec.wavelength_mm / drawn.wave)
+    coefficients = drawn.coefficients * height
     return BandField(lattice_from_model, coefficients, _diffused(coefficients, lattice_from_model, diffusion_mm))
 
 
