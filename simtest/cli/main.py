@@ -4,8 +4,12 @@ It loads nothing before signals are answered, so that a stop in the first moment
 """
 
 import sys
+from typing import TYPE_CHECKING
 
 from simtest.cli.stopping import INTERRUPTED, TERMINATED, Termination
+
+if TYPE_CHECKING:
+    from cyclopts import MissingArgumentError
 
 NARROWEST = 20
 """Columns of a terminal; tables and help cannot be laid out in fewer."""
@@ -36,7 +40,7 @@ def _run(stop: Termination) -> int:
     failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
     _answer_warnings(MANNERS.quiet, wants_traceback)
 
-    from cyclopts import CycloptsError, UnknownOptionError
+    from cyclopts import CycloptsError, MissingArgumentError, UnknownOptionError
 
     from simtest.cli.commands import APP
     from simtest.cli.options import gather_settings
@@ -63,6 +67,8 @@ def _run(stop: Termination) -> int:
         known = [name for argument in error.argument_collection for name in argument.names]
         word = error.token.keyword or error.token.value
         return _report(meant_flag(word, known) or str(error), BAD_USE)
+    except MissingArgumentError as error:
+        return _report(_missing(error), BAD_USE)
     except (CycloptsError, InputError) as error:
         return _report(str(error), BAD_USE)
     except SimtestError as error:
@@ -81,6 +87,16 @@ def _run(stop: Termination) -> int:
         raise
     except Exception as error:
         return _report(_problem(error), failed)
+
+
+def _missing(error: "MissingArgumentError") -> str:
+    """Return which argument or option is missing, or has no value, and what it must be."""
+    argument, command = error.argument, " ".join(["simtest", *(error.command_chain or ())])
+    if argument is None:
+        return str(error)
+    what = " ".join(str(argument.parameter.help or "").split()).rstrip(".")
+    lacks = "needs a value" if error.keyword or argument.tokens else "missing"
+    return f"{error.keyword or argument.name}: {lacks}{f' ({what})' if what else ''}; {command} --help describes it"
 
 
 def _problem(error: Exception) -> str:
