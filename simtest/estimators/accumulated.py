@@ -1,25 +1,26 @@
 """The base's normal over a patch of tissue, from highlights of many frames.
 
-With the light at the camera, a highlight at a tissue point X shows that the fine normal there faces the camera
-(theory.md section 7; the idea of Chen, Goesele and Seidel 2006). A camera that moves sweeps highlights over the relief.
-Over a patch of the base, the mean of the normals found is not the base's: only normals that face a camera are ever
-seen. So the density of the highlights, or of their light, is fitted over the patch:
+With the light at the camera, a highlight at a tissue point X shows that the fine normal there faces the camera; with
+the light beside it, that the normal bisects the directions to both (theory.md section 7; the idea of Chen, Goesele and
+Seidel 2006). A camera that moves sweeps highlights over the relief. Over a patch of the base, the mean of the normals
+found is not the base's: only normals that face a camera are ever seen. So the density of the highlights, or of their
+light, is fitted over the patch:
 
     log lambda_f(X) = alpha_f + o_f(X) + beta . q_f(X) - gamma |q_f(X)|^2 / 2,
 
-q_f(X) the slope, over a reference plane, of the normal that faces the camera of frame f. Slopes that are Gaussian
-about the base's have gamma = 1/s^2 and beta = gamma q_base (theory.md 7.1). What was never looked at enters by the
-integral of lambda over what was seen.
+q_f(X) the slope, over a reference plane, of the normal that mirrors the light to the camera of frame f. Slopes that are
+Gaussian about the base's have gamma = 1/s^2 and beta = gamma q_base (theory.md 7.1). What was never looked at enters by
+the integral of lambda over what was seen.
 
 - Counted highlights: one alpha for all frames, and o = 0. The highlights are a Poisson process.
 - Light: an alpha for each frame, since each may have its own exposure, and o = log(cos / r^4): the solid angle of the
-  tissue at distance r and obliquity, and the falloff of light at the camera. Light has no melted and no missed spots,
-  and the light of a smooth facet counts more, as its slope fills more of the patch: the mean slope of a whole patch of
-  relief is almost 0, where the mean over its glints varies with their number.
+  tissue at distance r and obliquity, and the falloff of light near the camera. Light has no melted and no missed spots.
+  A smooth facet gives more of it, as its slope fills more of the patch: so the mean of all slopes of a patch counts,
+  which is almost 0 over many waves of relief, and not the mean over its glints, whose number varies.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,15 +52,15 @@ POSE_DRAWS = 24
 class PatchNormal:
     """The base's normal over a patch.
 
-    The covariance is a jackknife's over tissue cells, widened by Hotelling's 95 % quantile for so many cells, plus that
-    of the poses.
+    The part ``relief`` of the budget is a jackknife's over tissue cells, widened by Hotelling's 95 % quantile for so
+    many cells; ``poses`` is what their stated errors do.
 
     Parameters
     ----------
     normal : ndarray, shape (3,)
         Unit, world frame.
-    covariance : ndarray, shape (2, 2)
-        Of the angles about `tangents`, rad^2.
+    budget : dict of str to ndarray, shape (2, 2)
+        Parts of the covariance of the angles along `tangents`, rad^2.
     tangents : ndarray, shape (2, 3)
         Unit vectors across the normal.
     slope : float
@@ -71,15 +72,24 @@ class PatchNormal:
     """
 
     normal: Array
-    covariance: Array
+    budget: dict[str, Array]
     tangents: Array
     slope: float
     highlights: int
     cells: float
 
+    @property
+    def covariance(self) -> Array:
+        """Sum of the budget's parts, shape (2, 2), rad^2."""
+        return np.asarray(sum(self.budget.values()))
+
+    def across(self, normal: Array) -> Array:
+        """Return another normal's angles along `tangents`, shape (2,), rad."""
+        return np.asarray(self.tangents @ (normal / (normal @ self.normal)))
+
     def squared_mahalanobis(self, normal: Array) -> float:
         """Return the squared distance of another normal, in standard deviations, shape ()."""
-        across = self.tangents @ (normal / (normal @ self.normal))
+        across = self.across(normal)
         return float(across @ np.linalg.solve(self.covariance, across))
 
 
@@ -148,17 +158,17 @@ def base_normal(
         moved = [_moved(each, rng, *pose_sd) for each in sightings]
         other = _fit(moved, plane, radius_mm)
         if isinstance(other, PatchNormal):
-            drawn.append(found.tangents @ (other.normal / (other.normal @ found.normal)))
+            drawn.append(found.across(other.normal))
     if len(drawn) < POSE_DRAWS // 2:
         return Failure(Reason.NO_ESTIMATE, f"errors of the poses leave {len(drawn)} of {POSE_DRAWS} fits")
-    return PatchNormal(**{**vars(found), "covariance": found.covariance + np.cov(np.transpose(drawn))})
+    return replace(found, budget=found.budget | {"poses": np.cov(np.transpose(drawn))})
 
 
 def _moved(sighting: Sighting, rng: np.random.Generator, centre_mm: float, turn_rad: float) -> Sighting:
     pose = sighting.world_from_camera.copy()
     pose[:3, :3] = pose[:3, :3] @ rotation(rng.normal(0, turn_rad, 3))
     pose[:3, 3] += rng.normal(0, centre_mm, 3)
-    return Sighting(pose, sighting.sightlines, sighting.in_view, sighting.light)
+    return replace(sighting, world_from_camera=pose)
 
 
 def _fit(sightings: Sequence[Sighting], plane: Plane, radius_mm: float) -> PatchNormal | Failure:
@@ -195,7 +205,7 @@ def _fit(sightings: Sequence[Sighting], plane: Plane, radius_mm: float) -> Patch
     tangents = np.concatenate(tangent_basis(normal[None]))
     turn = tangents @ axes.T / length
     covariance = turn @ by @ spread @ by.T @ turn.T
-    return PatchNormal(normal, covariance, tangents, float(gamma**-0.5), len(seen.cell), held)
+    return PatchNormal(normal, {"relief": covariance}, tangents, float(gamma**-0.5), len(seen.cell), held)
 
 
 def _seen(sightings: Sequence[Sighting], plane: Plane, axes: Array, radius_mm: float) -> _Points:
@@ -203,10 +213,10 @@ def _seen(sightings: Sequence[Sighting], plane: Plane, axes: Array, radius_mm: f
     terms, weights, cells = [np.empty((0, 3))], [np.empty(0)], [np.empty(0, dtype=np.int64)]
     frames = [np.empty(0, dtype=np.int64)]
     for number, sighting in enumerate(sightings):
-        position, rays, met = meet(sighting, plane)
+        position, met = meet(sighting, plane)
         across = (position - plane.point) @ axes.T
         inside = met & (np.linalg.norm(np.where(met[:, None], across, np.inf), axis=1) < radius_mm)
-        terms.append(_terms(-rays[inside], plane.normal, axes))
+        terms.append(_terms(sighting.facing(position[inside]), plane.normal, axes))
         light = sighting.light
         weights.append(np.ones(int(inside.sum())) if light is None else light[inside])
         cells.append(_cells(across[inside], radius_mm))
@@ -228,7 +238,7 @@ def _looked(sightings: Sequence[Sighting], plane: Plane, axes: Array, radius_mm:
         if sighting.in_view is not None:
             kept &= np.asarray(sighting.in_view(-towards @ sighting.world_from_camera[:3, :3]))
         count = int(kept.sum())
-        terms.append(_terms(towards[kept], plane.normal, axes))
+        terms.append(_terms(sighting.facing(world[kept]), plane.normal, axes))
         is_light = sighting.light is not None
         offsets.append(np.log(cosine[kept]) - 4 * np.log(distance[kept]) if is_light else np.zeros(count))
         cells.append(own[kept])

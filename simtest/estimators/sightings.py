@@ -39,12 +39,24 @@ class Sighting:
     light : ndarray, shape (N,), optional
         Light along each sightline: radiance times solid angle, in a unit of the frame's own. None: each highlight
         counts as one.
+    source_mm : ndarray, shape (3,), optional
+        Where the light is, camera frame, mm; of several the mean. None: at the camera.
     """
 
     world_from_camera: Array
     sightlines: Array
     in_view: Callable[[Array], Mask] | None = None
     light: Array | None = None
+    source_mm: Array | None = None
+
+    def facing(self, points: Array) -> Array:
+        """Return the unit normals that mirror the light to the camera at points, shape (N, 3), world frame, mm."""
+        centre = self.world_from_camera[:3, 3]
+        towards = _unit(centre - points)
+        if self.source_mm is None:
+            return towards
+        source = centre + self.world_from_camera[:3, :3] @ self.source_mm
+        return _unit(towards + _unit(source - points))
 
 
 @dataclass(frozen=True)
@@ -108,7 +120,11 @@ def plane_axes(plane: Plane) -> Array:
     return np.concatenate(tangent_basis(plane.normal[None]))
 
 
-def spots_of(frame: Frame, world_from_camera: Array) -> Sighting:
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def spots_of(frame: Frame, world_from_camera: Array, source_mm: Array | None = None) -> Sighting:
     """Return the bright spots of a frame, as `cloud` finds them.
 
     Parameters
@@ -117,12 +133,15 @@ def spots_of(frame: Frame, world_from_camera: Array) -> Sighting:
         Picture and calibration.
     world_from_camera : ndarray, shape (4, 4)
         Told pose, mm.
+    source_mm : ndarray, shape (3,), optional
+        See `Sighting`.
     """
     camera = frame.camera
-    return Sighting(world_from_camera, camera.unproject(find_spots(frame).points_px), _view(camera, frame.seen))
+    rays = camera.unproject(find_spots(frame).points_px)
+    return Sighting(world_from_camera, rays, _view(camera, frame.seen), None, source_mm)
 
 
-def light_of(frame: Frame, world_from_camera: Array) -> Sighting:
+def light_of(frame: Frame, world_from_camera: Array, source_mm: Array | None = None) -> Sighting:
     """Return the light of all highlights of a frame, without telling them apart.
 
     Parameters
@@ -131,6 +150,8 @@ def light_of(frame: Frame, world_from_camera: Array) -> Sighting:
         Picture and calibration.
     world_from_camera : ndarray, shape (4, 4)
         Told pose, mm.
+    source_mm : ndarray, shape (3,), optional
+        See `Sighting`.
     """
     camera, light = frame.camera, specular_light(frame)
     bright = light > 0
@@ -142,7 +163,7 @@ def light_of(frame: Frame, world_from_camera: Array) -> Sighting:
     solid = np.linalg.norm(np.cross(corners[1] - corners[0], corners[3] - corners[2]), axis=1)
     rays = camera.unproject(points)
     sound = np.isfinite(rays).all(axis=1) & np.isfinite(solid)
-    return Sighting(world_from_camera, rays[sound], _view(camera, frame.seen), (sums * solid)[sound])
+    return Sighting(world_from_camera, rays[sound], _view(camera, frame.seen), (sums * solid)[sound], source_mm)
 
 
 def _blocks(light: Image) -> tuple[Array, Array]:
@@ -174,7 +195,7 @@ def _view(camera: Camera, seen: Mask | None) -> Callable[[Array], Mask]:
 
 
 def fine_map(sightings: Sequence[Sighting], plane: Plane) -> FineMap:
-    """Return the fine normals that the highlights of frames show, with the light at the camera.
+    """Return the fine normals that the highlights of frames show.
 
     Parameters
     ----------
@@ -186,23 +207,23 @@ def fine_map(sightings: Sequence[Sighting], plane: Plane) -> FineMap:
     Returns
     -------
     FineMap
-        Each normal is the reverse of its sightline, and lies where the sightline meets the plane. Highlights whose
-        sightline does not meet it are left out.
+        Each normal lies where the sightline meets the plane, and mirrors the light to the camera: with the light at the
+        camera it is the reverse of the sightline. Highlights whose sightline does not meet the plane are left out.
     """
     positions, normals, frames = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, dtype=np.int64)]
     for number, sighting in enumerate(sightings):
-        position, rays, met = meet(sighting, plane)
+        position, met = meet(sighting, plane)
         positions.append(position[met])
-        normals.append(-rays[met])
+        normals.append(sighting.facing(position[met]))
         frames.append(np.full(int(met.sum()), number))
     return FineMap(np.concatenate(positions), np.concatenate(normals), np.concatenate(frames))
 
 
-def meet(sighting: Sighting, plane: Plane) -> tuple[Array, Array, Mask]:
-    """Return where sightlines meet a plane and their directions, shapes (N, 3), world frame, and which do meet it."""
+def meet(sighting: Sighting, plane: Plane) -> tuple[Array, Mask]:
+    """Return where sightlines meet a plane, shape (N, 3), world frame, and which do meet it."""
     rotation, centre = sighting.world_from_camera[:3, :3], sighting.world_from_camera[:3, 3]
     rays = sighting.sightlines @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = ((plane.point - centre) @ plane.normal) / (rays @ plane.normal)
         met = np.isfinite(distance) & (distance > 0)
-        return centre + distance[:, None] * rays, rays, met
+        return centre + distance[:, None] * rays, met

@@ -1,5 +1,7 @@
 """Highlights of many frames on the tissue: the base's normal from a process whose law is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -258,3 +260,28 @@ def test_a_frame_without_highlights_has_no_light_and_knows_its_view():
     half[:, :60] = True
     covered = light_of(Frame(dark.encoded, dark.calibration, 2.0, seen=half), np.eye(4))
     assert covered.in_view(np.array([[-0.1, 0.0, 1.0], [0.1, 0.0, 1.0]])).tolist() == [True, False]
+
+
+def test_a_light_beside_the_camera_is_accounted_for():
+    """Facets that bisect camera and light shine; taken as at the camera, the light turns the base by half its angle."""
+    rng, normal, errors, wrong = np.random.default_rng(14), tilted(4.0), [], []
+    source = np.array([3.0, 1.0, 0.0])
+    for _ in range(6):
+        at = np.zeros((6000, 3))
+        at[:, :2] = rng.uniform(-12, 12, (6000, 2))
+        fine = normal + np.concatenate([rng.normal(0, np.radians(4.0), (6000, 2)), np.zeros((6000, 1))], axis=1)
+        fine /= np.linalg.norm(fine, axis=1, keepdims=True)
+        seen = []
+        for pose in poses(10):
+            facing = Sighting(pose, np.empty((0, 3)), source_mm=source).facing(at)
+            rays = (at - pose[:3, 3]) @ pose[:3, :3]
+            shining = np.einsum("ni,ni->n", fine, facing) > np.cos(np.radians(1.0))
+            seen.append(
+                Sighting(pose, rays[shining] / np.linalg.norm(rays[shining], axis=1, keepdims=True), None, None, source)
+            )
+        errors.append(base_normal(seen, PLANE, RADIUS).across(normal))
+        wrong.append(base_normal([replace(s, source_mm=None) for s in seen], PLANE, RADIUS).across(normal))
+    # Half of the angle at 20 mm; six films of 0.4 deg each.
+    half = np.degrees(np.arctan(np.hypot(3, 1) / DISTANCE)) / 2
+    assert np.degrees(np.linalg.norm(np.mean(errors, axis=0))) < 0.7
+    assert np.degrees(np.linalg.norm(np.mean(wrong, axis=0))) == pytest.approx(half, abs=0.7)
