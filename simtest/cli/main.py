@@ -104,10 +104,22 @@ def _problem(error: Exception) -> str:
     from simtest.runtime.machine_errors import machine_problem
 
     # Only the output's stream has neither a name nor a reason of its own to fail.
-    what = machine_problem(error)
+    what = machine_problem(error) or _damaged_bytecode(error)
     if what is not None and isinstance(error, OSError) and error.filename is None and _output_fails():
         return f"the output cannot be written ({what})"
     return what or f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
+
+
+def _damaged_bytecode(error: Exception) -> str | None:
+    """Return which compiled file of Python is cut short, as a full disk leaves it; None for any other error."""
+    if not isinstance(error, EOFError | ValueError) or "marshal data" not in str(error):
+        return None
+    import traceback
+
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        if path := frame.f_locals.get("bytecode_path"):
+            return f"{path}: a compiled file of Python that is cut short, perhaps by a full disk; delete it"
+    return None
 
 
 def _output_fails() -> bool:

@@ -30,6 +30,23 @@ def shell(line, folder=None):
                           env=environment)  # fmt: skip
 
 
+def test_a_compiled_file_that_a_full_disk_cut_short_is_named(tmp_path):
+    """Python itself leaves such a file, and cannot read it afterwards."""
+    (tmp_path / "module.py").write_text("value = 1\n")
+    done = script(f"""
+        import importlib, pathlib, py_compile, sys
+        from simtest.cli.main import _problem
+        sys.path.insert(0, {str(tmp_path)!r})
+        made = pathlib.Path(py_compile.compile({str(tmp_path / "module.py")!r}))
+        made.write_bytes(made.read_bytes()[:-20])
+        try:
+            import module
+        except Exception as error:
+            print(_problem(error) == f"{{made}}: a compiled file of Python that is cut short, perhaps by a full disk; delete it")
+    """)
+    assert (done.stdout, done.stderr) == ("True\n", "")
+
+
 # Signals ---------------------------------------------------------------------------------------------------------
 
 
