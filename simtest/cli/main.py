@@ -19,6 +19,9 @@ LONGEST = 900
 
 BAD_USE = 2
 
+GOING_ON = ("validate", "advise", "dataset", "nightly", "bench")
+"""Commands that take up what a stopped run has finished."""
+
 
 def main() -> None:
     """Run the command line.
@@ -32,7 +35,7 @@ def main() -> None:
         sys.exit(_run(stop))
 
 
-def _run(stop: Termination) -> int:
+def _run(stop: Termination) -> int:  # noqa: C901 - a branch for each way in which a command may end
     """Run the command and return its exit code."""
     from simtest.cli.manners import MANNERS, meant_flag, take_flags
 
@@ -74,7 +77,8 @@ def _run(stop: Termination) -> int:
     except SimtestError as error:
         return _report(str(error), failed)
     except KeyboardInterrupt as stopped:
-        kept = "what is finished is kept, and the same command goes on from there"
+        goes_on = sys.argv[1:2] and sys.argv[1] in GOING_ON
+        kept = "what is finished is kept, and the same command " + ("goes on from there" if goes_on else "begins anew")
         how = "terminated" if stop.came else "stopped"
         return _report(f"{how}; {str(stopped) or kept}", TERMINATED if stop.came else INTERRUPTED)
     except BrokenPipeError:
