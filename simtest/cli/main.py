@@ -19,6 +19,9 @@ LONGEST = 900
 
 BAD_USE = 2
 
+GOING_ON = ("validate", "advise", "dataset", "nightly", "bench")
+"""Commands that take up what a stopped run has finished."""
+
 
 def main() -> None:
     """Run the command line.
@@ -32,7 +35,7 @@ def main() -> None:
         sys.exit(_run(stop))
 
 
-def _run(stop: Termination) -> int:
+def _run(stop: Termination) -> int:  # noqa: C901 - a branch for each way in which a command may end
     """Run the command and return its exit code."""
     from simtest.cli.manners import MANNERS, meant_flag, take_flags
 
@@ -74,7 +77,8 @@ def _run(stop: Termination) -> int:
     except SimtestError as error:
         return _report(str(error), failed)
     except KeyboardInterrupt as stopped:
-        kept = "what is finished is kept, and the same command goes on from there"
+        goes_on = sys.argv[1:2] and sys.argv[1] in GOING_ON
+        kept = "what is finished is kept, and the same command " + ("goes on from there" if goes_on else "begins anew")
         how = "terminated" if stop.came else "stopped"
         return _report(f"{how}; {str(stopped) or kept}", TERMINATED if stop.came else INTERRUPTED)
     except BrokenPipeError:
@@ -104,10 +108,22 @@ def _problem(error: Exception) -> str:
     from simtest.runtime.machine_errors import machine_problem
 
     # Only the output's stream has neither a name nor a reason of its own to fail.
-    what = machine_problem(error)
+    what = machine_problem(error) or _damaged_bytecode(error)
     if what is not None and isinstance(error, OSError) and error.filename is None and _output_fails():
         return f"the output cannot be written ({what})"
     return what or f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
+
+
+def _damaged_bytecode(error: Exception) -> str | None:
+    """Return which compiled file of Python is cut short, as a full disk leaves it; None for any other error."""
+    if not isinstance(error, EOFError | ValueError) or "marshal data" not in str(error):
+        return None
+    import traceback
+
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        if path := frame.f_locals.get("bytecode_path"):
+            return f"{path}: a compiled file of Python that is cut short, perhaps by a full disk; delete it"
+    return None
 
 
 def _output_fails() -> bool:
