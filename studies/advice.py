@@ -35,7 +35,7 @@ SEED = 1
 AGAIN_SEED = 20261123
 """Seed of the first block of the validations; those of further ones follow."""
 
-BLOCK = 48
+BLOCK = 32
 """Frames of a block."""
 
 NUMBERS = 1_000_000
