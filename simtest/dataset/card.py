@@ -6,7 +6,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
-from simtest.dataset.fields import BASE_FIELDS, FIELDS, INSTRUMENT
+from simtest.dataset.fields import FIELDS
 from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
 from simtest.dataset.manifest import Manifest
 from simtest.dataset.plan import Plan, spec_files
@@ -31,8 +31,6 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
     for shard in plan.shards:
         counts[shard.split][0] += len(shard.indices)
         counts[shard.split][1] += 1
-    left_out = [*(() if dataset.radiance else ("radiance",)), *(() if plan.has_relief else BASE_FIELDS)]
-    left_out += [] if plan.has_instruments else [INSTRUMENT]
     # Markdown, not HTML, so what a recipe says is escaped where it stands.
     environment = Environment(  # nosec B701
         loader=PackageLoader("simtest.dataset", "."), undefined=StrictUndefined, autoescape=False, trim_blocks=True,
@@ -42,7 +40,7 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
     return environment.get_template("card.md.j2").render(
         dataset=dataset,
         counts=counts,
-        fields=[field for field in FIELDS if field.name not in left_out],
+        fields=[field for field in FIELDS if field.name not in plan.fields_left_out],
         has_relief=plan.has_relief,
         has_instruments=plan.has_instruments,
         draws=list(_draws(plan)),

@@ -180,16 +180,27 @@ def shard_tables(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFra
         rows.append(SampleRow.of(meta, shard.name, offset, size))
         highlights += HighlightRow.of(meta)
         estimates += [{**row, "index": meta["index"], "split": meta["split"]} for row in meta["estimates"]]
+    content: dict[str, Iterable[Mapping[str, Any]]] = {
+        SAMPLES: map(vars, rows),
+        HIGHLIGHTS: map(vars, highlights),
+        ESTIMATES: estimates,
+    }
+    return {name: _table(content[name], schema) for name, schema in _schemas(plan).items()}
+
+
+def _schemas(plan: Plan) -> dict[str, dict[str, pl.DataType]]:
+    """Return the columns of each table of a dataset."""
     of_samples, of_estimates = _schema(SampleRow), dict(_ESTIMATE_SCHEMA)
     if plan.has_instruments:
         of_estimates[ON_INSTRUMENT] = pl.Boolean()
     else:
         del of_samples["instrument_share"]
-    return {
-        SAMPLES: _table(map(vars, rows), of_samples),
-        HIGHLIGHTS: _table(map(vars, highlights), _schema(HighlightRow)),
-        ESTIMATES: _table(estimates, of_estimates),
-    }
+    return {SAMPLES: of_samples, HIGHLIGHTS: _schema(HighlightRow), ESTIMATES: of_estimates}
+
+
+def table_columns(plan: Plan) -> dict[str, dict[str, str]]:
+    """Return the columns of each table of a dataset, with the name of their type."""
+    return {name: {column: str(kind) for column, kind in schema.items()} for name, schema in _schemas(plan).items()}
 
 
 def _stored(path: Path) -> Iterator[tuple[SampleMeta, int, int]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import JsonValue
 
+from simtest.dataset.fields import BASE_FIELDS, INSTRUMENT
 from simtest.errors import InputError
 from simtest.runtime.arrays import IntArray
 from simtest.runtime.resources import find
@@ -131,6 +132,13 @@ class Plan:
         drawn = (key for family in self.dataset.families for key in (*family.per_anatomy, *family.per_sample))
         is_drawn = any(key.split(".")[0] == "instruments" for key in (*drawn, *self.dataset.per_sample))
         return is_drawn or any(base.get("instruments") for base in self._bases)
+
+    @cached_property
+    def fields_left_out(self) -> tuple[str, ...]:
+        """Names of the fields that no sample stores."""
+        without_relief = () if self.has_relief else BASE_FIELDS
+        without_metal = () if self.has_instruments else (INSTRUMENT,)
+        return (*(() if self.dataset.radiance else ("radiance",)), *without_relief, *without_metal)
 
     def _base(self, number: int, family: Family) -> dict[str, Any]:
         path = find(family.scene, "scenes")

@@ -51,8 +51,8 @@ def finish(file: IO[bytes]) -> None:
     file.write(bytes(-file.tell() % tarfile.RECORDSIZE))
 
 
-def samples(file: IO[bytes], check: bool = True) -> Iterator[StoredSample]:
-    """Read the samples of a shard from a file at its beginning.
+def samples(file: IO[bytes], check: bool = True, offset: int = 0) -> Iterator[StoredSample]:
+    """Read the samples of a shard from a file, from the one at an offset, bytes, on.
 
     With `check` all members are read and their hashes compared; without, the metadata alone are read.
 
@@ -61,7 +61,7 @@ def samples(file: IO[bytes], check: bool = True) -> Iterator[StoredSample]:
     BrokenShardError
         At the first thing that is neither a whole sample nor the end of the archive.
     """
-    size, offset = os.fstat(file.fileno()).st_size, 0
+    size = os.fstat(file.fileno()).st_size
     # Key and members of the sample that is being read; its metadata end it.
     current, members = "", dict[str, tuple[int, int]]()
     while True:

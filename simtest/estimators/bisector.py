@@ -12,7 +12,7 @@ from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget, line_covariance
 from simtest.estimators.highlight_fit import HighlightAxis, fit_highlight, fit_highlights
 from simtest.estimators.light_assignment import light_of_highlight
-from simtest.estimators.prior_parts import add_camera_and_falloff, told_light_part
+from simtest.estimators.prior_parts import add_common_parts, told_light_part
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
@@ -23,14 +23,6 @@ STEP = 1e-4
 NARROW = 0.15
 """Standard deviation of a told distance, as a share of it, up to which the light's angle is taken as linear in it; at
 0.3 a surface at half the distance would lie three stated deviations off."""
-
-CROWD = 3
-"""A frame with more highlights than this for each light shows relief: a smooth patch shows one for each."""
-
-NEAR_MISS = np.radians(0.9)
-"""Standard deviation of an axis, rad, that a highlight has in such a frame under several lights. About one spot in
-three is a near miss, where the normal nowhere bisects light and camera (theory.md 7.1b); it is off by about the lobe's
-width and looks like the others. Fitted to 435 spots of rendered colons and stomachs under two lights."""
 
 DISTANCES = (np.arange(32) + 0.5) / 32
 """Shares of a prior on the distance at which the normal's moves are computed."""
@@ -69,8 +61,7 @@ class Bisector:
         The candidates are those of the lights that may have made the highlight, the proposed one first. With several
         lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
         lights' mean position is used, flagged ``ambiguous_light``, and the part ``light_offset`` of the budget is the
-        mean square of what the single lights would give, over the distances. Where the frame shows relief under several
-        lights, the part ``shape`` holds that the highlight may be a near miss (`NEAR_MISS`).
+        mean square of what the single lights would give, over the distances.
 
         Fails as `cone_axis` does, and with ``not_known`` without lights. In a highlight too small for isophotes s is
         the sightline of its centre, flagged ``unresolved``, and no axis ratio is stated.
@@ -93,8 +84,6 @@ class Bisector:
         budget = _budget(family, order[0], priors.distance, normal)
         if budget is not None and own is None:
             budget = {**budget, "light_offset": _light_part(family, order, priors.distance, normal)}
-        if budget is not None and _may_miss(patch, priors):
-            budget = {**budget, "shape": budget.get("shape", 0.0) + NEAR_MISS**2 * np.eye(2)}
         if budget is not None and priors.lights_covariance is not None:
             budget = _with_light_error(budget, found[0], order[0], own, priors)
         estimate = Estimate(
@@ -106,7 +95,7 @@ class Bisector:
             budget=budget,
             flags=flags,
         )
-        return add_camera_and_falloff(estimate, camera, priors, family)
+        return add_common_parts(estimate, camera, priors, family)
 
 
 bisector = Bisector()
@@ -170,12 +159,6 @@ def _light_part(family: HighlightAxis, lights: Sequence[Array], distance: Distri
     first, *single = (_normals(family, light, distances)[0] for light in lights)
     moved = np.concatenate([normals - first for normals in single]) @ basis_across(normal).T
     return np.asarray(moved.T @ moved / len(moved))
-
-
-def _may_miss(patch: Patch, priors: Priors) -> bool:
-    """Return whether a highlight under several lights lies in a frame that shows relief, by its many highlights."""
-    count = len(priors.lights_mm)
-    return count > 1 and len(patch.others_px) + 1 > CROWD * count
 
 
 def _with_light_error(

@@ -23,7 +23,7 @@ from simtest.estimators.cloud_mixture import (
 from simtest.estimators.cloud_shading import DiffuseLight
 from simtest.estimators.cloud_shape import LOBE_RAD2, CloudShape, slope_of
 from simtest.estimators.cloud_spots import find_spots
-from simtest.estimators.prior_parts import add_camera_and_falloff, light_offset_part, mean_light_part
+from simtest.estimators.prior_parts import add_common_parts, light_offset_part, mean_light_part
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Array, Camera, chi_squared
 from simtest.geometry.vectors import basis_across
@@ -181,7 +181,7 @@ def _estimate(
         target="base",
         cloud=shape,
     )
-    return add_camera_and_falloff(estimate, camera, priors)
+    return add_common_parts(estimate, camera, priors)
 
 
 def _refusal(cloud: Cloud, evidence: BaseEvidence, spots: int) -> Failure | None:

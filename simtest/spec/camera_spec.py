@@ -1,6 +1,7 @@
 """The camera of a scene, and camera files."""
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -221,7 +222,7 @@ class CameraSpec(Spec):
         if self.view_mask is not None:
             told = self.view_mask
             mask = ViewMask(*_centre(told.cx, told.cy, middle), told.radius, told.corner, told.half_height)
-        return Camera(self.width, self.height, self.fx, self.fy, cx, cy, self.skew, lens, mask)
+        return _camera(self.width, self.height, self.fx, self.fy, cx, cy, self.skew, lens, mask)
 
 
 class SceneCamera(CameraSpec):
@@ -239,6 +240,12 @@ class SceneCamera(CameraSpec):
     def still(self) -> "SceneCamera":
         """The same camera without its motion."""
         return self if self.motion is None else self.model_copy(update={"motion": None})
+
+
+@lru_cache(maxsize=16)
+def _camera(*values: Any) -> Camera:
+    """Return the camera of some values; an experiment checks the scenes of all its settings, which share one."""
+    return Camera(*values)
 
 
 def _centre(cx: float | None, cy: float | None, middle: tuple[float, float]) -> tuple[float, float]:

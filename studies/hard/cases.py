@@ -22,7 +22,7 @@ WIDER = 0.1
 """The told range of distances is wider by this share than that of the highlights in view."""
 
 ARRAYS = ("values", "peak_px", "saturated", "seen", "raw", "noise")
-NUMBERS = ("origin_px", "peak_value", "peak_pixel", "smoothing_px", "others_px")
+NUMBERS = ("origin_px", "peak_value", "peak_pixel", "smoothing_px", "others_px", "others_value")
 
 
 @dataclass(frozen=True)
@@ -122,6 +122,8 @@ def load(path: Path) -> Iterator[Case]:
             for name in ("origin_px", "peak_pixel"):
                 numbers[name] = tuple(int(v) for v in numbers[name])
             numbers["others_px"] = tuple(tuple(point) for point in numbers["others_px"])
+            # Files of before have none.
+            numbers["others_value"] = tuple(numbers.get("others_value", ()))
             told = each["case"]
             told |= {"holds": int(told["holds"]), "span_mm": tuple(told["span_mm"])}
             told["radius_px"] = math.nan if told["radius_px"] is None else told["radius_px"]

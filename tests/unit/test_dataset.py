@@ -208,7 +208,7 @@ def test_depth_that_sixteen_bits_cannot_hold_is_refused():
 def test_dataset_is_sound_and_says_what_it_holds(made):
     assert verify(made) == []
     names = {path.name for path in made.iterdir()}
-    assert {NAME, "README.md", *TABLES} <= names
+    assert {NAME, "README.md", "croissant.json", *TABLES} <= names
     assert not any(".part" in name for name in names)
     records = list(read(made))
     assert sorted(record["meta"]["index"] for record in records) == list(range(6))
@@ -548,6 +548,11 @@ def new_card(folder):
     honest(folder, "README.md")
 
 
+def new_croissant(folder):
+    (folder / "croissant.json").write_text("{}")
+    honest(folder, "croissant.json")
+
+
 def first(change):
     """Change the members of the first sample."""
     return lambda folder: rewrite(folder, TAR, lambda s: [(s[0][0], change(dict(s[0][1])), s[0][2]), *s[1:]])
@@ -584,6 +589,8 @@ DAMAGE = {
     "row lost from the highlights": (edit(HIGHLIGHTS, lambda t: t.head(3)), HIGHLIGHTS),
     "edited estimates": (edit(ESTIMATES, lambda t: t.with_columns(error_deg=pl.col("error_deg") / 2)), ESTIMATES),
     "edited card": (new_card, "README.md"),
+    "edited Croissant metadata": (new_croissant, "croissant.json"),
+    "missing Croissant metadata": (lambda f: (f / "croissant.json").unlink(), "croissant.json"),
     "normals turned away": (with_image("normal", lambda n: put(n, (0.0, 0.0, 1.0))), TAR),
     "normals of another frame": (with_image("normal", lambda n: n * np.array([-1, 1, 1])), TAR),
     "holes in the depth": (with_image("depth", lambda d: put(d, np.nan)), TAR),

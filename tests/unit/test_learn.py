@@ -1,6 +1,10 @@
 """Samples as tensors, crops, and a network that learns. Skipped where PyTorch is absent."""
 
+import shutil
+from itertools import chain
+
 import numpy as np
+import polars as pl
 import pytest
 
 torch = pytest.importorskip("torch")
@@ -27,13 +31,55 @@ def indices(items):
     return [item["meta"]["index"] for item in items]
 
 
-def test_workers_share_the_samples_out(made):
-    alone = Samples(made, "train")
-    loader = torch.utils.data.DataLoader(alone, batch_size=None, num_workers=2, multiprocessing_context="spawn")
-    assert sorted(indices(loader)) == sorted(indices(alone))
-    ranks = [indices(Samples(made, "train", rank=r, world=2)) for r in (0, 1)]
-    assert sorted(ranks[0] + ranks[1]) == sorted(indices(alone))
-    assert not set(ranks[0]) & set(ranks[1])
+# A spawned worker imports PyTorch anew, which takes seconds: one shows that everything reaches it.
+@pytest.mark.parametrize(("start", "workers"), [("fork", 3), ("spawn", 1)])
+def test_a_plain_loader_batches_what_its_workers_share_out(made, start, workers):
+    # Metadata hold None, which no loader can stack.
+    samples = Samples(made, "train", shuffle=4)
+    loader = torch.utils.data.DataLoader(samples, batch_size=2, num_workers=workers, multiprocessing_context=start)
+    batches = list(loader)
+    assert batches[0]["image"].shape == (2, 3, 48, 64)
+    assert isinstance(batches[0]["meta"], list)
+    assert None in [h["why_not"] for b in batches for m in b["meta"] for h in m["highlights"]]
+    read_there = sorted(m["index"] for b in batches for m in b["meta"])
+    assert read_there == sorted(indices(Samples(made, "train")))
+
+
+def test_ranks_share_the_samples_out(made, monkeypatch):
+    alone = sorted(indices(Samples(made, "train")))
+    for world in (2, 3, len(alone) + 1):
+        ranks = [Samples(made, "train", rank=r, world=world, even=False) for r in range(world)]
+        assert sorted(chain.from_iterable(map(indices, ranks))) == alone
+        # Training in step needs equal numbers: some samples are read twice, none is left out.
+        ranks = [Samples(made, "train", rank=r, world=world, shuffle=3) for r in range(world)]
+        each = -(-len(alone) // world)
+        assert [len(indices(rank)) for rank in ranks] == [each] * world == [len(rank) for rank in ranks]
+        assert set(chain.from_iterable(map(indices, ranks))) == set(alone)
+    monkeypatch.setenv("RANK", "1")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert indices(Samples(made, "train")) == indices(Samples(made, "train", rank=1, world=2))
+    monkeypatch.setenv("RANK", "first")
+    with pytest.raises(InputError, match="RANK = 'first': must be a whole number"):
+        Samples(made, "train")
+    with pytest.raises(InputError, match="rank = 2: must be 0 to 1"):
+        Samples(made, rank=2, world=2)
+    with pytest.raises(InputError, match="world = 0"):
+        Samples(made, world=0)
+
+
+def test_a_damaged_index_is_told_in_one_line(made, tmp_path):
+    folder = tmp_path / "damaged"
+    shutil.copytree(made, folder)
+    table = pl.read_parquet(folder / "index.parquet")
+    table.with_columns(offset=pl.col("offset") + 1).write_parquet(folder / "index.parquet")
+    with pytest.raises(InputError, match=r"train-000000.tar: no tar header at byte 1 .*verify --repair"):
+        indices(Samples(folder, "train"))
+    table.drop("offset").write_parquet(folder / "index.parquet")
+    with pytest.raises(InputError, match=r"index.parquet: cannot be read .*verify --repair"):
+        Samples(folder, "train")
+    (folder / "index.parquet").unlink()
+    with pytest.raises(InputError, match=r"index.parquet: .*verify --repair"):
+        Samples(folder, "train")
 
 
 def test_shuffling_hangs_on_seed_and_epoch(made):
@@ -54,10 +100,11 @@ def test_tensors_are_channels_first(made):
     assert item["instance"].dtype == torch.uint8
     batch = Samples.collate([item, item])
     assert batch["depth"].shape == (2, 48, 64)
+    small = {**item, "depth": item["depth"][1:]}
+    with pytest.raises(InputError, match=r"depth: samples of shapes \[\(47, 64\), \(48, 64\)\] in one batch"):
+        Samples.collate([item, small])
     with pytest.raises(InputError, match="field colour: unknown"):
         Samples(made, fields=("colour",))
-    with pytest.raises(InputError, match="rank = 2"):
-        Samples(made, rank=2, world=2)
 
 
 def test_crops_hold_the_truth_and_a_network_learns_it(made):

@@ -28,7 +28,7 @@ from simtest.nightly.records import FIGURES
 from simtest.nightly.run import run_nightly
 from simtest.nightly.storage import BASELINE_ROWS, save_run
 from simtest.runtime.resources import data_root
-from simtest.spec import experiments_of, load_profile
+from simtest.spec import Profile, experiments_of, load_profile
 from simtest.validation.cases import expand
 from simtest.validation.fingerprints import definition
 from tests.unit.nightly_samples import STARTED, canary, make_rows, make_run, regression
@@ -78,6 +78,19 @@ def sample():
     return make_run()
 
 
+plan_run = measure.plan_run
+
+
+@cache
+def _plan_of(described):
+    return plan_run(Profile.model_validate_json(described))
+
+
+def planned(profile):
+    """Return a profile's plan; a profile is expanded once in all tests, which takes half a second."""
+    return _plan_of(profile.model_dump_json())
+
+
 @pytest.fixture
 def measured(monkeypatch):
     """Have runs that are measured in no time; return the list whose first one is next."""
@@ -87,6 +100,7 @@ def measured(monkeypatch):
         return with_record(runs.pop(0), id=run_id, profile=profile.name)
 
     monkeypatch.setattr(run_module, "measure_run", measure_run)
+    monkeypatch.setattr(run_module, "plan_run", planned)
     # Their experiments are made up.
     monkeypatch.setattr(draw_module, "worst_cases", lambda *_: ())
     return runs

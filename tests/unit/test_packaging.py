@@ -1,13 +1,16 @@
 """The wheel holds the scenes, experiments and recipes, and they are found by name from any folder."""
 
 import importlib
+import importlib.metadata
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
 
 from benchmarks.__main__ import NAMES
 
@@ -71,3 +74,20 @@ def test_every_file_of_a_release_has_its_sum(tmp_path):
     subprocess.run("sha256sum --check SHA256SUMS", shell=True, cwd=tmp_path / "dist", check=True, capture_output=True)
     listed = {line.split()[1] for line in (tmp_path / "dist/SHA256SUMS").read_text().splitlines()}
     assert listed == {"a.whl", "constraints-cp311.txt"}
+
+
+@pytest.mark.extra
+def test_the_extra_for_learning_brings_no_cuda_to_a_cpu_build():
+    torch = pytest.importorskip("torch", reason="PyTorch is not installed")
+    if torch.version.cuda is not None:
+        pytest.skip("this PyTorch was built for CUDA")
+    # With PyTorch's CPU build there, everything else that the extra names is satisfied without a GPU's libraries.
+    names = {distribution.name.lower() for distribution in importlib.metadata.distributions()}
+    assert not [name for name in names if name.startswith(("nvidia-", "triton", "cuda-"))]
+    extra = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    (wanted,) = [text for text in extra["learn"] if text.startswith("torch")]
+    # pip takes the build that is there: its local version meets the bound and the pinned version.
+    requirement = Requirement(wanted)
+    pinned = next(line for line in (ROOT / "constraints.txt").read_text().splitlines() if line.startswith("torch=="))
+    assert requirement.specifier.contains(torch.__version__)
+    assert Requirement(pinned).specifier.contains(torch.__version__)

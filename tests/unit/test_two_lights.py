@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Priors, exactly
-from simtest.estimators.bisector import CROWD, NEAR_MISS, bisector
+from simtest.estimators.bisector import bisector
 from simtest.estimators.highlight_fit import fit_highlight
 from simtest.estimators.light_assignment import ALONE, light_of_highlight
 from simtest.geometry import Camera
@@ -57,16 +57,3 @@ def test_neighbours_on_rough_tissue_seldom_choose_one_of_two_lights(monkeypatch)
     # Negative control: the same fields choose where nothing stands alone.
     monkeypatch.setattr("simtest.estimators.light_assignment.ALONE", 1.0)
     assert chosen() > 0.11
-
-
-def test_many_highlights_under_several_lights_may_be_near_misses():
-    ring = [(80 + 20 * i, 60 - 35 * i) for i in range(3 * CROWD)]
-
-    def part(count, lights=LIGHTS):
-        found = bisector.estimate(among(ring[:count]), CAMERA, replace(PRIORS, lights_mm=lights))
-        return found.budget.get("shape", np.zeros((2, 2)))
-
-    few, many = part(CROWD * 2 - 1), part(CROWD * 2)
-    assert many - few == pytest.approx(NEAR_MISS**2 * np.eye(2), rel=1e-6, abs=1e-12)
-    # Negative control: one light has no such part, however many highlights there are.
-    assert np.array_equal(part(3 * CROWD, LIGHTS[:1]), part(0, LIGHTS[:1]))

@@ -1,0 +1,98 @@
+"""Near misses in the budget of crowded frames: when they enter, how they follow the brightness, and what they cover."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, exactly
+from simtest.estimators import load_estimators
+from simtest.estimators.near_misses import (
+    AROUND,
+    BRIGHT,
+    CROWD,
+    FAINT,
+    MOST,
+    RARER,
+    UNTOLD_FAINTNESS,
+    USUAL,
+    near_miss_variance,
+)
+from simtest.geometry import Camera, chi_squared
+from tests.unit.core_helpers import PATCH
+
+CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
+NAMES = ("bisector", "cone_axis", "curved", "brightest_point", "photometric")
+
+
+def among(count, value=1.0, patch=PATCH):
+    """Return the highlight among others on a spiral around it, the nearest first, over its own brightness."""
+    turns, away = 2.4 * np.arange(count), 40.0 + 5.0 * np.arange(count)
+    points = patch.peak_px + np.stack([away * np.cos(turns), away * np.sin(turns)], axis=1)
+    values = np.broadcast_to(value, count) * patch.peak_value
+    return replace(patch, others_px=tuple(map(tuple, points.tolist())), others_value=tuple(values.tolist()))
+
+
+def shape_of(name, patch, priors=LIGHT_AT_CAMERA):
+    return load_estimators([name])[name].estimate(patch, CAMERA, priors).budget.get("shape", np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_crowded_frame_adds_near_misses_to_the_part_shape(name):
+    alone = shape_of(name, among(0))
+    added = shape_of(name, among(CROWD)) - alone
+    assert added == pytest.approx((USUAL / (CROWD + 1)) ** RARER * BRIGHT * np.eye(2), rel=1e-6, abs=1e-14)
+    # Negative controls: few highlights, and a plane, which has no relief.
+    assert np.array_equal(shape_of(name, among(CROWD - 1)), alone)
+    assert np.array_equal(shape_of(name, among(CROWD), replace(LIGHT_AT_CAMERA, plane=True)), alone)
+
+
+def test_the_highlights_are_counted_for_each_light():
+    two = replace(LIGHT_AT_CAMERA, lights_mm=((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0)), distance_mm=exactly(20.0))
+    few, many = (shape_of("bisector", among(count), two) for count in (2 * CROWD - 1, 2 * CROWD))
+    assert many - few == pytest.approx((USUAL / (CROWD + 0.5)) ** RARER * BRIGHT * np.eye(2), rel=1e-6, abs=1e-14)
+    # Nobody told how many there are: one.
+    assert near_miss_variance(among(CROWD), 1) * np.eye(2) == pytest.approx(
+        shape_of("cone_axis", among(CROWD), NO_PRIORS) - shape_of("cone_axis", among(0), NO_PRIORS), rel=1e-6
+    )
+
+
+def test_a_dim_highlight_may_be_farther_off():
+    usual = near_miss_variance(among(USUAL - 1), 1)
+    assert usual == pytest.approx(BRIGHT)
+    # The brightest of the nearest counts, and a brighter one far away does not.
+    values = np.full(USUAL - 1, 0.5)
+    values[AROUND - 1] = np.e
+    assert near_miss_variance(among(USUAL - 1, values), 1) == pytest.approx(BRIGHT + FAINT)
+    values[AROUND - 1 : AROUND + 1] = 0.5, np.e
+    assert near_miss_variance(among(USUAL - 1, values), 1) == pytest.approx(BRIGHT)
+    # No patch there, or not known: the first is left out, the second taken as usual.
+    assert near_miss_variance(among(USUAL - 1, 0.0), 1) == pytest.approx(BRIGHT)
+    untold = replace(among(USUAL - 1), others_value=())
+    assert near_miss_variance(untold, 1) == pytest.approx(BRIGHT + UNTOLD_FAINTNESS * FAINT)
+
+
+def test_near_misses_get_rarer_with_the_number_of_highlights_up_to_a_limit():
+    falls = [near_miss_variance(among(count - 1), 1) for count in (10, 160, MOST, 2 * MOST)]
+    assert falls[0] / falls[1] == pytest.approx(16**RARER)
+    assert falls[2] == pytest.approx(falls[3])
+
+
+def test_the_region_holds_a_planted_mixture_of_near_misses_and_not_without_the_part():
+    # Two in five are near misses, off by a lobe of 1.7 deg half-angle at a brightness between the frame's brightest and
+    # a tenth of it: tau^2 = 2 s^2 ln(I0 / I). The share held is binomial; alpha = 0.001.
+    rng, lobe = np.random.default_rng(3), np.radians(1.7)
+    near = rng.random(400) < 0.4
+    faintness = np.where(near, rng.uniform(0.05, 2.3, 400), rng.uniform(0.0, 1.5, 400))
+    limit, held, without = chi_squared.quantile(0.95, 2), [], []
+    alone = shape_of("cone_axis", among(0)) + 1e-8 * np.eye(2)
+    for is_near, faint in zip(near, faintness, strict=True):
+        tau = lobe * np.sqrt(2 * faint) if is_near else 0.0
+        turn = rng.uniform(0, 2 * np.pi)
+        off = tau * np.array([np.cos(turn), np.sin(turn)])
+        part = near_miss_variance(among(USUAL - 1, np.exp(faint)), 1) * np.eye(2)
+        held.append(off @ np.linalg.solve(alone + part, off) <= limit)
+        without.append(off @ np.linalg.solve(alone, off) <= limit)
+    # 0.95 less 3.1 standard deviations of a share of 400
+    assert np.mean(held) > 0.95 - 3.1 * np.sqrt(0.95 * 0.05 / 400)
+    assert np.mean(without) < 0.7
