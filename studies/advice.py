@@ -94,18 +94,12 @@ def _compared(told: MeanError, measured: MeanError) -> dict[str, Any]:
     if told.mean_deg is None or measured.mean_deg is None:
         return {"ratio": None, "ratio_interval": (None, None), "agrees": None}
     ratio = told.mean_deg / measured.mean_deg
-    widths = [_relative_width(each) for each in (told, measured)]
+    widths = [told.reach, measured.reach]
     interval: tuple[float | None, float | None] = (None, None)
     if None not in widths:
         factor = math.exp(math.hypot(*[width for width in widths if width is not None]))
         interval = ratio / factor, ratio * factor
     return {"ratio": ratio, "ratio_interval": interval, "agrees": abs(ratio - 1) <= AGREES}
-
-
-def _relative_width(figure: MeanError) -> float | None:
-    """Return half of an interval over its mean."""
-    high = figure.interval_deg[1]
-    return None if high is None or not figure.mean_deg else high / figure.mean_deg - 1
 
 
 def main() -> None:

@@ -35,12 +35,15 @@ class MeanError:
     frames: int
 
     @property
+    def reach(self) -> float | None:
+        """How far the interval reaches above the mean, as a share of it; None without an interval."""
+        high = self.interval_deg[1]
+        return None if not self.mean_deg or high is None else high / self.mean_deg - 1
+
+    @property
     def is_wide(self) -> bool:
         """Whether the interval is too wide to tell a difference of 15 %."""
-        low, high = self.interval_deg
-        if self.mean_deg is None or low is None or high is None:
-            return True
-        return high - self.mean_deg > WIDE * self.mean_deg
+        return self.reach is None or self.reach > WIDE
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -13,7 +14,7 @@ from simtest.advice.advise import BREAKS, MAIN, RUN, advise, write_scene
 from simtest.advice.break_points import break_experiment, break_points, spot_size
 from simtest.advice.figures import mean_error, read_results
 from simtest.advice.organs import ORGANS, Surroundings, wall
-from simtest.advice.page import write_advice
+from simtest.advice.page import sentence, write_advice
 from simtest.advice.plan import (
     DISTANCES,
     Question,
@@ -273,6 +274,19 @@ def test_the_interval_of_a_mean_covers_it_where_frames_differ():
         naive += abs(values.mean() - 3.0) > half
     assert misses <= 36
     assert naive > 60
+
+
+@pytest.mark.parametrize(
+    ("high", "said"), [(1.1, None), (1.29, "--frames 32"), (2.49, "--frames 792"), (30.0, "more frames")]
+)
+def test_a_wide_interval_names_the_frames_that_narrow_it(high, said):
+    found = read_results(results([1.0, 1.2, 0.8, 1.0], [0, 1, 2, 3]), 8)
+    own = replace(found.method("cone_axis").fine, mean_deg=1.0, interval_deg=(0.5, high))
+    found = replace(found, methods=[replace(found.method("cone_axis"), fine=own)])
+    advised = SimpleNamespace(found=found)
+    text = sentence(advised, found.choices[0])
+    assert ("wide" in text) == (said is not None)
+    assert said is None or said in text
 
 
 @pytest.mark.render
