@@ -31,7 +31,7 @@ LEAST_FRAMES, MOST_FRAMES = 32, 128
 MOST_ASKED = 10_000
 """Frames that may be asked for."""
 
-BUDGET_S, FRAME_S, MEGAPIXEL_S = 150.0, 0.6, 5.0
+BUDGET_S, FRAME_S, MEGAPIXEL_S = 110.0, 0.6, 5.0
 """Processor time of the frames, and of one: about so much, and so much more for each million pixels."""
 
 FIRST_VIEWPOINT = 1000
