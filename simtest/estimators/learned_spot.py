@@ -62,11 +62,20 @@ class LearnedSpot:
     Raises
     ------
     InputError
-        At the first use: if ONNX Runtime (extra ``onnx``) is missing, or the file is no such network.
+        If the target is neither; at the first use, if ONNX Runtime (extra ``onnx``) is missing, or the file is no such
+        network.
     """
 
     model: str | Path
     target: Target = "base"
+
+    def __post_init__(self) -> None:
+        if self.target not in SURFACES:
+            raise InputError(f"target = {shown(self.target)}: must be base or fine")
+
+    def check(self) -> None:
+        """Load the network; raise `InputError` where it cannot be used."""
+        _ = self._network
 
     @cached_property
     def _network(self) -> "_Network":
@@ -145,6 +154,7 @@ class _Network:
         except Exception as error:  # its exceptions share no base but this
             reason = " ".join(str(error).split())
             raise InputError(f"{shown(path)}: is no ONNX model ({shown(reason, 100)})") from None
+        self._path = path
         self._read(path, text)
 
     def _read(self, path: Path, text: str) -> None:
@@ -171,11 +181,14 @@ class _Network:
 
     def run(self, crops: Array, extras: Array) -> tuple[Array, list[Failure | None]]:
         """Return outputs, shape (N, 2, 7), and for each row why it is refused, or None."""
-        outputs, features = (
-            np.asarray(each, dtype=float) for each in self._session.run(None, {"crops": crops, "extras": extras})
-        )
-        if outputs.shape[1:] != (len(SURFACES), len(OUTPUTS)):
-            raise ValueError(f"the network returns {outputs.shape}")
+        try:
+            made = self._session.run(None, {"crops": crops, "extras": extras})
+            outputs, features = (np.asarray(each, dtype=float) for each in made)
+            if outputs.shape[1:] != (len(SURFACES), len(OUTPUTS)) or features.shape[1:] != self._mean.shape:
+                raise ValueError(f"outputs {outputs.shape}, features {features.shape}")
+        except Exception as error:  # of ONNX Runtime, as above
+            reason = " ".join(str(error).split())
+            raise InputError(f"{shown(self._path)}: cannot be run ({shown(reason, 120)})") from None
         off = features - self._mean
         distances = np.einsum("ni,ij,nj->n", off, self._precision, off)
         return outputs, [self._refusal(row, distance) for row, distance in zip(extras, distances, strict=True)]

@@ -9,7 +9,7 @@ import numpy as np
 
 from simtest.calibration import Frame
 from simtest.dataset.fields import INSTRUMENT
-from simtest.dataset.reader import read_samples
+from simtest.dataset.reader import read_samples, sample_positions
 from simtest.dataset.sample import Sample
 from simtest.detection.detector import load_detector, run_detector
 from simtest.errors import Failure
@@ -27,7 +27,7 @@ NEAR_PX = 1.5
 
 SMOOTHING_PX = 1.0
 
-_FIELDS = ("image", "depth", "normal_base", "curvature_base", INSTRUMENT)
+FIELDS_READ = ("image", "depth", "normal_base", "curvature_base", INSTRUMENT)
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,11 @@ class Spots:
 def read_spots(folder: str | Path, split: str, most: int = MOST_OF_A_FRAME, progress: Progress | None = None) -> Spots:
     """Read the highlights of a split, as detected by colour; raise errors as `simtest.dataset.read`."""
     parts: list[Spots] = []
-    samples = read_samples(folder, split, _FIELDS)
-    for number, sample in enumerate(samples):
+    total = len(sample_positions(folder, split))
+    for number, sample in enumerate(read_samples(folder, split, FIELDS_READ)):
         parts.append(_spots(sample, most))
         if progress:
-            # How many frames there are is known only at their end.
-            progress(number + 1, number + 2, f"{split}: frames read")
+            progress(number + 1, total + 1, f"{split} split: frames read")
     if not parts:
         return Spots(*(np.empty(shape) for shape in _SHAPES))
     return Spots(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Spots)))
@@ -129,7 +128,7 @@ def _fine(sample: Sample, peaks: Array, rays: Array) -> tuple[AnyArray, AnyArray
     """Return rotation and axis ratio of the fine surface at the detections that show one glint alone."""
     rotation = np.full((len(peaks), 2), np.nan, dtype=np.float32)
     ratio = np.full(len(peaks), np.nan, dtype=np.float32)
-    for number, glint in _only_glints(sample, peaks):
+    for number, glint in only_glints(sample, peaks):
         truth = sample.meta["highlights"][glint]
         gains = sorted((abs(1 + truth["kd_min"]), abs(1 + truth["kd_max"])))
         rotation[number] = rotation_of(rays[number : number + 1], np.array([truth["normal"]]))[0]
@@ -137,7 +136,7 @@ def _fine(sample: Sample, peaks: Array, rays: Array) -> tuple[AnyArray, AnyArray
     return rotation, ratio
 
 
-def _only_glints(sample: Sample, peaks: Array) -> Iterator[tuple[int, int]]:
+def only_glints(sample: Sample, peaks: Array) -> Iterator[tuple[int, int]]:
     """Yield the detections that show a visible highlight of one glint, with the glint's number."""
     visible = sample.meta.get("visible_highlights", [])
     positions = np.array([spot["peak_px"] for spot in visible], dtype=float).reshape(-1, 2)
