@@ -33,6 +33,11 @@ USUAL, RARER, MOST = 60, 0.15, 400
 """Near misses get rarer with the number of highlights, since stronger relief makes more highlight points: the variance
 falls with this power of the number of highlights for each light, over the usual one, up to the largest."""
 
+SEVERAL = 0.5
+"""Share of the variance under several lights. Which light made a highlight is then seldom known, and that error is as
+large as the part of the budget that stands for it, or smaller, never several times larger: the sum of both parts would
+hold 99 % and more."""
+
 UNTOLD_FAINTNESS = 1.0
 """ln(I0 / I) where the patch does not know how bright the others are; two thirds of the spots have less."""
 
@@ -64,7 +69,7 @@ def near_miss_variance(patch: Patch, lights: int) -> float:
     count = (len(patch.others_px) + 1) / lights
     if count <= CROWD:
         return 0.0
-    scale = (USUAL / min(count, MOST)) ** RARER
+    scale = (USUAL / min(count, MOST)) ** RARER * (1.0 if lights == 1 else SEVERAL)
     return float(scale * (BRIGHT + FAINT * _faintness(patch)))
 
 
