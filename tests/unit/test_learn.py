@@ -16,6 +16,15 @@ from simtest.spec import load_dataset  # noqa: E402
 pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore")]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Several threads take turns at so small a network, and wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("learn") / "tiny"
@@ -27,6 +36,7 @@ def indices(items):
     return [item["meta"]["index"] for item in items]
 
 
+@pytest.mark.slow
 def test_workers_share_the_samples_out(made):
     alone = Samples(made, "train")
     loader = torch.utils.data.DataLoader(alone, batch_size=None, num_workers=2, multiprocessing_context="spawn")
@@ -60,7 +70,7 @@ def test_tensors_are_channels_first(made):
         Samples(made, rank=2, world=2)
 
 
-def test_crops_hold_the_truth_and_a_network_learns_it(made):
+def test_crops_hold_the_truth(made):
     crops = read_crops(made, "train")
     assert len(crops) >= 8
     assert np.allclose(np.linalg.norm(crops.normal, axis=1), 1)
@@ -68,12 +78,19 @@ def test_crops_hold_the_truth_and_a_network_learns_it(made):
     assert angle_deg(crops.towards, crops.normal).max() < 3
     assert ((crops.axis_ratio > 0) & (crops.axis_ratio <= 1)).all()
     assert set(crops.classical) == {"circle_pose", "brightest_point", "cone_axis"}
+
+
+def test_a_network_learns_the_truth(made):
+    crops = read_crops(made, "train")
     untaught = np.abs(propose(train(crops, epochs=0), crops)[1] - crops.axis_ratio).mean()
     taught = train(crops, epochs=150)
     normal, ratio = propose(taught, crops)
     assert np.allclose(np.linalg.norm(normal, axis=1), 1)
     assert np.abs(ratio - crops.axis_ratio).mean() < 0.5 * untaught
-    # The same seed gives the same network.
+
+
+def test_the_same_seed_gives_the_same_network(made):
+    crops = read_crops(made, "train")
     assert np.array_equal(propose(train(crops, epochs=2), crops)[0], propose(train(crops, epochs=2), crops)[0])
 
 
