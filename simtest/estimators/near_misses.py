@@ -37,9 +37,9 @@ APART = 3
 """Lights of a larger number are a ring, whose highlights melt: it counts as so many."""
 
 SEVERAL = 0.5
-"""Share of the variance under two or three lights. Which light made a highlight is then seldom known, and that error is as
-large as the part of the budget that stands for it, or smaller, never several times larger: the sum of both parts would
-hold 99 % and more."""
+"""Share of the variance under two or three lights. Which light made a highlight is then seldom known, and that error is
+as large as the part of the budget that stands for it, or smaller, never several times larger: the sum of both parts
+would hold 99 % and more."""
 
 UNTOLD_FAINTNESS = 1.0
 """ln(I0 / I) where the patch does not know how bright the others are; two thirds of the spots have less."""
