@@ -33,10 +33,13 @@ USUAL, RARER, MOST = 60, 0.15, 400
 """Near misses get rarer with the number of highlights, since stronger relief makes more highlight points: the variance
 falls with this power of the number of highlights for each light, over the usual one, up to the largest."""
 
+APART = 3
+"""Lights of a larger number are a ring, whose highlights melt: it counts as so many."""
+
 SEVERAL = 0.5
-"""Share of the variance under several lights. Which light made a highlight is then seldom known, and that error is as
-large as the part of the budget that stands for it, or smaller, never several times larger: the sum of both parts would
-hold 99 % and more."""
+"""Share of the variance under two or three lights. Which light made a highlight is then seldom known, and that error is
+as large as the part of the budget that stands for it, or smaller, never several times larger: the sum of both parts
+would hold 99 % and more."""
 
 UNTOLD_FAINTNESS = 1.0
 """ln(I0 / I) where the patch does not know how bright the others are; two thirds of the spots have less."""
@@ -59,17 +62,17 @@ def near_miss_variance(patch: Patch, lights: int) -> float:
     patch : Patch
         The highlight, with the frame's other ones.
     lights : int
-        How many lights there are.
+        How many lights there are, at least 1.
 
     Returns
     -------
     float
         0 in a frame that does not show more than `CROWD` highlights for each light.
     """
-    count = (len(patch.others_px) + 1) / lights
+    count = (len(patch.others_px) + 1) / min(lights, APART)
     if count <= CROWD:
         return 0.0
-    scale = (USUAL / min(count, MOST)) ** RARER * (1.0 if lights == 1 else SEVERAL)
+    scale = (USUAL / min(count, MOST)) ** RARER * (SEVERAL if 1 < lights <= APART else 1.0)
     return float(scale * (BRIGHT + FAINT * _faintness(patch)))
 
 

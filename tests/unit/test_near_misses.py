@@ -67,6 +67,11 @@ def test_the_highlights_are_counted_for_each_light():
     )
 
 
+def test_a_ring_of_lights_counts_as_three():
+    assert near_miss_variance(among(3 * CROWD - 1), 8) == 0
+    assert near_miss_variance(among(3 * CROWD), 8) == pytest.approx((USUAL / (CROWD + 1 / 3)) ** RARER * BRIGHT)
+
+
 def test_a_dim_highlight_may_be_farther_off():
     usual = near_miss_variance(among(USUAL - 1), 1)
     assert usual == pytest.approx(BRIGHT)
