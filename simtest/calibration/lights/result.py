@@ -167,6 +167,13 @@ def _doubts(
             f"ambiguous: other lights, one at ({place}) mm, would explain the highlights as well; add pictures with "
             "the ball or plate at other places and distances"
         )
+    for position in found.further:
+        if float(np.linalg.norm(position)) <= REACH_MM:
+            place = ", ".join(f"{value:.1f}" for value in position)
+            problems.append(
+                f"a further light may be at ({place}) mm, but too few pictures show it; add pictures with the ball "
+                "nearer to the camera, where its highlights lie farther apart"
+            )
     for number, light in enumerate(lights, 1):
         if light.pictures < pictures:
             notes.append(f"light {number}: {light.pictures} of {pictures} pictures show its highlight")

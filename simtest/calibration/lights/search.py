@@ -6,7 +6,7 @@ that explains most highlights becomes a light, its highlights are taken away, an
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -45,6 +45,9 @@ LEAST_SHARE = 0.6
 LEAST_PICTURES = 3
 """And in so many pictures, if there are as many."""
 
+SEEN_TOO_SELDOM = 3
+"""A position that explains so many of the highlights left may be a light that most pictures do not show."""
+
 MERGED_PX = 3.0
 """Two lights that are expected so near to each other, with one highlight, have merged: it is neither's."""
 
@@ -71,11 +74,14 @@ class Found:
         Number of the light of each highlight; -1: none.
     others : ndarray, shape (A, 3)
         Positions, mm, of another set of lights that explains the highlights about as well: the result is ambiguous.
+    further : ndarray, shape (B, 3)
+        Positions, mm, that explain three or more of the highlights left, but too few for a light.
     """
 
     bundle: Bundle
     source: Labels
     others: Array
+    further: Array
 
 
 @dataclass
@@ -112,8 +118,12 @@ def find_lights(camera: Camera, mirrors: Mirrors, highlights: Highlights, most: 
     bundle = solve(camera, mirrors, highlights, source, together[0].lights)
     if bundle is None:
         return None
-    others = _ambiguities(camera, mirrors, highlights, candidates, Found(bundle, together[1], np.empty((0, 3))), least)
-    return Found(bundle, source, others)
+    left = together[1] < 0
+    known = list(bundle.lights)
+    more = _chosen(camera, mirrors, loose, candidates, known, left, (SEEN_TOO_SELDOM, most))[len(known) :]
+    found = Found(bundle, source, np.empty((0, 3)), np.array(more).reshape(-1, 3))
+    others = _ambiguities(camera, mirrors, highlights, candidates, replace(found, source=together[1]), least)
+    return replace(found, others=others)
 
 
 def _chosen(

@@ -23,7 +23,7 @@ OUTLINE_FLOOR_PX = 0.02
 COMMON_PX, COMMON_RADIUS_PX = 0.015, 0.012
 """Error that the outlines of all pictures share, px: of their position an axis, and of their radius."""
 
-SHADED_PX = 0.02
+SHADED_PX = 0.03
 """The ball's shadow beside its outline moves all outlines away from the lights, by so many px for each mm that the
 middle of the lights lies beside the camera: a standard deviation."""
 
@@ -43,6 +43,9 @@ WIDEST_ON_PLATE = 0.06
 
 WIDER = 1.08
 """A spot that is wider by this factor than spots on a ball that looks larger is several highlights that merge."""
+
+SURELY = 3.0
+"""By so many standard deviations of its width, too."""
 
 FARTHEST_PX = 1e5
 """Largest number of a rough outline, px."""
@@ -152,7 +155,8 @@ def without_merged(views: Sequence[View]) -> list[View]:
 
 
 def _if_narrow(highlight: MeasuredHighlight, most_px: float) -> MeasuredHighlight:
-    if highlight.problem or highlight.width_px <= most_px:
+    # Noise alone makes a dim spot wide.
+    if highlight.problem or highlight.width_px - SURELY * highlight.width_sd_px <= most_px:
         return highlight
     return replace(highlight, problem="wider than on a ball that looks larger: several highlights that merge")
 
