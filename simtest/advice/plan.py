@@ -26,8 +26,12 @@ DISTANCES = 8
 """Distances at which the wall stands: the middles of so many equal parts of the range."""
 
 LEAST_FRAMES, MOST_FRAMES = 32, 128
+"""Of the default number of frames."""
 
-BUDGET_S, FRAME_S, MEGAPIXEL_S = 150.0, 0.6, 5.0
+MOST_ASKED = 10_000
+"""Frames that may be asked for."""
+
+BUDGET_S, FRAME_S, MEGAPIXEL_S = 110.0, 0.6, 5.0
 """Processor time of the frames, and of one: about so much, and so much more for each million pixels."""
 
 FIRST_VIEWPOINT = 1000
@@ -100,8 +104,8 @@ class Question:
         check_integer("--seed", self.seed, 0, MOST_SEED)
         if self.bound_deg > MOST_BOUND_DEG:
             raise InputError(f"--bound {self.bound_deg:g}: must be at most {MOST_BOUND_DEG:g} deg")
-        if self.frames is not None and not DISTANCES <= self.frames <= 10_000:
-            raise InputError(f"--frames {self.frames}: must be {DISTANCES} to 10000")
+        if self.frames is not None and not DISTANCES <= self.frames <= MOST_ASKED:
+            raise InputError(f"--frames {self.frames}: must be {DISTANCES} to {MOST_ASKED}")
 
     @property
     def kind(self) -> Organ:

@@ -95,7 +95,8 @@ def forget_meshes() -> None:
     from simtest.surfaces import mesh_surface as mesh
 
     meshes = (centreline._camera_path, colon.build, liver.build, mesh._prepare)
-    for cached in (*meshes, relief_field._make_field, tissue_pattern._make, vessels.grow_vessels):
+    reliefs, patterns = (relief_field._make_field, relief_field._unscaled), (tissue_pattern._make, tissue_pattern._bare)
+    for cached in (*meshes, *reliefs, *patterns, vessels.grow_vessels):
         cached.cache_clear()
 
 
