@@ -49,7 +49,7 @@ def ask(name: str, rig: dict[str, Any], out: Path, frames: int | None, seed: int
     """Render the frames of one rig's advice; return their rows and number."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"{name}.toml"
-    tables = {key: rig[key] for key in ("camera", "rig", "sensor", "relief") if key in rig}
+    tables: dict[str, Any] = {key: rig[key] for key in ("camera", "rig", "sensor", "relief") if key in rig}
     file.write_text(toml_tables(tables), encoding="utf-8")
     near, far = rig["distances_mm"]
     question = Question(read_scope(str(file)), rig["organ"], (near, far), frames=frames, seed=seed)

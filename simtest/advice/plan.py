@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -184,7 +184,7 @@ def main_experiment(question: Question) -> Experiment:
     })  # fmt: skip
 
 
-def drawn_values(question: Question, around: Surroundings) -> dict[str, list[float]]:
+def drawn_values(question: Question, around: Surroundings) -> dict[str, Sequence[float]]:
     """Return the drawn values of all frames by key path, in the order of `main_experiment`.
 
     At each distance a value takes one number from each of as many equal parts of its range as there are frames: a Latin
@@ -194,7 +194,7 @@ def drawn_values(question: Question, around: Surroundings) -> dict[str, list[flo
     """
     rng = generator(question.seed, "advice", "drawn", 0, Stage.SWEEP)
     count = question.per_distance
-    values = {}
+    values: dict[str, Sequence[float]] = {}
     for key, (low, high) in around.random.items():
         # Shape (frames at a distance, distances).
         parts = rng.permuted(np.repeat(np.arange(count)[:, None], DISTANCES, axis=1), axis=0)
