@@ -86,13 +86,13 @@ def _remedy(found: Advised, choice: Choice) -> str:
 def frames_for(found: Advised, choice: Choice) -> int | None:
     """Return about how many frames narrow the interval of a choice's error to `WIDE`.
 
-    The width falls with the root of the number. None where the interval is narrow enough or unknown, or where so many
+    The width of the mean's logarithm falls with the root of the number. None where the interval is narrow enough or unknown, or where so many
     frames are not allowed.
     """
     reach = None if choice.best is None else found.found.method(choice.best).own.reach
     if reach is None or reach <= WIDE:
         return None
-    needed = math.ceil(found.found.frames * (reach / WIDE) ** 2 / DISTANCES) * DISTANCES
+    needed = math.ceil(found.found.frames * (math.log1p(reach) / math.log1p(WIDE)) ** 2 / DISTANCES) * DISTANCES
     return needed if needed <= MOST_ASKED else None
 
 

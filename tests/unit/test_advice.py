@@ -328,7 +328,7 @@ def test_intervals_of_few_frames():
 
 
 @pytest.mark.parametrize(
-    ("high", "said"), [(1.1, None), (1.29, "--frames 32"), (2.49, "--frames 792"), (30.0, "more frames")]
+    ("high", "said"), [(1.1, None), (1.29, "--frames 32"), (2.49, "--frames 344"), (200.0, "more frames")]
 )
 def test_a_wide_interval_names_the_frames_that_narrow_it(high, said):
     found = read_results(results([1.0, 1.2, 0.8, 1.0], [0, 1, 2, 3]), 8)
