@@ -86,8 +86,8 @@ def _remedy(found: Advised, choice: Choice) -> str:
 def frames_for(found: Advised, choice: Choice) -> int | None:
     """Return about how many frames narrow the interval of a choice's error to `WIDE`.
 
-    The width of the mean's logarithm falls with the root of the number. None where the interval is narrow enough or unknown, or where so many
-    frames are not allowed.
+    The width of the mean's logarithm falls with the root of the number. None where the interval is narrow enough or
+    unknown, or where so many frames are not allowed.
     """
     reach = None if choice.best is None else found.found.method(choice.best).own.reach
     if reach is None or reach <= WIDE:
