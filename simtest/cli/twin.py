@@ -3,7 +3,7 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -23,6 +23,10 @@ def twin(
     *,
     out: Out,
     known: PictureOptions = DEFAULTS,
+    organ: Annotated[
+        Literal["colon", "stomach", "liver", "gallbladder"] | None,
+        Parameter(help="Organ in the picture, whose relief the twins have; default: any tissue's."),
+    ] = None,
     frames: Annotated[
         int | None,
         Parameter(help="Rendered frames; default 48, fewer where the picture is large.", converter=whole_number),
@@ -51,7 +55,7 @@ def twin(
     command = shlex.join(["simtest", *sys.argv[1:]])
     with exclusive_folder(out):
         with progress_bar("writing the page") as progress:
-            result = twin_picture(frame, options, frames, seed or 0, progress)
+            result = twin_picture(frame, options, frames, seed or 0, progress, organ)
         files = write_twins(result, out, command)
     if as_json:
         print_files(files, as_json, **to_json(result, command))
@@ -72,6 +76,8 @@ def _print(result: "TwinResult") -> None:
     print(f"twins: {result.rms_deg('base_rms_deg'):.2f} deg RMS against the base's normal")
     drawn = f"{counted(len(result.bank), 'rendered frame')}, {counted(len(result.bank_spots), 'highlight')} in them"
     print(f"bank: {drawn}, {100 * result.share_of('near_miss'):.0f} % near misses")
+    near, middle, far = result.distance_mm
+    print(f"twins stand at {near:.0f} to {far:.0f} mm (80 %), half nearer than {middle:.0f} mm")
     unlike = sum(not each.twins.is_covered for each in result.spots)
     if unlike:
         print(f"note: the bank holds no highlight like {unlike} of {len(spots)}; their figures are of the nearest ones")

@@ -61,7 +61,11 @@ def make_surface(
         from simtest.surfaces.deformation import DeformationAt
         from simtest.surfaces.deformed import DeformedSurface
 
-        return DeformedSurface(surface, DeformationAt(deformation, time_s), spec.type)
+        if isinstance(surface, Plane | Sphere | Cylinder):
+            from simtest.surfaces.graded_mesh import GradedMesh
+
+            surface = GradedMesh(surface)
+        return DeformedSurface(surface, DeformationAt(deformation, time_s))
     return surface
 
 

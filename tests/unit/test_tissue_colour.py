@@ -424,3 +424,16 @@ def test_the_cache_is_freed():
     assert _make.cache_info().currsize > 0
     forget_meshes()
     assert _make.cache_info().currsize == 0
+
+
+def test_a_surface_too_small_for_two_nodes_has_no_vessels():
+    """Each system is a root alone: there is nothing to draw, and the ground is left as it is."""
+    surface = make_surface(
+        scene_from_dict({"surface": {"type": "sphere", "radius_mm": 0.2, "distance_mm": 5.0}}).surface
+    )
+    forest = grow_vessels(surface_patch(surface), TissueColour().vessels, 3)
+    assert forest.parent.tolist() == [-1, -1]
+    assert not len(segments(forest).start)
+    pattern = make_pattern(surface, TissueColour())
+    points, _ = surface_patch(surface).draw(np.random.default_rng(1), 50)
+    assert not pattern.vessels.chords(points).any()

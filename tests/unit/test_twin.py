@@ -16,6 +16,7 @@ from simtest.advice.twin.patches import ANCHOR_MM, MOST_TILT_DEG, REACH_MM, Tiss
 from simtest.advice.twin.run import TwinResult, match_spots, twin_picture, twins_of
 from simtest.advice.twin.scenes import Look, SceneDraws, _distance, drawn_camera, look_of
 from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot, usable_spots
+from simtest.advice.twin.tissue import NAMES, WIDER, tissue_of
 from simtest.advice.twin.writing import COLUMNS, write_twins
 from simtest.calibration import Calibration, CameraPrior, Normal, Priors, Response, Uniform
 from simtest.errors import InputError
@@ -26,6 +27,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import run_picture
 from simtest.spec import load_scene
+from simtest.spec.dataset_recipe import load_dataset
 from simtest.surfaces.factory import make_surface
 
 CAMERA = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)
@@ -63,15 +65,44 @@ def test_a_sightline_meets_its_patch_at_the_drawn_distance_and_a_small_tilt(numb
     assert seen > 0
 
 
-def test_a_patch_that_bends_around_the_camera_has_no_view():
+def test_a_patch_whose_centre_of_curvature_is_the_camera_has_no_view():
     bowl = TissuePatch((-0.1, -0.1), {"type": "quadric", "distance_mm": ANCHOR_MM, "k1_per_mm": -0.1})
-    assert look_at(bowl, rng(), np.array([0.0, 0.0, 1.0]), 20.0) is None
-    assert look_at(bowl, rng(), np.array([0.0, 0.0, 1.0]), 4.0) is not None
+    ahead = np.array([0.0, 0.0, 1.0])
+    assert look_at(bowl, rng(), ahead, 10.0) is None
+    assert look_at(bowl, rng(), ahead, 4.0) is not None
+    # From beyond it the far wall of a lumen is seen.
+    assert look_at(bowl, rng(), ahead, 20.0) is not None
 
 
 def test_the_pool_is_always_the_same_and_has_many_shapes():
     assert make_pool(4) == make_pool(16)[:4]
     assert len({patch.k_per_mm for patch in make_pool()}) == len(make_pool())
+
+
+@pytest.mark.parametrize("organ", NAMES)
+def test_a_told_organ_has_its_relief_and_film_and_form(organ):
+    """All that the recipe draws lies in the ranges, and the ranges are no wider than they say."""
+    tissue, family = tissue_of(organ), next(f for f in load_dataset("endoscopy").families if f.scene.endswith(organ))
+    drawn = {**family.per_anatomy, **family.per_sample}
+    for number, band in enumerate(tissue.bands):
+        for key in ("slope_deg", "wavelength_mm"):
+            low, high = getattr(band, key)
+            if (told := drawn.get(f"surface.relief.bands.{number}.{key}")) is not None:
+                assert (low * WIDER, high / WIDER) == pytest.approx(told.ends)
+            assert high / low >= WIDER**2 - 1e-9
+    for patch in make_pool(6, tissue):
+        k1, k2 = patch.k_per_mm
+        assert tissue.k1_per_mm[0] <= k1 <= tissue.k1_per_mm[1]
+        assert tissue.k2_per_mm[0] <= k2 <= tissue.k2_per_mm[1]
+        for band, made in zip(tissue.bands, patch.surface["relief"]["bands"], strict=True):
+            assert band.wavelength_mm[0] <= made["wavelength_mm"] <= band.wavelength_mm[1]
+            assert band.slope_deg[0] <= made["slope_deg"] <= band.slope_deg[1]
+    assert tissue != tissue_of(None)
+
+
+def test_an_organ_that_nobody_knows_is_refused_before_anything_is_rendered(framed):
+    with pytest.raises(InputError, match="--organ brain: must be one of colon, stomach, liver, gallbladder"):
+        twin_picture(framed, Options(fov_deg=60.0), organ="brain")
 
 
 # Scenes ------------------------------------------------------------------------------------------------------------
@@ -169,7 +200,8 @@ def made_bank(count=3000, frames=30, seed=0, law=lambda size: 2 * size, kinds=("
         features = [size, *draws.normal(0.5, 0.05, len(FEATURES) - 1)]
         error = law(size) * float(np.hypot(*draws.standard_normal(2))) / math.sqrt(2)
         kind = kinds[int(draws.integers(len(kinds)))]
-        spots.append((i % frames, ScoredSpot(spot(features), kind, error, 2 * error, error < law(size))))
+        scored = ScoredSpot(spot(features), kind, error, 2 * error, error < law(size), 10 * (1 + size))
+        spots.append((i % frames, scored))
     return spots
 
 
@@ -187,6 +219,8 @@ def test_twins_measure_the_error_of_highlights_alike():
         assert twins.base_rms_deg == pytest.approx(2 * twins.rms_deg)
         assert twins.interval_deg[0] < twins.rms_deg < twins.interval_deg[1]
         assert twins.is_covered
+        assert twins.distance_mm[0] < 10 * (1 + size) < twins.distance_mm[2]
+        assert twins.distance_mm[1] == pytest.approx(10 * (1 + size), rel=0.2)
         # Of Rayleigh errors 63 % lie below the root of their mean square.
         assert twins.coverage == pytest.approx(0.63, abs=0.3)
     # Negative control: twins of another size measure another error.
@@ -318,6 +352,7 @@ def test_the_files_hold_what_was_measured(tmp_path, framed):
     for row, each in zip(rows, told["specularities"], strict=True):
         assert float(row["twin_rms_deg"]) == pytest.approx(each["twins"]["rms_deg"])
         assert float(row["stated_deg"]) == pytest.approx(each["stated_deg"])
+        assert float(row["median_mm"]) == pytest.approx(each["twins"]["distance_mm"][1])
     assert told["bank"]["highlights"] == 200
     assert told["bank"]["near_misses"] + told["bank"]["false"] <= 1
     page = files[2].read_text()

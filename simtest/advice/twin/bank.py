@@ -98,7 +98,8 @@ def make_bank(
         See `Progress`.
     """
     made: list[BankFrame] = []
-    pool = make_pool()
+    # All subjects show one organ.
+    pool = make_pool(tissue=subjects[0].draws.tissue)
     # Frames of one patch come one after the other, since its kernels and its mesh then stay.
     used = min(len(pool), max(count // FRAMES_PER_PATCH, 1))
     order = (np.sort(np.arange(count) % used) + seed) % len(pool)

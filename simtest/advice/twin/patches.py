@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from simtest.advice.twin.tissue import ANY, Tissue
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 
@@ -29,11 +30,8 @@ MOST_TILT_DEG = 35.0
 """Largest angle between the base's normal and the reversed sightline at that point: highlights farther out are rare."""
 
 LEAST_GAIN = 0.2
-"""Smallest 1 + d k of the base at that point: nearer to 0 a wall shows a streak, not highlights."""
-
-CURVED_PER_MM = 0.03
-"""Scale of the base's principal curvatures, 1/mm: half are beyond 0.7 times it, as on folds and in lumens of 2 to 8 cm
-across."""
+"""Smallest abs(1 + d k) of the base at that point: nearer to 0 a wall shows a streak, not highlights. 1 + d k is
+negative where the wall bends around the camera, as the far wall of a lumen does."""
 
 
 @dataclass(frozen=True)
@@ -58,33 +56,20 @@ class TissuePatch:
         return np.array([u, v, -(k1 * u * u + k2 * v * v) / 2]), normal / np.linalg.norm(normal)
 
 
-def make_pool(count: int = POOL) -> list[TissuePatch]:
-    """Return the pool: the first `count` patches."""
-    return [_patch(number) for number in range(count)]
+def make_pool(count: int = POOL, tissue: Tissue = ANY) -> list[TissuePatch]:
+    """Return the pool of a tissue: the first `count` patches."""
+    return [_patch(number, tissue) for number in range(count)]
 
 
-def _patch(number: int) -> TissuePatch:
-    """Draw a patch: curvature of a fold, a lumen or a body, and a relief of two bands as tissues have."""
+def _patch(number: int, tissue: Tissue) -> TissuePatch:
+    """Draw a patch: curvature of a fold, a lumen or a body, and a relief as the tissue has."""
     rng = from_integer(POOL_SEED + number)
-    # Laplace: most patches are nearly flat over a highlight, some are folds.
-    k1, k2 = (float(np.clip(rng.laplace(0.0, CURVED_PER_MM), -0.1, 0.2)) for _ in range(2))
-    first = "ridged" if rng.random() < 0.25 else "gaussian"
-    second = ("ridged", "pits", "gaussian")[int(rng.integers(3))]
-    coarse, fine = _between(rng, 1.2, 3.5), _between(rng, 0.5, 1.25)
-    bands = [
-        {"kind": first, "slope_deg": float(rng.uniform(1.5, 6.0)), "wavelength_mm": coarse, "width": 0.4},
-        {"kind": second, "slope_deg": float(rng.uniform(1.5, 7.0)), "wavelength_mm": fine},
-    ]
+    k1, k2 = tissue.draw_curvatures(rng)
     surface = {
         "type": "quadric", "distance_mm": ANCHOR_MM, "k1_per_mm": k1, "k2_per_mm": k2,
-        "relief": {"seed": number, "bands": bands},
+        "relief": {"seed": number, "bands": [band.draw(rng) for band in tissue.bands]},
     }  # fmt: skip
     return TissuePatch((k1, k2), surface)
-
-
-def _between(rng: np.random.Generator, low: float, high: float) -> float:
-    """Draw a number that is log-uniform between two ends."""
-    return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
 def look_at(
@@ -113,7 +98,7 @@ def look_at(
     for _ in range(tries):
         u, v = rng.uniform(-REACH_MM, REACH_MM, 2)
         point, normal = patch.points(float(u), float(v))
-        if 1 + distance * min(patch.k_per_mm) < LEAST_GAIN:
+        if min(abs(1 + distance * k) for k in patch.k_per_mm) < LEAST_GAIN:
             return None
         # Even in solid angle about the reversed sightline.
         tilt = math.acos(rng.uniform(math.cos(math.radians(MOST_TILT_DEG)), 1.0))

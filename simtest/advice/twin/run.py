@@ -11,6 +11,7 @@ from simtest.advice.twin.bank import BankFrame, Progress, Subject, all_spots, fr
 from simtest.advice.twin.matching import Matcher, Twins
 from simtest.advice.twin.scenes import Look, SceneDraws, look_of
 from simtest.advice.twin.scoring import ScoredSpot, Spot, SpotKind, usable_spots
+from simtest.advice.twin.tissue import Tissue, tissue_of
 from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.reconstruction.assumptions import Assumption
@@ -27,12 +28,19 @@ LEAST_TWINS = 20
 """A bank with fewer highlights measures nothing."""
 
 DRAWN = (
-    Assumption("relief, curvature and tilt of the tissue", "a pool of 16 patches; tilts up to 35 deg", "not yet told"),
-    Assumption("liquid film", "roughness 0.018 to 0.05, level -2 to 0.3", "not yet told"),
+    Assumption("curvature and tilt of the tissue", "a pool of 16 patches; tilts up to 35 deg", "not yet told"),
     Assumption("light exits", "discs of 0.5 to 1.3 mm radius; lights of one power", "not yet told"),
     Assumption("camera chain", "one of three presets, its sharpening, noise and coding drawn", "not yet told"),
 )
 """What no frame shows and no file states of a twin; the ranges are those of `patches` and `scenes`."""
+
+
+def _drawn(organ: str | None, tissue: Tissue) -> list[Assumption]:
+    """Return what is drawn anew for each frame of the bank; the relief and the film as the organ has them."""
+    name, how = ("any tissue", "--organ") if organ is None else (organ, "not yet told")
+    film = "roughness {:.2g} to {:.2g}, level {:.2g} to {:.2g}".format(*tissue.alpha, *tissue.level)
+    relief = Assumption("relief of the tissue", f"{name}: {tissue}", how)
+    return [relief, Assumption("liquid film", f"{name}: {film}", how), *DRAWN]
 
 
 @dataclass(frozen=True)
@@ -99,6 +107,12 @@ class TwinResult:
         return float(np.sqrt(np.mean([getattr(each.twins, of) ** 2 for each in self.spots])))
 
     @property
+    def distance_mm(self) -> tuple[float, float, float]:
+        """Medians over the highlights of the distances below which 10, 50 and 90 % of their twins stand, mm."""
+        near, middle, far = np.nanmedian([each.twins.distance_mm for each in self.spots], axis=0).tolist()
+        return near, middle, far
+
+    @property
     def coverage(self) -> float | None:
         """Mean share of the twins' stated 95 % regions that hold the truth."""
         told = [each.twins.coverage for each in self.spots if each.twins.coverage is not None]
@@ -106,7 +120,12 @@ class TwinResult:
 
 
 def twin_picture(
-    image: Path, options: Options, frames: int | None = None, seed: int = 0, progress: Progress | None = None
+    image: Path,
+    options: Options,
+    frames: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    organ: str | None = None,
 ) -> TwinResult:
     """Measure the errors at a picture's highlights on rendered twins of them.
 
@@ -122,21 +141,25 @@ def twin_picture(
         Of what is drawn.
     progress : callable, optional
         Called with frames rendered, frames in all, and what is done.
+    organ : str, optional
+        Whose relief and film the twins have (`simtest.advice.twin.tissue.NAMES`); default: any tissue's.
 
     Raises
     ------
     InputError
-        If the picture or the calibration is malformed, the picture holds no usable highlight, or the bank none like
-        any.
+        If the picture, the calibration or the organ is malformed, the picture holds no usable highlight, or the bank
+        too few.
     BackendError
         If the rendering backend cannot be used.
     """
     started = time.process_time()
     if is_sequence(image):
         raise InputError(f"{shown(image)}: is a folder or a film; twin takes one picture")
+    # A wrong name is told before minutes of rendering.
+    tissue_of(organ)
     picture = read_picture(image)
     calibration, warnings = read_calibration(options, picture)
-    found, bank, look, assumed = twins_of(picture, calibration, options, shown(image), frames, seed, progress)
+    found, bank, look, assumed = twins_of(picture, calibration, options, shown(image), frames, seed, progress, organ)
     spots = all_spots(bank)
     return TwinResult(
         image.name, picture, found, bank, spots, look, assumed, warnings, time.process_time() - started
@@ -151,6 +174,7 @@ def twins_of(
     frames: int | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    organ: str | None = None,
 ) -> tuple[list[SpotTwins], list[BankFrame], Look, list[Assumption]]:
     """Measure twins of a picture's usable highlights (see `twin_picture`); return them, the bank, look and priors."""
 
@@ -172,10 +196,11 @@ def twins_of(
     look = look_of(picture, view.seen)
     peaks: Array = np.array([spot.peak_px for spot in spots])
     count = frames_for(picture.shape[0] * picture.shape[1]) if frames is None else frames
-    subject = Subject(SceneDraws(known, look), peaks, view.seen, picture.ndim == 2)
+    tissue = tissue_of(organ)
+    subject = Subject(SceneDraws(known, look, tissue), peaks, view.seen, picture.ndim == 2)
     bank = make_bank([subject], reconstructs, count, seed, progress)
     matched = match_spots(spots, all_spots(bank), name, count)
-    return matched, bank, look, [*choices.assumed, *DRAWN]
+    return matched, bank, look, [*choices.assumed, *_drawn(organ, tissue)]
 
 
 def match_spots(

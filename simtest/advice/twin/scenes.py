@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from simtest.advice.twin.patches import TissuePatch, look_at
+from simtest.advice.twin.tissue import ANY, Tissue, between
 from simtest.calibration import Calibration, CameraPrior, Distribution, LogUniform, Uniform
 from simtest.errors import InputError
 from simtest.geometry import Camera
@@ -81,10 +82,12 @@ class SceneDraws:
         What the user told; each draw has lights, distances and a camera from its priors.
     look : Look
         Of the frame.
+    tissue : Tissue
+        Of the organ, where it was told.
     """
 
-    def __init__(self, calibration: Calibration, look: Look) -> None:
-        self._calibration, self._look = calibration, look
+    def __init__(self, calibration: Calibration, look: Look, tissue: Tissue = ANY) -> None:
+        self._calibration, self._look, self.tissue = calibration, look, tissue
         self._base = read_toml(find(look.organ, "scenes"))
 
     def draw(self, rng: np.random.Generator, patch: TissuePatch, pixels: Array, share: float) -> Scene | None:
@@ -120,8 +123,8 @@ class SceneDraws:
     def _film(self, rng: np.random.Generator) -> dict[str, float]:
         """Draw the liquid film: its lobe, and how far it fills the valleys."""
         film = dict(self._base["reflectance"]["film"])
-        film["alpha"] = math.exp(rng.uniform(math.log(0.018), math.log(0.05)))
-        film["level"] = float(rng.uniform(-2.0, 0.3))
+        film["alpha"] = between(rng, self.tissue.alpha)
+        film["level"] = float(rng.uniform(*self.tissue.level))
         return film
 
     def _rig(self, rng: np.random.Generator) -> dict[str, Any]:

@@ -87,6 +87,8 @@ class ScoredSpot:
         Angle to the base's normal at the same point.
     held : bool or None
         Whether the stated 95 % region holds the normal that the estimate states; None where nothing is stated.
+    distance_mm : float
+        Of the surface along the sightline; NaN where that meets none.
     """
 
     spot: Spot
@@ -94,6 +96,7 @@ class ScoredSpot:
     error_deg: float
     base_error_deg: float
     held: bool | None
+    distance_mm: float = math.nan
 
     @property
     def is_near_miss(self) -> bool:
@@ -158,7 +161,8 @@ def score(session: Session, view: RenderedView, made: Reconstruction) -> list[Sc
         else:
             continue
         kind: SpotKind = "glint" if i in matched else "near_miss" if shown[i] else "false"
-        scored.append(_scored(spot, kind, fine, base))
+        distance = math.nan if at_look is None else float(at_look.distance[i])
+        scored.append(_scored(spot, kind, fine, base, distance))
     return scored
 
 
@@ -170,12 +174,12 @@ def _shown(found: Sequence[Specularity], peaks_px: Sequence[Array]) -> list[bool
     return [i in enclosed or near[i] for i in range(len(found))]
 
 
-def _scored(spot: Spot, kind: SpotKind, fine: Array, base: Array) -> ScoredSpot:
+def _scored(spot: Spot, kind: SpotKind, fine: Array, base: Array, distance_mm: float) -> ScoredSpot:
     estimate = spot.estimate
-    distance = mahalanobis2(estimate, fine if estimate.target == "fine" else base)
-    held = None if distance is None else bool(distance <= chi_squared.quantile(0.95, 2))
+    squared = mahalanobis2(estimate, fine if estimate.target == "fine" else base)
+    held = None if squared is None else bool(squared <= chi_squared.quantile(0.95, 2))
     to_fine, to_base = (float(angle_deg(estimate.normal, normal)) for normal in (fine, base))
-    return ScoredSpot(spot, kind, to_fine, to_base, held)
+    return ScoredSpot(spot, kind, to_fine, to_base, held, distance_mm)
 
 
 def _radius_px(specularity: Specularity, highlight: Highlight | None) -> float:

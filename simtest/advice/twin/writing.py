@@ -15,7 +15,7 @@ FILES = ("twin.json", "twin.csv", "index.html")
 COLUMNS = (
     "specularity", "x_px", "y_px", "radius_px", "estimator", "stated_deg", "twin_rms_deg", "twin_low_deg",
     "twin_high_deg", "twin_p95_deg", "coverage", "near_misses", "false", "glint_rms_deg", "near_rms_deg",
-    "base_rms_deg", "base_low_deg", "base_high_deg", "twins", "unlikeness", "covered",
+    "base_rms_deg", "base_low_deg", "base_high_deg", "near_mm", "median_mm", "far_mm", "twins", "unlikeness", "covered",
 )  # fmt: skip
 
 
@@ -53,6 +53,7 @@ def to_json(result: TwinResult, command: str = "") -> JsonObject:
         "twin_rms_deg": result.rms_deg(),
         "twin_base_rms_deg": result.rms_deg("base_rms_deg"),
         "coverage": result.coverage,
+        "twin_distance_mm": [_finite(each) for each in result.distance_mm],
         "specularities": [_spot_json(each) for each in result.spots],
         "provenance": provenance.environment(),
     }
@@ -85,6 +86,7 @@ def twins_json(twins: Twins) -> JsonObject:
         "near_rms_deg": _finite(twins.near_rms_deg),
         "base_rms_deg": twins.base_rms_deg,
         "base_interval_deg": twins.base_interval_deg,
+        "distance_mm": [_finite(each) for each in twins.distance_mm],
         "effective": twins.effective,
         "unlikeness": twins.unlikeness,
         "covered": twins.is_covered,
@@ -103,5 +105,5 @@ def _row(each: SpotTwins) -> tuple[object, ...]:
         spot.index, round(x, 3), round(y, 3), spot.radius_px, spot.estimator, each.stated_deg, twins.rms_deg,
         *twins.interval_deg, twins.p95_deg, twins.coverage, twins.near_misses, twins.false,
         _finite(twins.glint_rms_deg), _finite(twins.near_rms_deg), twins.base_rms_deg, *twins.base_interval_deg,
-        twins.effective, twins.unlikeness, int(twins.is_covered),
+        *(_finite(each) for each in twins.distance_mm), twins.effective, twins.unlikeness, int(twins.is_covered),
     )  # fmt: skip

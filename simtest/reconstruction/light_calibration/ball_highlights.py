@@ -109,7 +109,7 @@ def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px
         region = _region(smooth > level, row, column) & inside
         claimed |= region
         single = _measured(values, region, level, noise, corner, peaks, smooth, widest_px)
-        found.append(single if spots is None else replace(single, width_px=spots.width_px))
+        found.append(single if spots is None else _of_one_spot(single, spots, corner))
     return found
 
 
@@ -119,6 +119,15 @@ def _separated(values: Array, blob: Mask, window: Mask, noise: float, base: floa
         return None
     spots = separate(values, window, noise, base)
     return spots if spots is not None and 2 * spots.width_px < widest_px else None
+
+
+def _of_one_spot(single: MeasuredHighlight, spots: Spots, corner: Array) -> MeasuredHighlight:
+    """Return a highlight with the centre of the spot that was fitted to it.
+
+    The pixels above half height are few on a small spot, and which ones they are moves their centroid.
+    """
+    covariance = spots.covariances[0] + CENTRE_FLOOR_PX**2 * np.eye(2)
+    return replace(single, pixel=spots.centres[0] + corner, covariance=covariance, width_px=spots.width_px)
 
 
 def _widened(mask: Mask) -> Mask:
