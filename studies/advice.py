@@ -82,14 +82,14 @@ def compare(record: dict[str, Any], asked: Asked, again: list[Asked]) -> None:
 
 
 def _compared(told: MeanError, measured: MeanError) -> dict[str, Any]:
-    """Return the prediction over the validation with its 95 % interval, from the relative widths of both."""
+    """Return the prediction over the validation with its 95 % interval, from the widths of both logarithms."""
     if told.mean_deg is None or measured.mean_deg is None:
         return {"ratio": None, "ratio_interval": (None, None), "agrees": None}
     ratio = told.mean_deg / measured.mean_deg
     widths = [told.reach, measured.reach]
     interval: tuple[float | None, float | None] = (None, None)
     if None not in widths:
-        factor = math.exp(math.hypot(*[width for width in widths if width is not None]))
+        factor = math.exp(math.hypot(*[math.log1p(width) for width in widths if width is not None]))
         interval = ratio / factor, ratio * factor
     return {"ratio": ratio, "ratio_interval": interval, "agrees": abs(ratio - 1) <= AGREES}
 
