@@ -49,7 +49,7 @@ def ask(name: str, rig: dict[str, Any], out: Path, frames: int | None, seed: int
     """Render the frames of one rig's advice; return their rows and number."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"{name}.toml"
-    tables = {key: rig[key] for key in ("camera", "rig", "sensor", "relief") if key in rig}
+    tables: dict[str, Any] = {key: rig[key] for key in ("camera", "rig", "sensor", "relief") if key in rig}
     file.write_text(toml_tables(tables), encoding="utf-8")
     near, far = rig["distances_mm"]
     question = Question(read_scope(str(file)), rig["organ"], (near, far), frames=frames, seed=seed)
@@ -82,14 +82,14 @@ def compare(record: dict[str, Any], asked: Asked, again: list[Asked]) -> None:
 
 
 def _compared(told: MeanError, measured: MeanError) -> dict[str, Any]:
-    """Return the prediction over the validation with its 95 % interval, from the relative widths of both."""
+    """Return the prediction over the validation with its 95 % interval, from the widths of both logarithms."""
     if told.mean_deg is None or measured.mean_deg is None:
         return {"ratio": None, "ratio_interval": (None, None), "agrees": None}
     ratio = told.mean_deg / measured.mean_deg
     widths = [told.reach, measured.reach]
     interval: tuple[float | None, float | None] = (None, None)
     if None not in widths:
-        factor = math.exp(math.hypot(*[width for width in widths if width is not None]))
+        factor = math.exp(math.hypot(*[math.log1p(width) for width in widths if width is not None]))
         interval = ratio / factor, ratio * factor
     return {"ratio": ratio, "ratio_interval": interval, "agrees": abs(ratio - 1) <= AGREES}
 

@@ -192,7 +192,8 @@ def mean_error(answered: pl.DataFrame, column: str, frames: int | None = None) -
     if not len(values):
         return MeanError(None, (None, None), 0, 0)
     strata, numbers = units(rows)
-    totals, counts = np.bincount(numbers, values), np.bincount(numbers).astype(float)
+    counts: Array = np.bincount(numbers).astype(np.float64)
+    totals: Array = np.asarray(np.bincount(numbers, values), dtype=np.float64)
     own = np.zeros(len(counts), dtype=np.int64)
     own[numbers] = strata
     return MeanError(float(np.mean(values)), ratio_interval(totals, counts, own, frames), len(values), len(counts))

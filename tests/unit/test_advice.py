@@ -10,23 +10,26 @@ import polars as pl
 import pytest
 
 import simtest
+from simtest.advice import draws
 from simtest.advice.advise import BREAKS, MAIN, RUN, advise, write_scene
 from simtest.advice.break_points import break_experiment, break_points, spot_size
+from simtest.advice.draws import drawn_values
 from simtest.advice.figures import mean_error, ratio_interval, read_results
 from simtest.advice.organs import ORGANS, Surroundings, wall
-from simtest.advice.page import sentence, write_advice
+from simtest.advice.page import narrower, sentence, write_advice
 from simtest.advice.plan import (
     DISTANCES,
     Question,
     affordable,
     distances_of,
-    drawn_values,
     main_experiment,
     surroundings,
     write_experiment,
 )
 from simtest.advice.scope import SCOPES, read_scope
 from simtest.errors import InputError
+from simtest.rendering.placement_checks import check_camera, check_lights
+from simtest.surfaces import make_surface
 from simtest.validation import laws
 from simtest.validation.cases import RELIEF_SEED
 from simtest.validation.paired import half_width
@@ -150,7 +153,7 @@ def test_the_plan_is_a_file_that_reads_back_as_the_same_experiment(tmp_path, org
 def test_drawn_values_fill_their_ranges_evenly_at_each_distance():
     question = Question(read_scope("laparoscope"), "liver", (20.0, 60.0), frames=40, seed=3)
     around = surroundings(question)
-    values = drawn_values(question, around)
+    values = drawn_values(around, 3, 5, DISTANCES)
     assert values.keys() == {*around.random, RELIEF_SEED}
     for key, (low, high) in around.random.items():
         shares = (np.array(values[key]).reshape(5, DISTANCES) - low) / (high - low)
@@ -162,22 +165,49 @@ def test_drawn_values_fill_their_ranges_evenly_at_each_distance():
     seeds = np.array(values[RELIEF_SEED]).reshape(5, DISTANCES)
     assert all(len(np.unique(column)) == 5 for column in seeds.T)
     # The same again, and others with another seed.
-    assert drawn_values(question, around) == values
-    other = drawn_values(replace(question, seed=4), around)
+    assert drawn_values(around, 3, 5, DISTANCES) == values
+    other = drawn_values(around, 4, 5, DISTANCES)
     assert all(not set(values[key]) & set(other[key]) for key in values)
 
 
 def test_a_hypercube_is_as_wide_as_independent_draws_and_its_means_vary_less():
     """alpha about 1e-6: 300 means of 8 uniform numbers; those of independent draws have a variance of 1/96."""
-    question = Question(read_scope("laparoscope"), "liver", (20.0, 60.0), frames=8 * DISTANCES)
     around = Surroundings({"surface": {}}, {"a": (0.0, 1.0)})
-    drawn = np.array([drawn_values(replace(question, seed=seed), around)["a"] for seed in range(300)])
+    drawn = np.array([drawn_values(around, seed, 8, DISTANCES)["a"] for seed in range(300)])
     assert drawn.mean() == pytest.approx(0.5, abs=0.002)
     assert drawn.var() == pytest.approx(1 / 12, rel=0.02)
     first = drawn.reshape(300, 8, DISTANCES)[:, :, 0].mean(axis=1)
     assert first.var() < 0.1 / 96
     # Negative control: numbers of different frames at one distance are no fixed grid.
     assert len(np.unique(drawn)) == drawn.size
+
+
+def test_every_wall_leaves_camera_and_lights_in_free_space():
+    """Of the drawn walls of a colon some hold the camera or touch a light; they are drawn anew, the others stay."""
+    question = Question(read_scope("colonoscope_2"), "colon", (20.0, 60.0), frames=160, seed=0)
+    around = surroundings(question)
+    drawn = drawn_values(around, 0, 20, DISTANCES)
+    planned = main_experiment(question)
+    pool = planned.groups[0].pool[0]
+    changed = [i for i in range(160) if any(drawn[key][i] != pool[key][i] for key in drawn)]
+    assert 0 < len(changed) < 40
+    for case in simtest.validation.cases.expand(planned)[:: 1 if len(changed) > 20 else 4]:
+        scene, _ = case.scene(planned, case.numbers()[0])
+        surface = make_surface(scene.surface.model_copy(update={"relief": None}))
+        check_camera(scene, surface)
+        check_lights(scene, surface)
+    # What is drawn anew lies within the ends.
+    for key, (low, high) in around.random.items():
+        assert all(low <= pool[key][i] <= high for i in changed)
+
+
+def test_a_distance_without_room_is_refused(monkeypatch):
+    monkeypatch.setattr(draws, "TRIES", 3)
+    far = [(0.0, 4000.0, 0.0), (0.0, -4000.0, 0.0), (4000.0, 0.0, 0.0), (-4000.0, 0.0, 0.0)]
+    question = Question(read_scope("laparoscope", lights_mm=far), "plane", (20.0, 60.0), frames=16)
+    with pytest.raises(InputError, match=r"--distances: at .* mm no wall") as error:
+        main_experiment(question)
+    assert "\n" not in str(error.value)
 
 
 def test_a_flat_phantom_is_a_plane():
@@ -328,7 +358,7 @@ def test_intervals_of_few_frames():
 
 
 @pytest.mark.parametrize(
-    ("high", "said"), [(1.1, None), (1.29, "--frames 32"), (2.49, "--frames 792"), (30.0, "more frames")]
+    ("high", "said"), [(1.1, None), (1.29, "32 frames"), (2.49, "344 frames"), (200.0, "more frames")]
 )
 def test_a_wide_interval_names_the_frames_that_narrow_it(high, said):
     found = read_results(results([1.0, 1.2, 0.8, 1.0], [0, 1, 2, 3]), 8)
@@ -338,6 +368,12 @@ def test_a_wide_interval_names_the_frames_that_narrow_it(high, said):
     text = sentence(advised, found.choices[0])
     assert ("wide" in text) == (said is not None)
     assert said is None or said in text
+    if said is not None and said != "more frames":
+        number = said.split()[0]
+        for command in ("simtest advise laparoscope --out 'a b'", "simtest advise laparoscope --frames 8 --out 'a b'"):
+            assert narrower(advised, command) == f"simtest advise laparoscope --out 'a b' --frames {number}"
+    else:
+        assert narrower(advised, "simtest advise laparoscope --out a") is None
 
 
 @pytest.mark.render
