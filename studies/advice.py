@@ -19,8 +19,8 @@ from typing import Any
 import polars as pl
 
 from simtest.advice.advise import MAIN
-from simtest.advice.figures import Found, MeanError, read_results
-from simtest.advice.plan import Question, main_experiment, write_experiment
+from simtest.advice.figures import MeanError, read_results
+from simtest.advice.plan import DISTANCES, Question, main_experiment, write_experiment
 from simtest.advice.scope import read_scope
 from simtest.runtime.files import write_json
 from simtest.spec.toml_files import read_toml, toml_tables
@@ -35,77 +35,63 @@ SEED = 1
 AGAIN_SEED = 20261123
 """Seed of the first block of the validations; those of further ones follow."""
 
-BLOCK = 48
+BLOCK = 32
 """Frames of a block."""
+
+Asked = tuple[pl.DataFrame, int]
+"""Rows of results, and the frames that they are of."""
 
 NUMBERS = 1_000_000
 """Frames of different blocks have numbers so far apart."""
 
 
-def ask(name: str, rig: dict[str, Any], out: Path, frames: int | None, seed: int) -> pl.DataFrame:
-    """Render the frames of one rig's advice; return their rows."""
+def ask(name: str, rig: dict[str, Any], out: Path, frames: int | None, seed: int) -> Asked:
+    """Render the frames of one rig's advice; return their rows and number."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"{name}.toml"
-    tables = {key: rig[key] for key in ("camera", "rig", "sensor", "relief") if key in rig}
+    tables: dict[str, Any] = {key: rig[key] for key in ("camera", "rig", "sensor", "relief") if key in rig}
     file.write_text(toml_tables(tables), encoding="utf-8")
     near, far = rig["distances_mm"]
     question = Question(read_scope(str(file)), rig["organ"], (near, far), frames=frames, seed=seed)
     planned = write_experiment(main_experiment(question), out / MAIN)
-    return run_experiment(planned, out / "run").results
+    return run_experiment(planned, out / "run").results, question.per_distance * DISTANCES
 
 
-def validate(one: Callable[[Path, int, int], pl.DataFrame], out: Path, block: int) -> pl.DataFrame:
-    """Ask about a rig (`ask`) again with the seed of a block; return the rows."""
-    rows = one(out / f"again_{block}", BLOCK, AGAIN_SEED + block)
-    return rows.with_columns(pl.col("realisation") + NUMBERS * block)
-
-
-def timed(record: dict[str, Any], key: str, run: Callable[[], pl.DataFrame]) -> pl.DataFrame:
-    """Return the rows of a run; keep in the record the processor time that it took when it was rendered."""
+def timed(record: dict[str, Any], key: str, run: Callable[[], Asked]) -> Asked:
+    """Return what a run gives; keep in the record the processor time that it took when it was rendered."""
     clock = time.process_time()
-    rows = run()
+    made = run()
     record["process_time_s"].setdefault(key, round(time.process_time() - clock, 1))
-    return rows
+    return made
 
 
-def compare(record: dict[str, Any], asked: pl.DataFrame, again: list[pl.DataFrame]) -> None:
+def compare(record: dict[str, Any], asked: Asked, again: list[Asked]) -> None:
     """Write into a rig's record both figures of the best methods."""
-    answer, seen = _read(asked), _read(pl.concat(again)) if again else None
-    record["frames"] = {"predicted": answer.frames, "validated": 0 if seen is None else seen.frames}
+    blocks = [rows.with_columns(pl.col("realisation") + NUMBERS * block) for block, (rows, _) in enumerate(again)]
+    answer, seen = read_results(*asked), read_results(pl.concat(blocks), sum(frames for _, frames in again))
+    record["frames"] = {"predicted": answer.frames, "validated": seen.frames}
     record["figures"] = []
     for choice in answer.choices:
         if choice.best is None:
             continue
-        told = answer.method(choice.best).own
-        measured = MeanError(None, (None, None), 0, 0) if seen is None else seen.method(choice.best).own
+        told, measured = answer.method(choice.best).own, seen.method(choice.best).own
         record["figures"].append({
             "target": choice.target, "method": choice.best, "predicted": vars(told), "validated": vars(measured),
             **_compared(told, measured),
         })  # fmt: skip
 
 
-def _read(rows: pl.DataFrame) -> Found:
-    """Read rows; frames without any highlight have none, so the count is that of the frames with some."""
-    return read_results(rows, rows.select("surface.distance_mm", "realisation").n_unique())
-
-
 def _compared(told: MeanError, measured: MeanError) -> dict[str, Any]:
-    """Return the prediction over the validation with its 95 % interval, from the relative widths of both."""
+    """Return the prediction over the validation with its 95 % interval, from the widths of both logarithms."""
     if told.mean_deg is None or measured.mean_deg is None:
         return {"ratio": None, "ratio_interval": (None, None), "agrees": None}
     ratio = told.mean_deg / measured.mean_deg
-    widths = [_relative_width(each) for each in (told, measured)]
+    widths = [told.reach, measured.reach]
     interval: tuple[float | None, float | None] = (None, None)
     if None not in widths:
-        factor = math.exp(math.hypot(*[width for width in widths if width is not None]))
+        factor = math.exp(math.hypot(*[math.log1p(width) for width in widths if width is not None]))
         interval = ratio / factor, ratio * factor
     return {"ratio": ratio, "ratio_interval": interval, "agrees": abs(ratio - 1) <= AGREES}
-
-
-def _relative_width(figure: MeanError) -> float | None:
-    """Return half of an interval over its mean."""
-    high = figure.interval_deg[1]
-    return None if high is None or not figure.mean_deg else high / figure.mean_deg - 1
 
 
 def main() -> None:
@@ -126,7 +112,10 @@ def main() -> None:
             record = done.setdefault(name, {"process_time_s": {}})
             one = partial(ask, name, rigs[name])
             rows = timed(record, "predicted", partial(one, told.out / name, told.frames, SEED))
-            again = [timed(record, f"again_{b}", partial(validate, one, told.out / name, b)) for b in range(blocks)]
+            again = [
+                timed(record, f"again_{b}", partial(one, told.out / name / f"again_{b}", BLOCK, AGAIN_SEED + b))
+                for b in range(blocks)
+            ]
             compare(record, rows, again)
             write_json(file, done)
             print(_text(name, record), flush=True)

@@ -1,8 +1,9 @@
 """What the results of an advice's frames say: each method's error and answers, the best one, and its budget.
 
-Frames, not highlights, are the independent units, and the distances are strata (`simtest.validation.paired`).
+Frames, not highlights, are the independent units, and the distances are strata.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -10,17 +11,21 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest.runtime.arrays import Array
+from simtest.geometry import student_t
+from simtest.runtime.arrays import Array, IntArray
 from simtest.validation.guide import Advice, MethodFigures, advice_of
 from simtest.validation.paired import FRAME, distinct_frames, half_width, side_by_side, targets_of, units
 from simtest.validation.situations import Situation
-from simtest.validation.statistics import Interval
+from simtest.validation.statistics import CONFIDENCE, Interval
 
 WIDE = 0.15
 """An interval that reaches farther from its mean than this share of it is called wide."""
 
 LEAST_PART_DEG = 1e-6
 """A part of the budget below this is rounding."""
+
+MOST_FACTOR = 10.0
+"""Of the logarithm of an interval's end over the mean, so that two or three frames give finite numbers."""
 
 STRATUM = "surface.distance_mm"
 
@@ -35,12 +40,15 @@ class MeanError:
     frames: int
 
     @property
+    def reach(self) -> float | None:
+        """How far the interval reaches above the mean, as a share of it; None without an interval."""
+        high = self.interval_deg[1]
+        return None if not self.mean_deg or high is None else high / self.mean_deg - 1
+
+    @property
     def is_wide(self) -> bool:
         """Whether the interval is too wide to tell a difference of 15 %."""
-        low, high = self.interval_deg
-        if self.mean_deg is None or low is None or high is None:
-            return True
-        return high - self.mean_deg > WIDE * self.mean_deg
+        return self.reach is None or self.reach > WIDE
 
 
 @dataclass(frozen=True)
@@ -132,7 +140,8 @@ def read_results(results: pl.DataFrame, frames: int) -> Found:
     targets = targets_of(rows)
     single = next((name for name, target in targets.items() if target == "fine"), None)
     visible, found, detections, false = _counted(rows.filter(pl.col("estimator") == single))
-    methods = [_answers(name, target, rows) for name, target in targets.items()]
+    each = frames // max(rows["setting"].n_unique(), 1)
+    methods = [_answers(name, target, rows, each) for name, target in targets.items()]
     return Found(frames, visible, found, detections, false, methods, _choices(rows))
 
 
@@ -159,7 +168,7 @@ def _asked(rows: pl.DataFrame, target: str) -> pl.DataFrame:
     return true.filter(pl.col("specularity").is_not_null()) if target == "fine" else true
 
 
-def _answers(name: str, target: str, rows: pl.DataFrame) -> MethodAnswers:
+def _answers(name: str, target: str, rows: pl.DataFrame, frames: int) -> MethodAnswers:
     own = _asked(rows.filter(pl.col("estimator") == name), target)
     answered = own.filter(pl.col("status") == "ok")
     missed = own.filter(pl.col("status") == "missed").height
@@ -168,20 +177,73 @@ def _answers(name: str, target: str, rows: pl.DataFrame) -> MethodAnswers:
     budget = {name.removeprefix("budget_").removesuffix("_deg"): value for name, value in told.items()}
     return MethodAnswers(
         name, target, own.height, answered.height, own.height - answered.height - missed, missed,
-        mean_error(answered, "error_fine_deg"), mean_error(answered, "error_base_deg"), _stated(answered), budget,
+        mean_error(answered, "error_fine_deg", frames), mean_error(answered, "error_base_deg", frames),
+        _stated(answered), budget,
     )  # fmt: skip
 
 
-def mean_error(answered: pl.DataFrame, column: str) -> MeanError:
-    """Return the mean of a column of errors, deg, with the interval that its frames' spread gives."""
+def mean_error(answered: pl.DataFrame, column: str, frames: int | None = None) -> MeanError:
+    """Return the mean of a column of errors, deg, with the interval that its frames' spread gives.
+
+    `frames` is how many there are at each distance, those without an answer too; default those with one.
+    """
     rows = answered.drop_nulls(column)
     values = rows[column].to_numpy()
-    count = rows.select(FRAME).n_unique()
     if not len(values):
         return MeanError(None, (None, None), 0, 0)
-    mean, half = float(np.mean(values)), half_width(values, *units(rows))
-    interval: Interval = (None, None) if half is None else (max(mean - half, 0.0), mean + half)
-    return MeanError(mean, interval, len(values), count)
+    strata, numbers = units(rows)
+    counts: Array = np.bincount(numbers).astype(np.float64)
+    totals: Array = np.asarray(np.bincount(numbers, values), dtype=np.float64)
+    own = np.zeros(len(counts), dtype=np.int64)
+    own[numbers] = strata
+    return MeanError(float(np.mean(values)), ratio_interval(totals, counts, own, frames), len(values), len(counts))
+
+
+def ratio_interval(totals: Array, counts: Array, strata: IntArray, frames: int | None = None) -> Interval:
+    """Compute the 95 % interval of the mean of all values: the sum of totals over the sum of counts.
+
+    The jackknife of a ratio leaves out one frame of a stratum at a time, and the others of the stratum weigh more
+    instead [Rao and Wu, J. Am. Stat. Assoc. 83, 1988, 231]. So the interval holds where the number of values varies
+    from frame to frame, and where a frame with many of them draws the mean to its own. Errors are positive and skewed:
+    the interval is that of the mean's logarithm.
+
+    Parameters
+    ----------
+    totals, counts : ndarray, shape (F,)
+        Sum and number of the values of each frame that has any.
+    strata : ndarray of int, shape (F,)
+        Number of the stratum of each, from 0.
+    frames : int, optional
+        Frames of each stratum, those without values too; default those with some.
+
+    Returns
+    -------
+    (float or None, float or None)
+        None for a single frame, or a mean of 0.
+    """
+    kinds = len(np.unique(strata))
+    if len(totals) < 2 * kinds:
+        # Too few to see the spread within strata: that between them is added.
+        frames = None if frames is None else frames * kinds
+        strata, kinds = np.zeros_like(strata), 1
+    freedom, mean = len(totals) - kinds, float(totals.sum() / counts.sum())
+    if not freedom or not mean:
+        return None, None
+    empty = np.maximum((frames or 0) - np.bincount(strata), 0)
+    strata = np.concatenate([strata, np.repeat(np.arange(len(empty)), empty)])
+    size = np.bincount(strata)[strata]
+    off = _without_each(totals, strata) / _without_each(counts, strata) - mean
+    deviation = math.sqrt(float(np.sum((1 - 1 / size) * off**2)))
+    factor = math.exp(min(student_t.quantile((1 + CONFIDENCE) / 2, freedom) * deviation / mean, MOST_FACTOR))
+    return mean / factor, mean * factor
+
+
+def _without_each(values: Array, strata: IntArray) -> Array:
+    """Return the sum of all values without each one; the others of its stratum weigh more. Missing values are 0."""
+    values = np.concatenate([values, np.zeros(len(strata) - len(values))])
+    size, own = np.bincount(strata)[strata], np.bincount(strata, values)[strata]
+    # A value that is alone in its stratum stays: it shows no spread.
+    return np.asarray(values.sum() + np.where(size > 1, (own - size * values) / np.maximum(size - 1, 1), 0.0))
 
 
 def _root_mean_square(rows: pl.DataFrame, column: str) -> float | None:

@@ -1,11 +1,14 @@
 """Writes an advice: advice.json, a figure as PNG, and one HTML file that needs nothing else."""
 
+import math
+import shlex
 from pathlib import Path
 
 import numpy as np
 
 from simtest.advice.advise import Advised
-from simtest.advice.figures import Choice
+from simtest.advice.figures import WIDE, Choice
+from simtest.advice.plan import DISTANCES, MOST_ASKED
 from simtest.pages import chart_png, chart_web, pixels
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Chart, Mark, Panel
@@ -44,6 +47,7 @@ def write_advice(found: Advised, out: Path, command: str = "") -> Path:
     html = environment().get_template("advice.html.j2").render(
         found=found, answers=[sentence(found, choice) for choice in found.found.choices] or [NOTHING],
         chart=chart, picture=pixels.data_address(found.picture, PICTURE_HEIGHT_PX), command=command,
+        narrower=narrower(found, command),
         interval=interval, surfaces=_SURFACES,
         parts=list(dict.fromkeys(name for each in found.found.methods for name in each.budget_deg)),
         provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"], "python": made_by["python"]},
@@ -68,8 +72,42 @@ def sentence(found: Advised, choice: Choice) -> str:
     if choice.ties:
         text += f" It cannot be told from {', '.join(choice.ties)}."
     if method.own.is_wide:
-        text += " The interval is wide: more frames (--frames) make it narrower."
+        text += f" The interval is wide: {_remedy(found, choice)}"
     return text
+
+
+def _remedy(found: Advised, choice: Choice) -> str:
+    """Return what makes the interval of a choice's error narrower."""
+    frames = frames_for(found, choice)
+    if frames is None or choice.best is None:
+        return "more frames (--frames) make it narrower."
+    reach = 100 * (found.found.method(choice.best).own.reach or 0.0)
+    return f"it reaches {reach:.0f} % from the mean; {frames} frames would narrow it to about {100 * WIDE:.0f} %."
+
+
+def narrower(found: Advised, command: str) -> str | None:
+    """Return the command with the frames that narrow the first interval that is too wide; None where there is none."""
+    frames = next((frames for choice in found.found.choices if (frames := frames_for(found, choice))), None)
+    if frames is None or not command:
+        return None
+    words = shlex.split(command)
+    if "--frames" in words[:-1]:
+        at = words.index("--frames")
+        del words[at : at + 2]
+    return shlex.join([*(word for word in words if not word.startswith("--frames=")), "--frames", str(frames)])
+
+
+def frames_for(found: Advised, choice: Choice) -> int | None:
+    """Return about how many frames narrow the interval of a choice's error to `WIDE`.
+
+    The width of the mean's logarithm falls with the root of the number. None where the interval is narrow enough or
+    unknown, or where so many frames are not allowed.
+    """
+    reach = None if choice.best is None else found.found.method(choice.best).own.reach
+    if reach is None or reach <= WIDE:
+        return None
+    needed = math.ceil(found.found.frames * (math.log1p(reach) / math.log1p(WIDE)) ** 2 / DISTANCES) * DISTANCES
+    return needed if needed <= MOST_ASKED else None
 
 
 def interval(ends: Interval) -> str:

@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from simtest.advice.draws import drawn_values, in_free_space
 from simtest.advice.organs import ORGANS, Organ, Surroundings, rough, wall
 from simtest.advice.scope import Interval, Scope
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
 from simtest.runtime.files import write_atomically
 from simtest.runtime.resources import shown, suggestion
-from simtest.runtime.seeds import Stage, generator
-from simtest.spec import Experiment, load_experiment
+from simtest.spec import Experiment, load_experiment, load_scene
 from simtest.spec.toml_files import toml_value
-from simtest.validation.cases import RELIEF_SEED
 
 ESTIMATORS = ("curved", "cone_axis", "brightest_point", "bisector", "cloud")
 
@@ -26,8 +25,12 @@ DISTANCES = 8
 """Distances at which the wall stands: the middles of so many equal parts of the range."""
 
 LEAST_FRAMES, MOST_FRAMES = 32, 128
+"""Of the default number of frames."""
 
-BUDGET_S, FRAME_S, MEGAPIXEL_S = 150.0, 0.6, 5.0
+MOST_ASKED = 10_000
+"""Frames that may be asked for."""
+
+BUDGET_S, FRAME_S, MEGAPIXEL_S = 110.0, 0.6, 5.0
 """Processor time of the frames, and of one: about so much, and so much more for each million pixels."""
 
 FIRST_VIEWPOINT = 1000
@@ -100,8 +103,8 @@ class Question:
         check_integer("--seed", self.seed, 0, MOST_SEED)
         if self.bound_deg > MOST_BOUND_DEG:
             raise InputError(f"--bound {self.bound_deg:g}: must be at most {MOST_BOUND_DEG:g} deg")
-        if self.frames is not None and not DISTANCES <= self.frames <= 10_000:
-            raise InputError(f"--frames {self.frames}: must be {DISTANCES} to 10000")
+        if self.frames is not None and not DISTANCES <= self.frames <= MOST_ASKED:
+            raise InputError(f"--frames {self.frames}: must be {DISTANCES} to {MOST_ASKED}")
 
     @property
     def kind(self) -> Organ:
@@ -164,41 +167,25 @@ def surroundings(question: Question) -> Surroundings:
 def main_experiment(question: Question) -> Experiment:
     """Return the experiment whose results are the expected errors; its name is that of its file."""
     around, frames = surroundings(question), question.per_distance * DISTANCES
+    told = seen_through(question)
     pool: dict[str, Any] = {"surface.viewpoint": list(range(FIRST_VIEWPOINT, FIRST_VIEWPOINT + frames))}
+    values = drawn_values(around, question.seed, question.per_distance, DISTANCES)
     if question.mesh is None:
         # Each distance once, then all again.
-        pool = {"surface.distance_mm": distances_of(question) * question.per_distance}
+        distances = distances_of(question) * question.per_distance
+        scene = load_scene(question.kind.scene, {**around.set, **told})
+        values = in_free_space(values, scene, distances, around.random, question.seed)
+        pool = {"surface.distance_mm": distances}
     group = {
         "scene": question.kind.scene, "label": question.mesh.stem if question.mesh else question.organ,
         # Whatever is found gets an answer, not isolated highlights alone.
         "isolated": False,
-        "set": {**around.set, **seen_through(question)}, "pool": [pool | drawn_values(question, around)],
+        "set": {**around.set, **told}, "pool": [pool | values],
     }  # fmt: skip
     return Experiment.model_validate({
         "name": "experiment", "title": f"Advice: {question.title}", "realisations": 1, "seed": question.seed,
         "estimators": estimators_of(question.scope), "groups": [group],
     })  # fmt: skip
-
-
-def drawn_values(question: Question, around: Surroundings) -> dict[str, list[float]]:
-    """Return the drawn values of all frames by key path, in the order of `main_experiment`.
-
-    At each distance a value takes one number from each of as many equal parts of its range as there are frames: a Latin
-    hypercube [McKay, Beckman and Conover, Technometrics 21, 1979, 239], whose means vary less than those of independent
-    draws. Frames at one distance have reliefs of their own. Those of different distances that follow each other share
-    the noise that a relief is made of, but no wavelength, slope, form or pose: a noise takes as long as a small frame.
-    """
-    rng = generator(question.seed, "advice", "drawn", 0, Stage.SWEEP)
-    count = question.per_distance
-    values = {}
-    for key, (low, high) in around.random.items():
-        # Shape (frames at a distance, distances).
-        parts = rng.permuted(np.repeat(np.arange(count)[:, None], DISTANCES, axis=1), axis=0)
-        shares = (parts + rng.uniform(size=parts.shape)) / count
-        values[key] = [round(float(low + (high - low) * share), 9) for share in shares.ravel()]
-    if "relief" in around.set["surface"]:
-        values[RELIEF_SEED] = np.repeat(rng.integers(2**32, size=count), DISTANCES).tolist()
-    return values
 
 
 def seen_through(question: Question) -> dict[str, Any]:

@@ -61,8 +61,8 @@ def light(
 
     mirror = _mirror(ball_radius, ball_radius_sd, outlines, plate, (plate_sd, plate_tilt_sd))
     command = shlex.join(["simtest", *sys.argv[1:]])
-    made = calibrate_lights(picture_readers(pictures), load_calibration(camera), mirror, encoding, most)
     with exclusive_folder(out):
+        made = calibrate_lights(picture_readers(pictures), load_calibration(camera), mirror, encoding, most)
         files = write_calibration(made, out, command)
     if as_json:
         print_files(files, as_json, **result_json(made))

@@ -35,6 +35,7 @@ COMMANDS = {
     "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
     "bench": "Run the frozen benchmark, verify its certificates, make a table of them.",
     "dataset": "Make a labelled dataset for learning, check it, look at it.",
+    "train": "Train a network on a dataset.",
     "camera": "Show what a camera file means, or convert it to another program's format.",
     "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",
     "completion": "Print or install the completion of commands, options and names for a shell.",

@@ -4,8 +4,12 @@ It loads nothing before signals are answered, so that a stop in the first moment
 """
 
 import sys
+from typing import TYPE_CHECKING
 
 from simtest.cli.stopping import INTERRUPTED, TERMINATED, Termination
+
+if TYPE_CHECKING:
+    from cyclopts import MissingArgumentError
 
 NARROWEST = 20
 """Columns of a terminal; tables and help cannot be laid out in fewer."""
@@ -14,6 +18,9 @@ LONGEST = 900
 """Characters of a line; a longer one is cut."""
 
 BAD_USE = 2
+
+GOING_ON = ("validate", "advise", "dataset", "nightly", "bench")
+"""Commands that take up what a stopped run has finished."""
 
 
 def main() -> None:
@@ -28,7 +35,7 @@ def main() -> None:
         sys.exit(_run(stop))
 
 
-def _run(stop: Termination) -> int:
+def _run(stop: Termination) -> int:  # noqa: C901 - a branch for each way in which a command may end
     """Run the command and return its exit code."""
     from simtest.cli.manners import MANNERS, meant_flag, take_flags
 
@@ -36,7 +43,7 @@ def _run(stop: Termination) -> int:
     failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
     _answer_warnings(MANNERS.quiet, wants_traceback)
 
-    from cyclopts import CycloptsError, UnknownOptionError
+    from cyclopts import CycloptsError, MissingArgumentError, UnknownOptionError
 
     from simtest.cli.commands import APP
     from simtest.cli.options import gather_settings
@@ -63,12 +70,15 @@ def _run(stop: Termination) -> int:
         known = [name for argument in error.argument_collection for name in argument.names]
         word = error.token.keyword or error.token.value
         return _report(meant_flag(word, known) or str(error), BAD_USE)
+    except MissingArgumentError as error:
+        return _report(_missing(error), BAD_USE)
     except (CycloptsError, InputError) as error:
         return _report(str(error), BAD_USE)
     except SimtestError as error:
         return _report(str(error), failed)
     except KeyboardInterrupt as stopped:
-        kept = "what is finished is kept, and the same command goes on from there"
+        goes_on = sys.argv[1:2] and sys.argv[1] in GOING_ON
+        kept = "what is finished is kept, and the same command " + ("goes on from there" if goes_on else "begins anew")
         how = "terminated" if stop.came else "stopped"
         return _report(f"{how}; {str(stopped) or kept}", TERMINATED if stop.came else INTERRUPTED)
     except BrokenPipeError:
@@ -83,15 +93,37 @@ def _run(stop: Termination) -> int:
         return _report(_problem(error), failed)
 
 
+def _missing(error: "MissingArgumentError") -> str:
+    """Return which argument or option is missing, or has no value, and what it must be."""
+    argument, command = error.argument, " ".join(["simtest", *(error.command_chain or ())])
+    if argument is None:
+        return str(error)
+    what = " ".join(str(argument.parameter.help or "").split()).rstrip(".")
+    lacks = "needs a value" if error.keyword or argument.tokens else "missing"
+    return f"{error.keyword or argument.name}: {lacks}{f' ({what})' if what else ''}; {command} --help describes it"
+
+
 def _problem(error: Exception) -> str:
     """Return an error that no command foresaw as text: of the output, of the machine, or of the program."""
     from simtest.runtime.machine_errors import machine_problem
 
     # Only the output's stream has neither a name nor a reason of its own to fail.
-    what = machine_problem(error)
+    what = machine_problem(error) or _damaged_bytecode(error)
     if what is not None and isinstance(error, OSError) and error.filename is None and _output_fails():
         return f"the output cannot be written ({what})"
     return what or f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
+
+
+def _damaged_bytecode(error: Exception) -> str | None:
+    """Return which compiled file of Python is cut short, as a full disk leaves it; None for any other error."""
+    if not isinstance(error, EOFError | ValueError) or "marshal data" not in str(error):
+        return None
+    import traceback
+
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        if path := frame.f_locals.get("bytecode_path"):
+            return f"{path}: a compiled file of Python that is cut short, perhaps by a full disk; delete it"
+    return None
 
 
 def _output_fails() -> bool:

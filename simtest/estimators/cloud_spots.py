@@ -90,9 +90,21 @@ def find_spots(frame: Frame) -> Spots:
 
 def bright_parts(frame: Frame) -> Mask:
     """Return where the light stands above that of the tissue around, shape (H, W): spots, faint ones too."""
+    return _above(frame)[1]
+
+
+def specular_light(frame: Frame) -> Image:
+    """Return the light above that of the tissue around in `bright_parts`, 0 elsewhere, shape (H, W), frame units."""
+    above, parts = _above(frame)
+    return np.asarray(np.where(parts if frame.seen is None else parts & frame.seen, above, np.float32(0)))
+
+
+def _above(frame: Frame) -> tuple[Image, Mask]:
+    """Return the light less that of the tissue around, and where this is no diffuse light, shape (H, W)."""
     light, noise = _light(frame)
     around, _ = _background(light)
-    return np.asarray(light - around > np.maximum(PART_CONTRAST * around, NOISE_FACTOR * noise))
+    above = light - around
+    return above, np.asarray(above > np.maximum(PART_CONTRAST * around, NOISE_FACTOR * noise))
 
 
 def _light(frame: Frame) -> tuple[Image, float]:

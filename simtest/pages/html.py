@@ -25,6 +25,7 @@ TEMPLATES = [
             "nightly/page",
             "bench",
             "dataset/scoring/dense",
+            "dataset/learn",
         )
     ),
 ]

@@ -55,7 +55,7 @@ LIGHT_AT_CAMERA = (
 NEAR_MISSES = Assumption(
     "highlights",
     "each holds a point whose normal bisects light and camera; where an organ folds about one in five only comes near: "
-    "its normal is then off by 2 to 3 deg along its longer axis, which no budget of a single light holds",
+    "its normal is then off by 2 to 3 deg, which the budget holds where a frame shows more than three for each light",
     "compare the normals of neighbouring highlights; in Python Priors(plane=True), if the surface is a plane",
 )
 """Shares and errors: python -m studies.human_meshes (docs/concepts/uncertainty.md)."""

@@ -8,6 +8,7 @@ from simtest.runtime.arrays import Array
 from simtest.spec.rig import LightSpec, Rig
 from simtest.spec.scene import Scene
 from simtest.surfaces import SurfaceModel
+from simtest.surfaces.deformed import DeformedSurface, stays_in_free_space
 from simtest.surfaces.instrument import RoundCones
 
 RIM_COPIES = (1.0, 0.75, 0.5, 0.25)
@@ -15,12 +16,28 @@ RIM_COPIES = (1.0, 0.75, 0.5, 0.25)
 
 
 def check_camera(scene: Scene, surface: SurfaceModel) -> None:
-    """Raise `InputError` where the camera lies in the wall."""
-    clearance = float(surface.clearance(surface.model_from_camera[None, :3, 3])[0])
+    """Raise `InputError` where the camera lies in the wall, or a wall that deforms has passed over it."""
+    camera = surface.model_from_camera[:3, 3]
+    own = float(surface.at_rest.clearance(camera[None])[0])
+    if not own > 0:
+        raise InputError(
+            f"scene {scene.name}: surface: the camera lies {-own:.3g} mm inside the wall; it must be in free "
+            "space: change surface.distance_mm, surface.tilt_deg or the curvature"
+        )
+    if not isinstance(surface, DeformedSurface):
+        return
+    moment, advice = f"at time_s = {scene.time_s:g}", "lower amplitude_mm or turn_deg, or move the camera"
+    clearance = float(surface.clearance(camera[None])[0])
     if not clearance > 0:
         raise InputError(
-            f"scene {scene.name}: surface: the camera lies {-clearance:.3g} mm inside the wall; it must be in free "
-            "space: change surface.distance_mm, surface.tilt_deg or the curvature"
+            f"scene {scene.name}: deformation: the camera lies {-clearance:.3g} mm inside the wall {moment}; it must "
+            f"be in free space: {advice}"
+        )
+    # Free space beyond a wall is no place that the camera could have come to.
+    if not stays_in_free_space(surface.rest, scene.deformation, scene.time_s, camera):
+        raise InputError(
+            f"scene {scene.name}: deformation: the wall has moved right over the camera {moment}; it must stay in free "
+            f"space from rest on: {advice}"
         )
 
 

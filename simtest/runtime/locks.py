@@ -60,6 +60,8 @@ def exclusive_folder(folder: Path, option: str = "--out") -> Iterator[None]:
 @contextlib.contextmanager
 def exclusive_file(path: Path, option: str = "--out") -> Iterator[None]:
     """Keep a file for results to this run, by a lock beside it; raise `InputError` as `exclusive_folder` does."""
+    if not path.name or path.name == "..":
+        raise InputError(f"{option} {shown(path)}: is a folder; must be a file")
     if path.parent.is_dir():
         with _exclusive(path.with_name(f".{path.name[:200]}{LOCK}"), f"{option} {shown(path)}"):
             yield

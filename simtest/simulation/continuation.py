@@ -40,11 +40,13 @@ LEAST_STEP = 1.0 / 256
 ANOTHER = 0.02
 """A ray that ends off the expected point by more than this share of the distance meets another part of the surface."""
 
-REACHED, MERGED, HIDDEN, OFF = "", "merged", "hidden", "off the surface"
-"""How a continuation ends: at the end of the motion, at a fold, behind another part of the surface, or beyond it.
+REACHED, MERGED, HIDDEN, OFF, LOST = "", "merged", "hidden", "off the surface", "not followed"
+"""How a continuation ends: at the end of the motion, at a fold, behind another part of the surface, beyond it, or where
+steps of `LEAST_STEP` are still too long and none of these explains it."""
 
-A fold is inferred: `MERGED` is the end of all that cannot be followed in steps of `LEAST_STEP` for no other reason.
-"""
+FOLD_STEPS, PROBE = 8.0, 1e-3
+"""A fold explains the end where the squared determinant, linear in time there, reaches 0 within so many shortest steps;
+its change is measured over this share of one."""
 
 
 @dataclass(frozen=True)
@@ -232,11 +234,32 @@ def follow(surface: SurfaceInTime, motion: Motion, positions: Array, lights: Int
         step[accepted] *= 2
         refused = going[~moved]
         step[refused] /= 2
-        for i, reason in zip(refused, np.asarray(why)[~moved], strict=True):
-            if step[i] < LEAST_STEP:
-                end[i] = str(reason)
+        ended = step[refused] < LEAST_STEP
+        reasons = np.where(_at_fold(surface, motion, share, lights, state, refused[ended]), MERGED, LOST)
+        for i, reason, other in zip(refused[ended], np.asarray(why)[~moved][ended], reasons, strict=True):
+            end[i] = str(other if reason == LOST else reason)
         going = np.array([i for i in going if share[i] < 1 and step[i] >= LEAST_STEP], dtype=np.int64)
     return Continued(position, share, end)
+
+
+def _at_fold(
+    surface: SurfaceInTime, motion: Motion, shares: Array, lights: IntArray, state: _State, chosen: IntArray
+) -> Mask:
+    """Return which of the chosen points are about to meet another one at a fold, shape (K,).
+
+    There the determinant falls as the root of the time that is left.
+    """
+    if not len(chosen):
+        return np.zeros(0, dtype=bool)
+    own, size = _part(state, chosen), np.full(len(chosen), PROBE * LEAST_STEP)
+    later, light = shares[chosen] + size, lights[chosen]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ahead = own.position + _predicted(surface, motion, later, light, own, size)
+        sound = np.asarray(np.isfinite(ahead).all(axis=1))
+        moved = _state(surface, motion, later, light, np.where(sound[:, None], ahead, own.position))
+        rate = (moved.determinant - own.determinant) / size
+        left = -own.determinant / (2 * rate)
+        return np.asarray(sound & (left > 0) & (left < FOLD_STEPS * LEAST_STEP))
 
 
 def _predicted(
@@ -275,7 +298,7 @@ def _corrected(
         same = (ratio > 1 / BEND) & (ratio < BEND)
         jumped = state.offset >= ANOTHER
     missed = ~np.isfinite(state.position).all(axis=1)
-    why = np.select([missed, jumped], [OFF, HIDDEN], MERGED).tolist()
+    why = np.select([missed, jumped], [OFF, HIDDEN], LOST).tolist()
     return state, done & near & same & ~jumped & ~missed, why
 
 

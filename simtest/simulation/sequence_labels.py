@@ -44,7 +44,7 @@ FIELDS = {
     "tracks": "first_frame, and in each frame of the track: entries (index in the frame's highlights), bp_px, "
     "position_world_mm; birth and death: sequence (its first or last frame), frame border, merged or split (at a fold, "
     "where two highlights become one and vanish, or are born), hidden (behind another part of the surface), off the "
-    "surface, not found",
+    "surface, not found, not followed",
     "base": "the same for the highlights of the base, without the relief; on a smooth surface they are those of the "
     "fine surface, and this is null",
 }

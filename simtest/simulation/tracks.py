@@ -16,7 +16,7 @@ from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import Json
 from simtest.simulation import continuation
-from simtest.simulation.continuation import MERGED, REACHED, Continued, Motion, StillSurface, SurfaceInTime
+from simtest.simulation.continuation import LOST, MERGED, REACHED, Continued, Motion, StillSurface, SurfaceInTime
 
 SAME_PX = 0.1
 """A followed point is the one found at the next frame where it arrives within this of it."""
@@ -41,8 +41,9 @@ class Track:
         Frame in which it is born.
     birth : str
         Why: "sequence" (it is there in the first frame), "frame border" (it enters the view), "split" (a pair is born
-        at a fold of the misfit), "hidden" (another part of the surface stood before it), "off the surface", or "not
-        found" (it lies in the view of the frame before too, but the search did not list it there).
+        at a fold of the misfit), "hidden" (another part of the surface stood before it), "off the surface", "not
+        found" (it lies in the view of the frame before too, but the search did not list it there), or "not followed"
+        (its motion bends too much for the shortest step, or leads to another highlight's point).
     death : str
         Why it has no point in the frame after its last: by the same names, "merged" instead of "split".
     entries : list of int
@@ -207,10 +208,10 @@ def _arrivals(followed: Continued, lights: IntArray, there: _Seen) -> tuple[dict
             if gaps[best] < nearest.get(best, np.inf):
                 # Two points cannot be one; the nearer one is it.
                 if best in partner:
-                    reasons[partner[best]] = MERGED
+                    reasons[partner[best]] = LOST
                 partner[best], nearest[best] = i, float(gaps[best])
             else:
-                reasons[i] = MERGED
+                reasons[i] = LOST
         else:
             reasons[i] = UNLISTED if there.camera.contains(pixel) else BORDER
     return partner, reasons

@@ -1,6 +1,7 @@
 """Writes pictures of views: one of each, a sheet of all of them, and a film of a sequence."""
 
 import math
+import os
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,9 @@ FRAMES_PER_SECOND = 25.0
 SHEET_WIDTH = 1600
 SHEET_COLUMNS = 10
 
+FILM, PART = "film.avi", ".film.part.avi"
+"""The film, and its name until it is finished: OpenCV knows its format by the suffix."""
+
 
 class ViewWriter:
     """Writes views as they come.
@@ -35,8 +39,18 @@ class ViewWriter:
         self._folder, self._fps = folder, fps
         self._thumbnails: list[Picture] = []
         self._film: cv2.VideoWriter | None = None
-        for old in (*folder.glob("view_*.png"), folder / "sheet.png", folder / "film.avi"):
+        for old in (*folder.glob("view_*.png"), folder / "sheet.png", folder / FILM, folder / PART):
             old.unlink(missing_ok=True)
+
+    def __enter__(self) -> "ViewWriter":
+        """Return the writer itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove a film that is not finished."""
+        if self._film is not None:
+            self._film.release()
+        (self._folder / PART).unlink(missing_ok=True)
 
     def add(self, view: RenderedView) -> WrittenView:
         """Write the frame of a view.
@@ -60,19 +74,20 @@ class ViewWriter:
     def _write(self, picture: Picture, fps: float) -> None:
         if self._film is None:
             # Motion JPEG is the codec that OpenCV writes everywhere.
-            file, codec = str(self._folder / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG")
+            file, codec = str(self._folder / PART), cv2.VideoWriter.fourcc(*"MJPG")
             self._film = cv2.VideoWriter(file, codec, fps, (picture.shape[1], picture.shape[0]))
             if not self._film.isOpened():
-                raise InputError(f"{file}: no film can be written here (OpenCV has no Motion JPEG)")
+                raise InputError(f"{self._folder / FILM}: no film can be written here (OpenCV has no Motion JPEG)")
         self._film.write(picture)
 
     def close(self) -> list[Path]:
         """Finish the film and write the sheet; return sheet.png and film.avi where there are any."""
         if self._film is not None:
             self._film.release()
+            os.replace(self._folder / PART, self._folder / FILM)
         if self._thumbnails:
             write_sheet(self._folder / "sheet.png", self._thumbnails)
-        return [file for name in ("sheet.png", "film.avi") if (file := self._folder / name).is_file()]
+        return [file for name in ("sheet.png", FILM) if (file := self._folder / name).is_file()]
 
 
 def thumbnail(picture: Picture) -> Picture:

@@ -38,12 +38,12 @@ def sample_into(
         raise InputError(f"fps = {fps:g}: must be {FPS[0]:g} to {FPS[1]:g} frames a second")
     rate = (fps or FRAMES_PER_SECOND) if sequence else None
     _remove_old(folder)
-    writer = ViewWriter(folder, rate)
     labeller = SequenceLabels(folder)
-    sampled = sample_views(
-        scene, count, viewpoints, variant, progress, writer.add, rate, labeller.add if labels else None
-    )
-    writer.close()
+    with ViewWriter(folder, rate) as writer:
+        sampled = sample_views(
+            scene, count, viewpoints, variant, progress, writer.add, rate, labeller.add if labels else None
+        )
+        writer.close()
     if labels:
         labeller.close()
     left_out = _write_poses(folder, scene, sampled)
@@ -63,7 +63,7 @@ def _write_poses(folder: Path, scene: Scene, sampled: SampledViews) -> list[str]
 
 
 def _remove_old(folder: Path) -> None:
-    """Remove the poses of an earlier call."""
+    """Remove the poses of an earlier call, and its list of views."""
     colmap = [folder / COLMAP / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
-    for old in (folder / TUM, folder / TRANSFORMS, *colmap):
+    for old in (folder / "views.json", folder / TUM, folder / TRANSFORMS, *colmap):
         old.unlink(missing_ok=True)

@@ -290,7 +290,8 @@ def load_camera(path: str | Path, view_radius_px: float | None = None) -> Camera
     # A scene's camera has a default size and focal length; a file of its own must state them.
     told = table if isinstance(table, Mapping) else {}
     missing = [key for key in ("width", "height", *(() if "fov_deg" in told else ("fx", "fy"))) if key not in told]
-    if missing:
+    # A mistyped key is named before the one that is missing because of it.
+    if missing and set(told) <= set(CameraSpec.model_fields):
         raise InputError(f"{path}: {missing[0]}: missing; a camera needs width, height, and fx and fy or fov_deg")
     return _validated(_with_view(told, view_radius_px, path), path)
 

@@ -1,7 +1,8 @@
-"""How a surface deforms in time: peristalsis, breathing, the dent of a probe."""
+"""How a surface deforms in time: peristalsis, contractions along a curved path, breathing, the dent of a probe."""
 
 import math
-from typing import Annotated, Literal
+from itertools import pairwise
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -25,13 +26,22 @@ Size = Annotated[float, Field(ge=0.1, le=1e4)]
 Amplitude = Annotated[float, Field(ge=-100, le=100)]
 
 
+MOST_POINTS = 500
+"""Of a path."""
+
+NEAREST_MM = 0.01
+"""Least distance of neighbouring points of a path."""
+
+MOST_RINGS = 20
+"""Contractions on a path at one time: each is a map of its own."""
+
+
 class _Periodic(Spec):
-    """A displacement that repeats; centre and directions are in the model frame."""
+    """A displacement that repeats; points and directions are in the model frame."""
 
     amplitude_mm: Amplitude = Field(description="largest displacement, mm")
     period_s: float = Field(ge=1e-3, le=1e6, description="time of one repetition, s")
     phase: float = Field(0.0, ge=0, le=1, description="share of the period that has passed at time 0")
-    centre_mm: Point = Field((0.0, 0.0, 0.0), description="point of the model frame, mm")
 
     def cycles(self, time_s: float) -> float:
         """Return how many periods have passed at a time."""
@@ -40,6 +50,11 @@ class _Periodic(Spec):
     def share(self, time_s: float) -> float:
         """Return (1 - cos)/2 of the cycle: 0 at rest, 1 at the middle of the period."""
         return (1 - math.cos(2 * math.pi * self.cycles(time_s))) / 2
+
+    def scaled(self, share: float) -> Self:
+        """Return the same deformation with a share, 0 to 1, of its amplitude and turn."""
+        amounts = {name: share * getattr(self, name) for name in ("amplitude_mm", "turn_deg") if hasattr(self, name)}
+        return self.model_copy(update=amounts)
 
     @property
     def stretch(self) -> float:
@@ -65,7 +80,11 @@ class _Periodic(Spec):
         raise NotImplementedError
 
 
-class Peristalsis(_Periodic):
+class _Centred(_Periodic):
+    centre_mm: Point = Field((0.0, 0.0, 0.0), description="point of the model frame, mm")
+
+
+class Peristalsis(_Centred):
     """Contractions that travel along a straight axis.
 
     With z along the axis and r the distance from it, points move inward by
@@ -88,7 +107,7 @@ class Peristalsis(_Periodic):
         return "radius_mm", "wavelength_mm"
 
 
-class Breathing(_Periodic):
+class Breathing(_Centred):
     """A slow motion to and fro, with a turn, that does not reach everything alike.
 
     With s = (1 - cos(2 pi t/period))/2 and b the coordinate along `along` from centre_mm, points move along `direction`
@@ -113,7 +132,7 @@ class Breathing(_Periodic):
         return ("wavelength_mm",)
 
 
-class Dent(_Periodic):
+class Dent(_Centred):
     """The dent of a probe that presses and lets go.
 
     Points move along `direction` by A s exp(-|X - centre|^2/(2 radius^2)), s = (1 - cos(2 pi t/period))/2.
@@ -133,4 +152,52 @@ class Dent(_Periodic):
         return ("radius_mm",)
 
 
-Deformation = Annotated[Peristalsis | Breathing | Dent, Field(discriminator="type")]
+class Contractions(_Periodic):
+    """Rings of contraction that travel along a curved path, such as the centreline of a colon with bends.
+
+    Each ring stands across the path. With z along the path's tangent there and r the distance from it, points move
+    inward by A (r/R) exp((1 - (r/R)^2 - (z/width)^2)/2): by A at most, at r = R. The rings are `spacing_mm` apart, move
+    on by as much in each period, and grow and fade within half of it from the path's ends. The maps of the rings are
+    applied one after the other, so rings that overlap at a bend do not fold space.
+    """
+
+    type: Literal["contractions"] = "contractions"
+    path_mm: tuple[Point, ...] = Field(
+        min_length=2, max_length=MOST_POINTS, description="points of a smooth curve, in order, model frame, mm"
+    )
+    radius_mm: Size = Field(description="distance from the path at which the displacement is largest, mm")
+    width_mm: Size = Field(description="standard deviation of a ring along the path, mm")
+    spacing_mm: Size = Field(description="distance between rings along the path, mm")
+
+    @property
+    def chords_mm(self) -> tuple[float, ...]:
+        """Distances between neighbouring points of the path, mm."""
+        return tuple(math.dist(near, far) for near, far in pairwise(self.path_mm))
+
+    @model_validator(mode="after")
+    def _path(self) -> "Contractions":
+        chords = self.chords_mm
+        if min(chords) < NEAREST_MM:
+            index = chords.index(min(chords))
+            raise ValueError(
+                f"path_mm: points {index} and {index + 1} are {chords[index]:.3g} mm apart; must be at least "
+                f"{NEAREST_MM:g} mm"
+            )
+        if sum(chords) > MOST_RINGS * self.spacing_mm:
+            raise ValueError(
+                f"spacing_mm = {self.spacing_mm:g}: a path of {sum(chords):.4g} mm holds more than {MOST_RINGS} rings; "
+                f"must be at least {sum(chords) / MOST_RINGS:.3g}"
+            )
+        return self
+
+    @property
+    def stretch(self) -> float:
+        """Bound A sqrt(e/R^2 + 1/(e width^2)) for one ring: of the parts across the path and along it."""
+        return abs(self.amplitude_mm) * math.hypot(math.exp(0.5) / self.radius_mm, math.exp(-0.5) / self.width_mm)
+
+    @property
+    def _lengths(self) -> tuple[str, ...]:
+        return "radius_mm", "width_mm"
+
+
+Deformation = Annotated[Peristalsis | Breathing | Dent | Contractions, Field(discriminator="type")]

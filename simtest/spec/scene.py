@@ -19,7 +19,7 @@ from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueReflec
 from simtest.spec.rig import Rig
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import Millimetres, Spec, validate
-from simtest.spec.surface import AnatomySurface, QuadricSurface, Surface
+from simtest.spec.surface import Surface
 from simtest.spec.tissue_colour import TissueColour
 from simtest.spec.toml_files import read_toml, source_name
 from simtest.spec.translucency import Translucency
@@ -145,15 +145,6 @@ class Scene(Spec):
             raise ValueError(
                 f"render.path_depth = {self.render.path_depth}: light that bounces is not traced between instruments "
                 "and tissue; must be 2 where instruments are present"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _deforms(self) -> "Scene":
-        if self.deformation and not isinstance(self.surface, AnatomySurface | QuadricSurface):
-            raise ValueError(
-                f"surface.type = {self.surface.type}: only meshes deform; must be anatomy or quadric where deformation "
-                "is given (a plane is a quadric of curvatures 0)"
             )
         return self
 

@@ -8,18 +8,21 @@ operators follow from these.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from simtest.geometry.vectors import rotation
-from simtest.runtime.arrays import Array
-from simtest.spec.deformation import MAX_STRETCH, Breathing, Deformation, Dent, Peristalsis
+from simtest.runtime.arrays import Array, Mask
+from simtest.spec.deformation import MAX_STRETCH, Breathing, Contractions, Deformation, Dent, Peristalsis
 
 CONVERGED_MM = 1e-12
 """Residual at which the inverse is found; rounding ends the steps earlier for coordinates of 1000 mm and more."""
+
+RING_REACH = 9.0
+"""In radii or widths of a ring of contraction; beyond, exp(-9^2/2) = 3e-18 is less than rounding."""
 
 INVERSE_STEPS = 400
 """Enough for the fixed-point iteration alone: 0.9^400 of any start."""
@@ -78,6 +81,10 @@ class _Part(ABC):
     def moved(self, points: Array) -> Array:
         return self._turned(points + self.displacement(points, 0)[0])
 
+    def near(self, points: Array) -> Mask | None:
+        """Return which points, shape (N, 3), the part moves by more than rounding; None: it may move all."""
+        return None
+
     def _turned(self, points: Array) -> Array:
         return np.asarray((points - self.centre) @ self.turn.T + self.centre)
 
@@ -111,6 +118,21 @@ class _Part(ABC):
         return X
 
 
+def _inward(P: Array, r: Array, amount: Sequence[Array]) -> tuple[Array, ...]:
+    """Return u = f r and its derivatives from f and its own; r = P (X - c), shape (N, 3), P a projection."""
+    f = amount[0]
+    parts = [f[:, None] * r]
+    if len(amount) > 1:
+        df = amount[1]
+        parts.append(f[:, None, None] * P + r[:, :, None] * df[:, None, :])
+    if len(amount) > 2:
+        # d2 u_i/dX_j dX_k = P_ij df_k + P_ik df_j + r_i Hess f_jk
+        parts.append(
+            np.einsum("ij,nk->nijk", P, df) + np.einsum("ik,nj->nijk", P, df) + np.einsum("ni,njk->nijk", r, amount[2])
+        )
+    return tuple(parts)
+
+
 class _Contraction(_Part):
     """Peristalsis: u = -a w(z) r exp((1 - |r|^2/R^2)/2), a = A/R, r = P (X - c) the part across the axis."""
 
@@ -129,26 +151,73 @@ class _Contraction(_Part):
         g = -self._a * np.exp((1 - np.sum(r * r, axis=1) / R2) / 2)
         # The scalar f = w g, u = f r; its gradient is g w' e - f r/R^2.
         f = w * g
-        parts = [f[:, None] * r]
+        amount = [f]
         if order:
             along = -k / 2 * np.sin(angle) * g
-            df = along[:, None] * e - f[:, None] * r / R2
-            parts.append(f[:, None, None] * P + r[:, :, None] * df[:, None, :])
+            amount.append(along[:, None] * e - f[:, None] * r / R2)
         if order > 1:
             # Hess f = g w'' e e^T - (w' g/R^2)(e r^T + r e^T) - f P/R^2 + f r r^T/R^4.
             bent = -(k * k) / 2 * np.cos(angle) * g
             er = e[None, :, None] * r[:, None, :]
-            hess = (
+            amount.append(
                 bent[:, None, None] * np.outer(e, e)
                 - (along / R2)[:, None, None] * (er + np.swapaxes(er, 1, 2))
                 - (f / R2)[:, None, None] * P
                 + (f / R2**2)[:, None, None] * r[:, :, None] * r[:, None, :]
             )
-            # d2 u_i/dX_j dX_k = P_ij df_k + P_ik df_j + r_i Hess f_jk
-            parts.append(
-                np.einsum("ij,nk->nijk", P, df) + np.einsum("ik,nj->nijk", P, df) + np.einsum("ni,njk->nijk", r, hess)
-            )
-        return tuple(parts)
+        return _inward(P, r, amount)
+
+
+class _Ring(_Part):
+    """A contraction at one point c of a path: u = -(A/R) r exp((1 - |r|^2/R^2 - z^2/width^2)/2)."""
+
+    def __init__(self, spec: Contractions, amplitude_mm: float, centre: Array, tangent: Array) -> None:
+        self._axis, self._origin = tangent, centre
+        self._across = np.eye(3) - np.outer(tangent, tangent)
+        self._a = amplitude_mm / spec.radius_mm
+        # The exponent is -X^T Q X/2.
+        self._Q = self._across / spec.radius_mm**2 + np.outer(tangent, tangent) / spec.width_mm**2
+        self._reach = RING_REACH * max(spec.radius_mm, spec.width_mm)
+
+    def near(self, points: Array) -> Mask:
+        return np.asarray(np.linalg.norm(points - self._origin, axis=1) < self._reach)
+
+    def displacement(self, points: Array, order: int) -> tuple[Array, ...]:
+        gap = points - self._origin
+        slope = gap @ self._Q
+        f = -self._a * np.exp((1 - np.sum(gap * slope, axis=1)) / 2)
+        amount = [f]
+        if order:
+            amount.append(-f[:, None] * slope)
+        if order > 1:
+            amount.append(f[:, None, None] * (slope[:, :, None] * slope[:, None, :] - self._Q))
+        return _inward(self._across, gap @ self._across, amount)
+
+
+def _rings(spec: Contractions, time_s: float) -> list[_Part]:
+    """Return the rings that stand on the path at a moment, from its begin to its end."""
+    nodes = np.array(spec.path_mm)
+    at = np.concatenate([[0.0], np.cumsum(spec.chords_mm)])
+    slopes = np.gradient(nodes, at, axis=0)
+    length, fade = at[-1], min(spec.spacing_mm, at[-1]) / 2
+    first = spec.cycles(time_s) % 1 * spec.spacing_mm
+    made: list[_Part] = []
+    for s in np.arange(first, length, spec.spacing_mm):
+        share = math.sin(math.pi / 2 * min(1.0, s / fade, (length - s) / fade)) ** 2
+        centre, tangent = _on_curve(at, nodes, slopes, float(s))
+        made.append(_Ring(spec, spec.amplitude_mm * share, centre, tangent))
+    return made
+
+
+def _on_curve(at: Array, nodes: Array, slopes: Array, s: float) -> tuple[Array, Array]:
+    """Return point and unit tangent of Hermite's cubic through nodes, shape (N, 3), with slopes, at a position s."""
+    i = int(np.clip(np.searchsorted(at, s, side="right") - 1, 0, len(at) - 2))
+    h = at[i + 1] - at[i]
+    t = (s - at[i]) / h
+    near, far, m, n = nodes[i], nodes[i + 1], h * slopes[i], h * slopes[i + 1]
+    point = (1 + 2 * t) * (1 - t) ** 2 * near + t * (1 - t) ** 2 * m + t * t * (3 - 2 * t) * far + t * t * (t - 1) * n
+    change = 6 * t * (1 - t) * (far - near) + (1 - t) * (1 - 3 * t) * m + t * (3 * t - 2) * n
+    return point, _unit(change)
 
 
 class _Along(_Part):
@@ -229,40 +298,64 @@ class DeformationAt:
     """
 
     def __init__(self, parts: Sequence[Deformation], time_s: float) -> None:
-        self._parts = [_part(spec, time_s) for spec in parts]
+        self._parts = [part for spec in parts for part in _parts_of(spec, time_s)]
 
     def moved(self, points: Array) -> Array:
         """Return where points at rest, shape (N, 3), model frame, mm, are now."""
         for part in self._parts:
-            points = part.moved(points)
+            points = _where_near(part, points, part.moved)
         return points
 
     def at_rest(self, points: Array) -> Array:
         """Return where the points that are now at `points`, shape (N, 3), model frame, mm, are at rest."""
         for part in reversed(self._parts):
-            points = part.at_rest(points)
+            points = _where_near(part, points, part.at_rest)
         return points
 
     def jets(self, points: Array) -> MapJets:
         """Return the map and its derivatives at points at rest, shape (N, 3), model frame, mm."""
-        jets = self._parts[0].jets(points)
-        for part in self._parts[1:]:
-            # Chain rule; H = J2 H1 + H2[J1, J1].
-            own, J = part.jets(jets.value), jets.jacobian
-            bent = (own.jacobian @ jets.hessian.reshape(-1, 3, 9)).reshape(-1, 3, 3, 3)
-            bent += np.swapaxes(J, 1, 2)[:, None] @ own.hessian @ J[:, None]
-            jets = MapJets(own.value, own.jacobian @ J, bent)
+        count = len(points)
+        jets = MapJets(points, np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3, 3, 3)))
+        for i, part in enumerate(self._parts):
+            near = part.near(jets.value)
+            if near is None:
+                jets = part.jets(jets.value) if i == 0 else _after(part, jets)
+            elif near.any():
+                whole = MapJets(jets.value.copy(), jets.jacobian.copy(), jets.hessian.copy())
+                own = _after(part, MapJets(jets.value[near], jets.jacobian[near], jets.hessian[near]))
+                whole.value[near], whole.jacobian[near], whole.hessian[near] = own.value, own.jacobian, own.hessian
+                jets = whole
         return jets
 
 
-def _part(spec: Deformation, time_s: float) -> _Part:
+def _where_near(part: _Part, points: Array, move: Callable[[Array], Array]) -> Array:
+    """Apply a part, forwards or back, to the points that it reaches."""
+    near = part.near(points)
+    if near is None:
+        return move(points)
+    moved = points.copy()
+    moved[near] = move(points[near])
+    return moved
+
+
+def _after(part: _Part, jets: MapJets) -> MapJets:
+    """Return the jets of a part applied to a map: H = J2 H1 + H2[J1, J1]."""
+    own, J = part.jets(jets.value), jets.jacobian
+    bent = (own.jacobian @ jets.hessian.reshape(-1, 3, 9)).reshape(-1, 3, 3, 3)
+    bent += np.swapaxes(J, 1, 2)[:, None] @ own.hessian @ J[:, None]
+    return MapJets(own.value, own.jacobian @ J, bent)
+
+
+def _parts_of(spec: Deformation, time_s: float) -> list[_Part]:
     match spec:
         case Peristalsis():
-            return _Contraction(spec, time_s)
+            return [_Contraction(spec, time_s)]
         case Breathing():
-            return _Breath(spec, time_s)
+            return [_Breath(spec, time_s)]
         case Dent():
-            return _Press(spec, time_s)
+            return [_Press(spec, time_s)]
+        case Contractions():
+            return _rings(spec, time_s)
 
 
 def _unit(vector: Sequence[float]) -> Array:

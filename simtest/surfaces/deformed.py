@@ -4,14 +4,15 @@ A ray through the deformed surface is a curve through the surface at rest. Newto
 met with the surface at rest exactly, finds where it meets it.
 """
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from simtest.errors import InputError
 from simtest.runtime.arrays import Array
+from simtest.spec.deformation import Deformation
 from simtest.surfaces.deformation import DeformationAt, MapJets
 from simtest.surfaces.model import (
     RayHits,
@@ -31,6 +32,9 @@ CONVERGED = 1e-13
 
 SETTLED_MM = 1e-9
 """A ray whose last step is longer has no point: it grazes the surface."""
+
+PASSAGE_MM = 0.1
+"""Thinner walls may pass unseen."""
 
 REACH = 10.0
 """How far before the hit the tangents start, in distances of the hit: a mesh judges its own hits by a share of it."""
@@ -57,36 +61,57 @@ class DeformedRelief(ReliefField):
         return HeightJets(own.height, gradient, hessian)
 
 
-class DeformedSurface(SurfaceModel):
-    """A meshed surface at one moment of its deformation; the camera stays where it is.
+def stays_in_free_space(rest: SurfaceModel, parts: Sequence[Deformation], time_s: float, point: Array) -> bool:
+    """Return whether no wall passes over a point while a deformation grows from none to that of a moment.
 
     Parameters
     ----------
     rest : SurfaceModel
-        The surface at rest, rendered as a mesh.
+        The surface at rest.
+    parts : sequence of Deformation
+        The deformation; all amplitudes and turns grow alike.
+    time_s : float
+        The moment, s.
+    point : ndarray, shape (3,)
+        Model frame, mm, in free space at rest and at the moment.
+    """
+
+    def at(share: float) -> tuple[float, Array, float]:
+        X = DeformationAt([part.scaled(share) for part in parts], time_s).at_rest(point[None])
+        return share, X[0], float(rest.clearance(X)[0])
+
+    # The tissue moves from where it surrounds the point at rest to where it does now: along this way none is met.
+    pending = [(at(0.0), at(1.0))]
+    while pending:
+        first, last = pending.pop()
+        if min(first[2], last[2]) <= 0:
+            return False
+        apart = float(np.linalg.norm(first[1] - last[1]))
+        if apart > max(PASSAGE_MM, max(first[2], last[2]) / 2):
+            middle = at((first[0] + last[0]) / 2)
+            pending += [(first, middle), (middle, last)]
+    return True
+
+
+class DeformedSurface(SurfaceModel):
+    """A surface at one moment of its deformation; the camera stays where it is.
+
+    Parameters
+    ----------
+    rest : SurfaceModel
+        The surface at rest; it must be rendered as a mesh (see `graded_mesh` for analytic ones).
     deformation : DeformationAt
         Of the model frame.
-    label : str
-        The surface's name in errors.
 
     Attributes
     ----------
     rest, deformation
         The given ones.
-
-    Raises
-    ------
-    InputError
-        If the surface is rendered as an analytic shape.
     """
 
-    def __init__(self, rest: SurfaceModel, deformation: DeformationAt, label: str = "surface") -> None:
+    def __init__(self, rest: SurfaceModel, deformation: DeformationAt) -> None:
         mesh = rest.shape().mesh
-        if mesh is None:
-            raise InputError(
-                f"deformation: surface.type = {label}: only meshes deform; must be anatomy or quadric (a plane is a "
-                "quadric of curvatures 0)"
-            )
+        assert mesh is not None
         self.rest, self.deformation = rest, deformation
         self.solid, self.faceted = rest.solid, rest.faceted
         self.model_from_camera = rest.model_from_camera
@@ -100,8 +125,8 @@ class DeformedSurface(SurfaceModel):
 
     @property
     def at_rest(self) -> SurfaceModel:
-        """The surface before its deformation."""
-        return self.rest
+        """The surface before its deformation, in its closed form where it has one."""
+        return self.rest.at_rest
 
     def at_moment(self, deformation: DeformationAt) -> "DeformedSurface":
         """Return the same surface under the deformation of another moment."""

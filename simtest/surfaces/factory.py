@@ -61,7 +61,11 @@ def make_surface(
         from simtest.surfaces.deformation import DeformationAt
         from simtest.surfaces.deformed import DeformedSurface
 
-        return DeformedSurface(surface, DeformationAt(deformation, time_s), spec.type)
+        if isinstance(surface, Plane | Sphere | Cylinder):
+            from simtest.surfaces.graded_mesh import GradedMesh
+
+            surface = GradedMesh(surface)
+        return DeformedSurface(surface, DeformationAt(deformation, time_s))
     return surface
 
 
@@ -91,7 +95,8 @@ def forget_meshes() -> None:
     from simtest.surfaces import mesh_surface as mesh
 
     meshes = (centreline._camera_path, colon.build, liver.build, mesh._prepare)
-    for cached in (*meshes, relief_field._make_field, tissue_pattern._make, vessels.grow_vessels):
+    reliefs, patterns = (relief_field._make_field, relief_field._unscaled), (tissue_pattern._make, tissue_pattern._bare)
+    for cached in (*meshes, *reliefs, *patterns, vessels.grow_vessels):
         cached.cache_clear()
 
 

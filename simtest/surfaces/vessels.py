@@ -133,7 +133,7 @@ def _grow(patch: Patch, spec: Vessels, rng: np.random.Generator) -> tuple[Array,
 
 def _neighbours(points: Array, normals: Array, tortuosity: float, rng: np.random.Generator) -> sparse.csr_matrix:
     """Return the costs of edges between neighbouring nodes, a symmetric sparse matrix."""
-    distance, other = cKDTree(points).query(points, k=min(NEIGHBOURS, len(points)))
+    distance, other = _nearest(points)
     first, second = np.repeat(np.arange(len(points)), distance.shape[1] - 1), other[:, 1:].ravel()
     low, high = np.minimum(first, second), np.maximum(first, second)
     # Each edge once
@@ -147,6 +147,13 @@ def _neighbours(points: Array, normals: Array, tortuosity: float, rng: np.random
         (np.concatenate([cost, cost]), (np.concatenate([low, high]), np.concatenate([high, low]))), shape=shape
     )
     return whole.tocsr()
+
+
+def _nearest(points: Array) -> tuple[Array, IntArray]:
+    """Return distances and numbers of each point's nearest ones, itself first, shape (N, K)."""
+    # SciPy drops the last axis of one neighbour: a small patch may hold a single node.
+    distance, other = cKDTree(points).query(points, k=np.arange(1, min(NEIGHBOURS, len(points)) + 1))
+    return distance, other
 
 
 def _roots(points: Array, count: int, rng: np.random.Generator) -> IntArray:
@@ -219,7 +226,7 @@ def _straightened(points: Array, normals: Array, parent: IntArray, carried: Arra
 
 def _shape_operators(points: Array, normals: Array) -> Array:
     """Fit dN = S dP over each node's neighbours, 1/mm, shape (N, 3, 3)."""
-    _, other = cKDTree(points).query(points, k=min(NEIGHBOURS, len(points)))
+    _, other = _nearest(points)
     gap, turn = points[other[:, 1:]] - points[:, None], normals[other[:, 1:]] - normals[:, None]
     near = np.einsum("nki,ni->nk", normals[other[:, 1:]], normals) > FACING
     gap, turn = gap * near[..., None], turn * near[..., None]

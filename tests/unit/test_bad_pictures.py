@@ -18,6 +18,7 @@ CAMERAS = {
         CALIBRATION.replace("fy = 40\n", ""),
         "fy: missing; a camera needs width, height, and fx and fy or fov_deg",
     ),
+    "mistyped key": (CALIBRATION.replace("fy", "fz"), "fz = 40: unknown key; allowed: "),
     "text": ("a calibration", "not valid TOML"),
     "NaN": (CALIBRATION.replace("fx = 40", "fx = nan"), "fx = nan: must be a finite number"),
     "in quotes": (CALIBRATION.replace("fx = 40", 'fx = "40"'), "fx = '40': must be a number"),

@@ -5,10 +5,10 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.spec import scene_from_dict
-from simtest.spec.deformation import MAX_STRETCH, Breathing, Dent, Peristalsis
+from simtest.spec.deformation import MAX_STRETCH, Breathing, Contractions, Dent, Peristalsis
 from simtest.surfaces import RayHits, make_surface
 from simtest.surfaces.deformation import DeformationAt
-from simtest.surfaces.deformed import DeformedSurface
+from simtest.surfaces.deformed import DeformedSurface, stays_in_free_space
 from simtest.surfaces.model import shape_operator
 
 PERISTALSIS = Peristalsis(
@@ -19,8 +19,16 @@ BREATHING = Breathing(
     turn_deg=5.0, axis=(1, 1, 0),
 )  # fmt: skip
 DENT = Dent(amplitude_mm=-3.0, period_s=2.0, direction=(0, 0.2, 1), radius_mm=5.0, centre_mm=(3, 1, 2))
-KINDS = {"peristalsis": [PERISTALSIS], "breathing": [BREATHING], "dent": [DENT]}
-CASES = {**KINDS, "all": [PERISTALSIS, BREATHING, DENT]}
+RING = Contractions(
+    amplitude_mm=4.0, period_s=3.0, phase=0.5, path_mm=((0, 0, -9), (1, 1, 0), (0, 0, 9)), radius_mm=12.0, width_mm=5.0,
+    spacing_mm=20.0,
+)  # fmt: skip
+BENT = Contractions(
+    amplitude_mm=3.0, period_s=2.0, path_mm=((-20, 0, 0), (0, 5, 0), (8, 20, 3), (0, 30, 10)), radius_mm=8.0,
+    width_mm=4.0, spacing_mm=9.0,
+)  # fmt: skip
+KINDS = {"peristalsis": [PERISTALSIS], "breathing": [BREATHING], "dent": [DENT], "contractions": [RING]}
+CASES = {**KINDS, "all": [PERISTALSIS, BREATHING, DENT], "bent": [BENT, BREATHING]}
 TIME = 0.7
 
 
@@ -74,7 +82,7 @@ def test_inverse_keeps_missing_points_missing():
 def test_stretch_bounds_the_derivative_and_is_no_idle_bound(kind):
     """No point of a cloud has a displacement's derivative above the bound; some reach half of it."""
     spec = KINDS[kind][0]
-    centre = np.array(spec.centre_mm)
+    centre = np.array(getattr(spec, "centre_mm", (0, 0, 0)))
     points = centre + np.random.default_rng(2).normal(0, 8, (10_000, 3))
     # The turn is rigid and no part of the displacement.
     rigid = {"turn_deg": 0.0} if kind == "breathing" else {}
@@ -91,24 +99,43 @@ def test_at_rest_nothing_moves(points):
     assert np.array_equal(at.jets(points).jacobian, np.broadcast_to(np.eye(3), (len(points), 3, 3)))
 
 
+QUADRIC = {"type": "quadric", "k1_per_mm": 0.03, "k2_per_mm": -0.02}
+ROUND = {"radius_mm": 12.0}
+SURFACES = {
+    # the table, and the height z over the anchor's tangent plane
+    "quadric": (QUADRIC, lambda x, y: -(0.03 * x**2 - 0.02 * y**2) / 2),
+    "plane": ({"type": "plane"}, lambda x, y: 0 * x),
+    "sphere": ({"type": "sphere", **ROUND}, lambda x, y: np.sqrt(144 - x**2 - y**2) - 12),
+    "sphere, inside": ({"type": "sphere", "side": "inside", **ROUND}, lambda x, y: 12 - np.sqrt(144 - x**2 - y**2)),
+    "cylinder": ({"type": "cylinder", **ROUND}, lambda x, y: np.sqrt(144 - x**2) - 12 + 0 * y),
+    "cylinder, inside": (
+        {"type": "cylinder", "side": "inside", **ROUND},
+        lambda x, y: 12 - np.sqrt(144 - x**2) + 0 * y,
+    ),
+}
+
+
+def surface_of(table, parts, time_s=TIME):
+    scene = scene_from_dict({"surface": {"distance_mm": 20.0, **table}, "deformation": parts})
+    return make_surface(scene.surface, deformation=scene.deformation, time_s=time_s)
+
+
 def quadric(parts, time_s=TIME):
-    spec = {"type": "quadric", "distance_mm": 20.0, "k1_per_mm": 0.03, "k2_per_mm": -0.02}
-    scene = scene_from_dict({"surface": spec})
-    return make_surface(scene.surface, deformation=parts, time_s=time_s)
+    return surface_of(QUADRIC, parts, time_s)
 
 
-def parameterised(at, x, y):
-    """Deformed points of the quadric by its own parameters: no ray, no derivative."""
-    return at.moved(np.stack([x, y, -(0.03 * x**2 - 0.02 * y**2) / 2], axis=1))
+def parameterised(at, x, y, height=SURFACES["quadric"][1]):
+    """Deformed points of a surface by its own parameters: no ray, no derivative."""
+    return at.moved(np.stack([x, y, height(x, y)], axis=1))
 
 
-def by_differences(at, x, y, step=2e-2):
-    """Unit normal, Gaussian and mean curvature of the deformed quadric from sixth-order differences of its points."""
+def by_differences(at, x, y, height, step=2e-2):
+    """Unit normal, Gaussian and mean curvature of a deformed surface from sixth-order differences of its points."""
     weights = {1: 45 / 60, 2: -9 / 60, 3: 1 / 60}
     second = {0: -490 / 180, 1: 270 / 180, 2: -27 / 180, 3: 2 / 180}
 
     def shifted(i, j):
-        return parameterised(at, x + i * step, y + j * step)
+        return parameterised(at, x + i * step, y + j * step, height)
 
     du = sum(w * (shifted(i, 0) - shifted(-i, 0)) for i, w in weights.items()) / step
     dv = sum(w * (shifted(0, i) - shifted(0, -i)) for i, w in weights.items()) / step
@@ -130,19 +157,21 @@ def by_differences(at, x, y, step=2e-2):
     return normal, (e * g - f * f) / area, (e * G - 2 * f * F + g * E) / (2 * area)
 
 
-@pytest.fixture(scope="module")
-def cast():
-    """Points of a deformed quadric on rays of a camera at its place, with their parameters at rest."""
-    surface = quadric(CASES["all"])
+@pytest.fixture(scope="module", params=[*((name, "all") for name in SURFACES), ("sphere", "bent")], ids=str)
+def cast(request):
+    """Points of a deformed surface on rays of a camera at its place, with their parameters at rest."""
+    name, case = request.param
+    table, height = SURFACES[name]
+    surface = surface_of(table, CASES[case])
     x, y = np.random.default_rng(3).uniform(-5, 5, (2, 500))
-    target = parameterised(surface.deformation, x, y)
+    target = parameterised(surface.deformation, x, y, height)
     origin = np.broadcast_to(surface.model_from_camera[:3, 3], target.shape)
     distance = np.linalg.norm(target - origin, axis=1)
     directions = (target - origin) / distance[:, None]
     # The renderer's hits are off by the flatness of its triangles.
     zero = np.zeros((len(x), 2))
     hits = RayHits(distance + 1e-3, np.zeros(len(x), dtype=np.int64), zero)
-    return surface, surface.points(origin, directions, hits), (x, y), distance
+    return surface, surface.points(origin, directions, hits), (x, y, height), distance
 
 
 def test_rays_meet_the_deformed_surface(cast):
@@ -157,11 +186,10 @@ def test_normals_are_those_of_differences(cast):
     assert np.linalg.norm(np.cross(normal, points.normal), axis=1).max() < 1e-8
     # Control: normals that are carried as tangents are, by J, are wrong by degrees.
     jets = surface.deformation.jets(surface.deformation.at_rest(points.position))
-    x, y = where
-    own = np.stack([0.03 * x, -0.02 * y, np.ones_like(x)], axis=1)
-    wrong = np.einsum("nij,nj->ni", jets.jacobian, own)
+    wrong = np.einsum("nji,nj->ni", jets.jacobian, normal)
+    wrong = np.einsum("nij,nj->ni", jets.jacobian, wrong)
     wrong /= np.linalg.norm(wrong, axis=1, keepdims=True)
-    assert np.median(np.linalg.norm(np.cross(normal, wrong), axis=1)) > 0.05
+    assert np.median(np.linalg.norm(np.cross(normal, wrong), axis=1)) > 0.03
 
 
 def test_curvatures_are_those_of_differences(cast):
@@ -216,6 +244,19 @@ def test_camera_in_the_deformed_wall_is_refused():
     assert surface.at_rest.clearance(inside)[0] > 0
 
 
+@pytest.mark.parametrize("along", [(0, 0, 1), (1, 0, 0)])
+def test_a_body_that_passes_over_the_camera_is_seen(along):
+    """A small ball moves 100 mm: past the camera, or right over it to free space behind."""
+    ball = make_surface(scene_from_dict({"surface": {"type": "sphere", "distance_mm": 20.0, "radius_mm": 3.0}}).surface)
+    camera = ball.model_from_camera[:3, 3]
+    moving = Breathing(amplitude_mm=100.0, period_s=2.0, direction=along, warp=0.0)
+    for time_s in (0.0, 1.0):
+        there = DeformationAt([moving], time_s).at_rest(camera[None])
+        assert ball.clearance(there)[0] > 10
+    assert stays_in_free_space(ball, [moving], 0.0, camera)
+    assert stays_in_free_space(ball, [moving], 1.0, camera) == (along == (1, 0, 0))
+
+
 DENT_TABLE = {"type": "dent", "amplitude_mm": 1.0, "period_s": 2.0, "direction": [0, 0, 1], "radius_mm": 5.0}
 BAD = {
     "folds": ({"amplitude_mm": 9.0}, r"amplitude_mm = 9: .* by up to 1\.09 of .* below 0\.9: .* radius_mm"),
@@ -241,9 +282,87 @@ def test_bad_tables(case):
     assert "\n" not in str(error.value)
 
 
-def test_only_meshes_deform():
-    with pytest.raises(InputError, match="sphere: only meshes deform; must be anatomy or quadric"):
-        scene_from_dict({"surface": {"type": "sphere"}, "deformation": [DENT_TABLE]})
+BENT_TABLE = {"type": "contractions", "amplitude_mm": 2.0, "period_s": 2.0, "path_mm": [[0, 0, 0], [9, 0, 0]],
+              "radius_mm": 9.0, "width_mm": 5.0, "spacing_mm": 5.0}  # fmt: skip
+BAD_PATHS = {
+    "one point": ({"path_mm": [[0, 0, 0]]}, r"path_mm.*: must have at least 2"),
+    "flat": ({"path_mm": [[0, 0], [9, 0]]}, "path_mm"),
+    "twice": (
+        {"path_mm": [[0, 0, 0], [9, 0, 0], [9, 0, 0]]},
+        r"points 1 and 2 are 0 mm apart; must be at least 0\.01 mm",
+    ),
+    "many rings": (
+        {"spacing_mm": 0.4},
+        r"spacing_mm = 0\.4: a path of 9 mm holds more than 20 rings; must be at least 0\.45",
+    ),
+    "folds": (
+        {"width_mm": 1.0},
+        r"amplitude_mm = 2: .* by up to 1\.27 of .*: lower amplitude_mm, or .* radius_mm or width_mm",
+    ),
+    "centre": ({"centre_mm": [0, 0, 0]}, "centre_mm.*unknown key"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PATHS)
+def test_bad_paths(case):
+    changes, message = BAD_PATHS[case]
+    with pytest.raises(InputError, match=message) as error:
+        scene_from_dict({"surface": {"type": "plane"}, "deformation": [{**BENT_TABLE, **changes}]})
+    assert "deformation.0" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_rings_follow_the_bends_of_their_path():
+    """On a quarter of a circle of 40 mm each ring narrows a tube around the circle where it stands, and there alone."""
+    angles = np.linspace(0, np.pi / 2, 20)
+    path = 40 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    spec = Contractions(
+        amplitude_mm=3.0, period_s=1.0, phase=0.5, path_mm=path.tolist(), radius_mm=8.0, width_mm=3.0, spacing_mm=31.4
+    )
+    at = DeformationAt([spec], 0.0)
+
+    def radii(angle, around):
+        """Distance from the circle of a tube's points, 8 mm at rest, across the circle at an angle."""
+        out, up = np.array([np.cos(angle), np.sin(angle), 0]), np.array([0, 0, 1.0])
+        centre = 40 * out
+        points = centre + 8 * (np.cos(around)[:, None] * out + np.sin(around)[:, None] * up)
+        return np.linalg.norm(at.moved(points) - centre, axis=1)
+
+    around = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    # Half a spacing from the begin, the ring is whole: 15.7 mm along the circle.
+    assert radii(15.7 / 40, around) == pytest.approx(5.0, abs=0.01)
+    # Midway to the next ring.
+    assert radii(31.4 / 40, around) == pytest.approx(8.0, abs=5e-3)
+    # At the ends rings begin and end without a jump.
+    points = np.random.default_rng(4).normal([40, 0, 0], 10, (200, 3))
+    before, after = (DeformationAt([spec], t).moved(points) for t in (0.5 - 1e-6, 0.5 + 1e-6))
+    assert np.abs(before - after).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "radius"),
+    [("plane", 1), ("sphere", 0.5), ("sphere", 400), ("sphere, inside", 12), ("cylinder, inside", 0.5)],
+)
+def test_meshes_of_analytic_surfaces(name, radius):
+    """Vertices on the surface, triangles on the camera's side, a sphere without gaps: also in single precision."""
+    table = {key: value for key, value in SURFACES[name][0].items() if key != "radius_mm"}
+    if "inside" in name and radius < 20:
+        table["distance_mm"] = 0.9 * radius
+    if table["type"] in ("sphere", "cylinder"):
+        table["radius_mm"] = radius
+    surface = surface_of(table, [DENT])
+    mesh = surface.rest.shape().mesh
+    assert np.abs(surface.at_rest.clearance(mesh.vertices)).max() < 1e-12 * max(radius, 1000)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    across = np.cross(b - a, c - a)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    assert np.einsum("ni,nci->nc", across, mesh.normals[mesh.faces]).min() > 0.98
+    if table["type"] == "sphere":
+        numbers = (mesh.vertices.astype(np.float32) + 0.0).view(np.int32).astype(np.int64)
+        _, same = np.unique(numbers @ [1, 1_000_003, 999_999_937], return_inverse=True)
+        faces, count = same[mesh.faces], len(same)
+        first, last = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
+        assert np.array_equal(np.sort(first * count + last), np.sort(last * count + first))
 
 
 def test_a_scene_at_rest_is_written_as_ever():

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from simtest.errors import InputError
 from simtest.rendering import Session
+from simtest.rendering.placement_checks import check_camera
 from simtest.spec import scene_from_dict
+from simtest.surfaces import make_surface
 
 DENT = {"type": "dent", "amplitude_mm": -2.0, "period_s": 2.0, "direction": [0.2, 0, 1], "radius_mm": 5.0,
         "centre_mm": [1, 0, 0]}  # fmt: skip
@@ -84,9 +87,47 @@ def test_a_failed_moment_leaves_the_session_where_it_was():
     press = {**DENT, "amplitude_mm": 30.0, "radius_mm": 30.0, "direction": [0, 0, 1]}
     session = Session(scene(0.0, deformation=(press,)))
     before = session.frame().radiance.total
-    with pytest.raises(Exception, match="inside the wall"):
+    told = r"deformation: the camera lies .* mm inside the wall at time_s = 1; .*: lower amplitude_mm or turn_deg, or"
+    with pytest.raises(InputError, match=told):
         session.update(scene(1.0, deformation=(press,)))
     assert np.array_equal(session.frame().radiance.total, before)
+
+
+def test_a_body_that_passed_over_the_camera_is_refused():
+    ball = {"type": "sphere", "distance_mm": 20.0, "radius_mm": 3.0}
+    ride = {"type": "breathing", "amplitude_mm": 100.0, "period_s": 2.0, "direction": [0, 0, 1], "warp": 0.0}
+    passed = scene_from_dict({"surface": ball, "time_s": 1.0, "deformation": [ride]})
+    surface = make_surface(passed.surface, deformation=passed.deformation, time_s=1.0)
+    with pytest.raises(
+        InputError, match=r"deformation: the wall has moved right over the camera at time_s = 1; it must"
+    ):
+        check_camera(passed, surface)
+
+
+TUBE = {"type": "cylinder", "side": "inside", "distance_mm": 12.0, "radius_mm": 15.0, "tilt_deg": 50.0}
+RINGS = {"type": "contractions", "amplitude_mm": 2.0, "period_s": 2.0, "radius_mm": 15.0, "width_mm": 8.0,
+         "spacing_mm": 30.0, "path_mm": [[0, -60, 15], [2, 0, 14], [0, 60, 15]]}  # fmt: skip
+
+
+@pytest.mark.parametrize(("surface", "part"), [(TUBE, RINGS), ({"type": "sphere", "radius_mm": 9.0}, DENT)])
+def test_analytic_surfaces_deform(surface, part):
+    """The rendered mesh is the exact surface within its cells, deformed and at rest."""
+    camera = {"width": 64, "height": 48, "fx": 56.0, "fy": 56.0, "cx": 32.0, "cy": 24.0}
+    still = {"surface": surface, "camera": camera, "reflectance": {"type": "phong", "exponent": 5.0}}
+    session = Session(scene_from_dict({**still, "deformation": [{**part, "amplitude_mm": 0.0}]}), labelled=True)
+    own = Session(scene_from_dict(still), labelled=True).frame()
+    scale = float(own.radiance.total.max())
+    # Pixels on the outline of a ball see another part of it.
+    gap = np.abs(session.frame().radiance.total - own.radiance.total)
+    assert np.quantile(gap, 0.99) < 2e-3 * scale
+    session.update(scene_from_dict({**still, "deformation": [part], "time_s": 0.8}))
+    moved, truth = session.frame(), session.truth()
+    assert session.rebuilds == 1
+    assert np.quantile(np.abs(moved.radiance.total - own.radiance.total), 0.99) > 0.02 * scale
+    seen = truth.mask
+    assert seen.mean() > 0.3
+    assert np.quantile(np.linalg.norm(moved.labels.normal - truth.normal, axis=-1)[seen], 0.98) < 1e-3
+    assert np.quantile(np.abs(moved.labels.depth - truth.depth)[seen], 0.98) < 1e-2
 
 
 @pytest.mark.slow

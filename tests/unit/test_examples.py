@@ -2,10 +2,12 @@
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
@@ -19,22 +21,57 @@ LARGEST_KB = 150
 pytestmark = pytest.mark.skipif(not EXAMPLES, reason="the checkout's examples folder is not there")
 
 
-@pytest.mark.render
-@pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.stem)
-def test_an_example_makes_its_picture(script, tmp_path):
-    # Run from another folder, so that an example depends on nothing that happens to lie in the checkout.
+def in_a_process_of_its_own(script, folder):
     own = dict(os.environ) | {"PYTHONPATH": str(ROOT)}
-    command = [sys.executable, str(script), "--quick", "--out", str(tmp_path / "made")]
-    done = subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, timeout=300)
+    command = [sys.executable, str(script), "--quick", "--out", str(folder / "made")]
+    done = subprocess.run(command, cwd=folder, env=own, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    made = [file for file in (tmp_path / "made").iterdir() if file.stem == script.stem]
+    return done.stdout
+
+
+@pytest.fixture
+def in_this_process(monkeypatch, capfd):
+    """Run an example as Python runs a script, without starting Python and the renderer anew: that takes 2 s."""
+
+    def run(script, folder):
+        monkeypatch.syspath_prepend(str(script.parent))
+        monkeypatch.setattr(sys, "argv", [str(script), "--quick", "--out", str(folder / "made")])
+        with plt.rc_context():
+            runpy.run_path(str(script), run_name="__main__")
+        return capfd.readouterr().out
+
+    monkeypatch.delitem(sys.modules, "common", raising=False)
+    yield run
+    sys.modules.pop("common", None)
+
+
+def check_picture(script, folder, output):
+    made = [file for file in (folder / "made").iterdir() if file.stem == script.stem]
     assert len(made) == 1
-    assert str(made[0]) in done.stdout
+    assert str(made[0]) in output
     pixels = np.asarray(Image.open(made[0]).convert("L"), float)
     assert min(pixels.shape) >= 300
     # A figure without its data is a white sheet with thin axes.
     assert (pixels < 250).mean() > 0.01
     assert pixels.std() > 10
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.stem)
+def test_an_example_makes_its_picture(script, tmp_path, monkeypatch, in_this_process):
+    # Run from another folder, so that an example depends on nothing that happens to lie in the checkout.
+    monkeypatch.chdir(tmp_path)
+    check_picture(script, tmp_path, in_this_process(script, tmp_path))
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(
+    "script",
+    [pytest.param(s, marks=[] if s.name.startswith("02_") else [pytest.mark.slow]) for s in EXAMPLES],
+    ids=lambda script: script.stem,
+)
+def test_an_example_runs_as_a_user_runs_it(script, tmp_path):
+    check_picture(script, tmp_path, in_a_process_of_its_own(script, tmp_path))
 
 
 def test_a_picture_without_a_highlight_ends_in_one_line(tmp_path):

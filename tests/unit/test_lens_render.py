@@ -36,6 +36,11 @@ OMNI = {
         "type": "scaramuzza", "k2": -0.625, "k3": 0.370, "k4": -0.545, "c": 0.99999, "d": 0.00288, "e": -0.00296,
     },
 }  # fmt: skip
+# Kalibr's omni, an endoscope's field of view on the same sensor.
+MEI = {
+    "width": 640, "height": 640, "fx": 700.0, "fy": 690.0, "view_mask": {"radius": 320},
+    "distortion": {"type": "mei", "xi": 1.1, "k1": -0.05, "k2": 0.01, "p1": 2e-3, "p2": -3e-3},
+}  # fmt: skip
 PINHOLE = {"width": 320, "height": 320, "fx": FOCAL, "fy": FOCAL}
 
 
@@ -239,9 +244,12 @@ def test_normals_through_a_fisheye_equal_those_through_a_pinhole(session, kind, 
 
 @pytest.mark.render
 @pytest.mark.parametrize(("kind", "angle"), [("plane", 2.0), ("plane", 45.0), ("cylinder", 30.0)])
-def test_normals_through_an_omnidirectional_lens(session, kind, angle):
-    """As through the fisheye, without noise to 0.02 deg; a wrong sign of d and e, or no lens, is seen."""
-    scene = scene_from_dict({"surface": tilted(kind, angle, False), "camera": OMNI, "reflectance": {"type": "phong"}})
+@pytest.mark.parametrize(
+    ("lens", "wrong"), [(OMNI, {"d": -0.00296, "e": 0.00288}), (MEI, {"p1": -3e-3, "p2": 2e-3})], ids=["omni", "mei"]
+)
+def test_normals_through_an_omnidirectional_lens(session, lens, wrong, kind, angle):
+    """As through the fisheye, without noise to 0.02 deg; wrong signs of small coefficients, or no lens, are seen."""
+    scene = scene_from_dict({"surface": tilted(kind, angle, False), "camera": lens, "reflectance": {"type": "phong"}})
     seen = render_view(session, scene)
     (truth,) = [t for t in seen.highlights if t.isolated]
     np.testing.assert_allclose(session.camera.project(truth.position), truth.bp_px, atol=1e-6)
@@ -253,7 +261,7 @@ def test_normals_through_an_omnidirectional_lens(session, kind, angle):
         (ignored,) = reconstruct(frame, plain, ["cone_axis"])
         assert angle_deg(ignored.estimates["cone_axis"].normal, truth.normal) > 2
         swapped = dataclasses.replace(
-            session.camera, distortion=dataclasses.replace(session.camera.distortion, d=-0.00296, e=0.00288)
+            session.camera, distortion=dataclasses.replace(session.camera.distortion, **wrong)
         )
         (other,) = reconstruct(frame, swapped, ["cone_axis"])
         assert angle_deg(other.estimates["cone_axis"].normal, truth.normal) > 0.05

@@ -1,11 +1,14 @@
 """Near misses in the budget of crowded frames: when they enter, how they follow the brightness, and what they cover."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from simtest.advice.twin.scoring import score
 from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, exactly
+from simtest.dataset.maker import colour_variant
 from simtest.estimators import load_estimators
 from simtest.estimators.near_misses import (
     AROUND,
@@ -14,11 +17,16 @@ from simtest.estimators.near_misses import (
     FAINT,
     MOST,
     RARER,
+    SEVERAL,
     UNTOLD_FAINTNESS,
     USUAL,
     near_miss_variance,
 )
 from simtest.geometry import Camera, chi_squared
+from simtest.reconstruction.pipeline import run_picture
+from simtest.rendering import Session
+from simtest.simulation.rendered_view import render_view
+from simtest.spec import load_scene
 from tests.unit.core_helpers import PATCH
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
@@ -50,11 +58,18 @@ def test_a_crowded_frame_adds_near_misses_to_the_part_shape(name):
 def test_the_highlights_are_counted_for_each_light():
     two = replace(LIGHT_AT_CAMERA, lights_mm=((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0)), distance_mm=exactly(20.0))
     few, many = (shape_of("bisector", among(count), two) for count in (2 * CROWD - 1, 2 * CROWD))
-    assert many - few == pytest.approx((USUAL / (CROWD + 0.5)) ** RARER * BRIGHT * np.eye(2), rel=1e-6, abs=1e-14)
+    assert many - few == pytest.approx(
+        SEVERAL * (USUAL / (CROWD + 0.5)) ** RARER * BRIGHT * np.eye(2), rel=1e-6, abs=1e-14
+    )
     # Nobody told how many there are: one.
     assert near_miss_variance(among(CROWD), 1) * np.eye(2) == pytest.approx(
         shape_of("cone_axis", among(CROWD), NO_PRIORS) - shape_of("cone_axis", among(0), NO_PRIORS), rel=1e-6
     )
+
+
+def test_a_ring_of_lights_counts_as_three():
+    assert near_miss_variance(among(3 * CROWD - 1), 8) == 0
+    assert near_miss_variance(among(3 * CROWD), 8) == pytest.approx((USUAL / (CROWD + 1 / 3)) ** RARER * BRIGHT)
 
 
 def test_a_dim_highlight_may_be_farther_off():
@@ -96,3 +111,29 @@ def test_the_region_holds_a_planted_mixture_of_near_misses_and_not_without_the_p
     # 0.95 less 3.1 standard deviations of a share of 400
     assert np.mean(held) > 0.95 - 3.1 * np.sqrt(0.95 * 0.05 / 400)
     assert np.mean(without) < 0.7
+
+
+@pytest.mark.slow
+def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monkeypatch):
+    # One frame of 168 highlights, of which a third are near misses. A share of 0.95 of so many has a standard deviation
+    # of 0.017; the bound lies four of them below (alpha < 1e-4), since highlights of one frame are not independent.
+    scene = load_scene("tissue_stomach")
+    scene = scene.model_copy(update={"rig": scene.rig.model_copy(update={"lights": scene.rig.lights[:1]})})
+    session = Session(scene, colour_variant())
+    view = render_view(session, scene)
+    picture = np.asarray(np.rint(255 * view.frame(1)) / 255, dtype=np.float32)
+
+    def shares():
+        scored = [
+            spot for spot in score(session, view, run_picture(picture, view.calibration)[0]) if spot.held is not None
+        ]
+        near = [spot.is_near_miss for spot in scored]
+        return len(scored), np.mean(near), np.mean([spot.held for spot in scored])
+
+    count, near, held = shares()
+    assert count >= 100
+    assert near > 0.2
+    assert held > 0.88
+    # Negative control: no frame is crowded.
+    monkeypatch.setattr("simtest.estimators.near_misses.CROWD", math.inf)
+    assert shares()[2] < 0.75

@@ -577,7 +577,7 @@ def test_a_night_that_could_not_be_run_exits_2(here, monkeypatch, error, said):
         ("--profile daily", "daily: no such file; shipped by name: full, quick"),
         ("--workers 0", "workers = 0: must be 1 to 256"),
         ("--workers many", "many is not a whole number"),
-        ("accept", 'Command "nightly accept" parameter --reason requires an argument'),
+        ("accept", "--reason: missing"),
         ("accept --reason because --profile full", "nightly/full: no night of the profile full; run simtest nightly"),
     ],
 )

@@ -182,6 +182,9 @@ def test_malformed_maps_are_refused_in_one_line(tmp_path, what):
 def test_a_camera_of_another_shape_is_refused(tmp_path):
     with pytest.raises(InputError, match="the camera is of 256 x 256 px; frames of c3vd are of 1350 x 1080 px"):
         load_map_reference(write_depth(tmp_path, "c3vd"), "c3vd", camera("ucl"))
+    # What is missing has no size.
+    with pytest.raises(InputError, match=r"none\.tiff: no such file; must be a map of c3vd"):
+        load_map_reference(tmp_path / "none.tiff", "c3vd", camera("ucl"))
 
 
 @pytest.mark.parametrize(

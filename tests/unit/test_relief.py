@@ -311,6 +311,21 @@ def test_seeds_and_bands_differ_and_repeat():
     assert np.array_equal(make(seed=1, level=0.0).tissue_jets(points).height, height)
 
 
+def test_reliefs_of_one_seed_differ_in_scale_alone():
+    """One is made from the other's kept noise; made from nothing it has the same bytes."""
+    points = np.random.default_rng(0).uniform(-20, 20, (2000, 3))
+
+    def relief(slope, wave):
+        return make_relief(Relief(bands=({"slope_deg": slope, "wavelength_mm": wave},), seed=5))
+
+    forget_meshes()
+    one, other = relief(2.0, 1.5), relief(3.0, 3.0)
+    # Twice the wavelength and 1.5 times the slope are three times the height.
+    assert other.jets(2 * points).height == pytest.approx(3 * one.jets(points).height, rel=1e-9, abs=1e-12)
+    forget_meshes()
+    assert np.array_equal(relief(3.0, 3.0).jets(points).height, other.jets(points).height)
+
+
 @pytest.mark.slow
 def test_heights_stay_below_the_limit():
     """The steepest relief that is allowed: hardly a point exceeds the limit, and some come near."""

@@ -1,5 +1,6 @@
 """Results on a relief: errors against both truths, their law, and a fresh relief for each realisation."""
 
+import dataclasses
 import itertools
 import shlex
 
@@ -165,3 +166,12 @@ def test_rows_of_truths_that_nothing_found_have_a_target_and_no_error():
     assert found["target"].to_list() == ["fine"] * len(truths)
     assert found["error_base_deg"].null_count() == len(truths)
     assert summarise(found)["s"]["cone_axis"].mean_base_deg is None
+
+
+def test_a_row_with_other_values_is_that_of_replace():
+    row = ResultRow(experiment="e", swept={"a": 1.0}, true_id=2)
+    made = row.having(true_id=3, status="missed", budget={"noise": 0.1})
+    assert made == dataclasses.replace(row, true_id=3, status="missed", budget={"noise": 0.1})
+    assert (row.true_id, row.status) == (2, None)
+    with pytest.raises(TypeError, match="no field 'eror_deg'"):
+        row.having(eror_deg=1.0)

@@ -1,12 +1,14 @@
 """Stops and broken surroundings: signals at any moment, readers that have gone, full disks, deleted folders."""
 
 import errno
+import importlib
 import os
 import signal
 import subprocess
 import sys
 import textwrap
 
+import numpy as np
 import pytest
 
 from simtest.cli.main import main
@@ -14,6 +16,7 @@ from simtest.cli.stopping import INTERRUPTED, TERMINATED
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.files import make_folder, refuse_file
 from simtest.runtime.machine_errors import cannot_write
+from simtest.simulation import view_folder
 from tests.refusals import refused
 
 MAIN = "from simtest.cli.main import main; main()"
@@ -28,6 +31,24 @@ def shell(line, folder=None):
     environment = {**os.environ, "SIMTEST": f"{sys.executable} -m simtest"}
     return subprocess.run(["bash", "-c", line], cwd=folder, capture_output=True, text=True, timeout=60, check=False,
                           env=environment)  # fmt: skip
+
+
+def test_a_compiled_file_that_a_full_disk_cut_short_is_named(tmp_path):
+    """Python itself leaves such a file, and cannot read it afterwards."""
+    (tmp_path / "module.py").write_text("value = 1\n")
+    done = script(f"""
+        import importlib, pathlib, py_compile, sys
+        from simtest.cli.main import _problem
+        sys.path.insert(0, {str(tmp_path)!r})
+        made = pathlib.Path(py_compile.compile({str(tmp_path / "module.py")!r}))
+        made.write_bytes(made.read_bytes()[:-20])
+        try:
+            import module
+        except Exception as error:
+            told = "a compiled file of Python that is cut short, perhaps by a full disk; delete it"
+            print(_problem(error) == f"{{made}}: {{told}}")
+    """)
+    assert (done.stdout, done.stderr) == ("True\n", "")
 
 
 # Signals ---------------------------------------------------------------------------------------------------------
@@ -222,3 +243,37 @@ def test_standard_input_is_a_pipe(tmp_path):
         assert done.stderr.startswith("simtest: /dev/stdin: is no plain file but a pipe (write it to a file first); ")
         assert done.stderr.count("/dev/stdin") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stopped_film_leaves_no_half_of_it(tmp_path, monkeypatch):
+    """The list of an earlier call's views goes too, since their pictures have gone."""
+
+    def stopped(scene, count, viewpoints, variant, progress, write, rate, label):
+        write.__self__._write(np.zeros((48, 64, 3), np.uint8), rate)
+        assert [path.suffix for path in tmp_path.iterdir()] == [".avi"]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(view_folder, "sample_views", stopped)
+    (tmp_path / "views.json").write_text("{}")
+    with pytest.raises(KeyboardInterrupt):
+        view_folder.sample_into(tmp_path, None, 3, [0.1], None, None, sequence=True)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("line", "module", "name", "goes_on"),
+    [
+        ("twin none.png --fov 60 --out x", "simtest.advice.twin.run", "twin_picture", False),
+        ("validate overview --out x", "simtest.api", "validate", True),
+    ],
+)
+def test_a_stop_says_whether_the_same_command_goes_on(here, monkeypatch, tmp_path, line, module, name, goes_on):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib.import_module(module), name, stopped)
+    code, output, errors = here(*line.split())
+    assert (code, output) == (INTERRUPTED, "")
+    told = "goes on from there" if goes_on else "begins anew"
+    assert errors[-1] == f"simtest: stopped; what is finished is kept, and the same command {told}"
+    assert not list(tmp_path.iterdir())

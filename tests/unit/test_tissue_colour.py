@@ -403,6 +403,20 @@ def test_light_bounces_off_the_same_colour():
     assert (bounced({"albedo": {"base": [0.6, 0.3, 0.2]}}) < tissue).all()
 
 
+def test_without_visible_vessels_all_surfaces_have_the_pattern_that_vessels_of_no_strength_give():
+    spec = TissueColour(vessels={"strength": 0.0})
+    bare = make_pattern(surface_of("plane"), spec)
+    assert make_pattern(surface_of("sphere"), spec) is bare
+    surface = surface_of("quadric")
+    patch = surface_patch(surface)
+    grown = _make(patch, spec)
+    assert grown.vessels.rows.any()
+    points = spread_points(patch, 1.0, np.random.default_rng(2))[0]
+    assert np.array_equal(bare.albedo(points), grown.albedo(points))
+    # Vessels that are seen change it.
+    assert not np.array_equal(bare.albedo(points), make_pattern(surface, TissueColour()).albedo(points))
+
+
 def test_the_cache_is_freed():
     from simtest.surfaces.factory import forget_meshes
 
@@ -410,3 +424,16 @@ def test_the_cache_is_freed():
     assert _make.cache_info().currsize > 0
     forget_meshes()
     assert _make.cache_info().currsize == 0
+
+
+def test_a_surface_too_small_for_two_nodes_has_no_vessels():
+    """Each system is a root alone: there is nothing to draw, and the ground is left as it is."""
+    surface = make_surface(
+        scene_from_dict({"surface": {"type": "sphere", "radius_mm": 0.2, "distance_mm": 5.0}}).surface
+    )
+    forest = grow_vessels(surface_patch(surface), TissueColour().vessels, 3)
+    assert forest.parent.tolist() == [-1, -1]
+    assert not len(segments(forest).start)
+    pattern = make_pattern(surface, TissueColour())
+    points, _ = surface_patch(surface).draw(np.random.default_rng(1), 50)
+    assert not pattern.vessels.chords(points).any()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from simtest.rendering import Session
+from simtest.simulation.continuation import LOST, REACHED, Contact, Motion, follow
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.tracks import Tracks
 from simtest.spec import load_scene, scene_from_dict
@@ -152,6 +153,33 @@ def test_glints_are_born_and_merge_in_pairs():
     assert links > 100
     assert merged > 0
     assert born > 0
+
+
+class Roof:
+    """Two planes that meet at the edge x = 0, where the normal turns at once by `turn` about y."""
+
+    deforms = False
+
+    def __init__(self, turn):
+        self.turn = turn
+
+    def meet(self, shares, origins, directions):
+        position = origins - directions * (origins[:, 2:] / directions[:, 2:])
+        tilt = np.where(position[:, 0] > 0, self.turn, 0.0)
+        normal = np.stack([np.sin(tilt), 0 * tilt, np.cos(tilt)], axis=1)
+        plane = np.broadcast_to([0.0, 0.0, 1.0], position.shape)
+        return Contact(position, normal, plane, np.zeros((len(position), 3, 3)))
+
+
+def test_an_end_at_an_edge_is_not_a_merger():
+    """The determinant does not change on the way to the edge: there is no fold."""
+    centres = np.array([-1.0, 0.0, 10.0]), np.array([1.0, 0.0, 10.0])
+    motion, start = Motion(centres, tuple(c[None] for c in centres)), np.array([[-1.0, 0.0, 0.0]])
+    flat, edge = (follow(Roof(turn), motion, start, np.zeros(1, dtype=np.int64)) for turn in (0.0, 0.1))
+    assert flat.end == [REACHED]
+    np.testing.assert_allclose(flat.position[0], [1.0, 0.0, 0.0], atol=1e-9)
+    assert edge.end == [LOST]
+    assert edge.share[0] == pytest.approx(0.5, abs=0.01)
 
 
 def test_glints_obey_the_law_and_the_base_has_its_own_highlight():

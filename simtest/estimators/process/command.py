@@ -185,6 +185,8 @@ def _called(word: str) -> str:
 
 def _program(what: str, word: str, folder: Path) -> Path:
     """Return the absolute path of a program; raise `InputError` where it is missing or cannot be run."""
+    if word in (".", ".."):
+        raise InputError(f"{what}: {word} is a folder; must be a program")
     if "/" not in word:
         found = shutil.which(word)
         # A directory of the name beside the user is no program, but a likely mistake.

@@ -55,14 +55,15 @@ class MeasuredHighlight:
         Of the centre, px^2.
     problem : str
         Why it is not used; empty: it is.
-    width_px : float
-        Radius at half height, px; 0: not known.
+    width_px, width_sd_px : float
+        Radius at half height, px, and its standard deviation; 0: not known.
     """
 
     pixel: Array
     covariance: Array
     problem: str = ""
     width_px: float = 0.0
+    width_sd_px: float = 0.0
 
 
 def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px: float) -> list[MeasuredHighlight]:
@@ -109,7 +110,7 @@ def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px
         region = _region(smooth > level, row, column) & inside
         claimed |= region
         single = _measured(values, region, level, noise, corner, peaks, smooth, widest_px)
-        found.append(single if spots is None else replace(single, width_px=spots.width_px))
+        found.append(single if spots is None else _of_one_spot(single, spots, corner))
     return found
 
 
@@ -119,6 +120,18 @@ def _separated(values: Array, blob: Mask, window: Mask, noise: float, base: floa
         return None
     spots = separate(values, window, noise, base)
     return spots if spots is not None and 2 * spots.width_px < widest_px else None
+
+
+def _of_one_spot(single: MeasuredHighlight, spots: Spots, corner: Array) -> MeasuredHighlight:
+    """Return a highlight with the centre of the spot that was fitted to it.
+
+    The pixels above half height are few on a small spot, and which ones they are moves their centroid.
+    """
+    covariance = spots.covariances[0] + CENTRE_FLOOR_PX**2 * np.eye(2)
+    return replace(
+        single, pixel=spots.centres[0] + corner, covariance=covariance,
+        width_px=spots.width_px, width_sd_px=spots.width_sd_px,
+    )  # fmt: skip
 
 
 def _widened(mask: Mask) -> Mask:
@@ -138,7 +151,11 @@ def _several(spots: Spots, corner: Array, blob: Mask) -> list[MeasuredHighlight]
             continue
         poor = float(np.linalg.eigvalsh(covariance)[1]) > MOST_SD_PX**2
         floor = CENTRE_FLOOR_PX**2 * np.eye(2)
-        found.append(MeasuredHighlight(centre + corner, covariance + floor, TOUCH if poor else "", spots.width_px))
+        found.append(
+            MeasuredHighlight(
+                centre + corner, covariance + floor, TOUCH if poor else "", spots.width_px, spots.width_sd_px
+            )
+        )
     return found
 
 

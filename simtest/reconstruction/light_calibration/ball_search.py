@@ -4,9 +4,15 @@ import cv2
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.geometry import Array
+from simtest.geometry import Array, Mask
 from simtest.geometry.camera import Camera
-from simtest.reconstruction.light_calibration.outline import LEAST_RADIUS_PX, BallOutline, outline_through
+from simtest.reconstruction.light_calibration.outline import (
+    LEAST_RADIUS_PX,
+    BallOutline,
+    angles_to,
+    cone_through,
+    outline_through,
+)
 
 SEARCHED_PX = 480
 """Longer side of the picture in which circles are searched."""
@@ -20,6 +26,9 @@ ON_EDGE_PX = 1.5
 LEAST_ON_EDGE = 0.5
 """Share of the directions whose strongest edge must lie on the outline."""
 
+SAME = 0.05
+"""Circles that differ by less than this share of their radius lead to the same edges."""
+
 DISPLAY_GAMMA = 2.2
 
 
@@ -30,33 +39,45 @@ def find_ball(intensity: Array, camera: Camera) -> tuple[BallOutline, float] | N
     """
     found = [
         traced
-        for x, y, radius in _circles(intensity)
+        for x, y, radius in _distinct(_circles(intensity))
         if (traced := trace_outline(intensity, camera, np.array([x, y]), radius)) is not None
     ]
     best = max(found, key=lambda each: each[1], default=None)
     return best if best is not None and best[1] >= LEAST_ON_EDGE else None
 
 
+def _distinct(circles: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
+    """Return circles without those that lead to the same edges as an earlier one."""
+    kept: list[tuple[float, float, float]] = []
+    for circle in circles:
+        if all(np.linalg.norm(np.subtract(circle, each)) > SAME * each[2] for each in kept):
+            kept.append(circle)
+    return kept
+
+
 def trace_outline(
     intensity: Array, camera: Camera, centre_px: Array, radius_px: float
 ) -> tuple[BallOutline, float] | None:
     """Return the outline on the strongest edges near a circle, and the share of directions that agree with it."""
-    outline, edges = None, np.empty((0, 2))
+    edges, agreeing = np.empty((0, 2)), np.empty(0, dtype=bool)
     for reach in (REACH, REACH / 2, REACH / 4):
         edges = _edges(intensity, camera, centre_px, radius_px, reach)
-        outline = _robust(camera, edges)
-        if outline is None:
+        traced = _robust(camera, edges)
+        if traced is None:
             return None
-        border = outline.pixels(camera)
+        (direction, half_angle), agreeing = traced
+        border = BallOutline(direction, half_angle, np.eye(3)).pixels(camera)
         if not np.isfinite(border).all():
             return None
         centre_px = border.mean(axis=0)
         radius_px = float(np.linalg.norm(border - centre_px, axis=1).mean())
         if radius_px < LEAST_RADIUS_PX:
             return None
-    if outline is None:
+    try:
+        outline = outline_through(camera, edges[agreeing])
+    except (InputError, np.linalg.LinAlgError):
         return None
-    return outline, float(np.mean(_gaps(camera, outline, edges) < ON_EDGE_PX) * len(edges) / DIRECTIONS)
+    return outline, float(agreeing.sum() / DIRECTIONS)
 
 
 def _circles(intensity: Array) -> list[tuple[float, float, float]]:
@@ -97,25 +118,20 @@ def _edges(intensity: Array, camera: Camera, centre_px: Array, radius_px: float,
     return np.asarray(found[camera.contains(found)])
 
 
-def _robust(camera: Camera, edges: Array) -> BallOutline | None:
-    """Return the outline through most of the edges, the farthest left out in turn."""
-    kept = edges
+def _robust(camera: Camera, edges: Array) -> tuple[tuple[Array, float], Mask] | None:
+    """Return the cone through most of the edges, the farthest left out in turn, and which edges agree with it."""
+    rays = camera.unproject(edges)
+    pixel = np.linalg.norm(camera.unproject(edges + 1) - rays, axis=1) / np.sqrt(2)
+    fine = np.asarray(np.isfinite(rays).all(axis=1) & np.isfinite(pixel) & (pixel > 0))
+    kept, cone, agreeing = fine, None, fine
     for share in (0.8, 0.7, 0.7, 0.8, 1.0):
-        if len(kept) < DIRECTIONS // 4:
+        if kept.sum() < DIRECTIONS // 4:
             return None
-        try:
-            outline = outline_through(camera, kept)
-        except (InputError, np.linalg.LinAlgError):
+        cone = cone_through(rays[kept])
+        if cone is None:
             return None
-        gaps = _gaps(camera, outline, edges)
+        gaps = np.where(fine, np.abs(angles_to(rays, cone[0]) - cone[1]) / np.where(fine, pixel, 1), np.inf)
+        agreeing = gaps < ON_EDGE_PX
         limit = ON_EDGE_PX if share == 1.0 else max(float(np.quantile(gaps, share)), ON_EDGE_PX)
-        kept = edges[gaps <= limit]
-    return outline if len(kept) >= DIRECTIONS // 4 else None
-
-
-def _gaps(camera: Camera, outline: BallOutline, edges: Array) -> Array:
-    """Return the distances of edges from an outline, px."""
-    border = outline.pixels(camera, 360)
-    if not np.isfinite(border).all():
-        return np.full(len(edges), np.inf)
-    return np.asarray(np.linalg.norm(edges[:, None] - border[None], axis=2).min(axis=1))
+        kept = gaps <= limit
+    return (cone, agreeing) if cone is not None and agreeing.sum() >= DIRECTIONS // 4 else None

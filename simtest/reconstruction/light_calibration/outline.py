@@ -4,14 +4,19 @@ The sightlines that touch a ball form a circular cone about the direction c to i
 sine is radius over distance. So the outline is a circle on the unit sphere. A pixel's angle to c, less a, over the
 angle of a pixel, is its signed distance s from the outline.
 
-Across the outline the brightness is modelled as blurred by a Gaussian: a constant and a ramp outside, and inside a
-step, a ramp and a term with the square root of the depth below the outline, as a matt ball that is lit from the camera
-has it. Their amplitudes are fitted in each sector of the outline, direction, half-angle and blur over all of it. With
-the square root the outline is not drawn inwards where the ball grows dark towards it.
+Across the outline the brightness is modelled as blurred by a Gaussian and by the pixel: a constant and a ramp outside,
+and inside a step, a ramp and a term with the square root of the depth below the outline, as a matt ball that is lit
+from the camera has it. Their amplitudes are fitted in each sector of the outline, direction, half-angle and blur over
+all of it. With the square root the outline is not drawn inwards where the ball grows dark towards it.
+
+Two errors are the same in all pictures of a scope, so no number of pictures averages them. A point spread that is no
+Gaussian (defocus, sharpening) is symmetric, so it changes the step by a function that is odd about the outline: three
+odd terms in each sector, the step's second, fourth and sixth derivative, take it up. Blur moves a curved edge towards
+its centre of curvature by variance / (2 radius); the model is moved as far.
 """
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import cv2
 import numpy as np
@@ -41,27 +46,53 @@ RING_GAIN = 2.0
 """A ring is told where the ball's shading begins so far inside the outline, and explains the profile so much better."""
 
 LEAST_SECTORS = 8
-LEAST_PIXELS = 14
+LEAST_PIXELS = 20
 LEAST_RADIUS_PX = 6.0
 """A smaller outline has no band of its own inside."""
 
 BLUR_PX = (0.25, 3.0)
 ROUNDS = 12
 HUBER = 2.0
+PIXEL_VARIANCE = 1 / 12
+COLUMNS = 8
+"""Amplitudes of a sector."""
+
 STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3])
 """Steps of the parameters: two turns and the half-angle in px, and the logarithm of the blur."""
 
-_REACH = 6.0
-_GRID = np.linspace(-_REACH, 40.0, 921)
+_STEP_PX, _REACH_PX = 0.02, 16.0
+_GRID = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX / 2, _STEP_PX)
+"""Depths below the outline, px, of the tabulated profile: all of the band, and what steps of the fit add."""
+
+_PIXEL = np.sqrt(0.15) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 18.0
+"""Gauss-Legendre points and weights of a pixel's width, px."""
+
+_ROOT_GRID = np.linspace(-6.0, 80.0, 4301)
 
 
 @cache
 def _blurred_root() -> Array:
-    """Return the square root of max(x, 0), blurred by a Gaussian of deviation 1, on the grid."""
+    """Return the square root of max(x, 0), blurred by a Gaussian of deviation 1, on its grid."""
     # Substituted u^2 = x, so that the root's infinite slope does no harm.
-    u = np.linspace(0.0, 8.0, 1601)
-    kernel = np.exp(-((_GRID[:, None] - u[None] ** 2) ** 2) / 2) / np.sqrt(2 * np.pi)
+    u = np.linspace(0.0, 9.5, 1901)
+    kernel = np.exp(-((_ROOT_GRID[:, None] - u[None] ** 2) ** 2) / 2) / np.sqrt(2 * np.pi)
     return np.asarray(np.trapezoid(2 * u**2 * kernel, u, axis=1))
+
+
+@lru_cache(maxsize=8)
+def _profiles(blur: float, with_odd: bool) -> Array:
+    """Return step, ramp and root, blurred, on the grid, and derivatives of the step if asked for; shape (3 or 6, G)."""
+    from scipy.special import ndtr
+
+    total = np.zeros((6 if with_odd else 3, len(_GRID)))
+    for offset, weight in zip(*_PIXEL, strict=True):
+        t = (_GRID + offset) / blur
+        bell, inside = np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi), ndtr(t)
+        root = np.interp(t, _ROOT_GRID, _blurred_root(), right=np.nan)
+        root = np.where(np.isnan(root), np.sqrt(np.maximum(t, 0)), root)
+        odd = [bell * t, bell * (t**3 - 3 * t), bell * (t**5 - 10 * t**3 + 15 * t)] if with_odd else []
+        total += weight * np.stack([inside, blur * (t * inside + bell), root, *odd])
+    return total
 
 
 @dataclass(frozen=True)
@@ -109,16 +140,14 @@ class BallOutline:
 def outline_through(camera: Camera, pixels: npt.ArrayLike, sd_px: float = 0.5) -> BallOutline:
     """Return the outline through points, shape (N, 2), px, N >= 3, each with an independent error of `sd_px`.
 
-    Sightlines u of the outline meet u . m = 1, with m along the ball's direction and of length 1 / cos(half-angle).
     Raises `InputError` where the points lie on no such cone.
     """
     points = np.asarray(pixels, dtype=float)
     rays = camera.unproject(points)
-    m: Array = np.asarray(np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0], dtype=float)
-    length = float(np.linalg.norm(m))
-    if not length > 1:
+    cone = cone_through(rays)
+    if cone is None:
         raise InputError(f"outline: {len(points)} points lie on no ball's outline; must be px on its edge")
-    direction, half_angle = m / length, float(np.arccos(1 / length))
+    direction, half_angle = cone
     first, second = basis_across(direction)
     J = np.column_stack([-_unit_across(rays, direction) @ np.array([first, second]).T, -np.ones(len(rays))])
     along, down = np.eye(2)
@@ -126,6 +155,16 @@ def outline_through(camera: Camera, pixels: npt.ArrayLike, sd_px: float = 0.5) -
     step = np.sqrt(np.linalg.norm(np.cross(*pixel), axis=1))
     weighted = J / (sd_px * step)[:, None]
     return BallOutline(direction, half_angle, np.asarray(np.linalg.inv(weighted.T @ weighted), dtype=float))
+
+
+def cone_through(rays: Array) -> tuple[Array, float] | None:
+    """Return axis and half-angle, rad, of the circular cone through unit sightlines, (N, 3); None where there is none.
+
+    Sightlines u of the cone meet u . m = 1, with m along the axis and of length 1 / cos(half-angle).
+    """
+    m: Array = np.asarray(np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0], dtype=float)
+    length = float(np.linalg.norm(m))
+    return (m / length, float(np.arccos(1 / length))) if length > 1 else None
 
 
 def _unit_across(rays: Array, direction: Array) -> Array:
@@ -157,16 +196,13 @@ def refine_outline(intensity: Array, camera: Camera, start: BallOutline) -> Ball
     found = start
     for _ in range(3):
         # The band moves with the outline.
-        band = _band(intensity, camera, found)
-        if band is None:
-            return None
-        before, fitted = found, _fit(band, found)
+        before, fitted = found, _fit(intensity, camera, found, is_fine=False)
         if fitted is None:
             return None
         found = fitted
-        if abs(found.half_angle - before.half_angle) < 0.05 * float(np.median(band.pixel_rad)):
+        if abs(found.half_angle - before.half_angle) * camera.fx < 0.05:
             break
-    return found
+    return _fit(intensity, camera, found, is_fine=True)
 
 
 def _band(intensity: Array, camera: Camera, outline: BallOutline) -> _Band | None:
@@ -181,7 +217,7 @@ def _band(intensity: Array, camera: Camera, outline: BallOutline) -> _Band | Non
     x, y = (np.arange(a, b) + 0.5 for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(x, y), axis=-1)
     rays = camera.unproject(grid)
-    angle = _angles(rays, outline.direction)
+    angle = angles_to(rays, outline.direction)
     pixel = np.hypot(*np.gradient(angle))
     with np.errstate(invalid="ignore"):
         near = np.abs(angle - outline.half_angle) < BAND_PX * pixel
@@ -197,13 +233,20 @@ def _band(intensity: Array, camera: Camera, outline: BallOutline) -> _Band | Non
     return _Band(kept[::every], values[::every], pixel[near][::every], sector[::every])
 
 
-def _angles(rays: Array, direction: Array) -> Array:
+def angles_to(rays: Array, direction: Array) -> Array:
+    """Return the angles of unit sightlines, shape (..., 3), to a direction, rad."""
     sine = np.linalg.norm(np.cross(rays, direction), axis=-1)
     return np.arctan2(sine, rays @ direction)
 
 
-def _fit(band: _Band, start: BallOutline) -> BallOutline | None:
-    """Fit direction, half-angle and blur by Gauss-Newton steps, the amplitudes projected out (see the module)."""
+def _fit(intensity: Array, camera: Camera, start: BallOutline, is_fine: bool) -> BallOutline | None:
+    """Fit direction, half-angle and blur by Gauss-Newton steps, the amplitudes projected out (see the module).
+
+    The fine fit keeps the blur and has the odd terms, which could take the outline elsewhere if it began farther off.
+    """
+    band = _band(intensity, camera, start)
+    if band is None:
+        return None
     scale = float(np.median(band.pixel_rad))
     used = [np.flatnonzero(band.sector == k) for k in range(SECTORS)]
     used = [rows for rows in used if len(rows) >= LEAST_PIXELS]
@@ -220,13 +263,16 @@ def _fit(band: _Band, start: BallOutline) -> BallOutline | None:
 
     def residuals(p: Array) -> Array:
         direction, half_angle, blur = outline_at(p)
-        s = (_angles(band.rays, direction) - half_angle) / band.pixel_rad
-        return _projected(s, band.values, blur, weights, used)
+        s = (angles_to(band.rays, direction) - half_angle) / band.pixel_rad
+        curvature = band.pixel_rad / np.tan(half_angle)
+        depth = -s - (blur**2 + PIXEL_VARIANCE) * curvature / 2
+        return _projected(depth, curvature, band.values, _profiles(blur, is_fine), weights, used)
 
+    steps = np.diag(STEPS)[: 3 if is_fine else 4]
     r = residuals(at)
     for _ in range(ROUNDS):
-        J = np.stack([(residuals(at + d) - residuals(at - d)) / (2 * d.sum()) for d in np.diag(STEPS)], axis=1)
-        step = np.linalg.lstsq(J, -r, rcond=None)[0]
+        J = np.stack([(residuals(at + d) - residuals(at - d)) / (2 * d.sum()) for d in steps], axis=1)
+        step = np.append(np.linalg.lstsq(J, -r, rcond=None)[0], [0.0] * (4 - len(steps)))
         step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
         at = at + step
         at[3] = np.clip(at[3], *np.log(BLUR_PX))
@@ -236,7 +282,7 @@ def _fit(band: _Band, start: BallOutline) -> BallOutline | None:
         # Sectors whose edge is another one, such as a shadow's, count less.
         weights = _weights(r, weights, used)
         r = residuals(at)
-    J = np.stack([(residuals(at + d) - residuals(at - d)) / (2 * d.sum()) for d in np.diag(STEPS)], axis=1)
+    J = np.stack([(residuals(at + d) - residuals(at - d)) / (2 * d.sum()) for d in steps], axis=1)
     covariance = _covariance(J, r, used)
     outside = [_is_darker_outside(band, outline_at(at), rows) for rows in used]
     if covariance is None or not np.abs(at[:3]).max() < 2 * BAND_PX:
@@ -248,22 +294,24 @@ def _fit(band: _Band, start: BallOutline) -> BallOutline | None:
 def _is_darker_outside(band: _Band, at: tuple[Array, float, float], rows: npt.NDArray[np.intp]) -> bool:
     """Return whether a sector's pixels are darker outside the outline than inside, some px from it."""
     direction, half_angle, _ = at
-    s = (_angles(band.rays[rows], direction) - half_angle) / band.pixel_rad[rows]
+    s = (angles_to(band.rays[rows], direction) - half_angle) / band.pixel_rad[rows]
     values = band.values[rows]
     inside, outside = values[(s < -BESIDE_PX)], values[s > BESIDE_PX]
     return bool(len(inside) and len(outside) and np.median(outside) < np.median(inside))
 
 
-def _projected(s: Array, values: Array, blur: float, weights: Array, used: list[npt.NDArray[np.intp]]) -> Array:
-    """Return the weighted residuals of the best amplitudes of each sector, shape (N,); 0 outside the sectors."""
-    from scipy.special import ndtr
+def _projected(
+    depth: Array, curvature: Array, values: Array, profiles: Array, weights: Array, used: list[npt.NDArray[np.intp]]
+) -> Array:
+    """Return the weighted residuals of the best amplitudes of each sector, shape (N,); 0 outside the sectors.
 
-    depth = -s / blur
-    inside = ndtr(depth)
-    ramp = depth * inside + np.exp(-(depth**2) / 2) / np.sqrt(2 * np.pi)
-    root = np.interp(depth, _GRID, _blurred_root())
-    columns = np.stack([np.ones_like(s), inside, ramp, ramp - depth, root], axis=1)
-    left = np.zeros(len(s))
+    `depth` below the outline is in px, the outline's `curvature` in 1/px.
+    """
+    step, ramp, root, *odd = (np.interp(depth, _GRID, profile) for profile in profiles)
+    # A sphere's shading is sqrt(2 depth c - (depth c)^2).
+    root = root * np.sqrt(1 - np.clip(depth * curvature / 2, 0.0, 0.9))
+    columns = np.stack([np.ones_like(depth), depth, step, ramp, root, *odd], axis=1)
+    left = np.zeros(len(depth))
     for rows in used:
         A, y, w = columns[rows], values[rows], weights[rows]
         Q, R = np.linalg.qr(A * w[:, None])
@@ -291,10 +339,10 @@ def _covariance(J: Array, r: Array, used: list[npt.NDArray[np.intp]]) -> Array |
         return None
     inverse = np.linalg.inv(normal)
     count = sum(len(rows) for rows in used)
-    white = float(r @ r) / max(count - 5 * len(used) - len(STEPS), 1) * inverse
+    white = float(r @ r) / max(count - COLUMNS * len(used) - J.shape[1], 1) * inverse
     # Errors that go together within a sector, such as a texture behind the ball.
     scores = np.array([J[rows].T @ r[rows] for rows in used])
-    share = len(used) / max(len(used) - len(STEPS), 1)
+    share = len(used) / max(len(used) - J.shape[1], 1)
     grouped = share * inverse @ (scores.T @ scores) @ inverse
     chosen = grouped if np.trace(grouped[:3, :3]) > np.trace(white[:3, :3]) else white
     return np.asarray(chosen, dtype=float)

@@ -162,8 +162,10 @@ def _check_scale(path: Path, name: str, form: MapFormat, scale_mm: float | None)
 
 
 def _check_size(path: Path, name: str, form: MapFormat, camera: Camera) -> None:
-    """Raise `InputError` where the camera has not the size of the data set's frames, or a smaller copy of them."""
+    """Raise `InputError` where the map is missing, or the camera has neither the frames' size nor that of a copy."""
     width, height = form.size_px
+    if not path.exists():
+        raise InputError(f"{shown(path)}: no such file; must be a map of {name}")
     if abs(camera.width * height - camera.height * width) > max(width, height):
         raise InputError(
             f"{shown(path)}: the camera is of {camera.width} x {camera.height} px; frames of {name} are of "

@@ -1,0 +1,198 @@
+"""Compare a network of the task `spot_normals` with `bisector` and `cloud` on anatomies that it has not seen.
+
+simtest dataset highlights --out data/highlights
+simtest train spot_normals data/highlights --out models/spots
+python -m studies.learned_spots data/highlights models/spots/model.onnx
+
+A third argument limits the frames of each anatomy: the anatomies are the independent units.
+"""
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from simtest.cli.progress import progress_bar
+from simtest.dataset.fields import INSTRUMENT
+from simtest.dataset.learn.spots import FIELDS_READ, only_glints, sample_frame
+from simtest.dataset.reader import read_samples, sample_positions
+from simtest.dataset.sample import Sample
+from simtest.errors import Failure
+from simtest.estimators import Estimate, load_estimators
+from simtest.estimators.learned_spot import LearnedSpot
+from simtest.geometry.vectors import tangent_coordinates
+from simtest.reconstruction.pipeline import run_pipeline
+from simtest.runtime.arrays import Array
+
+CHI2_95 = -2 * np.log(0.05)
+SEED, DRAWS = 2026, 2000
+FAMILIES = ("colon", "stomach", "liver")
+
+
+@dataclass
+class Row:
+    """One estimate: its errors, deg, NaN where there is no truth; squared Mahalanobis distance; where it comes from."""
+
+    estimator: str
+    spot: tuple[int, int]
+    family: int
+    anatomy: int
+    base_deg: float = np.nan
+    fine_deg: float = np.nan
+    distance2: float = np.nan
+    status: str = "ok"
+
+
+def main() -> None:
+    """Estimate on the test split, print the tables."""
+    folder, model = Path(sys.argv[1]), sys.argv[2]
+    most = int(sys.argv[3]) if len(sys.argv) > 3 else sys.maxsize
+    estimators = {
+        **load_estimators(["bisector", "cloud"]),
+        "learned_spot, base": LearnedSpot(model, "base"),
+        "learned_spot, fine": LearnedSpot(model, "fine"),
+    }
+    rows: list[Row] = []
+    taken: Counter[tuple[int, int]] = Counter()
+    total = len(sample_positions(folder, "test"))
+    with progress_bar("comparing") as progress:
+        for number, sample in enumerate(read_samples(folder, "test", FIELDS_READ)):
+            anatomy = (sample.meta["anatomy"]["family"], sample.meta["anatomy"]["number"])
+            taken[anatomy] += 1
+            if taken[anatomy] <= most:
+                rows += _rows(sample, estimators)
+            progress(number + 1, total + 1, "test split: frames")
+    print(f"{sum(min(count, most) for count in taken.values())} frames of {len(taken)} anatomies\n")
+    print("\n".join(_table(rows)))
+    print()
+    print("\n".join(_pairs(rows)))
+
+
+def _rows(sample: Sample, estimators: dict[str, object]) -> Iterator[Row]:
+    """Yield the estimates at the highlights of a sample that the detector by colour finds."""
+    frame, anatomy = sample_frame(sample), sample.meta["anatomy"]
+    found = run_pipeline(frame.encoded, frame.calibration, "colour", estimators, None, frame.smoothing_px)  # type: ignore[arg-type]
+    single = [each for each in found.specularities if not isinstance(each.patch, Failure)]
+    peaks = np.array([each.patch.peak_px for each in single if not isinstance(each.patch, Failure)]).reshape(-1, 2)
+    glints = dict(only_glints(sample, peaks))
+    for number, (each, peak) in enumerate(zip(single, peaks, strict=True)):
+        base = _base(sample, peak)
+        fine = np.array(sample.meta["highlights"][glints[number]]["normal"]) if number in glints else None
+        if base is None:
+            continue
+        for name, result in each.estimates.items():
+            row = Row(name, (sample.index, number), anatomy["family"], anatomy["number"])
+            yield _scored(row, result, base, fine)
+    answered = [
+        (n, p) for n, p in enumerate(peaks) if isinstance(single[n].estimates.get("learned_spot, base"), Estimate)
+    ]
+    for each in found.specularities:
+        for result in each.estimates.values():
+            if isinstance(result, Estimate) and result.cloud is not None and answered:
+                base = _base(sample, result.look_px)
+                near = min(answered, key=lambda found: float(np.hypot(*(found[1] - result.look_px))))[0]
+                if base is not None:
+                    yield _scored(
+                        Row("cloud", (sample.index, near), anatomy["family"], anatomy["number"]), result, base, None
+                    )
+
+
+def _base(sample: Sample, point: Array) -> Array | None:
+    """Return the base's normal at a pixel; None off the tissue."""
+    height, width = sample.images["depth"].shape
+    column, row = int(point[0]), int(point[1])
+    if not (0 <= column < width and 0 <= row < height) or sample.images[INSTRUMENT][row, column]:
+        return None
+    normal = sample.images["normal_base"][row, column].astype(float)
+    return normal / np.linalg.norm(normal) if np.isfinite(normal).all() else None
+
+
+def _scored(row: Row, result: Estimate | Failure, base: Array, fine: Array | None) -> Row:
+    if isinstance(result, Failure):
+        row.status = result.reason.value
+        return row
+    off = {"base": tangent_coordinates(result.normal, base)}
+    if fine is not None:
+        off["fine"] = tangent_coordinates(result.normal, fine)
+        row.fine_deg = float(np.degrees(np.hypot(*off["fine"])))
+    row.base_deg = float(np.degrees(np.hypot(*off["base"])))
+    if result.covariance is not None and result.target in off:
+        own = off[result.target]
+        row.distance2 = float(own @ np.linalg.solve(result.covariance, own))
+    return row
+
+
+def _table(rows: list[Row]) -> Iterator[str]:
+    """Yield the table of each estimator over each organ."""
+    heads = ("estimator", "organ", "detections", "answered", "base: median, deg", "95 % below",
+             "fine: median, deg (n)", "95 % below", "inside its 95 % ellipse")  # fmt: skip
+    yield f"| {' | '.join(heads)} |"
+    yield "|---|---|---|---|---|---|---|---|---|"
+    for name in dict.fromkeys(row.estimator for row in rows):
+        for family in (None, 0, 1, 2):
+            own = [row for row in rows if row.estimator == name and family in (None, row.family)]
+            ok = [row for row in own if row.status == "ok"]
+            if not ok:
+                continue
+            base, fine, distance = (
+                _known(ok, lambda row, key=key: getattr(row, key)) for key in ("base_deg", "fine_deg", "distance2")
+            )
+            organ = "all" if family is None else FAMILIES[family]
+            inside = f"{np.mean(distance <= CHI2_95):.3f}" if len(distance) else "none"
+            cells = (name, organ, len(own), len(ok), _median(base), _p95(base), f"{_median(fine)} ({len(fine)})",
+                     _p95(fine), inside)  # fmt: skip
+            yield f"| {' | '.join(map(str, cells))} |"
+
+
+def _known(rows: list[Row], value: Callable[[Row], float]) -> Array:
+    values = np.array([value(row) for row in rows], dtype=float)
+    return values[np.isfinite(values)]
+
+
+def _median(values: Array) -> str:
+    return f"{np.median(values):.2f}" if len(values) else "none"
+
+
+def _p95(values: Array) -> str:
+    return f"{np.percentile(values, 95):.2f}" if len(values) else "none"
+
+
+def _pairs(rows: list[Row]) -> Iterator[str]:
+    """Yield the differences of the network from the others where both answered, with intervals over anatomies."""
+    yield "| pair | truth | n | anatomies | mean difference, deg | 95 % interval | median of both, deg |"
+    yield "|---|---|---|---|---|---|---|"
+    for one, other, key in (
+        ("learned_spot, base", "bisector", "base_deg"),
+        ("learned_spot, base", "cloud", "base_deg"),
+        ("learned_spot, fine", "bisector", "fine_deg"),
+    ):
+        first = {row.spot: row for row in rows if row.estimator == one and np.isfinite(getattr(row, key))}
+        pairs = [(first[row.spot], row) for row in rows if row.estimator == other and row.spot in first
+                 and np.isfinite(getattr(row, key))]  # fmt: skip
+        if not pairs:
+            yield f"| {one} - {other} | {key[:4]} | 0 | 0 | none | none | none |"
+            continue
+        values = np.array([[getattr(row, key) for row in pair] for pair in pairs])
+        groups = np.array([10_000 * pair[1].family + pair[1].anatomy for pair in pairs])
+        low, high = _interval(values[:, 0] - values[:, 1], groups)
+        medians = " and ".join(f"{value:.2f}" for value in np.median(values, axis=0))
+        yield (
+            f"| {one} - {other} | {key[:4]} | {len(pairs)} | {len(set(groups.tolist()))} | "
+            f"{np.mean(values[:, 0] - values[:, 1]):+.2f} | {low:+.2f} to {high:+.2f} | {medians} |"
+        )
+
+
+def _interval(differences: Array, groups: Array) -> tuple[float, float]:
+    """Return the 95 % interval of the mean by bootstrap over anatomies, the independent units."""
+    rng = np.random.default_rng(SEED)
+    sums = np.array([[differences[groups == group].sum(), (groups == group).sum()] for group in np.unique(groups)])
+    drawn = sums[rng.integers(len(sums), size=(DRAWS, len(sums)))].sum(axis=1)
+    low, high = np.percentile(drawn[:, 0] / drawn[:, 1], [2.5, 97.5])
+    return float(low), float(high)
+
+
+if __name__ == "__main__":
+    main()

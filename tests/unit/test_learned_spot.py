@@ -1,0 +1,224 @@
+"""A network as an estimator: equal in PyTorch and ONNX Runtime, calibrated, and silent outside its training."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+onnxruntime = pytest.importorskip("onnxruntime")
+
+from simtest.calibration import Calibration, Priors  # noqa: E402
+from simtest.dataset.learn.spot_export import export  # noqa: E402
+from simtest.dataset.learn.spot_task import SpotNormals, squared_distance  # noqa: E402
+from simtest.dataset.learn.training import Training  # noqa: E402
+from simtest.errors import Failure, InputError  # noqa: E402
+from simtest.estimators import Estimate  # noqa: E402
+from simtest.estimators.learned_spot import METADATA, LearnedSpot  # noqa: E402
+from simtest.estimators.spot_inputs import rays_of, spot_inputs  # noqa: E402
+from simtest.geometry import BrownConrady, Camera  # noqa: E402
+from simtest.geometry.vectors import angle_deg  # noqa: E402
+from simtest.reconstruction.pipeline import run_pipeline  # noqa: E402
+
+pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore")]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Several threads take turns at so small a network, and wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+SIZE = 96
+LIGHTS = ((3.0, 1.0, 0.0), (-3.0, 1.0, 0.0))
+
+
+def picture(seed):
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:SIZE, :SIZE] + 0.5
+    light = 0.1 + 0.002 * rng.normal(size=(SIZE, SIZE))
+    for column, row in rng.uniform(25, SIZE - 25, (3, 2)):
+        light += 0.6 * np.exp(-((x - column) ** 2 + (y - row) ** 2) / rng.uniform(15, 40))
+    return np.clip(light, 0, 1).astype(np.float32)
+
+
+def calibration(focal=90.0, lights=LIGHTS, **camera):
+    return Calibration(Camera(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2, **camera), priors=Priors(lights_mm=lights))
+
+
+def examples(seeds):
+    """Return inputs at the spots of frames, with rotations that the network cannot predict exactly."""
+    from simtest.calibration import Frame
+
+    rng = np.random.default_rng(seeds[0])
+    crops, extras = [], []
+    for seed in seeds:
+        frame = Frame(picture(seed), calibration(), 1.0)
+        made = spot_inputs(frame, rng.uniform(20, SIZE - 20, (6, 2)))
+        crops.append(made[0])
+        extras.append(made[1])
+    batch = {"crops": np.concatenate(crops), "extras": np.concatenate(extras)}
+    count = len(batch["crops"])
+    for name in ("base", "fine"):
+        batch[name] = rng.normal(0, 0.1, (count, 2)).astype(np.float32)
+        batch[f"{name}_ratio"] = rng.uniform(0.2, 1, count).astype(np.float32)
+    return {name: torch.from_numpy(values) for name, values in batch.items()}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    taught, judged = examples(range(30)), examples(range(100, 120))
+    task = SpotNormals()
+    torch.manual_seed(3)
+    network = task.network(taught, Training(name="spot", task="spot_normals")).eval()
+    out = tmp_path_factory.mktemp("spot")
+    return network, taught, judged, export(network, taught, judged, out, {"dataset": "drawn"})
+
+
+def test_onnx_gives_what_pytorch_gives(made):
+    network, _, judged, path = made
+    session = onnxruntime.InferenceSession(path.read_bytes())
+    inputs = {name: judged[name].numpy() for name in ("crops", "extras")}
+    with torch.no_grad():
+        wanted = [each.numpy() for each in network(judged["crops"], judged["extras"])]
+    for one, other in zip(session.run(None, inputs), wanted, strict=True):
+        assert one.shape == other.shape
+        assert np.abs(one - other).max() < 1e-5
+
+
+def test_covariances_are_scaled_to_cover_95_percent_of_the_validation_split(made):
+    network, _, judged, path = made
+    content = json.loads(onnxruntime.InferenceSession(path.read_bytes()).get_modelmeta().custom_metadata_map[METADATA])
+    with torch.no_grad():
+        outputs, _ = network(judged["crops"], judged["extras"])
+    for number, surface in enumerate(("base", "fine")):
+        distances = squared_distance(outputs[:, number], judged[surface]) / content["scales"][surface]
+        assert 0.93 < float((distances < 5.991).float().mean()) < 0.97
+    assert content["about"] == {"dataset": "drawn"}
+
+
+def test_the_pipeline_runs_it_beside_the_others(made):
+    network, path = made[0], made[3]
+    frame = picture(7)
+    learned = LearnedSpot(path)
+    found = run_pipeline(frame, calibration(), "peaks", {"learned_spot": learned}, None, 2.0)
+    results = [each.estimates["learned_spot"] for each in found.specularities]
+    assert results
+    assert all(isinstance(result, Estimate) for result in results), results
+    peaks = np.array([result.look_px for result in results])
+    crops, extras = spot_inputs(found.detection.frame, peaks)
+    with torch.no_grad():
+        outputs = network(torch.from_numpy(crops), torch.from_numpy(extras))[0].numpy()[:, 0]
+    rays = rays_of(calibration().camera, peaks)
+    for result, ray, row in zip(results, rays, outputs, strict=True):
+        assert result.target == "base"
+        assert 0 < result.axis_ratio < 1
+        # The network's rotation is the angle between the normal and the direction to the camera.
+        turned = 0.1 * np.hypot(*row[:2])
+        assert angle_deg(result.normal[None], -ray[None])[0] == pytest.approx(np.degrees(turned), abs=1e-4)
+        # The map from rotations to normals keeps areas but for the angle's sine, so determinants agree.
+        wanted = (0.1**2 * np.exp(row[2] + row[4])) ** 2 * learned._network.scales["base"] ** 2
+        assert np.linalg.det(result.covariance) == pytest.approx(wanted * np.sinc(turned / np.pi) ** 2, rel=1e-3)
+
+
+def told(path, calibrated, seed=7):
+    found = run_pipeline(picture(seed), calibrated, "peaks", {"learned_spot": LearnedSpot(path)}, None, 2.0)
+    return [each.estimates["learned_spot"] for each in found.specularities]
+
+
+def test_it_refuses_what_it_was_not_taught(made):
+    path = made[3]
+    refused = {
+        "another focal length": (calibration(focal=200.0), "focal length"),
+        "other lights": (calibration(lights=((40.0, 0.0, 0.0),)), "light"),
+        "a lens with distortion": (calibration(distortion=BrownConrady(k1=-0.05)), "a lens with distortion"),
+        "no lights": (Calibration(calibration().camera), "needs the lights"),
+    }
+    for name, (calibrated, said) in refused.items():
+        results = told(path, calibrated)
+        assert results, name
+        for result in results:
+            assert isinstance(result, Failure), name
+            assert said in result.detail, name
+
+
+def test_it_refuses_highlights_unlike_those_of_its_training(made):
+    # Spots of another form: wide stripes, whose crops no frame of the train split holds.
+    y, x = np.mgrid[:SIZE, :SIZE] + 0.5
+    stripes = (0.02 + 0.9 * np.exp(-((x - 48) ** 2) / 8 - ((y - 48) ** 2) / 900)).astype(np.float32) ** 2
+    found = run_pipeline(stripes, calibration(), "peaks", {"one": LearnedSpot(made[3])}, (20, 20, 56, 56), 2.0)
+    (result,) = [each.estimates["one"] for each in found.specularities]
+    assert isinstance(result, Failure)
+    assert "unlike the network's training" in result.detail
+
+
+def without_metadata(model):
+    del model.metadata_props[:]
+
+
+def changed(**values):
+    def change(model):
+        content = json.loads(model.metadata_props[0].value)
+        content.update(values)
+        model.metadata_props[0].value = json.dumps(content)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (without_metadata, "is no network of simtest train"),
+        (changed(format="mine"), "format 'mine'"),
+        (changed(scales={"base": 1.0}), "KeyError"),
+        (changed(scales={"base": 0.0, "fine": 1.0}), "above 0"),
+        (changed(feature_mean=[0.0]), "does not fit"),
+        (changed(low=3), "is no network of simtest train"),
+    ],
+    ids=["no metadata", "another format", "a scale missing", "a scale of 0", "other features", "no ranges"],
+)
+def test_another_model_is_refused_in_one_line(made, tmp_path, change, said):
+    model = onnx.load(made[3])
+    change(model)
+    onnx.save(model, tmp_path / "other.onnx")
+    with pytest.raises(InputError, match=said) as raised:
+        LearnedSpot(tmp_path / "other.onnx").check()
+    assert "\n" not in str(raised.value)
+    assert "other.onnx" in str(raised.value)
+
+
+def test_a_network_of_other_inputs_is_refused_in_one_line(made, tmp_path):
+    model = onnx.load(made[3])
+    for node in model.graph.node:
+        node.input[:] = ["pictures" if name == "crops" else name for name in node.input]
+    model.graph.input[0].name = "pictures"
+    onnx.save(model, tmp_path / "other.onnx")
+    with pytest.raises(InputError, match=r"other.onnx: cannot be run \(.*crops") as raised:
+        told(tmp_path / "other.onnx", calibration())
+    assert "\n" not in str(raised.value)
+
+
+def test_what_is_no_model_is_refused_in_one_line(tmp_path):
+    (tmp_path / "text.onnx").write_text("no model")
+    with pytest.raises(InputError, match=r"text.onnx: is no ONNX model"):
+        LearnedSpot(tmp_path / "text.onnx").check()
+    with pytest.raises(InputError, match=r"none.onnx: cannot be read \(No such file"):
+        LearnedSpot(tmp_path / "none.onnx").check()
+    with pytest.raises(InputError, match="target = both: must be base or fine"):
+        LearnedSpot(tmp_path / "none.onnx", "both")
+
+
+def test_it_needs_no_pytorch(made):
+    code = (
+        "import sys; sys.modules['torch'] = None; "
+        "from simtest.estimators.learned_spot import LearnedSpot; "
+        f"LearnedSpot({str(made[3])!r}).check()"
+    )
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert child.returncode == 0, child.stderr

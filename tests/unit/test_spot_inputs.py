@@ -1,0 +1,102 @@
+"""What a network sees of a highlight: mirrored and turned with the picture, and the same whatever the detector."""
+
+import numpy as np
+import pytest
+
+from simtest.calibration import Calibration, Frame, Priors
+from simtest.estimators.spot_inputs import (
+    EXTRAS,
+    SIDE,
+    STEPS,
+    image_basis,
+    normal_of,
+    rays_of,
+    rotation_of,
+    spot_inputs,
+)
+from simtest.geometry import Camera
+
+WIDTH = 121
+LIGHTS = np.array([[3.0, 1.0, 0.0], [-2.0, 1.5, 0.5]])
+PEAK = np.array([70.5, 41.5])
+
+
+def frame(picture, lights=LIGHTS):
+    camera = Camera(WIDTH, WIDTH, 150.0, 150.0, WIDTH / 2, WIDTH / 2)
+    return Frame(picture, Calibration(camera, priors=Priors(lights_mm=tuple(map(tuple, lights)))), 1.0)
+
+
+@pytest.fixture
+def picture():
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[:WIDTH, :WIDTH] + 0.5
+    lobe = 0.9 * np.exp(-((x - PEAK[0]) ** 2 + 2 * (y - PEAK[1]) ** 2) / 40)
+    return (lobe + rng.uniform(0.05, 0.1, (WIDTH, WIDTH))).astype(np.float32)
+
+
+def test_crops_show_the_frame_around_the_peak(picture):
+    crops, extras = spot_inputs(frame(picture), [PEAK])
+    assert crops.shape == (1, len(STEPS), SIDE, SIDE)
+    assert extras.shape == (1, len(EXTRAS))
+    light = frame(picture).channels
+    own = np.log(light / np.median(light) + 0.02)
+    # Between four centres of pixels each value is their mean.
+    row, column = int(PEAK[1]), int(PEAK[0])
+    assert np.isclose(crops[0, 0, 16, 16], own[row : row + 2, column : column + 2].mean(), atol=1e-4)
+    # The widest crop reaches over the border, where it is dark.
+    assert crops[0, 2, 0, 0] == pytest.approx(np.log(0.02))
+    assert np.isfinite(crops).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "moved"),
+    [
+        (lambda p: p[:, ::-1], (True, False, False)),
+        (lambda p: p[::-1], (False, True, False)),
+        (lambda p: p.T, (False, False, True)),
+        (lambda p: p.T[::-1], (True, False, True)),
+    ],
+    ids=["mirrored", "upside down", "transposed", "turned"],
+)
+def test_a_moved_picture_gives_moved_inputs(picture, change, moved):
+    torch = pytest.importorskip("torch")
+    from simtest.dataset.learn import spot_task
+
+    flip_x, flip_y, transpose = moved
+    # The move of the picture as a matrix, for lights, peak and normal: mirrored first, then transposed.
+    matrix = np.diag([-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0, 1.0])
+    matrix = matrix[[1, 0, 2]] if transpose else matrix
+    middle = WIDTH / 2
+    peak = (matrix[:2, :2] @ (PEAK - middle)) + middle
+    normal = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
+    before, after = frame(picture), frame(np.ascontiguousarray(change(picture)), LIGHTS @ matrix.T)
+    batch = {}
+    for name, seen, at, true in (("before", before, PEAK, normal), ("after", after, peak, matrix @ normal)):
+        crops, extras = spot_inputs(seen, [at])
+        rotation = rotation_of(rays_of(seen.camera, at[None]), true[None])
+        batch[name] = {
+            "crops": torch.from_numpy(crops), "extras": torch.from_numpy(extras),
+            "base": torch.from_numpy(rotation), "fine": torch.from_numpy(rotation),
+        }  # fmt: skip
+    turned = spot_task.moved(batch["before"], flip_x, flip_y, transpose)
+    assert torch.allclose(turned["crops"], batch["after"]["crops"], atol=1e-4)
+    # The basis follows the image's x, so off the axis a transposed one is turned by a small angle.
+    tolerance = 0.03 if transpose else 1e-5
+    for name in ("extras", "base", "fine"):
+        assert torch.allclose(turned[name], batch["after"][name], atol=tolerance), name
+    # What is compared does change with the move.
+    assert not torch.allclose(batch["before"]["extras"], batch["after"]["extras"], atol=0.05)
+
+
+def test_rotations_and_normals_are_each_other_s_inverse():
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(50, 3)) * [0.5, 0.5, 0.1] + [0, 0, 1]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rotation = rng.normal(0, 0.4, (50, 2))
+    normals = normal_of(rays, rotation)
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1)
+    assert np.allclose(rotation_of(rays, normals), rotation)
+    assert np.allclose(normal_of(rays, np.zeros((50, 2))), -rays)
+    frames = np.concatenate([image_basis(rays), rays[:, None]], axis=1)
+    assert np.allclose(frames @ frames.transpose(0, 2, 1), np.eye(3))
+    assert np.allclose(np.linalg.det(frames), 1)
