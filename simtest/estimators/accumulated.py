@@ -45,8 +45,8 @@ CHI95 = 5.991464547107979
 
 NEWTON_STEPS, CONVERGED = 60, 1e-9
 REFITS = 2
-"""Fits on a plane that faces as the last one found: where a plane is told tilted, parts of the patch lie nearer or
-farther than told, and the light's falloff turns the normal found at a slope of 6 deg by 0.03 of the tilt."""
+"""Fits on a plane that faces as the last one found. Where a plane is told tilted, parts of the patch lie nearer or
+farther than told, and the light's falloff turns the normal found by 2 s^2 of the tilt, s the slope seen, rad."""
 
 POSE_DRAWS = 24
 """Fits with drawn errors of the poses."""
