@@ -226,6 +226,23 @@ def test_lights_are_found_and_written(tmp_path: Path) -> None:
     assert "Positions of the lights" in (tmp_path / "index.html").read_text()
 
 
+@pytest.mark.slow
+def test_chance_meetings_of_rays_are_no_doubt() -> None:
+    """Four lights of which a fifth position explains as many highlights as one of them, but no set with it does."""
+    from studies.light_calibration.plantings import plant
+
+    rig = plant(3000)
+    made = calibrate_lights(
+        rig.pictures(), Calibration(rig.camera, Response("gamma", rig.look.gamma)), Ball(rig.radius_mm)
+    )
+    assert made.result.problems == ()
+    assert len(made.result.own) == len(rig.lights)
+    for light in made.result.own:
+        gap = min((light.position_mm - each for each in rig.lights), key=lambda each: float(np.linalg.norm(each)))
+        assert np.linalg.norm(gap) < 0.2
+        assert gap @ np.linalg.solve(light.covariance_mm2, gap) < 16.3
+
+
 def write_inputs(folder: Path) -> None:
     values = np.full((200, 240), 128, np.uint8)
     for name in ("0.png", "1.png"):
