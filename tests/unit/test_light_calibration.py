@@ -153,7 +153,7 @@ def test_clipped_spot_stays_one() -> None:
 
 def test_centres_of_small_spots_are_as_good_as_stated() -> None:
     rng, grid, total = np.random.default_rng(8), CAMERA.pixel_centres(), 0.0
-    for _ in range(20):
+    for _ in range(10):
         centre = np.array([120.0, 100.0]) + rng.uniform(-0.5, 0.5, 2)
         values = 0.2 + 0.5 * np.exp(-np.sum((grid - centre) ** 2, axis=-1) / (2 * 0.75**2))
         values += rng.normal(0, 0.01, values.shape)
@@ -161,7 +161,7 @@ def test_centres_of_small_spots_are_as_good_as_stated() -> None:
         assert [each.problem for each in found] == [""]
         gap = found[0].pixel - centre
         total += float(gap @ np.linalg.solve(found[0].covariance, gap))
-    assert total < 73.4  # chi-squared, 40 degrees of freedom, alpha = 0.001
+    assert total < 45.3  # chi-squared, 20 degrees of freedom, alpha = 0.001
 
 
 def test_same_picture_twice_counts_once() -> None:
