@@ -4,6 +4,8 @@ VENV ?= .venv
 WORKERS ?= auto
 BIN := $(VENV)/bin
 RELEASE_PYTHONS ?= all
+# A file's tests share what they render, so they stay in one process; tests/conftest.py names the long files, which come first.
+PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
 
 .PHONY: help demo docs docs-commands test test-all test-ci examples bench bench-cycles lint audit hashed-constraints \
@@ -68,13 +70,13 @@ docs-commands: $(VENV)/.docs
 	$(BIN)/python -m studies.manual commands $(QUICK) $(PAGES)
 
 test: $(VENV)/.tests
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow"
+	$(PYTEST) -m "not slow"
 
 test-all: $(VENV)/.tests
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(PYTEST)
 
 test-ci: $(VENV)/.ci
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow or extra" -rs
+	$(PYTEST) -m "not slow or extra" -rs
 
 bench: $(VENV)/.benchmarks
 	$(BIN)/python -m benchmarks

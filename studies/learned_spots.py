@@ -3,9 +3,12 @@
 simtest dataset highlights --out data/highlights
 simtest train spot_normals data/highlights --out models/spots
 python -m studies.learned_spots data/highlights models/spots/model.onnx
+
+A third argument limits the frames of each anatomy: the anatomies are the independent units.
 """
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,17 +49,23 @@ class Row:
 def main() -> None:
     """Estimate on the test split, print the tables."""
     folder, model = Path(sys.argv[1]), sys.argv[2]
+    most = int(sys.argv[3]) if len(sys.argv) > 3 else sys.maxsize
     estimators = {
         **load_estimators(["bisector", "cloud"]),
         "learned_spot, base": LearnedSpot(model, "base"),
         "learned_spot, fine": LearnedSpot(model, "fine"),
     }
     rows: list[Row] = []
+    taken: Counter[tuple[int, int]] = Counter()
     total = len(sample_positions(folder, "test"))
     with progress_bar("comparing") as progress:
         for number, sample in enumerate(read_samples(folder, "test", FIELDS_READ)):
-            rows += _rows(sample, estimators)
+            anatomy = (sample.meta["anatomy"]["family"], sample.meta["anatomy"]["number"])
+            taken[anatomy] += 1
+            if taken[anatomy] <= most:
+                rows += _rows(sample, estimators)
             progress(number + 1, total + 1, "test split: frames")
+    print(f"{sum(min(count, most) for count in taken.values())} frames of {len(taken)} anatomies\n")
     print("\n".join(_table(rows)))
     print()
     print("\n".join(_pairs(rows)))

@@ -12,6 +12,10 @@ from hypothesis import settings
 settings.register_profile("untimed", settings(), deadline=None)
 settings.load_profile("untimed")
 
+# Where each core has a worker, more threads of the renderer only wait for each other: a sixth of its processor time.
+if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
+    os.environ.setdefault("SIMTEST_THREADS", "1")
+
 # Tests change constants and functions that the key of a kept array does not know of.
 os.environ["SIMTEST_CACHE"] = "off"
 
@@ -34,6 +38,25 @@ def pytest_collection_finish():
     """
     gc.collect()
     gc.freeze()
+
+
+LONGEST = (
+    "test_examples", "test_relief", "test_gate_edits", "test_gate", "test_dataset", "test_nightly_run",
+    "test_process_runs", "test_cli", "test_colon", "test_core_check", "test_deformed_render", "test_tissue_colour",
+    "test_canaries", "test_photometric", "test_page_up_to_date", "test_dense_shading", "test_fit",
+    "test_nightly_page", "test_inverse_rendering", "test_reuse", "test_learn", "test_sensor_scenes", "test_export",
+    "test_dense_command", "test_mesh_surface", "test_motion_sequence", "test_gate_signs", "test_tracks",
+    "test_motion_evidence", "test_circle_pose", "test_process_faults", "test_nightly_browser", "test_dense_depths",
+    "test_curved", "test_stopping", "test_camera_path", "test_deforming_sequence", "test_anatomies", "test_glints",
+    "test_pages_browser",
+)  # fmt: skip
+"""Files of 4 s of processor time and more, the longest first."""
+
+
+def pytest_collection_modifyitems(items):
+    """Put the longest files first: one that began last would leave the other workers idle."""
+    order = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared" / "data"

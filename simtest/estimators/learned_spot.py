@@ -24,6 +24,7 @@ from simtest.estimators.spot_inputs import (
 )
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across
+from simtest.runtime.arrays import Image
 from simtest.runtime.files import require_plain
 from simtest.runtime.resources import shown
 
@@ -111,10 +112,8 @@ class LearnedSpot:
         crops, extras = spot_inputs(frame, peaks)
         outputs, refusals = self._network.run(crops, extras)
         rays, number = rays_of(frame.camera, np.asarray(peaks)), SURFACES.index(self.target)
-        return [
-            self._estimate(ray, peak, outputs[n, number]) if refusals[n] is None else refusals[n]
-            for n, (ray, peak) in enumerate(zip(rays, peaks, strict=True))
-        ]
+        rows = zip(rays, peaks, outputs[:, number], refusals, strict=True)
+        return [refusal or self._estimate(ray, peak, made) for ray, peak, made, refusal in rows]
 
     def _estimate(self, ray: Array, peak: Array, made: Array) -> Estimate:
         """Return the estimate of one row of outputs."""
@@ -179,7 +178,7 @@ class _Network:
                 f"its metadata must hold {METADATA!r} of the form {FORMAT!r}"
             ) from None
 
-    def run(self, crops: Array, extras: Array) -> tuple[Array, list[Failure | None]]:
+    def run(self, crops: Image, extras: Image) -> tuple[Array, list[Failure | None]]:
         """Return outputs, shape (N, 2, 7), and for each row why it is refused, or None."""
         try:
             made = self._session.run(None, {"crops": crops, "extras": extras})
@@ -193,7 +192,7 @@ class _Network:
         distances = np.einsum("ni,ij,nj->n", off, self._precision, off)
         return outputs, [self._refusal(row, distance) for row, distance in zip(extras, distances, strict=True)]
 
-    def _refusal(self, extras: Array, distance: float) -> Failure | None:
+    def _refusal(self, extras: Image, distance: float) -> Failure | None:
         for name, value in zip(EXTRAS, extras.tolist(), strict=True):
             low, high = self._low[name], self._high[name]
             margin = MARGIN * (1 + high - low)

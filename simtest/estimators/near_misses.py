@@ -24,13 +24,22 @@ CROWD = 3
 AROUND = 12
 """The brightest of so many nearest highlights stands for a highlight point's radiance."""
 
-BRIGHT, FAINT = np.radians(0.84) ** 2, np.radians(1.22) ** 2
+BRIGHT, FAINT = np.radians(0.93) ** 2, np.radians(1.26) ** 2
 """Variance along each axis, rad^2, of a highlight as bright as those around, and its growth with ln(I0 / I). The region
-of such a normal holds 95 % of the highlights, of which nearly a half are near misses."""
+of such a normal held 97 % of the highlights that were fitted, of which nearly a half are near misses: lobes and slopes
+differ from frame to frame, and the frame does not tell them."""
 
-USUAL, RARER, MOST = 60, 0.25, 400
+USUAL, RARER, MOST = 60, 0.15, 400
 """Near misses get rarer with the number of highlights, since stronger relief makes more highlight points: the variance
 falls with this power of the number of highlights for each light, over the usual one, up to the largest."""
+
+APART = 3
+"""Lights of a larger number are a ring, whose highlights melt: it counts as so many."""
+
+SEVERAL = 0.5
+"""Share of the variance under two or three lights. Which light made a highlight is then seldom known, and that error is
+as large as the part of the budget that stands for it, or smaller, never several times larger: the sum of both parts
+would hold 99 % and more."""
 
 UNTOLD_FAINTNESS = 1.0
 """ln(I0 / I) where the patch does not know how bright the others are; two thirds of the spots have less."""
@@ -45,26 +54,25 @@ def near_miss_parts(patch: Patch, priors: Priors) -> Budget:
 def near_miss_variance(patch: Patch, lights: int) -> float:
     """Return the variance of a highlight's normal along each axis by the chance that it is a near miss, rad^2.
 
-    The numbers were fitted to the 95 % quantile of the error of 3,568 highlights on rendered colons, stomachs, livers
-    and gallbladders under one light, at the camera or beside it, with slopes of 2 to 8 deg
-    (docs/concepts/uncertainty.md).
+    The numbers were fitted to the errors of 3,568 highlights on rendered colons, stomachs, livers and gallbladders
+    under one light, at the camera or beside it, with slopes of 2 to 8 deg (docs/concepts/uncertainty.md).
 
     Parameters
     ----------
     patch : Patch
         The highlight, with the frame's other ones.
     lights : int
-        How many lights there are.
+        How many lights there are, at least 1.
 
     Returns
     -------
     float
         0 in a frame that does not show more than `CROWD` highlights for each light.
     """
-    count = (len(patch.others_px) + 1) / lights
+    count = (len(patch.others_px) + 1) / min(lights, APART)
     if count <= CROWD:
         return 0.0
-    scale = (USUAL / min(count, MOST)) ** RARER
+    scale = (USUAL / min(count, MOST)) ** RARER * (SEVERAL if 1 < lights <= APART else 1.0)
     return float(scale * (BRIGHT + FAINT * _faintness(patch)))
 
 

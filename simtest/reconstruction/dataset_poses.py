@@ -1,6 +1,8 @@
 """Trajectories in the files of public data sets of colonoscopy: C3VD's pose.txt and SimCol3D's pair of text files.
 
-C3VD writes camera-to-world matrices for row vectors, 16 numbers a line, mm: the translation stands in the last row.
+C3VD writes camera-to-world matrices, 16 numbers a line, mm. Its loader takes them for row vectors, with the translation
+in the last row; its page calls them row-major, and that of its successor column-major. Where the translation stands
+tells which they are: the last row, or the last column, is 0, 0, 0, 1.
 SimCol3D writes tx ty tz, cm, into SavedPosition_NAME.txt and qx qy qz qw into SavedRotationQuaternion_NAME.txt, in the
 left-handed frame of its game engine, whose y axis points up.
 """
@@ -39,7 +41,9 @@ def dataset_poses(path: Path, text: str, where: str) -> list[Array] | None:
 
 
 def _c3vd(text: str, where: str) -> list[Array]:
-    return [np.array(row).reshape(4, 4).T for row in _numbers(text, 16, ",", where)]
+    matrices = np.array(_numbers(text, 16, ",", where)).reshape(-1, 4, 4)
+    in_column = bool((matrices[:, 3, :3] == 0).all() and (matrices[:, :3, 3] != 0).any())
+    return list(matrices if in_column else matrices.transpose(0, 2, 1))
 
 
 def _simcol3d(path: Path, text: str, where: str) -> list[Array]:

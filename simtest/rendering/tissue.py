@@ -73,8 +73,76 @@ def visible_over_cosine(direction: Any, alpha: Any, ggx: bool) -> Any:
     return dr.rcp(cosine + hidden)
 
 
+def _lift(bsdf: Any, albedo: Any) -> Any:
+    """Compute the base's share of the light within the film that leaves it upwards, times eta^2."""
+    return albedo / (1 - albedo * bsdf.returned)
+
+
+def _film(bsdf: Any, wi: Any, wo: Any) -> tuple[Any, Any]:
+    """Compute f cos(theta) and the sampling density of the film's reflection, of directions above it."""
+    import drjit as dr
+
+    mi = bsdf.of_variant
+    # Slope and Fresnel's cosine from the sum of both directions: a cosine of the facet's angle would lose the
+    # digits that matter next to 1.
+    both = wi + wo
+    squared = (dr.square(both.x) + dr.square(both.y)) / dr.square(both.z)
+    facing = dr.minimum(dr.norm(both) / 2, 1)
+    seen, lit = visible_over_cosine(wi, bsdf.alpha, bsdf.ggx), visible_over_cosine(wo, bsdf.alpha, bsdf.ggx)
+    density = facet_density(squared, bsdf.alpha, bsdf.ggx) * seen / 4
+    # Gradients must not flow through the choice of samples.
+    return density * lit * wo.z * mi.fresnel(facing, bsdf.index)[0], dr.detach(density)
+
+
+def _values(bsdf: Any, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
+    """Compute f cos(theta) and the sampling density of the enabled parts."""
+    import drjit as dr
+
+    mi = bsdf.of_variant
+    active &= (si.wi.z > 0) & (wo.z > 0)
+    # Other lanes compute with a direction of their own, so that no derivative is NaN.
+    wi, wo = dr.select(active, si.wi, mi.Vector3f(0, 0, 1)), dr.select(active, wo, mi.Vector3f(0, 0, 1))
+    value, density = mi.Spectrum(0), mi.Float(0)
+    share = bsdf._share(ctx, si, wi, active)
+    glossy, diffuse = bsdf._enabled(ctx)
+    if glossy:
+        film, drawn = bsdf._film(wi, wo)
+        value += film
+        density += share * drawn
+    if diffuse:
+        through = (1 - mi.fresnel(wi.z, bsdf.index)[0]) * (1 - mi.fresnel(wo.z, bsdf.index)[0])
+        value += bsdf._lift(bsdf._albedo(si, active)) * (through * bsdf.passage * wo.z * dr.inv_pi)
+        density += (1 - share) * dr.inv_pi * wo.z
+    return dr.select(active, value, 0), dr.select(active, density, 0)
+
+
+def _share(bsdf: Any, ctx: Any, si: Any, wi: Any, active: Any) -> Any:
+    """Return the share of samples for the film's reflection: its part of what is reflected, about."""
+    import drjit as dr
+
+    mi = bsdf.of_variant
+    glossy, diffuse = bsdf._enabled(ctx)
+    if not (glossy and diffuse):
+        return mi.Float(float(glossy))
+    film = mi.fresnel(wi.z, bsdf.index)[0]
+    base = (1 - film) * (1 - bsdf.returned) * dr.mean(bsdf._lift(bsdf._albedo(si, active)))
+    return dr.detach(film / (film + base))
+
+
+def _draw(bsdf: Any, ctx: Any, si: Any, sample2: Any, active: Any) -> tuple[Any, Any, Any]:
+    import drjit as dr
+
+    mi = bsdf.of_variant
+    active &= si.wi.z > 0
+    wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
+    # The normals of the facets that are seen from the direction of incidence.
+    kind = mi.MicrofacetType.GGX if bsdf.ggx else mi.MicrofacetType.Beckmann
+    facet, _ = mi.MicrofacetDistribution(kind, dr.detach(bsdf.alpha)).sample(wi, sample2)
+    return mi.reflect(wi, facet), bsdf._share(ctx, si, wi, active), active
+
+
 @cache
-def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose base is known at run time only
+def _make_class(mi: Any, variant: str) -> Any:
     import drjit as dr
 
     class Tissue(lobe_over_base(mi, variant)):  # type: ignore[misc]
@@ -89,6 +157,8 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
         Parameters: `alpha`, `index` (of the film, above 1), `distribution` ("beckmann" or "ggx") and
         `diffuse_reflectance`, the base's albedo. Components: 0 the film's reflection, 1 the base.
         """
+
+        of_variant = mi
 
         def __init__(self, props: Any) -> None:
             super().__init__(props, 0.5)
@@ -113,56 +183,7 @@ def _make_class(mi: Any, variant: str) -> Any:  # noqa: C901 - a class whose bas
             self.returned, self.passage = 1 - passed, (1 - MARGIN * self.alpha) / dr.square(self.index)
             dr.make_opaque(self.returned, self.passage)
 
-        def _lift(self, albedo: Any) -> Any:
-            """Compute the base's share of the light within the film that leaves it upwards, times eta^2."""
-            return albedo / (1 - albedo * self.returned)
-
-        def _film(self, wi: Any, wo: Any) -> tuple[Any, Any]:
-            """Compute f cos(theta) and the sampling density of the film's reflection, of directions above it."""
-            # Slope and Fresnel's cosine from the sum of both directions: a cosine of the facet's angle would lose the
-            # digits that matter next to 1.
-            both = wi + wo
-            squared = (dr.square(both.x) + dr.square(both.y)) / dr.square(both.z)
-            facing = dr.minimum(dr.norm(both) / 2, 1)
-            seen, lit = visible_over_cosine(wi, self.alpha, self.ggx), visible_over_cosine(wo, self.alpha, self.ggx)
-            density = facet_density(squared, self.alpha, self.ggx) * seen / 4
-            # Gradients must not flow through the choice of samples.
-            return density * lit * wo.z * mi.fresnel(facing, self.index)[0], dr.detach(density)
-
-        def _values(self, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
-            """Compute f cos(theta) and the sampling density of the enabled parts."""
-            active &= (si.wi.z > 0) & (wo.z > 0)
-            # Other lanes compute with a direction of their own, so that no derivative is NaN.
-            wi, wo = dr.select(active, si.wi, mi.Vector3f(0, 0, 1)), dr.select(active, wo, mi.Vector3f(0, 0, 1))
-            value, density = mi.Spectrum(0), mi.Float(0)
-            share = self._share(ctx, si, wi, active)
-            glossy, diffuse = self._enabled(ctx)
-            if glossy:
-                film, drawn = self._film(wi, wo)
-                value += film
-                density += share * drawn
-            if diffuse:
-                through = (1 - mi.fresnel(wi.z, self.index)[0]) * (1 - mi.fresnel(wo.z, self.index)[0])
-                value += self._lift(self._albedo(si, active)) * (through * self.passage * wo.z * dr.inv_pi)
-                density += (1 - share) * dr.inv_pi * wo.z
-            return dr.select(active, value, 0), dr.select(active, density, 0)
-
-        def _share(self, ctx: Any, si: Any, wi: Any, active: Any) -> Any:
-            """Return the share of samples for the film's reflection: its part of what is reflected, about."""
-            glossy, diffuse = self._enabled(ctx)
-            if not (glossy and diffuse):
-                return mi.Float(float(glossy))
-            film = mi.fresnel(wi.z, self.index)[0]
-            base = (1 - film) * (1 - self.returned) * dr.mean(self._lift(self._albedo(si, active)))
-            return dr.detach(film / (film + base))
-
-        def _draw(self, ctx: Any, si: Any, sample2: Any, active: Any) -> tuple[Any, Any, Any]:
-            active &= si.wi.z > 0
-            wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
-            # The normals of the facets that are seen from the direction of incidence.
-            kind = mi.MicrofacetType.GGX if self.ggx else mi.MicrofacetType.Beckmann
-            facet, _ = mi.MicrofacetDistribution(kind, dr.detach(self.alpha)).sample(wi, sample2)
-            return mi.reflect(wi, facet), self._share(ctx, si, wi, active), active
+        _lift, _film, _values, _share, _draw = _lift, _film, _values, _share, _draw
 
         def to_string(self) -> str:
             return f"Tissue[alpha={self.alpha}, index={self.index}, ggx={self.ggx}]"

@@ -29,7 +29,7 @@ def measured(planting: Planting, told_radius: float | None = None, lights: Any =
 def row(planting: Planting, with_pictures: bool) -> dict[str, Any]:
     """Return one planting as a row of the table."""
     told: dict[str, Any] = {
-        "seed": planting.seed, "lens": planting.lens, "planted": len(planting.lights), "radius_mm": planting.radius_mm,
+        "seed": planting.seed, "lens": planting.lens, "kind": planting.kind, "planted": len(planting.lights), "radius_mm": planting.radius_mm,
     }  # fmt: skip
     try:
         result = measured(planting).result if with_pictures else measured_points(planting)

@@ -13,6 +13,7 @@ from studies.light_calibration.pictures import Floats, Look, picture_of_ball
 
 WIDTH, HEIGHT = 640, 512
 LENSES = ("pinhole", "brown_conrady", "kannala_brandt")
+KINDS = ("wet", "chrome")
 VIEWS = 8
 APART_MM = 3.0
 """Least distance of two lights: nearer ones show one highlight on most balls."""
@@ -22,9 +23,10 @@ NEAREST_MM, FARTHEST_MM = 20.0, 60.0
 
 @dataclass(frozen=True)
 class Planting:
-    """A rig: camera, lights, shape (S, 3), mm, the ball's radius, mm, and its centres, shape (V, 3), mm."""
+    """A rig: camera, lights, shape (S, 3), mm, the ball's kind and radius, mm, and its centres, shape (V, 3), mm."""
 
     lens: str
+    kind: str
     camera: Camera
     lights: Floats
     radius_mm: float
@@ -55,8 +57,19 @@ def plant(seed: int, count: int | None = None, **look: float) -> Planting:
         "wall_mm": radius * float(rng.uniform(2.0, 6.0)),
         "blur_px": float(rng.uniform(0.5, 1.0)), "noise": float(rng.uniform(0.002, 0.015)),
     }  # fmt: skip
+    kind = KINDS[seed // len(LENSES) % len(KINDS)]
+    if kind == "chrome":
+        drawn |= _chrome(np.random.default_rng([2312, seed]))
     centres = np.array([_centre(rng, camera, radius) for _ in range(VIEWS)])
-    return Planting(lens, camera, lights, radius, centres, Look(**(drawn | look)), seed)  # type: ignore[arg-type]
+    return Planting(lens, kind, camera, lights, radius, centres, Look(**(drawn | look)), seed)  # type: ignore[arg-type]
+
+
+def _chrome(rng: np.random.Generator) -> dict[str, float]:
+    """Draw the look of a polished ball: it mirrors the room, and shows nearly no shading of its own."""
+    return {
+        "diffuse": float(rng.uniform(0.0, 0.03)), "mirrored": float(rng.uniform(0.15, 0.7)),
+        "specular": float(10 ** rng.uniform(1.0, 2.0)), "exponent": float(10 ** rng.uniform(4.0, 5.0)),
+    }  # fmt: skip
 
 
 def _camera(lens: str, rng: np.random.Generator) -> Camera:

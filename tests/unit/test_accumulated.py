@@ -166,6 +166,14 @@ def test_light_gives_the_base_whatever_the_exposure_and_the_distance():
     assert np.median(counted) > np.median(light)
 
 
+def test_the_tilt_of_the_told_plane_does_not_matter():
+    """Light falls with the distance, which a tilted plane tells wrong: the plane found corrects it."""
+    rng, normal = np.random.default_rng(15), tilted(4.0)
+    seen = lit(rng, normal, 6.0, poses(8), np.ones(8))
+    told = [base_normal(seen, Plane(np.zeros(3), tilted(tilt, 2.0)), RADIUS).normal for tilt in (0.0, 10.0)]
+    assert angle_deg(*told) < 0.1
+
+
 def test_light_of_some_frames_alone_and_a_patch_without_size_are_refused():
     rng = np.random.default_rng(12)
     seen = lit(rng, tilted(3.0), 4.0, poses(2), [1.0, 1.0])

@@ -33,7 +33,8 @@ def test_generated_colon_and_liver_have_isolated_highlights(tmp_path):
         assert error < 1.0, (name, error)
 
 
-@pytest.mark.parametrize("name", [pytest.param("colon_edingca_00090", marks=pytest.mark.slow), "liver_sksurgery"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["colon_edingca_00090", "liver_sksurgery"])
 def test_real_meshes_give_results(shared_data, tmp_path, name):
     path = shared_data / "meshes" / f"{name}.ply"
     results = results_of(path, range(4), tmp_path / name)

@@ -69,7 +69,7 @@ def poses_of(path, **keys):
     return surfaces[0], np.stack([surface.model_from_camera for surface in surfaces])
 
 
-@pytest.mark.parametrize("name", ["colon", "colon_edingca_00090.ply"])
+@pytest.mark.parametrize("name", ["colon", pytest.param("colon_edingca_00090.ply", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("view", ["path", "off_axis", "wall"])
 def test_poses_are_rigid_smooth_and_never_in_tissue(request, name, view):
     path = name if name == "colon" else request.getfixturevalue("shared_data") / "meshes" / name

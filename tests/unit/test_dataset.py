@@ -254,7 +254,9 @@ class StopError(Exception):
     pass
 
 
-@pytest.mark.parametrize("stop_after", [1, 3, 5])
+@pytest.mark.parametrize(
+    "stop_after", [pytest.param(1, marks=pytest.mark.slow), 3, pytest.param(5, marks=pytest.mark.slow)]
+)
 def test_a_stopped_run_goes_on(made, tmp_path, stop_after):
     told = 0
 

@@ -60,6 +60,7 @@ def test_a_large_step_links_the_highlights_that_small_steps_link(relief):
         assert {t.death for t in coarse} <= {"sequence", "merged", "frame border"}
 
 
+@pytest.mark.slow
 def test_control_followed_as_if_tissue_stood_still():
     """A highlight that is followed on the new frame's surface at rest starts off it, and is not linked."""
     session, deforming, still, time = Session(scene(0.1)), None, None, SurfaceOverTime()

@@ -138,6 +138,7 @@ assert all_of(mono) == alone
 """
 
 
+@pytest.mark.slow
 def test_sessions_of_two_variants_do_not_disturb_each_other():
     done = subprocess.run([sys.executable, "-c", _TWO_VARIANTS], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -20,6 +20,15 @@ from simtest.spec import load_dataset  # noqa: E402
 pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore")]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Several threads take turns at so small a network, and wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("learn") / "tiny"
@@ -32,7 +41,7 @@ def indices(items):
 
 
 # A spawned worker imports PyTorch anew, which takes seconds: one shows that everything reaches it.
-@pytest.mark.parametrize(("start", "workers"), [("fork", 3), ("spawn", 1)])
+@pytest.mark.parametrize(("start", "workers"), [("fork", 3), pytest.param("spawn", 1, marks=pytest.mark.slow)])
 def test_a_plain_loader_batches_what_its_workers_share_out(made, start, workers):
     # Metadata hold None, which no loader can stack.
     samples = Samples(made, "train", shuffle=4)
@@ -107,7 +116,7 @@ def test_tensors_are_channels_first(made):
         Samples(made, fields=("colour",))
 
 
-def test_crops_hold_the_truth_and_a_network_learns_it(made):
+def test_crops_hold_the_truth(made):
     crops = read_crops(made, "train")
     assert len(crops) >= 8
     assert np.allclose(np.linalg.norm(crops.normal, axis=1), 1)
@@ -115,12 +124,19 @@ def test_crops_hold_the_truth_and_a_network_learns_it(made):
     assert angle_deg(crops.towards, crops.normal).max() < 3
     assert ((crops.axis_ratio > 0) & (crops.axis_ratio <= 1)).all()
     assert set(crops.classical) == {"circle_pose", "brightest_point", "cone_axis"}
+
+
+def test_a_network_learns_the_truth(made):
+    crops = read_crops(made, "train")
     untaught = np.abs(propose(train(crops, epochs=0), crops)[1] - crops.axis_ratio).mean()
     taught = train(crops, epochs=150)
     normal, ratio = propose(taught, crops)
     assert np.allclose(np.linalg.norm(normal, axis=1), 1)
     assert np.abs(ratio - crops.axis_ratio).mean() < 0.5 * untaught
-    # The same seed gives the same network.
+
+
+def test_the_same_seed_gives_the_same_network(made):
+    crops = read_crops(made, "train")
     assert np.array_equal(propose(train(crops, epochs=2), crops)[0], propose(train(crops, epochs=2), crops)[0])
 
 

@@ -25,6 +25,16 @@ from simtest.reconstruction.pipeline import run_pipeline  # noqa: E402
 
 pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore")]
 
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Several threads take turns at so small a network, and wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 SIZE = 96
 LIGHTS = ((3.0, 1.0, 0.0), (-3.0, 1.0, 0.0))
 

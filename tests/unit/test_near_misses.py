@@ -17,6 +17,7 @@ from simtest.estimators.near_misses import (
     FAINT,
     MOST,
     RARER,
+    SEVERAL,
     UNTOLD_FAINTNESS,
     USUAL,
     near_miss_variance,
@@ -57,11 +58,18 @@ def test_a_crowded_frame_adds_near_misses_to_the_part_shape(name):
 def test_the_highlights_are_counted_for_each_light():
     two = replace(LIGHT_AT_CAMERA, lights_mm=((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0)), distance_mm=exactly(20.0))
     few, many = (shape_of("bisector", among(count), two) for count in (2 * CROWD - 1, 2 * CROWD))
-    assert many - few == pytest.approx((USUAL / (CROWD + 0.5)) ** RARER * BRIGHT * np.eye(2), rel=1e-6, abs=1e-14)
+    assert many - few == pytest.approx(
+        SEVERAL * (USUAL / (CROWD + 0.5)) ** RARER * BRIGHT * np.eye(2), rel=1e-6, abs=1e-14
+    )
     # Nobody told how many there are: one.
     assert near_miss_variance(among(CROWD), 1) * np.eye(2) == pytest.approx(
         shape_of("cone_axis", among(CROWD), NO_PRIORS) - shape_of("cone_axis", among(0), NO_PRIORS), rel=1e-6
     )
+
+
+def test_a_ring_of_lights_counts_as_three():
+    assert near_miss_variance(among(3 * CROWD - 1), 8) == 0
+    assert near_miss_variance(among(3 * CROWD), 8) == pytest.approx((USUAL / (CROWD + 1 / 3)) ** RARER * BRIGHT)
 
 
 def test_a_dim_highlight_may_be_farther_off():

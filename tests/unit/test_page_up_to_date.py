@@ -1,7 +1,9 @@
 """A run's page: written once, again where anything it is made of has changed, and whole at every moment."""
 
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -9,11 +11,17 @@ from simtest.report import page, up_to_date, write_report
 from tests.unit.test_report import make_run
 
 
-@pytest.fixture
-def run(tmp_path):
-    made = make_run(tmp_path / "run", items=2, realisations=3)
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    made = make_run(tmp_path_factory.mktemp("run") / "run", items=2, realisations=3)
     write_report(made)
     return made
+
+
+@pytest.fixture
+def run(drawn, tmp_path):
+    """Return a run of one's own with its page; times of files are kept."""
+    return Path(shutil.copytree(drawn, tmp_path / "run"))
 
 
 def contents(run):

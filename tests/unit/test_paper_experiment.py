@@ -70,6 +70,7 @@ def test_no_two_realisations_share_a_seed(run):
     assert pose["seed"].n_unique() == pose.height
 
 
+@pytest.mark.slow
 def test_rows_do_not_depend_on_the_workers(run, tmp_path):
     with_two = run_experiment(small(), tmp_path / "two", engine=make_engine(workers=2))
     assert with_two.results.equals(run.results)

@@ -162,9 +162,11 @@ def test_an_error_that_is_not_stated_is_assumed_not_zero(tmp_path):
     assert (read_poses(path).error, read_poses(path).error_told) == (PoseError(0.0, 0.0), True)
 
 
-def test_the_poses_of_c3vd_have_their_translation_in_the_last_row(tmp_path):
+@pytest.mark.parametrize("in_row", [True, False])
+def test_the_poses_of_c3vd_have_their_translation_in_the_last_row_or_column(tmp_path, in_row):
+    """Its loader says the one, its page the other."""
     path = tmp_path / "pose.txt"
-    path.write_text("\n".join(",".join(map(repr, T.T.ravel().tolist())) for T in TWO) + "\n")
+    path.write_text("\n".join(",".join(map(repr, (T.T if in_row else T).ravel().tolist())) for T in TWO) + "\n")
     np.testing.assert_allclose(read_poses(path).world_from_camera, TWO, atol=1e-12)
 
 
@@ -182,7 +184,12 @@ def test_the_left_handed_poses_of_simcol3d_carry_points_where_the_engine_does(tm
 DATASETS = {
     "15 numbers": ("pose.txt", ",".join("1" * 16) + "\n" + ",".join("1" * 15), None, "line 2: .*; must be 16 numbers"),
     "no rotation": ("pose.txt", ",".join(["2"] + ["0"] * 15), None, "pose 0: off a rotation"),
-    "column vectors": ("pose.txt", "1,0,0,5,0,1,0,0,0,0,1,0,0,0,0,1", None, "pose 0: off a rotation and a translation"),
+    "row and column": (
+        "pose.txt",
+        "1,0,0,5,0,1,0,0,0,0,1,0,0,0,0,1\n1,0,0,0,0,1,0,0,0,0,1,0,5,0,0,1",
+        None,
+        "pose 0: off a rotation and a translation",
+    ),
     "alone": ("SavedPosition_S1.txt", "1 2 3\n", None, "needs SavedRotationQuaternion_S1.txt beside it"),
     "fewer": ("SavedPosition_S1.txt", "1 2 3\n1 2 3\n", "0 0 0 1\n", "2 positions, but .* has 1 rotations"),
     "no unit": ("SavedPosition_S1.txt", "1 2 3\n", "0 0 0 2\n", "pose 0: quaternion of length 2; must be 1"),

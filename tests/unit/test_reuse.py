@@ -128,9 +128,9 @@ def recipe(family, **values):
     ("family", "least"),
     [
         pytest.param("colon", 3, marks=pytest.mark.slow),
-        ("liver", 3),
+        pytest.param("liver", 3, marks=pytest.mark.slow),
         pytest.param("rough", 6, marks=pytest.mark.slow),
-        pytest.param("one sample", 3, marks=pytest.mark.slow),
+        ("one sample", 3),
     ],
 )
 def test_samples_are_the_same_bytes_without_reuse(family, least, monkeypatch):

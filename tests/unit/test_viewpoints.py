@@ -16,7 +16,7 @@ from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
 
 ROOT = Path(__file__).resolve().parents[2]
 MESHES = ROOT.parent / "shared/data/meshes"
-SURFACES = ["colon", "liver", "colon_edingca_00090", "liver_sksurgery"]
+SURFACES = ["colon", pytest.param("liver", marks=pytest.mark.slow), "colon_edingca_00090", "liver_sksurgery"]
 
 
 def make(name, viewpoint):

@@ -14,7 +14,7 @@ from simtest.advice.twin.scoring import ScoredSpot, Spot, SpotKind, usable_spots
 from simtest.advice.twin.tissue import Tissue, tissue_of
 from simtest.calibration import Calibration
 from simtest.errors import InputError
-from simtest.reconstruction.assumptions import Assumption
+from simtest.reconstruction.assumptions import NEAR_MISSES, Assumption
 from simtest.reconstruction.choices import complete
 from simtest.reconstruction.found import Reconstruction
 from simtest.reconstruction.image_io import is_sequence, read_picture
@@ -200,7 +200,9 @@ def twins_of(
     subject = Subject(SceneDraws(known, look, tissue), peaks, view.seen, picture.ndim == 2)
     bank = make_bank([subject], reconstructs, count, seed, progress)
     matched = match_spots(spots, all_spots(bank), name, count)
-    return matched, bank, look, [*choices.assumed, *_drawn(organ, tissue)]
+    # Twins have near misses, so nothing is assumed of them.
+    assumed = [each for each in choices.assumed if each is not NEAR_MISSES]
+    return matched, bank, look, [*assumed, *_drawn(organ, tissue)]
 
 
 def match_spots(

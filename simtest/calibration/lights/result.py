@@ -1,8 +1,8 @@
 """What highlights on mirrors say of the lights: positions with 95 % intervals, residuals, and what is doubtful."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -113,7 +113,7 @@ def judge(
         Standard deviation of the ball's radius as a share of it. A scene and its scaled copy give the same pictures,
         so each position is wrong by the same share, which no residual shows.
     further : ndarray, shape (3 S, 3 S)
-        Covariance by other errors, such as the camera's (`camera_covariance`), mm^2.
+        Covariance by errors that are common to all pictures (`covariance_of_variations`), mm^2.
     """
     bundle = found.bundle
     inflation = max(1.0, bundle.chi2 / bundle.freedom) if bundle.freedom > 0 else 1.0
@@ -164,9 +164,16 @@ def _doubts(
     if len(found.others):
         place = ", ".join(f"{value:.1f}" for value in found.others[0])
         problems.append(
-            f"ambiguous: a light at ({place}) mm would explain as many highlights; add pictures with the ball or plate "
-            "at other places and distances"
+            f"ambiguous: other lights, one at ({place}) mm, would explain the highlights as well; add pictures with "
+            "the ball or plate at other places and distances"
         )
+    for position in found.further:
+        if float(np.linalg.norm(position)) <= REACH_MM:
+            place = ", ".join(f"{value:.1f}" for value in position)
+            problems.append(
+                f"a further light may be at ({place}) mm, but too few pictures show it; add pictures with the ball "
+                "nearer to the camera, where its highlights lie farther apart"
+            )
     for number, light in enumerate(lights, 1):
         if light.pictures < pictures:
             notes.append(f"light {number}: {light.pictures} of {pictures} pictures show its highlight")
@@ -202,25 +209,20 @@ def _widest(light: MeasuredLight) -> tuple[float, Array] | None:
     return (half, axis) if half > WIDE_MM else None
 
 
-def camera_covariance(
-    camera: Camera, mirrors_of: Callable[[Camera], Mirrors], highlights: Highlights, found: Found, variations: Array
+def covariance_of_variations(
+    variations: Iterable[tuple[Camera, Mirrors]], highlights: Highlights, found: Found
 ) -> Array:
-    """Return the covariance of the lights by the camera's errors, shape (3 S, 3 S), mm^2.
+    """Return the covariance of the lights by errors that are common to all pictures, shape (3 S, 3 S), mm^2.
 
     Parameters
     ----------
-    mirrors_of : callable
-        The mirrors as another camera sees them in the same pixels.
-    variations : ndarray, shape (K, 3)
-        Independent errors of one standard deviation: relative focal length, and principal point along x and y, px.
+    variations : iterable of tuple
+        Camera and mirrors as they are if one of several independent errors is one standard deviation.
     """
     size = found.bundle.lights.size
     total = np.zeros((size, size))
-    for focal, dx, dy in variations:
-        other = replace(
-            camera, fx=camera.fx * (1 + focal), fy=camera.fy * (1 + focal), cx=camera.cx + dx, cy=camera.cy + dy
-        )
-        moved = solve(other, mirrors_of(other), highlights, found.source, found.bundle.lights)
+    for camera, mirrors in variations:
+        moved = solve(camera, mirrors, highlights, found.source, found.bundle.lights)
         if moved is not None:
             step = (moved.lights - found.bundle.lights).ravel()
             total += np.outer(step, step)

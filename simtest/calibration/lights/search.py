@@ -6,7 +6,7 @@ that explains most highlights becomes a light, its highlights are taken away, an
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -45,11 +45,17 @@ LEAST_SHARE = 0.6
 LEAST_PICTURES = 3
 """And in so many pictures, if there are as many."""
 
+SEEN_TOO_SELDOM = 3
+"""A position that explains so many of the highlights left may be a light that most pictures do not show."""
+
 MERGED_PX = 3.0
 """Two lights that are expected so near to each other, with one highlight, have merged: it is neither's."""
 
 PARALLEL = 0.02
 """Rays at a smaller angle, rad, count as parallel."""
+
+MOST_GHOSTS = 12
+"""Candidates that may belong to another explanation, the likeliest first, are tried up to this number."""
 
 FIRST_STEPS = 5
 ROUNDS = 6
@@ -67,12 +73,15 @@ class Found:
     source : ndarray of int, shape (N,)
         Number of the light of each highlight; -1: none.
     others : ndarray, shape (A, 3)
-        Positions, mm, that explain as many highlights as a light does and are none: the assignment is ambiguous.
+        Positions, mm, of another set of lights that explains the highlights about as well: the result is ambiguous.
+    further : ndarray, shape (B, 3)
+        Positions, mm, that explain three or more of the highlights left, but too few for a light.
     """
 
     bundle: Bundle
     source: Labels
     others: Array
+    further: Array
 
 
 @dataclass
@@ -98,29 +107,47 @@ def find_lights(camera: Camera, mirrors: Mirrors, highlights: Highlights, most: 
     candidates = _grow(camera, mirrors, loose, _candidates(camera, mirrors, loose))
     shown = len(np.unique(highlights.view))
     least = max(min(LEAST_PICTURES, max(len(mirrors), 2)), math.ceil(LEAST_SHARE * shown))
-    free = np.ones(len(highlights), dtype=bool)
-    starts: list[Array] = []
-    while len(starts) < most and len(candidates.lights):
-        counts = _counted(candidates, free)
-        best = int(np.lexsort((candidates.chi2, -counts))[0])
-        if counts[best] < least:
-            break
-        alone = _refined(camera, mirrors, loose, candidates.lights[best][None], free, 1)
-        if alone is None or (alone[1] >= 0).sum() < least:
-            candidates = candidates.only(np.arange(len(candidates.lights)) != best)
-            continue
-        starts.append(alone[0].lights[0])
-        free &= alone[1] < 0
+    everything = np.ones(len(highlights), dtype=bool)
+    starts = _chosen(camera, mirrors, loose, candidates, [], everything, (least, most))
     if not starts:
         return None
-    together = _refined(camera, mirrors, loose, np.array(starts), np.ones(len(highlights), dtype=bool), ROUNDS)
+    together = _refined(camera, mirrors, loose, np.array(starts), everything, ROUNDS)
     if together is None:
         return None
     source = _without_merged(camera, mirrors, loose, *together)
     bundle = solve(camera, mirrors, highlights, source, together[0].lights)
     if bundle is None:
         return None
-    return Found(bundle, source, _ambiguities(camera, mirrors, loose, candidates, bundle, source))
+    left = together[1] < 0
+    known = list(bundle.lights)
+    more = _chosen(camera, mirrors, loose, candidates, known, left, (SEEN_TOO_SELDOM, most))[len(known) :]
+    found = Found(bundle, source, np.empty((0, 3)), np.array(more).reshape(-1, 3))
+    others = _ambiguities(camera, mirrors, highlights, candidates, replace(found, source=together[1]), least)
+    return replace(found, others=others)
+
+
+def _chosen(
+    camera: Camera, mirrors: Mirrors, highlights: Highlights, candidates: _Candidates, starts: list[Array], free: Mask,
+    counts_allowed: tuple[int, int],
+) -> list[Array]:  # fmt: skip
+    """Return positions of lights: those given, and the candidates that explain most of the highlights left, in turn.
+
+    `counts_allowed` is the least number of highlights of a light and the largest number of lights.
+    """
+    least, most = counts_allowed
+    starts, free = list(starts), free.copy()
+    while len(starts) < most and len(candidates.lights):
+        counts = _counted(candidates, free)
+        best = int(np.lexsort((candidates.chi2, -counts))[0])
+        if counts[best] < least:
+            break
+        alone = _refined(camera, mirrors, highlights, candidates.lights[best][None], free, 1)
+        if alone is None or (alone[1] >= 0).sum() < least:
+            candidates = candidates.only(np.arange(len(candidates.lights)) != best)
+            continue
+        starts.append(alone[0].lights[0])
+        free &= alone[1] < 0
+    return starts
 
 
 def _without_merged(camera: Camera, mirrors: Mirrors, highlights: Highlights, bundle: Bundle, source: Labels) -> Labels:
@@ -299,31 +326,47 @@ def assign(
 
 
 def _ambiguities(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, candidates: _Candidates, bundle: Bundle, source: Labels
+    camera: Camera, mirrors: Mirrors, highlights: Highlights, candidates: _Candidates, found: Found, least: int
 ) -> Array:
-    """Return positions that explain at least as many highlights as some light does, and are no light."""
-    if not len(candidates.lights):
-        return np.empty((0, 3))
-    least = int(np.bincount(source[source >= 0]).min())
+    """Return positions of further lights that are part of an explanation about as good as the one found; (A, 3), mm.
+
+    A candidate that explains as many highlights as a light is often a chance meeting of other lights' rays. It is a
+    doubt only if the best set of lights that holds it explains as many highlights as the lights found, about as well.
+    """
+    loose, bundle = with_error(highlights, SLACK_PX), found.bundle
     everything = np.ones(len(highlights), dtype=bool)
-    counts, found = _counted(candidates, everything), list[Array]()
+    explained, lights = int((found.source >= 0).sum()), len(bundle.lights)
+    own = solve(camera, mirrors, highlights, found.source, bundle.lights)
+    if not len(candidates.lights) or own is None:
+        return np.empty((0, 3))
+    inflation = max(1.0, own.chi2 / own.freedom) if own.freedom > 0 else 1.0
+    counts, tried = _counted(candidates, everything), list[tuple[Array, Array]]()
     for index in np.lexsort((candidates.chi2, -counts)):
-        if counts[index] < least:
-            break
         light, spread = candidates.lights[index], candidates.covariances[index]
-        known = [(each, bundle.covariance_of(i)) for i, each in enumerate(bundle.lights)]
-        known += [(each, np.zeros((3, 3))) for each in found]
-        gaps = [(light - each) @ np.linalg.solve(spread + own, light - each) for each, own in known]
-        if min(gaps) < DISTINCT:
+        known = [(each, bundle.covariance_of(i)) for i, each in enumerate(bundle.lights)] + tried
+        if counts[index] < least or len(tried) >= MOST_GHOSTS:
+            break
+        if min((light - each) @ np.linalg.solve(spread + about, light - each) for each, about in known) < DISTINCT:
             continue
-        alone = _refined(camera, mirrors, highlights, light[None], everything, 1)
-        if alone is None or (alone[1] >= 0).sum() < least or not _is_apart(alone[0], bundle):
+        tried.append((light, spread))
+        alone = _refined(camera, mirrors, loose, light[None], everything, 1)
+        if alone is None or (alone[1] >= 0).sum() < least or not _is_apart(alone[0], 0, bundle):
             continue
-        found.append(alone[0].lights[0])
-    return np.array(found).reshape(-1, 3)
+        starts = _chosen(camera, mirrors, loose, candidates, [alone[0].lights[0]], alone[1] < 0, (least, lights))
+        other = _refined(camera, mirrors, loose, np.array(starts), everything, ROUNDS)
+        if other is None or (other[1] >= 0).sum() < explained:
+            continue
+        strict = solve(camera, mirrors, highlights, other[1], other[0].lights)
+        if strict is None or (strict.chi2 - own.chi2) / inflation > GATE:
+            continue
+        for number in range(len(strict.lights)):
+            if _is_apart(strict, number, bundle):
+                return strict.lights[number][None]
+    return np.empty((0, 3))
 
 
-def _is_apart(alone: Bundle, bundle: Bundle) -> bool:
-    gaps = alone.lights[0] - bundle.lights
-    spreads = [alone.covariance + bundle.covariance_of(i) for i in range(len(gaps))]
+def _is_apart(other: Bundle, number: int, bundle: Bundle) -> bool:
+    """Return whether a light of another bundle is none of a bundle's lights."""
+    gaps = other.lights[number] - bundle.lights
+    spreads = [other.covariance_of(number) + bundle.covariance_of(i) for i in range(len(gaps))]
     return min(float(gap @ np.linalg.solve(spread, gap)) for gap, spread in zip(gaps, spreads, strict=True)) > DISTINCT

@@ -1,6 +1,12 @@
 """Learning from datasets with PyTorch (extra ``learn``).
 
-`samples` yields a dataset as tensors, `crops` cuts out its highlights, `network` learns normals and shapes from them.
+`samples` yields a dataset as tensors, for loops of one's own; `shares` divides it among ranks and workers.
+
+`runs` trains a network as a file of `training` says: `engine` is the loop, with `checkpoint` and `page`, and knows a
+task of `tasks` alone. The task of `spot_task` learns from the highlights that `spots` reads; `spot_export` writes its
+network for `simtest.estimators.learned_spot`.
+
+`crops` and `network` are those of docs/gallery/learning.md: smooth colons, without uncertainty.
 """
 
 from typing import TYPE_CHECKING

@@ -28,8 +28,7 @@ def write_page(training: Training, state: State, out: Path, data: str, command: 
     charts = _charts(state)
     make_folder(out / "figures")
     for chart in charts:
-        content = pixels.png(chart_png.draw([chart])[0])
-        write_atomically(out / "figures" / f"{chart.key}.png", lambda part, content=content: part.write_bytes(content))
+        _write_png(out / "figures" / f"{chart.key}.png", chart)
     made_by = provenance.environment()
     record = {"data": data, "command": command, **made_by}
     rows = history_table(state)
@@ -43,6 +42,11 @@ def write_page(training: Training, state: State, out: Path, data: str, command: 
     )  # fmt: skip
     write_atomically(out / PAGE, lambda part: part.write_text(text, encoding="utf-8"))
     return out / PAGE
+
+
+def _write_png(path: Path, chart: Chart) -> None:
+    content = pixels.png(chart_png.draw([chart])[0])
+    write_atomically(path, lambda part: part.write_bytes(content))
 
 
 def _charts(state: State) -> list[Chart]:

@@ -1,5 +1,8 @@
 """A training from its dataset to its files: what `simtest train` runs."""
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +12,8 @@ from simtest.dataset.reader import open_manifest
 from simtest.errors import InputError
 
 try:
+    import torch
+
     from simtest.dataset.learn.checkpoint import LAST, State, read_state
     from simtest.dataset.learn.engine import train
     from simtest.dataset.learn.page import write_page
@@ -56,7 +61,7 @@ def run_training(training: Training, data: Path, out: Path, progress: Progress |
         "simtest": provenance.version(),
         "training": training.model_dump_json(),
     }
-    with exclusive_folder(out):
+    with exclusive_folder(out), _one_thread():
         taught, judged = (task.examples(data, split, progress) for split in ("train", "validation"))
         try:
             trained = train(training, task, taught, judged, out, progress)
@@ -65,3 +70,18 @@ def run_training(training: Training, data: Path, out: Path, progress: Progress |
                 page = write_page(training, read_state(out / LAST), out, shown(data))
         files = task.finish(trained.network, taught, judged, out, about)
     return TrainingRun(trained.state, [page, *files])
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute on one thread, unless OMP_NUM_THREADS names a number.
+
+    Several threads wait for each other at small networks, and the order of their sums changes the weights' last digits.
+    """
+    before = torch.get_num_threads()
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

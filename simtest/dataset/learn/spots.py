@@ -14,7 +14,7 @@ from simtest.dataset.sample import Sample
 from simtest.detection.detector import load_detector, run_detector
 from simtest.errors import Failure
 from simtest.estimators.spot_inputs import rays_of, rotation_of, spot_inputs
-from simtest.runtime.arrays import AnyArray, Array
+from simtest.runtime.arrays import AnyArray, Array, Image
 from simtest.simulation.frame_files import picture_calibration
 from simtest.spec import Scene
 from simtest.validation.runner import Progress
@@ -90,7 +90,7 @@ _SHAPES = ((0, 3, 32, 32), (0, 11), (0, 3), (0, 2), (0, 2), (0,), (0,), (0, 2), 
 def sample_frame(sample: Sample) -> Frame:
     """Return a sample's picture as the estimators see it."""
     scene = Scene.model_validate(sample.meta["scene"])
-    picture = sample.images["image"].astype(np.float32) / 255
+    picture: Image = sample.images["image"].astype(np.float32) / np.float32(255)
     return Frame(picture, picture_calibration(scene.calibration(), scene.sensor), SMOOTHING_PX)
 
 

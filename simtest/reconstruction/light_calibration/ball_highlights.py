@@ -55,14 +55,15 @@ class MeasuredHighlight:
         Of the centre, px^2.
     problem : str
         Why it is not used; empty: it is.
-    width_px : float
-        Radius at half height, px; 0: not known.
+    width_px, width_sd_px : float
+        Radius at half height, px, and its standard deviation; 0: not known.
     """
 
     pixel: Array
     covariance: Array
     problem: str = ""
     width_px: float = 0.0
+    width_sd_px: float = 0.0
 
 
 def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px: float) -> list[MeasuredHighlight]:
@@ -127,7 +128,10 @@ def _of_one_spot(single: MeasuredHighlight, spots: Spots, corner: Array) -> Meas
     The pixels above half height are few on a small spot, and which ones they are moves their centroid.
     """
     covariance = spots.covariances[0] + CENTRE_FLOOR_PX**2 * np.eye(2)
-    return replace(single, pixel=spots.centres[0] + corner, covariance=covariance, width_px=spots.width_px)
+    return replace(
+        single, pixel=spots.centres[0] + corner, covariance=covariance,
+        width_px=spots.width_px, width_sd_px=spots.width_sd_px,
+    )  # fmt: skip
 
 
 def _widened(mask: Mask) -> Mask:
@@ -147,7 +151,11 @@ def _several(spots: Spots, corner: Array, blob: Mask) -> list[MeasuredHighlight]
             continue
         poor = float(np.linalg.eigvalsh(covariance)[1]) > MOST_SD_PX**2
         floor = CENTRE_FLOOR_PX**2 * np.eye(2)
-        found.append(MeasuredHighlight(centre + corner, covariance + floor, TOUCH if poor else "", spots.width_px))
+        found.append(
+            MeasuredHighlight(
+                centre + corner, covariance + floor, TOUCH if poor else "", spots.width_px, spots.width_sd_px
+            )
+        )
     return found
 
 

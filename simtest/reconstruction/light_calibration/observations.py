@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from simtest.calibration import Calibration
-from simtest.calibration.lights.bundle import Highlights
+from simtest.calibration.lights.bundle import REACH_MM, Highlights
 from simtest.calibration.lights.mirrors import Balls, Plates
 from simtest.errors import InputError
 from simtest.geometry import Array, Image, Mask
@@ -19,6 +19,15 @@ from simtest.runtime.resources import shown
 
 OUTLINE_FLOOR_PX = 0.02
 """Error of an outline that stays however little noise there is, px: pixels are squares, lenses no Gaussians."""
+
+COMMON_PX, COMMON_RADIUS_PX = 0.015, 0.012
+"""Error that the outlines of all pictures share, px: of their position an axis, and of their radius."""
+
+SHADED_PX = 0.03
+"""The ball's shadow beside its outline moves all outlines away from the lights, by so many px for each mm that the
+middle of the lights lies beside the camera: a standard deviation."""
+
+MOST_SHADED_MM = 6.0
 
 LIGHT_MM = 4.0
 """Where a picture is dark behind the ball, a light so far beside the camera leaves a strip of the rim in its shadow."""
@@ -34,6 +43,9 @@ WIDEST_ON_PLATE = 0.06
 
 WIDER = 1.08
 """A spot that is wider by this factor than spots on a ball that looks larger is several highlights that merge."""
+
+SURELY = 3.0
+"""By so many standard deviations of its width, too."""
 
 FARTHEST_PX = 1e5
 """Largest number of a rough outline, px."""
@@ -143,7 +155,8 @@ def without_merged(views: Sequence[View]) -> list[View]:
 
 
 def _if_narrow(highlight: MeasuredHighlight, most_px: float) -> MeasuredHighlight:
-    if highlight.problem or highlight.width_px <= most_px:
+    # Noise alone makes a dim spot wide.
+    if highlight.problem or highlight.width_px - SURELY * highlight.width_sd_px <= most_px:
         return highlight
     return replace(highlight, problem="wider than on a ball that looks larger: several highlights that merge")
 
@@ -236,6 +249,27 @@ def with_floor(outline: BallOutline, camera: Camera, radius_mm: float) -> BallOu
     strip = outline.dark_share * outline.half_angle * (LIGHT_MM / distance) ** 2 / 2
     error = np.diag([SHADOW * strip, SHADOW * strip, SHADOW * strip]) ** 2 + (OUTLINE_FLOOR_PX * pixel) ** 2 * np.eye(3)
     return replace(outline, covariance=outline.covariance + error)
+
+
+def common_outline_errors(lights: Array) -> Array:
+    """Return independent errors that all outlines share, shape (4, 3): shift along x and y and of the radius, px.
+
+    `lights`, shape (S, 3), mm, are all lights found; far lamps cast no shadow that moves with the camera.
+    """
+    near = lights[np.linalg.norm(lights, axis=1) < REACH_MM]
+    beside = near[:, :2].mean(axis=0) if len(near) else np.zeros(2)
+    length = float(np.linalg.norm(beside))
+    shaded = SHADED_PX * beside * min(1.0, MOST_SHADED_MM / max(length, 1e-9))
+    return np.array([[COMMON_PX, 0, 0], [0, COMMON_PX, 0], [0, 0, COMMON_RADIUS_PX], [*shaded, 0]])
+
+
+def moved_outline(view: View, camera: Camera, shift_px: Array, wider_px: float) -> BallOutline:
+    """Return the outline of a view, shifted in the picture and with a larger radius, px."""
+    assert view.outline is not None
+    at = camera.project(view.outline.direction)
+    pixel = float(np.linalg.norm(camera.step_of_pixels(at)) / np.sqrt(2))
+    direction = camera.unproject(at + shift_px)
+    return replace(view.outline, direction=direction, half_angle=view.outline.half_angle + wider_px * pixel)
 
 
 def plates_of(views: Sequence[View], sd_mm: float, sd_rad: float) -> Plates:

@@ -11,8 +11,8 @@ all of it. With the square root the outline is not drawn inwards where the ball 
 
 Two errors are the same in all pictures of a scope, so no number of pictures averages them. A point spread that is no
 Gaussian (defocus, sharpening) is symmetric, so it changes the step by a function that is odd about the outline: three
-odd terms in each sector, the step's second, fourth and sixth derivative, take it up. Blur moves a curved edge towards its centre of curvature by
-variance / (2 radius); the model is moved as far.
+odd terms in each sector, the step's second, fourth and sixth derivative, take it up. Blur moves a curved edge towards
+its centre of curvature by variance / (2 radius); the model is moved as far.
 """
 
 from dataclasses import dataclass

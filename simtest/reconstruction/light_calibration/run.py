@@ -1,6 +1,6 @@
 """From pictures of a ball or plate to the positions of the lights."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -9,8 +9,8 @@ import numpy as np
 
 from simtest.calibration import Calibration
 from simtest.calibration.lights.mirrors import Mirrors
-from simtest.calibration.lights.result import LightCalibration, camera_covariance, judge
-from simtest.calibration.lights.search import MOST_LIGHTS, find_lights
+from simtest.calibration.lights.result import LightCalibration, covariance_of_variations, judge
+from simtest.calibration.lights.search import MOST_LIGHTS, Found, find_lights
 from simtest.calibration.priors import UNTOLD_OFFSET_MM, Matrix
 from simtest.errors import InputError
 from simtest.geometry import Array, Image
@@ -23,6 +23,8 @@ from simtest.reconstruction.light_calibration.observations import (
     View,
     Views,
     balls_of,
+    common_outline_errors,
+    moved_outline,
     plates_of,
     read_balls,
     read_plates,
@@ -136,9 +138,7 @@ def calibrate_lights(
             f"no light explains highlights in most of the {len(seen.views)} pictures; must be pictures of one rig: "
             "the lights fixed to the camera, --ball-radius and --camera right"
         )
-    further = camera_covariance(
-        camera, lambda other: _seen_by(seen.views, camera, other, mirror), highlights, found, _variations(calibration)
-    )
+    further = covariance_of_variations(_variations(seen.views, calibration, mirror, found), highlights, found)
     share = mirror.radius_sd_mm / mirror.radius_mm if isinstance(mirror, Ball) else 0.0
     result = judge(camera, mirrors, highlights, found, share, further)
     if isinstance(mirror, Ball):
@@ -172,11 +172,22 @@ def _seen_by(views: Sequence[View], camera: Camera, other: Camera, mirror: Ball 
     return balls_of(moved, other, mirror.radius_mm)
 
 
-def _variations(calibration: Calibration) -> Array:
-    """Return the camera's independent errors of one standard deviation (see `camera_covariance`)."""
-    prior = calibration.priors.camera
-    rows = np.diag([prior.focal_sd, prior.centre_sd_px, prior.centre_sd_px])
-    return rows[rows.any(axis=1)]
+def _variations(
+    views: Sequence[View], calibration: Calibration, mirror: Ball | Plate, found: Found
+) -> Iterator[tuple[Camera, Mirrors]]:
+    """Return camera and mirrors with each independent error that all pictures share, of one standard deviation."""
+    camera, prior = calibration.camera, calibration.priors.camera
+    for focal, dx, dy in np.diag([prior.focal_sd, prior.centre_sd_px, prior.centre_sd_px]):
+        if focal or dx or dy:
+            other = replace(
+                camera, fx=camera.fx * (1 + focal), fy=camera.fy * (1 + focal), cx=camera.cx + dx, cy=camera.cy + dy
+            )
+            yield other, _seen_by(views, camera, other, mirror)
+    if isinstance(mirror, Ball):
+        for dx, dy, wider in common_outline_errors(found.bundle.lights):
+            outlines = [moved_outline(view, camera, np.array([dx, dy]), wider) for view in views]
+            moved = [replace(view, outline=outline) for view, outline in zip(views, outlines, strict=True)]
+            yield camera, balls_of(moved, camera, mirror.radius_mm)
 
 
 def _too_few(seen: Views, given: int) -> str:

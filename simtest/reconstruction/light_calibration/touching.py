@@ -46,11 +46,15 @@ DROP = 0.15
 
 @dataclass(frozen=True)
 class Spots:
-    """Separated spots: centres, px, shape (K, 2), covariances, px^2, (K, 2, 2), and their radius at half height, px."""
+    """Separated spots: centres, px, shape (K, 2), covariances, px^2, (K, 2, 2), and their radius at half height, px.
+
+    All have one radius; `width_sd_px` is its standard deviation.
+    """
 
     centres: Array
     covariances: Array
     width_px: float
+    width_sd_px: float
 
 
 @dataclass(frozen=True)
@@ -206,7 +210,8 @@ def _spots(blob: _Blob, fitted: Array, chi2: float) -> Spots | None:
             if gap @ np.linalg.solve(spread, gap) < LEAST_APART**2:
                 return None
     blocks = [covariance[SHAPE + 3 * i :, SHAPE + 3 * i :][:2, :2] for i in kept]
-    return Spots(spots[kept, :2], np.array(blocks), _half_height(fitted))
+    width = _half_height(fitted)
+    return Spots(spots[kept, :2], np.array(blocks), width, width * float(np.sqrt(covariance[0, 0])))
 
 
 def _half_height(fitted: Array) -> float:
