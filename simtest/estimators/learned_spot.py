@@ -30,9 +30,6 @@ from simtest.runtime.resources import shown
 
 METADATA, FORMAT = "simtest", "simtest spot_normals, version 1"
 
-NETWORK = "network"
-"""Part of the budget."""
-
 _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 """Extras whose range is checked: focal length and lights. The others differ from frame to frame."""
 
@@ -126,7 +123,7 @@ class LearnedSpot:
         covariance = jacobian @ factor @ factor.T @ jacobian.T * self._network.scales[self.target]
         return Estimate(
             normal=normals[0], candidates=normals[:1], look_px=np.asarray(peak, dtype=float),
-            axis_ratio=float(1 / (1 + np.exp(-made[5]))), budget={NETWORK: covariance}, target=self.target,
+            axis_ratio=float(1 / (1 + np.exp(-made[5]))), covariance=covariance, target=self.target,
         )  # fmt: skip
 
 
