@@ -80,12 +80,8 @@ class LearnedSpot:
         return _Network(Path(self.model))
 
     def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
-        """Estimate at the highlights that the detector `peaks` finds (see `simtest.estimators.FrameEstimator`)."""
-        from simtest.detection.detector import load_detector, run_detector
-
-        found = run_detector(load_detector("peaks"), frame)
-        results, _ = self.estimate_regions(frame, [frame.patch(region.box, region.peak) for region in found.regions])
-        return [result for result in results if isinstance(result, Estimate)]
+        """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
+        return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
 
     def estimate_regions(
         self, frame: Frame, patches: Sequence[Patch | Failure], /
