@@ -171,9 +171,32 @@ def test_the_tissue_is_that_of_the_nearest_colour(colour, organ):
     # Black borders do not count.
     bordered = np.zeros((60, 80, 3), dtype=np.float32)
     bordered[10:50, 10:60] = picture
-    look = look_of(bordered, bordered.any(axis=2))
-    assert look.organ == organ
-    assert look.mean == pytest.approx(float(np.clip(picture.mean(), 0.1, 0.8)), rel=1e-5)
+    for seen in (bordered.any(axis=2), None):
+        look = look_of(bordered, seen)
+        assert look.organ == organ
+        assert look.mean == pytest.approx(float(np.clip(picture.mean(), 0.1, 0.8)), rel=1e-5)
+
+
+@pytest.mark.parametrize("grey", [False, True])
+def test_a_background_without_tissue_tells_neither_colour_nor_exposure(grey):
+    """The dark room behind a small organ once made a liver a gallbladder, and halved the exposure of its twins."""
+    colour = np.float32((0.10, 0.020, 0.0165)) ** (1 / 2.2)
+    picture = (rng().uniform(0.0, 0.01, (60, 80, 3))).astype(np.float32)
+    picture[10:50, 10:40] = colour
+    # Highlights are far brighter than the tissue, and few.
+    picture[20:22, 20:22] = 1.0
+    look = look_of(picture.mean(axis=2) if grey else picture, None)
+    assert look.organ == ("tissue_colon" if grey else "tissue_liver")
+    assert look.mean == pytest.approx(float(colour.mean()), rel=0.02)
+
+
+@pytest.mark.parametrize("organ", NAMES)
+@pytest.mark.parametrize("shape", [(40, 50), (40, 50, 3)])
+def test_a_told_organ_decides_the_colour(organ, shape):
+    """A picture's colour does not tell how dark its tissue is, and that decides which spots stand out of it."""
+    look = look_of(np.full(shape, 0.5, dtype=np.float32), None, tissue_of(organ))
+    assert look == Look(f"tissue_{organ}", 0.5)
+    assert tissue_of(None).scene is None
 
 
 def test_a_range_of_distances_is_even_in_the_logarithm():

@@ -193,10 +193,10 @@ def twins_of(
         raise InputError(f"{name}: no usable highlight: none was found that has a normal of its own; try --all")
     view = made.detection.view
     known = complete(calibration, options.encoding)
-    look = look_of(picture, view.seen)
     peaks: Array = np.array([spot.peak_px for spot in spots])
     count = frames_for(picture.shape[0] * picture.shape[1]) if frames is None else frames
     tissue = tissue_of(organ)
+    look = look_of(picture, view.seen, tissue)
     subject = Subject(SceneDraws(known, look, tissue), peaks, view.seen, picture.ndim == 2)
     bank = make_bank([subject], reconstructs, count, seed, progress)
     matched = match_spots(spots, all_spots(bank), name, count)

@@ -30,6 +30,9 @@ RIGS = ((1, 0.3), (2, 0.3), (3, 0.2), (8, 0.2))
 MEAN_LEVELS = (0.1, 0.8)
 """Mean values of a picture that an exposure can be set to."""
 
+DARK, BRIGHT = 0.1, 0.95
+"""Pixels below this share of the encoded value at this quantile show no tissue, but what lies far behind it."""
+
 SAMPLES = 4
 """Rays of a pixel."""
 
@@ -44,21 +47,27 @@ class Look:
     Parameters
     ----------
     organ : str
-        The shipped scene whose colour is nearest.
+        The shipped scene whose colour and translucency twins have: that of the told organ, or of the nearest colour.
     mean : float
-        Mean encoded value of the pixels that are seen.
+        Mean encoded value of the pixels that show tissue.
     """
 
     organ: str
     mean: float
 
 
-def look_of(picture: Image, seen: Mask | None) -> Look:
-    """Measure a picture as encoded, shape (H, W) or (H, W, 3); `seen`, shape (H, W), are the pixels of its view."""
+def look_of(picture: Image, seen: Mask | None, tissue: Tissue = ANY) -> Look:
+    """Measure a picture as encoded, shape (H, W) or (H, W, 3); `seen`, shape (H, W), are the pixels of its view.
+
+    A black background has the colour of no tissue, and an exposure set by an average does not count it. A colour does
+    not tell how dark the tissue is, but the film shines as brightly on dark tissue as on pale: so a told organ decides.
+    """
     values = picture.reshape(-1, *picture.shape[2:]) if seen is None else picture[seen]
+    levels = values if values.ndim == 1 else values.mean(axis=1)
+    values = values[levels >= DARK * np.quantile(levels, BRIGHT)]
     mean = float(np.clip(values.mean(), *MEAN_LEVELS))
-    if picture.ndim == 2:
-        return Look(ORGANS[0], mean)
+    if tissue.scene is not None or picture.ndim == 2:
+        return Look(tissue.scene or ORGANS[0], mean)
     linear = np.median(values, axis=0).astype(float) ** 2.2 + 1e-3
     bases = {organ: _base_colour(organ) for organ in ORGANS}
     # Colour alone: the level is the exposure's.

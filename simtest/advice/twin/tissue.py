@@ -66,6 +66,8 @@ class Tissue:
     k1_per_mm, k2_per_mm : (float, float), optional
         Ranges of the base's principal curvatures, 1/mm, convex positive; without them, draws have a Laplace
         distribution: most patches are nearly flat over a highlight, some are folds.
+    scene : str, optional
+        Shipped scene whose colour and translucency it has; without it, that of the nearest colour.
     """
 
     bands: tuple[Band, ...]
@@ -73,6 +75,7 @@ class Tissue:
     level: Interval
     k1_per_mm: Interval | None = None
     k2_per_mm: Interval | None = None
+    scene: str | None = None
 
     def draw_curvatures(self, rng: np.random.Generator) -> tuple[float, float]:
         """Draw the principal curvatures of the base, 1/mm."""
@@ -119,7 +122,7 @@ def tissue_of(organ: str | None) -> Tissue:
     level = drawn.get("reflectance.film.level", (film["level"], film["level"]))
     alpha = drawn.get("reflectance.film.alpha", (film["alpha"], film["alpha"]))
     film_level = level[0] - WIDER_LEVEL, level[1] + WIDER_LEVEL
-    return Tissue(tuple(bands), _wider(alpha), film_level, form.k1_per_mm, form.k2_per_mm)
+    return Tissue(tuple(bands), _wider(alpha), film_level, form.k1_per_mm, form.k2_per_mm, form.scene)
 
 
 def _wider(ends: Interval) -> Interval:
