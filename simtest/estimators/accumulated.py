@@ -187,7 +187,8 @@ def _fit(sightings: Sequence[Sighting], plane: Plane, radius_mm: float) -> Patch
     shown = np.bincount(seen.cell, seen.weight, CELLS**2)
     held = float(shown.sum() ** 2 / (shown**2).sum()) if shown.any() else 0.0
     if held < LEAST_CELLS:
-        return Failure(Reason.NO_ESTIMATE, f"highlights in {held:.1f} cells: takes {LEAST_CELLS:g}")
+        filled = f"highlights fill {held:.1f} of the patch's {CELLS**2} cells"
+        return Failure(Reason.NO_ESTIMATE, f"{filled}; must be {LEAST_CELLS:g} or more")
     looked = _looked(sightings, plane, axes, radius_mm)
     fitted = _maximise(seen, looked)
     if isinstance(fitted, Failure):

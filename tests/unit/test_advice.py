@@ -376,6 +376,19 @@ def test_a_wide_interval_names_the_frames_that_narrow_it(high, said):
         assert narrower(advised, "simtest advise laparoscope --out a") is None
 
 
+@pytest.mark.parametrize(("base_deg", "said"), [(2.5, True), (6.5, False), (None, False)])
+def test_the_best_for_the_base_is_compared_with_fine_normals(base_deg, said):
+    """`cloud` is ranked alone for the base: a method of the fine surface that comes nearer to it is named."""
+    found = read_results(results([1.0, 1.2, 0.8, 1.0], [0, 1, 2, 3]), 8)
+    single = found.method("cone_axis")
+    near = replace(single, base=replace(single.fine, mean_deg=base_deg))
+    cloud = replace(single, estimator="cloud", target="base", base=replace(single.fine, mean_deg=6.0))
+    choice = replace(found.choices[0], target="base", best="cloud", ties=())
+    advised = SimpleNamespace(found=replace(found, methods=[near, cloud]))
+    assert ("fine normals of cone_axis lie nearer to it: mean 2.5 deg, 4 of 4" in sentence(advised, choice)) == said
+    assert "lie nearer" not in sentence(advised, found.choices[0])
+
+
 @pytest.mark.render
 @pytest.mark.slow
 def test_every_figure_runs_again_and_the_page_prints_how(tmp_path):
