@@ -29,8 +29,9 @@ from simtest.advice.plan import (
 from simtest.advice.scope import SCOPES, read_scope
 from simtest.errors import InputError
 from simtest.rendering.placement_checks import check_camera, check_lights
+from simtest.runtime.kept_arrays import kept
 from simtest.surfaces import make_surface
-from simtest.validation import laws
+from simtest.validation import laws, realisation
 from simtest.validation.cases import RELIEF_SEED
 from simtest.validation.paired import half_width
 
@@ -208,6 +209,29 @@ def test_a_distance_without_room_is_refused(monkeypatch):
     with pytest.raises(InputError, match=r"--distances: at .* mm no wall") as error:
         main_experiment(question)
     assert "\n" not in str(error.value)
+
+
+class StoringSession:
+    """Stands for a session: makes what a surface makes, an anatomy and a relief, and renders nothing."""
+
+    def __init__(self, scene, variant):
+        for kind in ("colon", "relief"):
+            kept(kind, scene.surface.model_dump_json(), lambda: {"a": np.zeros(1)})
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_reliefs_that_are_drawn_for_a_frame_are_not_kept(tmp_path, monkeypatch, own):
+    monkeypatch.setenv("SIMTEST_CACHE", str(tmp_path / "kept"))
+    monkeypatch.setattr(realisation, "Session", StoringSession)
+    monkeypatch.setattr(realisation, "render_view", lambda session, scene: SimpleNamespace(scene=scene))
+    monkeypatch.setattr(realisation, "further_views", lambda session, scene: [])
+    planned = main_experiment(Question(read_scope("colonoscope_2"), "colon", frames=8))
+    case = simtest.validation.cases.expand(planned)[0]
+    # Negative control: the relief of an experiment that does not draw it is kept.
+    case = case if own else replace(case, swept={})
+    realisation.Realiser(None).view(planned, case, 0)
+    kinds = {path.name.split("-")[0] for path in (tmp_path / "kept").iterdir()}
+    assert kinds == ({"colon"} if own else {"colon", "relief"})
 
 
 def test_a_flat_phantom_is_a_plane():
