@@ -120,7 +120,7 @@ def report(rows: Sequence[Row]) -> int:
     lines = [_line(name, [row for row in rows if row[key] == value]) for name, (key, value) in cells.items()]
     head = ["highlights", "frames", "n", "RMS error, deg", "stated, deg", "held", "stated before, deg", "held before"]
     print_markdown([head, *(line for line in lines if line), _line("all", rows)])
-    of = {"single highlights": "single", "clouds": "cloud"}
+    of = {"single highlights": "single", "clouds": "cloud", "clouds about no highlight point": "none"}
     lines = [_line(name, [row for row in base if row["of"] == value]) for name, value in of.items()]
     print_markdown([["against the base's normal", *head[1:6]], *(line[:6] for line in lines if line)])
     held = [[float(row["held"]) for row in rows if row[key] == value] for key, value in list(cells.values())[2:]]
@@ -203,7 +203,10 @@ def _base_rows(
         if not isinstance(cloud, Estimate):
             continue
         # Lights are one here, so a cloud belongs to one point of the base.
-        for number in match_cloud(session, view, cloud)[:1]:
+        numbers = match_cloud(session, view, cloud)
+        if not numbers:
+            rows.append({**about, "of": "none", "error": math.nan, "stated": _stated(cloud), "held": 0.0})
+        for number in numbers[:1]:
             truth = view.clouds[number].normal_base
             distance = mahalanobis2(cloud, truth)
             held = math.nan if distance is None else float(distance <= chi_squared.quantile(0.95, 2))
