@@ -45,6 +45,9 @@ SEED = 9642
 
 FRAMES = 36
 
+PLANNED = 120
+"""Frames of the plan whose first ones `clouds_alone` judges, so that a longer run goes on where a shorter one ended."""
+
 ORGANS = ("colon", "stomach", "liver", "gallbladder")
 """Families of the recipe."""
 
@@ -109,7 +112,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def clouds_alone(frames: int, seed: int) -> None:
     """Print the table of the clouds of colons, stomachs and livers, a line for each organ."""
-    plan, rows = OneLight(seed, frames), list[Row]()
+    plan, rows = OneLight(seed, PLANNED), list[Row]()
     for number in range(frames):
         if ORGANS[plan.draw(number).anatomy.family] == "gallbladder" or (made := _rendered(plan, number)) is None:
             continue
