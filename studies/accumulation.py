@@ -113,11 +113,13 @@ def told(sightings: Iterable[Sighting], error: tuple[float, float], rng: np.rand
 def answer(row: Row, name: str, sightings: list[Sighting], plane: Plane, error: tuple[float, float]) -> None:
     """Estimate the base's normal, and write error, squared distance, stated uncertainty and slope into a row."""
     found = base_normal(sightings, plane, RADIUS_MM, (error[0], float(np.radians(error[1]))))
-    ok = not isinstance(found, Failure)
-    row[f"{name} error"] = float(angle_deg(found.normal, UP)) if ok else float("nan")
-    row[f"{name} d2"] = found.squared_mahalanobis(UP) if ok else float("nan")
-    row[f"{name} stated"] = float(np.degrees(np.sqrt(np.trace(found.covariance)))) if ok else float("nan")
-    row[f"{name} slope"] = float(np.degrees(found.slope)) if ok else float("nan")
+    if isinstance(found, Failure):
+        row |= {f"{name} {what}": float("nan") for what in ("error", "d2", "stated", "slope")}
+        return
+    row[f"{name} error"] = float(angle_deg(found.normal, UP))
+    row[f"{name} d2"] = found.squared_mahalanobis(UP)
+    row[f"{name} stated"] = float(np.degrees(np.sqrt(np.trace(found.covariance))))
+    row[f"{name} slope"] = float(np.degrees(found.slope))
 
 
 def one_film(slope_deg: float, seed: int) -> list[Row]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from simtest.advice.advise import Advised
-from simtest.advice.figures import WIDE, Choice
+from simtest.advice.figures import WIDE, Choice, MethodAnswers
 from simtest.advice.plan import DISTANCES, MOST_ASKED
 from simtest.pages import chart_png, chart_web, pixels
 from simtest.pages.axes import Axis
@@ -71,9 +71,27 @@ def sentence(found: Advised, choice: Choice) -> str:
     text += f" (95 % interval {interval(method.own.interval_deg)}), {method.answered} of {method.asked} answered."
     if choice.ties:
         text += f" It cannot be told from {', '.join(choice.ties)}."
+    text += _nearer(found, method)
     if method.own.is_wide:
         text += f" The interval is wide: {_remedy(found, choice)}"
     return text
+
+
+def _nearer(found: Advised, best: MethodAnswers) -> str:
+    """Return a sentence if a method of the fine surface comes nearer to the base than the best of those that state it.
+
+    Only methods that state the base's normal are ranked for it, however few answers they have.
+    """
+    if best.target == "fine" or best.own.mean_deg is None:
+        return ""
+    others = [each for each in found.found.methods if each.target == "fine" and each.base.mean_deg is not None]
+    nearest = min(others, key=lambda each: each.base.mean_deg or 0.0, default=None)
+    if nearest is None or (nearest.base.mean_deg or 0.0) >= best.own.mean_deg:
+        return ""
+    return (
+        f" In these frames the fine normals of {nearest.estimator} lie nearer to it: mean "
+        f"{number(nearest.base.mean_deg)} deg, {nearest.answered} of {nearest.asked} answered."
+    )
 
 
 def _remedy(found: Advised, choice: Choice) -> str:

@@ -45,8 +45,8 @@ CHI95 = 5.991464547107979
 
 NEWTON_STEPS, CONVERGED = 60, 1e-9
 REFITS = 2
-"""Fits on a plane that faces as the last one found: where a plane is told tilted, parts of the patch lie nearer or
-farther than told, and the light's falloff turns the normal found at a slope of 6 deg by 0.03 of the tilt."""
+"""Fits on a plane that faces as the last one found. Where a plane is told tilted, parts of the patch lie nearer or
+farther than told, and the light's falloff turns the normal found by 2 s^2 of the tilt, s the slope seen, rad."""
 
 POSE_DRAWS = 24
 """Fits with drawn errors of the poses."""
@@ -187,7 +187,8 @@ def _fit(sightings: Sequence[Sighting], plane: Plane, radius_mm: float) -> Patch
     shown = np.bincount(seen.cell, seen.weight, CELLS**2)
     held = float(shown.sum() ** 2 / (shown**2).sum()) if shown.any() else 0.0
     if held < LEAST_CELLS:
-        return Failure(Reason.NO_ESTIMATE, f"highlights in {held:.1f} cells: takes {LEAST_CELLS:g}")
+        filled = f"highlights fill {held:.1f} of the patch's {CELLS**2} cells"
+        return Failure(Reason.NO_ESTIMATE, f"{filled}; must be {LEAST_CELLS:g} or more")
     looked = _looked(sightings, plane, axes, radius_mm)
     fitted = _maximise(seen, looked)
     if isinstance(fitted, Failure):

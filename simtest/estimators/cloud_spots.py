@@ -73,6 +73,9 @@ def find_spots(frame: Frame) -> Spots:
     light, noise = _light(frame)
     around, brightest_near = _background(light)
     above = light - around
+    if frame.light is not None:
+        # Where a detector split the light there is none around: a spot is bright beside what it took off.
+        brightest_near = np.maximum(brightest_near, _background(_tissue(frame))[1])
     if frame.seen is not None:
         above = np.where(frame.seen, above, np.float32(0))
     least = NOISE_FACTOR * noise
@@ -104,20 +107,27 @@ def _above(frame: Frame) -> tuple[Image, Mask]:
     light, noise = _light(frame)
     around, _ = _background(light)
     above = light - around
-    return above, np.asarray(above > np.maximum(PART_CONTRAST * around, NOISE_FACTOR * noise))
+    tissue = around if frame.light is None else np.maximum(around, _background(_tissue(frame))[0])
+    return above, np.asarray(above > np.maximum(PART_CONTRAST * tissue, NOISE_FACTOR * noise))
 
 
 def _light(frame: Frame) -> tuple[Image, float]:
     """Return the light in which spots are looked for, smoothed, shape (H, W), and the noise that is left in it."""
-    corrected = frame.corrected
-    values, factor = corrected.intensity, 1.0
+    noise = float(np.median(frame.noise)) * share_of_noise(SMOOTHING_PX)
     if frame.light is None and frame.encoded.ndim == 3:
-        values = frame.channels.min(axis=2)
-        values = values if corrected.gain is None else values * corrected.gain
         # The noise of the mean is known; the minimum has about that of one channel.
-        factor = float(np.sqrt(frame.encoded.shape[2]))
-    noise = factor * float(np.median(frame.noise))
-    return smooth(values, SMOOTHING_PX, frame.seen), noise * share_of_noise(SMOOTHING_PX)
+        return _tissue(frame), noise * float(np.sqrt(frame.encoded.shape[2]))
+    return smooth(frame.corrected.intensity, SMOOTHING_PX, frame.seen), noise
+
+
+def _tissue(frame: Frame) -> Image:
+    """Return the light of a frame's weakest channel, smoothed, shape (H, W), frame units.
+
+    Between the spots it is the diffuse light, whatever a detector split off.
+    """
+    gain, values = frame.corrected.gain, frame.channels
+    values = values if values.ndim == 2 else values.min(axis=2)
+    return smooth(values if gain is None else values * gain, SMOOTHING_PX, frame.seen)
 
 
 def _background(light: Image) -> tuple[Image, Image]:

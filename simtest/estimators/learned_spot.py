@@ -30,9 +30,6 @@ from simtest.runtime.resources import shown
 
 METADATA, FORMAT = "simtest", "simtest spot_normals, version 1"
 
-NETWORK = "network"
-"""Part of the budget."""
-
 _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 """Extras whose range is checked: focal length and lights. The others differ from frame to frame."""
 
@@ -83,12 +80,8 @@ class LearnedSpot:
         return _Network(Path(self.model))
 
     def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
-        """Estimate at the highlights that the detector `peaks` finds (see `simtest.estimators.FrameEstimator`)."""
-        from simtest.detection.detector import load_detector, run_detector
-
-        found = run_detector(load_detector("peaks"), frame)
-        results, _ = self.estimate_regions(frame, [frame.patch(region.box, region.peak) for region in found.regions])
-        return [result for result in results if isinstance(result, Estimate)]
+        """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
+        return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
 
     def estimate_regions(
         self, frame: Frame, patches: Sequence[Patch | Failure], /
@@ -126,7 +119,7 @@ class LearnedSpot:
         covariance = jacobian @ factor @ factor.T @ jacobian.T * self._network.scales[self.target]
         return Estimate(
             normal=normals[0], candidates=normals[:1], look_px=np.asarray(peak, dtype=float),
-            axis_ratio=float(1 / (1 + np.exp(-made[5]))), budget={NETWORK: covariance}, target=self.target,
+            axis_ratio=float(1 / (1 + np.exp(-made[5]))), covariance=covariance, target=self.target,
         )  # fmt: skip
 
 

@@ -121,6 +121,8 @@ def _reconstruct(
     path, settings = source.path, _settings(source.path, options)
     _check_settings(out / SETTINGS, settings)
     run = _Run(out, options, settings)
+    if poses is not None and poses.names and not source.is_video:
+        run.strangers = frozenset(file.name for file in source.files) - frozenset(poses.names)
     for frame in source.frames():
         if progress is not None:
             progress(frame.index, max(source.count, frame.index + 1), frame.name)
@@ -162,6 +164,7 @@ class _Run:
         self.frames: list[TrackedFrame] = []
         self.taken = self.failed = 0
         self.first_error = ""
+        self.strangers: frozenset[str] = frozenset()  # files that the poses do not name, such as a contact sheet
         self.is_flipped = False
         self.assumed: Sequence[Assumption] = ()
         self._calibration: Calibration | None = None
@@ -181,7 +184,7 @@ class _Run:
             self.frames.append(self._reconstruct(frame, stem))
         except InputError as error:
             # The first frame shows a wrong camera or estimator; a file that is no picture is passed over.
-            if not self.frames and self._calibration is not None:
+            if not self.frames and self._calibration is not None and frame.name not in self.strangers:
                 raise
             self.failed += 1
             self.first_error = self.first_error or str(error)

@@ -13,7 +13,7 @@ import time
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextvars import ContextVar
 from functools import cache
 from hashlib import blake2b
@@ -43,7 +43,16 @@ SOURCES = ("surfaces", "geometry", "spec", "runtime/seeds.py")
 
 LIBRARIES = ("numpy", "scipy", "scikit-image")
 
-_keeping: ContextVar[bool] = ContextVar("keeping", default=True)
+_unkept: ContextVar[Container[str]] = ContextVar("unkept", default=())
+"""Kinds of arrays that are read but not kept."""
+
+
+class _All:
+    """Holds every kind."""
+
+    def __contains__(self, kind: object) -> bool:
+        return True
+
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -75,19 +84,22 @@ def kept(kind: str, key: str, make: Callable[[], Arrays]) -> Arrays:
         arrays = make()
     for warning in caught:
         warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-    if not caught and _keeping.get():
+    if not caught and kind not in _unkept.get():
         _write(path, arrays)
     return arrays
 
 
 @contextlib.contextmanager
-def only_reading() -> Iterator[None]:
-    """Within it nothing more is kept: for what is made once and never again, such as a dataset's anatomies."""
-    before = _keeping.set(False)
+def only_reading(*kinds: str) -> Iterator[None]:
+    """Within it nothing more of some kinds is kept, by default of all: for what is made once and never again.
+
+    Such are a dataset's anatomies, and reliefs that are drawn for one frame.
+    """
+    before = _unkept.set(kinds or _All())
     try:
         yield
     finally:
-        _keeping.reset(before)
+        _unkept.reset(before)
 
 
 def cache_folder() -> Path | None:

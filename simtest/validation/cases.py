@@ -128,6 +128,11 @@ class Case:
         """Whether the experiment itself names the relief's seed, so that none is drawn."""
         return RELIEF_SEED in self.settings or RELIEF_SEED in self.random
 
+    @property
+    def has_own_relief(self) -> bool:
+        """Whether the case sweeps or pools the relief's seed, so that its relief is that of few frames."""
+        return RELIEF_SEED in self.swept
+
     def noise_seed(self, experiment: Experiment, realisation: int) -> int:
         """Return the seed of a realisation's noise: the `seed` column, and ``sensor.seed`` of a scene made alone."""
         return integer(experiment.seed, experiment.name, self.name, realisation, Stage.SENSOR)

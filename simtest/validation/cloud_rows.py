@@ -58,18 +58,19 @@ def apart(
 
 
 def match_cloud(session: Session, view: RenderedView, estimate: Estimate) -> list[int]:
-    """Return the indices in `view.clouds` of the lit highlight points of the base that an estimate is of, one a light.
+    """Return the indices in `view.clouds` of the base's highlight points that an estimate is of, one a light.
 
     Of each light it is the one that most of the estimate's spots belong to; of several, the nearest to where the
-    estimate looks. That of most spots comes first. Empty where they belong to none that is in view.
+    estimate looks. That of most spots comes first. Empty where they belong to none that is in view. A point that an
+    instrument covers or shades counts too, since the spots around it still belong to it.
     """
     if estimate.cloud is None or not view.clouds:
         return []
     points, centres = estimate.cloud.points_px, list(view.clouds)
     votes: dict[int, int] = {}
-    for light in sorted({centre.light for centre in centres if centre.lit}):
+    for light in sorted({centre.light for centre in centres}):
         owners = regions.assign(session, np.full(len(points), light), points, centres)
-        counts = Counter(n for n in owners if n is not None and centres[n].lit)
+        counts = Counter(n for n in owners if n is not None)
         if counts:
             best = [n for n, count in counts.items() if count == max(counts.values())]
             nearest = min(best, key=lambda n: float(np.hypot(*(centres[n].bp_px - estimate.look_px))))

@@ -1,6 +1,7 @@
 """One realisation: render, expose, reconstruct, match, measure."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 from simtest.errors import Reason
@@ -8,6 +9,7 @@ from simtest.estimators import AnyEstimator
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
+from simtest.runtime.kept_arrays import only_reading
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment
@@ -75,12 +77,14 @@ class Realiser:
     def view(self, experiment: Experiment, case: Case, number: int) -> tuple[RenderedView, dict[str, float]]:
         """Render the scene of a realisation, at which `session` then is; return it with the values drawn for it."""
         scene, drawn = case.scene(experiment, number)
-        # A scene without drawn values is rendered once for all realisations.
-        if self._view is None:
-            self.session = Session(scene, self.variant)
-        if self._view is None or scene != self._view.scene:
-            self._further = further_views(self.session, scene)
-            self._view = render_view(self.session, scene)
+        # Reliefs of tens of megabytes that no other frame has would push the anatomies out of the user's cache.
+        with only_reading("relief") if case.has_own_relief else nullcontext():
+            # A scene without drawn values is rendered once for all realisations.
+            if self._view is None:
+                self.session = Session(scene, self.variant)
+            if self._view is None or scene != self._view.scene:
+                self._further = further_views(self.session, scene)
+                self._view = render_view(self.session, scene)
         return self._view, drawn
 
 

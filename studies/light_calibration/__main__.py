@@ -29,7 +29,8 @@ def measured(planting: Planting, told_radius: float | None = None, lights: Any =
 def row(planting: Planting, with_pictures: bool) -> dict[str, Any]:
     """Return one planting as a row of the table."""
     told: dict[str, Any] = {
-        "seed": planting.seed, "lens": planting.lens, "kind": planting.kind, "planted": len(planting.lights), "radius_mm": planting.radius_mm,
+        "seed": planting.seed, "lens": planting.lens, "kind": planting.kind, "planted": len(planting.lights),
+        "radius_mm": planting.radius_mm,
     }  # fmt: skip
     try:
         result = measured(planting).result if with_pictures else measured_points(planting)
@@ -66,7 +67,11 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
         f"number of lights, {len(sure) - len(right)} with another, {sum(e['status'] == 'doubtful' for e in rows)} told "
         f"as doubtful, {len(rows) - len(sure) - sum(e['status'] == 'doubtful' for e in rows)} refused"
     ]
-    for name, group in (("right number", right), ("every answer", sure)):
+    groups = [("right number", right), ("every answer", sure)]
+    for count in sorted({each["planted"] for each in rows}):
+        drawn = [each for each in rows if each["planted"] == count]
+        groups.append((f"{count} planted, {len(drawn)} rigs", [each for each in sure if each["planted"] == count]))
+    for name, group in groups:
         lights = [light for each in group for light in each["lights"]]
         if not lights:
             continue
@@ -77,7 +82,7 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
         share = float((squares <= chi_squared.quantile(0.95, 3)).mean())
         good = ((np.abs(errors) <= np.maximum(halves, WITHIN_MM)).all(axis=1)).mean()
         lines.append(
-            f"{name}: {len(lights)} lights, error median {np.median(length):.3f}, "
+            f"{name}: {len(group)} answered, {len(lights)} lights, error median {np.median(length):.3f}, "
             f"95 % {np.quantile(length, 0.95):.3f}, largest {length.max():.3f} mm; "
             f"within 0.2 mm {np.mean(length <= WITHIN_MM):.1%}; within 0.2 mm or the interval {good:.1%}; "
             f"intervals cover {inside.mean():.1%} of {inside.size} coordinates, 95 % regions {share:.1%}"
@@ -92,11 +97,15 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1000, help="seed of the first rig")
     parser.add_argument("--out", type=Path, default=Path("out/light_calibration.jsonl"))
     parser.add_argument("--points", action="store_true", help="without pictures: the solver alone, on drawn centres")
+    parser.add_argument("--resume", action="store_true", help="keep the rigs that --out holds, and add the others")
     told = parser.parse_args()
     told.out.parent.mkdir(parents=True, exist_ok=True)
-    rows = []
-    with told.out.open("w", encoding="utf-8") as file:
+    rows = [json.loads(line) for line in told.out.read_text("utf-8").splitlines()] if told.resume else []
+    kept = {each["seed"] for each in rows}
+    with told.out.open("a" if told.resume else "w", encoding="utf-8") as file:
         for seed in range(told.first, told.first + told.rigs):
+            if seed in kept:
+                continue
             rows.append(row(plant(seed), not told.points))
             file.write(json.dumps(rows[-1]) + "\n")
             file.flush()

@@ -214,7 +214,7 @@ def test_no_answer_from_too_little():
     pose = poses(1)[0]
     one = base_normal([Sighting(pose, np.array([[0.0, 0.0, 1.0]]))], PLANE, RADIUS)
     assert isinstance(one, Failure)
-    assert "1.0 cells" in one.detail
+    assert one.detail == "highlights fill 1.0 of the patch's 49 cells; must be 6 or more"
     assert isinstance(base_normal([], PLANE, RADIUS), Failure)
 
 

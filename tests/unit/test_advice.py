@@ -29,8 +29,9 @@ from simtest.advice.plan import (
 from simtest.advice.scope import SCOPES, read_scope
 from simtest.errors import InputError
 from simtest.rendering.placement_checks import check_camera, check_lights
+from simtest.runtime.kept_arrays import kept
 from simtest.surfaces import make_surface
-from simtest.validation import laws
+from simtest.validation import laws, realisation
 from simtest.validation.cases import RELIEF_SEED
 from simtest.validation.paired import half_width
 
@@ -210,6 +211,29 @@ def test_a_distance_without_room_is_refused(monkeypatch):
     assert "\n" not in str(error.value)
 
 
+class StoringSession:
+    """Stands for a session: makes what a surface makes, an anatomy and a relief, and renders nothing."""
+
+    def __init__(self, scene, variant):
+        for kind in ("colon", "relief"):
+            kept(kind, scene.surface.model_dump_json(), lambda: {"a": np.zeros(1)})
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_reliefs_that_are_drawn_for_a_frame_are_not_kept(tmp_path, monkeypatch, own):
+    monkeypatch.setenv("SIMTEST_CACHE", str(tmp_path / "kept"))
+    monkeypatch.setattr(realisation, "Session", StoringSession)
+    monkeypatch.setattr(realisation, "render_view", lambda session, scene: SimpleNamespace(scene=scene))
+    monkeypatch.setattr(realisation, "further_views", lambda session, scene: [])
+    planned = main_experiment(Question(read_scope("colonoscope_2"), "colon", frames=8))
+    case = simtest.validation.cases.expand(planned)[0]
+    # Negative control: the relief of an experiment that does not draw it is kept.
+    case = case if own else replace(case, swept={})
+    realisation.Realiser(None).view(planned, case, 0)
+    kinds = {path.name.split("-")[0] for path in (tmp_path / "kept").iterdir()}
+    assert kinds == ({"colon"} if own else {"colon", "relief"})
+
+
 def test_a_flat_phantom_is_a_plane():
     around = wall(ORGANS["plane"], None, 20.0)
     assert around.set["surface"] == {"type": "plane"}
@@ -374,6 +398,19 @@ def test_a_wide_interval_names_the_frames_that_narrow_it(high, said):
             assert narrower(advised, command) == f"simtest advise laparoscope --out 'a b' --frames {number}"
     else:
         assert narrower(advised, "simtest advise laparoscope --out a") is None
+
+
+@pytest.mark.parametrize(("base_deg", "said"), [(2.5, True), (6.5, False), (None, False)])
+def test_the_best_for_the_base_is_compared_with_fine_normals(base_deg, said):
+    """`cloud` is ranked alone for the base: a method of the fine surface that comes nearer to it is named."""
+    found = read_results(results([1.0, 1.2, 0.8, 1.0], [0, 1, 2, 3]), 8)
+    single = found.method("cone_axis")
+    near = replace(single, base=replace(single.fine, mean_deg=base_deg))
+    cloud = replace(single, estimator="cloud", target="base", base=replace(single.fine, mean_deg=6.0))
+    choice = replace(found.choices[0], target="base", best="cloud", ties=())
+    advised = SimpleNamespace(found=replace(found, methods=[near, cloud]))
+    assert ("fine normals of cone_axis lie nearer to it: mean 2.5 deg, 4 of 4" in sentence(advised, choice)) == said
+    assert "lie nearer" not in sentence(advised, found.choices[0])
 
 
 @pytest.mark.render

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, Priors, Uniform, exactly
+from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, Priors, Response, Uniform, exactly
 from simtest.errors import Failure, Reason
 from simtest.estimators.cloud import CloudCentre, cloud, small_sample
 from simtest.estimators.cloud_mixture import fit_mixture, sampling_covariance, window_of
@@ -83,6 +83,25 @@ def test_texture_of_tissue_is_no_spot():
     assert not len(find_spots(frame_of(picture_of([], noise=0.002) + texture.astype(np.float32))).peaks)
     shining = picture_of([(60.0, 60.0)]) + texture.astype(np.float32)
     assert len(find_spots(frame_of(shining)).peaks) == 1
+
+
+@pytest.mark.parametrize("coloured", [True, False])
+def test_what_a_split_of_the_light_leaves_of_the_tissue_is_no_spot(coloured):
+    """Specular light with residues of a fifth of the tissue's light: spots where the tissue is dark, else none."""
+    rng = np.random.default_rng(4)
+    points = spread_points(rng, 12)
+    residues = np.stack(np.meshgrid(np.arange(20, 310, 24), np.arange(15, 230, 24)), axis=-1).reshape(-1, 2) + 0.5
+    split = picture_of(points) + 0.1 * picture_of(residues, noise=0.0)
+    found = {}
+    for tissue in (0.0, 0.5):
+        picture = picture_of(points, background=tissue, seed=1)
+        picture = np.repeat(picture[..., None], 3, axis=2) if coloured else picture
+        calibration = Calibration(CAMERA, response=Response(), priors=LIGHT_AT_CAMERA)
+        found[tissue] = find_spots(Frame(picture, calibration, 1.0, light=split))
+    assert len(found[0.0].peaks) > 60
+    gaps = np.linalg.norm(found[0.5].points_px[:, None] - points, axis=2)
+    assert len(gaps) == 12
+    assert gaps.min(axis=1).max() < 0.5
 
 
 def test_faint_spots_do_not_count():

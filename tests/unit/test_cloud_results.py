@@ -1,10 +1,13 @@
 """Rows of estimator `cloud` in results: against the base's highlight point, found, missed and refused."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from simtest.estimators.cloud import CloudCentre, cloud
 from simtest.geometry.vectors import angle_deg
+from simtest.simulation import clouds as regions
 from simtest.spec import Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
@@ -54,3 +57,14 @@ def test_a_cloud_that_is_not_answered_is_a_row_with_its_reason():
     assert row.status == "no_estimate"
     assert row.error_deg is None
     assert "a cloud takes 500" in row.flags
+
+
+def test_a_cloud_belongs_to_the_point_of_most_of_its_spots_also_where_an_instrument_covers_that(monkeypatch):
+    """One stray spot at a lit point far away does not make that point the truth."""
+    centres = [SimpleNamespace(light=0, lit=lit, bp_px=np.array(at)) for lit, at in ((False, (50, 50)), (True, (9, 9)))]
+    points = np.zeros((26, 2))
+    estimate = SimpleNamespace(cloud=SimpleNamespace(points_px=points), look_px=np.array([50.0, 50.0]))
+    view = SimpleNamespace(clouds=centres)
+    for owners, expected in (([0] * 25 + [1], [0]), ([0] * 12 + [1] * 14, [1]), ([None] * 26, [])):
+        monkeypatch.setattr(regions, "assign", lambda *_, owners=owners: owners)
+        assert match_cloud(None, view, estimate) == expected

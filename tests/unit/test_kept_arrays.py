@@ -174,6 +174,16 @@ def test_only_reading_keeps_nothing_more(folder):
     assert len(list(folder.iterdir())) == 2
 
 
+def test_kinds_that_are_only_read(folder):
+    make, _ = counted()
+    with only_reading("relief"):
+        for kind in ("relief", "colon"):
+            assert_same(kept(kind, "one", make))
+    assert [path.name.split("-")[0] for path in folder.iterdir()] == ["colon"]
+    kept("relief", "one", make)
+    assert len(list(folder.iterdir())) == 2
+
+
 def test_several_processes_at_once(folder):
     code = (
         "import numpy as np; from simtest.runtime.kept_arrays import kept\n"

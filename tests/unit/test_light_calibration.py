@@ -16,7 +16,13 @@ from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.camera import Camera
 from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
-from simtest.reconstruction.light_calibration.observations import View, circles_of, with_floor, without_merged
+from simtest.reconstruction.light_calibration.observations import (
+    View,
+    circles_of,
+    read_balls,
+    with_floor,
+    without_merged,
+)
 from simtest.reconstruction.light_calibration.outline import (
     BallOutline,
     has_dark_ring,
@@ -55,6 +61,37 @@ def test_outline_gives_the_centre_within_its_error() -> None:
     assert np.linalg.norm(gap) < 0.1
 
 
+def blurred(kind: str, light: npt.NDArray[np.float64], samples: int) -> npt.NDArray[np.float64]:
+    """Return light with the point spread of a lens that is sharp, out of focus, or sharpened by its processor."""
+    if kind == "sharp":
+        return np.asarray(cv2.GaussianBlur(light, (0, 0), 0.5 * samples))
+    if kind == "disc":
+        x = np.arange(-2 * samples, 2 * samples + 1)
+        disc = (x[:, None] ** 2 + x**2 <= (2 * samples) ** 2).astype(float)
+        return np.asarray(cv2.filter2D(light, -1, disc / disc.sum()))
+    narrow, wide = (cv2.GaussianBlur(light, (0, 0), sd * samples) for sd in (0.7, 1.5))
+    return np.asarray(1.5 * narrow - 0.5 * wide)
+
+
+@pytest.mark.parametrize("kind", ["sharp", "disc", "sharpened"])
+def test_point_spread_does_not_move_the_outline(kind: str) -> None:
+    """An error of the outline's radius is the same in all pictures; no number of pictures averages it."""
+    samples, camera = 6, Camera(110, 110, 180.0, 180.0, 55.3, 54.6)
+    centre = np.array([0.4, -0.3, 25.0])
+    fine = Camera(660, 660, 1080.0, 1080.0, 331.8, 327.6)
+    rays = fine.unproject(fine.pixel_centres())
+    cosine = rays @ (centre / np.linalg.norm(centre))
+    sine = np.sqrt(1 - cosine**2) * np.linalg.norm(centre) / RADIUS
+    light = np.where(sine < 1, 0.15 * np.sqrt(np.maximum(1 - sine**2, 0)), 0.45)
+    picture = blurred(kind, light, samples).reshape(110, samples, 110, samples).mean(axis=(1, 3))
+    true = outline_of(centre)
+    start = replace(true, half_angle=true.half_angle + 0.7 / camera.fx)
+    found = refine_outline(picture, camera, start)
+    assert found is not None
+    assert abs(found.half_angle - true.half_angle) * camera.fx < 0.02
+    assert np.linalg.norm(found.direction - true.direction) * camera.fx < 0.02
+
+
 def test_outline_through_points_is_the_ball_s() -> None:
     true = outline_of(CENTRE)
     traced = outline_through(CAMERA, true.pixels(CAMERA, 12))
@@ -80,6 +117,7 @@ def test_highlights_are_where_the_mirror_law_says() -> None:
     assert max(gaps) < 0.1
 
 
+INSIDE_SMALL = np.linalg.norm(CAMERA.pixel_centres() - [120.0, 100.0], axis=-1) < 40
 INSIDE = CAMERA.unproject(CAMERA.pixel_centres()) @ (CENTRE / np.linalg.norm(CENTRE)) > np.cos(0.95 * 0.2)
 
 
@@ -111,6 +149,28 @@ def test_clipped_spot_stays_one() -> None:
         found = measure_highlights(np.minimum(values, 1.0), np.ones(values.shape, dtype=bool), 12.0)
         assert [each.problem for each in found] == [""]
         assert np.linalg.norm(found[0].pixel - [120 + offset, 100.0]) < 0.1
+
+
+def test_centres_of_small_spots_are_as_good_as_stated() -> None:
+    rng, grid, total = np.random.default_rng(8), CAMERA.pixel_centres(), 0.0
+    for _ in range(10):
+        centre = np.array([120.0, 100.0]) + rng.uniform(-0.5, 0.5, 2)
+        values = 0.2 + 0.5 * np.exp(-np.sum((grid - centre) ** 2, axis=-1) / (2 * 0.75**2))
+        values += rng.normal(0, 0.01, values.shape)
+        found = measure_highlights(values, INSIDE_SMALL, 12.0)
+        assert [each.problem for each in found] == [""]
+        gap = found[0].pixel - centre
+        total += float(gap @ np.linalg.solve(found[0].covariance, gap))
+    assert total < 45.3  # chi-squared, 20 degrees of freedom, alpha = 0.001
+
+
+def test_same_picture_twice_counts_once() -> None:
+    values = np.random.default_rng(2).uniform(0, 1, (200, 240)).astype(np.float32)
+    circle = {"a.png": (120.0, 100.0, 40.0), "b.png": (120.0, 100.0, 40.0)}
+    twice = [(name, lambda: values) for name in ("a.png", "b.png")]
+    assert (
+        read_balls(twice, Calibration(CAMERA), circle).left_out["b.png"] == "the same picture as a.png; it counts once"
+    )
 
 
 def test_long_reflection_is_left_out() -> None:
@@ -164,6 +224,23 @@ def test_lights_are_found_and_written(tmp_path: Path) -> None:
     told = json.loads((tmp_path / "lights.json").read_text())
     assert len(told["lights"]) == 2
     assert "Positions of the lights" in (tmp_path / "index.html").read_text()
+
+
+@pytest.mark.slow
+def test_chance_meetings_of_rays_are_no_doubt() -> None:
+    """Four lights of which a fifth position explains as many highlights as one of them, but no set with it does."""
+    from studies.light_calibration.plantings import plant
+
+    rig = plant(3000)
+    made = calibrate_lights(
+        rig.pictures(), Calibration(rig.camera, Response("gamma", rig.look.gamma)), Ball(rig.radius_mm)
+    )
+    assert made.result.problems == ()
+    assert len(made.result.own) == len(rig.lights)
+    for light in made.result.own:
+        gap = min((light.position_mm - each for each in rig.lights), key=lambda each: float(np.linalg.norm(each)))
+        assert np.linalg.norm(gap) < 0.2
+        assert gap @ np.linalg.solve(light.covariance_mm2, gap) < 16.3
 
 
 def write_inputs(folder: Path) -> None:

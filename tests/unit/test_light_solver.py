@@ -189,6 +189,34 @@ def test_two_pictures_of_two_lights_are_not_sure_of_a_ghost() -> None:
     assert result.problems or (nearest_errors(result, LIGHTS) < 16.3).all()
 
 
+def test_lights_and_balls_in_one_plane_are_ambiguous() -> None:
+    """In one plane all reflected rays meet, so two pictures show two lights or the two points of the other pairing."""
+    centres = np.array([[-4.0, 0.0, 30.0], [4.0, 0.0, 30.0]])
+    mirrors = Balls(centres, np.broadcast_to(1e-3 * np.eye(3), (2, 3, 3)).copy(), np.full(2, 5.0))
+    lights = np.array([[2.0, 0.0, 0.0], [-2.0, 0.0, 0.0]])
+    highlights, _ = seen(mirrors, lights)
+    assert any("ambiguous" in problem for problem in measured(mirrors, highlights).problems)
+    # From a third place off the plane one pairing is left.
+    more = np.concatenate([centres, [[1.0, 7.0, 26.0], [-3.0, -6.0, 35.0]]])
+    mirrors = Balls(more, np.broadcast_to(1e-3 * np.eye(3), (4, 3, 3)).copy(), np.full(4, 5.0))
+    highlights, _ = seen(mirrors, lights)
+    result = measured(mirrors, highlights)
+    assert result.problems == ()
+    assert (nearest_errors(result, lights) < 16.3).all()
+
+
+def test_light_that_few_pictures_show_is_a_doubt() -> None:
+    mirrors = balls(8)
+    highlights, source = seen(mirrors, LIGHTS)
+    few = (source != 1) | (highlights.view < 3)
+    shown = Highlights(highlights.view[few], highlights.pixels[few], highlights.covariance[few])
+    result = measured(mirrors, shown)
+    assert any("further light" in problem for problem in result.problems)
+    fewer = (source != 1) | (highlights.view < 1)
+    shown = Highlights(highlights.view[fewer], highlights.pixels[fewer], highlights.covariance[fewer])
+    assert measured(mirrors, shown).problems == ()
+
+
 def test_nothing_but_stray_highlights_is_no_light() -> None:
     mirrors = balls(10)
     rng = np.random.default_rng(2)

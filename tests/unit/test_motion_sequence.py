@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -103,6 +104,30 @@ def test_a_sequence_with_poses_tells_the_shape(film, name, tmp_path):
     assert f"{expected}, 4 of 4" in (tmp_path / "out" / "index.html").read_text()
     assert made.motion.startswith(f"bends of 4 highlights: 4 {expected}; 0 fit no curvature")
     assert "\n" not in made.motion
+
+
+@pytest.mark.render
+def test_a_picture_that_the_poses_do_not_name_is_passed_over(film, tmp_path):
+    """The folder of `simtest views` holds a contact sheet of another size, which comes before its frames."""
+    folder, options = film("convex")
+    named = json.loads((folder / "poses.json").read_text())
+    (tmp_path / "frames").mkdir()
+    for entry in named["frames"]:
+        name = f"view_{entry['frame']}"
+        shutil.copy(folder / "frames" / entry["frame"], tmp_path / "frames" / name)
+        entry["frame"] = name
+    cv2.imwrite(str(tmp_path / "frames" / "sheet.png"), np.zeros((40, 60), np.uint8))
+    options = replace(options, poses=tmp_path / "poses.json")
+    options.poses.write_text(json.dumps(named))
+    with pytest.warns(UserWarning, match=r"frame 0: sheet\.png: frame is 60 x 40 px: must be 320 x 320"):
+        made = reconstruct_sequence(tmp_path / "frames", tmp_path / "out", options)
+    assert made.failed == 1
+    assert made.motion.startswith("bends of 4 highlights: 4 convex")
+    # A first picture that the poses name is refused: the camera is not that of the frames.
+    named["frames"].append({"frame": "sheet.png", "world_from_camera": np.eye(4).tolist()})
+    options.poses.write_text(json.dumps(named))
+    with pytest.raises(InputError, match=r"sheet\.png: frame is 60 x 40 px"):
+        reconstruct_sequence(tmp_path / "frames", tmp_path / "refused", options)
 
 
 @pytest.mark.render

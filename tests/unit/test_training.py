@@ -85,6 +85,7 @@ def test_a_resumed_training_ends_with_the_weights_of_an_undisturbed_one(tmp_path
     assert resumed.state == whole.state
     for name in (LAST, BEST):
         assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    assert (tmp_path / "whole" / LAST).stat().st_mode & 0o777 == (tmp_path / "whole").stat().st_mode & 0o666
     # A finished training is not done again.
     assert run(tmp_path / "whole", stop).state == whole.state
 

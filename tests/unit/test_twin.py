@@ -4,6 +4,7 @@ import csv
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -19,13 +20,14 @@ from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot, usable_spots
 from simtest.advice.twin.tissue import NAMES, WIDER, tissue_of
 from simtest.advice.twin.writing import COLUMNS, write_twins
 from simtest.calibration import Calibration, CameraPrior, Normal, Priors, Response, Uniform
-from simtest.errors import InputError
+from simtest.errors import InputError, SimtestError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import run_picture
+from simtest.runtime.kept_arrays import kept
 from simtest.spec import load_scene
 from simtest.spec.dataset_recipe import load_dataset
 from simtest.surfaces.factory import make_surface
@@ -383,6 +385,21 @@ def test_the_files_hold_what_was_measured(tmp_path, framed):
     assert 'src="https' not in page
     assert page.count("<tr><td>") == len(spots)
     assert page.count('alt="Twin ') == 6 * len(spots)
+
+
+def test_a_bank_keeps_no_relief(tmp_path, monkeypatch):
+    monkeypatch.setenv("SIMTEST_CACHE", str(tmp_path / "kept"))
+
+    def session(scene, variant):
+        for kind in ("colon", "relief"):
+            kept(kind, "one", lambda: {"a": np.zeros(1)})
+        raise SimtestError("rendered nothing")
+
+    monkeypatch.setattr(banks, "Session", session)
+    monkeypatch.setattr(banks, "make_pool", lambda tissue: [None])
+    subject = SimpleNamespace(draws=SimpleNamespace(tissue=None, draw=lambda *told: "scene"), pixels=None)
+    assert banks.make_bank([subject], None, 1, 0) == []
+    assert [path.name.split("-")[0] for path in (tmp_path / "kept").iterdir()] == ["colon"]
 
 
 @pytest.mark.render

@@ -14,6 +14,7 @@ from simtest.errors import SimtestError
 from simtest.reconstruction.found import Reconstruction
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image, Mask, Picture
+from simtest.runtime.kept_arrays import only_reading
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.video_processor import luma
@@ -115,7 +116,8 @@ def make_bank(
         patch, scene = next(((patch, scene) for patch, scene in drawn if scene is not None), (at, None))
         if scene is not None:
             try:
-                with warnings.catch_warnings():
+                # Each frame has a relief of its own, tens of megabytes: none is kept in the user's cache.
+                with warnings.catch_warnings(), only_reading("relief"):
                     warnings.simplefilter("ignore")
                     session = session if session is not None and patch == at else Session(scene, colour_variant())
                     at = patch

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from simtest.errors import InputError
@@ -59,7 +59,9 @@ def save_checkpoint(path: Path, network: nn.Module, optimiser: torch.optim.Optim
         tensors |= {f"{_OPTIMISER}{index}.{name}": tensor for name, tensor in values.items()}
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     metadata = {_STATE: json.dumps(asdict(state))}
-    write_atomically(path, lambda part: save_file(plain, part, metadata=metadata))
+    content = save(plain, metadata=metadata)
+    # Written here, not by safetensors, whose files nobody else may read.
+    write_atomically(path, lambda part: part.write_bytes(content))
 
 
 def load_checkpoint(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer, made_of: dict[str, Any]) -> State:

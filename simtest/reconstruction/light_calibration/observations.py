@@ -126,8 +126,13 @@ def read_balls(
     """
     found = Views()
     camera = calibration.camera
+    contents: dict[bytes, str] = {}
     for name, read in pictures:
-        intensity = _linear(name, read(), calibration)
+        values = read()
+        if (first := _first_of(contents, name, values)) != name:
+            found.left_out[name] = _SAME.format(shown(first))
+            continue
+        intensity = _linear(name, values, calibration)
         outline = _outline(intensity, camera, circles.get(name))
         if isinstance(outline, str):
             found.left_out[name] = outline
@@ -167,6 +172,7 @@ def read_plates(
     """Read pictures of a plate that lies in the plane z = 0 of the poses' world (`world_from_camera`, mm)."""
     found, camera = Views(), calibration.camera
     everywhere = camera.contains(camera.pixel_centres())
+    contents: dict[bytes, str] = {}
     for (name, read), pose in zip(pictures, poses, strict=True):
         if pose is None:
             found.left_out[name] = "the file of poses does not name it"
@@ -175,7 +181,11 @@ def read_plates(
         if plane is None:
             found.left_out[name] = "the camera is in the plate's plane, z = 0"
             continue
-        intensity = _linear(name, read(), calibration)
+        values = read()
+        if (first := _first_of(contents, name, values)) != name:
+            found.left_out[name] = _SAME.format(shown(first))
+            continue
+        intensity = _linear(name, values, calibration)
         widest = WIDEST_ON_PLATE * max(camera.width, camera.height)
         found.views.append(View(name, intensity, measure_highlights(intensity, everywhere, widest), plane=plane))
     return found
@@ -188,6 +198,18 @@ def _plane(world_from_camera: Array) -> tuple[Array, float] | None:
         return None
     side = 1.0 if height > 0 else -1.0
     return side * normal / np.linalg.norm(normal), -abs(height) / float(np.linalg.norm(normal))
+
+
+_SAME = "the same picture as {}; it counts once"
+
+
+def _first_of(contents: dict[bytes, str], name: str, values: Image) -> str:
+    """Return the name of the first picture with the same values; a copy would count as a second measurement."""
+    from hashlib import sha256
+
+    content = np.ascontiguousarray(values)
+    digest = sha256(repr((content.shape, content.dtype.str)).encode() + content.tobytes()).digest()
+    return contents.setdefault(digest, name)
 
 
 def _linear(name: str, values: Image, calibration: Calibration) -> Array:
