@@ -13,7 +13,7 @@ from simtest.calibration.lights.result import LightCalibration
 from simtest.errors import InputError
 from simtest.geometry import chi_squared
 from simtest.reconstruction.light_calibration.run import Ball, Calibrated, calibrate_lights
-from studies.light_calibration.plantings import Planting, plant
+from studies.light_calibration.plantings import Planting, plant, write_pictures
 from studies.light_calibration.points import about, measured_points
 
 WITHIN_MM = 0.2
@@ -98,7 +98,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/light_calibration.jsonl"))
     parser.add_argument("--points", action="store_true", help="without pictures: the solver alone, on drawn centres")
     parser.add_argument("--resume", action="store_true", help="keep the rigs that --out holds, and add the others")
+    parser.add_argument("--write", type=Path, help="folder for the pictures of the rig --first; nothing is measured")
     told = parser.parse_args()
+    if told.write is not None:
+        planting = plant(told.first)
+        write_pictures(planting, told.write)
+        print(f"ball of {planting.radius_mm:.3f} mm; lights at {np.round(planting.lights, 3).tolist()} mm")
+        return
     told.out.parent.mkdir(parents=True, exist_ok=True)
     rows = [json.loads(line) for line in told.out.read_text("utf-8").splitlines()] if told.resume else []
     kept = {each["seed"] for each in rows}

@@ -3,12 +3,16 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration import Calibration, Response
 from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
+from simtest.spec.calibration_file import save_calibration
 from studies.light_calibration.pictures import Floats, Look, picture_of_ball
 
 WIDTH, HEIGHT = 640, 512
@@ -42,6 +46,15 @@ class Planting:
         rng = np.random.default_rng([self.seed, view])
         shown = self.lights if lights is None else lights[view]
         return picture_of_ball(self.camera, self.centres[view], self.radius_mm, shown, self.look, rng)
+
+
+def write_pictures(planting: Planting, folder: Path) -> None:
+    """Write a rig's pictures as PNG, and the calibration file that lacks its lights, scope.toml, beside the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, read in planting.pictures():
+        cv2.imwrite(str(folder / name), np.round(255 * read()).astype(np.uint8))
+    known = Calibration(planting.camera, Response("gamma", planting.look.gamma))
+    save_calibration(known, folder.parent / "scope.toml")
 
 
 def plant(seed: int, count: int | None = None, **look: float) -> Planting:

@@ -15,6 +15,7 @@ from simtest.calibration import Calibration, Response
 from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.camera import Camera
+from simtest.reconstruction.image_io import read_picture
 from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
 from simtest.reconstruction.light_calibration.observations import (
     View,
@@ -241,6 +242,19 @@ def test_chance_meetings_of_rays_are_no_doubt() -> None:
         gap = min((light.position_mm - each for each in rig.lights), key=lambda each: float(np.linalg.norm(each)))
         assert np.linalg.norm(gap) < 0.2
         assert gap @ np.linalg.solve(light.covariance_mm2, gap) < 16.3
+
+
+def test_the_study_writes_its_pictures(tmp_path: Path) -> None:
+    from studies.light_calibration.plantings import plant, write_pictures
+
+    rig = plant(7004)
+    rig = replace(rig, centres=rig.centres[:1])
+    write_pictures(rig, tmp_path / "ball")
+    ((name, read),) = rig.pictures()
+    np.testing.assert_allclose(read_picture(tmp_path / "ball" / name), read(), atol=1e-6)
+    known = load_calibration(tmp_path / "scope.toml")
+    assert known.response == Response("gamma", rig.look.gamma)
+    assert known.priors.lights_mm is None or not len(known.priors.lights_mm)
 
 
 def write_inputs(folder: Path) -> None:
