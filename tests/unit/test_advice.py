@@ -19,6 +19,8 @@ from simtest.advice.organs import ORGANS, Surroundings, wall
 from simtest.advice.page import narrower, sentence, write_advice
 from simtest.advice.plan import (
     DISTANCES,
+    LEAST_FRAMES,
+    MOST_FRAMES,
     Question,
     affordable,
     distances_of,
@@ -26,7 +28,7 @@ from simtest.advice.plan import (
     surroundings,
     write_experiment,
 )
-from simtest.advice.scope import SCOPES, read_scope
+from simtest.advice.scope import SCOPES, ReliefPrior, read_scope
 from simtest.errors import InputError
 from simtest.rendering.placement_checks import check_camera, check_lights
 from simtest.runtime.kept_arrays import kept
@@ -267,9 +269,13 @@ def test_spots_shrink_with_relief_and_have_the_smooth_size_without():
     assert smooth.shapeless_beyond_mm == math.inf
 
 
-def test_larger_pictures_get_fewer_frames():
-    large = read_scope("colonoscope_2", camera=None)
-    assert affordable(large) % DISTANCES == 0
+def test_large_pictures_and_rough_walls_get_fewer_frames(tmp_path):
+    large, tiny = read_scope("colonoscope_2"), read_scope(written(tmp_path, CAMERA))
+    smooth = replace(large, relief=ReliefPrior(slope_deg=0.0))
+    rough, bare, most = (affordable(Question(scope, "colon")) for scope in (large, smooth, tiny))
+    assert LEAST_FRAMES < rough < bare < most == MOST_FRAMES
+    assert affordable(Question(large, "plane")) == bare
+    assert Question(large, "colon").per_distance * DISTANCES == rough
     assert distances_of(Question(large, distances_mm=(20.0, 60.0)))[0] == 22.5
 
 
