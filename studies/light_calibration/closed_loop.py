@@ -3,8 +3,8 @@
     python -m studies.light_calibration.closed_loop [RIGS] [FIRST_SEED]
 
 Each rig of one to three lights takes pictures of a ball (`rendered`) and is calibrated on them. The same lights then
-render a smooth cylinder and rough tissue. Both pictures are reconstructed three times, with calibration files that differ
-in the lights alone: not told, as calibrated, and exact. The distance is told with a standard deviation of 15 %.
+render a smooth cylinder and rough tissue. Both pictures are reconstructed three times, with calibration files that
+differ in the lights alone: not told, as calibrated, and exact. The distance is told with a standard deviation of 15 %.
 """
 
 import sys

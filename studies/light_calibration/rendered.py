@@ -1,4 +1,4 @@
-"""Pictures of a ball that simtest renders with Mitsuba: a glossy sphere seen from outside, before a wall or before nothing.
+"""Pictures of a ball that simtest renders with Mitsuba: a glossy sphere from outside, before a wall or before nothing.
 
 Sphere, lens, lobe and shading come from the renderer, and nothing from `pictures`. The renderer has no room light, so
 the wall is added where the rays miss the ball; it has no shadow on it.

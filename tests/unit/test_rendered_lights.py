@@ -67,23 +67,24 @@ def test_wrong_radius_moves_the_lights_out_of_their_regions(tmp_path: Path) -> N
     assert max(squares) > chi_squared.quantile(1 - 0.001 / 3, 3)
 
 
-@pytest.mark.parametrize("blur_px", [0.7, 1.0])
-def test_dark_background_widens_the_intervals(tmp_path: Path, blur_px: float) -> None:
-    """The unlit side of a ball cannot be told from the background; the outline errs by half a pixel."""
-    lights = RIGS[2]
-    priors = measured(tmp_path, Rendering(lights, places(8, RADIUS, 2), RADIUS, wall=False, blur_px=blur_px))
-    assert len(priors.lights) == 2
+@pytest.mark.parametrize("count", [1, 2])
+def test_dark_background_widens_the_intervals(tmp_path: Path, count: int) -> None:
+    """The unlit side of a ball cannot be told from the background; one light moves all outlines by 1 to 2 px alike."""
+    lights = RIGS[count]
+    priors = measured(tmp_path, Rendering(lights, places(8, RADIUS, count), RADIUS, wall=False, blur_px=1.0))
+    assert len(priors.lights) == count
     assert priors.lights_covariance is not None
     _, squares = distances(priors, lights)
-    assert max(squares) < chi_squared.quantile(1 - 0.001 / 2, 3)
+    # The median would be 2.4: a larger bound would let through intervals that are half as wide as they must be.
+    assert max(squares) < chi_squared.quantile(0.95, 3)
     # across the view the lights are still known
-    assert np.sqrt(priors.lights_covariance[:, [0, 1], [0, 1]]).max() < 0.5
+    assert np.sqrt(priors.lights_covariance[:, [0, 1], [0, 1]]).max() < 1.5
 
 
 def test_calibrated_lights_are_as_good_as_exact_ones_on_frames(tmp_path: Path) -> None:
     lights = plant(6802, 2).lights
-    wrong = tuple(tuple(float(value) for value in light + [0.0, 9.0, 0.0]) for light in lights)
-    rows = rows_of_rig(lights, 6802, tmp_path, {"wrong": Priors(lights_mm=wrong)})  # type: ignore[arg-type]
+    wrong = tuple((float(x), float(y) + 9.0, float(z)) for x, y, z in lights)
+    rows = rows_of_rig(lights, 6802, tmp_path, {"wrong": Priors(lights_mm=wrong)})
 
     def of(told: str, frame: str, what: str) -> Floats:
         return np.array([getattr(row, what) for row in rows if (row.told, row.frame) == (told, frame)], dtype=float)
