@@ -281,8 +281,8 @@ def _unlit_strip(outline: BallOutline, radius_mm: float) -> float:
 def unlit_outline_errors(views: Sequence[View], camera: Camera, radius_mm: float) -> Iterator[list[BallOutline]]:
     """Return all outlines, moved by what the unlit rim may do to all of them alike; none where every rim is seen.
 
-    The lights stay where they are, so a dark background moves the outlines of all pictures to the same side, each by its
-    own strip (`with_floor` counts what differs between the pictures). They move along x, along y, and in their radius.
+    The lights stay where they are, so a dark background moves the outlines of all pictures to the same side, each by
+    its own strip (`with_floor` counts what differs between the pictures). They move along x, along y, and in radius.
     """
     strips = []
     for view in views:
