@@ -1,6 +1,7 @@
 """How well `simtest advise` predicts: its mean errors against separate validations of rigs that it was not made with.
 
-    python -m studies.advice studies/advice_rigs.toml OUT [--frames N] [--blocks B] [--rig NAME]...
+    python -m studies.advice studies/advice_rigs.toml OUT [--frames N] [--blocks B] [--rig NAME]... [--seed S]
+        [--again-seed S]
 
 Each rig is asked about once, with the default number of frames or N, and again in B blocks of `BLOCK` frames, each
 with a seed of its own; the first block of all rigs comes before the second. Both figures are of the method that the
@@ -30,10 +31,10 @@ AGREES = 0.15
 """The figures agree where they differ by at most this share of the validation's."""
 
 SEED = 1
-"""Seed of the predictions."""
+"""Default seed of the predictions."""
 
 AGAIN_SEED = 20261123
-"""Seed of the first block of the validations; those of further ones follow."""
+"""Default seed of the first block of the validations; those of further ones follow."""
 
 BLOCK = 32
 """Frames of a block."""
@@ -102,6 +103,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     parser.add_argument("--blocks", type=int, default=2)
     parser.add_argument("--rig", action="append", dest="names")
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--again-seed", type=int, default=AGAIN_SEED)
     told = parser.parse_args()
     rigs = read_toml(told.rigs)
     file = told.out / "advice.json"
@@ -111,9 +114,9 @@ def main() -> None:
         for name in told.names or rigs:
             record = done.setdefault(name, {"process_time_s": {}})
             one = partial(ask, name, rigs[name])
-            rows = timed(record, "predicted", partial(one, told.out / name, told.frames, SEED))
+            rows = timed(record, "predicted", partial(one, told.out / name, told.frames, told.seed))
             again = [
-                timed(record, f"again_{b}", partial(one, told.out / name / f"again_{b}", BLOCK, AGAIN_SEED + b))
+                timed(record, f"again_{b}", partial(one, told.out / name / f"again_{b}", BLOCK, told.again_seed + b))
                 for b in range(blocks)
             ]
             compare(record, rows, again)

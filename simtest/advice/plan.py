@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from simtest.advice.draws import drawn_values, in_free_space
-from simtest.advice.organs import ORGANS, Organ, Surroundings, rough, wall
+from simtest.advice.organs import ORGANS, Organ, Surroundings, is_smooth, rough, wall
 from simtest.advice.scope import Interval, Scope
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
@@ -24,14 +24,17 @@ ESTIMATORS = ("curved", "cone_axis", "brightest_point", "bisector", "cloud")
 DISTANCES = 8
 """Distances at which the wall stands: the middles of so many equal parts of the range."""
 
-LEAST_FRAMES, MOST_FRAMES = 32, 128
+LEAST_FRAMES, MOST_FRAMES = 32, 200
 """Of the default number of frames."""
 
 MOST_ASKED = 10_000
 """Frames that may be asked for."""
 
-BUDGET_S, FRAME_S, MEGAPIXEL_S = 110.0, 0.6, 5.0
-"""Processor time of the frames, and of one: about so much, and so much more for each million pixels."""
+BUDGET_S = 140.0
+"""Processor time of the frames, about."""
+
+ROUGH_S, SMOOTH_S = (0.6, 5.0), (0.35, 2.5)
+"""Processor time of a frame of a wall with relief, and of one without: so much, and so much more a million pixels."""
 
 FIRST_VIEWPOINT = 1000
 """Number of a mesh's first viewpoint: scenes that are shown begin at 0."""
@@ -114,7 +117,7 @@ class Question:
     @property
     def per_distance(self) -> int:
         """Frames at each distance."""
-        return max(1, round((self.frames or affordable(self.scope)) / DISTANCES))
+        return max(1, round((self.frames or affordable(self)) / DISTANCES))
 
     @property
     def middle_mm(self) -> float:
@@ -133,10 +136,11 @@ class Question:
         return f"{self.scope.name}, {self.mesh.name if self.mesh else self.organ}, {near:g} to {far:g} mm"
 
 
-def affordable(scope: Scope) -> int:
-    """Return how many frames of a scope `BUDGET_S` allows."""
-    width, height = scope.size
-    frames = BUDGET_S / (FRAME_S + MEGAPIXEL_S * width * height / 1e6)
+def affordable(question: Question) -> int:
+    """Return how many frames `BUDGET_S` allows: large pictures and rough walls take longer."""
+    width, height = question.scope.size
+    each, megapixel = SMOOTH_S if is_smooth(question.kind, question.scope.relief) else ROUGH_S
+    frames = BUDGET_S / (each + megapixel * width * height / 1e6)
     return int(min(max(frames, LEAST_FRAMES), MOST_FRAMES)) // DISTANCES * DISTANCES
 
 

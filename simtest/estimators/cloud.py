@@ -31,6 +31,10 @@ from simtest.geometry.vectors import basis_across
 LEAST_SPOTS = 6
 """A cloud of fewer spots gets no answer: a lone large highlight is a cloud of one."""
 
+LEAST_UNVERIFIED = 15
+"""Nor does a cloud of fewer spots on tissue whose diffuse light does not tell whether the base faces the light there:
+so few show no shape, and folds that come near to facing the light make such groups."""
+
 LEAST_IN_VIEW = 0.95
 """Nor does a cloud of which less is in view, whose centre would be a guess."""
 
@@ -185,13 +189,15 @@ def _estimate(
 
 
 def _refusal(cloud: Cloud, evidence: BaseEvidence, spots: int) -> Failure | None:
-    """Return why a cloud gets no answer where the base has no highlight point at its centre, or more than one."""
+    """Return why a cloud gets no answer: the base has no highlight point there, several, or nothing shows one."""
     if evidence.refutes:
         off = math.degrees(evidence.misfit)
         why = f"the diffuse light says that the base is turned by {off:.0f} deg from facing the light at its centre"
     elif evidence.shows and _extent(cloud) > MOST_EXTENT:
         most, extent = (math.degrees(value) for value in (MOST_EXTENT, _extent(cloud)))
         why = f"its extent is {extent:.0f} deg, over {most:.0f}: the base has several highlight points there or none"
+    elif evidence.shows and not evidence.told and spots < LEAST_UNVERIFIED:
+        why = f"the diffuse light does not tell whether the base faces the light there: it takes {LEAST_UNVERIFIED}"
     else:
         return None
     return _unstated(spots, why)

@@ -26,9 +26,9 @@ from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import shown
+from simtest.runtime.resources import data_root, shown
 
-METADATA, FORMAT = "simtest", "simtest spot_normals, version 1"
+METADATA, FORMAT = "simtest", "simtest spot_normals, version 2"
 
 _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 """Extras whose range is checked: focal length and lights. The others differ from frame to frame."""
@@ -41,6 +41,42 @@ STEP = 1e-5
 
 LARGEST_MODEL_BYTES = 256 * 2**20
 
+SHIPPED = ("learning", "weights", "learned_spot.onnx")
+"""Below the shipped scenes; its card lies beside it."""
+
+
+@dataclass(frozen=True)
+class CovarianceScale:
+    """Factor of a covariance, as it hangs on how sure the network states to be of the highlight.
+
+    Parameters
+    ----------
+    log_deviation : tuple of float
+        Mean logarithm of the two stated deviations (`log_deviation`), ascending; constant beyond the ends.
+    factor : tuple of float
+        Factor of the covariance there; its logarithm is interpolated.
+    """
+
+    log_deviation: tuple[float, ...]
+    factor: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not len(self.log_deviation) == len(self.factor) >= 1:
+            raise ValueError("scales need as many factors as deviations, 1 or more")
+        if not np.isfinite(self.log_deviation).all() or (np.diff(self.log_deviation) <= 0).any():
+            raise ValueError("deviations of scales must ascend")
+        if not np.isfinite(self.factor).all() or min(self.factor) <= 0:
+            raise ValueError("scales must be above 0")
+
+    def at(self, log_deviation: Array | float) -> Array:
+        """Return the factors at stated deviations."""
+        return np.asarray(np.exp(np.interp(log_deviation, self.log_deviation, np.log(self.factor))))
+
+
+def log_deviation(outputs: Array) -> Array:
+    """Return the mean logarithm of the two stated deviations for the outputs of one surface, shape (..., 7)."""
+    return np.asarray(np.clip(outputs[..., [2, 4]], *LOG_RANGE).mean(axis=-1))
+
 
 @dataclass(frozen=True)
 class LearnedSpot:
@@ -52,8 +88,8 @@ class LearnedSpot:
 
     Parameters
     ----------
-    model : str or Path
-        The file model.onnx.
+    model : str or Path, optional
+        The file model.onnx. Default: the shipped network.
     target : {"base", "fine"}
         Which surface's normals are stated.
 
@@ -64,7 +100,7 @@ class LearnedSpot:
         network.
     """
 
-    model: str | Path
+    model: str | Path | None = None
     target: Target = "base"
 
     def __post_init__(self) -> None:
@@ -77,7 +113,7 @@ class LearnedSpot:
 
     @cached_property
     def _network(self) -> "_Network":
-        return _Network(Path(self.model))
+        return _Network(Path(self.model) if self.model else data_root("scenes").joinpath(*SHIPPED))
 
     def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
         """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
@@ -116,7 +152,9 @@ class LearnedSpot:
         jacobian = basis_across(normals[0]) @ (normals[1:] - normals[0]).T / STEP
         first, second = np.exp(np.clip(made[[2, 4]], *LOG_RANGE))
         factor = ROTATION_SCALE * np.array([[first, 0.0], [made[3], second]])
-        covariance = jacobian @ factor @ factor.T @ jacobian.T * self._network.scales[self.target]
+        covariance = (
+            jacobian @ factor @ factor.T @ jacobian.T * self._network.scales[self.target].at(log_deviation(made))
+        )
         return Estimate(
             normal=normals[0], candidates=normals[:1], look_px=np.asarray(peak, dtype=float),
             axis_ratio=float(1 / (1 + np.exp(-made[5]))), covariance=covariance, target=self.target,
@@ -155,16 +193,12 @@ class _Network:
             content: dict[str, Any] = json.loads(text)
             if content["format"] != FORMAT:
                 raise ValueError(f"format {content['format']!r}")
-            self.scales = {surface: float(content["scales"][surface]) for surface in SURFACES}
+            self.scales = {surface: _scale(content["scales"][surface]) for surface in SURFACES}
             self._low = {name: float(content["low"][name]) for name in EXTRAS}
             self._high = {name: float(content["high"][name]) for name in EXTRAS}
             self._mean = np.array(content["feature_mean"], dtype=float)
-            self._precision = np.array(content["feature_precision"], dtype=float)
+            self._precision = _symmetric(np.array(content["feature_precision"], dtype=float), len(self._mean))
             self._limit = float(content["feature_limit"])
-            if self._precision.shape != (len(self._mean), len(self._mean)):
-                raise ValueError("feature_precision does not fit feature_mean")
-            if min(self.scales.values()) <= 0:
-                raise ValueError("scales must be above 0")
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"{shown(path)}: is no network of simtest train ({type(error).__name__}: {shown(error, 80)}); "
@@ -200,3 +234,21 @@ class _Network:
                 f"unlike the network's training: features at {distance:.3g}, limit {self._limit:.3g}",
             )
         return None
+
+
+def _scale(content: dict[str, list[float]]) -> CovarianceScale:
+    return CovarianceScale(*(tuple(float(v) for v in content[key]) for key in ("log_deviation", "factor")))
+
+
+def _symmetric(upper: Array, size: int) -> Array:
+    """Return a symmetric matrix from its upper triangle, row by row; raise `ValueError` for another length."""
+    if upper.shape != (size * (size + 1) // 2,):
+        raise ValueError("feature_precision does not fit feature_mean")
+    whole = np.zeros((size, size))
+    rows, columns = np.triu_indices(size)
+    whole[rows, columns] = whole[columns, rows] = upper
+    return whole
+
+
+learned_spot = LearnedSpot()
+"""The shipped network; it is read at its first use."""

@@ -18,7 +18,10 @@ ESTIMATOR_COLOURS: Mapping[str, str] = {
     "inverse_rendering": "#644FFA",
     "cloud": "#7F5C43",
 }
-"""Colour of each estimator: blue, vermilion, green, pink, sky blue, orange, violet, brown; hexadecimal."""
+"""Colour of each estimator: blue, vermilion, green, pink, sky blue, orange, violet, brown; hexadecimal.
+
+`learned_spot` takes a further one: no ninth colour is far enough from these eight for all three observers.
+"""
 
 NEUTRAL = "#747981"
 """Grey of laws and truth in charts."""

@@ -119,6 +119,19 @@ def test_a_cloud_where_the_base_is_turned_away_gets_no_answer():
     assert "diffuse light says that the base is turned by" in made.detail
 
 
+def test_few_spots_whose_base_nothing_verifies_get_no_answer(monkeypatch):
+    """Where the light verifies the base so few are answered, and more are answered with a flag where it does not."""
+    few, many = (frame_of(light_of_sphere(direction(0.0)), points_around(direction(0.0), count=n)) for n in (12, 20))
+    (verified,) = estimates(few)
+    assert "base_unverified" not in verified.flags
+    monkeypatch.setattr(cloud_module, "evidence_of", lambda *_: BaseEvidence(True))
+    refused = estimates(few)
+    assert isinstance(refused, Failure)
+    assert "12 spots states no normal: the diffuse light does not tell" in refused.detail
+    (flagged,) = estimates(many)
+    assert "base_unverified" in flagged.flags
+
+
 def test_a_refused_cloud_leaves_a_flag_on_the_others():
     points = np.concatenate(
         [points_around(direction(0.0), extent_px=10.0), points_around(direction(20.0), extent_px=10.0)]

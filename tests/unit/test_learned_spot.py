@@ -12,12 +12,12 @@ onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 
 from simtest.calibration import Calibration, Priors  # noqa: E402
-from simtest.dataset.learn.spot_export import export  # noqa: E402
+from simtest.dataset.learn.spot_export import export, fitted_scale  # noqa: E402
 from simtest.dataset.learn.spot_task import SpotNormals, squared_distance  # noqa: E402
 from simtest.dataset.learn.training import Training  # noqa: E402
 from simtest.errors import Failure, InputError  # noqa: E402
 from simtest.estimators import Estimate  # noqa: E402
-from simtest.estimators.learned_spot import METADATA, LearnedSpot  # noqa: E402
+from simtest.estimators.learned_spot import METADATA, CovarianceScale, LearnedSpot, log_deviation  # noqa: E402
 from simtest.estimators.spot_inputs import rays_of, spot_inputs  # noqa: E402
 from simtest.geometry import BrownConrady, Camera  # noqa: E402
 from simtest.geometry.vectors import angle_deg  # noqa: E402
@@ -98,9 +98,51 @@ def test_covariances_are_scaled_to_cover_95_percent_of_the_validation_split(made
     with torch.no_grad():
         outputs, _ = network(judged["crops"], judged["extras"])
     for number, surface in enumerate(("base", "fine")):
-        distances = squared_distance(outputs[:, number], judged[surface]) / content["scales"][surface]
-        assert 0.93 < float((distances < 5.991).float().mean()) < 0.97
+        scale = CovarianceScale(**{key: tuple(values) for key, values in content["scales"][surface].items()})
+        factors = scale.at(log_deviation(outputs[:, number].numpy()))
+        distances = squared_distance(outputs[:, number], judged[surface]).numpy() / factors
+        assert 0.94 < (distances < 5.991).mean() < 0.98
     assert content["about"] == {"dataset": "drawn"}
+
+
+def test_what_is_stated_too_surely_gets_a_larger_factor():
+    # Deviations stated as exp(-1) are half of the true ones, those stated as exp(1) are true.
+    rng = np.random.default_rng(4)
+    deviations = np.repeat([-1.0, 1.0], 2000) + rng.uniform(0, 1e-3, 4000)
+    distances = rng.chisquare(2, 4000) * np.repeat([4.0, 1.0], 2000)
+    scale = fitted_scale(distances, deviations)
+    inside = distances < 5.991 * scale.at(deviations)
+    assert inside[:2000].mean() == pytest.approx(0.95, abs=0.02)
+    one = np.quantile(distances, 0.95) / 5.991
+    assert (distances[:2000] < 5.991 * one).mean() < 0.92
+    # No group gains at another's cost.
+    assert min(scale.factor) >= 0.99 * one
+    assert fitted_scale(distances[:10], deviations[:10]) == CovarianceScale((0.0,), (1.0,))
+
+
+def test_the_shipped_network_runs_by_its_name():
+    from simtest.estimators import load_estimators
+    from simtest.reconstruction.pipeline import default_estimators
+
+    assert "learned_spot" not in default_estimators(calibration())
+    made = load_estimators(["learned_spot"])["learned_spot"]
+    # Its frames have 480 px; the features of a smaller one's highlights are another matter.
+    results = run_pipeline(picture(7), calibration(), "peaks", {"one": made}, None, 2.0).specularities
+    assert results
+    assert all("outside the network's training: log of the focal length" in r.estimates["one"].detail for r in results)
+
+
+def test_without_its_package_the_shipped_network_says_so_in_one_line(tmp_path):
+    code = (
+        "import sys; sys.modules['onnxruntime'] = None; import numpy as np; from simtest.calibration import *; "
+        "from simtest.geometry import Camera; from simtest.errors import InputError; import simtest\n"
+        "c = Calibration(Camera(96, 96, 90, 90, 48, 48), priors=Priors(lights_mm=((1., 0., 0.),)))\n"
+        "y, x = np.mgrid[:96, :96]; p = (0.1 + 0.8 * np.exp(-((x - 40)**2 + (y - 50)**2) / 40)).astype('f4')\n"
+        "try: simtest.reconstruct(p, c, ['learned_spot'])\n"
+        "except InputError as error: print(error)"
+    )
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert child.stdout == "learned_spot needs the package onnxruntime: install the extra onnx\n", child.stderr
 
 
 def test_the_pipeline_runs_it_beside_the_others(made):
@@ -124,7 +166,8 @@ def test_the_pipeline_runs_it_beside_the_others(made):
         turned = 0.1 * np.hypot(*row[:2])
         assert angle_deg(result.normal[None], -ray[None])[0] == pytest.approx(np.degrees(turned), abs=1e-4)
         # The map from rotations to normals keeps areas but for the angle's sine, so determinants agree.
-        wanted = (0.1**2 * np.exp(row[2] + row[4])) ** 2 * learned._network.scales["base"] ** 2
+        factor = learned._network.scales["base"].at(log_deviation(row))
+        wanted = (0.1**2 * np.exp(row[2] + row[4])) ** 2 * factor**2
         assert np.linalg.det(result.covariance) == pytest.approx(wanted * np.sinc(turned / np.pi) ** 2, rel=1e-3)
 
 
@@ -172,18 +215,26 @@ def changed(**values):
     return change
 
 
+def scales(deviations, factors):
+    return {name: {"log_deviation": deviations, "factor": factors} for name in ("base", "fine")}
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (without_metadata, "is no network of simtest train"),
         (changed(format="mine"), "format 'mine'"),
-        (changed(scales={"base": 1.0}), "KeyError"),
-        (changed(scales={"base": 0.0, "fine": 1.0}), "above 0"),
+        (changed(scales={"fine": 1.0}), "KeyError"),
+        (changed(scales={"base": 1.0, "fine": 1.0}), "TypeError"),
+        (changed(scales=scales((0.0,), (0.0,))), "above 0"),
+        (changed(scales=scales((0.0,), (1.0, 2.0))), "as many factors as deviations"),
+        (changed(scales=scales((1.0, 0.0), (1.0, 2.0))), "must ascend"),
         (changed(feature_mean=[0.0]), "does not fit"),
         (changed(low=3), "is no network of simtest train"),
     ],
-    ids=["no metadata", "another format", "a scale missing", "a scale of 0", "other features", "no ranges"],
-)
+    ids=["no metadata", "another format", "a scale missing", "a scale of an older form", "a scale of 0",
+         "too few scales", "scales in disorder", "other features", "no ranges"],
+)  # fmt: skip
 def test_another_model_is_refused_in_one_line(made, tmp_path, change, said):
     model = onnx.load(made[3])
     change(model)

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from torch import nn
 
 from simtest.dataset.learn.spot_task import squared_distance
 from simtest.dataset.learn.tasks import Batch
-from simtest.estimators.learned_spot import FORMAT, METADATA
+from simtest.estimators.learned_spot import FORMAT, METADATA, CovarianceScale, log_deviation
 from simtest.estimators.spot_inputs import EXTRAS, SURFACES
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import write_atomically
@@ -32,8 +33,13 @@ SHRUNK = 0.1
 
 OPSET = 17
 
-LEAST_FOR_SCALE = 30
-"""Examples from which a scale is fitted; with fewer the covariances stay as they are."""
+LEAST_FOR_SCALE = 60
+"""Examples from which one factor of the covariances is fitted; with fewer in all they stay as they are."""
+
+MOST_FACTORS = 5
+
+DIGITS = 7
+"""Of the numbers of the metadata: those of the weights have no more."""
 
 
 def export(network: nn.Module, taught: Batch, judged: Batch, out: Path, about: dict[str, str]) -> Path:
@@ -66,9 +72,10 @@ def _calibration(network: nn.Module, taught: Batch, judged: Batch) -> dict[str, 
     scales = {}
     for number, surface in enumerate(SURFACES):
         known = torch.isfinite(judged[surface][:, 0])
-        distances = squared_distance(outputs[known, number], judged[surface][known]).numpy()
-        enough = len(distances) >= LEAST_FOR_SCALE
-        scales[surface] = float(np.quantile(distances, COVERAGE) / _CHI2) if enough else 1.0
+        made = outputs[known, number]
+        distances = squared_distance(made, judged[surface][known]).double().numpy()
+        scale = fitted_scale(distances, log_deviation(made.double().numpy()))
+        scales[surface] = {key: _rounded(values) for key, values in asdict(scale).items()}
     mean, covariance = own.mean(axis=0), np.cov(own.T)
     average = np.trace(covariance) / len(covariance)
     precision = np.linalg.inv((1 - SHRUNK) * covariance + SHRUNK * average * np.eye(len(covariance)))
@@ -78,10 +85,45 @@ def _calibration(network: nn.Module, taught: Batch, judged: Batch) -> dict[str, 
         "scales": scales,
         "low": dict(zip(EXTRAS, extras.min(axis=0).tolist(), strict=True)),
         "high": dict(zip(EXTRAS, extras.max(axis=0).tolist(), strict=True)),
-        "feature_mean": mean.tolist(),
-        "feature_precision": precision.tolist(),
+        "feature_mean": _rounded(mean),
+        "feature_precision": _rounded(precision[np.triu_indices(len(precision))]),
         "feature_limit": float(np.quantile(distances, 1 - REFUSED)),
     }
+
+
+def fitted_scale(distances: Array, deviations: Array) -> CovarianceScale:
+    """Return the covariances' factors that put a share `COVERAGE` of examples inside their ellipses.
+
+    The examples are sorted by the deviation that the network states and divided into groups, each with a factor of its
+    own: a network may be too sure where it states to be sure, and right elsewhere. No group's factor is below that of
+    all examples together, so that no group gains at another's cost.
+
+    Parameters
+    ----------
+    distances : ndarray, shape (N,)
+        Squared Mahalanobis distances of the truths.
+    deviations : ndarray, shape (N,)
+        Stated deviations (`simtest.estimators.learned_spot.log_deviation`).
+    """
+    groups = min(len(distances) // LEAST_FOR_SCALE, MOST_FACTORS)
+    if groups == 0:
+        return CovarianceScale((0.0,), (1.0,))
+    parts = np.array_split(np.argsort(deviations, kind="stable"), groups)
+    centres = [float(np.median(deviations[part])) for part in parts]
+    least = _factor(distances)
+    if (np.diff(centres) <= 0).any():
+        return CovarianceScale((centres[0],), (least,))
+    return CovarianceScale(tuple(centres), tuple(max(_factor(distances[part]), least) for part in parts))
+
+
+def _factor(distances: Array) -> float:
+    """Return the factor for N examples: the ceil((N + 1) 0.95)-th smallest distance, which covers one more at 95 %."""
+    rank = min(int(np.ceil((len(distances) + 1) * COVERAGE)), len(distances))
+    return float(np.sort(distances)[rank - 1] / _CHI2)
+
+
+def _rounded(values: Any) -> list[float]:
+    return [float(f"{value:.{DIGITS}g}") for value in values]
 
 
 def _distances(features: Array, mean: Array, precision: Array) -> Array:

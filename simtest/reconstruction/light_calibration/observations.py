@@ -1,6 +1,6 @@
 """What the pictures show: the ball or plate of each, and its highlights."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -267,10 +267,34 @@ def balls_of(views: Sequence[View], camera: Camera, radius_mm: float) -> Balls:
 def with_floor(outline: BallOutline, camera: Camera, radius_mm: float) -> BallOutline:
     """Return an outline with the errors that its fit cannot see: of pixels, and of a shadow at a dark background."""
     pixel = float(np.linalg.norm(camera.step_of_pixels(camera.project(outline.direction))) / np.sqrt(2))
-    distance = radius_mm / np.sin(outline.half_angle)
-    strip = outline.dark_share * outline.half_angle * (LIGHT_MM / distance) ** 2 / 2
+    strip = _unlit_strip(outline, radius_mm)
     error = np.diag([SHADOW * strip, SHADOW * strip, SHADOW * strip]) ** 2 + (OUTLINE_FLOOR_PX * pixel) ** 2 * np.eye(3)
     return replace(outline, covariance=outline.covariance + error)
+
+
+def _unlit_strip(outline: BallOutline, radius_mm: float) -> float:
+    """Return the width of the rim that a light beside the camera leaves dark, rad; 0 before a bright background."""
+    distance = radius_mm / np.sin(outline.half_angle)
+    return float(outline.dark_share * outline.half_angle * (LIGHT_MM / distance) ** 2 / 2)
+
+
+def unlit_outline_errors(views: Sequence[View], camera: Camera, radius_mm: float) -> Iterator[list[BallOutline]]:
+    """Return all outlines, moved by what the unlit rim may do to all of them alike; none where every rim is seen.
+
+    The lights stay where they are, so a dark background moves the outlines of all pictures to the same side, each by
+    its own strip (`with_floor` counts what differs between the pictures). They move along x, along y, and in radius.
+    """
+    strips = []
+    for view in views:
+        assert view.outline is not None
+        pixel = np.linalg.norm(camera.step_of_pixels(camera.project(view.outline.direction))) / np.sqrt(2)
+        strips.append(SHADOW * _unlit_strip(view.outline, radius_mm) / float(pixel))
+    if any(strips):
+        for dx, dy, wider in np.eye(3):
+            yield [
+                moved_outline(view, camera, strip * np.array([dx, dy]), strip * wider)
+                for view, strip in zip(views, strips, strict=True)
+            ]
 
 
 def common_outline_errors(lights: Array) -> Array:

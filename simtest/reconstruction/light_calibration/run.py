@@ -28,6 +28,7 @@ from simtest.reconstruction.light_calibration.observations import (
     plates_of,
     read_balls,
     read_plates,
+    unlit_outline_errors,
 )
 from simtest.reconstruction.light_calibration.outline import outline_through
 from simtest.reconstruction.poses import read_poses
@@ -184,8 +185,11 @@ def _variations(
             )
             yield other, _seen_by(views, camera, other, mirror)
     if isinstance(mirror, Ball):
-        for dx, dy, wider in common_outline_errors(found.bundle.lights):
-            outlines = [moved_outline(view, camera, np.array([dx, dy]), wider) for view in views]
+        changed = [
+            [moved_outline(view, camera, np.array([dx, dy]), wider) for view in views]
+            for dx, dy, wider in common_outline_errors(found.bundle.lights)
+        ]
+        for outlines in (*changed, *unlit_outline_errors(views, camera, mirror.radius_mm)):
             moved = [replace(view, outline=outline) for view, outline in zip(views, outlines, strict=True)]
             yield camera, balls_of(moved, camera, mirror.radius_mm)
 
