@@ -8,7 +8,13 @@ from typing import Any
 
 from simtest.runtime.resources import data_root
 
-FOLDERS = {"scenes": "", "experiments": "experiments", "datasets": "datasets", "profiles": "profiles"}
+FOLDERS = {
+    "scenes": "",
+    "experiments": "experiments",
+    "datasets": "datasets",
+    "trainings": "learning",
+    "profiles": "profiles",
+}
 """Kinds of shipped files, and their folders below scenes/."""
 
 

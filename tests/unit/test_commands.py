@@ -49,6 +49,7 @@ def test_the_list_names_what_commands_take(here):
         for name in listed[kind]:
             if name != "published":  # a scene of validate alone
                 load(name)
+    assert list(listed["trainings"]) == ["spot_normals"]
     assert list(listed["estimators"]) == ESTIMATORS.names()
     for name in listed["sensors"]:
         load_scene("plane", {"sensor.preset": name})
@@ -64,8 +65,8 @@ def test_one_kind_is_listed_alone(here):
     assert code == 0
     assert [line.split()[0] for line in lines] == ["full", "quick"]
     assert here("list", "profile")[2] == [
-        'simtest: Invalid value "profile" for KIND. Choose from: "scenes", "experiments", "datasets", "profiles", '
-        '"estimators", "detectors", "sensors", "rigs". Did you mean "profiles"?'
+        'simtest: Invalid value "profile" for KIND. Choose from: "scenes", "experiments", "datasets", "trainings", '
+        '"profiles", "estimators", "detectors", "sensors", "rigs". Did you mean "profiles"?'
     ]
 
 
