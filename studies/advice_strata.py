@@ -89,7 +89,7 @@ def frames_of(folder: Path, method: str) -> Array:
     own = rows.filter(answered).drop_nulls("error_fine_deg")
     numbers, errors = own["realisation"].to_numpy(), own["error_fine_deg"].to_numpy()
     totals = np.bincount(numbers, errors, minlength=len(distance))
-    return np.stack([totals, np.bincount(numbers, minlength=len(distance)), np.minimum(*turns)])
+    return np.stack([totals, np.bincount(numbers, minlength=len(distance)), np.min(turns, axis=0)])
 
 
 def main() -> None:
