@@ -97,7 +97,11 @@ def test_calibrated_lights_are_as_good_as_exact_ones_on_frames(tmp_path: Path) -
         assert misses <= 1 + len(held) * 0.05 + 3.1 * np.sqrt(len(held) * 0.0475)
         gap = of("calibrated", frame, "error") - of("exact", frame, "error")
         assert np.abs(gap).max() < 0.2
-        assert of("calibrated", frame, "stated").mean() < of("not told", frame, "stated").mean()
+        ratio = of("calibrated", frame, "stated") / of("exact", frame, "stated")
+        assert np.abs(ratio - 1).max() < 0.1
+    # On tissue, the doubt which of the lights made a highlight may exceed what knowing the lights saves.
+    assert of("calibrated", "cylinder", "stated").mean() < of("not told", "cylinder", "stated").mean()
     assert of("calibrated", "cylinder", "light").max() < 0.1 * of("not told", "cylinder", "light").min()
     # The negative control: lights 9 mm off.
+    assert len(of("wrong", "cylinder", "held"))
     assert of("wrong", "cylinder", "held").mean() < 1
