@@ -239,7 +239,7 @@ def test_reports_are_json_on_request():
                "doctor", "list", "render", "views", "view", "export", "reconstruct", "realism", "fit", "validate",
                "nightly", "nightly accept", "dataset", "dataset verify", "dataset sample", "dataset preview",
                "dataset export", "mesh check", "mesh colon", "mesh liver", "bench run", "bench verify", "bench table",
-               "bench seal", "bench cases", "bench frames", "camera show", "camera convert"}  # fmt: skip
+               "bench seal", "bench cases", "bench frames", "camera show", "camera convert", "train"}  # fmt: skip
     without = {"schema", "completion", "mesh"}  # a schema is JSON, a script is none, mesh alone does nothing
     for name in reports:
         found, *_ = commands.APP.parse_commands(name.split())[1][-1:]
