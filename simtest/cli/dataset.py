@@ -35,7 +35,7 @@ def make(
     Parameters
     ----------
     described : str
-        A dataset file, or the name of a shipped one: endoscopy, learning, smooth, tiny.
+        A dataset file, or the name of a shipped one: endoscopy, highlights, learning, smooth, tiny.
     """
     from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar

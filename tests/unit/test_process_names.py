@@ -47,7 +47,7 @@ def folder(tmp_path, monkeypatch):
         ("command: no-such-program-anywhere --flag", "no program no-such-program-anywhere' on PATH"),
         ("command: ./missing", "./missing does not exist"),
         ("command: ./inside", "./inside is a folder; must be a program"),
-        ("command: .", "no program '.' on PATH"),
+        ("command: .", ". is a folder; must be a program"),
         ("command: ./model.onnx", "./model.onnx is not executable"),
         ("command: ./script.py", "./script.py is not executable"),
         ("command: script.py", 'a script is called with what runs it: "python script.py"'),
