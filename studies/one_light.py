@@ -270,7 +270,7 @@ def _numbers(spot: ScoredSpot, before: ScoredSpot | None) -> Row:
 
 
 def _with_distance(calibration: Calibration, view: RenderedView) -> Calibration:
-    """Tell the distance of the middle highlight with a normal error."""
+    """Return a calibration that states the distance of the middle highlight, with a normal error."""
     true = float(np.median([point.distance for point in view.highlights if point.lit] or [30.0]))
     off = 1 + DISTANCE_SD * from_integer(view.scene.sensor.seed).standard_normal()
     distance = Normal(max(true * off, true / 2), DISTANCE_SD * true)

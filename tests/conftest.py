@@ -3,6 +3,7 @@
 import gc
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -103,3 +104,14 @@ def matlab_here(monkeypatch):
             raise InputError(f"{path}: {error}") from error
 
     monkeypatch.setattr(matlab, "read_struct", read)
+
+
+@pytest.fixture(scope="module")
+def one_torch_thread() -> Iterator[None]:
+    """Give PyTorch one thread: several take turns at small networks, and wait for each other."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

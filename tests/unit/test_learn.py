@@ -17,16 +17,7 @@ from simtest.geometry.vectors import angle_deg  # noqa: E402
 from simtest.runtime.engines import make_engine  # noqa: E402
 from simtest.spec import load_dataset  # noqa: E402
 
-pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore")]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Several threads take turns at so small a network, and wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
 
 @pytest.fixture(scope="module")

@@ -23,16 +23,7 @@ from simtest.geometry import BrownConrady, Camera  # noqa: E402
 from simtest.geometry.vectors import angle_deg  # noqa: E402
 from simtest.reconstruction.pipeline import run_pipeline  # noqa: E402
 
-pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore")]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Several threads take turns at so small a network, and wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
 
 SIZE = 96

@@ -16,16 +16,7 @@ from simtest.dataset.learn.tasks import load_task  # noqa: E402
 from simtest.dataset.learn.training import Training, load_training  # noqa: E402
 from simtest.errors import InputError  # noqa: E402
 
-pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore")]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Several threads take turns at so small a network, and wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
 
 SHORT = {"name": "line", "task": "line", "epochs": 4, "batch": 16, "learning_rate": 0.03, "patience": 0}
