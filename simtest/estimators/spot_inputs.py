@@ -44,6 +44,9 @@ OUTPUTS = ("rotation, first", "rotation, second", "logarithm of L11", "L21", "lo
            "logarithm of the axis ratio's deviation")  # fmt: skip
 """Of each surface. L is the Cholesky factor of the rotation's covariance, both in units of `ROTATION_SCALE`."""
 
+RATIO, RATIO_DEVIATION = 5, 6
+"""Columns of the axis ratio and of its deviation."""
+
 LOG_RANGE = (-5.0, 2.0)
 """Of the logarithms of deviations: outside it they are clipped, so that no example decides the fit."""
 
