@@ -42,8 +42,8 @@ def run_training(training: Training, data: Path, out: Path, progress: Progress |
     data : Path
         Folder of a finished dataset.
     out : Path
-        Gets last.safetensors, best.safetensors, training.json, index.html, figures, and the task's own files: model.onnx
-        and its card, model.md.
+        Gets last.safetensors, best.safetensors, training.json, index.html, figures, and the task's own files:
+        model.onnx and its card, model.md.
     progress : callable, optional
         As in `simtest.dataset.learn.engine.train`. Whatever stops the training, the page shows the epochs done.
 
