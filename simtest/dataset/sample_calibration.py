@@ -1,4 +1,4 @@
-"""What reconstruction may know of a sample's picture: the calibration that the dataset's recipe tells, never the truth."""
+"""What reconstruction may know of a sample's picture: the calibration that the recipe tells, never the truth."""
 
 from simtest.calibration import Calibration
 from simtest.dataset.metadata import SampleMeta
