@@ -12,16 +12,19 @@ onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 
 from simtest.calibration import Calibration, Priors  # noqa: E402
-from simtest.dataset.learn.spot_export import export, fitted_scale  # noqa: E402
+from simtest.dataset.learn.calibration import fitted_scale  # noqa: E402
+from simtest.dataset.learn.spot_export import export_spots  # noqa: E402
 from simtest.dataset.learn.spot_task import SpotNormals, squared_distance  # noqa: E402
 from simtest.dataset.learn.training import Training  # noqa: E402
 from simtest.errors import Failure, InputError  # noqa: E402
 from simtest.estimators import Estimate  # noqa: E402
-from simtest.estimators.learned_spot import METADATA, CovarianceScale, LearnedSpot, log_deviation  # noqa: E402
+from simtest.estimators.covariance_scale import CovarianceScale  # noqa: E402
+from simtest.estimators.learned_spot import LearnedSpot, log_deviation  # noqa: E402
 from simtest.estimators.spot_inputs import rays_of, spot_inputs  # noqa: E402
 from simtest.geometry import BrownConrady, Camera  # noqa: E402
 from simtest.geometry.vectors import angle_deg  # noqa: E402
 from simtest.reconstruction.pipeline import run_pipeline  # noqa: E402
+from simtest.runtime.onnx_model import METADATA  # noqa: E402
 
 pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
@@ -69,7 +72,7 @@ def made(tmp_path_factory):
     torch.manual_seed(3)
     network = task.network(taught, Training(name="spot", task="spot_normals")).eval()
     out = tmp_path_factory.mktemp("spot")
-    return network, taught, judged, export(network, taught, judged, out, {"dataset": "drawn"})
+    return network, taught, judged, export_spots(network, taught, judged, out, {"dataset": "drawn"})
 
 
 def test_onnx_gives_what_pytorch_gives(made):
@@ -93,6 +96,10 @@ def test_covariances_are_scaled_to_cover_95_percent_of_the_validation_split(made
         factors = scale.at(log_deviation(outputs[:, number].numpy()))
         distances = squared_distance(outputs[:, number], judged[surface]).numpy() / factors
         assert 0.94 < (distances < 5.991).mean() < 0.98
+        scale = CovarianceScale(**{key: tuple(values) for key, values in content["ratio_scales"][surface].items()})
+        sure = outputs[:, number, 6]
+        off = (judged[f"{surface}_ratio"] - torch.sigmoid(outputs[:, number, 5])) / torch.exp(sure)
+        assert 0.94 < (off.numpy() ** 2 < 3.842 * scale.at(sure.numpy())).mean() < 0.98
     assert content["about"] == {"dataset": "drawn"}
 
 
@@ -153,6 +160,8 @@ def test_the_pipeline_runs_it_beside_the_others(made):
     for result, ray, row in zip(results, rays, outputs, strict=True):
         assert result.target == "base"
         assert 0 < result.axis_ratio < 1
+        wanted = np.exp(row[6]) * np.sqrt(learned._network.ratio_scales["base"].at(row[6]))
+        assert result.axis_ratio_deviation == pytest.approx(wanted, rel=1e-4)
         # The network's rotation is the angle between the normal and the direction to the camera.
         turned = 0.1 * np.hypot(*row[:2])
         assert angle_deg(result.normal[None], -ray[None])[0] == pytest.approx(np.degrees(turned), abs=1e-4)
