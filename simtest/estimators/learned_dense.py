@@ -28,7 +28,7 @@ from simtest.estimators.turned_normals import turned_normals
 from simtest.geometry import Array, Camera, Patch
 from simtest.runtime.arrays import Image
 from simtest.runtime.onnx_model import OnnxModel
-from simtest.runtime.resources import data_root
+from simtest.runtime.resources import data_root, shown
 from simtest.runtime.training_range import TrainingRange
 
 FORMAT = "simtest dense_normals, version 1"
@@ -96,6 +96,12 @@ class LearnedDense:
         made = replace(self, model=model)
         made.check()
         return made
+
+    @property
+    def description(self) -> str:
+        """What the estimator is, in one line for a reader who chooses one."""
+        network = shown(self.model or SHIPPED[-1])
+        return f"The normal of the base surface at each highlight, by the network {network} of the whole frame."
 
     @cached_property
     def _network(self) -> "_Network":

@@ -140,5 +140,5 @@ def test_the_camera_s_values_hang_on_field_of_view_not_on_size():
 
 
 def test_outputs_have_rows_and_columns_of_half_the_grid():
-    assert CELLS == tuple(count // 2 for count in GRID)
+    assert tuple(count // 2 for count in GRID) == CELLS
     assert output_centres(camera()).shape == (*CELLS, 2)

@@ -299,4 +299,4 @@ def test_whole_frames_reach_the_deepest_cells():
         outputs, features = network(planes)
     assert outputs.shape == (2, 7, *CELLS)
     assert not torch.allclose(outputs[0, :, -1, -1], outputs[1, :, -1, -1])
-    assert features.shape == (2, 12)
+    assert features.shape == (2, 8)

@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from simtest.estimators.dense_inputs import OUTPUTS, PLANES
 
-CHANNELS = (16, 24, 32, 48)
+CHANNELS = (16, 24, 24, 32)
 """Of each level; the first has half the cells of the planes along each axis, and each next one half of those."""
 
 
@@ -27,7 +27,7 @@ class DenseNetwork(nn.Module):
         self.heads = nn.Conv2d(channels[0], len(OUTPUTS), 1)
 
     def forward(self, planes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return outputs, (N, 7, 48, 64), and features of the frame, (N, 48 width), for planes, (N, 10, 96, 128)."""
+        """Return outputs, (N, 7, 48, 64), and features of the frame, (N, 32 width), for planes, (N, 10, 96, 128)."""
         made, skipped = (planes - self.mean) / self.spread, []
         for level in self.down:
             made = level(made)
