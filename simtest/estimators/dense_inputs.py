@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from simtest.calibration import Frame
-from simtest.estimators.spot_inputs import LIGHT_SCALE_MM, image_basis
+from simtest.estimators.spot_inputs import LIGHT_SCALE_MM, image_basis, median_of_lit
 from simtest.geometry import Array, Camera
 from simtest.runtime.arrays import Image, Mask
 
@@ -25,13 +25,16 @@ CELLS = (GRID[0] // STRIDE, GRID[1] // STRIDE)
 """Rows and columns of the outputs."""
 
 DARKEST = 0.02
-"""Share of the view's median light that is added before the logarithm."""
+"""Share of the lit pixels' median light that is added before the logarithm."""
+
+LEAST_LIT = 0.1
+"""Cells with less light than this share of the view's median have no colour of their own."""
 
 LEAST_SEEN = 0.02
 """A cell of which a smaller share is seen is empty."""
 
 PLANES = (
-    "logarithm of the light over the view's median", "logarithm of the mean light over that mean",
+    "logarithm of the light over its median", "logarithm of the mean light over that mean",
     "logarithm of red over green", "logarithm of blue over green", "share seen",
     "sightline, x", "sightline, y", "mean light, first", "mean light, second", "mean light, towards",
 )  # fmt: skip
@@ -141,12 +144,14 @@ def _viewed(frame: Frame, size: tuple[int, int]) -> Image:
     def mean(values: Image) -> Image:
         return np.asarray(_averaged(values * weight, size) / whole, dtype=np.float32)
 
-    median = max(float(np.median(light[seen])), 1e-6) if seen.any() else 1.0
+    median = median_of_lit(light[seen])
     light = light / np.float32(median)
     logarithm = mean(np.log(light + DARKEST, dtype=np.float32))
-    spread = np.log(mean(light) + DARKEST) - logarithm
+    whole_light = mean(light)
+    spread = np.log(whole_light + DARKEST) - logarithm
+    lit = known & (whole_light > LEAST_LIT)
     red, green, blue = (mean(channels[..., k]) / median + DARKEST for k in range(3))
-    colours = [_centred(np.log(other / green), known) for other in (red, blue)]
+    colours = [_centred(np.log(other / green), lit) for other in (red, blue)]
     return np.asarray(np.stack([logarithm, spread, *colours, share]) * known, dtype=np.float32)
 
 
@@ -154,6 +159,6 @@ def _averaged(values: Image, size: tuple[int, int]) -> Image:
     return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def _centred(values: Image, known: Mask) -> Image:
-    """Return values less their median: the albedo's colour and the white balance are no part of the shape."""
-    return np.asarray(values - np.median(values[known])) if known.any() else values
+def _centred(values: Image, lit: Mask) -> Image:
+    """Return values less those of the lit cells' median: albedo and white balance are no part of the shape."""
+    return np.asarray(values - np.median(values[lit])) if lit.any() else values

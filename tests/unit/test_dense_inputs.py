@@ -51,6 +51,16 @@ def test_a_plane_holds_the_logarithm_of_the_light(picture):
     assert (planes[4] == 1).all()
 
 
+def test_a_dark_background_does_not_change_what_the_tissue_looks_like(picture):
+    # A small organ before black, as a liver: more than half of the view is dark.
+    dark = np.zeros((HEIGHT, WIDTH, 1), bool)
+    dark[:, 60:] = True
+    before, after = (dense_inputs(frame(np.where(mask, np.float32(0), picture))) for mask in (np.zeros_like(dark), dark))
+    column = GRID[1] * 50 // WIDTH
+    assert np.allclose(before[:4, :, :column], after[:4, :, :column], atol=0.25)
+    assert np.abs(after[:4]).max() < 5
+
+
 def test_a_frame_of_another_aspect_lies_in_the_middle():
     assert Layout.of(1280, 720) == Layout(128, 72, 0, 12)
     assert Layout.of(480, 480) == Layout(96, 96, 16, 0)

@@ -14,7 +14,7 @@ onnxruntime = pytest.importorskip("onnxruntime")
 from simtest.calibration import Calibration, Frame, Priors  # noqa: E402
 from simtest.dataset.learn import dense_network  # noqa: E402
 from simtest.dataset.learn.dense_export import dense_scales, evaluated  # noqa: E402
-from simtest.dataset.learn.dense_task import DenseNormals, disturbed, known_cells  # noqa: E402
+from simtest.dataset.learn.dense_task import DenseNormals, disturbed, known_cells, without_factor  # noqa: E402
 from simtest.dataset.learn.engine import train  # noqa: E402
 from simtest.dataset.learn.likelihood import squared_distance  # noqa: E402
 from simtest.dataset.learn.training import Training, load_training  # noqa: E402
@@ -106,6 +106,23 @@ def test_onnx_gives_what_pytorch_gives(made):
         assert np.abs(one - other).max() < 1e-5 * max(1, np.abs(other).max())
 
 
+def test_eight_bits_change_the_outputs_little(made, tmp_path):
+    _, _, judged, path = made
+    # The tiny network's tensors are below the size from which weights are stored in fewer bits.
+    from simtest.dataset.learn import onnx_export
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(onnx_export, "LEAST_HALVED", 50)
+        small = onnx_export.in_eight_bits(onnx.load(path))
+    data = small.SerializeToString()
+    assert len(data) < 0.8 * path.stat().st_size
+    inputs = {"planes": judged["planes"].numpy()}
+    one, other = (onnxruntime.InferenceSession(each).run(None, inputs)[0] for each in (path.read_bytes(), data))
+    off = np.abs(one - other)
+    assert 0 < off.max()
+    assert np.median(off) < 0.02 * one.std()
+
+
 def test_scales_put_95_percent_of_the_validation_split_inside(made):
     trained, _, judged, path = made
     outputs, _ = evaluated(trained.network, judged["planes"])
@@ -178,6 +195,21 @@ def test_interpolation_is_exact_at_centres_and_between_them():
     planes = np.arange(12.0).reshape(1, 3, 4)
     points = np.array([[0, 0], [3, 2], [1.5, 1.0], [1.0, 0.5], [-4, 0], [9, 9]], dtype=float)
     assert interpolated(planes, points)[0].tolist() == [0, 11, 5.5, 3, 0, 11]
+
+
+def test_a_factor_of_a_frame_is_no_error_of_its_shape(made):
+    cells = torch.tensor([3, 0, 2])
+    left = without_factor(torch.tensor([1.0, 2.0, 3.0, 5.0, 9.0]), cells)
+    assert left.tolist() == [-1.0, 0.0, 1.0, -2.0, 2.0]
+    trained, _, judged, _ = made
+    task, part = DenseNormals(), {name: values[:4].clone() for name, values in judged.items()}
+    with torch.no_grad():
+        before = task.metrics(trained.network, part)
+        part["distance"][1] *= 1.7
+        after = task.metrics(trained.network, part)
+    key = "median error of the distance after a factor, %"
+    assert after[key] == pytest.approx(before[key], rel=1e-3)
+    assert abs(after["median error of the distance, %"] - before["median error of the distance, %"]) > 1
 
 
 def test_disturbed_frames_keep_truth_and_empty_cells(made):

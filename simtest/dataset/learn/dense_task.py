@@ -25,6 +25,10 @@ CUT_CHANCE, CUT_CELLS = 0.25, 14
 
 DISTANCE_WEIGHT = 0.5
 
+RELIEF_WEIGHT = 2.0
+"""Of the distances' mean error without a factor for each frame: the likelihood is about that factor alone, which a
+single frame hardly tells, and would leave the shape of the distances to chance."""
+
 
 class DenseNormals:
     """The task (see `simtest.dataset.learn.tasks.Task`)."""
@@ -58,7 +62,8 @@ class DenseNormals:
         outputs, _ = network(batch["planes"])
         made, rotation, distance = known_cells(outputs, batch)
         of_distance = number_loss(made[:, 5], made[:, 6], distance)
-        return (pair_loss(made, rotation) + DISTANCE_WEIGHT * of_distance).mean()
+        off = without_factor(made[:, 5] - distance, cells_of(batch)).abs()
+        return (pair_loss(made, rotation) + DISTANCE_WEIGHT * of_distance + RELIEF_WEIGHT * off).mean()
 
     def metrics(self, network: nn.Module, batch: Batch) -> dict[str, float]:
         """Return median errors of the normal, deg, and of the distance, before and after a factor for each frame."""
@@ -68,10 +73,9 @@ class DenseNormals:
             outputs, _ = network(part["planes"])
             made, rotation, distance = known_cells(outputs, part)
             normal.append(torch.linalg.norm(made[:, :2] - rotation, dim=1) * ROTATION_SCALE)
-            frames = torch.isfinite(part["distance"]).flatten(1).sum(dim=1).tolist()
-            for off in ((made[:, 5] - distance) * DISTANCE_SCALE).split(frames):
-                raw.append(off.abs())
-                scaled.append((off - off.median()).abs() if len(off) else off)
+            off = (made[:, 5] - distance) * DISTANCE_SCALE
+            raw.append(off.abs())
+            scaled.append(without_factor(off, cells_of(part)).abs())
         return {
             "median error of the normal, deg": float(np.degrees(torch.cat(normal).median().item())),
             "median error of the distance, %": 100 * float(torch.cat(raw).median()),
@@ -96,10 +100,26 @@ def known_cells(outputs: Tensor, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
 
     The cells of the first frame come first.
     """
-    known = torch.isfinite(batch["distance"]) & torch.isfinite(batch["rotation"]).all(dim=1)
+    known = _known(batch)
     made = outputs.float().movedim(1, -1)[known]
     rotation = batch["rotation"].movedim(1, -1)[known] / ROTATION_SCALE
     return made, rotation, torch.log(batch["distance"][known] / DISTANCE_MM) / DISTANCE_SCALE
+
+
+def cells_of(batch: Batch) -> Tensor:
+    """Return how many cells of each frame are known, shape (N,)."""
+    return _known(batch).flatten(1).sum(dim=1)
+
+
+def without_factor(logarithms: Tensor, cells: Tensor) -> Tensor:
+    """Return logarithms less the mean of each frame's; the first frame has the first `cells[0]` of them, and so on."""
+    frames = torch.repeat_interleave(torch.arange(len(cells), device=cells.device), cells)
+    sums = torch.zeros(len(cells), device=cells.device).index_add(0, frames, logarithms)
+    return logarithms - (sums / cells.clamp(min=1))[frames]
+
+
+def _known(batch: Batch) -> Tensor:
+    return torch.isfinite(batch["distance"]) & torch.isfinite(batch["rotation"]).all(dim=1)
 
 
 def moved(batch: Batch, flip_x: bool, flip_y: bool) -> Batch:
