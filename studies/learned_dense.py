@@ -23,7 +23,7 @@ from simtest.dataset.reader import read_samples, sample_positions
 from simtest.dataset.sample import Sample
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
-from simtest.estimators.learned_dense import DenseMaps, LearnedDense
+from simtest.estimators.learned_dense import LEAST_HIGHLIGHTS, DenseMaps, LearnedDense
 from simtest.estimators.shading_maps import shading_maps
 from simtest.estimators.spot_inputs import normal_of
 from simtest.geometry.vectors import angle_deg, tangent_basis, tangent_coordinates
@@ -48,6 +48,7 @@ class Scores:
     distance: dict[tuple[int, int], list[Array]] = field(default_factory=lambda: defaultdict(list))
     scaled: dict[tuple[int, int], list[Array]] = field(default_factory=lambda: defaultdict(list))
     distance_inside: dict[tuple[int, int], list[Array]] = field(default_factory=lambda: defaultdict(list))
+    contradictions: list[float] = field(default_factory=list)
     asked: int = 0
     answered: int = 0
 
@@ -74,6 +75,10 @@ def main() -> None:
     print(f"{sum(min(n, options.most) for n in taken.values())} frames of {len(taken)} anatomies\n")
     for place, scores in (("each pixel", pixels), ("highlights", spots)):
         print("\n".join(_table(place, scores)), end="\n\n")
+    for name, own in spots.items():
+        if own.contradictions:
+            told = ", ".join(f"{share:g} %: {np.percentile(own.contradictions, share):.2f}" for share in (50, 90, 99.5))
+            print(f"`{name}`: distance from the law of reflection in {len(own.contradictions)} frames: {told}")
     print("\n".join(_distances(pixels)), end="\n\n")
     print("\n".join(_pairs(pairs)))
 
@@ -130,6 +135,11 @@ def _score_spots(
     frame = sample_frame(sample)
     estimators = {**load_estimators(["bisector", "learned_spot"]), **dense}
     found = run_pipeline(frame.encoded, frame.calibration, "colour", estimators, None, frame.smoothing_px)
+    peaks = [each.patch.peak_px for each in found.specularities if not isinstance(each.patch, Failure)]
+    if len(peaks) >= LEAST_HIGHLIGHTS:
+        for name, estimator in dense.items():
+            off = estimator.contradiction(frame, np.array(peaks, dtype=float))
+            scores[name].contradictions += [] if isinstance(off, Failure) else [off]
     errors: dict[str, dict[int, float]] = defaultdict(dict)
     inside: dict[str, list[float]] = defaultdict(list)
     for number, each in enumerate(found.specularities):

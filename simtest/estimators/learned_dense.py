@@ -23,6 +23,7 @@ from simtest.estimators.dense_inputs import (
     dense_inputs,
 )
 from simtest.estimators.protocol import Estimate
+from simtest.estimators.reflection_check import reflection_distance
 from simtest.estimators.spot_inputs import LOG_RANGE
 from simtest.estimators.turned_normals import turned_normals
 from simtest.geometry import Array, Camera, Patch
@@ -41,6 +42,12 @@ ASPECTS = (1.0, 1.9)
 
 CELL_PX = (1.5, 20.0)
 """Pixels of a cell along x: resampling covers these."""
+
+LEAST_HIGHLIGHTS, REFLECTION_LIMIT = 4, 3.0
+"""From so many highlights a frame's normals are checked against the law of reflection, and refused beyond the limit.
+
+`python -m studies.learned_dense DATA MODEL --split validation` prints how far the validation split's frames go.
+"""
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,8 @@ class LearnedDense:
     It sees the whole frame on a coarse grid, the sightlines and the lights. It states the base's normal and the
     distance everywhere (`maps`); as an estimator it answers for each detection. It refuses with ``no_estimate`` what
     lies outside the range that it was taught: another lens or other lights, a frame without colour, of an unusual
-    aspect or too small, and frames whose features lie far from those of the train split.
+    aspect or too small, and frames whose features lie far from those of the train split. As an estimator it refuses
+    frames too at whose highlights its normals contradict the law of reflection (`reflection_distance`).
 
     Parameters
     ----------
@@ -132,6 +140,13 @@ class LearnedDense:
             made.append(whole)
         return DenseMaps(*made)
 
+    def contradiction(self, frame: Frame, points_px: Array) -> float | Failure:
+        """Return how far the normals at highlights are from the law of reflection (`reflection_distance`)."""
+        outputs = self._outputs(frame)
+        if isinstance(outputs, Failure):
+            return outputs
+        return _contradiction(self._stated(outputs, frame.camera, points_px), frame, points_px)
+
     def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
         """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
         return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
@@ -152,7 +167,14 @@ class LearnedDense:
         if isinstance(outputs, Failure):
             return [outputs] * len(peaks)
         points = np.asarray(peaks, dtype=float)
-        normals, covariances, *_ = self._stated(outputs, frame.camera, points)
+        stated = self._stated(outputs, frame.camera, points)
+        normals, covariances, *_ = stated
+        off = _contradiction(stated, frame, points)
+        if len(points) >= LEAST_HIGHLIGHTS and off > REFLECTION_LIMIT:
+            told = (
+                f"contradicts the law of reflection at {len(points)} highlights: {off:.3g}, limit {REFLECTION_LIMIT:g}"
+            )
+            return [Failure(Reason.NO_ESTIMATE, told)] * len(points)
         return [
             Estimate(normal=normal, candidates=normal[None], look_px=point, covariance=covariance, target="base")
             for normal, covariance, point in zip(normals, covariances, points, strict=True)
@@ -177,6 +199,13 @@ class LearnedDense:
         logarithm = np.clip(made[:, 6], *LOG_RANGE)
         share = DISTANCE_SCALE * np.exp(logarithm) * np.sqrt(scales["distance"].at(logarithm))
         return normals, covariances, distance, share * distance
+
+
+def _contradiction(stated: tuple[Array, Array, Array, Array], frame: Frame, points_px: Array) -> float:
+    """Return how far what is stated at highlights is from the law of reflection."""
+    normals, covariances, distance, deviation = stated
+    rays, lights = frame.camera.unproject(points_px), frame.calibration.priors.lights
+    return reflection_distance(normals, covariances, rays, distance, deviation / distance, lights)
 
 
 def stated_deviation(made: Array) -> Array:
