@@ -41,7 +41,10 @@ class Task(Protocol):
         """Write what runs the network elsewhere into the training's folder; `about` names data and versions."""
 
 
-TASKS = {"spot_normals": "simtest.dataset.learn.spot_task:SpotNormals"}
+TASKS = {
+    "dense_normals": "simtest.dataset.learn.dense_task:DenseNormals",
+    "spot_normals": "simtest.dataset.learn.spot_task:SpotNormals",
+}
 """Class of each task by name."""
 
 
