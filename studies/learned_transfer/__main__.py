@@ -1,10 +1,11 @@
 """Compare networks taught on smooth surfaces with those taught on tissue: on other rendered frames, and on real ones.
 
-    python -m studies.learned_transfer --kept FOLDER [--scenes 24] [--spots SMOOTH TISSUE] [--dense SMOOTH TISSUE]
+    python -m studies.learned_transfer --kept FOLDER [--scenes 18] [--spots SMOOTH TISSUE] [--dense SMOOTH TISSUE]
         [--detectors SMOOTH TISSUE] [--hard] [--real] [--overlays FOLDER] [--sheet FILE]
 
 SMOOTH and TISSUE are the files model.onnx of one task, trained on `highlights_smooth` and on `highlights`
-(`simtest train`). KEPT holds the frames of the corpus `hard`, rendered at the first run. Without `--hard` and `--real`
+(`simtest train`). The folder of `--kept` holds the frames of the corpus `hard`, rendered at the first run, and the
+answers on them: a run that was ended goes on where it stopped. Without `--hard` and `--real`
 both parts are run. Tasks without files are left out. `--overlays` writes a PNG of each real frame and method, `--sheet`
 one contact sheet of all.
 """
@@ -17,14 +18,15 @@ from pathlib import Path
 
 import cv2
 
-from simtest.detection.detector import Detector, run_detector
+from simtest.detection.detector import Detector
 from simtest.estimators import AnyEstimator
 from simtest.runtime.files import make_folder
 from studies.detection.real_frames import outlined_frames
-from studies.detection.tissue import Counts, score_frame
+from studies.detection.tissue import Counts
 from studies.learned_transfer import real, sheet, tables
-from studies.learned_transfer.answers import OK, Answer, answers
+from studies.learned_transfer.answers import OK, Answer
 from studies.learned_transfer.frames import FIRST, GUIDES, ONE_LIGHT, ROWS, hard_frames
+from studies.learned_transfer.kept import Kept
 from studies.learned_transfer.networks import CLASSICAL, COLOUR, SMOOTH, TISSUE, detectors, estimators, named
 
 TASKS = ("learned_spot", "learned_dense")
@@ -40,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(prog="python -m studies.learned_transfer", description="Smooth against tissue.")
     parser.add_argument("--kept", type=Path, required=True, help="folder of the rendered frames")
-    parser.add_argument("--scenes", type=int, default=24)
+    parser.add_argument("--scenes", type=int, default=18)
     for task in ("spots", "dense", "detectors"):
         parser.add_argument(f"--{task}", type=Path, nargs=2, metavar=("SMOOTH", "TISSUE"))
     parser.add_argument("--hard", action="store_true", help="the corpus hard alone")
@@ -64,14 +66,12 @@ def _hard(
 ) -> Iterator[str]:
     """Yield the tables of the corpus `hard`."""
     made: list[Answer] = []
-    counts: dict[str, dict[str, dict[int, Counts]]] = {
-        name: defaultdict(lambda: defaultdict(Counts)) for name in finders
-    }
+    counts: dict[str, dict[str, list[dict[int, Counts]]]] = {name: defaultdict(list) for name in finders}
+    answered = Kept(kept)
     for frame in hard_frames(scenes, ROWS, kept):
-        made += answers(frame, normals)
+        made += answered.normals(frame, normals)
         for name, finder in finders.items():
-            found = run_detector(finder, frame.frame())
-            score_frame(frame.as_tissue(), found.highlights, counts[name][frame.row.name])
+            counts[name][frame.row.name].append(answered.detection(frame, name, finder))
         print(f"scene {frame.scene}, {frame.row.name}", file=sys.stderr, flush=True)
     yield from ("", "## Corpus hard: normals", "")
     yield from tables.summary(made, GROUPS, list(normals))

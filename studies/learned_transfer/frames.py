@@ -67,8 +67,6 @@ GUIDES = (
     Row("relief 4 deg", by_guides(with_relief(4.0)), _picture()),
     Row("vessels", by_guides(vessels), _picture()),
     Row("JPEG 60", by_guides(vessels), _picture(coding={"type": "jpeg", "quality": 60})),
-    Row("sharpening", by_guides(vessels), _picture(sharpening={"radius_px": 1.3, "amount": 0.9})),
-    Row("clipping 3 x", by_guides(vessels), _picture(exposure={"gain": 3.0})),
     Row("exposed for the tissue", by_guides(vessels), _picture(exposure={"average": 0.4})),
     Row("motion 7 px", by_guides(moving(7.0)), _picture()),
 )

@@ -1,10 +1,11 @@
 """Networks on real frames: what is marked where nothing shines, and how far normals agree with the classical ones.
 
-Nobody knows the true normals of these frames, nor their cameras. Two ways are measured:
+Nobody knows the true normals of these frames, nor their cameras. Detectors see the frames as they are. For normals the
+picture is reduced to 480 px across, the size that the networks were taught, and taken in two ways:
 
-- as `simtest reconstruct FRAME --fov 80` takes the file: its own size, lights not told;
-- with a rig told: the picture reduced to 480 px across, a field of view of 80 deg across it, two light guides 4 mm
-  beside the camera (eight in the laparoscope), tissue 30 mm away, give or take 15. Guides and angle are assumed.
+- as `simtest reconstruct FRAME --fov 80` does: a field of view of 80 deg across it, lights not told;
+- with a rig told: the same, and two light guides 4 mm beside the camera (eight in the laparoscope), tissue 30 mm away,
+  give or take 15. Guides and angle are assumed.
 """
 
 import math
@@ -94,8 +95,8 @@ def reduced(picture: Image) -> Image:
 
 def ways(frame: OutlinedFrame) -> Iterator[tuple[str, Image, Calibration]]:
     """Yield the two ways in which a frame is measured: name, picture, calibration."""
-    yield UNTOLD, frame.picture, untold(frame.picture)
     small = reduced(frame.picture)
+    yield UNTOLD, small, untold(small)
     yield TOLD, small, told(small, frame.name)
 
 

@@ -97,15 +97,15 @@ def pairs(
 
 
 def detection(
-    counts: Mapping[str, Mapping[str, Mapping[int, Counts]]], rows: Mapping[str, Sequence[str]]
+    counts: Mapping[str, Mapping[str, Sequence[Mapping[int, Counts]]]], rows: Mapping[str, Sequence[str]]
 ) -> Iterator[str]:
-    """Yield the table of F1 by radius class; `counts` by detector, row and class."""
+    """Yield the table of F1 by radius class; `counts` by detector and row: of each frame, by class."""
     yield from head(("rows", "detector", *(f"from {low:g} px: F1 (found + missed, false)" for low in CLASSES)))
     for group, members in rows.items():
         for name, by_row in counts.items():
             cells = []
             for key in range(len(CLASSES)):
-                own = [by_row[row][key] for row in members if row in by_row and key in by_row[row]]
+                own = [frame[key] for row in members for frame in by_row.get(row, ()) if key in frame]
                 hits, missed, false = (sum(getattr(c, part) for c in own) for part in ("hits", "missed", "false"))
                 total = 2 * hits + missed + false
                 cells.append(f"{2 * hits / total:.3f} ({hits} + {missed}, {false})" if total else NONE)

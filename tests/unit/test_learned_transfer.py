@@ -1,7 +1,6 @@
 """The arithmetic of studies.learned_transfer: errors and refusals, pairing, overlap of regions, scores, kept frames."""
 
 import math
-from collections import defaultdict
 from dataclasses import replace
 
 import cv2
@@ -20,7 +19,7 @@ from studies.detection.tissue import Counts
 from studies.hard.cases import scene_of
 from studies.hard.scenes import KINDS
 from studies.learned_transfer import answers as answering
-from studies.learned_transfer import frames, networks, real, sheet, tables
+from studies.learned_transfer import frames, kept, networks, real, sheet, tables
 from studies.learned_transfer.answers import OK, Answer
 from studies.learned_transfer.frames import FIRST, GUIDES, LENS, ONE_LIGHT, ROWS, HardFrame, hard_frames
 
@@ -132,7 +131,7 @@ def test_the_tables_count_answers_refusals_and_coverage():
     (pair,) = list(tables.pairs(made, ALL, [("t", "s")]))[2:]
     assert pair == "| all | t - s | 0 | 0 | none | none | none |"
     row = GUIDES[0].name
-    counts = {"colour": defaultdict(lambda: defaultdict(Counts), {row: {0: Counts(3, 1, 1)}})}
+    counts = {"colour": {row: [{0: Counts(1, 1, 0)}, {0: Counts(2, 0, 1)}]}}
     assert list(tables.detection(counts, {"one": (row,)}))[2] == (
         "| one | colour | 0.750 (3 + 1, 1) | none | none | none |"
     )
@@ -219,6 +218,38 @@ def test_frames_are_kept_and_those_that_a_scene_cannot_show_left_out(tmp_path, m
     assert calls == [row.name for row in GUIDES[:2]]
     assert read.as_tissue().regions.max() == 1
     assert read.frame().camera.width == 480
+
+
+def test_answers_are_kept_by_the_hash_of_the_network(tmp_path, monkeypatch):
+    frame, asked = a_frame(), []
+
+    def made(frame, estimators):
+        asked.append(sorted(estimators))
+        return iter([answer(name, 0, 1.5, frame.scene) for name in estimators])
+
+    class Network:
+        def __init__(self, model):
+            self.model = model
+
+        def detect(self, frame, camera, priors):
+            asked.append("detect")
+            return Detection((), None)
+
+    monkeypatch.setattr(kept, "answers", made)
+    for name, text in (("one", "a"), ("two", "b"), ("same", "a")):
+        (tmp_path / name).write_text(text)
+    folder = kept.Kept(tmp_path)
+    networks = {"n, smooth": Network(tmp_path / "one"), "n, tissue": Network(tmp_path / "two"), "bisector": object()}
+    first = folder.normals(frame, networks)
+    assert [each.estimator for each in first] == list(networks)
+    assert repr(folder.normals(frame, networks)) == repr(first)
+    (read,) = folder.normals(frame, {"n, other": Network(tmp_path / "same")})
+    assert (read.estimator, read.base_deg, math.isnan(read.stated_deg)) == ("n, other", 1.5, True)
+    assert asked == [sorted(networks)]
+    for _ in range(2):
+        counts = folder.detection(frame, "d, smooth", networks["n, smooth"])
+        assert counts == {0: Counts(missed=1)}
+    assert asked[1:] == ["detect"]
 
 
 def test_a_sheet_is_small_and_needles_point_as_normals_do(tmp_path):
