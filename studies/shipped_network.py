@@ -10,28 +10,8 @@ stay.
 import sys
 
 import onnx
-from onnx import TensorProto, helper, numpy_helper
 
-LEAST_VALUES = 1000
-"""Smaller tensors keep all their digits."""
-
-
-def halved(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a copy of a model whose large weights are stored in half precision and cast to single at the start."""
-    made = onnx.ModelProto()
-    made.CopyFrom(model)
-    casts = []
-    for tensor in made.graph.initializer:
-        values = numpy_helper.to_array(tensor)
-        if tensor.data_type == TensorProto.FLOAT and values.size >= LEAST_VALUES:
-            name = tensor.name
-            tensor.CopyFrom(numpy_helper.from_array(values.astype("float16"), f"{name}_half"))
-            casts.append(helper.make_node("Cast", [f"{name}_half"], [name], to=TensorProto.FLOAT))
-    nodes = [*casts, *made.graph.node]
-    del made.graph.node[:]
-    made.graph.node.extend(nodes)
-    onnx.checker.check_model(made)
-    return made
+from simtest.dataset.learn.onnx_export import halved
 
 
 def main() -> None:

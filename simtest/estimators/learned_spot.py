@@ -1,16 +1,15 @@
 """`learned_spot`: a trained network's normals at single highlights, run by ONNX Runtime, without PyTorch."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from simtest.calibration import Frame, Priors
 from simtest.errors import Failure, InputError, Reason
+from simtest.estimators.covariance_scale import CovarianceScale
 from simtest.estimators.protocol import Estimate, Target
 from simtest.estimators.spot_inputs import (
     EXTRAS,
@@ -25,52 +24,20 @@ from simtest.estimators.spot_inputs import (
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
-from simtest.runtime.files import require_plain
+from simtest.runtime.onnx_model import OnnxModel
 from simtest.runtime.resources import data_root, shown
+from simtest.runtime.training_range import TrainingRange
 
-METADATA, FORMAT = "simtest", "simtest spot_normals, version 2"
+FORMAT = "simtest spot_normals, version 2"
 
 _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 """Extras whose range is checked: focal length and lights. The others differ from frame to frame."""
 
-MARGIN = 0.05
-"""Share of a range, and absolute part, by which an input may leave it."""
-
 STEP = 1e-5
 """Step of the differences of the normal, rad."""
 
-LARGEST_MODEL_BYTES = 256 * 2**20
-
 SHIPPED = ("learning", "weights", "learned_spot.onnx")
 """Below the shipped scenes; its card lies beside it."""
-
-
-@dataclass(frozen=True)
-class CovarianceScale:
-    """Factor of a covariance, as it hangs on how sure the network states to be of the highlight.
-
-    Parameters
-    ----------
-    log_deviation : tuple of float
-        Mean logarithm of the two stated deviations (`log_deviation`), ascending; constant beyond the ends.
-    factor : tuple of float
-        Factor of the covariance there; its logarithm is interpolated.
-    """
-
-    log_deviation: tuple[float, ...]
-    factor: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if not len(self.log_deviation) == len(self.factor) >= 1:
-            raise ValueError("scales need as many factors as deviations, 1 or more")
-        if not np.isfinite(self.log_deviation).all() or (np.diff(self.log_deviation) <= 0).any():
-            raise ValueError("deviations of scales must ascend")
-        if not np.isfinite(self.factor).all() or min(self.factor) <= 0:
-            raise ValueError("scales must be above 0")
-
-    def at(self, log_deviation: Array | float) -> Array:
-        """Return the factors at stated deviations."""
-        return np.asarray(np.exp(np.interp(log_deviation, self.log_deviation, np.log(self.factor))))
 
 
 def log_deviation(outputs: Array) -> Array:
@@ -165,89 +132,22 @@ class _Network:
     """A network in ONNX Runtime, with the range that it was taught."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            import onnxruntime
-        except ImportError:
-            raise InputError("learned_spot needs the package onnxruntime: install the extra onnx") from None
-        try:
-            data = require_plain(path).read_bytes()
-        except OSError as error:
-            raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from None
-        if len(data) > LARGEST_MODEL_BYTES:
-            raise InputError(f"{shown(path)}: has {len(data)} bytes; may have {LARGEST_MODEL_BYTES}")
-        options = onnxruntime.SessionOptions()
-        # The harness divides the cores among its workers.
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        try:
-            self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-            text = self._session.get_modelmeta().custom_metadata_map.get(METADATA, "")
-        except Exception as error:  # its exceptions share no base but this
-            reason = " ".join(str(error).split())
-            raise InputError(f"{shown(path)}: is no ONNX model ({shown(reason, 100)})") from None
-        self._path = path
-        self._read(path, text)
-
-    def _read(self, path: Path, text: str) -> None:
-        """Take scales and ranges from the metadata."""
-        try:
-            content: dict[str, Any] = json.loads(text)
-            if content["format"] != FORMAT:
-                raise ValueError(f"format {content['format']!r}")
-            self.scales = {surface: _scale(content["scales"][surface]) for surface in SURFACES}
-            self._low = {name: float(content["low"][name]) for name in EXTRAS}
-            self._high = {name: float(content["high"][name]) for name in EXTRAS}
-            self._mean = np.array(content["feature_mean"], dtype=float)
-            self._precision = _symmetric(np.array(content["feature_precision"], dtype=float), len(self._mean))
-            self._limit = float(content["feature_limit"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{shown(path)}: is no network of simtest train ({type(error).__name__}: {shown(error, 80)}); "
-                f"its metadata must hold {METADATA!r} of the form {FORMAT!r}"
-            ) from None
+        self._model = OnnxModel(path, FORMAT, "learned_spot")
+        with self._model.reading():
+            content = self._model.content
+            self.scales = {surface: CovarianceScale.read(content["scales"][surface]) for surface in SURFACES}
+            self._range = TrainingRange.read(content, EXTRAS)
+        self._shapes = {"outputs": (None, len(SURFACES), len(OUTPUTS)), "features": (None, len(self._range.mean))}
 
     def run(self, crops: Image, extras: Image) -> tuple[Array, list[Failure | None]]:
         """Return outputs, shape (N, 2, 7), and for each row why it is refused, or None."""
-        try:
-            made = self._session.run(None, {"crops": crops, "extras": extras})
-            outputs, features = (np.asarray(each, dtype=float) for each in made)
-            if outputs.shape[1:] != (len(SURFACES), len(OUTPUTS)) or features.shape[1:] != self._mean.shape:
-                raise ValueError(f"outputs {outputs.shape}, features {features.shape}")
-        except Exception as error:  # of ONNX Runtime, as above
-            reason = " ".join(str(error).split())
-            raise InputError(f"{shown(self._path)}: cannot be run ({shown(reason, 120)})") from None
-        off = features - self._mean
-        distances = np.einsum("ni,ij,nj->n", off, self._precision, off)
-        return outputs, [self._refusal(row, distance) for row, distance in zip(extras, distances, strict=True)]
-
-    def _refusal(self, extras: Image, distance: float) -> Failure | None:
-        for name, value in zip(EXTRAS, extras.tolist(), strict=True):
-            low, high = self._low[name], self._high[name]
-            margin = MARGIN * (1 + high - low)
-            if name in _CHECKED and not low - margin <= value <= high + margin:
-                return Failure(
-                    Reason.NO_ESTIMATE,
-                    f"outside the network's training: {name} is {value:.3g}, was {low:.3g} to {high:.3g}",
-                )
-        if not distance <= self._limit:
-            return Failure(
-                Reason.NO_ESTIMATE,
-                f"unlike the network's training: features at {distance:.3g}, limit {self._limit:.3g}",
-            )
-        return None
-
-
-def _scale(content: dict[str, list[float]]) -> CovarianceScale:
-    return CovarianceScale(*(tuple(float(v) for v in content[key]) for key in ("log_deviation", "factor")))
-
-
-def _symmetric(upper: Array, size: int) -> Array:
-    """Return a symmetric matrix from its upper triangle, row by row; raise `ValueError` for another length."""
-    if upper.shape != (size * (size + 1) // 2,):
-        raise ValueError("feature_precision does not fit feature_mean")
-    whole = np.zeros((size, size))
-    rows, columns = np.triu_indices(size)
-    whole[rows, columns] = whole[columns, rows] = upper
-    return whole
+        outputs, features = self._model.run({"crops": crops, "extras": extras}, self._shapes)
+        checked = ({name: float(row[EXTRAS.index(name)]) for name in _CHECKED} for row in extras)
+        refusals = [
+            self._range.refusal(values) or unlike
+            for values, unlike in zip(checked, self._range.refusals(features), strict=True)
+        ]
+        return np.asarray(outputs, dtype=float), refusals
 
 
 learned_spot = LearnedSpot()

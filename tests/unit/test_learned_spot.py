@@ -12,16 +12,19 @@ onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 
 from simtest.calibration import Calibration, Priors  # noqa: E402
-from simtest.dataset.learn.spot_export import export, fitted_scale  # noqa: E402
+from simtest.dataset.learn.calibration import fitted_scale  # noqa: E402
+from simtest.dataset.learn.spot_export import export_spots  # noqa: E402
 from simtest.dataset.learn.spot_task import SpotNormals, squared_distance  # noqa: E402
 from simtest.dataset.learn.training import Training  # noqa: E402
 from simtest.errors import Failure, InputError  # noqa: E402
 from simtest.estimators import Estimate  # noqa: E402
-from simtest.estimators.learned_spot import METADATA, CovarianceScale, LearnedSpot, log_deviation  # noqa: E402
+from simtest.estimators.covariance_scale import CovarianceScale  # noqa: E402
+from simtest.estimators.learned_spot import LearnedSpot, log_deviation  # noqa: E402
 from simtest.estimators.spot_inputs import rays_of, spot_inputs  # noqa: E402
 from simtest.geometry import BrownConrady, Camera  # noqa: E402
 from simtest.geometry.vectors import angle_deg  # noqa: E402
 from simtest.reconstruction.pipeline import run_pipeline  # noqa: E402
+from simtest.runtime.onnx_model import METADATA  # noqa: E402
 
 pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
@@ -69,7 +72,7 @@ def made(tmp_path_factory):
     torch.manual_seed(3)
     network = task.network(taught, Training(name="spot", task="spot_normals")).eval()
     out = tmp_path_factory.mktemp("spot")
-    return network, taught, judged, export(network, taught, judged, out, {"dataset": "drawn"})
+    return network, taught, judged, export_spots(network, taught, judged, out, {"dataset": "drawn"})
 
 
 def test_onnx_gives_what_pytorch_gives(made):

@@ -109,9 +109,9 @@ class SpotNormals:
 
     def finish(self, network: nn.Module, taught: Batch, judged: Batch, out: Path, about: dict[str, str]) -> list[Path]:
         """Write model.onnx for `simtest.estimators.learned_spot`; covariances are scaled on the validation split."""
-        from simtest.dataset.learn.spot_export import export
+        from simtest.dataset.learn.spot_export import export_spots
 
-        return [export(network, taught, judged, out, about)]
+        return [export_spots(network, taught, judged, out, about)]
 
 
 def batch_of(spots: Spots) -> Batch:

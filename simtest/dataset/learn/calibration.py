@@ -1,0 +1,87 @@
+"""Fits what a network states of itself beside its weights: scales of covariances, and the range it was taught."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import chdtri
+
+from simtest.estimators.covariance_scale import CovarianceScale
+from simtest.runtime.arrays import AnyArray, Array
+from simtest.runtime.training_range import TrainingRange
+
+COVERAGE = 0.95
+"""Share of the truths that a stated region holds."""
+
+REFUSED = 0.005
+"""Share of the validation split's examples whose features the network would refuse."""
+
+SHRUNK = 0.1
+"""Weight of the mean variance in the features' covariance, which has more dimensions than the examples fill."""
+
+LEAST_FOR_SCALE = 60
+"""Examples from which one factor of the covariances is fitted; with fewer in all they stay as they are."""
+
+MOST_FACTORS = 5
+
+
+def fitted_range(names: Sequence[str], inputs: AnyArray, taught: AnyArray, judged: AnyArray) -> TrainingRange:
+    """Return the range that a network was taught.
+
+    Parameters
+    ----------
+    names : sequence of str, length M
+        Names of the inputs that have a range.
+    inputs : ndarray, shape (N, M)
+        Their values on the train split.
+    taught, judged : ndarray, shapes (N, F) and (V, F)
+        Features of the network on the train split, which give mean and covariance, and on the validation split, which
+        gives the limit: a share `REFUSED` of its rows lies beyond.
+    """
+    taught = np.asarray(taught, dtype=float)
+    mean, covariance = taught.mean(axis=0), np.atleast_2d(np.cov(taught.T))
+    average = np.trace(covariance) / len(covariance)
+    precision = np.linalg.inv((1 - SHRUNK) * covariance + SHRUNK * average * np.eye(len(covariance)))
+    low, high = (
+        dict(zip(names, each.tolist(), strict=True)) for each in (inputs.min(axis=0), inputs.max(axis=0))
+    )  # fmt: skip
+    unlimited = TrainingRange(low, high, mean, precision, np.inf)
+    return TrainingRange(low, high, mean, precision, float(np.quantile(unlimited.distances(judged), 1 - REFUSED)))
+
+
+def fitted_scale(
+    distances: Array, deviations: Array, coverage: float = COVERAGE, dimensions: int = 2
+) -> CovarianceScale:
+    """Return the covariances' factors that put a share of the examples inside their regions of 95 %.
+
+    The examples are sorted by the deviation that the network states and divided into groups, each with a factor of its
+    own: a network may be too sure where it states to be sure, and right elsewhere. No group's factor is below that of
+    all examples together, so that no group gains at another's cost.
+
+    Parameters
+    ----------
+    distances : ndarray, shape (N,)
+        Squared Mahalanobis distances of the truths.
+    deviations : ndarray, shape (N,)
+        Mean logarithms of the stated deviations.
+    coverage : float
+        The share.
+    dimensions : int
+        Of what is stated: 2 for a normal, 1 for a distance.
+    """
+    limit = float(chdtri(dimensions, 1 - COVERAGE))
+    groups = min(len(distances) // LEAST_FOR_SCALE, MOST_FACTORS)
+    if groups == 0:
+        return CovarianceScale((0.0,), (1.0,))
+    parts = np.array_split(np.argsort(deviations, kind="stable"), groups)
+    centres = [float(np.median(deviations[part])) for part in parts]
+    least = _factor(distances, coverage, limit)
+    if (np.diff(centres) <= 0).any():
+        return CovarianceScale((centres[0],), (least,))
+    factors = tuple(max(_factor(distances[part], coverage, limit), least) for part in parts)
+    return CovarianceScale(tuple(centres), factors)
+
+
+def _factor(distances: Array, coverage: float, limit: float) -> float:
+    """Return the factor for N examples: the ceil((N + 1) coverage)-th smallest distance, which covers one more."""
+    rank = min(int(np.ceil((len(distances) + 1) * coverage)), len(distances))
+    return float(np.sort(distances)[rank - 1] / limit)
