@@ -47,3 +47,9 @@ def median_light(linear: Image, inside: Mask) -> float:
     """Return the median of the mean of the channels inside the view, from every other row and column."""
     light = mean_channel(linear[::2, ::2])[inside[::2, ::2]]
     return max(float(np.median(light)), 1e-6) if light.size else 1.0
+
+
+def frame_statistics(linear: Image, seen: Mask | None, longer_side_px: int) -> tuple[float, float]:
+    """Return longer side, px, as the network sees the frame, and logarithm of the median light, share of full scale."""
+    inside = np.ones(linear.shape[:2], dtype=bool) if seen is None else seen
+    return float(longer_side_px), float(np.log(median_light(linear, inside)))

@@ -7,7 +7,7 @@ from torch import Generator, Tensor
 
 from simtest.calibration import srgb_decode, srgb_encode
 from simtest.calibration.calibration import brightest_channel, mean_channel
-from simtest.dataset.learn.detector_frames import FULL, OUTSIDE
+from simtest.dataset.learn.detector_frames import FULL, HIGHLIGHT, OUTSIDE
 from simtest.dataset.learn.tasks import Batch
 from simtest.detection.highlight_inputs import highlight_inputs
 from simtest.detection.light_split import split_light
@@ -25,8 +25,11 @@ SATURATION = (0.75, 1.2)
 BLUR_PX, SHARPENING, NOISE = 0.8, 0.8, 0.012
 """Largest blur, and amount of an unsharp mask of 1 px; largest noise, share of full scale, encoded."""
 
-ZOOM = 2.0
-"""Largest magnification of a crop; half of the crops have none."""
+ZOOM = (0.8, 2.0)
+"""Least and largest magnification of a crop; half of the crops have none."""
+
+ON_HIGHLIGHT = 0.7
+"""Share of the crops that hold a pixel of a highlight for sure."""
 
 
 def inputs_of(encoded: Image, state: AnyArray) -> Image:
@@ -53,19 +56,21 @@ def moved_crops(batch: Batch, generator: Generator, crop_px: int = CROP_PX) -> B
     parts: list[tuple[AnyArray, ...]] = []
     for picture, state, bump in zip(*(batch[name].cpu().numpy() for name in ("picture", "state", "bump")), strict=True):
         random = np.random.default_rng(int(torch.randint(2**31, (1,), generator=generator)))
-        inputs = inputs_of(_other_camera(picture, random), state)
+        inputs = inputs_of(other_camera(picture, random), state)
         parts += [_crop(inputs, state, bump, crop_px, random) for _ in range(CROPS)]
     names = ("inputs", "state", "bump")
     tensors: list[Tensor] = [torch.from_numpy(np.stack(each)) for each in zip(*parts, strict=True)]
     return {name: tensor.to(device) for name, tensor in zip(names, tensors, strict=True)}
 
 
-def _other_camera(picture: AnyArray, random: np.random.Generator) -> Image:
+def other_camera(picture: AnyArray, random: np.random.Generator) -> Image:
     """Return a picture as a slightly different camera would have encoded it; what is clipped stays so."""
     clipped = picture >= FULL
     linear = srgb_decode(picture.astype(np.float32) / np.float32(FULL))
     gains = np.exp(random.normal(0, CHANNEL_GAIN, 3) + random.uniform(-LIGHT_GAIN, LIGHT_GAIN)).astype(np.float32)
-    encoded = srgb_encode(np.minimum(linear * gains, np.float32(1))) ** np.float32(np.exp(random.uniform(-GAMMA, GAMMA)))
+    encoded = srgb_encode(np.minimum(linear * gains, np.float32(1))) ** np.float32(
+        np.exp(random.uniform(-GAMMA, GAMMA))
+    )
     grey = mean_channel(encoded)[..., None]
     encoded = grey + np.float32(random.uniform(*SATURATION)) * (encoded - grey)
     encoded[clipped] = 1
@@ -78,18 +83,25 @@ def _other_camera(picture: AnyArray, random: np.random.Generator) -> Image:
     return np.asarray(np.clip(np.rint(FULL * encoded), 0, FULL) / FULL, dtype=np.float32)
 
 
-def _crop(inputs: Image, state: AnyArray, bump: AnyArray, side: int, random: np.random.Generator) -> tuple[AnyArray, ...]:
-    """Return a crop, magnified in half of all cases, mirrored and turned by right angles."""
+def _crop(
+    inputs: Image, state: AnyArray, bump: AnyArray, side: int, random: np.random.Generator
+) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Return a crop, resized in half of all cases, mirrored and turned by right angles."""
     height, width = state.shape
-    zoom = 1.0 if random.random() < 0.5 else float(np.exp(random.uniform(0, np.log(ZOOM))))
+    zoom = 1.0 if random.random() < 0.5 else float(np.exp(random.uniform(*np.log(ZOOM))))
     own = min(round(side / zoom), height, width)
     y, x = int(random.integers(height - own + 1)), int(random.integers(width - own + 1))
+    if random.random() < ON_HIGHLIGHT and (state == HIGHLIGHT).any():
+        rows, columns = np.nonzero(state == HIGHLIGHT)
+        middle = int(random.integers(len(rows)))
+        y = int(np.clip(rows[middle] - random.integers(own), 0, height - own))
+        x = int(np.clip(columns[middle] - random.integers(own), 0, width - own))
     window = np.s_[y : y + own, x : x + own]
     parts = [*inputs[:, *window], state[window], bump[window]]
     if own != side:
-        nearest = cv2.INTER_NEAREST
-        ways = [cv2.INTER_LINEAR] * (len(parts) - 2) + [nearest, cv2.INTER_LINEAR]
+        smooth = cv2.INTER_LINEAR if own < side else cv2.INTER_AREA
+        ways = [smooth] * len(inputs) + [cv2.INTER_NEAREST, smooth]
         parts = [cv2.resize(part, (side, side), interpolation=way) for part, way in zip(parts, ways, strict=True)]
     mirrored, turns = bool(random.integers(2)), int(random.integers(4))
     parts = [np.rot90(part[:, ::-1] if mirrored else part, turns) for part in parts]
-    return np.ascontiguousarray(np.stack(parts[:-2])), np.ascontiguousarray(parts[-2]), np.ascontiguousarray(parts[-1])
+    return np.stack(parts[:-2]), np.ascontiguousarray(parts[-2]), np.ascontiguousarray(parts[-1])

@@ -55,10 +55,10 @@ class HighlightInstances:
         return {"pixels: intersection over union": both / either if either else 1.0}
 
     def finish(self, network: nn.Module, taught: Batch, judged: Batch, out: Path, about: dict[str, str]) -> list[Path]:
-        """Write model.onnx for `simtest.detection.learned_detector`; its threshold is chosen on the validation split."""
-        from simtest.dataset.learn.detector_export import export
+        """Write model.onnx for `simtest.detection.learned_detector`; its threshold is fitted on the judged frames."""
+        from simtest.dataset.learn.detector_export import export_detector
 
-        return [export(network, taught, judged, out, about)]
+        return [export_detector(network, taught, judged, out, about)]
 
 
 def batch_of(frames: DetectorFrames) -> Batch:
