@@ -63,7 +63,7 @@ class CoreForm(Form):
     """What was run."""
 
     name: Text
-    kind: Literal["installed", "command", "maps", "baseline"]
+    kind: Literal["installed", "command", "network", "maps", "baseline"]
     version: Text | None
     sha256: Hash | None
     program: ProgramForm | None = None

@@ -14,13 +14,13 @@ from simtest.calibration import Frame, Priors
 from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.installed import ESTIMATORS
-from simtest.estimators.process import is_core
 from simtest.estimators.process.command import INTERPRETERS, parse_core
-from simtest.estimators.process.naming import core_hashes, core_name, core_records
+from simtest.estimators.process.naming import core_hashes, core_records, has_files, short_name
 from simtest.estimators.protocol import BatchEstimator, Estimator
 from simtest.geometry import Camera, Patch
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.files import Json, JsonObject
+from simtest.runtime.model_names import parse_model
 from simtest.validation.cases import expand
 from simtest.validation.realisation import Realiser
 
@@ -47,9 +47,13 @@ def core_record(text: str) -> JsonObject:
         If it is unknown or cannot be started.
     """
     name, _ = load_core(text)
-    if not is_core(text):
+    if not has_files(text):
         ((_, package),) = ESTIMATORS.distributions([text]).items()
         return {"name": name, "kind": "installed", "version": package, "sha256": None}
+    if parse_model(text):
+        ((_, package),) = ESTIMATORS.distributions([text]).items()
+        (digest,) = core_hashes([text])[text].values()
+        return {"name": name, "kind": "network", "version": package, "sha256": digest}
     (record,) = core_records([text]).values()
     ((_, hashes),) = core_hashes([text]).items()
     (program, digest), *files = hashes.items()
@@ -58,7 +62,7 @@ def core_record(text: str) -> JsonObject:
     named: Json = sorted([Path(file).name, of_file] for file, of_file in own)
     version = record.get("version")
     return {
-        "name": core_name(text), "kind": "command", "version": None if version is None else str(version),
+        "name": short_name(text), "kind": "command", "version": None if version is None else str(version),
         "sha256": digest_of({"files": named, "words": _words(parse_core(text).arguments[1:])}),
         "program": {"name": Path(program).name, "sha256": digest},
     }  # fmt: skip

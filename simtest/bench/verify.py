@@ -144,7 +144,7 @@ def verify_run(
         run = run_maps(suite, maps or SHADING, folder, seeds, options, engine, progress)
     else:
         if core is None and told["kind"] != "installed":
-            raise InputError(f"{shown(certificate.path)}: is of a command; --core must say how to start it here")
+            raise InputError(f"{shown(certificate.path)}: is of a {told['kind']}; --core must say how to start it here")
         if core is None and told["name"] not in ESTIMATORS.names():
             # A stranger wrote the name: a command in its place is never run.
             raise InputError(

@@ -95,7 +95,8 @@ Estimators = Annotated[
         files=True,
         name="--estimator",
         negative="",
-        help="Estimator by name, or a core of your own: 'command: PROGRAM ARGUMENT...' or FILE.toml; may be repeated.",
+        help="Estimator by name, a network of your own, learned_spot:FILE.onnx, or a core of your own: "
+        "'command: PROGRAM ARGUMENT...' or FILE.toml; may be repeated.",
     ),
 ]
 Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.", converter=named_path)]

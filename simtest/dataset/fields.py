@@ -205,6 +205,17 @@ def _decode_picture(data: bytes, _: SampleMeta) -> AnyArray:
     return decode(data)
 
 
+def _encode_numbers(numbers: AnyArray) -> bytes:
+    if numbers.max(initial=0) > LEVELS:
+        raise ValueError(f"{numbers.max()} highlights; 16 bits hold {LEVELS}")
+    return encode(numbers.astype(np.uint16), "none")
+
+
+def _decode_numbers(data: bytes, _: SampleMeta) -> AnyArray:
+    # PyTorch computes with few unsigned types.
+    return decode(data).astype(np.int32)
+
+
 def _encode_half(radiance: AnyArray) -> bytes:
     # Half precision ends at 65504; beyond it is infinity, which a picture must not hold.
     file = BytesIO()
@@ -227,6 +238,9 @@ _CURVATURE = (
     f"16-bit PNG of 2 H rows: k_min above k_max; k = (count - {OFFSET}) * {CURVATURE_SCALE:g}; 0: unknown; "
     f"1 and {LEVELS}: that or beyond"
 )
+
+VISIBLE = "visible"
+"""Field of the visible highlights' pixels."""
 
 FIELDS = (
     Field("image", "image.png", "(H, W, 3)", "uint8", "sensor counts",
@@ -262,6 +276,10 @@ FIELDS = (
     Field("instance", "instance.png", "(H, W)", "uint8", "1",
           "0, or 1 + the place in the list highlights of the isolated highlight whose region at half height this is",
           "8-bit PNG", _encode_picture, _decode_picture),
+    Field(VISIBLE, "visible.png", "(H, W)", "int32", "1",
+          "0, or 1 + the index in the list visible_highlights of the visible highlight whose pixel this is: above half "
+          "of its lobe's peak in the noise-free frame; only in datasets that keep it",
+          "16-bit PNG", _encode_numbers, _decode_numbers),
     Field("instrument", "instrument.png", "(H, W)", "uint8", "1",
           "0, or 1 + the index in the scene's instruments of the metal instrument that is seen: depth and normals "
           "are its own there, curvature is NaN; stored where the scene lists instruments, elsewhere it is 0 everywhere",
@@ -280,6 +298,9 @@ FINE_OF = {"normal_base": "normal", "curvature_base": "curvature"}
 
 INSTRUMENT = "instrument"
 """Field that is stored where the scene lists instruments alone, present or not."""
+
+KEPT_ON_DEMAND = ("radiance", VISIBLE)
+"""Fields that a recipe must ask for, by keys of these names."""
 
 BASE_FIELDS = (*FINE_OF, "pool")
 """Fields that are stored where there is a relief alone."""

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import JsonValue
 
 from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
-from simtest.dataset.fields import INSTRUMENT, depth_scale_mm
+from simtest.dataset.fields import INSTRUMENT, VISIBLE, depth_scale_mm
 from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta, SampleMeta
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample import Sample, sample_key
@@ -92,8 +92,9 @@ class Maker:
         if scene.instruments:
             meta["instrument_share"] = float(np.mean(images[INSTRUMENT] > 0))
         if seen.is_rough:
-            spots = [spot.to_json() for spot in seen.visible_highlights]
             meta["clouds"] = cast("list[dict[str, JsonValue]]", [cloud_json(centre) for centre in seen.clouds])
+        if seen.is_rough or self.plan.dataset.visible:
+            spots = [spot.to_json() for spot in seen.visible_highlights]
             meta["visible_highlights"] = cast("list[dict[str, JsonValue]]", spots)
         return Sample(meta, images)
 
@@ -195,6 +196,8 @@ class Maker:
         parts = {"specular": radiance.specular, "diffuse": radiance.diffuse, "indirect": radiance.indirect}
         images |= {name: _share_of(part, scale) for name, part in parts.items()}
         images["instance"] = _instances(seen, drawn.scene.camera.model().seen)
+        if self.plan.dataset.visible:
+            images[VISIBLE] = seen.spots.regions
         if self.plan.dataset.radiance:
             images["radiance"] = _colour(radiance.total / np.float32(scale))
         return images

@@ -11,7 +11,7 @@ from pydantic import JsonValue
 
 from simtest.dataset.plan import Plan, spec_files
 from simtest.errors import InputError
-from simtest.estimators.process.naming import core_hashes, core_name
+from simtest.estimators.process.naming import core_hashes, short_name
 from simtest.runtime import provenance
 from simtest.runtime.files import write_json
 from simtest.runtime.limits import check_limit
@@ -105,7 +105,7 @@ def _core_files(plan: Plan) -> dict[str, str]:
     made: dict[str, str] = {}
     for name, hashes in core_hashes(plan.dataset.estimators).items():
         for path, digest in hashes.items():
-            label = f"core {core_name(name)}: {Path(path).name}"
+            label = f"core {short_name(name)}: {Path(path).name}"
             # Files of one name in several folders are numbered in the command's order.
             count = sum(each.split(" (")[0] == label for each in made)
             made[f"{label} ({count + 1})" if count else label] = digest

@@ -75,7 +75,7 @@ class SampleMeta(TypedDict):
     attempt: int
     highlights: list[HighlightMeta]
     clouds: NotRequired[list[dict[str, JsonValue]]]  # highlight points of the base below a relief
-    visible_highlights: NotRequired[list[dict[str, JsonValue]]]  # of a surface with relief
+    visible_highlights: NotRequired[list[dict[str, JsonValue]]]  # with relief, or where their pixels are kept
     detections: list[DetectionMeta]
     estimates: list[EstimateMeta]
     depth_scale_mm: float

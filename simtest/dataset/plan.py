@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import JsonValue
 
-from simtest.dataset.fields import BASE_FIELDS, INSTRUMENT
+from simtest.dataset.fields import BASE_FIELDS, INSTRUMENT, KEPT_ON_DEMAND
 from simtest.errors import InputError
 from simtest.runtime.arrays import IntArray
 from simtest.runtime.resources import find
@@ -138,7 +138,8 @@ class Plan:
         """Names of the fields that no sample stores."""
         without_relief = () if self.has_relief else BASE_FIELDS
         without_metal = () if self.has_instruments else (INSTRUMENT,)
-        return (*(() if self.dataset.radiance else ("radiance",)), *without_relief, *without_metal)
+        not_asked_for = tuple(name for name in KEPT_ON_DEMAND if not getattr(self.dataset, name))
+        return (*not_asked_for, *without_relief, *without_metal)
 
     def _base(self, number: int, family: Family) -> dict[str, Any]:
         path = find(family.scene, "scenes")

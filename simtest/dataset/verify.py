@@ -9,7 +9,7 @@ import polars as pl
 
 from simtest.dataset.card import CARD, make_card
 from simtest.dataset.croissant import CROISSANT, make_croissant
-from simtest.dataset.fields import BASE_FIELDS, BY_SUFFIX, FIELDS, INSTRUMENT
+from simtest.dataset.fields import BASE_FIELDS, BY_SUFFIX, FIELDS, INSTRUMENT, KEPT_ON_DEMAND, VISIBLE
 from simtest.dataset.index import TABLES, make_tables
 from simtest.dataset.manifest import (
     NAME,
@@ -47,7 +47,7 @@ MAX_DEPTH_ERROR = 0.05
 MAX_SLOPES = 4.0
 """The median angle between fine normals and those of the base is 1.2 slopes of the relief, and far below this many."""
 
-REQUIRED = tuple(field.name for field in FIELDS if field.name not in ("radiance", INSTRUMENT, *BASE_FIELDS))
+REQUIRED = tuple(field.name for field in FIELDS if field.name not in (*KEPT_ON_DEMAND, INSTRUMENT, *BASE_FIELDS))
 """Images of every sample; with a relief also those of the base."""
 
 
@@ -205,6 +205,7 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
     yield from _surface(sample, camera, relief)
     if listed and sample.images[INSTRUMENT].max() > listed:
         yield f"{INSTRUMENT} names instrument {int(sample.images[INSTRUMENT].max())} of {listed}"
+    yield from _visible(sample)
     # highlights
     depth, instance = sample.images["depth"], sample.images["instance"]
     if instance.max() > len(highlights):
@@ -217,6 +218,20 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
         seen = float(depth[row, column])
         if highlight["isolated"] and not abs(seen / highlight["distance_mm"] - 1) < MAX_DEPTH_ERROR:
             yield f"highlight {number}: depth is {seen:g} mm and its distance {highlight['distance_mm']:g} mm"
+
+
+def _visible(sample: Sample) -> Iterator[str]:
+    """Check the pixels of the visible highlights, where they are kept, against the list."""
+    if VISIBLE not in sample.images:
+        return
+    spots = sample.meta.get("visible_highlights", [])
+    areas = np.bincount(sample.images[VISIBLE].ravel(), minlength=len(spots) + 1)[1:]
+    if len(areas) > len(spots):
+        yield f"{VISIBLE} names highlight {len(areas)} of {len(spots)}"
+        return
+    for number, (spot, area) in enumerate(zip(spots, areas.tolist(), strict=True)):
+        if spot.get("area_px") != area:
+            yield f"visible highlight {number}: has {area} pixels; area_px is {spot.get('area_px')}"
 
 
 def _relief(meta: SampleMeta) -> Relief | None:

@@ -1,7 +1,7 @@
 """`learned_spot`: a trained network's normals at single highlights, run by ONNX Runtime, without PyTorch."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -73,6 +73,18 @@ class LearnedSpot:
     def __post_init__(self) -> None:
         if self.target not in SURFACES:
             raise InputError(f"target = {shown(self.target)}: must be base or fine")
+
+    def with_model(self, model: Path) -> "LearnedSpot":
+        """Return the estimator with another network, which is read (see `simtest.runtime.entry_points`)."""
+        made = replace(self, model=model)
+        made.check()
+        return made
+
+    @property
+    def description(self) -> str:
+        """What the estimator is, in one line for a reader who chooses one."""
+        network = shown(self.model or SHIPPED[-1])
+        return f"The normal of the {self.target} surface at each highlight, by the network {network}."
 
     def check(self) -> None:
         """Load the network; raise `InputError` where it cannot be used."""

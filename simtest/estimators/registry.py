@@ -1,4 +1,4 @@
-"""Estimators by name: those of packages, through the entry-point group ``simtest.estimators``, and cores by command."""
+"""Estimators by name: those of packages (entry-point group ``simtest.estimators``), and those of the user's own."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -11,6 +11,7 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
 from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
 from simtest.geometry import Camera, Patch
+from simtest.runtime.model_names import SUFFIX, parse_model
 from simtest.runtime.resources import shown
 
 
@@ -50,32 +51,50 @@ def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[st
     """Load estimators by name, or take those of a mapping, in the given order.
 
     A name is as registered, or "package:name" where two packages register it; or it is a core's
-    (`simtest.estimators.process.command.parse_core`), which is started and stands under its short name.
+    (`simtest.estimators.process.command.parse_core`), which is started, or that of a network of the user's own
+    ("learned_spot:FILE.onnx", `simtest.runtime.model_names`), which is read. Both stand under their short names.
 
     Raises
     ------
     InputError
-        If a name is unknown, ambiguous or given twice, its package cannot be imported, an object is no estimator, or a
-        core cannot be started or has the name of an installed estimator.
+        If a name is unknown, ambiguous or given twice, its package cannot be imported, an object is no estimator, a
+        core cannot be started, a network cannot be used, or either has the name of an installed estimator.
     """
     if isinstance(estimators, Mapping):
         return {name: as_estimator(name, given) for name, given in estimators.items()}
     loaded: dict[str, AnyEstimator] = {}
     for name in estimators:
-        if "," in name and not is_core(name):
-            each = " ".join(f"--estimator {part.strip()}" for part in name.split(","))
-            raise InputError(f"estimator {name!r}: one name each; several are given as {each}")
-        if not is_core(name) and (" " in name.strip() or "/" in name):
-            raise InputError(
-                f"estimator {shown(name, 120)!r}: is no estimator's name; a program of yours needs 'command: ' "
-                "before it"
-            )
-        # Raises where the name is not clear.
-        short, given = _core(name) if is_core(name) else (name, _installed(name))
+        short, given = _core(name) if is_core(name) else _network(name) if parse_model(name) else _plain(name)
         if short in loaded:
             raise InputError(f"estimator {short!r}: given twice")
         loaded[short] = as_estimator(name, given)
     return loaded
+
+
+def _plain(name: str) -> tuple[str, object]:
+    """Return the name and estimator of a registered name; errors say what else it may have meant."""
+    if "," in name:
+        each = " ".join(f"--estimator {part.strip()}" for part in name.split(","))
+        raise InputError(f"estimator {name!r}: one name each; several are given as {each}")
+    if name.endswith(SUFFIX):
+        raise InputError(
+            f"estimator {shown(name, 120)!r}: is no estimator's name; a network stands behind what runs it, as in "
+            f"learned_spot:{shown(Path(name), 80)}"
+        )
+    if " " in name.strip() or "/" in name:
+        raise InputError(
+            f"estimator {shown(name, 120)!r}: is no estimator's name; a program of yours needs 'command: ' before it"
+        )
+    return name, _installed(name)
+
+
+def _network(name: str) -> tuple[str, object]:
+    """Return the short name of an estimator with a user's network, and the estimator."""
+    from simtest.estimators.process.naming import short_name
+
+    # Loaded first: an unknown estimator is told before the name that its results would bear.
+    given = ESTIMATORS.load(name)
+    return short_name(name), given
 
 
 def _installed(name: str) -> object:
@@ -92,6 +111,6 @@ def _installed(name: str) -> object:
 def _core(name: str) -> tuple[str, object]:
     """Return a core's short name and its estimator; imported at need, since few runs name one."""
     from simtest.estimators.process.estimator import load_core
-    from simtest.estimators.process.naming import core_name
+    from simtest.estimators.process.naming import short_name
 
-    return core_name(name), load_core(name)
+    return short_name(name), load_core(name)

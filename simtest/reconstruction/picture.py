@@ -82,7 +82,9 @@ class Options:
             try:
                 load_detector(self.detector)
             except InputError as error:
-                raise InputError(f"--{error}; auto chooses among those of simtest") from None
+                known = str(error).startswith("detector ")
+                how = f"--{error}; auto chooses among those of simtest" if known else f"--detector: {error}"
+                raise InputError(how) from None
         if self.target not in TARGETS:
             raise InputError(f"--target {self.target}: must be one of {', '.join(TARGETS)}")
         if (self.camera is None) == (self.fov_deg is None):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
+from simtest.runtime.model_names import ModelName, parse_model
 from simtest.runtime.resources import shown, suggestion
 
 OWN = "simtest"
@@ -21,7 +22,8 @@ class EntryPointGroup:
     """One entry-point group.
 
     A name that two packages register is refused, unless the package is named too: "package:name", which is accepted for
-    every name.
+    every name. "name:FILE.onnx" is the member with a network of the user's own; the member must have a method
+    ``with_model(path)``, which returns it.
 
     Parameters
     ----------
@@ -46,8 +48,11 @@ class EntryPointGroup:
         Raises
         ------
         InputError
-            If the name is unknown, several packages register it, or its package cannot be imported.
+            If the name is unknown, several packages register it, its package cannot be imported, or it names a file
+            for a member that runs none, or that the member refuses.
         """
+        if model := parse_model(name):
+            return self._with_model(model, name)
         found = self._registered(name)
         if not found:
             names, meant = self.names(), suggestion(name, self.names())
@@ -65,6 +70,13 @@ class EntryPointGroup:
         except Exception as error:
             raise InputError(f"{self.kind} {name!r}: {found[0].value} cannot be imported ({error})") from error
 
+    def _with_model(self, model: ModelName, name: str) -> Any:
+        """Return a member with a user's network, which is read here, so that errors come before any work."""
+        with_model = getattr(self.load(model.runner), "with_model", None)
+        if with_model is None:
+            raise InputError(f"{self.kind} {shown(name, 120)!r}: {model.runner} runs no network; must stand alone")
+        return with_model(model.file)
+
     def described(self, own: Mapping[str, str] | None = None) -> dict[str, str]:
         """Return a line about each member, by name.
 
@@ -80,7 +92,8 @@ class EntryPointGroup:
 
     def distributions(self, names: Sequence[str]) -> dict[str, str]:
         """Return package and version of each installed name, by "kind NAME"."""
-        found = {name: self._registered(name) for name in names}
+        runners = {name: model.runner if (model := parse_model(name)) else name for name in names}
+        found = {name: self._registered(runner) for name, runner in runners.items()}
         dists = {name: points[0].dist for name, points in found.items() if points}
         return {f"{self.kind} {name}": f"{dist.name} {dist.version}" if dist else "" for name, dist in dists.items()}
 

@@ -150,6 +150,7 @@ class Dataset(Spec):
         ("circle_pose", "brightest_point", "cone_axis"), description="classical estimates kept beside the truth"
     )
     radiance: bool = Field(False, description="keep the linear radiance as well (float16)")
+    visible: bool = Field(False, description="keep the pixels of the visible highlights as well, and list these")
     exact: bool = Field(
         False,
         description="normals and curvatures of the smooth surface at each pixel, some seconds a sample; "

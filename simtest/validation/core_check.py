@@ -14,7 +14,7 @@ from simtest.estimators.process.child import END_S, Child
 from simtest.estimators.process.command import CoreCommand, parse_core
 from simtest.estimators.process.core import Core, Hello, hello_of
 from simtest.estimators.process.estimator import ProcessEstimator, ProcessFrameEstimator
-from simtest.estimators.process.naming import core_name
+from simtest.estimators.process.naming import short_name
 from simtest.estimators.process.wire import PROTOCOL, CoreFault, encode
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array
@@ -127,7 +127,7 @@ def check_core(text: str) -> CoreReport:
     # A command may end with the name of a TOML file too, which is an argument of it.
     is_named = text.startswith(PREFIX) or (is_core(text) and (len(text.split()) == 1 or Path(text).exists()))
     name = text if is_named else f"{PREFIX} {text}"
-    core_name(name)
+    short_name(name)
     command = parse_core(name)
     report = CoreReport(text)
     core = Core(command)

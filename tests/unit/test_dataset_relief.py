@@ -187,3 +187,41 @@ def test_loader_passes_the_base_on(made):
         assert item["pool"].dtype == torch.bool
         same = torch.equal(torch.nan_to_num(item["normal"]), torch.nan_to_num(item["normal_base"]))
         assert same == (item["meta"]["scene"]["surface"]["relief"] is None)
+
+
+@pytest.fixture(scope="module")
+def with_visible(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("visible") / "two"
+    smooth = {**SMOOTH, "set": CAMERA | {"reflectance.exponent": 400.0}}
+    write_dataset(recipe(visible=True, families=[ROUGH, smooth]), folder, make_engine())
+    return folder
+
+
+def test_the_pixels_of_visible_highlights_are_kept_on_demand(made, with_visible):
+    assert all("visible" not in record for record in read(made))
+    with pytest.raises(InputError, match=r"sample 000000000 has no visible"):
+        list(read(made, fields=["visible"]))
+    assert verify(with_visible) == []
+    records = list(read(with_visible))
+    assert {is_rough(record) for record in records} == {True, False}
+    assert sum(len(record["meta"]["visible_highlights"]) for record in records) >= len(records)
+    for record in records:
+        numbers = record["visible"]
+        assert numbers.dtype == np.int32
+        for index, spot in enumerate(record["meta"]["visible_highlights"]):
+            assert np.count_nonzero(numbers == index + 1) == spot["area_px"]
+            column, row = (int(v) for v in spot["peak_px"])
+            assert numbers[row, column] == index + 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda n: np.where(n > 0, n + 500, 0), "visible names highlight 5"),
+        (lambda n: 0 * n, "has 0 pixels; area_px is"),
+    ],
+)
+def test_wrong_pixels_of_visible_highlights_are_found(with_visible, change, said):
+    members, meta = stored_rough(with_visible)
+    assert list(check_sample(members, meta)) == []
+    assert any(said in fault for fault in check_sample(recoded(members, "visible", change), meta))

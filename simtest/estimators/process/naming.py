@@ -1,4 +1,4 @@
-"""The names of cores among those of estimators: in results, in records, and in other processes."""
+"""Names of estimators with files of the user's own, cores and networks: in results, in records, in other processes."""
 
 import sys
 from collections.abc import Iterable
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from simtest.errors import InputError
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
+from simtest.runtime.model_names import parse_model
 from simtest.runtime.resources import shown
 
 if TYPE_CHECKING:
@@ -14,42 +15,63 @@ if TYPE_CHECKING:
 
 
 def short_names(estimators: Iterable[str]) -> tuple[str, ...]:
-    """Return the names under which estimators stand in results: those of cores shortened, all others as they are."""
-    return tuple(core_name(name) if is_core(name) else name for name in estimators)
+    """Return the names under which estimators stand in results: those with files shortened, all others as they are."""
+    return tuple(short_name(name) if has_files(name) else name for name in estimators)
 
 
-def core_name(name: str) -> str:
-    """Return a core's short name.
+def has_files(name: str) -> bool:
+    """Return whether an estimator's name is that of a core, or names a network's file."""
+    return is_core(name) or parse_model(name) is not None
+
+
+def short_name(name: str) -> str:
+    """Return the short name of a core, or of an estimator with a network's file.
 
     Raises
     ------
     InputError
-        If the core's name is malformed, or it is that of an installed estimator, for which it would be taken.
+        If the name is malformed, or the short one is that of an installed estimator, for which it would be taken.
     """
-    short = _parsed(name).name
+    model = parse_model(name)
+    short = _parsed(name).name if model is None else model.short
     if short in ESTIMATORS.names():
+        how = "in a TOML file (core.name)" if model is None else "by its file"
         raise InputError(
-            f"estimator {shown(name, 120)!r}: is called {short}, as an installed estimator is; name it otherwise in a "
-            "TOML file (core.name)"
+            f"estimator {shown(name, 120)!r}: is called {short}, as an installed estimator is; name it otherwise {how}"
         )
     return short
 
 
 def absolute_names(estimators: Iterable[str]) -> tuple[str, ...]:
     """Return names that mean the same estimators in a process with another current folder."""
-    return tuple(_parsed(name).absolute if is_core(name) else name for name in estimators)
+    return tuple(_absolute(name) for name in estimators)
+
+
+def _absolute(name: str) -> str:
+    if model := parse_model(name):
+        return model.absolute
+    return _parsed(name).absolute if is_core(name) else name
 
 
 def core_records(estimators: Iterable[str]) -> dict[str, dict[str, object]]:
-    """Return what a run's record says of the cores among estimators: command, greeting and files, by short name."""
+    """Return what a run's record says of cores and networks among estimators, by short name.
+
+    Of a core it is command, greeting and files, of a network its name and file.
+    """
     from simtest.estimators.process.core import kept_core
 
-    return {core_name(name): kept_core(name).record() for name in estimators if is_core(name)}
+    made: dict[str, dict[str, object]] = {}
+    for name in estimators:
+        if model := parse_model(name):
+            made[short_name(name)] = {"name": model.short, "kind": "network", "files": model.hashes()}
+        elif is_core(name):
+            made[short_name(name)] = kept_core(name).record()
+    return made
 
 
 def core_hashes(estimators: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return the SHA-256 of the files of the cores among estimators, by name and path."""
-    return {name: _parsed(name).hashes() for name in estimators if is_core(name)}
+    """Return the SHA-256 of the files of cores and networks among estimators, by name and path."""
+    return {name: (parse_model(name) or _parsed(name)).hashes() for name in estimators if has_files(name)}
 
 
 def close_cores() -> None:
