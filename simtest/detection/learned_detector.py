@@ -31,9 +31,6 @@ SHIPPED = ("learning", "weights", "learned_detector.onnx")
 MULTIPLE = 8
 """Height and width of what the network sees are multiples of this."""
 
-WIDEST_PX = 960
-"""A frame whose longer side is larger is seen reduced by the least whole factor that brings it below."""
-
 RANGED = ("longer side, px", "logarithm of the median light")
 """Statistics of a frame, as the network sees it, whose range is checked."""
 
@@ -113,6 +110,8 @@ class _Network:
             if not 0 < self._least_top < 1:
                 raise ValueError(f"least_top = {self._least_top:g}: must be in (0, 1)")
             self._range = TrainingRange.read(content, RANGED)
+            if not self._range.high[RANGED[0]] >= MULTIPLE:
+                raise ValueError(f"{RANGED[0]} reaches {self._range.high[RANGED[0]]:g}; must be {MULTIPLE} at least")
 
     def detect(self, linear: Image, clipped: Mask, seen: Mask | None) -> ColourDetection | Failure:
         """Find the highlights of a frame (see `LearnedDetector.find`)."""
@@ -135,7 +134,8 @@ class _Network:
     def _maps(self, inputs: Image) -> tuple[Image, Image, Image, int]:
         """Return both maps of probabilities at full size, the features, and the longer side as seen, px."""
         height, width = inputs.shape[1:]
-        factor = -(-max(height, width) // WIDEST_PX)
+        # A large frame is seen reduced by the least whole factor that fits the training.
+        factor = max(int(np.ceil(max(height, width) / self._range.high[RANGED[0]])), 1)
         size = (-(-width // factor), -(-height // factor))
         if factor > 1:
             inputs = np.stack([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in inputs])

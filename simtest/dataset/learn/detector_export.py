@@ -20,14 +20,18 @@ from simtest.runtime.arrays import AnyArray, Array, Image
 NEAR_PX = 1.5
 """A top within this distance of a highlight's pixels lies on it."""
 
+MOST_FRAMES = 48
+"""Frames of the train split, spread over it, from which the range is taken."""
+
 SEED = 0
 """Of the moved frames from which the range is taken."""
 
 
 def export_detector(network: nn.Module, taught: Batch, judged: Batch, out: Path, about: dict[str, str]) -> Path:
     """Write model.onnx into a folder and return its path; `about` goes into the file's metadata."""
-    network = network.cpu().eval().to(memory_format=torch.contiguous_format)
-    statistics, own = _seen(network, taught)
+    network = network.cpu().eval()
+    step = -(-len(taught["state"]) // MOST_FRAMES)
+    statistics, own = _seen(network, {name: values[::step] for name, values in taught.items()})
     _, others = _seen(network, judged)
     longer_side = max(taught["state"].shape[1:])
     # Frames of the dataset have one size; crops were resized in training.
@@ -38,6 +42,7 @@ def export_detector(network: nn.Module, taught: Batch, judged: Batch, out: Path,
         **fitted_range(RANGED, ends, own, others).written(),
         "about": about,
     }
+    network = network.to(memory_format=torch.contiguous_format)
     example = torch.from_numpy(next(_inputs(taught))[None])
     example = example[..., : example.shape[2] // MULTIPLE * MULTIPLE, : example.shape[3] // MULTIPLE * MULTIPLE]
     free = {2: "height", 3: "width"}

@@ -16,7 +16,7 @@ from simtest.validation.runner import Progress
 BUMP_WEIGHT, TOP_WEIGHT = 2.0, 9.0
 """Weight of the bumps' loss beside that of the pixels, and of a bump's top beside a pixel of tissue."""
 
-JUDGED_PX = 256
+JUDGED_PX = 192
 """Side of the middle part of each frame that is judged after an epoch."""
 
 
