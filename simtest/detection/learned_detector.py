@@ -127,7 +127,8 @@ class _Network:
         smoothed = np.maximum(smooth(light.specular, SMOOTHING_PX, seen), np.float32(LEAST_VALUE))
         tissue = smooth(light.tissue, SMOOTHING_PX, seen)
         flat, white = plateaus(linear, clipped)
-        spots = spots_of(given_basins(smoothed * rise_of_clipped(flat), labels), smoothed, tissue)
+        climbed = np.asarray(smoothed * rise_of_clipped(flat), dtype=np.float32)
+        spots = spots_of(given_basins(climbed, labels), smoothed, tissue)
         spots, bright, foreign = tissue_spots(spots, clipped.shape)
         return judge_spots(spots, light, linear, bright, (flat, white), (labels > 0) & ~foreign, seen)
 
