@@ -37,7 +37,7 @@ RANGED = ("longer side, px", "logarithm of the median light")
 PIXEL = 0.5
 """A pixel is a highlight's where the network gives it at least this probability."""
 
-SADDLE = 0.8
+SADDLE = 0.9
 """A maximum of the bumps counts if its saddle to any higher one is below this share of it."""
 
 LEAST_VALUE = 1e-4
