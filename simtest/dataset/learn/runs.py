@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from simtest.dataset.learn.training import Training
-from simtest.dataset.manifest import NAME
-from simtest.dataset.reader import open_manifest
 from simtest.errors import InputError
 
 try:
@@ -16,11 +14,11 @@ try:
 
     from simtest.dataset.learn.checkpoint import LAST, State, read_state
     from simtest.dataset.learn.engine import train
+    from simtest.dataset.learn.model_card import origin_of, validation_of, write_card
     from simtest.dataset.learn.page import write_page
     from simtest.dataset.learn.tasks import load_task
 except ImportError as error:
     raise InputError(f"training needs the package {error.name}: install the extra learn") from error
-from simtest.runtime import provenance
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.resources import shown
 from simtest.validation.runner import Progress
@@ -44,7 +42,8 @@ def run_training(training: Training, data: Path, out: Path, progress: Progress |
     data : Path
         Folder of a finished dataset.
     out : Path
-        Gets last.safetensors, best.safetensors, training.json, index.html, figures, and the task's own files.
+        Gets last.safetensors, best.safetensors, training.json, index.html, figures, and the task's own files:
+        model.onnx and its card, model.md.
     progress : callable, optional
         As in `simtest.dataset.learn.engine.train`. Whatever stops the training, the page shows the epochs done.
 
@@ -54,13 +53,7 @@ def run_training(training: Training, data: Path, out: Path, progress: Progress |
         If the task or the dataset cannot be used, or the folder holds another training.
     """
     task = load_task(training.task)
-    open_manifest(data)
-    about = {
-        "dataset": shown(data.name),
-        "dataset_sha256": provenance.file_hash(data / NAME),
-        "simtest": provenance.version(),
-        "training": training.model_dump_json(),
-    }
+    about = origin_of(training, data)
     with exclusive_folder(out), _one_thread():
         taught, judged = (task.examples(data, split, progress) for split in ("train", "validation"))
         try:
@@ -68,8 +61,9 @@ def run_training(training: Training, data: Path, out: Path, progress: Progress |
         finally:
             if (out / LAST).exists():
                 page = write_page(training, read_state(out / LAST), out, shown(data))
-        files = task.finish(trained.network, taught, judged, out, about)
-    return TrainingRun(trained.state, [page, *files])
+        files = task.finish(trained.network, taught, judged, out, about | validation_of(trained.state))
+        cards = [write_card(file) for file in files if file.suffix == ".onnx"]
+    return TrainingRun(trained.state, [page, *files, *cards])
 
 
 @contextmanager
