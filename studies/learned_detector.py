@@ -1,11 +1,13 @@
 """Highlights found by a trained network and by colour, on unseen anatomies: F1 by radius, on tissue and on real frames.
 
-`python -m studies.learned_detector DATA NETWORK [OTHER ...] [--split test] [--tissue COUNT] [--kept FOLDER] [--real]`
+`python -m studies.learned_detector DATA [NETWORK ...] [--split test] [--tissue COUNT] [--kept FOLDER] [--real]
+[--picture FILE]`
 
-DATA is a dataset with the field `visible`; NETWORK a file model.onnx, or `shipped`. `--tissue` adds so many frames of
-each tissue of `studies.detection.tissue`, with seeds of their own, kept in a folder; `--real` adds the real frames of
-`studies.detection.real_frames`. Each cell is F1 (found + missed, false); frames that a network refuses count as missed.
-Differences are paired: F1 of a network less F1 by colour, with an interval of 95 % from 2,000 draws of anatomies.
+DATA is a dataset with the field `visible`; NETWORK a file model.onnx, or `shipped`. `--picture` draws the frame of the
+split with the most highlights. `--tissue` adds so many frames of each tissue of `studies.detection.tissue`, with seeds
+of their own, kept in a folder; `--real` adds the real frames of `studies.detection.real_frames`. Each cell is F1
+(found + missed, false); frames that a network refuses count as missed. Differences are paired: F1 of a network less F1
+by colour, with an interval of 95 % from 2,000 draws of anatomies.
 """
 
 import argparse
@@ -14,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -33,7 +36,15 @@ from simtest.reconstruction.picture_detection import PictureDetection
 from studies.detection import tissue_frames
 from studies.detection.real_frames import outlined_frames
 from studies.detection.real_frames import score_frame as score_real
-from studies.detection.tissue import CLASSES, Counts, score_frame
+from studies.detection.tissue import (
+    CLASSES,
+    Counts,
+    detected_peaks,
+    false_ones,
+    matches,
+    needed_ones,
+    score_frame,
+)
 from studies.detection.tissue_frames import TISSUES, TissueFrame
 
 DRAWS, LEVEL = 2000, 0.95
@@ -172,6 +183,42 @@ def real(networks: dict[str, LearnedDetector]) -> None:
             print(f"{head} {score.covered:8.3f} {score.answered:8.3f} {score.iou:6.3f} {score.count:6d}  {where}")
 
 
+FOUND, MISSED, FALSE = (60, 220, 60), (40, 40, 255), (0, 230, 255)
+"""Colours of the picture, blue first."""
+
+SHOWN_PX, TIMES = 200, 2
+"""Side of the part of a frame that is drawn, around the middle of its highlights, and its magnification."""
+
+
+def draw(frames: Iterator[tuple[str, TissueFrame, Frame]], finders: dict[str, Finder], path: Path) -> None:
+    """Draw the frame with the most highlights: found ones, missed ones and false ones of each detector."""
+    _, labels, frame = max(frames, key=lambda each: np.count_nonzero(needed_ones(each[1])))
+    needed = needed_ones(labels)
+    height, width = labels.picture.shape[:2]
+    x, y = (np.median(labels.peaks[needed], axis=0) - SHOWN_PX / 2).astype(int)
+    x, y = int(np.clip(x, 0, width - SHOWN_PX)), int(np.clip(y, 0, height - SHOWN_PX))
+    part = np.ascontiguousarray(labels.picture[y : y + SHOWN_PX, x : x + SHOWN_PX, ::-1])
+    plain = cv2.resize(part, None, fx=TIMES, fy=TIMES, interpolation=cv2.INTER_NEAREST)
+    panels = [plain]
+    for name, find in finders.items():
+        found = find(frame)
+        points, _ = detected_peaks(() if isinstance(found, Failure) else found)
+        matched, _ = matches(labels, points)
+        hit = np.array([number in matched for number in range(len(needed))], dtype=bool)
+        panel = plain.copy()
+        for which, colour in ((needed & hit, FOUND), (needed & ~hit, MISSED)):
+            _circles(panel, labels.peaks[which] - [x, y], colour)
+        _circles(panel, points[false_ones(labels, points)] - [x, y], FALSE)
+        print(f"{path.name}, {labels.name}: panel {len(panels) + 1} is {name}")
+        panels.append(panel)
+    cv2.imwrite(str(path), np.hstack(panels), [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+def _circles(panel: npt.NDArray[np.uint8], points: npt.NDArray[np.float64], colour: tuple[int, int, int]) -> None:
+    for x, y in np.rint(points * TIMES).astype(int):
+        cv2.circle(panel, (int(x), int(y)), 4 * TIMES, colour, 1, cv2.LINE_AA)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -181,11 +228,14 @@ def main() -> None:
     parser.add_argument("--tissue", type=int, default=0)
     parser.add_argument("--kept", type=Path, default=Path("tissue_frames"))
     parser.add_argument("--real", action="store_true")
+    parser.add_argument("--picture", type=Path)
     given = parser.parse_args()
     networks = networks_of(given.networks)
     finders = {"colour": finder_of(ColourDetector(isolated=False))}
     finders |= {name: finder_of(each) for name, each in networks.items()}
     compare(f"{given.data.name}, {given.split}", dataset_frames(given.data, given.split), finders)
+    if given.picture:
+        draw(dataset_frames(given.data, given.split), finders, given.picture)
     if given.tissue:
         compare("tissue scenes", more_tissue(given.tissue, given.kept), finders)
     if given.real:

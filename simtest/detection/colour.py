@@ -9,7 +9,7 @@ from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.calibration.noise_estimate import MAD_TO_SIGMA, median
 from simtest.detection.detector import Detection
 from simtest.detection.judging import ColourDetection, detection_of, judge_spots, plateaus, tissue_spots
-from simtest.detection.light_split import fill, split_light
+from simtest.detection.light_split import SplitLight, fill, split_light
 from simtest.detection.spots import Spot, find_spots
 from simtest.detection.view_mask import View, find_view
 from simtest.errors import InputError
@@ -77,6 +77,36 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
         The pixels inside the view; default all.
     """
     light = split_light(linear, clipped, seen)
+    flat, white = plateaus(linear, clipped)
+    spots, candidates, bare = colour_spots(light, clipped, flat, seen)
+    spots, bright, foreign = tissue_spots(spots, candidates.shape)
+    # Only now: text is known by whole lines.
+    total = smooth(light.specular, SMOOTHING_PX, seen) + smooth(light.tissue, SMOOTHING_PX, seen)
+    spots = [spot for spot in spots if _stands_out(spot, total, bare)]
+    return judge_spots(spots, light, linear, bright, (flat, white), candidates & ~foreign, seen)
+
+
+def colour_spots(
+    light: SplitLight, clipped: Mask, flat: Mask, seen: Mask | None = None
+) -> tuple[list[Spot], Mask, Mask]:
+    """Find what shines in a frame, on tissue or not.
+
+    Parameters
+    ----------
+    light : SplitLight
+        The frame's two parts.
+    clipped, flat : ndarray of bool, shape (H, W)
+        Where a channel is clipped, and where all are.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the view; default all.
+
+    Returns
+    -------
+    list of Spot
+        The brightest first.
+    candidates, bare : ndarray of bool, shape (H, W)
+        Pixels that may belong to a highlight, and those away from all these.
+    """
     smoothed = smooth(light.specular, SMOOTHING_PX, seen)
     tissue = smooth(light.tissue, SMOOTHING_PX, seen)
     noise = NOISE_LEFT * light.noise
@@ -86,16 +116,11 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
     if seen is not None:
         candidates &= seen
     least = np.maximum(max(LEAST_SPECULAR, PEAK_NOISE * noise), ratio * tissue)
-    flat, white = plateaus(linear, clipped)
     spots = find_spots(smoothed, tissue, candidates, least, noise, flat)
     bare = cv2.dilate(candidates.astype(np.uint8), _WIDE) == 0
     if seen is not None:
         bare &= seen
-    spots = _brighter_than_around(spots, smoothed + tissue, bare, ratio)
-    spots, bright, foreign = tissue_spots(spots, candidates.shape)
-    # Only now: text is known by whole lines.
-    spots = [spot for spot in spots if _stands_out(spot, smoothed + tissue, bare)]
-    return judge_spots(spots, light, linear, bright, (flat, white), candidates & ~foreign, seen)
+    return _brighter_than_around(spots, smoothed + tissue, bare, ratio), candidates, bare
 
 
 def _texture(specular: Image, tissue: Image, clipped: Mask, seen: Mask | None) -> float:

@@ -52,10 +52,15 @@ class ColourDetection:
         return [highlight for highlight in self.highlights if highlight.is_isolated]
 
 
-def tissue_spots(spots: list[Spot], shape: tuple[int, ...]) -> tuple[list[Spot], Mask, Mask]:
-    """Return the spots that lie on no text or instrument, the pixels of all, and those of text and instruments."""
+def tissue_spots(
+    spots: list[Spot], shape: tuple[int, ...], shining: list[Spot] | None = None
+) -> tuple[list[Spot], Mask, Mask]:
+    """Return the spots that lie on no text or instrument, the pixels of all, and those of text and instruments.
+
+    `shining` are all spots of light on tissue or not, by which text and instruments are known; default `spots`.
+    """
     bright = _pixels(spots, shape)
-    foreign = find_foreign(bright)
+    foreign = find_foreign(bright if shining is None else bright | _pixels(shining, shape))
     if foreign.any():
         spots = [spot for spot in spots if not foreign[spot.crop][spot.mask].mean() > ON_FOREIGN]
     return spots, bright, foreign

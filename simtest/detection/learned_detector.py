@@ -9,7 +9,7 @@ import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.detection.basins import given_basins
-from simtest.detection.colour import SMOOTHING_PX
+from simtest.detection.colour import SMOOTHING_PX, colour_spots
 from simtest.detection.detector import Detection
 from simtest.detection.highlight_inputs import frame_statistics, highlight_inputs
 from simtest.detection.judging import ColourDetection, detection_of, judge_spots, plateaus, tissue_spots
@@ -129,7 +129,9 @@ class _Network:
         flat, white = plateaus(linear, clipped)
         climbed = np.asarray(smoothed * rise_of_clipped(flat), dtype=np.float32)
         spots = spots_of(given_basins(climbed, labels), smoothed, tissue)
-        spots, bright, foreign = tissue_spots(spots, clipped.shape)
+        # The network knows no text or instruments; where they shine, the split by colour sees all of it.
+        shining, _, _ = colour_spots(light, clipped, flat, seen)
+        spots, bright, foreign = tissue_spots(spots, clipped.shape, shining)
         return judge_spots(spots, light, linear, bright, (flat, white), (labels > 0) & ~foreign, seen)
 
     def _maps(self, inputs: Image) -> tuple[Image, Image, Image, int]:
