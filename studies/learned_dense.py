@@ -11,7 +11,7 @@ import argparse
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -133,7 +133,8 @@ def _score_spots(
 ) -> None:  # fmt: skip
     """Score estimators of the base's normal at the detected highlights of a frame, and pair them."""
     frame = sample_frame(sample)
-    estimators = {**load_estimators(["bisector", "learned_spot"]), **dense}
+    alone = {f"{name}, network alone": replace(each, reflection=False) for name, each in dense.items()}
+    estimators = {**load_estimators(["bisector", "learned_spot"]), **dense, **alone}
     found = run_pipeline(frame.encoded, frame.calibration, "colour", estimators, None, frame.smoothing_px)
     peaks = [each.patch.peak_px for each in found.specularities if not isinstance(each.patch, Failure)]
     if len(peaks) >= LEAST_HIGHLIGHTS:
