@@ -28,7 +28,7 @@ from simtest.estimators.shading_maps import shading_maps
 from simtest.estimators.spot_inputs import normal_of
 from simtest.geometry.vectors import angle_deg, tangent_basis, tangent_coordinates
 from simtest.reconstruction.pipeline import run_pipeline
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, IntArray
 
 STEP = 4
 """Each so many pixels along each axis one is scored."""
@@ -139,8 +139,8 @@ def _score_spots(
     peaks = [each.patch.peak_px for each in found.specularities if not isinstance(each.patch, Failure)]
     if len(peaks) >= LEAST_HIGHLIGHTS:
         for name, estimator in dense.items():
-            off = estimator.contradiction(frame, np.array(peaks, dtype=float))
-            scores[name].contradictions += [] if isinstance(off, Failure) else [off]
+            told = estimator.contradiction(frame, np.array(peaks, dtype=float))
+            scores[name].contradictions += [] if isinstance(told, Failure) else [told]
     errors: dict[str, dict[int, float]] = defaultdict(dict)
     inside: dict[str, list[float]] = defaultdict(list)
     for number, each in enumerate(found.specularities):
@@ -266,7 +266,7 @@ def _median_interval(values: dict[tuple[int, int], list[Array]]) -> tuple[float,
     return float(low), float(high)
 
 
-def _draws(count: int) -> Array:
+def _draws(count: int) -> IntArray:
     return np.random.default_rng(SEED).integers(count, size=(DRAWS, count))
 
 
