@@ -11,7 +11,7 @@ import argparse
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ from simtest.estimators.shading_maps import shading_maps
 from simtest.estimators.spot_inputs import normal_of
 from simtest.geometry.vectors import angle_deg, tangent_basis, tangent_coordinates
 from simtest.reconstruction.pipeline import run_pipeline
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, IntArray
 
 STEP = 4
 """Each so many pixels along each axis one is scored."""
@@ -133,13 +133,14 @@ def _score_spots(
 ) -> None:  # fmt: skip
     """Score estimators of the base's normal at the detected highlights of a frame, and pair them."""
     frame = sample_frame(sample)
-    estimators = {**load_estimators(["bisector", "learned_spot"]), **dense}
+    alone = {f"{name}, network alone": replace(each, reflection=False) for name, each in dense.items()}
+    estimators = {**load_estimators(["bisector", "learned_spot"]), **dense, **alone}
     found = run_pipeline(frame.encoded, frame.calibration, "colour", estimators, None, frame.smoothing_px)
     peaks = [each.patch.peak_px for each in found.specularities if not isinstance(each.patch, Failure)]
     if len(peaks) >= LEAST_HIGHLIGHTS:
         for name, estimator in dense.items():
-            off = estimator.contradiction(frame, np.array(peaks, dtype=float))
-            scores[name].contradictions += [] if isinstance(off, Failure) else [off]
+            told = estimator.contradiction(frame, np.array(peaks, dtype=float))
+            scores[name].contradictions += [] if isinstance(told, Failure) else [told]
     errors: dict[str, dict[int, float]] = defaultdict(dict)
     inside: dict[str, list[float]] = defaultdict(list)
     for number, each in enumerate(found.specularities):
@@ -265,7 +266,7 @@ def _median_interval(values: dict[tuple[int, int], list[Array]]) -> tuple[float,
     return float(low), float(high)
 
 
-def _draws(count: int) -> Array:
+def _draws(count: int) -> IntArray:
     return np.random.default_rng(SEED).integers(count, size=(DRAWS, count))
 
 

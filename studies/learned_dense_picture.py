@@ -58,7 +58,7 @@ def _panels(sample: Sample, estimator: LearnedDense) -> Iterator[Picture]:
     )
     yield _small(sample.images["image"])
     yield _small(_directions(true))
-    yield _small(_directions(maps.normal))
+    yield _small(_directions(maps.normal.astype(float)))
     yield _small(_shares(error / ERROR_END_DEG))
     yield _small(_shares(deviation / DEVIATION_END_DEG))
 
