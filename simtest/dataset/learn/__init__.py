@@ -4,7 +4,7 @@
 
 `runs` trains a network as a file of `training` says: `engine` is the loop, with `checkpoint` and `page`, and knows a
 task of `tasks` alone. The task of `spot_task` learns from the highlights that `spots` reads; `spot_export` writes its
-network for `simtest.estimators.learned_spot`.
+network for `simtest.estimators.learned_spot`, with what `calibration` fits, through `onnx_export`.
 
 `crops` and `network` are those of docs/gallery/learning.md: smooth colons, without uncertainty.
 """
