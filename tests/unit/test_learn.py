@@ -112,7 +112,7 @@ def test_the_calibration_of_a_sample_reconstructs_its_picture(made):
             meta["camera"]["height"],
         )
         # The picture is sRGB, whatever the sensor's frame was.
-        assert calibration.response.type == "srgb"
+        assert calibration.response.kind == "srgb"
         found = simtest.reconstruct(record["image"], calibration, ["brightest_point"], detector="peaks")
         errors.append(
             angle_deg(found[0].estimates["brightest_point"].normal, np.array(meta["highlights"][0]["normal"]))
