@@ -4,7 +4,7 @@
 chooses the epoch on two, and writes model.onnx, which runs by its name wherever an estimator does; the last two test
 it. No GPU is needed, but the extra learn: pip install ".[learn]" (docs/start/install.md says how without CUDA).
 
-Picture: a test frame with the network's normals, and all errors. Takes 90 s of processor time.
+Picture: a test frame with the network's normals, and all errors. Takes 100 s of processor time.
 """
 
 import subprocess
@@ -26,11 +26,9 @@ from torch.utils.data import DataLoader  # noqa: E402 (not before its absence is
 
 folder, trained = chosen.out / "11_dataset", chosen.out / "11_training"
 few = ["--samples=6", "--set=samples_per_anatomy=2"] if chosen.quick else []
-for command in (
-    ["dataset", "highlights_tiny", f"--out={folder}", *few],
-    ["train", "spot_normals", str(folder), f"--out={trained}", "--set=epochs=40"],
-):
-    subprocess.run([sys.executable, "-m", "simtest", *command], check=True)
+command = [sys.executable, "-m", "simtest"]
+subprocess.run([*command, "dataset", "highlights_tiny", f"--out={folder}", *few], check=True)
+subprocess.run([*command, "train", "spot_normals", str(folder), f"--out={trained}", "--set=epochs=40"], check=True)
 # What a loop of your own would read.
 batch = next(iter(DataLoader(Samples(folder, fields=["image", "normal_base"], shuffle=20), batch_size=2)))
 print({name: tuple(values.shape) for name, values in batch.items() if name != "meta"})

@@ -104,8 +104,10 @@ def _real(
     agreed: list[real.Agreement] = []
     for frame in frames:
         for way, picture, calibration in real.ways(frame):
-            at = real.specularities(picture, calibration, normals)
-            for name in normals:
+            # Without lights the classical ones have nothing to say either.
+            asked = {name: each for name, each in normals.items() if way == real.TOLD or name in learned}
+            at = real.specularities(picture, calibration, asked)
+            for name in asked:
                 count = real.refusals(at, name)
                 why = "; ".join(f"{n} {reason}" for reason, n in count.most_common() if reason != OK) or "0"
                 yield f"| {frame.name} | {way} | {name} | {count.total()} | {count[OK]} | {why} |"

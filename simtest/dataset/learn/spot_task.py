@@ -55,6 +55,7 @@ class SpotNormals:
     """The task (see `simtest.dataset.learn.tasks.Task`)."""
 
     name = "spot_normals"
+    evaluated_at_once = 1024
 
     def examples(self, folder: Path, split: str, progress: Progress | None = None) -> Batch:
         """Read the examples of a split."""
