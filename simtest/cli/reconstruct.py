@@ -208,9 +208,10 @@ def _print_counts(record: "PictureRecord", image: Path) -> None:
     """Print how many highlights were found, how many have a normal, and what the others are."""
     from simtest.reconstruction.borders import BORDERED
     from simtest.reconstruction.explanations import kinds_counted
+    from simtest.reconstruction.picture import REFUSED
 
     for warning in record.warnings:
-        if warning.startswith(BORDERED):
+        if warning.startswith((BORDERED, REFUSED)):
             print(f"note: {warning}")
 
     spots, others = record.specularities, record.other_highlights

@@ -55,16 +55,8 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
         ... and lower than it by more than this.
     """
     shape = values.shape
-    # pixels of the mask, numbered; a margin of one pixel spares the borders
-    number = np.full((shape[0] + 2, shape[1] + 2), -1, dtype=np.int64)
-    rows, columns = rows_and_columns(mask)
+    rows, columns, height, order, ends = _pixels_of(values, mask)
     count = len(rows)
-    number[rows + 1, columns + 1] = np.arange(count)
-    height = values[rows, columns].astype(np.float64)
-    # A strict order, so that a plateau has a way up too.
-    order = np.empty(count, dtype=np.int64)
-    order[np.argsort(height, kind="stable")] = np.arange(count)
-    ends = [number[rows + 1 + down, columns + 1 + right] for down, right in _NEIGHBOURS]
     pixels = np.arange(count)
     # steepest ascent, and then each pixel's summit
     up = _highest_neighbour(order, pixels, ends)
@@ -91,6 +83,45 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     labels[rows, columns] = mine[basin] + 1
     pairs, low = _highest_of_pairs(mine[first], mine[second], saddle, order, len(kept))
     return Basins(rows[tops[kept]], columns[tops[kept]], labels, pairs, np.stack([rows[low], columns[low]], axis=1))
+
+
+def given_basins(values: Image, labels: Index) -> Basins:
+    """Return the basins of a frame whose pixels are shared out already.
+
+    Parameters
+    ----------
+    values : ndarray, shape (H, W)
+        What is climbed: specular light.
+    labels : ndarray of int, shape (H, W)
+        Number of the basin that a pixel belongs to, from 1; 0 where none. The summit of each is its highest pixel.
+    """
+    rows, columns, _, order, ends = _pixels_of(values, labels != 0)
+    # From the highest pixel down the first one of each basin is its summit.
+    down = np.argsort(-order)
+    _, first = np.unique(labels[rows, columns][down], return_index=True)
+    tops = down[np.sort(first)]
+    rank = np.zeros(int(labels.max(initial=0)) + 1, dtype=np.int64)
+    rank[labels[rows[tops], columns[tops]]] = np.arange(len(tops))
+    mine = rank[labels[rows, columns]]
+    made = np.zeros(labels.shape, dtype=np.int64)
+    made[rows, columns] = mine + 1
+    first, second, low = _saddles(mine, order, np.arange(len(rows)), ends, len(tops))
+    pairs, saddles = np.stack([first, second], axis=1), np.stack([rows[low], columns[low]], axis=1)
+    return Basins(rows[tops], columns[tops], made, pairs, saddles)
+
+
+def _pixels_of(values: Image, mask: Mask) -> tuple[Index, Index, Array, Index, list[Index]]:
+    """Return rows, columns, heights and strict order of a mask's pixels, and the numbers of their neighbours, or -1."""
+    # a margin of one pixel spares the borders
+    number = np.full((mask.shape[0] + 2, mask.shape[1] + 2), -1, dtype=np.int64)
+    rows, columns = rows_and_columns(mask)
+    count = len(rows)
+    number[rows + 1, columns + 1] = np.arange(count)
+    height = values[rows, columns].astype(np.float64)
+    # A strict order, so that a plateau has a way up too.
+    order = np.empty(count, dtype=np.int64)
+    order[np.argsort(height, kind="stable")] = np.arange(count)
+    return rows, columns, height, order, [number[rows + 1 + down, columns + 1 + right] for down, right in _NEIGHBOURS]
 
 
 def _numbered(values: Index, count: int) -> tuple[Index, Index]:

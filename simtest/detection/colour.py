@@ -1,28 +1,22 @@
 """`colour`: highlights of a colour frame by the tissue's own colour, and which of them are isolated."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.calibration.noise_estimate import MAD_TO_SIGMA, median
-from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
-from simtest.detection.blobs import MIN_SHAPE_PX, SINGLE, Highlight, Kind, classify
 from simtest.detection.detector import Detection
-from simtest.detection.foreign import find_foreign
+from simtest.detection.judging import ColourDetection, detection_of, judge_spots, plateaus, tissue_spots
 from simtest.detection.light_split import SplitLight, fill, split_light
 from simtest.detection.spots import Spot, find_spots
 from simtest.detection.view_mask import View, find_view
 from simtest.errors import InputError
 from simtest.geometry import Camera, Image, Mask, smooth
-from simtest.geometry.pixel_sets import rows_and_columns
 
 SMOOTHING_PX = 0.35
 """Smoothing before highlights are told apart; a wider one melts small ones."""
-
-SHAPE_PX = 0.7
-"""The same before their shape is measured."""
 
 NOISE_LEFT = 0.8
 """What this smoothing leaves of white noise, 1 / (2 sqrt(pi) width)."""
@@ -57,45 +51,13 @@ BESIDE_PX, NARROW_PX = 6, 64
 """Tissue is beside a highlight within this distance of the box of its pixels. With more pixels than the second number a
 spot is no edge, and so wide that shading matters."""
 
-DIM, CLEARLY_CLIPPED = 0.8, 0.1
-"""Where the normal bisects light and camera, one lobe is as bright at every distance, over the tissue beside it. So
-where more than the second share of one highlight is clipped, a resolved one below the first share of its light is
-dim."""
-
 _WIDE = np.ones((5, 5), dtype=np.uint8)
 
-FOOT_REACH = 0.8
-"""A highlight's foot reaches this share of its radius at half height beyond that: a Gaussian's at a tenth of it."""
-
-PLATEAU, GLARE = 0.97, 0.7
-"""All channels are clipped above this share of the clipped value, and where a spot's shape is judged above the second:
-demosaicing and JPEG round them off."""
-
-ON_FOREIGN = 0.5
-"""A spot of which more than this share lies on text or an instrument is none of the tissue's."""
-
 FOOT = 0.4
-"""Its pixels are searched for down to this share of that."""
+"""A highlight's pixels are searched for down to this share of what its peak must have."""
 
 LEAST_SPECULAR = 0.02
 """Least specular light, share of full scale: two steps of an 8-bit sRGB picture at mid tones."""
-
-
-@dataclass(frozen=True)
-class ColourDetection:
-    """The light of a colour frame in its two parts, the pixels of highlights of every kind, shape (H, W), and these.
-
-    The highlights come brightest first.
-    """
-
-    light: SplitLight
-    mask: Mask
-    highlights: list[Highlight]
-
-    @property
-    def isolated(self) -> list[Highlight]:
-        """The highlights that may carry one normal."""
-        return [highlight for highlight in self.highlights if highlight.is_isolated]
 
 
 def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> ColourDetection:
@@ -115,6 +77,36 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
         The pixels inside the view; default all.
     """
     light = split_light(linear, clipped, seen)
+    flat, white = plateaus(linear, clipped)
+    spots, candidates, bare = colour_spots(light, clipped, flat, seen)
+    spots, bright, foreign = tissue_spots(spots, candidates.shape)
+    # Only now: text is known by whole lines.
+    total = smooth(light.specular, SMOOTHING_PX, seen) + smooth(light.tissue, SMOOTHING_PX, seen)
+    spots = [spot for spot in spots if _stands_out(spot, total, bare)]
+    return judge_spots(spots, light, linear, bright, (flat, white), candidates & ~foreign, seen)
+
+
+def colour_spots(
+    light: SplitLight, clipped: Mask, flat: Mask, seen: Mask | None = None
+) -> tuple[list[Spot], Mask, Mask]:
+    """Find what shines in a frame, on tissue or not.
+
+    Parameters
+    ----------
+    light : SplitLight
+        The frame's two parts.
+    clipped, flat : ndarray of bool, shape (H, W)
+        Where a channel is clipped, and where all are.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the view; default all.
+
+    Returns
+    -------
+    list of Spot
+        The brightest first.
+    candidates, bare : ndarray of bool, shape (H, W)
+        Pixels that may belong to a highlight, and those away from all these.
+    """
     smoothed = smooth(light.specular, SMOOTHING_PX, seen)
     tissue = smooth(light.tissue, SMOOTHING_PX, seen)
     noise = NOISE_LEFT * light.noise
@@ -124,33 +116,11 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
     if seen is not None:
         candidates &= seen
     least = np.maximum(max(LEAST_SPECULAR, PEAK_NOISE * noise), ratio * tissue)
-    flat, white = _all_clipped(linear, clipped)
     spots = find_spots(smoothed, tissue, candidates, least, noise, flat)
     bare = cv2.dilate(candidates.astype(np.uint8), _WIDE) == 0
     if seen is not None:
         bare &= seen
-    spots = _brighter_than_around(spots, smoothed + tissue, bare, ratio)
-    bright = _pixels(spots, candidates.shape)
-    foreign = find_foreign(bright)
-    if foreign.any():
-        spots = [spot for spot in spots if not foreign[spot.crop][spot.mask].mean() > ON_FOREIGN]
-    # Only now: text is known by whole lines.
-    spots = [spot for spot in spots if _stands_out(spot, smoothed + tissue, bare)]
-    made = classify(spots, smooth(light.specular, SHAPE_PX, seen), light, linear, bright, flat, white, seen)
-    kept = [(spot, highlight) for spot, highlight in zip(spots, made, strict=True) if highlight is not None]
-    # pixels that show a highlight
-    mask = _pixels([spot for spot, _ in kept], candidates.shape)
-    more = (light.specular >= SPECULAR_DIFFUSE_RATIO * light.tissue) & candidates & ~foreign
-    mask |= _feet([spot for spot, _ in kept], mask, light.specular, more)
-    return ColourDetection(light, mask, _with_dim_marked([highlight for _, highlight in kept], light))
-
-
-def _pixels(spots: list[Spot], shape: tuple[int, ...]) -> Mask:
-    """Return the pixels of spots."""
-    mask = np.zeros(shape, dtype=bool)
-    for spot in spots:
-        mask[spot.crop] |= spot.mask
-    return mask
+    return _brighter_than_around(spots, smoothed + tissue, bare, ratio), candidates, bare
 
 
 def _texture(specular: Image, tissue: Image, clipped: Mask, seen: Mask | None) -> float:
@@ -191,55 +161,6 @@ def _stands_out(spot: Spot, total: Image, bare: Mask) -> bool:
     return bool(total[beside].max(where=bare[beside], initial=0) <= STANDS_OUT * total[row, column])
 
 
-def _with_dim_marked(highlights: list[Highlight], light: SplitLight) -> list[Highlight]:
-    """Return highlights of which those are marked that are dim beside clipped ones."""
-    pixels = [highlight.region.peak[::-1] for highlight in highlights]
-    total = [float(light.specular[pixel]) + float(light.tissue[pixel]) for pixel in pixels]
-    shining = [own for own, each in zip(total, highlights, strict=True) if each.clipped > CLEARLY_CLIPPED]
-    least = DIM * max(shining, default=0.0)
-    return [
-        replace(each, dim=True) if each.area_px >= MIN_SHAPE_PX and own < least else each
-        for own, each in zip(total, highlights, strict=True)
-    ]
-
-
-def _feet(spots: list[Spot], mask: Mask, specular: Image, more: Mask) -> Mask:
-    """Return which of more pixels belong to the nearest spot: near it, and not far below its peak."""
-    if not spots:
-        return mask
-    number = np.zeros(mask.shape, dtype=np.int32)
-    for i, spot in enumerate(spots):
-        number[spot.crop][spot.mask] = i
-    # Ways between pixels stay inside the box around all of them.
-    x, y, width, height = cv2.boundingRect((mask | more).view(np.uint8))
-    box = np.s_[y : y + height, x : x + width]
-    away, nearest = cv2.distanceTransformWithLabels(
-        (~mask[box]).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    owner = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
-    owner[nearest[mask[box]]] = number[mask]
-    down, right = rows_and_columns((more & ~mask)[box])
-    rows, columns = down + y, right + x
-    mine = owner[nearest[down, right]]
-    reach = np.array([FOOT_REACH * np.sqrt(spot.area_px / np.pi) + 1 for spot in spots])
-    peak = np.array([spot.value for spot in spots])
-    near = (away[down, right] <= reach[mine]) & (specular[rows, columns] >= SPECULAR_PEAK_SHARE * peak[mine])
-    feet = np.zeros(mask.shape, dtype=bool)
-    feet[rows[near], columns[near]] = True
-    return feet
-
-
-def _all_clipped(linear: Image, clipped: Mask) -> tuple[Mask, Mask]:
-    """Return where all channels are clipped, and where they are nearly so."""
-    if not clipped.any():
-        return clipped, clipped
-    channels = cv2.split(np.ascontiguousarray(linear))
-    least = cv2.min(cv2.min(channels[0], channels[1]), channels[2])
-    # the least value that a clipped channel has
-    full = float(linear[clipped].max(axis=1).min())
-    return np.asarray(least >= PLATEAU * full), np.asarray(least >= GLARE * full)
-
-
 @dataclass(frozen=True)
 class ColourDetector:
     """Highlights by the tissue's own colour (`detect_colour`).
@@ -260,11 +181,7 @@ class ColourDetector:
             raise InputError(f"frame has shape {frame.encoded.shape}: detection by colour takes (H, W, 3)")
         view = find_view(frame.encoded) if frame.seen is None else View(frame.seen)
         found = detect_colour(frame.channels, frame.clipped, view.seen)
-        kinds = (*SINGLE, Kind.CLUSTER) if self.isolated else tuple(Kind)
-        taken = tuple(highlight for highlight in found.highlights if highlight.kind in kinds)
-        others = tuple(highlight for highlight in found.highlights if highlight.kind not in kinds)
-        specular = replace(frame, seen=view.seen, light=found.light.specular)
-        return Detection(tuple(highlight.region for highlight in taken), specular, taken, others, view)
+        return detection_of(found, frame, view, self.isolated)
 
 
 colour = ColourDetector()

@@ -7,7 +7,7 @@ from simtest.calibration import Frame, Priors
 from simtest.detection.blobs import Highlight
 from simtest.detection.regions import Region
 from simtest.detection.view_mask import WHOLE, View
-from simtest.errors import InputError
+from simtest.errors import Failure, InputError
 from simtest.geometry import Camera
 from simtest.runtime.entry_points import EntryPointGroup
 from simtest.runtime.resources import shown
@@ -30,6 +30,8 @@ class Detection:
         How each region was judged, and what was left out; empty where the detector judges none.
     view : View
         The part of the picture that shows tissue, where the detector looks for it.
+    refusal : Failure, optional
+        Why the detector does not answer for this frame; there are no regions then. None: it does.
     """
 
     regions: tuple[Region, ...]
@@ -37,6 +39,7 @@ class Detection:
     highlights: tuple[Highlight, ...] = ()
     others: tuple[Highlight, ...] = ()
     view: View = WHOLE
+    refusal: Failure | None = None
 
     __repr__ = short_repr
 

@@ -80,15 +80,29 @@ def find_spots(
     flat : ndarray of bool, shape (H, W), optional
         Pixels where all channels are clipped.
     """
-    climbed, base = specular, tissue
-    if flat is not None and flat.any():
-        # Light that is clipped is the higher the farther from the rim.
-        depth = cv2.distanceTransform(flat.astype(np.uint8), cv2.DIST_L2, 5)
-        rise = (1 + depth) ** RISE
-        climbed, base = specular * rise, tissue * rise
-    basins = find_basins(climbed, mask, base, SADDLE, SADDLE_NOISE * noise)
+    rise = rise_of_clipped(flat)
+    basins = find_basins(specular * rise, mask, tissue * rise, SADDLE, SADDLE_NOISE * noise)
+    return [spot for spot in spots_of(basins, specular, tissue) if spot.value >= least[_at(spot)]]
+
+
+def rise_of_clipped(flat: Mask | None) -> Image | float:
+    """Return the factor by which light is taken to rise where all channels are clipped: the farther from the rim."""
+    if flat is None or not flat.any():
+        return 1.0
+    depth = cv2.distanceTransform(flat.astype(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray((1 + depth) ** RISE)
+
+
+def _at(spot: Spot) -> tuple[int, int]:
+    return int(spot.peaks[0][1]), int(spot.peaks[0][0])
+
+
+def spots_of(basins: Basins, specular: Image, tissue: Image) -> list[Spot]:
+    """Return the spots of basins, the brightest first: basins that the isophote at half height joins are one cluster.
+
+    The two parts of the light, shape (H, W), are smoothed.
+    """
     peak = specular[basins.rows, basins.columns].astype(np.float64)
-    high = peak >= least[basins.rows, basins.columns]
     saddle = specular[basins.saddles[:, 0], basins.saddles[:, 1]].astype(np.float64)
     groups, touching = _groups(peak, basins.pairs, saddle)
     number, level = np.full(len(peak), -1), HIGHLIGHT_ISOVALUE * peak
@@ -96,8 +110,7 @@ def find_spots(
         number[group] = i
         level[group] = level[group[0]]
     melted = _melted(basins, specular + tissue, number, len(groups))
-    spots = _cut(specular, basins, level, number, groups, touching, melted)
-    return [spot for spot, group in zip(spots, groups, strict=True) if high[group[0]]]
+    return _cut(specular, basins, level, number, groups, touching, melted)
 
 
 def _groups(peak: Array, pairs: Index, saddle: Array) -> tuple[list[list[int]], list[bool]]:

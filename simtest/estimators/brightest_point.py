@@ -10,7 +10,7 @@ from simtest.conventions import CONE_AXIS_ISOVALUES, HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
 from simtest.estimators.family_fit import fit_isophote_family
-from simtest.estimators.highlight_fit import fit_highlight, fit_highlights, fit_small
+from simtest.estimators.highlight_fit import Fitted, fit_highlight, fit_highlights, fit_small
 from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate
@@ -25,34 +25,51 @@ GAP_SHARE, RIPPLES = 1.5, 7.0
 the truth, and over the ripples (`IsophoteFamily.ripple_error`). All three were fitted to random fields of glints that
 no published figure uses (docs/concepts/uncertainty.md)."""
 
+TOP_ISOVALUE = 0.9
+"""Where the border cuts even the isophote at this value, it may cut off the peak."""
+
 
 @dataclass(frozen=True)
 class BrightestPoint:
     """The reversed sightline through the peak of the smoothed patch.
 
-    What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
+    It assumes that the peak is in the picture. What the priors leave open is added to the budget
+    (`simtest.estimators.prior_parts`).
     """
 
     def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
         """Fit the isophotes of several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
         fit_highlights(patches, camera, CONE_AXIS_ISOVALUES)
 
-    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate:
+    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`).
 
         The estimate has one candidate and looks at the peak. It has the flags of `cone_axis` for the isophote at
-        t = 0.5: where that runs into the border the peak itself may be cut off, and along a streak it may lie anywhere.
-        In a highlight too small for isophotes it looks at the fitted centre instead, flagged ``unresolved``. The budget
-        follows from the isophotes; without any, no uncertainty is stated.
+        t = 0.5; along a streak the peak may lie anywhere. Where the border of the region, the frame or the view cuts
+        that isophote, the highlight's peak may be outside: the result is a Failure where no arcs can be fitted either,
+        or where the cut reaches up to `TOP_ISOVALUE`. In a highlight too small for isophotes it looks at the fitted
+        centre instead, flagged ``unresolved``. The budget follows from the isophotes; without any, no uncertainty is
+        stated.
         """
         if (spot := fit_small([patch], camera)[0]) is not None:
             return add_untold_parts(spot.estimate(), camera, priors, spot)
         normal = -camera.unproject(patch.peak_px)
         whole = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
+        if (cut := _cut_off(patch, whole)) is not None:
+            return cut
         family = whole if isinstance(whole, IsophoteFamily) else None
         budget = None if family is None else _budget(family)
         estimate = Estimate(normal, normal[None], patch.peak_px, flags=_flags(patch, camera, family), budget=budget)
         return add_untold_parts(estimate, camera, priors, family)
+
+
+def _cut_off(patch: Patch, family: Fitted) -> Failure | None:
+    """Return a Failure where the peak may lie outside what the picture shows of the highlight."""
+    top = HIGHLIGHT_ISOVALUE if isinstance(family, Failure) else TOP_ISOVALUE
+    # Level sets are nested: where the lower one is closed, so is the upper one, and the lower one is known already.
+    if patch.area_px(HIGHLIGHT_ISOVALUE) is not None or patch.area_px(top) is not None:
+        return None
+    return Failure(Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {top:g}: the border may cut it off")
 
 
 def _flags(patch: Patch, camera: Camera, family: IsophoteFamily | None) -> tuple[str, ...]:

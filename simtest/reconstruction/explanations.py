@@ -72,8 +72,8 @@ PARTS = {
 UNTOLD_ERROR = {
     "light_offset": "a known light is not at the camera, which this method ignores, so it cannot tell its error",
     "circle_pose": "circle_pose states an error on surfaces that are known to be planes alone",
-    "no_isophote": "no whole isophote is left around the peak, and the error follows from the isophotes",
-    "other": "the noise of the picture could not be estimated, or the estimator states no error",
+    "other": "the noise of the picture could not be estimated, fewer than two isophotes are ellipses, or the estimator "
+    "states no error",
 }
 """Why an estimate has no ±."""
 
@@ -96,10 +96,7 @@ def why_no_error(name: str, result: Estimate) -> str:
         return ""
     if "light_offset" in result.flags:
         return UNTOLD_ERROR["light_offset"]
-    if name == "circle_pose":
-        return UNTOLD_ERROR["circle_pose"]
-    own = name in ("brightest_point", "cone_axis", "curved", "bisector")
-    return UNTOLD_ERROR["no_isophote" if own and not result.isophotes and "partial_arc" in result.flags else "other"]
+    return UNTOLD_ERROR["circle_pose" if name == "circle_pose" else "other"]
 
 
 def kind_name(kind: str | None) -> str:

@@ -22,6 +22,9 @@ TARGETS = ("fine", "base")
 
 NOTHING = "no specularity found that stands out of the noise and has the shape of a highlight; try --all or --roi"
 
+REFUSED = "the detector does not answer for this picture"
+"""Begins the warning of a picture that the detector refuses."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -151,6 +154,8 @@ def reconstruct_values(
     # Any other extent is that of the whole picture, borders included.
     across_all = options.fov_deg is not None and options.fov_of != "view"
     bordered = border_note(picture, view) if across_all else ""
+    refusal = made.detection.refusal
+    refused = f"{REFUSED} ({choices.detector}): {refusal.detail}" if refusal else ""
     # describe
     return PictureRecord(
         image=name,
@@ -158,7 +163,7 @@ def reconstruct_values(
         encoding=choices.encoding,
         detector=choices.detector,
         view=view,
-        warnings=[*cautions, bordered] if bordered else list(cautions),
+        warnings=[*cautions, *filter(None, (bordered, refused))],
         specularities=describe(made, calibration.camera, options.target),
         other_highlights=made.detection.others,
         assumed=choices.assumed,

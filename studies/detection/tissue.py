@@ -66,14 +66,17 @@ def size_class(radius: float) -> int:
     return int(np.searchsorted(CLASSES, radius, side="right")) - 1
 
 
-def score_frame(frame: TissueFrame, highlights: Sequence[Highlight], counts: dict[int, Counts]) -> None:
-    """Add a frame's counts by class.
+def needed_ones(frame: TissueFrame) -> npt.NDArray[np.bool_]:
+    """Return which visible highlights need be found: those 10 noise deviations high, clear of the border."""
+    return (frame.clearness >= HIGHLIGHT_CONTRAST_SIGMA) & frame.whole & (frame.radii >= CLASSES[0])
 
-    Those that need be found stand 10 noise deviations high, clear of the border. A detection on another one counts
-    neither as right nor as wrong. Each detected peak matches the nearest highlight whose pixels it is on, each once.
+
+def matches(frame: TissueFrame, points: Floats) -> tuple[dict[int, int], npt.NDArray[np.int64]]:
+    """Match detected peaks, px, shape (N, 2), with the visible highlights of a frame.
+
+    Each peak matches the nearest highlight whose pixels it is on, each once. Returns the peak by highlight, and for
+    each peak the highlight that it is on, or -1.
     """
-    points, radii = detected_peaks(highlights)
-    needed = (frame.clearness >= HIGHLIGHT_CONTRAST_SIGMA) & frame.whole & (frame.radii >= CLASSES[0])
     # candidates: pairs of a detected peak and a highlight whose pixels it is on
     outside = (frame.regions == 0).astype(np.uint8)
     away, nearest = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
@@ -90,18 +93,32 @@ def score_frame(frame: TissueFrame, highlights: Sequence[Highlight], counts: dic
     for _, i, truth in sorted(pairs):
         if truth not in matched:
             matched[truth] = i
-    taken = set(matched.values())
-    for truth in np.flatnonzero(needed):
+    return matched, on
+
+
+def false_ones(frame: TissueFrame, points: Floats) -> npt.NDArray[np.bool_]:
+    """Return which detected peaks are false: on no highlight, or the further ones on one that need be found."""
+    matched, on = matches(frame, points)
+    needed, taken = needed_ones(frame), set(matched.values())
+    return np.array([i not in taken and not (on[i] >= 0 and not needed[on[i]]) for i in range(len(points))], dtype=bool)
+
+
+def score_frame(frame: TissueFrame, highlights: Sequence[Highlight], counts: dict[int, Counts]) -> None:
+    """Add a frame's counts by class.
+
+    A detection on a highlight that need not be found (`needed_ones`) counts neither as right nor as wrong.
+    """
+    points, radii = detected_peaks(highlights)
+    matched, _ = matches(frame, points)
+    for truth in np.flatnonzero(needed_ones(frame)):
         key = size_class(frame.radii[truth])
         if int(truth) in matched:
             counts[key].hits += 1
         else:
             counts[key].missed += 1
             counts[key].clustered += _in_cluster(frame.peaks[truth], highlights)
-    for i in range(len(points)):
-        optional = on[i] >= 0 and not needed[on[i]]
-        if i not in taken and not optional:
-            counts[max(size_class(radii[i]), 0)].false += 1
+    for i in np.flatnonzero(false_ones(frame, points)):
+        counts[max(size_class(radii[i]), 0)].false += 1
 
 
 def _in_cluster(peak: Floats, highlights: Sequence[Highlight]) -> bool:

@@ -88,7 +88,7 @@ def test_a_field_of_view_alone_leaves_all_of_it_open():
     ]  # fmt: skip
     assert "uniform from 0 to 6 mm" in str(fine[0])
     assert all(each.how_to_narrow for each in fine)
-    assert assumptions(calibration, None, "base")[-2].distribution == "uniform from 0 to 8 deg an axis"
+    assert assumptions(calibration, None, "base")[-2].distribution == "uniform from 0 to 9 deg an axis"
     assert "response" not in {each.what for each in assumptions(calibration, "linear", "fine")}
 
 
@@ -246,9 +246,9 @@ def test_a_picture_of_which_nothing_is_told(tmp_path, target):
     assert f"mostly {max(deviations, key=deviations.get)}" in found["best_because"]
     assert document["stated"]["count"] == 1
     assert next(iter(document["stated"]["parts_deg"])) == max(deviations, key=deviations.get)
-    # Not 0.009 deg: between a few deg and what the priors allow.
+    # Not 0.009 deg: between a few deg and what the priors allow, of which the relief is 12.7 deg and the light 5.5.
     stated = np.degrees(np.sqrt(np.trace(found["estimates"]["cone_axis"]["covariance"])))
-    assert 4 < stated < (7 if target == "fine" else 12)
+    assert 4 < stated < (7 if target == "fine" else 15)
     assert [each["what"] for each in document["assumed"]][:2] == ["light", "distance of the tissue"]
     with pytest.raises(InputError, match="--target top"):
         Options(fov_deg=53.0, target="top")

@@ -9,6 +9,7 @@ from simtest.calibration import LIGHT_AT_CAMERA, Calibration, LogUniform, Normal
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.bisector import bisector
+from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.budget import dominant
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
@@ -249,6 +250,30 @@ def test_a_highlight_cut_by_the_border_is_flagged():
     assert "partial_arc" not in cone_axis.estimate(part, CAMERA).flags
     cut = Patch.cut(np.asarray(patch.values), (55, 0, 95, 120))
     assert {"missing_isovalues", "partial_arc"} <= set(cone_axis.estimate(cut, CAMERA).flags)
+
+
+@pytest.mark.parametrize(
+    ("first_column", "reason"),
+    [
+        (45, None),  # whole
+        (90, None),  # the isophote at 0.5 is cut, that at 0.9 is not
+        (100, Reason.NO_CLOSED_ISOPHOTE),  # arcs can be fitted, but the way up to the peak is cut
+        (106, Reason.NO_CLOSED_ISOPHOTE),  # the peak is outside
+        (125, Reason.NO_CLOSED_ISOPHOTE),  # a flank alone: nothing can be fitted
+    ],
+)
+def test_brightest_point_refuses_a_peak_that_the_border_may_cut_off(first_column, reason):
+    """The lobe's peak is at column 103.3, its isophotes at 0.5 and 0.9 reach 16.5 and 6.4 px from there."""
+    smoothed = np.zeros((160, 200))
+    whole = lobe()
+    smoothed[20:140, 30:180] = whole.values
+    patch = Patch.cut(smoothed, (first_column, 20, 180 - first_column, 120), smoothing_px=2.0)
+    result = brightest_point.estimate(patch, CAMERA)
+    if reason is None:
+        assert angle_deg(result.normal, -CAMERA.unproject((103.3, 76.8))) < 0.1
+        assert ("partial_arc" in result.flags) == (first_column > 80)
+    else:
+        assert (type(result), result.reason) == (Failure, reason)
 
 
 def test_a_choice_without_known_noise_has_no_margin():

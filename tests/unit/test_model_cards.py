@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -74,7 +75,7 @@ class TestMade:
         from simtest.spec import load_dataset
 
         folder = tmp_path_factory.mktemp("cards") / "tiny"
-        values = {"samples": 6, "samples_per_anatomy": 1, "estimators": [], "title": "Small | frames"}
+        values = {"samples": 6, "samples_per_anatomy": 2, "estimators": [], "title": "Small | frames"}
         write_dataset(load_dataset("tiny", values), folder, make_engine())
         return folder
 
@@ -89,7 +90,6 @@ class TestMade:
             f"SHA-256 `{hashlib.sha256(file.read_bytes()).hexdigest()}`",
             f"`{hashlib.sha256((data / 'manifest.json').read_bytes()).hexdigest()}`",
             "| recipe | `tiny`, seed 1: Small \\| frames |",
-            "| train split | 4 frames of 4 anatomies |",
             "| inputs | x (n, 40) |",
             "| weights | 1,230 |",
             "2 epochs were done. Epoch 1 has the smallest loss",
@@ -97,6 +97,10 @@ class TestMade:
             "| x | 0 | 2.5 |",
         ):
             assert said in card, said
+        # Three anatomies of two frames each.
+        counts = re.findall(r"\| (\w+) split \| (\d+) frames of (\d+) anatomies \|", card)
+        assert {split for split, *_ in counts} == {"train", "validation", "test"}
+        assert [sum(int(row[column]) for row in counts) for column in (1, 2)] == [6, 3]
         toml = card.partition("```toml\n")[2].partition("```")[0]
         assert tomllib.loads(toml) == {k: v for k, v in json.loads(about["training"]).items() if k != "name"}
         assert card.rstrip().endswith("how often the test split was used.")

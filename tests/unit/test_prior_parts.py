@@ -13,6 +13,7 @@ from simtest.estimators.family_fit import fit_isophote_family
 from simtest.estimators.prior_parts import (
     SPOT_ONSET,
     SPOT_SPREAD,
+    STEEPER,
     add_untold_parts,
     falloff_part,
     light_offset_part,
@@ -151,17 +152,21 @@ def test_an_error_along_a_line_is_covered_beside_a_normal_one(draw):
     np.testing.assert_allclose(turned, v * np.outer([0.6, 0.8], [0.6, 0.8]), atol=1e-9 * v)
 
 
-def test_relief_is_covered_at_the_base():
+@pytest.mark.parametrize(("plane", "steeper"), [(True, 1.0), (False, STEEPER)])
+def test_relief_is_covered_at_the_base(plane, steeper):
     rng, count = np.random.default_rng(6), 40000
-    slope = np.radians(rng.uniform(0, 8, count))
-    # highlights lie wider than the slope by the width of their lobe, in squares
-    spread = np.hypot(slope, SPOT_SPREAD * np.sqrt(1 - np.exp(-((slope / SPOT_ONSET) ** 2))))
+    slope = np.radians(rng.uniform(0, 9, count))
+    # highlights lie wider than the slope by the width of their lobe, in squares, and on organs where it is steep
+    spread = np.hypot(steeper * slope, SPOT_SPREAD * np.sqrt(1 - np.exp(-((slope / SPOT_ONSET) ** 2))))
     moves = spread[:, None] * rng.standard_normal((count, 2))
-    assert held(moves, relief_part(Priors())) == pytest.approx(0.95, abs=0.006)
-    told = relief_part(Priors(relief_slope=exactly(np.radians(5.0))))
-    np.testing.assert_allclose(told, (np.radians(5.0) ** 2 + SPOT_SPREAD**2) * np.eye(2), rtol=1e-5)
+    assert held(moves, relief_part(Priors(plane=plane))) == pytest.approx(0.95, abs=0.006)
+    if not plane:
+        # Negative control: what holds a plane's relief does not hold an organ's.
+        assert held(moves, relief_part(Priors(plane=True))) < 0.9
+    told = relief_part(Priors(relief_slope=exactly(np.radians(5.0)), plane=plane))
+    np.testing.assert_allclose(told, ((steeper * np.radians(5.0)) ** 2 + SPOT_SPREAD**2) * np.eye(2), rtol=1e-5)
     # A smooth surface has one highlight, at the base's own brightest point.
-    np.testing.assert_array_equal(relief_part(Priors(relief_slope=exactly(0.0))), np.zeros((2, 2)))
+    np.testing.assert_array_equal(relief_part(Priors(relief_slope=exactly(0.0), plane=plane)), np.zeros((2, 2)))
 
 
 def test_a_single_highlight_states_the_base_with_the_relief_in_its_budget():

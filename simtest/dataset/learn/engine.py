@@ -18,9 +18,6 @@ from simtest.errors import InputError
 from simtest.runtime.files import make_folder
 from simtest.validation.runner import Progress
 
-EVALUATED_AT_ONCE = 1024
-"""Examples of a batch without gradients."""
-
 
 @dataclass(frozen=True)
 class Trained:
@@ -142,7 +139,9 @@ class _Run:
         """Judge the network after an epoch, and write the checkpoints."""
         self._network.eval()
         with torch.no_grad():
-            loss = _mean(lambda batch: float(self._task.loss(self._network, batch)), self._judged)
+            loss = _mean(
+                lambda batch: float(self._task.loss(self._network, batch)), self._judged, self._task.evaluated_at_once
+            )
             metrics = self._task.metrics(self._network, self._judged)
         history = self.state.history
         is_best = not history or loss < history[self.state.best].validation_loss
@@ -154,11 +153,11 @@ class _Run:
         save_checkpoint(self._out / LAST, self._network, self._optimiser, self.state)
 
 
-def _mean(figure: Callable[[Batch], float], examples: Batch) -> float:
-    """Return the mean of a figure over examples, some at once."""
+def _mean(figure: Callable[[Batch], float], examples: Batch, at_once: int) -> float:
+    """Return the mean of a figure over examples, so many at once."""
     count, total = _count(examples), 0.0
-    for first in range(0, count, EVALUATED_AT_ONCE):
-        batch = {name: values[first : first + EVALUATED_AT_ONCE] for name, values in examples.items()}
+    for first in range(0, count, at_once):
+        batch = {name: values[first : first + at_once] for name, values in examples.items()}
         total += figure(batch) * _count(batch)
     return total / count
 

@@ -22,6 +22,10 @@ class Task(Protocol):
     def name(self) -> str:
         """Name, as in a training's file."""
 
+    @property
+    def evaluated_at_once(self) -> int:
+        """Examples of a batch without gradients."""
+
     def examples(self, folder: Path, split: str, progress: Progress | None = None) -> Batch:
         """Read the examples of a dataset's split, all at once."""
 
@@ -41,7 +45,11 @@ class Task(Protocol):
         """Write what runs the network elsewhere into the training's folder; `about` names data and versions."""
 
 
-TASKS = {"spot_normals": "simtest.dataset.learn.spot_task:SpotNormals"}
+TASKS = {
+    "dense_normals": "simtest.dataset.learn.dense_task:DenseNormals",
+    "highlight_instances": "simtest.dataset.learn.detector_task:HighlightInstances",
+    "spot_normals": "simtest.dataset.learn.spot_task:SpotNormals",
+}
 """Class of each task by name."""
 
 

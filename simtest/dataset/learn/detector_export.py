@@ -1,0 +1,130 @@
+"""Writes a network of the task `highlight_instances` as ONNX, with its threshold and the range that it was taught."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Generator, nn
+
+from simtest.calibration import srgb_decode
+from simtest.dataset.learn.calibration import fitted_range
+from simtest.dataset.learn.detector_frames import FULL, OUTSIDE, UNJUDGED
+from simtest.dataset.learn.detector_moves import ZOOM, inputs_of, other_camera
+from simtest.dataset.learn.onnx_export import MODEL, export
+from simtest.dataset.learn.tasks import Batch
+from simtest.detection.highlight_inputs import frame_statistics
+from simtest.detection.learned_detector import FORMAT, MULTIPLE, RANGED, bump_tops
+from simtest.runtime.arrays import AnyArray, Array, Image
+
+NEAR_PX = 1.5
+"""A top within this distance of a highlight's pixels lies on it."""
+
+MOST_FRAMES = 48
+"""Frames of the train split, spread over it, from which the range is taken."""
+
+SEED = 0
+"""Of the moved frames from which the range is taken."""
+
+
+def export_detector(network: nn.Module, taught: Batch, judged: Batch, out: Path, about: dict[str, str]) -> Path:
+    """Write model.onnx into a folder and return its path; `about` goes into the file's metadata."""
+    network = network.cpu().eval()
+    step = -(-len(taught["state"]) // MOST_FRAMES)
+    statistics, own = _seen(network, {name: values[::step] for name, values in taught.items()})
+    _, others = _seen(network, judged)
+    longer_side = max(taught["state"].shape[1:])
+    # Frames of the dataset have one size; crops were resized in training.
+    ends = np.array([[longer_side * zoom, median] for zoom in ZOOM for median in statistics[[0, -1], 1]])
+    content = {
+        "format": FORMAT,
+        "least_top": least_top(network, judged),
+        **fitted_range(RANGED, ends, own, others).written(),
+        "about": about,
+    }
+    network = network.to(memory_format=torch.contiguous_format)
+    example = torch.from_numpy(next(_inputs(taught))[None])
+    example = example[..., : example.shape[2] // MULTIPLE * MULTIPLE, : example.shape[3] // MULTIPLE * MULTIPLE]
+    free = {2: "height", 3: "width"}
+    return export(
+        network, {"inputs": example}, ("outputs", "features"), {"inputs": free, "outputs": free}, content, out / MODEL
+    )
+
+
+def _seen(network: nn.Module, batch: Batch) -> tuple[Array, Array]:
+    """Return the statistics, by rising median light, and the features of frames as they are and as moved ones."""
+    statistics, features = [], []
+    generator = Generator().manual_seed(SEED)
+    for picture, state in zip(batch["picture"].cpu().numpy(), batch["state"].cpu().numpy(), strict=True):
+        random = np.random.default_rng(int(torch.randint(2**31, (1,), generator=generator)))
+        for encoded in (picture.astype(np.float32) / np.float32(FULL), other_camera(picture, random)):
+            statistics.append(frame_statistics(srgb_decode(encoded), state != OUTSIDE, max(state.shape)))
+            features.append(_run(network, inputs_of(encoded, state))[1])
+    order = np.array(statistics)
+    return order[np.argsort(order[:, 1])], np.array(features)
+
+
+def _inputs(batch: Batch) -> Iterator[Image]:
+    """Yield the inputs of each frame as it is."""
+    for picture, state in zip(batch["picture"].cpu().numpy(), batch["state"].cpu().numpy(), strict=True):
+        yield inputs_of(picture.astype(np.float32) / np.float32(FULL), state)
+
+
+def _run(network: nn.Module, inputs: Image) -> tuple[Image, Array]:
+    """Return the map of bumps, in [0, 1], and the features of a frame."""
+    height, width = inputs.shape[1:]
+    padded = np.pad(inputs, ((0, 0), (0, -height % MULTIPLE), (0, -width % MULTIPLE)), mode="edge")
+    with torch.no_grad():
+        outputs, features = network(torch.from_numpy(padded[None]))
+    return torch.sigmoid(outputs[0, 1, :height, :width]).numpy(), features[0].double().numpy()
+
+
+def least_top(network: nn.Module, judged: Batch) -> float:
+    """Return the least height of a bump's top that gives the best F1 on frames.
+
+    A top on a highlight that need be found finds it, the highest one first; further ones and those on tissue are false;
+    others do not count.
+    """
+    heights: list[float] = []
+    right: list[bool] = []
+    needed = 0
+    for inputs, region, state in zip(
+        _inputs(judged), judged["region"].cpu().numpy(), judged["state"].cpu().numpy(), strict=True
+    ):
+        needed += len(np.unique(region[region > 0]))
+        for height, found in _tops(_run(network, inputs)[0], region.astype(np.int64), state):
+            heights.append(height)
+            right.append(found)
+    return best_threshold(np.array(heights), np.array(right, dtype=bool), needed)
+
+
+def _tops(bumps: Image, region: AnyArray, state: AnyArray) -> Iterator[tuple[float, bool]]:
+    """Yield height of each top of a map that counts, the highest first, and whether it finds a highlight."""
+    from skimage.segmentation import expand_labels
+
+    numbers = bump_tops(bumps)
+    rows, columns = np.nonzero(numbers)
+    order = np.argsort(-bumps[rows, columns], kind="stable")
+    _, first = np.unique(numbers[rows, columns][order], return_index=True)
+    # Numbers must be above 0; those that need not be found come behind the others.
+    many = int(np.abs(region).max(initial=0))
+    around = expand_labels(np.where(region < 0, many - region, region), NEAR_PX)
+    found: set[int] = set()
+    for index in order[np.sort(first)]:
+        at = rows[index], columns[index]
+        owner = int(around[at])
+        if owner > many or (owner == 0 and state[at] in (UNJUDGED, OUTSIDE)):
+            continue
+        yield float(bumps[at]), 0 < owner not in found
+        found.add(owner)
+
+
+def best_threshold(heights: Array, right: AnyArray, needed: int) -> float:
+    """Return the height from which on tops have the best F1; 0.5 where none is right."""
+    if not right.any():
+        return 0.5
+    order = np.argsort(-heights)
+    hits = np.cumsum(right[order])
+    best = int(np.argmax(2 * hits / (needed + np.arange(1, len(hits) + 1))))
+    following = heights[order[best + 1]] if best + 1 < len(hits) else 0.0
+    return float(np.clip((heights[order[best]] + following) / 2, 0.01, 0.99))

@@ -1,0 +1,252 @@
+"""A network as a detector: labels, instances from its maps, equal in PyTorch and ONNX Runtime, refusals, bad files."""
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+onnxruntime = pytest.importorskip("onnxruntime")
+pytest.importorskip("safetensors")
+
+from simtest.calibration import Calibration, Frame, Response, srgb_encode  # noqa: E402
+from simtest.dataset.learn.detector_export import best_threshold  # noqa: E402
+from simtest.dataset.learn.detector_frames import HIGHLIGHT, TISSUE, UNJUDGED, bumps, needs_be_found  # noqa: E402
+from simtest.dataset.learn.detector_moves import moved_crops  # noqa: E402
+from simtest.dataset.learn.detector_task import HighlightInstances  # noqa: E402
+from simtest.dataset.learn.engine import train  # noqa: E402
+from simtest.dataset.learn.training import load_training  # noqa: E402
+from simtest.detection import load_detector  # noqa: E402
+from simtest.detection.learned_detector import LearnedDetector, share_out  # noqa: E402
+from simtest.errors import InputError, Reason  # noqa: E402
+from simtest.geometry import Camera  # noqa: E402
+from simtest.runtime.onnx_model import METADATA  # noqa: E402
+
+pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
+
+SIDE = 160
+
+
+def drawn(seed, count=14):
+    """Return picture, state, bump and region of reddish tissue with grey highlights."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:SIDE, :SIDE] + 0.5
+    linear = (0.2 + 0.04 * np.sin(x / 30 + seed) * np.cos(y / 25))[..., None] * [1.0, 0.45, 0.35]
+    region = np.zeros((SIDE, SIDE), dtype=np.int64)
+    for number, (column, row) in enumerate(rng.uniform(12, SIDE - 12, (count, 2)), start=1):
+        width = rng.uniform(1.5, 4)
+        lobe = np.exp(-((x - column) ** 2 + (y - row) ** 2) / width**2)
+        linear += rng.uniform(0.3, 0.7) * lobe[..., None]
+        region[(lobe >= 0.5) & (region == 0)] = number
+    picture = np.rint(255 * srgb_encode(np.clip(linear + 0.002 * rng.standard_normal(linear.shape), 0, 1)))
+    state = np.where(region > 0, HIGHLIGHT, TISSUE).astype(np.uint8)
+    return picture.astype(np.uint8), state, bumps(region), region.astype(np.int16)
+
+
+def batch(seeds):
+    parts = zip(*(drawn(seed) for seed in seeds), strict=True)
+    names = ("picture", "state", "bump", "region")
+    return {name: torch.from_numpy(np.stack(part)) for name, part in zip(names, parts, strict=True)}
+
+
+def frame_of(picture, camera=None):
+    height, width = picture.shape[:2]
+    calibration = Calibration(
+        camera or Camera.from_fov(60.0, width, height), response=Response("srgb"), saturation_level=1.0
+    )
+    return Frame(picture.astype(np.float32) / np.float32(255), calibration, 1.0)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A network trained for a few seconds, and its file."""
+    out = tmp_path_factory.mktemp("detector")
+    taught, judged = batch(range(6)), batch(range(100, 104))
+    training = load_training("highlight_instances", {"epochs": 8, "learning_rate": 0.01})
+    made = train(training, HighlightInstances(), taught, judged, out)
+    [path] = HighlightInstances().finish(made.network, taught, judged, out, {"dataset": "drawn"})
+    return made, path
+
+
+def changed(path, out, **change):
+    """Write a network's file with other metadata; return its path."""
+    model = onnx.load(path)
+    content = json.loads({prop.key: prop.value for prop in model.metadata_props}[METADATA])
+    onnx.helper.set_model_props(model, {METADATA: json.dumps({**content, **change})})
+    onnx.save(model, out / "model.onnx")
+    return out / "model.onnx"
+
+
+def test_a_short_training_finds_most_highlights_of_a_fresh_frame(trained, tmp_path):
+    made, path = trained
+    history = made.state.history
+    overlap = [next(iter(epoch.metrics.values())) for epoch in history]
+    assert overlap[-1] > 0.5 > overlap[0]
+    picture, _, _, region = drawn(200)
+    # Four frames are too few for the range of the features.
+    detector = LearnedDetector(changed(path, tmp_path, feature_limit=1e9), isolated=False)
+    found = detector.detect(frame_of(picture), None)
+    assert found.refusal is None
+    hit = {int(region[y, x]) for each in found.highlights for x, y in each.peaks} - {0}
+    assert len(hit) >= 0.7 * len(np.unique(region[region > 0]))
+    # Not by marking everything.
+    assert len(detector.detect(frame_of(drawn(201, count=0)[0]), None).highlights) <= 1
+
+
+def test_onnx_gives_what_pytorch_gives_at_every_size(trained):
+    made, path = trained
+    session = onnxruntime.InferenceSession(path.read_bytes())
+    network = made.network.cpu().eval()
+    for height, width in ((64, 64), (104, 160)):
+        inputs = np.random.default_rng(height).normal(size=(1, 5, height, width)).astype(np.float32)
+        with torch.no_grad():
+            wanted = [each.numpy() for each in network(torch.from_numpy(inputs))]
+        for one, other in zip(session.run(None, {"inputs": inputs}), wanted, strict=True):
+            assert one.shape == other.shape
+            assert np.abs(one - other).max() < 1e-5
+
+
+def test_what_lies_outside_the_training_is_refused(trained):
+    detector = LearnedDetector(trained[1])
+    picture = drawn(300)[0]
+    grey = Frame(picture[..., 0].astype(np.float32) / 255, frame_of(picture).calibration, 1.0)
+    small, dark = picture[:64, :64], (picture * 0.05).astype(np.uint8)
+    noise = np.random.default_rng(0).integers(0, 255, picture.shape, dtype=np.uint8)
+    for frame, said in (
+        (grey, "three channels"), (frame_of(small), "longer side"), (frame_of(dark), "median light"),
+        (frame_of(noise), "network's training"),
+    ):  # fmt: skip
+        found = detector.detect(frame, None)
+        assert not found.regions
+        assert found.refusal.reason is Reason.NO_ESTIMATE
+        assert said in found.refusal.detail
+        assert "\n" not in found.refusal.detail
+    assert detector.detect(frame_of(picture), None).refusal is None
+
+
+def test_a_large_frame_is_seen_reduced(trained, tmp_path):
+    plain, _, _, region = drawn(200)
+    detector = LearnedDetector(changed(trained[1], tmp_path, feature_limit=1e9), isolated=False)
+    counts = []
+    for times in (1, 3):
+        found = detector.detect(frame_of(np.kron(plain, np.ones((times, times, 1), dtype=np.uint8))), None)
+        assert found.refusal is None
+        counts.append(len({int(region[y // times, x // times]) for h in found.highlights for x, y in h.peaks} - {0}))
+    assert counts[1] >= 0.8 * counts[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"format": "other"}, "format"), ({"least_top": 2}, "least_top"), ({"least_top": "x"}, "least_top|could not"),
+        ({"low": {}}, "longer side"),
+        ({"high": {"longer side, px": 2, "logarithm of the median light": 0}}, "must be 8"),
+        ({"feature_precision": [1.0]}, "feature_precision"),
+        ({"feature_mean": [0.0], "feature_precision": [1.0]}, "features"),
+    ],
+)  # fmt: skip
+def test_a_damaged_file_is_told_in_one_line(trained, tmp_path, change, said):
+    path = changed(trained[1], tmp_path, **change)
+    with pytest.raises(InputError, match=said) as error:
+        LearnedDetector().with_model(path).detect(frame_of(drawn(1)[0]), None)
+    assert "\n" not in str(error.value)
+    assert "model.onnx" in str(error.value)
+
+
+@pytest.mark.parametrize(("content", "said"), [(b"", "no ONNX model"), (b"text", "no ONNX model"), (None, "be read")])
+def test_a_file_that_is_no_network_is_told_in_one_line(tmp_path, content, said):
+    path = tmp_path / "model.onnx"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=said):
+        LearnedDetector().with_model(path)
+
+
+def test_the_shipped_network_finds_highlights_by_its_name():
+    from simtest.reconstruction.pipeline import run_picture
+
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:360, :480] + 0.5
+    linear = (0.16 + 0.04 * np.sin(x / 60) * np.cos(y / 50))[..., None] * [1.0, 0.45, 0.33]
+    for column, row in rng.uniform(60, 300, (12, 2)):
+        linear += 0.6 * np.exp(-((x - column) ** 2 + (y - row) ** 2) / 3.0**2)[..., None]
+    picture = srgb_encode(np.clip(linear + 0.002 * rng.standard_normal(linear.shape), 0, 1)).astype(np.float32)
+    detector = load_detector("learned_detector")
+    assert isinstance(detector, LearnedDetector)
+    detector.check()
+    made, choices = run_picture(picture, Calibration(Camera.from_fov(60.0, 480, 360)), None, "learned_detector")
+    assert choices.detector == "learned_detector"
+    assert choices.smoothing_px == 1.0
+    assert made.detection.refusal is not None or made.specularities
+
+
+# Labels, moves and instances
+
+
+def test_which_highlights_must_be_found():
+    sound = {"whole": True, "peak_snr": 30.0, "area_px": 9, "instrument": None}
+    others = ({"whole": False}, {"peak_snr": 9.0}, {"area_px": 3}, {"instrument": 0}, {"peak_snr": None})
+    assert needs_be_found([sound, *({**sound, **other} for other in others)]).tolist() == [True, *[False] * 4, True]
+
+
+def test_bumps_stand_in_the_middle_of_their_pixels():
+    region = np.zeros((20, 30), dtype=np.int64)
+    region[3:8, 4:9], region[12, 10:21] = 1, 2
+    made = bumps(region)
+    assert made[5, 6] == made[12, 15] == 255
+    assert (made[region == 0] == 0).all()
+    # Two standard deviations away along the long highlight, whose second moment is 10 + 0.25.
+    assert made[12, 20] == np.rint(255 * np.exp(-25 / (2 * 10.25)))
+
+
+def test_touching_highlights_are_shared_out_and_faint_bumps_left_out():
+    y, x = np.mgrid[:40, :60] + 0.5
+    each = [np.exp(-((x - c) ** 2 + (y - 20) ** 2) / 18) for c in (20, 31, 50)]
+    made = share_out(np.maximum.reduce([each[0], 0.8 * each[1], 0.2 * each[2]]), sum(each) > 0.1, 0.3)
+    assert set(np.unique(made)) == {0, 1, 2}
+    assert made[20, 20] != made[20, 31]
+    assert made[20, 50] == 0
+    assert share_out(np.zeros((9, 9)), np.ones((9, 9), dtype=bool), 0.3).max() == 0
+
+
+def test_a_dip_that_is_not_clearly_lower_separates_nothing():
+    x = np.broadcast_to(np.arange(40), (5, 40))
+    bump = np.exp(-((x - 20.0) ** 2) / 60)
+    bump[:, 20] *= 0.9
+    assert share_out(bump, bump > 0.1, 0.3).max() == 1
+    bump[:, 20] *= 0.7
+    assert share_out(bump, bump > 0.1, 0.3).max() == 2
+
+
+def test_moved_crops_hang_on_their_generator_alone():
+    examples = batch(range(2))
+    one, same, other = (moved_crops(examples, torch.Generator().manual_seed(seed), 64) for seed in (1, 1, 2))
+    assert all(torch.equal(one[name], same[name]) for name in one)
+    assert not torch.equal(one["inputs"], other["inputs"])
+    assert one["inputs"].shape == (6, 5, 64, 64)
+    assert one["inputs"].isfinite().all()
+    # What shines stays where its label is.
+    inside, outside = one["state"] == HIGHLIGHT, one["state"] == TISSUE
+    assert one["inputs"][:, 3][inside].median() > one["inputs"][:, 3][outside].median() + 1
+
+
+def test_pixels_that_are_not_judged_do_not_change_the_loss():
+    torch.manual_seed(0)
+    task, examples = HighlightInstances(), batch([1])
+    network = task.network(examples, load_training("highlight_instances")).eval()
+    crops = moved_crops(examples, torch.Generator().manual_seed(1), 64)
+    with torch.no_grad():
+        before = task.loss(network, crops)
+        crops["state"][:, :32] = UNJUDGED
+        masked = task.loss(network, crops)
+        crops["bump"][:, :32] = 255
+        assert task.loss(network, crops) == masked
+        assert masked != before
+
+
+def test_the_threshold_with_the_best_f1_is_taken():
+    heights, right = np.array([0.9, 0.8, 0.6, 0.4, 0.2]), np.array([True, True, False, True, False])
+    assert best_threshold(heights, right, 3) == pytest.approx(0.3)
+    assert best_threshold(heights, np.array([True, True, False, False, False]), 3) == pytest.approx(0.7)
+    assert best_threshold(heights, np.zeros(5, dtype=bool), 3) == 0.5
