@@ -17,7 +17,7 @@ help:
 	@echo "make docs-commands  run the manual's commands as they stand; QUICK=--quick leaves out what takes minutes"
 	@echo "make test      fast tests (about 9 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
-	@echo "make test-ci   fast tests and those of all extras, which it installs"
+	@echo "make test-ci   fast tests, the cases of tests/slow_cases.py and those of all extras, which it installs"
 	@echo "make bench     speeds, as ratios within one run"
 	@echo "make bench-cycles  a labelled frame beside Blender's Cycles, which it installs (Python 3.11; 1 GB)"
 	@echo "make lint      ruff, mypy, import-linter"
@@ -69,8 +69,9 @@ docs: $(VENV)/.docs
 docs-commands: $(VENV)/.docs
 	$(BIN)/python -m studies.manual commands $(QUICK) $(PAGES)
 
+# A few examples of each property; the others draw all.
 test: $(VENV)/.tests
-	$(PYTEST) -m "not slow"
+	SIMTEST_EXAMPLES=few $(PYTEST) -m "not slow"
 
 test-all: $(VENV)/.tests
 	$(PYTEST)

@@ -17,7 +17,7 @@ import numpy as np
 
 from simtest.cli.progress import progress_bar
 from simtest.dataset.fields import INSTRUMENT
-from simtest.dataset.learn.spots import FIELDS_READ, only_glints, sample_frame
+from simtest.dataset.learn.spots import FIELDS_READ, NEAR_PX, only_glints, sample_frame
 from simtest.dataset.reader import read_samples, sample_positions
 from simtest.dataset.sample import Sample
 from simtest.errors import Failure
@@ -34,7 +34,11 @@ FAMILIES = ("colon", "stomach", "liver")
 
 @dataclass
 class Row:
-    """One estimate: its errors, deg, NaN where there is no truth; squared Mahalanobis distance; where it comes from."""
+    """One estimate; NaN where there is no truth.
+
+    Errors and stated deviation, deg; squared Mahalanobis distance; whether the base's axis ratio lies within 1.96
+    deviations; where it comes from; whether the detection shows glints or near misses alone.
+    """
 
     estimator: str
     spot: tuple[int, int]
@@ -43,7 +47,10 @@ class Row:
     base_deg: float = np.nan
     fine_deg: float = np.nan
     distance2: float = np.nan
+    stated_deg: float = np.nan
+    ratio_inside: float = np.nan
     status: str = "ok"
+    kind: str = ""
 
 
 def main() -> None:
@@ -69,6 +76,10 @@ def main() -> None:
     print("\n".join(_table(rows)))
     print()
     print("\n".join(_pairs(rows)))
+    print()
+    print("\n".join(_fifths([row for row in rows if row.estimator == "learned_spot, base" and row.status == "ok"])))
+    ratios = _known([row for row in rows if row.estimator == "learned_spot, base"], lambda row: row.ratio_inside)
+    print(f"\naxis ratio of the base within 1.96 stated deviations: {ratios.mean():.3f} of {len(ratios)}")
 
 
 def _rows(sample: Sample, estimators: dict[str, object]) -> Iterator[Row]:
@@ -77,14 +88,17 @@ def _rows(sample: Sample, estimators: dict[str, object]) -> Iterator[Row]:
     found = run_pipeline(frame.encoded, frame.calibration, "colour", estimators, None, frame.smoothing_px)  # type: ignore[arg-type]
     single = [each for each in found.specularities if not isinstance(each.patch, Failure)]
     peaks = np.array([each.patch.peak_px for each in single if not isinstance(each.patch, Failure)]).reshape(-1, 2)
-    glints = dict(only_glints(sample, peaks))
+    glints, kinds = dict(only_glints(sample, peaks)), _kinds(sample, peaks)
     for number, (each, peak) in enumerate(zip(single, peaks, strict=True)):
         base = _base(sample, peak)
         fine = np.array(sample.meta["highlights"][glints[number]]["normal"]) if number in glints else None
         if base is None:
             continue
         for name, result in each.estimates.items():
-            row = Row(name, (sample.index, number), anatomy["family"], anatomy["number"])
+            row = Row(name, (sample.index, number), anatomy["family"], anatomy["number"], kind=kinds[number])
+            if isinstance(result, Estimate) and result.axis_ratio_deviation and result.target == "base":
+                off = abs((result.axis_ratio or np.nan) - _base_ratio(sample, peak))
+                row.ratio_inside = float(off <= 1.96 * result.axis_ratio_deviation) if np.isfinite(off) else np.nan
             yield _scored(row, result, base, fine)
     answered = [
         (n, p) for n, p in enumerate(peaks) if isinstance(single[n].estimates.get("learned_spot, base"), Estimate)
@@ -110,6 +124,25 @@ def _base(sample: Sample, point: Array) -> Array | None:
     return normal / np.linalg.norm(normal) if np.isfinite(normal).all() else None
 
 
+def _base_ratio(sample: Sample, point: Array) -> float:
+    """Return abs(1 + d k) of the smaller over that of the larger, of the base at a pixel."""
+    column, row = int(point[0]), int(point[1])
+    gains = np.abs(1 + sample.images["depth"][row, column] * sample.images["curvature_base"][row, column].astype(float))
+    return float(gains.min() / gains.max()) if gains.max() > 0 else np.nan
+
+
+def _kinds(sample: Sample, peaks: Array) -> list[str]:
+    """Return for each detection whether the visible highlight that it shows holds glints or near misses alone."""
+    visible = sample.meta.get("visible_highlights", [])
+    positions = np.array([spot["peak_px"] for spot in visible], dtype=float).reshape(-1, 2)
+    kinds = []
+    for peak in peaks:
+        gaps = np.hypot(*(positions - peak).T)
+        near = len(gaps) and gaps.min() <= NEAR_PX
+        kinds.append(("glints" if visible[int(gaps.argmin())]["glints"] else "near misses") if near else "none near")
+    return kinds
+
+
 def _scored(row: Row, result: Estimate | Failure, base: Array, fine: Array | None) -> Row:
     if isinstance(result, Failure):
         row.status = result.reason.value
@@ -118,6 +151,7 @@ def _scored(row: Row, result: Estimate | Failure, base: Array, fine: Array | Non
     if fine is not None:
         off["fine"] = tangent_coordinates(result.normal, fine)
         row.fine_deg = float(np.degrees(np.hypot(*off["fine"])))
+    row.stated_deg = result.deviation_deg or np.nan
     row.base_deg = float(np.degrees(np.hypot(*off["base"])))
     if result.covariance is not None and result.target in off:
         own = off[result.target]
@@ -145,6 +179,25 @@ def _table(rows: list[Row]) -> Iterator[str]:
             cells = (name, organ, len(own), len(ok), _median(base), _p95(base), f"{_median(fine)} ({len(fine)})",
                      _p95(fine), inside)  # fmt: skip
             yield f"| {' | '.join(map(str, cells))} |"
+
+
+def _fifths(rows: list[Row]) -> Iterator[str]:
+    """Yield the base's errors in five groups sorted by the stated deviation, then by what the detection shows."""
+    yield "| answers | n | stated deviation, deg | base: median, deg | 95 % below | inside its 95 % ellipse |"
+    yield "|---|---|---|---|---|---|"
+    order = np.argsort([row.stated_deg for row in rows], kind="stable")
+    names = ("surest fifth", "second", "third", "fourth", "least sure fifth")
+    groups = [(name, [rows[k] for k in part]) for name, part in zip(names, np.array_split(order, 5), strict=True)]
+    groups += [(kind, [row for row in rows if row.kind == kind]) for kind in ("glints", "near misses", "none near")]
+    for name, own in groups:
+        base = _known(own, lambda row: row.base_deg)
+        if len(base):
+            stated, inside = (np.mean(_known(own, value)) for value in (lambda r: r.stated_deg, _is_inside))
+            yield f"| {name} | {len(base)} | {stated:.1f} | {_median(base)} | {_p95(base)} | {inside:.3f} |"
+
+
+def _is_inside(row: Row) -> float:
+    return float(row.distance2 <= CHI2_95) if np.isfinite(row.distance2) else np.nan
 
 
 def _known(rows: list[Row], value: Callable[[Row], float]) -> Array:

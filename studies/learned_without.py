@@ -4,12 +4,15 @@ python -m studies.learned_without data/highlights liver stomach
 
 Each network is the shipped training (scenes/learning/spot_normals.toml) on the train split without that organ. Its
 covariances, and the limit of the features beyond which it refuses, come from the validation split without that organ.
-The table shows the test split's highlights of the organ: detected by colour, at most 64 of a frame. The network of all
-organs is the shipped one. `--kept DIR` keeps the examples as arrays there, and reads them the next time.
+The table shows the test split's highlights of the organ: detected by colour, at most 64 of a frame. A second row shows
+what the network would have said where it refuses: whether it was right to. The network of all organs is the shipped
+one. `--kept DIR` keeps the examples as arrays there, and reads them the next time.
 """
 
+import re
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -22,9 +25,10 @@ from simtest.dataset.learn.engine import train
 from simtest.dataset.learn.spot_task import SpotNormals, batch_of, squared_distance
 from simtest.dataset.learn.spots import Spots, read_spots
 from simtest.dataset.learn.training import load_training
-from simtest.estimators.learned_spot import LearnedSpot, log_deviation
+from simtest.estimators.learned_spot import LearnedSpot, _Network, log_deviation
 from simtest.estimators.spot_inputs import ROTATION_SCALE, SURFACES, normal_of
 from simtest.geometry.vectors import angle_deg
+from simtest.runtime.arrays import Array
 
 FAMILIES = ("colon", "stomach", "liver")
 CHI2_95 = -2 * np.log(0.05)
@@ -40,7 +44,8 @@ def main() -> None:
         del arguments[at : at + 2]
     folder, organs = Path(arguments[0]), arguments[1:]
     splits = {split: _spots(folder, split, kept) for split in ("train", "validation", "test")}
-    print("| tested on | network | highlights | answered | base: median, deg | 95 % below | inside its 95 % ellipse |")
+    heads = ("tested on", "network", "highlights", "base: median, deg", "95 % below", "inside its 95 % ellipse", "why")
+    print(f"| {' | '.join(heads)} |")
     print("|---|---|---|---|---|---|---|")
     for organ in organs:
         number = FAMILIES.index(organ)
@@ -49,7 +54,8 @@ def main() -> None:
             others = {name: split.chosen(split.family != number) for name, split in splits.items()}
             without = LearnedSpot(_trained(others["train"], others["validation"], Path(out)))
             for name, network in ((f"without {organ}", without), ("of all organs", LearnedSpot())):
-                print(f"| {organ} | {name} | {' | '.join(_cells(network, tested))} |", flush=True)
+                for row, cells in _rows(network, tested):
+                    print(f"| {organ} | {name}{row} | {' | '.join(cells)} |", flush=True)
 
 
 def _spots(folder: Path, split: str, kept: Path | None) -> Spots:
@@ -73,17 +79,24 @@ def _trained(taught: Spots, judged: Spots, out: Path) -> Path:
     return task.finish(trained.network, *batches, out, {})[0]
 
 
-def _cells(estimator: LearnedSpot, spots: Spots) -> Iterator[str]:
-    """Yield a row's figures: the base's errors and coverage at the highlights that are answered."""
+def _rows(estimator: LearnedSpot, spots: Spots) -> Iterator[tuple[str, list[str]]]:
+    """Yield the figures of the highlights that are answered, and of those that are refused."""
     network = estimator._network
     outputs, refusals = network.run(spots.crops.astype(np.float32), spots.extras.astype(np.float32))
-    answered = np.array([refusal is None for refusal in refusals])
+    refused = np.array([refusal is not None for refusal in refusals])
+    reasons = Counter(re.split(" is | at ", refusal.detail)[0].split(": ")[-1] for refusal in refusals if refusal)
+    for row, chosen in ((", answered", ~refused), (", refused", refused)):
+        told = "; ".join(f"{reason}: {count}" for reason, count in reasons.most_common(3)) if chosen is refused else ""
+        yield row, [*_cells(network, outputs[chosen, BASE], spots.chosen(chosen)), told]
+
+
+def _cells(network: _Network, made: Array, spots: Spots) -> Iterator[str]:
+    """Yield number, median and 95th percentile of the base's errors, and the coverage."""
     yield str(len(spots))
-    yield str(int(answered.sum()))
-    if not answered.any():
+    if not len(spots):
         yield from ("none",) * 3
         return
-    made, truth, rays = outputs[answered, BASE], spots.base[answered].astype(float), spots.rays[answered]
+    truth, rays = spots.base.astype(float), spots.rays
     off = angle_deg(normal_of(rays, made[:, :2] * ROTATION_SCALE), normal_of(rays, truth))
     yield f"{np.median(off):.2f}"
     yield f"{np.percentile(off, 95):.2f}"

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.slow_cases import SLOW
+
 # No test depends on wall time; all else is as hypothesis has it, in CI for one.
 settings.register_profile("untimed", settings(), deadline=None)
 settings.load_profile("untimed")
@@ -54,8 +56,31 @@ LONGEST = (
 """Files of 4 s of processor time and more, the longest first."""
 
 
+COLLECTED: dict[str, set[str]] = {}
+"""Names of the collected tests by file, those that are not chosen too."""
+
+
+def matches(listed, name):
+    """Return whether a name of `SLOW` stands for a test."""
+    return name == listed or (listed[-1] == "*" and name.startswith(listed[:-1]))
+
+
+def is_slow(stem, name):
+    """Return whether `SLOW` names a test of a file."""
+    return any(matches(listed, name) for names in SLOW.get(stem, {}).values() for listed in names)
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Put the longest files first: one that began last would leave the other workers idle."""
+    """Mark the cases that are slow, and put the longest files first: one that began last would leave workers idle.
+
+    What is chosen by marks is chosen afterwards. `make test-ci` runs these cases too.
+    """
+    for item in items:
+        COLLECTED.setdefault(item.path.stem, set()).add(item.name)
+        if is_slow(item.path.stem, item.name):
+            item.add_marker("slow")
+            item.add_marker("extra")
     order = {name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 

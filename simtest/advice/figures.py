@@ -14,7 +14,15 @@ import polars as pl
 from simtest.geometry import student_t
 from simtest.runtime.arrays import Array, IntArray
 from simtest.validation.guide import Advice, MethodFigures, advice_of
-from simtest.validation.paired import FRAME, distinct_frames, half_width, side_by_side, targets_of, units
+from simtest.validation.paired import (
+    FRAME,
+    deviation_of_mean,
+    distinct_frames,
+    half_width,
+    side_by_side,
+    targets_of,
+    units,
+)
 from simtest.validation.situations import Situation
 from simtest.validation.statistics import CONFIDENCE, Interval
 
@@ -202,10 +210,9 @@ def mean_error(answered: pl.DataFrame, column: str, frames: int | None = None) -
 def ratio_interval(totals: Array, counts: Array, strata: IntArray, frames: int | None = None) -> Interval:
     """Compute the 95 % interval of the mean of all values: the sum of totals over the sum of counts.
 
-    The jackknife of a ratio leaves out one frame of a stratum at a time, and the others of the stratum weigh more
-    instead [Rao and Wu, J. Am. Stat. Assoc. 83, 1988, 231]. So the interval holds where the number of values varies
-    from frame to frame, and where a frame with many of them draws the mean to its own. Errors are positive and skewed:
-    the interval is that of the mean's logarithm.
+    It holds where the number of values varies from frame to frame (`simtest.validation.paired.deviation_of_mean`), and
+    where a frame with many of them draws the mean to its own. Errors are positive and skewed: the interval is that of
+    the mean's logarithm.
 
     Parameters
     ----------
@@ -231,19 +238,10 @@ def ratio_interval(totals: Array, counts: Array, strata: IntArray, frames: int |
         return None, None
     empty = np.maximum((frames or 0) - np.bincount(strata), 0)
     strata = np.concatenate([strata, np.repeat(np.arange(len(empty)), empty)])
-    size = np.bincount(strata)[strata]
-    off = _without_each(totals, strata) / _without_each(counts, strata) - mean
-    deviation = math.sqrt(float(np.sum((1 - 1 / size) * off**2)))
+    nothing = np.zeros(len(strata) - len(totals))
+    deviation = deviation_of_mean(np.concatenate([totals, nothing]), np.concatenate([counts, nothing]), strata)
     factor = math.exp(min(student_t.quantile((1 + CONFIDENCE) / 2, freedom) * deviation / mean, MOST_FACTOR))
     return mean / factor, mean * factor
-
-
-def _without_each(values: Array, strata: IntArray) -> Array:
-    """Return the sum of all values without each one; the others of its stratum weigh more. Missing values are 0."""
-    values = np.concatenate([values, np.zeros(len(strata) - len(values))])
-    size, own = np.bincount(strata)[strata], np.bincount(strata, values)[strata]
-    # A value that is alone in its stratum stays: it shows no spread.
-    return np.asarray(values.sum() + np.where(size > 1, (own - size * values) / np.maximum(size - 1, 1), 0.0))
 
 
 def _root_mean_square(rows: pl.DataFrame, column: str) -> float | None:

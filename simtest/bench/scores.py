@@ -99,11 +99,11 @@ def score_part(rows: pl.DataFrame, layout: Layout) -> PartScore:
         false=told.n_false,
         refused=told.n_failed_by_reason,
         median_deg=told.median_deg,
-        median_interval=_interval(errors, scenes_of(answered, layout), median=True),
+        median_interval=interval_over_scenes(errors, scenes_of(answered, layout), median=True),
         mean_deg=told.mean_deg,
         p95_deg=told.p95_deg,
         score_deg=total / number if number else None,
-        score_interval=_interval(capped, scenes_of(true, layout)),
+        score_interval=interval_over_scenes(capped, scenes_of(true, layout)),
         scenes=scenes,
         uncertainty=score_uncertainty(answered, scenes_of(answered, layout)),
         results=results_hash(rows),
@@ -154,7 +154,7 @@ def _plain(value: Any) -> Json:
     return plain
 
 
-def _interval(values: Array, scenes: Array, median: bool = False) -> Interval | None:
+def interval_over_scenes(values: Array, scenes: Array, median: bool = False) -> Interval | None:
     """Compute the 95 % interval of a mean or median by bootstrap over scenes; None with fewer than two of them."""
     count = len(np.unique(scenes))
     if count < 2:

@@ -35,7 +35,8 @@ def make(
     Parameters
     ----------
     described : str
-        A dataset file, or the name of a shipped one: endoscopy, highlights, learning, smooth, tiny.
+        A dataset file, or the name of a shipped one: endoscopy, highlights, highlights_smooth,
+        highlights_tiny, learning, smooth, tiny.
     """
     from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar

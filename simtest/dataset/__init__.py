@@ -2,10 +2,20 @@
 
 `plan` fixes what each sample is made of, `maker` makes it, `shard_writer` writes it (`fields`, `png`, `shard`), with
 `manifest`, `index`, `card` and `croissant` beside the shards. `reader` reads them back, `verify` checks and repairs,
-`reproduce` makes one sample anew, `preview` draws a contact sheet. `learn` needs PyTorch.
+`reproduce` makes one sample anew, `preview` draws a contact sheet. `sample_calibration` tells what reconstruction may
+know of a sample. `learn` needs PyTorch.
 """
+
+from typing import TYPE_CHECKING
 
 from simtest.dataset.fields import FIELDS
 from simtest.dataset.reader import read
+from simtest.runtime.lazy_names import lazy_names
 
-__all__ = ["FIELDS", "read"]
+if TYPE_CHECKING:
+    from simtest.dataset.sample_calibration import calibration_of
+
+__all__ = ["FIELDS", "calibration_of", "read"]
+
+# Scenes take a tenth of a second to import, and who reads arrays needs none.
+__getattr__, _ = lazy_names(__name__, {"simtest.dataset.sample_calibration": ("calibration_of",)})

@@ -15,6 +15,7 @@ DESCRIPTIONS: dict[str, str] = {
     "photometric": "A fit of the reflectance model to all pixels of the highlight.",
     "inverse_rendering": "A curved patch, rendered and adjusted until it looks like the highlight.",
     "cloud": "The normal of the base surface, from the cloud of glints that its relief makes of one highlight.",
+    "learned_dense": "The normal of the base surface at each highlight, by a network of the whole frame; lights told.",
     "learned_spot": "The normal of the base surface at each highlight, by a small network; needs the lights told.",
 }
 """Of this package's estimators, by name: in pages, `simtest list`, completion and the reference."""

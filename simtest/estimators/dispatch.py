@@ -230,7 +230,8 @@ def _malformed(estimate: Estimate) -> Failure | None:
             return Failure(Reason.ESTIMATOR_ERROR, f"{name}: must be an array of shape {shape}")
         if name != "look_px" and not _is_finite(value):
             return Failure(Reason.NOT_FINITE, f"{name} holds NaN or infinity")
-    for name, number in (("axis_ratio", estimate.axis_ratio), ("choice_margin", estimate.choice_margin)):
+    for name in ("axis_ratio", "axis_ratio_deviation", "choice_margin"):
+        number = getattr(estimate, name)
         if number is not None and not np.isfinite(number):
             return Failure(Reason.NOT_FINITE, f"{name} is {number}")
     if estimate.region is not None and not np.isfinite(estimate.region.statistic(estimate.candidates)).all():

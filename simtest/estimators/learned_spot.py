@@ -15,6 +15,7 @@ from simtest.estimators.spot_inputs import (
     EXTRAS,
     LOG_RANGE,
     OUTPUTS,
+    RATIO_DEVIATION,
     ROTATION_SCALE,
     SURFACES,
     normal_of,
@@ -28,7 +29,7 @@ from simtest.runtime.onnx_model import OnnxModel
 from simtest.runtime.resources import data_root, shown
 from simtest.runtime.training_range import TrainingRange
 
-FORMAT = "simtest spot_normals, version 2"
+FORMAT = "simtest spot_normals, version 3"
 
 _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 """Extras whose range is checked: focal length and lights. The others differ from frame to frame."""
@@ -134,9 +135,12 @@ class LearnedSpot:
         covariance = (
             jacobian @ factor @ factor.T @ jacobian.T * self._network.scales[self.target].at(log_deviation(made))
         )
+        sure = float(np.clip(made[RATIO_DEVIATION], *LOG_RANGE))
+        deviation = np.exp(sure) * np.sqrt(self._network.ratio_scales[self.target].at(sure))
         return Estimate(
             normal=normals[0], candidates=normals[:1], look_px=np.asarray(peak, dtype=float),
             axis_ratio=float(1 / (1 + np.exp(-made[5]))), covariance=covariance, target=self.target,
+            axis_ratio_deviation=float(deviation),
         )  # fmt: skip
 
 
@@ -148,6 +152,7 @@ class _Network:
         with self._model.reading():
             content = self._model.content
             self.scales = {surface: CovarianceScale.read(content["scales"][surface]) for surface in SURFACES}
+            self.ratio_scales = {name: CovarianceScale.read(content["ratio_scales"][name]) for name in SURFACES}
             self._range = TrainingRange.read(content, EXTRAS)
         self._shapes = {"outputs": (None, len(SURFACES), len(OUTPUTS)), "features": (None, len(self._range.mean))}
 

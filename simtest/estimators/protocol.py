@@ -58,6 +58,8 @@ class Estimate:
         Pixel at whose surface point the normal is proposed.
     axis_ratio : float, optional
         Smaller over larger half-axis of the back-projected cone.
+    axis_ratio_deviation : float, optional
+        Standard deviation of `axis_ratio`, where it is stated.
     isophotes : tuple of FittedIsophote
         The fitted isophotes.
     choice_margin : float, optional
@@ -99,6 +101,7 @@ class Estimate:
     budget: Budget | None = None
     target: Target = "fine"
     cloud: CloudShape | None = None
+    axis_ratio_deviation: float | None = None
 
     def __post_init__(self) -> None:
         if self.budget is not None and self.covariance is None:

@@ -22,6 +22,9 @@ STEPS = (1, 3, 9)
 DARKEST = 0.02
 """Share of the frame's median light that is added before the logarithm; what lies outside the view is this dark."""
 
+LEAST_LIT, BRIGHT_PERCENT = 0.05, 95.0
+"""Pixels with less than this share of the light at this percentile count as unlit (`median_of_lit`)."""
+
 LIGHT_SCALE_MM = 5.0
 """Position of a light, mm, for an input of 1."""
 
@@ -43,6 +46,9 @@ SURFACES = ("base", "fine")
 OUTPUTS = ("rotation, first", "rotation, second", "logarithm of L11", "L21", "logarithm of L22", "axis ratio, logit",
            "logarithm of the axis ratio's deviation")  # fmt: skip
 """Of each surface. L is the Cholesky factor of the rotation's covariance, both in units of `ROTATION_SCALE`."""
+
+RATIO, RATIO_DEVIATION = 5, 6
+"""Columns of the axis ratio and of its deviation."""
 
 LOG_RANGE = (-5.0, 2.0)
 """Of the logarithms of deviations: outside it they are clipped, so that no example decides the fit."""
@@ -86,15 +92,14 @@ def spot_inputs(frame: Frame, peaks_px: Sequence[Array] | Array) -> tuple[Image,
     Returns
     -------
     crops : ndarray of float32, shape (N, 3, 32, 32)
-        Logarithm of the linear light over the frame's median, the smallest step first.
+        Logarithm of the linear light over the median of the frame's lit pixels, the smallest step first.
     extras : ndarray of float32, shape (N, 11)
         See `EXTRAS`.
     """
     peaks = np.asarray(peaks_px, dtype=float).reshape(-1, 2)
     light = frame.channels if frame.channels.ndim == 2 else frame.channels.mean(axis=2, dtype=np.float32)
     seen = np.ones(light.shape, dtype=bool) if frame.seen is None else frame.seen
-    median = max(float(np.median(light[seen])), 1e-6) if seen.any() else 1.0
-    logarithm = np.log(np.where(seen, light / median, 0.0) + DARKEST, dtype=np.float32)
+    logarithm = np.log(np.where(seen, light / median_of_lit(light[seen]), 0.0) + DARKEST, dtype=np.float32)
     # A coarse crop averages what one of its pixels covers.
     layers = [logarithm if step == 1 else cv2.blur(logarithm, (step, step)) for step in STEPS]
     outside = float(np.log(DARKEST))
@@ -108,6 +113,17 @@ def spot_inputs(frame: Frame, peaks_px: Sequence[Array] | Array) -> tuple[Image,
                 borderMode=cv2.BORDER_CONSTANT, borderValue=outside,
             )  # fmt: skip
     return crops, _extras(frame, peaks, crops)
+
+
+def median_of_lit(light: Image) -> float:
+    """Return the median light of a frame's lit pixels, 1 where there are none.
+
+    An organ before a dark background may cover less than half of the picture, whose median then is no tissue's.
+    """
+    if light.size == 0:
+        return 1.0
+    lit = light[light > LEAST_LIT * np.percentile(light, BRIGHT_PERCENT)]
+    return max(float(np.median(lit)), 1e-6) if lit.size else 1.0
 
 
 def _extras(frame: Frame, peaks: Array, crops: Image) -> Image:

@@ -20,7 +20,8 @@ ESTIMATOR_COLOURS: Mapping[str, str] = {
 }
 """Colour of each estimator: blue, vermilion, green, pink, sky blue, orange, violet, brown; hexadecimal.
 
-`learned_spot` takes a further one: no ninth colour is far enough from these eight for all three observers.
+`learned_spot` and `learned_dense` take further ones: no ninth colour is far enough from these eight for all three
+observers.
 """
 
 NEUTRAL = "#747981"

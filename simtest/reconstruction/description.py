@@ -332,6 +332,8 @@ def _estimate_json(result: Estimate | Failure, drawing: Drawing | None) -> JsonO
         "curvature": None,
         "flags": result.flags,
     }
+    if result.axis_ratio_deviation is not None:
+        entry["axis_ratio_deviation"] = result.axis_ratio_deviation
     if (shape := result.curvature) is not None:
         entry["curvature"] = {"directions": shape.directions, "axis_ratio": shape.axis_ratio, "gains": shape.hypotheses}
     if drawing is not None:

@@ -14,7 +14,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from simtest.geometry import student_t
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, IntArray
 from simtest.validation.statistics import CONFIDENCE, Interval
 
 FRAME = ("experiment", "setting", "realisation")
@@ -25,6 +25,7 @@ KEYS = (*FRAME, "target", "true_id")
 LEAST_FRAMES = 5
 """Distinct frames that each setting needs before the interval of a median is stated."""
 
+_ROUNDING = 1e-6
 _RESAMPLES = 1000
 _CHUNK = 2_000_000  # numbers in memory at once
 
@@ -138,6 +139,10 @@ def is_above_zero(differences: Array, settings: Array, frames: Array, certain: N
 def half_width(values: Array, settings: Array, frames: Array, total: int | None = None) -> float | None:
     """Compute half the 95 % interval of the mean of values whose frames are the independent units.
 
+    The number of values varies from frame to frame, and a frame with many of them draws the mean to its own. So the
+    spread is that of `deviation_of_mean`, and Student's t has fewer degrees of freedom where few frames hold most
+    values: n (sum c^2)^2 / (N sum c^4), with c the values of a frame, N the frames and n those less the settings.
+
     Parameters
     ----------
     values : ndarray
@@ -152,20 +157,51 @@ def half_width(values: Array, settings: Array, frames: Array, total: int | None 
     float or None
         None for a single frame.
     """
-    count, kinds = len(np.unique(frames)), len(np.unique(settings))
-    freedom = count - kinds
-    if freedom:
-        totals, sizes = np.bincount(settings, values), np.bincount(settings)
-        residuals = values - (totals / np.maximum(sizes, 1))[settings]
-    else:
+    _, first, frame = np.unique(frames, return_index=True, return_inverse=True)
+    totals: Array = np.asarray(np.bincount(frame, values), dtype=np.float64)
+    counts: Array = np.bincount(frame).astype(np.float64)
+    strata = np.unique(settings[first], return_inverse=True)[1]
+    if len(totals) == strata.max() + 1:
         # One frame a setting: no spread within any is seen, so that between them has to do.
-        residuals, freedom = values - float(np.mean(values)), count - 1
-    if not freedom:
+        strata = np.zeros_like(strata)
+    seen = np.bincount(strata)[strata] > 1
+    if not seen.any():
         return None
-    # Highlights of one frame are no draws of their own: residuals are summed before they are squared.
-    sums = np.bincount(frames, residuals)
-    deviation = math.sqrt(count / freedom * float(np.sum(sums**2))) / (total or len(values))
+    deviation = deviation_of_mean(totals, counts, strata, (total or len(values)) - len(values))
+    # Frames that are alone in their setting spread as the others do.
+    deviation *= math.sqrt(len(totals) / np.count_nonzero(seen))
+    weights, free = counts[seen] ** 2, 1 - (strata.max() + 1) / len(totals)
+    freedom = max(math.floor(free * float(weights.sum() ** 2 / (weights @ weights)) + _ROUNDING), 1)
     return student_t.quantile((1 + CONFIDENCE) / 2, freedom) * deviation
+
+
+def deviation_of_mean(totals: Array, counts: Array, strata: IntArray, others: int = 0) -> float:
+    """Compute the standard deviation of the mean of all values by the jackknife over frames.
+
+    It leaves out one frame of a stratum at a time, and the others of the stratum weigh more instead [Rao and Wu, J. Am.
+    Stat. Assoc. 83, 1988, 231]. So it holds where the number of values varies from frame to frame.
+
+    Parameters
+    ----------
+    totals, counts : ndarray, shape (F,)
+        Sum and number of the values of each frame; 0 of a frame without any.
+    strata : ndarray of int, shape (F,)
+        Number of the stratum of each, from 0.
+    others : int
+        Further values that the mean is over, without spread.
+    """
+    size = np.bincount(strata)[strata]
+    # A value without spread moves the mean by its number alone.
+    number, mean = float(counts.sum()), float(totals.sum() / counts.sum())
+    off = _without_each(totals, strata) / _without_each(counts, strata) - mean
+    return math.sqrt(float(np.sum((1 - 1 / size) * off**2))) * number / (number + others)
+
+
+def _without_each(values: Array, strata: IntArray) -> Array:
+    """Return the sum of all values without each one; the others of its stratum weigh more."""
+    size, own = np.bincount(strata)[strata], np.bincount(strata, values)[strata]
+    # A value that is alone in its stratum stays: it shows no spread.
+    return np.asarray(values.sum() + np.where(size > 1, (own - size * values) / np.maximum(size - 1, 1), 0.0))
 
 
 def median_interval(values: Array, settings: Array, frames: Array) -> Interval:

@@ -127,25 +127,29 @@ def inside_outlines(highlights: Sequence[Highlight], shape: tuple[int, ...]) -> 
 
 
 def score_frame(frame: OutlinedFrame, found: PictureDetection) -> FrameScore:
-    """Score a detection on an outlined frame."""
-    detection = found.detection
+    """Score a detection by colour on an outlined frame."""
+    return score_highlights(frame, found.detection.highlights, found.detection.mask)
+
+
+def score_highlights(frame: OutlinedFrame, highlights: Sequence[Highlight], mask: Mask) -> FrameScore:
+    """Score highlights of any detector, and the pixels that it marks, shape (H, W), on an outlined frame."""
     clear = ~frame.unclear
     specular = frame.specular & clear
-    area = max(int(np.count_nonzero(specular)), 1) if specular.any() else 0
-    outlined = inside_outlines(detection.highlights, specular.shape)
-    answered = inside_outlines(detection.isolated, specular.shape)
-    marked = detection.mask & clear
+    area = int(np.count_nonzero(specular))
+    outlined = inside_outlines(highlights, specular.shape)
+    answered = inside_outlines([highlight for highlight in highlights if highlight.is_isolated], specular.shape)
+    marked = mask & clear
     union = int(np.count_nonzero(marked | specular))
-    peaks = [highlight.region.peak for highlight in detection.highlights]
-    marks = {kind: sum(bool(mask[y, x]) for x, y in peaks) for kind, mask in frame.forbidden.items()}
+    peaks = [highlight.region.peak for highlight in highlights]
+    marks = {kind: sum(bool(part[y, x]) for x, y in peaks) for kind, part in frame.forbidden.items()}
     return FrameScore(
         covered=np.count_nonzero(outlined & specular) / area if area else float("nan"),
         answered=np.count_nonzero(answered & specular) / area if area else float("nan"),
         iou=np.count_nonzero(marked & specular) / union if union else float("nan"),
         marks=marks,
-        count=len(detection.highlights),
-        clusters=sum(str(highlight.kind) == "cluster" for highlight in detection.highlights),
-        empty=sum(len(highlight.outline) < 3 for highlight in detection.highlights),
+        count=len(highlights),
+        clusters=sum(str(highlight.kind) == "cluster" for highlight in highlights),
+        empty=sum(len(highlight.outline) < 3 for highlight in highlights),
     )
 
 

@@ -34,16 +34,16 @@ class Frames:
 
     def __init__(self, number: int) -> None:
         self.number = number
-        self._session: Session | None = None
+        self.session: Session | None = None
         self._radiance: dict[str, Radiance] = {}
 
     def view(self, row: Row) -> RenderedView:
         """Render a row of the scene."""
         tables, scene = scene_of(self.number, row)
-        if self._session is None:
-            self._session = Session(scene, COLOUR)
+        if self.session is None:
+            self.session = Session(scene, COLOUR)
         same = json.dumps(tables, sort_keys=True)
-        seen = render_view(self._session, scene, self._radiance.get(same))
+        seen = render_view(self.session, scene, self._radiance.get(same))
         self._radiance[same] = seen.radiance
         return seen
 

@@ -9,6 +9,7 @@ from simtest.errors import Failure, Reason
 from simtest.estimators.isophote_fit import FittedIsophote, fit_cut_isophote
 from simtest.geometry import Camera, FittedArc, Patch, ellipse_of_conic, fit_arc, fit_ellipse, smooth
 from simtest.geometry.arc_fit import _residuals
+from tests.example_counts import examples
 
 
 def arc_points(a, b, extent_deg, count=60, centre=(30.0, 20.0), middle=0.4, turn=0.7):
@@ -26,7 +27,7 @@ def test_derivatives_are_those_of_finite_differences():
         np.testing.assert_allclose(J[:, k], numeric, atol=1e-7)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=examples(60), deadline=None, derandomize=True)
 @given(st.floats(0.2, 1), st.floats(150, 360), st.floats(0, 6), st.floats(-1.5, 1.5), st.floats(-3, 3))
 def test_exact_arcs_are_recovered(ratio, extent, middle, turn, log_scale):
     scale = 10**log_scale

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from simtest.errors import Failure, Reason
 from simtest.geometry import Camera, circle_pose, cone_axes, cone_of_conic, fit_ellipse
+from tests.example_counts import examples
 
 CAMERA = Camera(640, 480, 500.0, 430.0, 330.0, 225.0, 15.0)
 EXACT_DEG = 1e-6
@@ -75,7 +76,7 @@ SMALL_GRAZING = Circle(np.array([0.0, 0, 1]), np.array([np.sqrt(1 - 0.05**2), 0,
 HEAD_ON = Circle(np.array([0.0, 0, 1]), np.array([0.0, 0, -1]), 0.1)
 
 
-@settings(max_examples=600, deadline=None, derandomize=True)
+@settings(max_examples=examples(600), deadline=None, derandomize=True)
 @given(circles())
 @example(SMALL_GRAZING)
 @example(HEAD_ON)
@@ -88,7 +89,7 @@ def test_one_candidate_is_the_true_normal(circle):
     assert pose.normals[best] @ circle.sight < 0
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=examples(300), deadline=None, derandomize=True)
 @given(circles())
 @example(SMALL_GRAZING)
 def test_both_candidates_lean_alike_in_the_plane_of_e1_and_the_axis(circle):
@@ -101,7 +102,7 @@ def test_both_candidates_lean_alike_in_the_plane_of_e1_and_the_axis(circle):
     np.testing.assert_allclose(pose.normals @ vectors[:, 1], 0, atol=1e-9)
 
 
-@settings(max_examples=600, deadline=None, derandomize=True)
+@settings(max_examples=examples(600), deadline=None, derandomize=True)
 @given(circles(max_off_axis_deg=80))
 @example(SMALL_GRAZING)
 @example(HEAD_ON)
@@ -115,7 +116,7 @@ def test_centre_of_the_right_candidate_projects_to_the_true_centre(circle):
     np.testing.assert_allclose(pole[:2] / pole[2], seen, rtol=1e-6, atol=1e-5)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=examples(300), deadline=None, derandomize=True)
 @given(circles(), st.floats(-12, 12), st.sampled_from([-1.0, 1.0]))
 def test_scale_and_sign_of_the_cone_do_not_matter(circle, exponent, sign):
     first = circle_pose(circle.cone())
@@ -131,7 +132,7 @@ def test_scale_and_sign_of_the_cone_do_not_matter(circle, exponent, sign):
     np.testing.assert_allclose(first.axis_ratio, second.axis_ratio, rtol=1e-7)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=examples(300), deadline=None, derandomize=True)
 @given(circles())
 def test_axis_points_into_the_scene_and_lies_inside_the_cone(circle):
     pose, _, _ = solve(circle)
@@ -151,7 +152,7 @@ def test_axis_ratio_is_that_of_the_half_angles():
     assert abs(pose.axis_ratio - 0.5) < 1e-5
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=examples(200), deadline=None, derandomize=True)
 @given(circles(max_off_axis_deg=60))
 def test_pose_from_points_in_the_image(circle):
     """Points, ellipse fit, K^T C K and pose together; a camera with skew and unequal focal lengths."""

@@ -10,6 +10,7 @@ from skimage.measure import EllipseModel
 
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry import FittedConic, ellipse_of_conic, fit_ellipse, fit_ellipses
+from tests.example_counts import examples
 
 
 def ellipse_points(centre, a, b, angle, phase):
@@ -42,7 +43,7 @@ def check(points, centre, a, b, angle, digits):
         assert abs((found_angle - angle + np.pi / 2) % np.pi - np.pi / 2) < digits * 10 / (1 - b / a)
 
 
-@settings(max_examples=400, deadline=None, derandomize=True)
+@settings(max_examples=examples(400), deadline=None, derandomize=True)
 @given(
     st.floats(-1000, 1000), st.floats(-1000, 1000), st.floats(0, 3), st.floats(0.05, 1), st.floats(-1.57, 1.57),
     st.integers(6, 60), st.floats(0, 6),
@@ -67,7 +68,7 @@ def test_scale_does_not_matter(scale):
     check(points * scale, np.array([2, -1]) * scale, 3 * scale, 1.5 * scale, -0.7, digits=1e-12)
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=examples(150), deadline=None, derandomize=True)
 @given(st.integers(0, 10**6), st.floats(-3, 3), st.floats(-3, 3), st.floats(-500, 500), st.floats(-500, 500))
 def test_a_similarity_of_the_points_is_one_of_the_fit(seed, turn, log_scale, shift_x, shift_y):
     """4 a c - b^2 changes by a factor under a similarity, so the minimum moves along, noise included."""

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from simtest.dataset.png import decode, encode
+from tests.example_counts import examples
 
 IMAGES = st.sampled_from([np.uint8, np.uint16]).flatmap(
     lambda kind: arrays.arrays(
@@ -26,7 +27,7 @@ def opened_by_opencv(data):
 
 
 @given(IMAGES, st.sampled_from(["none", "up"]))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 def test_an_image_comes_back(image, rows):
     data = encode(image, rows)
     for found in (decode(data), opened_by_opencv(data)):
@@ -35,14 +36,14 @@ def test_an_image_comes_back(image, rows):
 
 
 @given(IMAGES)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 def test_files_of_other_writers_are_read(image):
     _, data = cv2.imencode(".png", image if image.ndim == 2 else image[:, :, ::-1])
     np.testing.assert_array_equal(decode(data.tobytes()), image)
 
 
 @given(st.data())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 def test_damaged_files_give_an_error_or_an_image(data):
     good = encode(np.arange(64 * 48, dtype=np.uint16).reshape(48, 64), "up")
     place = data.draw(st.integers(0, len(good) - 1))

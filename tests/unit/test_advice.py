@@ -35,8 +35,8 @@ from simtest.runtime.kept_arrays import kept
 from simtest.surfaces import make_surface
 from simtest.validation import laws, realisation
 from simtest.validation.cases import RELIEF_SEED
-from simtest.validation.paired import half_width
 from studies.advice_strata import frames_of, gain
+from tests.unit.given_numbers import of_given_numbers
 
 CAMERA = "[camera]\nwidth = 96\nheight = 72\nfx = 90.0\nfy = 90.0\n"
 
@@ -366,7 +366,7 @@ def test_the_interval_holds_where_the_number_of_highlights_varies():
         missed += not low <= true <= high
         # Negative control: numbers of highlights taken as given.
         values = np.concatenate([values for _, values in shown])
-        half = half_width(
+        half = of_given_numbers(
             values, np.repeat(strata, counts.astype(int)), np.repeat(np.arange(len(shown)), counts.astype(int))
         )
         naive += abs(values.mean() - true) > half

@@ -8,11 +8,12 @@ from hypothesis import strategies as st
 
 from simtest.errors import InputError
 from simtest.geometry import Camera
+from tests.example_counts import examples
 
 CAMERA = Camera(640, 480, 500.0, 430.0, 331.2, 225.7, 17.0)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=examples(200), deadline=None, derandomize=True)
 @given(
     st.floats(50, 2000), st.floats(50, 2000), st.floats(-500, 1500), st.floats(-500, 1500), st.floats(-50, 50),
     st.lists(st.tuples(st.floats(-2000, 3000), st.floats(-2000, 3000)), min_size=1, max_size=5),

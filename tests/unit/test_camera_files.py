@@ -15,6 +15,7 @@ from simtest import BrownConrady, Camera, InputError, KannalaBrandt, ViewMask, l
 from simtest.spec import scene_from_dict
 from simtest.spec.camera_formats import matlab_struct, plain_yaml
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
+from tests.example_counts import examples
 
 PINHOLE = Camera(640, 480, 500.1, 430.3, 331.2, 225.7)
 PLUMB_BOB = Camera(640, 480, 500.1, 430.3, 331.2, 225.7, 0.0, BrownConrady(-0.3, 0.1, 0.001, -0.002, 0.01))
@@ -346,7 +347,7 @@ def test_values_are_counted_up_to_the_limit(tmp_path, monkeypatch):
             read(tmp_path, f"a: [{', '.join('1' * count)}]")
 
 
-@settings(max_examples=300, deadline=2000, derandomize=True)
+@settings(max_examples=examples(300), deadline=2000, derandomize=True)
 @given(st.text(alphabet="ab1.-: \n\t[]{},&*!|>'\"%@`?#~<", max_size=60))
 def test_yaml_raises_value_errors_only(text):
     said = "line "
@@ -358,7 +359,7 @@ def test_yaml_raises_value_errors_only(text):
     assert "\n" not in said
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=examples(150), deadline=None, derandomize=True)
 @given(st.sampled_from(["c.yml", "c.xml", "c.json", "c.yaml"]), st.integers(0, 10**6), st.binary(max_size=3))
 def test_damaged_files_raise_input_errors_only(tmp_path_factory, name, place, damage):
     path = tmp_path_factory.mktemp("damaged") / name

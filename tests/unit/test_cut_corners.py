@@ -10,6 +10,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera, ViewMask
 from simtest.rendering import Session
 from simtest.spec import load_camera, load_scene, save_camera
+from tests.example_counts import examples
 
 SIZE = {"width": 120, "height": 100, "fx": 400.0, "fy": 400.0}
 SHAPES = {"corner": 30.0, "half_height": 40.0}
@@ -21,7 +22,7 @@ SHAPES = {"corner": 30.0, "half_height": 40.0}
     st.floats(0, 1),
     st.lists(st.tuples(st.floats(-120, 120), st.floats(-120, 120)), min_size=1, max_size=50),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 def test_contains_is_the_polygon_of_the_outline(half_width, half_height, cut, points):
     mask = ViewMask(3.0, -2.0, half_width, cut * min(half_width, half_height), half_height)
     points = np.array(points)

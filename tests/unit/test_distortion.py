@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from simtest.errors import InputError
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Mei, Scaramuzza, ViewMask
+from tests.example_counts import examples
 
 WIDTH, HEIGHT = 640, 480
 MASK = ViewMask(325.0, 236.0, 220.0)
@@ -39,7 +40,7 @@ MEI = st.builds(
 )
 
 
-@settings(max_examples=80, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=examples(80), deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
 @given(st.one_of(BROWN, FISHEYE, OMNI, MEI), st.sampled_from([None, MASK]), spread(150, 900))
 def test_pixels_round_trip(lens, mask, focal):
     try:
@@ -53,7 +54,7 @@ def test_pixels_round_trip(lens, mask, focal):
     np.testing.assert_allclose(camera.project(0.3 * rays), pixels, atol=1e-8)
 
 
-@settings(max_examples=120, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=examples(120), deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
 @given(st.one_of(BROWN, FISHEYE, OMNI), st.integers(0, 2**32 - 1))
 def test_directions_round_trip(lens, seed):
     """On the first branch, undistort takes back what distort did, to the digits that the branch's slope leaves."""

@@ -5,6 +5,7 @@ import re
 import runpy
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -18,7 +19,21 @@ MANUAL = ROOT / "docs" / "images" / "examples"
 LONGEST = 60
 LARGEST_KB = 150
 
+LEARN = ("torch", "safetensors", "onnx", "onnxruntime")
+"""Packages of the extra that the example of a training needs."""
+
 pytestmark = pytest.mark.skipif(not EXAMPLES, reason="the checkout's examples folder is not there")
+
+
+def cases(in_process):
+    """Yield the examples; trainings run where their packages are, in tests that take longer, and once."""
+    for script in EXAMPLES:
+        trains = "_train_" in script.name
+        lacks = pytest.mark.skipif(not all(map(find_spec, LEARN)), reason=f"needs the extra learn: {', '.join(LEARN)}")
+        marks = [pytest.mark.slow, *([pytest.mark.extra] if in_process else []), lacks] if trains else []
+        if not (in_process or trains or script.name.startswith("02_")):
+            marks = [pytest.mark.slow]
+        yield pytest.param(script, marks=marks, id=script.stem)
 
 
 def in_a_process_of_its_own(script, folder):
@@ -57,7 +72,7 @@ def check_picture(script, folder, output):
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.stem)
+@pytest.mark.parametrize("script", cases(in_process=True))
 def test_an_example_makes_its_picture(script, tmp_path, monkeypatch, in_this_process):
     # Run from another folder, so that an example depends on nothing that happens to lie in the checkout.
     monkeypatch.chdir(tmp_path)
@@ -65,11 +80,7 @@ def test_an_example_makes_its_picture(script, tmp_path, monkeypatch, in_this_pro
 
 
 @pytest.mark.render
-@pytest.mark.parametrize(
-    "script",
-    [pytest.param(s, marks=[] if s.name.startswith("02_") else [pytest.mark.slow]) for s in EXAMPLES],
-    ids=lambda script: script.stem,
-)
+@pytest.mark.parametrize("script", cases(in_process=False))
 def test_an_example_runs_as_a_user_runs_it(script, tmp_path):
     check_picture(script, tmp_path, in_a_process_of_its_own(script, tmp_path))
 
@@ -82,6 +93,19 @@ def test_a_picture_without_a_highlight_ends_in_one_line(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
     assert done.stderr == f"{tmp_path / 'dark.png'}: no highlight with a normal: none found\n"
+
+
+def test_a_training_without_its_packages_ends_in_one_line(tmp_path):
+    (script,) = (script for script in EXAMPLES if "_train_" in script.name)
+    # A module that cannot be found stands for a package that is not installed.
+    hide = "import importlib.util as u, runpy, sys; u.find_spec = lambda name: None; sys.argv = sys.argv[1:]; "
+    hide += f"sys.path.insert(0, {str(script.parent)!r}); runpy.run_path(sys.argv[0], run_name='__main__')"
+    own = dict(os.environ) | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", hide, str(script), "--out", str(tmp_path)]
+    done = subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    assert done.stderr.startswith("missing: torch, safetensors, onnx, onnxruntime; pip install")
+    assert len(done.stderr.splitlines()) == 1
 
 
 def test_examples_are_short_numbered_and_listed():
@@ -99,7 +123,7 @@ def test_examples_use_public_names_alone():
     for script in EXAMPLES:
         text = script.read_text(encoding="utf-8")
         modules = set(re.findall(r"^\s*(?:from|import) (simtest[\w.]*)", text, re.MULTILINE))
-        assert modules <= {"simtest", "simtest.dataset"}, script.name
+        assert modules <= {"simtest", "simtest.dataset", "simtest.dataset.learn"}, script.name
 
 
 def test_pictures_of_the_manual_are_small():

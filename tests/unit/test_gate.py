@@ -294,22 +294,33 @@ def test_coverage_is_worse_where_it_falls():
     assert row["low"] < row["difference"] < row["high"] < 0
 
 
-def test_an_uncertainty_that_is_no_longer_stated_is_seen():
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_an_uncertainty_that_is_no_number_covers_nothing(value):
     table = changed(rows(), True, mahalanobis2=1.0)
-    for value in (float("nan"), float("inf")):
-        verdict = compare(night(changed(table, FIRST_12, mahalanobis2=value)), night(table))
-        assert set(verdict.regressions["quantity"]) == {"coverage95"}
-        assert one(verdict, "coverage95")["tonight"] == pytest.approx(0.4)
-    for lost, quantity in (("mahalanobis2", "no_region"), ("axis_ratio", "no_axis_ratio")):
-        for condition, share in ((FIRST_12, 0.6), (True, 1.0)):
-            verdict = compare(night(changed(table, condition, **{lost: None})), night(table))
-            assert set(verdict.regressions["quantity"]) == {quantity}
-            row = one(verdict, quantity)
-            assert (row["baseline"], row["tonight"]) == (0, pytest.approx(share))
-            # Where none ever states it there is nothing to lose.
-            never = changed(table, True, **{lost: None})
-            quiet = compare(night(raised(never, 1 + 1e-9)), night(never))
-            assert quantity not in set(quiet.comparisons["quantity"])
+    verdict = compare(night(changed(table, FIRST_12, mahalanobis2=value)), night(table))
+    assert set(verdict.regressions["quantity"]) == {"coverage95"}
+    assert one(verdict, "coverage95")["tonight"] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(("lost", "quantity"), [("mahalanobis2", "no_region"), ("axis_ratio", "no_axis_ratio")])
+@pytest.mark.parametrize(("condition", "share"), [(FIRST_12, 0.6), (True, 1.0)], ids=["some", "all"])
+def test_an_uncertainty_that_is_no_longer_stated_is_seen(lost, quantity, condition, share):
+    table = changed(rows(), True, mahalanobis2=1.0)
+    verdict = compare(night(changed(table, condition, **{lost: None})), night(table))
+    assert set(verdict.regressions["quantity"]) == {quantity}
+    row = one(verdict, quantity)
+    assert (row["baseline"], row["tonight"]) == (0, pytest.approx(share))
+
+
+@pytest.mark.parametrize(("lost", "quantity"), [("mahalanobis2", "no_region"), ("axis_ratio", "no_axis_ratio")])
+def test_where_no_uncertainty_was_ever_stated_there_is_none_to_lose(lost, quantity):
+    never = changed(rows(), True, **{"mahalanobis2": 1.0, lost: None})
+    quiet = compare(night(raised(never, 1 + 1e-9)), night(never))
+    assert quantity not in set(quiet.comparisons["quantity"])
+
+
+def test_an_uncertainty_that_is_not_stated_at_other_seeds_is_seen():
+    table = changed(rows(), True, mahalanobis2=1.0)
     fresh = compare(night(changed(rows(seed=1), True, mahalanobis2=None)), night(table))
     assert (one(fresh, "no_region")["outcome"], one(fresh, "no_region")["method"]) == ("worse", "unpaired")
 

@@ -5,21 +5,29 @@ import polars as pl
 import pytest
 from gate_nights import changed, night, whole
 
-from simtest.nightly.gate.checks import RULES, broken_rules
+from simtest.nightly.gate.checks import RULES, broken_rules, inconsistent
 from simtest.nightly.gate.compare import compare
-from studies.gate.edits import EDITS, MEDIANS, edited
+from studies.gate.edits import EDITS, MEDIANS, edited, run_of
 
 TONIGHT, OTHER = whole(), whole(seed=1)
 
 
 @pytest.fixture(scope="module")
 def found():
+    """Return what the gate says of each edit against the same seeds."""
+    return {one.name: one for one in edited(TONIGHT, None)}
+
+
+@pytest.fixture(scope="module")
+def found_fresh():
+    """The same against other seeds too, which takes twice as long."""
     return {one.name: one for one in edited(TONIGHT, OTHER)}
 
 
 def test_results_as_they_are_are_fine(found):
     assert (found["none"].same.state, found["none"].same.bit_equal) == ("fine", True)
-    assert found["none"].fresh.state == "fine"
+    assert found["none"].fresh is None
+    assert compare(run_of(TONIGHT), run_of(OTHER)).state == "fine"
 
 
 @pytest.mark.parametrize("name", [*EDITS, MEDIANS])
@@ -43,8 +51,15 @@ def test_no_edit_is_called_fine_and_the_cause_is_named(found, name):
         "a setting dropped", "flags removed", "axis ratio constant", MEDIANS,
     ],
 )  # fmt: skip
-def test_edits_are_seen_against_other_seeds_too(found, name):
-    assert found[name].fresh.state in ("regression", "changed")
+def test_edits_are_seen_against_other_seeds_too(found_fresh, name):
+    assert found_fresh["none"].fresh.state == "fine"
+    assert found_fresh[name].fresh.state in ("regression", "changed")
+
+
+@pytest.mark.parametrize("name", ["all errors 0", "regions x 1.25", "seeds shared between settings"])
+def test_some_edits_are_seen_against_other_seeds_in_each_run(name):
+    run = run_of(EDITS[name](TONIGHT, np.random.default_rng(0)))
+    assert compare(run, run_of(OTHER)).state in ("regression", "changed")
 
 
 def test_stored_figures_that_are_not_those_of_the_rows_are_told():
@@ -95,11 +110,16 @@ def test_each_rule_is_broken_by_what_it_is_about(rule, values, everywhere):
     cell = (pl.col("setting") == "b") & (pl.col("estimator") == "curved")
     of_seed = (pl.col("setting") == "b") | (pl.col("setting") == "c")
     where = of_seed if rule == "check: seeds" else cell if everywhere else cell & FIRST
-    broken = broken_rules(changed(TONIGHT, where & pl.col("true_id").is_not_null(), **values))
-    assert rule in set(broken["quantity"])
+    tonight = changed(TONIGHT, where & pl.col("true_id").is_not_null(), **values)
     assert rule in RULES
-    worse = compare(night(changed(TONIGHT, where & pl.col("true_id").is_not_null(), **values)), night(TONIGHT))
-    assert rule in set(worse.regressions["quantity"])
+    assert rule in set(broken_rules(tonight)["quantity"])
+    worse = inconsistent(tonight, TONIGHT)
+    assert rule in set(worse.filter(outcome="worse")["quantity"])
+
+
+def test_a_rule_that_is_broken_is_a_regression():
+    tonight = changed(TONIGHT, FIRST & (pl.col("setting") == "b"), gain_2=2.2)
+    assert "check: gains" in set(compare(night(tonight), night(TONIGHT)).regressions["quantity"])
 
 
 def test_round_highlights_all_have_the_ratio_1():
@@ -113,21 +133,32 @@ def test_a_rule_that_the_baseline_breaks_as_much_is_no_regression():
     assert compare(night(table), None).state == "regression"
 
 
-def test_a_single_result_that_moved_is_told_on_the_same_machine_alone():
+def moved_results():
+    """Return tonight's rows with two numbers of one result three times larger."""
     cell = (pl.col("setting") == "b") & (pl.col("estimator") == "curved") & FIRST
-    moved = TONIGHT.with_columns(
+    return TONIGHT.with_columns(
         pl.when(cell).then(pl.col(name) * 3).otherwise(name).alias(name) for name in ("error_law_deg", "peak_snr")
     )
-    verdict = compare(night(moved), night(TONIGHT))
+
+
+def test_a_single_result_that_moved_is_told():
+    verdict = compare(night(moved_results()), night(TONIGHT))
     found = verdict.unexplained.filter(method="single").sort("quantity")
     assert found.select("quantity", "setting", "estimator", "n").rows() == [
         ("single law", "b", "curved", 1), ("single peak", "b", "curved", 1)
     ]  # fmt: skip
     assert found["tonight"].to_list() == [3.0, 150.0]
-    for other in ({"processor": "two"}, {"variant": "v"}, {"versions": {"numpy": "9"}}, {"definitions": {"e": "2"}}):
-        before = night(TONIGHT, definitions={"e": "1"}) if "definitions" in other else night(TONIGHT)
-        elsewhere = compare(night(moved, **other), before)
-        assert "single" not in set(elsewhere.comparisons["method"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("processor", "two"), ("variant", "v"), ("versions", {"numpy": "9"}), ("definitions", {"e": "2"})],
+    ids=["processor", "variant", "versions", "definitions"],
+)
+def test_a_single_result_that_moved_is_told_on_the_same_machine_alone(name, value):
+    before = night(TONIGHT, definitions={"e": "1"}) if name == "definitions" else night(TONIGHT)
+    elsewhere = compare(night(moved_results(), **{name: value}), before)
+    assert "single" not in set(elsewhere.comparisons["method"])
 
 
 def test_rounding_moves_no_single_result():

@@ -364,7 +364,7 @@ def test_methods_say_what_they_are_and_where_they_break():
 def test_every_estimator_of_this_package_is_described():
     from simtest.pages.palette import ESTIMATOR_COLOURS
 
-    assert set(DESCRIPTIONS) == {*ESTIMATOR_COLOURS, "learned_spot"}
+    assert set(DESCRIPTIONS) == {*ESTIMATOR_COLOURS, "learned_spot", "learned_dense"}
     assert describe_estimators(["cone_axis"]) == {"cone_axis": DESCRIPTIONS["cone_axis"]}
 
 

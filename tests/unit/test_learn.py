@@ -1,7 +1,7 @@
 """Samples as tensors, crops, and a network that learns. Skipped where PyTorch is absent."""
 
 import shutil
-from itertools import chain
+from itertools import chain, islice
 
 import numpy as np
 import polars as pl
@@ -9,6 +9,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+import simtest  # noqa: E402
+from simtest.dataset import calibration_of, read  # noqa: E402
 from simtest.dataset.learn import Samples, read_crops  # noqa: E402
 from simtest.dataset.learn.network import propose, train  # noqa: E402
 from simtest.dataset.shard_writer import write_dataset  # noqa: E402
@@ -23,7 +25,7 @@ pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.ma
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("learn") / "tiny"
-    write_dataset(load_dataset("tiny", {"samples": 24}), folder, make_engine())
+    write_dataset(load_dataset("tiny", {"samples": 24, "visible": True}), folder, make_engine())
     return folder
 
 
@@ -67,6 +69,25 @@ def test_ranks_share_the_samples_out(made, monkeypatch):
         Samples(made, world=0)
 
 
+def test_pixels_of_visible_highlights_come_through_workers_and_ranks(made):
+    wanted = {index: visible for index, visible in ((i["meta"]["index"], i["visible"]) for i in visible_of(made))}
+    found = {}
+    for rank in range(2):
+        samples = visible_of(made, rank=rank, world=2, even=False)
+        for batch in torch.utils.data.DataLoader(samples, batch_size=3, num_workers=2, multiprocessing_context="fork"):
+            # Numbers of highlights, not shares of 255.
+            assert batch["visible"].dtype == torch.int32
+            assert batch["visible"].shape[1:] == (48, 64)
+            found |= {meta["index"]: visible for meta, visible in zip(batch["meta"], batch["visible"], strict=True)}
+    assert found.keys() == wanted.keys()
+    assert all(torch.equal(found[index], wanted[index]) for index in wanted)
+    assert {int(visible.max()) for visible in wanted.values()} >= {1}
+
+
+def visible_of(folder, **share):
+    return Samples(folder, "train", fields=("visible",), **share)
+
+
 def test_a_damaged_index_is_told_in_one_line(made, tmp_path):
     folder = tmp_path / "damaged"
     shutil.copytree(made, folder)
@@ -80,6 +101,23 @@ def test_a_damaged_index_is_told_in_one_line(made, tmp_path):
     (folder / "index.parquet").unlink()
     with pytest.raises(InputError, match=r"index.parquet: .*verify --repair"):
         Samples(folder, "train")
+
+
+def test_the_calibration_of_a_sample_reconstructs_its_picture(made):
+    errors = []
+    for record in islice(read(made, fields=["image"]), 3):
+        calibration, meta = calibration_of(record["meta"]), record["meta"]
+        assert (calibration.camera.width, calibration.camera.height) == (
+            meta["camera"]["width"],
+            meta["camera"]["height"],
+        )
+        # The picture is sRGB, whatever the sensor's frame was.
+        assert calibration.response.kind == "srgb"
+        found = simtest.reconstruct(record["image"], calibration, ["brightest_point"], detector="peaks")
+        errors.append(
+            angle_deg(found[0].estimates["brightest_point"].normal, np.array(meta["highlights"][0]["normal"]))
+        )
+    assert max(errors) < 3
 
 
 def test_shuffling_hangs_on_seed_and_epoch(made):

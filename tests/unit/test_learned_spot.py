@@ -96,6 +96,10 @@ def test_covariances_are_scaled_to_cover_95_percent_of_the_validation_split(made
         factors = scale.at(log_deviation(outputs[:, number].numpy()))
         distances = squared_distance(outputs[:, number], judged[surface]).numpy() / factors
         assert 0.94 < (distances < 5.991).mean() < 0.98
+        scale = CovarianceScale(**{key: tuple(values) for key, values in content["ratio_scales"][surface].items()})
+        sure = outputs[:, number, 6]
+        off = (judged[f"{surface}_ratio"] - torch.sigmoid(outputs[:, number, 5])) / torch.exp(sure)
+        assert 0.94 < (off.numpy() ** 2 < 3.842 * scale.at(sure.numpy())).mean() < 0.98
     assert content["about"] == {"dataset": "drawn"}
 
 
@@ -156,6 +160,8 @@ def test_the_pipeline_runs_it_beside_the_others(made):
     for result, ray, row in zip(results, rays, outputs, strict=True):
         assert result.target == "base"
         assert 0 < result.axis_ratio < 1
+        wanted = np.exp(row[6]) * np.sqrt(learned._network.ratio_scales["base"].at(row[6]))
+        assert result.axis_ratio_deviation == pytest.approx(wanted, rel=1e-4)
         # The network's rotation is the angle between the normal and the direction to the camera.
         turned = 0.1 * np.hypot(*row[:2])
         assert angle_deg(result.normal[None], -ray[None])[0] == pytest.approx(np.degrees(turned), abs=1e-4)

@@ -13,6 +13,7 @@ from simtest.spec import scene_from_dict
 from simtest.spec.relief import MAX_HEIGHT_MM, Relief
 from simtest.surfaces import forget_meshes
 from simtest.surfaces.relief_field import NODES, HeightJets, fine_normals, make_relief
+from tests.example_counts import examples
 
 STENCIL = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))
 """Central differences of 4th order."""
@@ -349,7 +350,7 @@ def test_heights_stay_below_the_limit():
     level=st.floats(-1.5, 1.5),
     gradient=st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_film_fills_valleys_smoothly(height, level, gradient):
     field = make(level=0.0)
     field = replace(field, level=level * field.deviation)

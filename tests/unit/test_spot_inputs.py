@@ -9,6 +9,7 @@ from simtest.estimators.spot_inputs import (
     SIDE,
     STEPS,
     image_basis,
+    median_of_lit,
     normal_of,
     rays_of,
     rotation_of,
@@ -46,6 +47,16 @@ def test_crops_show_the_frame_around_the_peak(picture):
     # The widest crop reaches over the border, where it is dark.
     assert crops[0, 2, 0, 0] == pytest.approx(np.log(0.02))
     assert np.isfinite(crops).all()
+
+
+def test_a_dark_background_does_not_set_the_scale_of_the_light(picture):
+    before = picture.copy()
+    # A liver before an unlit background: three fifths of the picture are nearly black.
+    before[: WIDTH // 5, :], before[3 * WIDTH // 5 :, :] = 1e-4, 1e-4
+    crop, alone = (spot_inputs(frame(each), [PEAK])[0][0, 0, 12:20, 12:20] for each in (before, picture))
+    assert np.median(frame(before).channels) < 0.01 * np.median(frame(picture).channels)
+    assert np.abs(crop - alone).max() < 0.1
+    assert median_of_lit(np.zeros(9, np.float32)) == median_of_lit(np.zeros(0, np.float32)) == 1.0
 
 
 @pytest.mark.parametrize(

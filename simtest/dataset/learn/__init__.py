@@ -4,7 +4,8 @@
 
 `runs` trains a network as a file of `training` says: `engine` is the loop, with `checkpoint` and `page`, and knows a
 task of `tasks` alone. The task of `spot_task` learns from the highlights that `spots` reads; `spot_export` writes its
-network for `simtest.estimators.learned_spot`.
+network for `simtest.estimators.learned_spot`. The task of `dense_task` learns from the frames that `dense_frames`
+reads; `dense_export` writes its network for `simtest.estimators.learned_dense`.
 
 `crops` and `network` are those of docs/gallery/learning.md: smooth colons, without uncertainty.
 """

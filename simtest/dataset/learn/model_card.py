@@ -123,14 +123,14 @@ def _measured(path: Path) -> str:
 
 
 def _shape(model: onnx.ModelProto) -> JsonObject:
-    """Return inputs and outputs with their shapes, and how many weights there are, and how many in half precision."""
+    """Return inputs and outputs with their shapes, and how many weights there are, and how many in 16 and 8 bits."""
     counts: Counter[int] = Counter()
     for tensor in model.graph.initializer:
         counts[tensor.data_type] += int(np.prod(numpy_helper.to_array(tensor).shape))
-    weights = counts[TensorProto.FLOAT] + counts[TensorProto.FLOAT16]
+    weights = counts[TensorProto.FLOAT] + counts[TensorProto.FLOAT16] + counts[TensorProto.INT8]
     sides = {"inputs": model.graph.input, "outputs": model.graph.output}
     shapes = {side: [f"{each.name} {_sizes(each)}" for each in values] for side, values in sides.items()}
-    return {**shapes, "weights": weights, "halved": counts[TensorProto.FLOAT16]}
+    return {**shapes, "weights": weights, "halved": counts[TensorProto.FLOAT16], "stepped": counts[TensorProto.INT8]}
 
 
 def _sizes(value: onnx.ValueInfoProto) -> str:

@@ -3,14 +3,15 @@
 from pathlib import Path
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from simtest.dataset.learn.calibration import fitted_range, fitted_scale
 from simtest.dataset.learn.onnx_export import MODEL, export
 from simtest.dataset.learn.spot_task import squared_distance
 from simtest.dataset.learn.tasks import Batch
+from simtest.estimators.covariance_scale import CovarianceScale
 from simtest.estimators.learned_spot import FORMAT, log_deviation
-from simtest.estimators.spot_inputs import EXTRAS, SURFACES
+from simtest.estimators.spot_inputs import EXTRAS, LOG_RANGE, RATIO, RATIO_DEVIATION, SURFACES
 from simtest.runtime.files import JsonObject
 
 
@@ -30,11 +31,20 @@ def _calibration(network: nn.Module, taught: Batch, judged: Batch) -> JsonObject
     with torch.no_grad():
         outputs, features = network(judged["crops"], judged["extras"])
         own = network(taught["crops"], taught["extras"])[1]
-    scales = {}
+    scales, ratio_scales = {}, {}
     for number, surface in enumerate(SURFACES):
         known = torch.isfinite(judged[surface][:, 0])
         made = outputs[known, number]
         distances = squared_distance(made, judged[surface][known]).double().numpy()
         scales[surface] = fitted_scale(distances, log_deviation(made.double().numpy())).written()
+        ratio_scales[surface] = _ratio_scale(outputs[:, number], judged[f"{surface}_ratio"]).written()
     taught_range = fitted_range(EXTRAS, taught["extras"].numpy(), own.numpy(), features.numpy())
-    return {"scales": scales, **taught_range.written()}
+    return {"scales": scales, "ratio_scales": ratio_scales, **taught_range.written()}
+
+
+def _ratio_scale(made: Tensor, ratio: Tensor) -> CovarianceScale:
+    """Return the factor of the axis ratio's variance, where the ratio is known."""
+    known = torch.isfinite(ratio)
+    sure = made[known, RATIO_DEVIATION].clamp(*LOG_RANGE)
+    off = (ratio[known] - torch.sigmoid(made[known, RATIO])) * torch.exp(-sure)
+    return fitted_scale((off * off).double().numpy(), sure.double().numpy(), dimensions=1)

@@ -7,10 +7,12 @@ import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
+from simtest.dataset.learn import likelihood
+from simtest.dataset.learn.likelihood import number_loss, pair_loss
 from simtest.dataset.learn.spots import Spots, read_spots
 from simtest.dataset.learn.tasks import Batch
 from simtest.dataset.learn.training import Training
-from simtest.estimators.spot_inputs import EXTRAS, LOG_RANGE, OUTPUTS, ROTATION_SCALE, SIDE, STEPS, SURFACES
+from simtest.estimators.spot_inputs import EXTRAS, OUTPUTS, ROTATION_SCALE, SIDE, STEPS, SURFACES
 from simtest.validation.runner import Progress
 
 VECTORS = ((1, 2), (3, 4))
@@ -142,22 +144,15 @@ def moved(batch: Batch, flip_x: bool, flip_y: bool, transpose: bool) -> Batch:
 
 
 def _rotation_loss(made: Tensor, rotation: Tensor) -> Tensor:
-    """Return the negative log-likelihood of rotations under a normal distribution, shape (N,)."""
-    log_first, log_second = (made[:, column].clamp(*LOG_RANGE) for column in (2, 4))
-    return 0.5 * squared_distance(made, rotation) + log_first + log_second
+    """Return the negative log-likelihood of rotations, rad, under a normal distribution, shape (N,)."""
+    return pair_loss(made, rotation / ROTATION_SCALE)
 
 
 def squared_distance(made: Tensor, rotation: Tensor) -> Tensor:
     """Return the squared Mahalanobis distance of rotations, rad, from outputs of one surface, shape (N,)."""
-    off = rotation / ROTATION_SCALE - made[:, :2]
-    log_first, log_second = (made[:, column].clamp(*LOG_RANGE) for column in (2, 4))
-    u = off[:, 0] * torch.exp(-log_first)
-    v = (off[:, 1] - made[:, 3] * u) * torch.exp(-log_second)
-    return u * u + v * v
+    return likelihood.squared_distance(made, rotation / ROTATION_SCALE)
 
 
 def _ratio_loss(made: Tensor, ratio: Tensor) -> Tensor:
     """Return the negative log-likelihood of axis ratios, shape (N,); 0 where none is known."""
-    log_deviation = made[:, 6].clamp(*LOG_RANGE)
-    off = torch.nan_to_num(ratio - torch.sigmoid(made[:, 5]), nan=0.0) * torch.exp(-log_deviation)
-    return torch.where(torch.isfinite(ratio), 0.5 * off * off + log_deviation, torch.zeros_like(off))
+    return number_loss(torch.sigmoid(made[:, 5]), made[:, 6], ratio)

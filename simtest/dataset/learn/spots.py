@@ -11,12 +11,11 @@ from simtest.calibration import Frame
 from simtest.dataset.fields import INSTRUMENT
 from simtest.dataset.reader import read_samples, sample_positions
 from simtest.dataset.sample import Sample
+from simtest.dataset.sample_calibration import calibration_of
 from simtest.detection.detector import load_detector, run_detector
 from simtest.errors import Failure
 from simtest.estimators.spot_inputs import rays_of, rotation_of, spot_inputs
 from simtest.runtime.arrays import AnyArray, Array, Image
-from simtest.simulation.frame_files import picture_calibration
-from simtest.spec import Scene
 from simtest.validation.runner import Progress
 
 MOST_OF_A_FRAME = 64
@@ -89,9 +88,8 @@ _SHAPES = ((0, 3, 32, 32), (0, 11), (0, 3), (0, 2), (0, 2), (0,), (0,), (0, 2), 
 
 def sample_frame(sample: Sample) -> Frame:
     """Return a sample's picture as the estimators see it."""
-    scene = Scene.model_validate(sample.meta["scene"])
     picture: Image = sample.images["image"].astype(np.float32) / np.float32(255)
-    return Frame(picture, picture_calibration(scene.calibration(), scene.sensor), SMOOTHING_PX)
+    return Frame(picture, calibration_of(sample.meta), SMOOTHING_PX)
 
 
 def _spots(sample: Sample, most: int) -> Spots:

@@ -1,0 +1,273 @@
+"""`learned_dense`: a trained network's normals and distances all over a frame, run by ONNX Runtime, without PyTorch."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from simtest.calibration import Calibration, Frame, Priors
+from simtest.errors import Failure, Reason
+from simtest.estimators.covariance_scale import CovarianceScale
+from simtest.estimators.dense_inputs import (
+    CAMERA,
+    CELLS,
+    DISTANCE_MM,
+    DISTANCE_SCALE,
+    OUTPUTS,
+    ROTATION_SCALE,
+    STRIDE,
+    Layout,
+    camera_values,
+    dense_inputs,
+)
+from simtest.estimators.protocol import Estimate
+from simtest.estimators.reflection_check import Reflection, reflected, reflection
+from simtest.estimators.spot_inputs import LOG_RANGE
+from simtest.estimators.turned_normals import turned_normals
+from simtest.geometry import Array, Camera, Patch
+from simtest.runtime.arrays import Image
+from simtest.runtime.onnx_model import OnnxModel
+from simtest.runtime.resources import data_root, shown
+from simtest.runtime.training_range import TrainingRange
+
+FORMAT = "simtest dense_normals, version 1"
+
+SHIPPED = ("learning", "weights", "learned_dense.onnx")
+"""Below the shipped scenes; its card lies beside it."""
+
+ASPECTS = (1.0, 1.9)
+"""Width over height: what the training's cut views cover."""
+
+CELL_PX = (1.5, 20.0)
+"""Pixels of a cell along x: resampling covers these."""
+
+LEAST_HIGHLIGHTS, REFLECTION_LIMIT = 4, 3.0
+"""From so many highlights a frame's normals are checked against the law of reflection, and refused beyond the limit.
+
+`python -m studies.learned_dense DATA MODEL --split validation` prints how far the validation split's frames go.
+"""
+
+
+@dataclass(frozen=True)
+class DenseMaps:
+    """What a network states of each pixel of a frame; NaN out of view.
+
+    Parameters
+    ----------
+    normal : ndarray of float32, shape (H, W, 3)
+        Unit normal of the base surface, camera frame.
+    covariance : ndarray of float32, shape (H, W, 2, 2)
+        Of the normal in the basis `simtest.geometry.vectors.tangent_basis(normal)`, rad^2.
+    distance_mm : ndarray of float32, shape (H, W)
+        Along the ray.
+    deviation_mm : ndarray of float32, shape (H, W)
+        Standard deviation of the distance, to first order.
+    """
+
+    normal: Image
+    covariance: Image
+    distance_mm: Image
+    deviation_mm: Image
+
+
+@dataclass(frozen=True)
+class LearnedDense:
+    """A network of the task ``dense_normals`` (`simtest train`) as an estimator.
+
+    It sees the whole frame on a coarse grid, the sightlines and the lights. It states the base's normal and the
+    distance everywhere (`maps`); as an estimator it answers for each detection. It refuses with ``no_estimate`` what
+    lies outside the range that it was taught: another lens or other lights, a frame without colour, of an unusual
+    aspect or too small, and frames whose features lie far from those of the train split. As an estimator it refuses
+    frames too at whose highlights its normals contradict the law of reflection (`simtest.estimators.reflection_check`).
+
+    Parameters
+    ----------
+    model : str or Path, optional
+        The file model.onnx. Default: the shipped network.
+    reflection : bool
+        Whether the normal at a highlight is corrected by the law of reflection: the bisector of light and camera at the
+        stated distance counts as a measurement of it. Maps are the network's own.
+
+    Raises
+    ------
+    InputError
+        At the first use, if ONNX Runtime (extra ``onnx``) is missing, or the file is no such network.
+    """
+
+    model: str | Path | None = None
+    reflection: bool = True
+
+    def check(self) -> None:
+        """Load the network; raise `InputError` where it cannot be used."""
+        _ = self._network
+
+    def with_model(self, model: Path) -> "LearnedDense":
+        """Return the estimator with another network, loaded; raise `InputError` where it cannot be used."""
+        made = replace(self, model=model)
+        made.check()
+        return made
+
+    @property
+    def description(self) -> str:
+        """What the estimator is, in one line for a reader who chooses one."""
+        network = shown(self.model or SHIPPED[-1])
+        return f"The normal of the base surface at each highlight, by the network {network} of the whole frame."
+
+    @cached_property
+    def _network(self) -> "_Network":
+        return _Network(Path(self.model) if self.model else data_root("scenes").joinpath(*SHIPPED))
+
+    def maps(self, values: Image, calibration: Calibration) -> DenseMaps | Failure:
+        """Compute the normals and distances of a frame, or say why there are none.
+
+        Parameters
+        ----------
+        values : ndarray of float32, shape (H, W, 3)
+            The frame as encoded, in [0, 1].
+        calibration : Calibration
+            Camera, lights, response and falloff.
+        """
+        frame = Frame(values, calibration, 0.0)
+        outputs = self._outputs(frame)
+        if isinstance(outputs, Failure):
+            return outputs
+        camera = frame.camera
+        shape = (camera.height, camera.width)
+        seen = np.ones(shape, dtype=bool) if frame.seen is None else frame.seen
+        stated = self._stated(outputs, camera, camera.pixel_centres()[seen])
+        made = []
+        for part in stated:
+            whole = np.full((*shape, *part.shape[1:]), np.nan, dtype=np.float32)
+            whole[seen] = part
+            made.append(whole)
+        return DenseMaps(*made)
+
+    def contradiction(self, frame: Frame, points_px: Array) -> float | Failure:
+        """Return how far the normals at highlights are from the law of reflection (`Reflection.distance`)."""
+        outputs = self._outputs(frame)
+        if isinstance(outputs, Failure):
+            return outputs
+        return _reflection(self._stated(outputs, frame.camera, points_px), frame, points_px).distance
+
+    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
+        """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
+        return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
+
+    def estimate_regions(
+        self, frame: Frame, patches: Sequence[Patch | Failure], /
+    ) -> tuple[Sequence[Estimate | Failure | None], Sequence[Estimate]]:
+        """Return an estimate or a failure for each patch (see `simtest.estimators.protocol.RegionEstimator`)."""
+        peaks = [patch.peak_px for patch in patches if not isinstance(patch, Failure)]
+        made = iter(self._at(frame, peaks))
+        return [patch if isinstance(patch, Failure) else next(made) for patch in patches], []
+
+    def _at(self, frame: Frame, peaks: Sequence[Array]) -> list[Estimate | Failure]:
+        """Return an estimate or a failure for each peak of a frame."""
+        if not peaks:
+            return []
+        outputs = self._outputs(frame)
+        if isinstance(outputs, Failure):
+            return [outputs] * len(peaks)
+        points = np.asarray(peaks, dtype=float)
+        stated = self._stated(outputs, frame.camera, points)
+        normals, covariances, *_ = stated
+        seen = _reflection(stated, frame, points)
+        off = seen.distance
+        if len(points) >= LEAST_HIGHLIGHTS and off > REFLECTION_LIMIT:
+            told = (
+                f"contradicts the law of reflection at {len(points)} highlights: {off:.3g}, limit {REFLECTION_LIMIT:g}"
+            )
+            return [Failure(Reason.NO_ESTIMATE, told)] * len(points)
+        if self.reflection:
+            normals, covariances = reflected(normals, covariances, seen)
+        return [
+            Estimate(normal=normal, candidates=normal[None], look_px=point, covariance=covariance, target="base")
+            for normal, covariance, point in zip(normals, covariances, points, strict=True)
+        ]
+
+    def _outputs(self, frame: Frame) -> Array | Failure:
+        """Return the network's outputs, shape (7, 48, 64), or why the frame is refused."""
+        if not frame.calibration.priors.lights_mm:
+            return Failure(Reason.NOT_KNOWN, "needs the lights' positions")
+        return _unfit(frame) or self._network.run(frame)
+
+    def _stated(self, outputs: Array, camera: Camera, points_px: Array) -> tuple[Array, Array, Array, Array]:
+        """Return normals, covariances, distances, mm, and their deviations, mm, at pixel positions, shape (N, 2)."""
+        layout, scales = Layout.of(camera.width, camera.height), self._network.scales
+        made = interpolated(outputs, layout.to_cells(points_px, camera) / STRIDE - 0.5).T
+        first, second = (np.exp(np.clip(made[:, column], *LOG_RANGE)) for column in (2, 4))
+        root = np.zeros((len(made), 2, 2))
+        root[:, 0, 0], root[:, 1, 0], root[:, 1, 1] = first, made[:, 3], second
+        root *= ROTATION_SCALE * np.sqrt(scales["base"].at(stated_deviation(made)))[:, None, None]
+        normals, covariances = turned_normals(camera.unproject(points_px), made[:, :2] * ROTATION_SCALE, root)
+        distance = DISTANCE_MM * np.exp(DISTANCE_SCALE * made[:, 5])
+        logarithm = np.clip(made[:, 6], *LOG_RANGE)
+        share = DISTANCE_SCALE * np.exp(logarithm) * np.sqrt(scales["distance"].at(logarithm))
+        return normals, covariances, distance, share * distance
+
+
+def _reflection(stated: tuple[Array, Array, Array, Array], frame: Frame, points_px: Array) -> Reflection:
+    """Compare what is stated at highlights with the law of reflection."""
+    normals, covariances, distance, deviation = stated
+    rays, lights = frame.camera.unproject(points_px), frame.calibration.priors.lights
+    return reflection(normals, covariances, rays, distance, deviation / distance, lights)
+
+
+def stated_deviation(made: Array) -> Array:
+    """Return the mean logarithm of the two deviations of a rotation, in outputs of shape (N, 7)."""
+    return np.asarray(np.clip(made[:, [2, 4]], *LOG_RANGE).mean(axis=1))
+
+
+def interpolated(outputs: Array, points: Array) -> Array:
+    """Return planes, shape (C, rows, columns), between their cells' centres, which stand at integers, shape (C, N)."""
+    last = np.array([outputs.shape[2] - 1, outputs.shape[1] - 1])
+    points = np.clip(points, 0, last)
+    corner = np.minimum(points.astype(int), last - 1)
+    (x, y), (u, v) = corner.T, (points - corner).T
+    above = outputs[:, y, x] * (1 - u) + outputs[:, y, x + 1] * u
+    below = outputs[:, y + 1, x] * (1 - u) + outputs[:, y + 1, x + 1] * u
+    return np.asarray(above * (1 - v) + below * v)
+
+
+def _unfit(frame: Frame) -> Failure | None:
+    """Return why no network of this kind can take a frame, or None."""
+    camera, told = frame.camera, None
+    aspect = camera.width / camera.height
+    if camera.distortion is not None:
+        told = "a lens with distortion"
+    elif frame.encoded.ndim != 3:
+        told = "a frame of one channel"
+    elif not ASPECTS[0] <= aspect <= ASPECTS[1]:
+        told = f"width over height is {aspect:.3g}, may be {ASPECTS[0]:g} to {ASPECTS[1]:g}"
+    else:
+        cell = camera.width / Layout.of(camera.width, camera.height).columns
+        if not CELL_PX[0] <= cell <= CELL_PX[1]:
+            told = f"a cell has {cell:.3g} px, may have {CELL_PX[0]:g} to {CELL_PX[1]:g}"
+    return Failure(Reason.NO_ESTIMATE, f"outside the network's training: {told}") if told else None
+
+
+class _Network:
+    """A network in ONNX Runtime, with the range that it was taught."""
+
+    def __init__(self, path: Path) -> None:
+        self._model = OnnxModel(path, FORMAT, "learned_dense")
+        with self._model.reading():
+            content = self._model.content
+            self.scales = {name: CovarianceScale.read(content["scales"][name]) for name in ("base", "distance")}
+            self._range = TrainingRange.read(content, CAMERA)
+
+    def run(self, frame: Frame) -> Array | Failure:
+        """Return the outputs of a frame, shape (7, 48, 64), or why it is refused."""
+        told = dict(zip(CAMERA, camera_values(frame).tolist(), strict=True))
+        if refused := self._range.refusal(told):
+            return refused
+        shapes = {"outputs": (1, len(OUTPUTS), *CELLS), "features": (1, len(self._range.mean))}
+        outputs, features = self._model.run({"planes": dense_inputs(frame)[None]}, shapes)
+        (refused,) = self._range.refusals(features)
+        return refused or np.asarray(outputs[0], dtype=float)
+
+
+learned_dense = LearnedDense()
+"""The shipped network; it is read at its first use."""

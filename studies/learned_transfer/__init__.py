@@ -1,0 +1,1 @@
+"""What networks trained on smooth surfaces and on tissue are worth elsewhere. See `__main__`."""

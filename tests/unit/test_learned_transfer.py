@@ -1,0 +1,294 @@
+"""The arithmetic of studies.learned_transfer: errors and refusals, pairing, overlap of regions, scores, kept frames."""
+
+import json
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from simtest.detection.blobs import Highlight, Kind
+from simtest.detection.detector import Detection
+from simtest.detection.regions import Region
+from simtest.errors import Failure, Reason
+from simtest.estimators import Estimate
+from simtest.estimators.learned_spot import SHIPPED
+from simtest.geometry import Patch
+from simtest.reconstruction import Specularity
+from simtest.runtime.resources import data_root
+from studies.detection.real_frames import OutlinedFrame
+from studies.detection.tissue import Counts
+from studies.hard.cases import scene_of
+from studies.hard.scenes import KINDS
+from studies.learned_transfer import answers as answering
+from studies.learned_transfer import frames, kept, networks, real, sheet, tables
+from studies.learned_transfer.answers import OK, Answer
+from studies.learned_transfer.frames import FIRST, GUIDES, LENS, ONE_LIGHT, ROWS, HardFrame, hard_frames
+
+TOWARDS = np.array([0.0, 0.0, -1.0])
+ALL = {"all": tuple(row.name for row in ROWS)}
+
+
+def a_frame(**changes):
+    """Return a frame of a wall across the view with one visible highlight, whose only glint is tilted by 0.1 rad."""
+    height, width = 24, 32
+    normal = np.zeros((height, width, 3), dtype=np.float16)
+    normal[..., 2] = -1
+    normal[:, :4] = np.nan
+    regions = np.zeros((height, width), dtype=np.uint16)
+    regions[9:12, 14:17] = 1
+    made = HardFrame(
+        FIRST, GUIDES[0], np.full((height, width, 3), 90, dtype=np.uint8), normal,
+        np.full((height, width), 20, dtype=np.float32), regions, np.array([[15.5, 10.5]]), np.array([1.7]),
+        np.array([50.0]), np.array([True]), np.array([[math.sin(0.1), 0.0, -math.cos(0.1)]]),
+    )  # fmt: skip
+    return replace(made, **changes)
+
+
+def an_estimate(angle=0.0, sd=0.05, target="base", **more):
+    normal = np.array([math.sin(angle), 0.0, -math.cos(angle)])
+    return Estimate(normal, normal[None], np.array([15.5, 10.5]), covariance=sd**2 * np.eye(2), target=target, **more)
+
+
+def a_specularity(estimates, peak=(15, 10)):
+    values = np.random.default_rng(0).random((9, 9)).astype(np.float32)
+    values[4, 4] = 3.0
+    patch = Patch.cut(values, (0, 0, 9, 9), raw=values, noise=0.01, smoothing_px=1.0)
+    return Specularity(Region((11, 6, 9, 9), peak, 1.0), patch, estimates)
+
+
+def a_highlight(box, kind=Kind.ISOLATED):
+    x, y, w, h = box
+    outline = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h], [x, y]], dtype=float)
+    peak = (x + w // 2, y + h // 2)
+    return Highlight(Region(box, peak, 1.0), kind, 1.0, w * h, None, None, None, 1.0, 0.0, outline)
+
+
+def answer(estimator, spot, base_deg, scene=1, status=OK, row=GUIDES[0].name, inside=math.nan):
+    return Answer(row, "plane", scene, spot, estimator, status, base_deg, inside=inside)
+
+
+@pytest.mark.parametrize("number", range(FIRST, FIRST + len(KINDS)))
+def test_every_row_is_a_picture_that_tells_its_lights(number):
+    for row in ROWS:
+        scene = scene_of(number, row)[1]
+        assert scene.sensor.bits == 8
+        lights = scene.calibration().priors.lights_mm
+        assert len(lights) == (1 if row in ONE_LIGHT else 2)
+        assert (scene.camera.distortion is not None) == (row in LENS)
+
+
+def test_an_answer_is_judged_against_the_surface_that_it_states(monkeypatch):
+    frame = a_frame()
+    results = {
+        "base": an_estimate(0.02),
+        "fine": an_estimate(0.1, 0.001, "fine"),
+        "refuses": Failure(Reason.NO_ESTIMATE, "unlike the network's training: features at 90, limit 80"),
+        "sure": an_estimate(0.02, 0.001),
+    }
+    found = type("Found", (), {"specularities": [a_specularity(results), a_specularity(results, (2, 10))]})()
+    monkeypatch.setattr(answering, "run_pipeline", lambda *arguments: found)
+    made = {each.estimator: each for each in answering.answers(frame, {})}
+    assert len(list(answering.answers(frame, {}))) == len(results)  # nothing is known off the surface
+    assert made["base"].base_deg == pytest.approx(math.degrees(0.02), abs=1e-6)
+    assert made["base"].fine_deg == pytest.approx(math.degrees(0.08), abs=1e-6)
+    assert (made["base"].inside, made["sure"].inside, made["fine"].inside) == (1, 0, 1)
+    assert made["fine"].base_deg == pytest.approx(math.degrees(0.1), abs=1e-6)
+    assert made["fine"].stated_deg == pytest.approx(math.degrees(0.001))
+    assert made["refuses"].status == "unlike the network's training: features"
+    assert math.isnan(made["refuses"].base_deg)
+
+
+def test_a_glint_is_known_only_near_its_visible_highlight_and_alone():
+    frame = a_frame()
+    assert answering.fine_at(frame, np.array([16.5, 10.5])) is not None
+    assert answering.fine_at(frame, np.array([18.5, 10.5])) is None
+    assert answering.fine_at(replace(frame, fine=np.full((1, 3), np.nan)), np.array([15.5, 10.5])) is None
+    assert answering.fine_at(replace(frame, peaks=np.empty((0, 2))), np.array([15.5, 10.5])) is None
+    assert answering.base_at(frame, np.array([40.0, 3.0])) is None
+
+
+def test_differences_are_paired_and_their_interval_is_over_scenes():
+    tissue = [answer("t", k, 2.0 + scene, scene) for scene in range(6) for k in range(4)]
+    smooth = [answer("s", k, 5.0 + scene, scene) for scene in range(6) for k in range(4)]
+    alone = [answer("s", 9, 80.0), answer("t", 8, math.nan, status="refused")]
+    made = tables.paired([*tissue, *smooth, *alone], "t", "s")
+    assert (made.pairs, made.scenes, made.difference) == (24, 6, pytest.approx(-3.0))
+    assert made.interval == pytest.approx((-3.0, -3.0))
+    # Highlights of a scene err alike: that is no proof of a difference.
+    rng = np.random.default_rng(1)
+    offs = rng.normal(0, 3, 6)
+    noisy = [answer("t", k, 9.0 + offs[scene], scene) for scene in range(6) for k in range(50)]
+    level = [answer("s", k, 9.0, scene) for scene in range(6) for k in range(50)]
+    low, high = tables.paired([*noisy, *level], "t", "s").interval
+    assert low < 0 < high
+    assert tables.paired(alone, "t", "s").pairs == 0
+    assert tables.paired([answer("t", 0, 1.0), answer("s", 0, 2.0)], "t", "s").interval is None
+
+
+def test_the_tables_count_answers_refusals_and_coverage():
+    made = [answer("t", k, float(k), inside=float(k < 3)) for k in range(4)] + [answer("t", 4, math.nan, status="why")]
+    lines = list(tables.summary(made, ALL, ["t", "absent"]))
+    assert lines[2:] == ["| all | t | 5 | 4 | 1 why | 1.50 | 2.85 | none | 75.0 (4) |"]
+    (pair,) = list(tables.pairs(made, ALL, [("t", "s")]))[2:]
+    assert pair == "| all | t - s | 0 | 0 | none | none | none |"
+    row = GUIDES[0].name
+    counts = {"colour": {row: [{0: Counts(1, 1, 0)}, {0: Counts(2, 0, 1)}]}}
+    assert list(tables.detection(counts, {"one": (row,)}))[2] == (
+        "| one | colour | 0.750 (3 + 1, 1) | none | none | none |"
+    )
+
+
+def test_regions_overlap_as_a_search_over_their_points_says():
+    rng = np.random.default_rng(3)
+    angles = np.linspace(0, 2 * np.pi, 400)
+    circle = np.stack([np.cos(angles), np.sin(angles)])
+    outcomes = []
+    for _ in range(60):
+        first, second = (a @ a.T + 0.02 * np.eye(2) for a in rng.normal(0, 0.5, (2, 2, 2)))
+        off = rng.normal(0, 2.5, 2)
+        if any(off @ np.linalg.solve(each, off) <= real.CHI2_95 for each in (first, second)):
+            near = True  # a centre lies inside the other region
+        else:
+            rim = np.linalg.cholesky(first) @ circle * math.sqrt(real.CHI2_95)
+            gaps = np.einsum("in,in->n", rim - off[:, None], np.linalg.solve(second, rim - off[:, None]))
+            near = bool(gaps.min() <= real.CHI2_95)
+        outcomes.append(near)
+        assert real.regions_overlap(off, first, second) == near
+    assert len(set(outcomes)) == 2
+
+
+def test_agreement_turns_the_other_covariance_into_the_first_basis():
+    one, other = an_estimate(0.0, 0.01), an_estimate(0.06, 0.01)
+    made = real.compared("f", ("n", one), ("b", other))
+    assert made.off_deg == pytest.approx(math.degrees(0.06), rel=1e-3)
+    assert made.overlaps is False
+    assert real.compared("f", ("n", one), ("b", an_estimate(0.02, 0.01))).overlaps is True
+    assert real.compared("f", ("n", one), ("b", other.without_uncertainty())).overlaps is None
+    found = [a_specularity({"n": one, "b": other}), a_specularity({"n": one, "b": Failure(Reason.NO_PEAK, "")})]
+    assert len(list(real.agreements("f", found, ["n"], ["b"]))) == 1
+    (line,) = list(tables.agreement([made], []))[2:]
+    assert line == "| all | n - b | 1 | 3.44 | 3.44 | 0 of 1 |"
+    assert real.refusals(found, "b") == {OK: 1, "no_peak": 1}
+
+
+def test_detections_on_real_frames_are_scored_alike_for_all_detectors():
+    shape = (40, 60)
+    specular, text = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    specular[10:14, 10:14], text[30:34, 40:50] = True, True
+    nothing = np.zeros(shape, dtype=bool)
+    frame = OutlinedFrame("f", "figures", np.zeros((*shape, 3), np.float32), specular, nothing, {"text": text})
+    own, other = (a_highlight((10, 10, 4, 4)), a_highlight((42, 30, 4, 4))), (a_highlight((9, 9, 6, 6)),)
+    found = Detection(tuple(each.region for each in own), None, own)
+    score = real.detection_score(frame, found)
+    assert (score.covered, score.answered, score.iou, score.count) == (1.0, 1.0, 0.5, 2)
+    assert score.marks == {"text": 1}
+    cluster = replace(found, highlights=(a_highlight((10, 10, 4, 4), Kind.CLUSTER), own[1]))
+    assert real.detection_score(frame, cluster).answered == 0
+    assert (real.shared(own, other, shape), real.shared(other, own, shape)) == (0.5, 1.0)
+    assert math.isnan(real.shared((), own, shape))
+    line = real.detection_line(frame, "n", found, Detection((), None, other))
+    assert line == "| f | n | 1.000 | 1.000 | 0.500 | 2 | 0.50 | 1.00 | 0, 1, 0, 0 | no |"
+
+
+def test_what_is_told_of_a_real_frame():
+    picture = np.random.default_rng(0).random((300, 600, 3)).astype(np.float32)
+    small = real.reduced(picture)
+    assert small.shape == (240, 480, 3)
+    assert small.mean() == pytest.approx(picture.mean(), abs=1e-3)
+    assert real.reduced(small) is small
+    assert not real.untold(small).priors.lights_mm
+    assert len(real.told(small, "fig5_a.bmp").priors.lights_mm) == 2
+    assert len(real.told(small, real.LAPAROSCOPY).priors.lights_mm) == 8
+    assert real.told(small, "x").camera.fx == pytest.approx(240 / math.tan(math.radians(40)))
+
+
+def test_frames_are_kept_and_those_that_a_scene_cannot_show_left_out(tmp_path, monkeypatch):
+    made = a_frame()
+    arrays = {name: getattr(made, name) for name in frames.ARRAYS}
+    calls = []
+
+    def rendered(renderer, row):
+        calls.append(row.name)
+        return arrays if row is GUIDES[0] else {"why_not": np.array("no room")}
+
+    monkeypatch.setattr(frames, "_rendered", rendered)
+    for _ in range(2):
+        (read,) = hard_frames([FIRST], GUIDES[:2], tmp_path)
+        np.testing.assert_array_equal(read.normal_base, made.normal_base)
+        assert (read.scene, read.row, read.kind) == (FIRST, GUIDES[0], KINDS[FIRST % len(KINDS)])
+    assert calls == [row.name for row in GUIDES[:2]]
+    assert read.as_tissue().regions.max() == 1
+    assert read.frame().camera.width == 480
+
+
+def test_answers_are_kept_by_the_hash_of_the_network(tmp_path, monkeypatch):
+    frame, asked = a_frame(), []
+
+    def made(frame, estimators):
+        asked.append(sorted(estimators))
+        return iter([answer(name, 0, 1.5, frame.scene) for name in estimators])
+
+    class Network:
+        def __init__(self, model):
+            self.model = model
+
+        def detect(self, frame, camera, priors):
+            asked.append("detect")
+            return Detection((), None)
+
+    monkeypatch.setattr(kept, "answers", made)
+    for name, text in (("one", "a"), ("two", "b"), ("same", "a")):
+        (tmp_path / name).write_text(text)
+    folder = kept.Kept(tmp_path)
+    networks = {"n, smooth": Network(tmp_path / "one"), "n, tissue": Network(tmp_path / "two"), "bisector": object()}
+    first = folder.normals(frame, networks)
+    assert [each.estimator for each in first] == list(networks)
+    assert repr(folder.normals(frame, networks)) == repr(first)
+    (read,) = folder.normals(frame, {"n, other": Network(tmp_path / "same")})
+    assert (read.estimator, read.base_deg, math.isnan(read.stated_deg)) == ("n, other", 1.5, True)
+    assert asked == [sorted(networks)]
+    for _ in range(2):
+        counts = folder.detection(frame, "d, smooth", networks["n, smooth"])
+        assert counts == {0: Counts(missed=1)}
+    assert asked[1:] == ["detect"]
+
+
+def test_a_sheet_is_small_and_needles_point_as_normals_do(tmp_path):
+    picture = np.random.default_rng(0).random((90, 120, 3)).astype(np.float32)
+    dark = np.zeros_like(picture)
+    one, many = a_highlight((10, 10, 20, 8)), a_highlight((50, 50, 9, 9), Kind.CLUSTER)
+    drawn = sheet.outlined(dark, [one, many], 2)
+    assert drawn.shape == (180, 240, 3)
+    blue, green, red = np.moveaxis(drawn.astype(int), 2, 0)
+    assert (green > red + blue)[18:40, 18:64].any()
+    assert not (green > red)[80:].any()
+    assert (red > green + blue)[98:122, 98:122].any()
+    drawn = sheet.outlined(picture, [one, many], 2)
+    estimate = replace(an_estimate(math.pi / 4, 1e-4), look_px=np.array([60.0, 45.0]))
+    columns = np.nonzero((sheet.needles(dark, [a_specularity({"n": estimate})], "n") > 0).any(axis=(0, 2)))[0]
+    assert 57 <= columns.min() <= 60 < 66 <= columns.max() <= 71
+    assert not sheet.needles(dark, [a_specularity({"n": Failure(Reason.NO_PEAK, "")})], "n").any()
+    sheet.write_sheet([[drawn] * 3] * 4, ["one", "two", "three"], tmp_path / "sheet.jpg")
+    assert (tmp_path / "sheet.jpg").stat().st_size <= sheet.LARGEST_BYTES
+    assert cv2.imread(str(tmp_path / "sheet.jpg")).shape[1] == 3 * (sheet.TILE_PX + 3)
+
+
+def test_without_files_the_classical_methods_alone_are_measured():
+    assert tuple(networks.estimators(None, None)) == networks.CLASSICAL
+    assert tuple(networks.detectors(None)) == (networks.COLOUR,)
+
+
+def test_a_network_without_its_limit_keeps_everything_else():
+    onnx = pytest.importorskip("onnx")
+    from studies.learned_transfer.unlimited import LIMIT, unlimited
+
+    model = onnx.load(data_root("scenes").joinpath(*SHIPPED))
+    made = unlimited(model)
+    before, after = ({prop.key: prop.value for prop in one.metadata_props} for one in (model, made))
+    contents = [json.loads(props.pop("simtest")) for props in (before, after)]
+    assert contents[0].pop("feature_limit") < contents[1].pop("feature_limit") == LIMIT
+    assert contents[0] == contents[1]
+    assert before == after
+    assert made.graph == model.graph
