@@ -89,7 +89,6 @@ SLOW: dict[str, dict[str, tuple[str, ...]]] = {
         ),
     },
     "test_colon": {
-        ONE_OF_A_KIND: ("test_another_seed_is_another_mesh[shipped]",),
         "the recipe with polyps and relief": (
             "test_partial_derivatives_match_finite_differences[pedunculated]",
             "test_normals_and_curvatures_match_finite_differences_of_the_surface[pedunculated]",
@@ -232,11 +231,9 @@ SLOW: dict[str, dict[str, tuple[str, ...]]] = {
         ),
     },
     "test_two_truths": {
+        "the same on surfaces that are made here": ("test_labels_of_a_users_mesh_are_both_truths[liver*",),
         ONE_OF_A_KIND: ("test_labels_are_both_exact_truths_to_the_meshs_fineness[saddle-*",),
-        MESHES: (
-            "test_labels_are_both_exact_truths_to_the_meshs_fineness[colon-*",
-            "test_labels_of_a_users_mesh_are_both_truths[liver*",
-        ),
+        MESHES: ("test_labels_are_both_exact_truths_to_the_meshs_fineness[colon-*",),
     },
     "test_closed_form": {
         ONE_OF_A_KIND: (
@@ -265,12 +262,9 @@ SLOW: dict[str, dict[str, tuple[str, ...]]] = {
             "test_a_highlight_moves_as_the_law_says[saddle*",
         ),
     },
-    "test_phong_sampling": {ONE_OF_A_KIND: ("test_samples_follow_the_density[4]",)},
-    "test_tissue_sampling": {ONE_OF_A_KIND: ("test_samples_follow_the_density[4]",)},
     "test_pose_region_coverage": {
         ONE_OF_A_KIND: ("test_regions_cover_at_and_far_from_the_branch_point[58.0-0.05]",),
     },
-    "test_curved": {ONE_OF_A_KIND: ("test_stated_regions_cover_the_truth[cylinder*",)},
     "test_cone_axis": {
         ONE_OF_A_KIND: (
             "test_cone_axis_stays_below_two_hundredths_of_a_degree[sphere]",
