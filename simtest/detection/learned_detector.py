@@ -6,19 +6,19 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
-from simtest.detection.basins import given_basins
-from simtest.detection.colour import SMOOTHING_PX, colour_spots
+from simtest.detection.basins import Basins, find_basins, given_basins
+from simtest.detection.colour import NOISE_LEFT, SMOOTHING_PX, colour_spots
 from simtest.detection.detector import Detection
 from simtest.detection.highlight_inputs import frame_statistics, highlight_inputs
 from simtest.detection.judging import ColourDetection, detection_of, judge_spots, plateaus, tissue_spots
-from simtest.detection.light_split import split_light
-from simtest.detection.spots import rise_of_clipped, spots_of
+from simtest.detection.light_split import SplitLight, split_light
+from simtest.detection.spots import SADDLE, SADDLE_NOISE, rise_of_clipped, spots_of
 from simtest.detection.view_mask import View, find_view
 from simtest.errors import Failure, Reason
 from simtest.geometry import Camera, Image, Mask, smooth
-from simtest.runtime.arrays import Index
 from simtest.runtime.onnx_model import OnnxModel
 from simtest.runtime.resources import data_root
 from simtest.runtime.training_range import TrainingRange
@@ -34,11 +34,8 @@ MULTIPLE = 8
 RANGED = ("longer side, px", "logarithm of the median light")
 """Statistics of a frame, as the network sees it, whose range is checked."""
 
-PIXEL = 0.5
-"""A pixel is a highlight's where the network gives it at least this probability."""
-
-SADDLE = 0.9
-"""A maximum of the bumps counts if its saddle to any higher one is below this share of it."""
+PIXEL = 0.3
+"""A pixel may be a highlight's where the network gives it at least this probability."""
 
 LEAST_VALUE = 1e-4
 """Least specular light of a spot, share of full scale: the split by colour may find none where the network does."""
@@ -49,8 +46,9 @@ class LearnedDetector:
     """A network of the task ``highlight_instances`` (`simtest train`) as a detector.
 
     The network gives each pixel's probability of being a highlight's, and a map with a bump in the middle of each
-    highlight. Maxima of the bumps are the highlights, and a watershed from them shares out the pixels. Light is split
-    and highlights are classified as `colour` does it; estimators see the specular light alone.
+    highlight. Specular light is climbed on the pixels that may be a highlight's: saddles tell highlights apart as the
+    definition of a visible highlight does (theory.md 7.1b). A summit's basin is a highlight where a bump rises in it.
+    Light is split and highlights are classified as `colour` does it; estimators see the specular light alone.
 
     The detector refuses (`Detection.refusal`) frames without colour, of a size or brightness outside the training's
     range, or whose features lie far from those of the train split.
@@ -122,13 +120,11 @@ class _Network:
         refusal = self._range.refusal(statistics) or self._range.refusals(features)[0]
         if refusal is not None:
             return refusal
-        inside = pixels >= PIXEL if seen is None else (pixels >= PIXEL) & seen
-        labels = share_out(bumps, inside, self._least_top)
-        smoothed = np.maximum(smooth(light.specular, SMOOTHING_PX, seen), np.float32(LEAST_VALUE))
-        tissue = smooth(light.tissue, SMOOTHING_PX, seen)
         flat, white = plateaus(linear, clipped)
-        climbed = np.asarray(smoothed * rise_of_clipped(flat), dtype=np.float32)
-        spots = spots_of(given_basins(climbed, labels), smoothed, tissue)
+        basins, tops = basins_of(pixels, bumps, light, flat, seen)
+        labels = np.where(np.append(False, tops >= self._least_top)[basins.labels], basins.labels, 0)
+        smoothed, tissue = smoothed_light(light, seen)
+        spots = spots_of(given_basins(climbed_light(smoothed, flat), labels), smoothed, tissue)
         # The network knows no text or instruments; where they shine, the split by colour sees all of it.
         shining, _, _ = colour_spots(light, clipped, flat, seen)
         spots, bright, foreign = tissue_spots(spots, clipped.shape, shining)
@@ -154,45 +150,41 @@ class _Network:
         return maps[0], maps[1], features, max(size)
 
 
-def share_out(bumps: Image, pixels: Mask, least_top: float) -> Index:
-    """Share out pixels among the highlights whose bumps rise in them.
+def basins_of(
+    pixels: Image, bumps: Image, light: SplitLight, flat: Mask, seen: Mask | None
+) -> tuple[Basins, npt.NDArray[np.float32]]:
+    """Return the basins of the specular light where highlights may be, and the height of the highest bump in each.
 
     Parameters
     ----------
-    bumps : ndarray, shape (H, W)
-        Height of a bump around the middle of each highlight, in [0, 1].
-    pixels : ndarray of bool, shape (H, W)
-        Pixels of highlights; those that no bump is connected with are left out.
-    least_top : float
-        Least height of a bump's top.
-
-    Returns
-    -------
-    ndarray of int, shape (H, W)
-        Number of the highlight from 1; 0 where none.
+    pixels, bumps : ndarray of float32, shape (H, W)
+        The network's maps: probability of a highlight's pixel, and bumps in the middles of highlights, in [0, 1].
+    light : SplitLight
+        The frame's two parts.
+    flat : ndarray of bool, shape (H, W)
+        Where all channels are clipped.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the view; default all.
     """
-    from skimage.segmentation import watershed
-
-    tops = bump_tops(bumps)
-    tops[bumps < least_top] = 0
-    labels: Index = watershed(-bumps, tops, mask=pixels | (tops > 0)).astype(np.int64)
-    return labels
-
-
-def bump_tops(bumps: Image) -> Index:
-    """Return the maxima of bumps that count, numbered from 1, shape (H, W); 0 elsewhere (see `SADDLE`)."""
-    from skimage.measure import label
-    from skimage.morphology import local_maxima, reconstruction
-
-    # In logarithms the ratio of saddle and top is a height, and these are the h-maxima.
-    log = np.log(np.maximum(bumps, LEAST_BUMP)).astype(np.float64)
-    flooded = reconstruction(log + np.log(SADDLE), log, method="dilation")
-    tops: Index = label(local_maxima(flooded) & (bumps > LEAST_BUMP), connectivity=2)
-    return tops
+    smoothed, tissue = smoothed_light(light, seen)
+    mask = pixels >= PIXEL if seen is None else (pixels >= PIXEL) & seen
+    rise, noise = rise_of_clipped(flat), NOISE_LEFT * light.noise
+    base = np.asarray(tissue * rise, dtype=np.float32)
+    basins = find_basins(climbed_light(smoothed, flat), mask, base, SADDLE, SADDLE_NOISE * noise)
+    tops = np.zeros(len(basins.rows) + 1, dtype=np.float32)
+    np.maximum.at(tops, basins.labels[mask], bumps[mask])
+    return basins, tops[1:]
 
 
-LEAST_BUMP = 0.02
-"""Lower bumps are none."""
+def smoothed_light(light: SplitLight, seen: Mask | None) -> tuple[Image, Image]:
+    """Return the specular light, at least `LEAST_VALUE`, and the tissue's, both smoothed."""
+    specular = np.maximum(smooth(light.specular, SMOOTHING_PX, seen), np.float32(LEAST_VALUE))
+    return specular, smooth(light.tissue, SMOOTHING_PX, seen)
+
+
+def climbed_light(specular: Image, flat: Mask) -> Image:
+    """Return the light whose summits are highlights: clipped light is taken to rise from its rim."""
+    return np.asarray(specular * rise_of_clipped(flat), dtype=np.float32)
 
 
 learned_detector = LearnedDetector()

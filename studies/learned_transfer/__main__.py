@@ -76,9 +76,8 @@ def _hard(
     yield from ("", "## Corpus hard: normals", "")
     yield from tables.summary(made, GROUPS, list(normals))
     compared = [(named(task, TISSUE), named(task, SMOOTH)) for task in TASKS if named(task, TISSUE) in normals]
-    compared += [
-        (named(task, TISSUE), other) for task in TASKS for other in CLASSICAL if named(task, TISSUE) in normals
-    ]
+    # A cloud is of no single highlight, so it pairs with none.
+    compared += [(named(task, TISSUE), CLASSICAL[0]) for task in TASKS if named(task, TISSUE) in normals]
     yield from ("", "## Corpus hard: paired differences", "")
     yield from tables.pairs(made, GROUPS, compared)
     yield from ("", "## Corpus hard: detection", "")
@@ -100,7 +99,7 @@ def _real(
             yield real.detection_line(frame, name, detection, found[COLOUR])
             pictures[frame.name][name] = sheet.outlined(frame.picture, detection.highlights, 2)
     yield from ("", "## Real frames: normals", "")
-    yield from tables.head(("frame", "way", "estimator", "detections", "answered", "refused"))
+    yield from tables.head(real.NORMALS_HEADS)
     agreed: list[real.Agreement] = []
     for frame in frames:
         for way, picture, calibration in real.ways(frame):
@@ -110,7 +109,8 @@ def _real(
             for name in asked:
                 count = real.refusals(at, name)
                 why = "; ".join(f"{n} {reason}" for reason, n in count.most_common() if reason != OK) or "0"
-                yield f"| {frame.name} | {way} | {name} | {count.total()} | {count[OK]} | {why} |"
+                on = real.misplaced(frame, at, name, picture)
+                yield f"| {frame.name} | {way} | {name} | {count.total()} | {count[OK]} | {why} | {on} |"
             if way == real.TOLD:
                 agreed += real.agreements(frame.name, at, learned, CLASSICAL)
                 for name in learned:

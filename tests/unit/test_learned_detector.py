@@ -18,7 +18,8 @@ from simtest.dataset.learn.detector_task import HighlightInstances  # noqa: E402
 from simtest.dataset.learn.engine import train  # noqa: E402
 from simtest.dataset.learn.training import load_training  # noqa: E402
 from simtest.detection import load_detector  # noqa: E402
-from simtest.detection.learned_detector import LearnedDetector, share_out  # noqa: E402
+from simtest.detection.learned_detector import LearnedDetector, basins_of  # noqa: E402
+from simtest.detection.light_split import SplitLight  # noqa: E402
 from simtest.errors import InputError, Reason  # noqa: E402
 from simtest.geometry import Camera  # noqa: E402
 from simtest.runtime.onnx_model import METADATA  # noqa: E402
@@ -200,23 +201,21 @@ def test_bumps_stand_in_the_middle_of_their_pixels():
     assert made[12, 20] == np.rint(255 * np.exp(-25 / (2 * 10.25)))
 
 
-def test_touching_highlights_are_shared_out_and_faint_bumps_left_out():
+def test_saddles_of_the_light_tell_highlights_apart_and_faint_bumps_are_told():
     y, x = np.mgrid[:40, :60] + 0.5
     each = [np.exp(-((x - c) ** 2 + (y - 20) ** 2) / 18) for c in (20, 31, 50)]
-    made = share_out(np.maximum.reduce([each[0], 0.8 * each[1], 0.2 * each[2]]), sum(each) > 0.1, 0.3)
-    assert set(np.unique(made)) == {0, 1, 2}
-    assert made[20, 20] != made[20, 31]
-    assert made[20, 50] == 0
-    assert share_out(np.zeros((9, 9)), np.ones((9, 9), dtype=bool), 0.3).max() == 0
-
-
-def test_a_dip_that_is_not_clearly_lower_separates_nothing():
-    x = np.broadcast_to(np.arange(40), (5, 40))
-    bump = np.exp(-((x - 20.0) ** 2) / 60)
-    bump[:, 20] *= 0.9
-    assert share_out(bump, bump > 0.1, 0.3).max() == 1
-    bump[:, 20] *= 0.7
-    assert share_out(bump, bump > 0.1, 0.3).max() == 2
+    specular = sum(each).astype(np.float32)
+    light = SplitLight(specular, np.full_like(specular, 0.1), 0.001)
+    pixels = (specular > 0.1).astype(np.float32)
+    bumps = np.maximum.reduce([each[0], 0.8 * each[1], 0.2 * each[2]]).astype(np.float32)
+    basins, tops = basins_of(pixels, bumps, light, np.zeros(x.shape, dtype=bool), None)
+    found = {int(column): float(top) for column, top in zip(basins.columns, tops, strict=True)}
+    assert sorted(found) == pytest.approx([20, 31, 50], abs=1)
+    assert [found[column] for column in sorted(found)] == pytest.approx([1, 0.8, 0.2], abs=0.05)
+    # A shallow saddle separates nothing, and without pixels there is nothing.
+    light = SplitLight(np.exp(-((x - 30) ** 2) / 60).astype(np.float32), np.ones_like(specular), 0.001)
+    assert len(basins_of(pixels * 0 + 1, bumps, light, np.zeros(x.shape, dtype=bool), None)[1]) == 1
+    assert len(basins_of(0 * pixels, bumps, light, np.zeros(x.shape, dtype=bool), None)[1]) == 0
 
 
 def test_moved_crops_hang_on_their_generator_alone():

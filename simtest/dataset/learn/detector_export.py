@@ -8,13 +8,17 @@ import torch
 from torch import Generator, nn
 
 from simtest.calibration import srgb_decode
+from simtest.calibration.calibration import brightest_channel
 from simtest.dataset.learn.calibration import fitted_range
 from simtest.dataset.learn.detector_frames import FULL, OUTSIDE, UNJUDGED
 from simtest.dataset.learn.detector_moves import ZOOM, inputs_of, other_camera
 from simtest.dataset.learn.onnx_export import MODEL, export
 from simtest.dataset.learn.tasks import Batch
-from simtest.detection.highlight_inputs import frame_statistics
-from simtest.detection.learned_detector import FORMAT, MULTIPLE, RANGED, bump_tops
+from simtest.detection.basins import Basins
+from simtest.detection.highlight_inputs import INPUTS, frame_statistics, highlight_inputs
+from simtest.detection.judging import plateaus
+from simtest.detection.learned_detector import FORMAT, MULTIPLE, RANGED, basins_of
+from simtest.detection.light_split import split_light
 from simtest.runtime.arrays import AnyArray, Array, Image
 
 NEAR_PX = 1.5
@@ -43,8 +47,9 @@ def export_detector(network: nn.Module, taught: Batch, judged: Batch, out: Path,
         "about": about,
     }
     network = network.to(memory_format=torch.contiguous_format)
-    example = torch.from_numpy(next(_inputs(taught))[None])
-    example = example[..., : example.shape[2] // MULTIPLE * MULTIPLE, : example.shape[3] // MULTIPLE * MULTIPLE]
+    example = torch.zeros((1, len(INPUTS), 8 * MULTIPLE, 12 * MULTIPLE)).normal_(
+        generator=Generator().manual_seed(SEED)
+    )
     free = {2: "height", 3: "width"}
     return export(
         network, {"inputs": example}, ("outputs", "features"), {"inputs": free, "outputs": free}, content, out / MODEL
@@ -64,58 +69,52 @@ def _seen(network: nn.Module, batch: Batch) -> tuple[Array, Array]:
     return order[np.argsort(order[:, 1])], np.array(features)
 
 
-def _inputs(batch: Batch) -> Iterator[Image]:
-    """Yield the inputs of each frame as it is."""
-    for picture, state in zip(batch["picture"].cpu().numpy(), batch["state"].cpu().numpy(), strict=True):
-        yield inputs_of(picture.astype(np.float32) / np.float32(FULL), state)
-
-
 def _run(network: nn.Module, inputs: Image) -> tuple[Image, Array]:
-    """Return the map of bumps, in [0, 1], and the features of a frame."""
+    """Return both maps, in [0, 1], and the features of a frame."""
     height, width = inputs.shape[1:]
     padded = np.pad(inputs, ((0, 0), (0, -height % MULTIPLE), (0, -width % MULTIPLE)), mode="edge")
     with torch.no_grad():
         outputs, features = network(torch.from_numpy(padded[None]))
-    return torch.sigmoid(outputs[0, 1, :height, :width]).numpy(), features[0].double().numpy()
+    return torch.sigmoid(outputs[0, :, :height, :width]).numpy(), features[0].double().numpy()
 
 
 def least_top(network: nn.Module, judged: Batch) -> float:
     """Return the least height of a bump's top that gives the best F1 on frames.
 
-    A top on a highlight that need be found finds it, the highest one first; further ones and those on tissue are false;
-    others do not count.
+    A basin whose summit lies on a highlight that need be found finds it, the one with the highest bump first; further
+    ones and those on tissue are false; others do not count.
     """
     heights: list[float] = []
     right: list[bool] = []
     needed = 0
-    for inputs, region, state in zip(
-        _inputs(judged), judged["region"].cpu().numpy(), judged["state"].cpu().numpy(), strict=True
-    ):
+    names = ("picture", "state", "region")
+    for picture, state, region in zip(*(judged[name].cpu().numpy() for name in names), strict=True):
         needed += len(np.unique(region[region > 0]))
-        for height, found in _tops(_run(network, inputs)[0], region.astype(np.int64), state):
+        encoded, seen = picture.astype(np.float32) / np.float32(FULL), state != OUTSIDE
+        linear, clipped = srgb_decode(encoded), brightest_channel(encoded) >= 1
+        light, flat = split_light(linear, clipped, seen), plateaus(linear, clipped)[0]
+        pixels, bumps = _run(network, highlight_inputs(linear, clipped, light, seen))[0]
+        basins, tops = basins_of(pixels, bumps, light, flat, seen)
+        for height, found in _judged_tops(basins, tops, region.astype(np.int64), state):
             heights.append(height)
             right.append(found)
     return best_threshold(np.array(heights), np.array(right, dtype=bool), needed)
 
 
-def _tops(bumps: Image, region: AnyArray, state: AnyArray) -> Iterator[tuple[float, bool]]:
-    """Yield height of each top of a map that counts, the highest first, and whether it finds a highlight."""
+def _judged_tops(basins: Basins, tops: Image, region: AnyArray, state: AnyArray) -> Iterator[tuple[float, bool]]:
+    """Yield the height of each basin's bump that counts, the highest first, and whether it finds a highlight."""
     from skimage.segmentation import expand_labels
 
-    numbers = bump_tops(bumps)
-    rows, columns = np.nonzero(numbers)
-    order = np.argsort(-bumps[rows, columns], kind="stable")
-    _, first = np.unique(numbers[rows, columns][order], return_index=True)
     # Numbers must be above 0; those that need not be found come behind the others.
     many = int(np.abs(region).max(initial=0))
     around = expand_labels(np.where(region < 0, many - region, region), NEAR_PX)
     found: set[int] = set()
-    for index in order[np.sort(first)]:
-        at = rows[index], columns[index]
+    for index in np.argsort(-tops, kind="stable"):
+        at = basins.rows[index], basins.columns[index]
         owner = int(around[at])
         if owner > many or (owner == 0 and state[at] in (UNJUDGED, OUTSIDE)):
             continue
-        yield float(bumps[at]), 0 < owner not in found
+        yield float(tops[index]), 0 < owner not in found
         found.add(owner)
 
 
