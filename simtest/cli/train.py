@@ -23,7 +23,7 @@ def train(
     Parameters
     ----------
     training : str
-        A training file, or the name of a shipped one: spot_normals.
+        A training file, or the name of a shipped one (`simtest list trainings`).
     data : Path
         Folder of the dataset.
     """

@@ -120,15 +120,9 @@ class _Network:
         refusal = self._range.refusal(statistics) or self._range.refusals(features)[0]
         if refusal is not None:
             return refusal
-        flat, white = plateaus(linear, clipped)
-        basins, tops = basins_of(pixels, bumps, light, flat, seen)
-        labels = np.where(np.append(False, tops >= self._least_top)[basins.labels], basins.labels, 0)
-        smoothed, tissue = smoothed_light(light, seen)
-        spots = spots_of(given_basins(climbed_light(smoothed, flat), labels), smoothed, tissue)
-        # The network knows no text or instruments; where they shine, the split by colour sees all of it.
-        shining, _, _ = colour_spots(light, clipped, flat, seen)
-        spots, bright, foreign = tissue_spots(spots, clipped.shape, shining)
-        return judge_spots(spots, light, linear, bright, (flat, white), (labels > 0) & ~foreign, seen)
+        full = plateaus(linear, clipped)
+        basins, tops = basins_of(pixels, bumps, light, full[0], seen)
+        return highlights_of(basins, tops >= self._least_top, light, linear, (clipped, *full), seen)
 
     def _maps(self, inputs: Image) -> tuple[Image, Image, Image, int]:
         """Return both maps of probabilities at full size, the features, and the longer side as seen, px."""
@@ -174,6 +168,36 @@ def basins_of(
     tops = np.zeros(len(basins.rows) + 1, dtype=np.float32)
     np.maximum.at(tops, basins.labels[mask], bumps[mask])
     return basins, tops[1:]
+
+
+def highlights_of(
+    basins: Basins, kept: Mask, light: SplitLight, linear: Image, clipped: tuple[Mask, Mask, Mask], seen: Mask | None
+) -> ColourDetection:
+    """Return the highlights of basins.
+
+    Parameters
+    ----------
+    basins : Basins
+        Of a frame (`basins_of`).
+    kept : ndarray of bool, shape (N,)
+        Which of them are highlights.
+    light : SplitLight
+        The frame's two parts.
+    linear : ndarray of float32, shape (H, W, 3)
+        The frame.
+    clipped : tuple of ndarray of bool
+        Where a channel is clipped, where all are, and where they are nearly so.
+    seen : ndarray of bool, shape (H, W), optional
+        The pixels inside the view; default all.
+    """
+    any_channel, flat, white = clipped
+    labels = np.where(np.append(False, kept)[basins.labels], basins.labels, 0)
+    smoothed, tissue = smoothed_light(light, seen)
+    spots = spots_of(given_basins(climbed_light(smoothed, flat), labels), smoothed, tissue)
+    # The network knows no text or instruments; where they shine, the split by colour sees all of it.
+    shining, _, _ = colour_spots(light, any_channel, flat, seen)
+    spots, bright, foreign = tissue_spots(spots, flat.shape, shining)
+    return judge_spots(spots, light, linear, bright, (flat, white), (labels > 0) & ~foreign, seen)
 
 
 def smoothed_light(light: SplitLight, seen: Mask | None) -> tuple[Image, Image]:

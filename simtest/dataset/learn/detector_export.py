@@ -14,10 +14,9 @@ from simtest.dataset.learn.detector_frames import FULL, OUTSIDE, UNJUDGED
 from simtest.dataset.learn.detector_moves import ZOOM, inputs_of, other_camera
 from simtest.dataset.learn.onnx_export import MODEL, export
 from simtest.dataset.learn.tasks import Batch
-from simtest.detection.basins import Basins
 from simtest.detection.highlight_inputs import INPUTS, frame_statistics, highlight_inputs
 from simtest.detection.judging import plateaus
-from simtest.detection.learned_detector import FORMAT, MULTIPLE, RANGED, basins_of
+from simtest.detection.learned_detector import FORMAT, MULTIPLE, RANGED, basins_of, highlights_of
 from simtest.detection.light_split import split_light
 from simtest.runtime.arrays import AnyArray, Array, Image
 
@@ -26,6 +25,9 @@ NEAR_PX = 1.5
 
 MOST_FRAMES = 48
 """Frames of the train split, spread over it, from which the range is taken."""
+
+LOWEST = 0.1
+"""Lower bumps are no highlights, whatever the threshold."""
 
 SEED = 0
 """Of the moved frames from which the range is taken."""
@@ -81,7 +83,7 @@ def _run(network: nn.Module, inputs: Image) -> tuple[Image, Array]:
 def least_top(network: nn.Module, judged: Batch) -> float:
     """Return the least height of a bump's top that gives the best F1 on frames.
 
-    A basin whose summit lies on a highlight that need be found finds it, the one with the highest bump first; further
+    A peak on a highlight that need be found finds it, the one with the highest bump first; further
     ones and those on tissue are false; others do not count.
     """
     heights: list[float] = []
@@ -92,17 +94,21 @@ def least_top(network: nn.Module, judged: Batch) -> float:
         needed += len(np.unique(region[region > 0]))
         encoded, seen = picture.astype(np.float32) / np.float32(FULL), state != OUTSIDE
         linear, clipped = srgb_decode(encoded), brightest_channel(encoded) >= 1
-        light, flat = split_light(linear, clipped, seen), plateaus(linear, clipped)[0]
+        light, full = split_light(linear, clipped, seen), plateaus(linear, clipped)
         pixels, bumps = _run(network, highlight_inputs(linear, clipped, light, seen))[0]
-        basins, tops = basins_of(pixels, bumps, light, flat, seen)
-        for height, found in _judged_tops(basins, tops, region.astype(np.int64), state):
+        basins, tops = basins_of(pixels, bumps, light, full[0], seen)
+        # What is left out later, such as pale tissue, must not raise the threshold.
+        made = highlights_of(basins, tops >= LOWEST, light, linear, (clipped, *full), seen)
+        peaks = np.concatenate([each.peaks for each in made.highlights] or [np.empty((0, 2), dtype=np.int64)])
+        numbers = basins.labels[peaks[:, 1], peaks[:, 0]] - 1
+        for height, found in _judged_tops(peaks, tops[numbers], region.astype(np.int64), state):
             heights.append(height)
             right.append(found)
     return best_threshold(np.array(heights), np.array(right, dtype=bool), needed)
 
 
-def _judged_tops(basins: Basins, tops: Image, region: AnyArray, state: AnyArray) -> Iterator[tuple[float, bool]]:
-    """Yield the height of each basin's bump that counts, the highest first, and whether it finds a highlight."""
+def _judged_tops(peaks: AnyArray, tops: Image, region: AnyArray, state: AnyArray) -> Iterator[tuple[float, bool]]:
+    """Yield the height of the bump of each peak that counts, the highest first, and whether it finds a highlight."""
     from skimage.segmentation import expand_labels
 
     # Numbers must be above 0; those that need not be found come behind the others.
@@ -110,7 +116,7 @@ def _judged_tops(basins: Basins, tops: Image, region: AnyArray, state: AnyArray)
     around = expand_labels(np.where(region < 0, many - region, region), NEAR_PX)
     found: set[int] = set()
     for index in np.argsort(-tops, kind="stable"):
-        at = basins.rows[index], basins.columns[index]
+        at = int(peaks[index, 1]), int(peaks[index, 0])
         owner = int(around[at])
         if owner > many or (owner == 0 and state[at] in (UNJUDGED, OUTSIDE)):
             continue
