@@ -66,7 +66,7 @@ def main() -> int:
     options = parser.parse_args()
     try:
         with tempfile.TemporaryDirectory(prefix="simtest-release-") as scratch:
-            if options.skip_offline and (reason := offline(Path(scratch) / "probe")):
+            if options.skip_offline and (reason := offline(Path(scratch))):
                 print(f"release check: skipped, since pip reaches no package registry: {reason}")
                 return 0
             wheel = build(Path(scratch), options.out.resolve())
@@ -82,13 +82,22 @@ def main() -> int:
     return 0
 
 
+def tools(scratch: Path) -> Path:
+    """Return the Python of the environment, made once, that holds what builds the files: no other is made for each."""
+    folder = scratch / "tools"
+    python = folder / "bin" / "python"
+    if not folder.exists():
+        wanted = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["build-system"]["requires"]
+        environment(Path(sys.executable), folder)
+        # One attempt: without a network, those of pip would take a minute.
+        run([python, *PIP, "--retries", "0", "--timeout", "20", BUILD, *wanted], scratch)
+    return python
+
+
 def offline(scratch: Path) -> str:
     """Return why the tools that build the files cannot be had here; an empty text where they can."""
-    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["build-system"]["requires"]
-    python = environment(Path(sys.executable), scratch / "venv")
     try:
-        # One attempt: without a network, those of pip would take a minute.
-        run([python, *DOWNLOAD, "--dest", scratch / "files", BUILD, *wanted], scratch)
+        tools(scratch)
     except CheckError as error:
         return str(error).partition(": ")[2]
     return ""
@@ -96,10 +105,9 @@ def offline(scratch: Path) -> str:
 
 def build(scratch: Path, out: Path) -> Path:
     """Build the sdist, and the wheel from it; return the wheel."""
-    python = environment(Path(sys.executable), scratch / "build")
-    run([python, *PIP, BUILD], scratch)
+    python = tools(scratch)
     made = scratch / "dist"
-    run([python, "-m", "build", "--outdir", made, ROOT], scratch)
+    run([python, "-m", "build", "--no-isolation", "--outdir", made, ROOT], scratch)
     version = project()["version"]
     expected = {f"simtest-{version}-py3-none-any.whl", f"simtest-{version}.tar.gz"}
     if {file.name for file in made.iterdir()} != expected:
@@ -181,8 +189,6 @@ def environment(base: Path, folder: Path) -> Path:
 
 
 PIP = ("-m", "pip", "install", "--quiet", "--disable-pip-version-check")
-DOWNLOAD = ("-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps", "--retries", "0",
-            "--timeout", "20")  # fmt: skip
 
 
 def project() -> dict[str, str]:

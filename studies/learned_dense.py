@@ -11,7 +11,7 @@ import argparse
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -133,8 +133,7 @@ def _score_spots(
 ) -> None:  # fmt: skip
     """Score estimators of the base's normal at the detected highlights of a frame, and pair them."""
     frame = sample_frame(sample)
-    alone = {f"{name}, network alone": replace(each, reflection=False) for name, each in dense.items()}
-    estimators = {**load_estimators(["bisector", "learned_spot"]), **dense, **alone}
+    estimators = {**load_estimators(["bisector", "learned_spot"]), **dense}
     found = run_pipeline(frame.encoded, frame.calibration, "colour", estimators, None, frame.smoothing_px)
     peaks = [each.patch.peak_px for each in found.specularities if not isinstance(each.patch, Failure)]
     if len(peaks) >= LEAST_HIGHLIGHTS:
@@ -160,7 +159,7 @@ def _score_spots(
                     inside[name].append(float(off @ np.linalg.solve(result.covariance, off) <= CHI2_95))
     for name, own in errors.items():
         _add(scores[name], anatomy, np.array(list(own.values())), np.array(inside[name]) if inside[name] else None)
-        both = sorted(own.keys() & errors[DENSE].keys())
+        both = sorted(own.keys() & errors.get(DENSE, {}).keys())
         if name != DENSE and both:
             pairs[f"highlights: {DENSE} - {name}"][anatomy].append(np.array([errors[DENSE][n] - own[n] for n in both]))
 

@@ -22,7 +22,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.runtime.arrays import Array, Picture
 
 SIZE = (256, 192)
-HEAD_PX, GAP_PX, QUALITY = 24, 4, 88
+HEAD_PX, GAP_PX, QUALITY = 24, 4, 85
 ERROR_END_DEG, DEVIATION_END_DEG = 30.0, 30.0
 HEADS = ("frame", "true normal, base", "estimated", f"error, 0 to {ERROR_END_DEG:g} deg",
          f"stated deviation, 0 to {DEVIATION_END_DEG:g} deg")  # fmt: skip

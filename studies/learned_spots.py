@@ -4,7 +4,8 @@ simtest dataset highlights --out data/highlights
 simtest train spot_normals data/highlights --out models/spots
 python -m studies.learned_spots data/highlights models/spots/model.onnx
 
-A third argument limits the frames of each anatomy: the anatomies are the independent units.
+A third argument limits the frames of each anatomy: the anatomies are the independent units. A fourth names the split,
+default test.
 """
 
 import sys
@@ -23,7 +24,8 @@ from simtest.dataset.sample import Sample
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.learned_spot import LearnedSpot
-from simtest.geometry.vectors import tangent_coordinates
+from simtest.estimators.spot_inputs import rays_of
+from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import run_pipeline
 from simtest.runtime.arrays import Array
 
@@ -37,7 +39,8 @@ class Row:
     """One estimate; NaN where there is no truth.
 
     Errors and stated deviation, deg; squared Mahalanobis distance; whether the base's axis ratio lies within 1.96
-    deviations; where it comes from; whether the detection shows glints or near misses alone.
+    deviations; where it comes from; whether the detection shows glints or near misses alone; angle between the base's
+    normal and the direction to the camera.
     """
 
     estimator: str
@@ -51,12 +54,14 @@ class Row:
     ratio_inside: float = np.nan
     status: str = "ok"
     kind: str = ""
+    tilt_deg: float = np.nan
 
 
 def main() -> None:
     """Estimate on the test split, print the tables."""
     folder, model = Path(sys.argv[1]), sys.argv[2]
     most = int(sys.argv[3]) if len(sys.argv) > 3 else sys.maxsize
+    split = sys.argv[4] if len(sys.argv) > 4 else "test"
     estimators = {
         **load_estimators(["bisector", "cloud"]),
         "learned_spot, base": LearnedSpot(model, "base"),
@@ -64,14 +69,14 @@ def main() -> None:
     }
     rows: list[Row] = []
     taken: Counter[tuple[int, int]] = Counter()
-    total = len(sample_positions(folder, "test"))
+    total = len(sample_positions(folder, split))
     with progress_bar("comparing") as progress:
-        for number, sample in enumerate(read_samples(folder, "test", FIELDS_READ)):
+        for number, sample in enumerate(read_samples(folder, split, FIELDS_READ)):
             anatomy = (sample.meta["anatomy"]["family"], sample.meta["anatomy"]["number"])
             taken[anatomy] += 1
             if taken[anatomy] <= most:
                 rows += _rows(sample, estimators)
-            progress(number + 1, total + 1, "test split: frames")
+            progress(number + 1, total + 1, f"{split} split: frames")
     print(f"{sum(min(count, most) for count in taken.values())} frames of {len(taken)} anatomies\n")
     print("\n".join(_table(rows)))
     print()
@@ -96,6 +101,7 @@ def _rows(sample: Sample, estimators: dict[str, object]) -> Iterator[Row]:
             continue
         for name, result in each.estimates.items():
             row = Row(name, (sample.index, number), anatomy["family"], anatomy["number"], kind=kinds[number])
+            row.tilt_deg = float(angle_deg(base, -rays_of(frame.camera, peak[None])[0]))
             if isinstance(result, Estimate) and result.axis_ratio_deviation and result.target == "base":
                 off = abs((result.axis_ratio or np.nan) - _base_ratio(sample, peak))
                 row.ratio_inside = float(off <= 1.96 * result.axis_ratio_deviation) if np.isfinite(off) else np.nan
@@ -182,13 +188,15 @@ def _table(rows: list[Row]) -> Iterator[str]:
 
 
 def _fifths(rows: list[Row]) -> Iterator[str]:
-    """Yield the base's errors in five groups sorted by the stated deviation, then by what the detection shows."""
+    """Yield the base's errors in five groups by stated deviation, by what the detection shows, by tilt."""
     yield "| answers | n | stated deviation, deg | base: median, deg | 95 % below | inside its 95 % ellipse |"
     yield "|---|---|---|---|---|---|"
     order = np.argsort([row.stated_deg for row in rows], kind="stable")
     names = ("surest fifth", "second", "third", "fourth", "least sure fifth")
     groups = [(name, [rows[k] for k in part]) for name, part in zip(names, np.array_split(order, 5), strict=True)]
     groups += [(kind, [row for row in rows if row.kind == kind]) for kind in ("glints", "near misses", "none near")]
+    for low, high in ((0, 10), (10, 20), (20, 90)):
+        groups.append((f"base tilted by {low} to {high} deg", [row for row in rows if low <= row.tilt_deg < high]))
     for name, own in groups:
         base = _known(own, lambda row: row.base_deg)
         if len(base):

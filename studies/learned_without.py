@@ -82,15 +82,15 @@ def _trained(taught: Spots, judged: Spots, out: Path) -> Path:
 def _rows(estimator: LearnedSpot, spots: Spots) -> Iterator[tuple[str, list[str]]]:
     """Yield the figures of the highlights that are answered, and of those that are refused."""
     network = estimator._network
-    outputs, refusals = network.run(spots.crops.astype(np.float32), spots.extras.astype(np.float32))
+    outputs, inflated, refusals = network.run(spots.crops.astype(np.float32), spots.extras.astype(np.float32))
     refused = np.array([refusal is not None for refusal in refusals])
     reasons = Counter(re.split(" is | at ", refusal.detail)[0].split(": ")[-1] for refusal in refusals if refusal)
     for row, chosen in ((", answered", ~refused), (", refused", refused)):
         told = "; ".join(f"{reason}: {count}" for reason, count in reasons.most_common(3)) if chosen is refused else ""
-        yield row, [*_cells(network, outputs[chosen, BASE], spots.chosen(chosen)), told]
+        yield row, [*_cells(network, outputs[chosen, BASE], inflated[chosen], spots.chosen(chosen)), told]
 
 
-def _cells(network: _Network, made: Array, spots: Spots) -> Iterator[str]:
+def _cells(network: _Network, made: Array, inflated: Array, spots: Spots) -> Iterator[str]:
     """Yield number, median and 95th percentile of the base's errors, and the coverage."""
     yield str(len(spots))
     if not len(spots):
@@ -101,7 +101,7 @@ def _cells(network: _Network, made: Array, spots: Spots) -> Iterator[str]:
     yield f"{np.median(off):.2f}"
     yield f"{np.percentile(off, 95):.2f}"
     distances = squared_distance(torch.from_numpy(made), torch.from_numpy(truth)).numpy()
-    inside = distances <= CHI2_95 * network.scales["base"].at(log_deviation(made))
+    inside = distances <= CHI2_95 * network.scales["base"].at(log_deviation(made)) * inflated
     yield f"{inside.mean():.3f}"
 
 

@@ -56,8 +56,8 @@ LONGEST = (
 """Files of 4 s of processor time and more, the longest first."""
 
 
-COLLECTED: dict[str, set[str]] = {}
-"""Names of the collected tests by file, those that are not chosen too."""
+COLLECTED: dict[str, dict[str, bool]] = {}
+"""Whether a test is slow, by name and file, of all that were collected; those that are not chosen too."""
 
 
 def matches(listed, name):
@@ -77,10 +77,11 @@ def pytest_collection_modifyitems(items):
     What is chosen by marks is chosen afterwards. `make test-ci` runs these cases too.
     """
     for item in items:
-        COLLECTED.setdefault(item.path.stem, set()).add(item.name)
         if is_slow(item.path.stem, item.name):
             item.add_marker("slow")
             item.add_marker("extra")
+        own = COLLECTED.setdefault(item.path.stem, {})
+        own[item.name] = item.get_closest_marker("slow") is not None
     order = {name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 

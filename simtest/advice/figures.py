@@ -18,6 +18,7 @@ from simtest.validation.paired import (
     FRAME,
     deviation_of_mean,
     distinct_frames,
+    freedom_of,
     half_width,
     side_by_side,
     targets_of,
@@ -233,9 +234,10 @@ def ratio_interval(totals: Array, counts: Array, strata: IntArray, frames: int |
         # Too few to see the spread within strata: that between them is added.
         frames = None if frames is None else frames * kinds
         strata, kinds = np.zeros_like(strata), 1
-    freedom, mean = len(totals) - kinds, float(totals.sum() / counts.sum())
-    if not freedom or not mean:
+    mean = float(totals.sum() / counts.sum())
+    if len(totals) == kinds or not mean:
         return None, None
+    freedom = freedom_of(counts, strata)
     empty = np.maximum((frames or 0) - np.bincount(strata), 0)
     strata = np.concatenate([strata, np.repeat(np.arange(len(empty)), empty)])
     nothing = np.zeros(len(strata) - len(totals))

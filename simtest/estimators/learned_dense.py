@@ -23,7 +23,7 @@ from simtest.estimators.dense_inputs import (
     dense_inputs,
 )
 from simtest.estimators.protocol import Estimate
-from simtest.estimators.reflection_check import Reflection, reflected, reflection
+from simtest.estimators.reflection_check import reflection_distance
 from simtest.estimators.spot_inputs import LOG_RANGE
 from simtest.estimators.turned_normals import turned_normals
 from simtest.geometry import Array, Camera, Patch
@@ -43,7 +43,7 @@ ASPECTS = (1.0, 1.9)
 CELL_PX = (1.5, 20.0)
 """Pixels of a cell along x: resampling covers these."""
 
-LEAST_HIGHLIGHTS, REFLECTION_LIMIT = 4, 3.0
+LEAST_HIGHLIGHTS, REFLECTION_LIMIT = 4, 2.0
 """From so many highlights a frame's normals are checked against the law of reflection, and refused beyond the limit.
 
 `python -m studies.learned_dense DATA MODEL --split validation` prints how far the validation split's frames go.
@@ -80,15 +80,12 @@ class LearnedDense:
     distance everywhere (`maps`); as an estimator it answers for each detection. It refuses with ``no_estimate`` what
     lies outside the range that it was taught: another lens or other lights, a frame without colour, of an unusual
     aspect or too small, and frames whose features lie far from those of the train split. As an estimator it refuses
-    frames too at whose highlights its normals contradict the law of reflection (`simtest.estimators.reflection_check`).
+    frames too at whose highlights its normals contradict the law of reflection (`reflection_distance`).
 
     Parameters
     ----------
     model : str or Path, optional
         The file model.onnx. Default: the shipped network.
-    reflection : bool
-        Whether the normal at a highlight is corrected by the law of reflection: the bisector of light and camera at the
-        stated distance counts as a measurement of it. Maps are the network's own.
 
     Raises
     ------
@@ -97,7 +94,6 @@ class LearnedDense:
     """
 
     model: str | Path | None = None
-    reflection: bool = True
 
     def check(self) -> None:
         """Load the network; raise `InputError` where it cannot be used."""
@@ -145,11 +141,11 @@ class LearnedDense:
         return DenseMaps(*made)
 
     def contradiction(self, frame: Frame, points_px: Array) -> float | Failure:
-        """Return how far the normals at highlights are from the law of reflection (`Reflection.distance`)."""
+        """Return how far the normals at highlights are from the law of reflection (`reflection_distance`)."""
         outputs = self._outputs(frame)
         if isinstance(outputs, Failure):
             return outputs
-        return _reflection(self._stated(outputs, frame.camera, points_px), frame, points_px).distance
+        return _contradiction(self._stated(outputs, frame.camera, points_px), frame, points_px)
 
     def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
         """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
@@ -173,15 +169,12 @@ class LearnedDense:
         points = np.asarray(peaks, dtype=float)
         stated = self._stated(outputs, frame.camera, points)
         normals, covariances, *_ = stated
-        seen = _reflection(stated, frame, points)
-        off = seen.distance
+        off = _contradiction(stated, frame, points)
         if len(points) >= LEAST_HIGHLIGHTS and off > REFLECTION_LIMIT:
             told = (
                 f"contradicts the law of reflection at {len(points)} highlights: {off:.3g}, limit {REFLECTION_LIMIT:g}"
             )
             return [Failure(Reason.NO_ESTIMATE, told)] * len(points)
-        if self.reflection:
-            normals, covariances = reflected(normals, covariances, seen)
         return [
             Estimate(normal=normal, candidates=normal[None], look_px=point, covariance=covariance, target="base")
             for normal, covariance, point in zip(normals, covariances, points, strict=True)
@@ -208,11 +201,11 @@ class LearnedDense:
         return normals, covariances, distance, share * distance
 
 
-def _reflection(stated: tuple[Array, Array, Array, Array], frame: Frame, points_px: Array) -> Reflection:
-    """Compare what is stated at highlights with the law of reflection."""
+def _contradiction(stated: tuple[Array, Array, Array, Array], frame: Frame, points_px: Array) -> float:
+    """Return how far what is stated at highlights is from the law of reflection."""
     normals, covariances, distance, deviation = stated
     rays, lights = frame.camera.unproject(points_px), frame.calibration.priors.lights
-    return reflection(normals, covariances, rays, distance, deviation / distance, lights)
+    return reflection_distance(normals, covariances, rays, distance, deviation / distance, lights)
 
 
 def stated_deviation(made: Array) -> Array:

@@ -27,7 +27,7 @@ from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
 from simtest.runtime.onnx_model import OnnxModel
 from simtest.runtime.resources import data_root, shown
-from simtest.runtime.training_range import TrainingRange
+from simtest.runtime.training_range import TrainingRange, inflation
 
 FORMAT = "simtest spot_normals, version 3"
 
@@ -119,13 +119,13 @@ class LearnedSpot:
             refused = Failure(Reason.NO_ESTIMATE, "outside the network's training: a lens with distortion")
             return [refused] * len(peaks)
         crops, extras = spot_inputs(frame, peaks)
-        outputs, refusals = self._network.run(crops, extras)
+        outputs, inflations, refusals = self._network.run(crops, extras)
         rays, number = rays_of(frame.camera, np.asarray(peaks)), SURFACES.index(self.target)
-        rows = zip(rays, peaks, outputs[:, number], refusals, strict=True)
-        return [refusal or self._estimate(ray, peak, made) for ray, peak, made, refusal in rows]
+        rows = zip(rays, peaks, outputs[:, number], inflations, refusals, strict=True)
+        return [refusal or self._estimate(*row) for *row, refusal in rows]
 
-    def _estimate(self, ray: Array, peak: Array, made: Array) -> Estimate:
-        """Return the estimate of one row of outputs."""
+    def _estimate(self, ray: Array, peak: Array, made: Array, inflated: float) -> Estimate:
+        """Return the estimate of one row of outputs, whose covariance is inflated by a factor."""
         turn = made[:2] * ROTATION_SCALE
         steps = turn + STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         normals = normal_of(np.repeat(ray[None], 3, axis=0), steps)
@@ -133,10 +133,14 @@ class LearnedSpot:
         first, second = np.exp(np.clip(made[[2, 4]], *LOG_RANGE))
         factor = ROTATION_SCALE * np.array([[first, 0.0], [made[3], second]])
         covariance = (
-            jacobian @ factor @ factor.T @ jacobian.T * self._network.scales[self.target].at(log_deviation(made))
+            jacobian
+            @ factor
+            @ factor.T
+            @ jacobian.T
+            * (self._network.scales[self.target].at(log_deviation(made)) * inflated)
         )
         sure = float(np.clip(made[RATIO_DEVIATION], *LOG_RANGE))
-        deviation = np.exp(sure) * np.sqrt(self._network.ratio_scales[self.target].at(sure))
+        deviation = np.exp(sure) * np.sqrt(self._network.ratio_scales[self.target].at(sure) * inflated)
         return Estimate(
             normal=normals[0], candidates=normals[:1], look_px=np.asarray(peak, dtype=float),
             axis_ratio=float(1 / (1 + np.exp(-made[5]))), covariance=covariance, target=self.target,
@@ -154,17 +158,21 @@ class _Network:
             self.scales = {surface: CovarianceScale.read(content["scales"][surface]) for surface in SURFACES}
             self.ratio_scales = {name: CovarianceScale.read(content["ratio_scales"][name]) for name in SURFACES}
             self._range = TrainingRange.read(content, EXTRAS)
+            self._usual = float(content["feature_usual"])
+            if not 0 < self._usual < np.inf:
+                raise ValueError(f"feature_usual = {self._usual}: must be above 0")
         self._shapes = {"outputs": (None, len(SURFACES), len(OUTPUTS)), "features": (None, len(self._range.mean))}
 
-    def run(self, crops: Image, extras: Image) -> tuple[Array, list[Failure | None]]:
-        """Return outputs, shape (N, 2, 7), and for each row why it is refused, or None."""
+    def run(self, crops: Image, extras: Image) -> tuple[Array, Array, list[Failure | None]]:
+        """Return outputs, shape (N, 2, 7), factors of the covariances, and for each row why it is refused, or None."""
         outputs, features = self._model.run({"crops": crops, "extras": extras}, self._shapes)
         checked = ({name: float(row[EXTRAS.index(name)]) for name in _CHECKED} for row in extras)
         refusals = [
             self._range.refusal(values) or unlike
             for values, unlike in zip(checked, self._range.refusals(features), strict=True)
         ]
-        return np.asarray(outputs, dtype=float), refusals
+        inflated = inflation(self._range.distances(features), self._usual)
+        return np.asarray(outputs, dtype=float), inflated, refusals
 
 
 learned_spot = LearnedSpot()

@@ -86,6 +86,15 @@ class TrainingRange:
         return Failure(Reason.NO_ESTIMATE, told)
 
 
+def inflation(distances: Array, usual: float) -> Array:
+    """Return factors of covariances for features at squared distances from those of the train split.
+
+    They are 1 up to the usual distance and proportional to the squared distance beyond: where the features say that a
+    highlight differs from those taught, the network is less sure than it states.
+    """
+    return np.maximum(1.0, distances / usual)
+
+
 DIGITS = 7
 """Of the numbers of the metadata: those of the weights have no more."""
 

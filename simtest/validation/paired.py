@@ -140,8 +140,7 @@ def half_width(values: Array, settings: Array, frames: Array, total: int | None 
     """Compute half the 95 % interval of the mean of values whose frames are the independent units.
 
     The number of values varies from frame to frame, and a frame with many of them draws the mean to its own. So the
-    spread is that of `deviation_of_mean`, and Student's t has fewer degrees of freedom where few frames hold most
-    values: n (sum c^2)^2 / (N sum c^4), with c the values of a frame, N the frames and n those less the settings.
+    spread is that of `deviation_of_mean`, and Student's t has the degrees of freedom of `freedom_of`.
 
     Parameters
     ----------
@@ -170,9 +169,20 @@ def half_width(values: Array, settings: Array, frames: Array, total: int | None 
     deviation = deviation_of_mean(totals, counts, strata, (total or len(values)) - len(values))
     # Frames that are alone in their setting spread as the others do.
     deviation *= math.sqrt(len(totals) / np.count_nonzero(seen))
-    weights, free = counts[seen] ** 2, 1 - (strata.max() + 1) / len(totals)
-    freedom = max(math.floor(free * float(weights.sum() ** 2 / (weights @ weights)) + _ROUNDING), 1)
-    return student_t.quantile((1 + CONFIDENCE) / 2, freedom) * deviation
+    return student_t.quantile((1 + CONFIDENCE) / 2, freedom_of(counts, strata)) * deviation
+
+
+def freedom_of(counts: Array, strata: IntArray) -> int:
+    """Return the degrees of freedom of `deviation_of_mean`, fewer where few frames hold most of the values.
+
+    They are (1 - S / F) (sum c^2)^2 / sum c^4, with c the number of values of each of the F frames, and S strata: what
+    Satterthwaite's rule gives if each value spreads alike. At least 1.
+    """
+    weights = counts[np.bincount(strata)[strata] > 1] ** 2
+    if not weights.any():
+        return 1
+    free = 1 - len(np.unique(strata)) / len(strata)
+    return max(math.floor(free * float(weights.sum() ** 2 / (weights @ weights)) + _ROUNDING), 1)
 
 
 def deviation_of_mean(totals: Array, counts: Array, strata: IntArray, others: int = 0) -> float:

@@ -1,7 +1,7 @@
 """Compare networks taught on smooth surfaces with those taught on tissue: on other rendered frames, and on real ones.
 
-    python -m studies.learned_transfer --kept FOLDER [--scenes 18] [--spots SMOOTH TISSUE] [--dense SMOOTH TISSUE]
-        [--detectors SMOOTH TISSUE] [--hard] [--real] [--overlays FOLDER] [--sheet FILE]
+    python -m studies.learned_transfer --kept FOLDER [--scenes 12] [--spots SMOOTH TISSUE] [--dense SMOOTH TISSUE]
+        [--detectors [SMOOTH] TISSUE] [--hard] [--real] [--overlays FOLDER] [--sheet FILE]
 
 SMOOTH and TISSUE are the files model.onnx of one task, trained on `highlights_smooth` and on `highlights`
 (`simtest train`). The folder of `--kept` holds the frames of the corpus `hard`, rendered at the first run, and the
@@ -27,7 +27,7 @@ from studies.learned_transfer import real, sheet, tables
 from studies.learned_transfer.answers import OK, Answer
 from studies.learned_transfer.frames import FIRST, GUIDES, ONE_LIGHT, ROWS, hard_frames
 from studies.learned_transfer.kept import Kept
-from studies.learned_transfer.networks import CLASSICAL, COLOUR, SMOOTH, TISSUE, detectors, estimators, named
+from studies.learned_transfer.networks import CLASSICAL, COLOUR, SMOOTH, TAUGHT, TISSUE, detectors, estimators, named
 
 TASKS = ("learned_spot", "learned_dense")
 
@@ -42,14 +42,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(prog="python -m studies.learned_transfer", description="Smooth against tissue.")
     parser.add_argument("--kept", type=Path, required=True, help="folder of the rendered frames")
-    parser.add_argument("--scenes", type=int, default=18)
+    parser.add_argument("--scenes", type=int, default=12)
     for task in ("spots", "dense", "detectors"):
-        parser.add_argument(f"--{task}", type=Path, nargs=2, metavar=("SMOOTH", "TISSUE"))
+        parser.add_argument(f"--{task}", type=Path, nargs="+", metavar="FILE")
     parser.add_argument("--hard", action="store_true", help="the corpus hard alone")
     parser.add_argument("--real", action="store_true", help="the real frames alone")
     parser.add_argument("--overlays", type=Path)
     parser.add_argument("--sheet", type=Path)
     given = parser.parse_args(arguments)
+    if any(len(files or ()) > len(TAUGHT) for files in (given.spots, given.dense, given.detectors)):
+        parser.error("a task has two networks at most: SMOOTH TISSUE, or TISSUE alone")
     normals, finders = estimators(given.spots, given.dense), detectors(given.detectors)
     both = given.hard == given.real
     if given.hard or both:
@@ -75,10 +77,9 @@ def _hard(
         print(f"scene {frame.scene}, {frame.row.name}", file=sys.stderr, flush=True)
     yield from ("", "## Corpus hard: normals", "")
     yield from tables.summary(made, GROUPS, list(normals))
-    compared = [(named(task, TISSUE), named(task, SMOOTH)) for task in TASKS if named(task, TISSUE) in normals]
-    compared += [
-        (named(task, TISSUE), other) for task in TASKS for other in CLASSICAL if named(task, TISSUE) in normals
-    ]
+    compared = [(named(task, TISSUE), named(task, SMOOTH)) for task in TASKS if named(task, SMOOTH) in normals]
+    # A cloud is of no single highlight, so it pairs with none.
+    compared += [(named(task, TISSUE), CLASSICAL[0]) for task in TASKS if named(task, TISSUE) in normals]
     yield from ("", "## Corpus hard: paired differences", "")
     yield from tables.pairs(made, GROUPS, compared)
     yield from ("", "## Corpus hard: detection", "")
@@ -100,7 +101,7 @@ def _real(
             yield real.detection_line(frame, name, detection, found[COLOUR])
             pictures[frame.name][name] = sheet.outlined(frame.picture, detection.highlights, 2)
     yield from ("", "## Real frames: normals", "")
-    yield from tables.head(("frame", "way", "estimator", "detections", "answered", "refused"))
+    yield from tables.head(real.NORMALS_HEADS)
     agreed: list[real.Agreement] = []
     for frame in frames:
         for way, picture, calibration in real.ways(frame):
@@ -110,7 +111,8 @@ def _real(
             for name in asked:
                 count = real.refusals(at, name)
                 why = "; ".join(f"{n} {reason}" for reason, n in count.most_common() if reason != OK) or "0"
-                yield f"| {frame.name} | {way} | {name} | {count.total()} | {count[OK]} | {why} |"
+                on = real.misplaced(frame, at, name, picture)
+                yield f"| {frame.name} | {way} | {name} | {count.total()} | {count[OK]} | {why} | {on} |"
             if way == real.TOLD:
                 agreed += real.agreements(frame.name, at, learned, CLASSICAL)
                 for name in learned:

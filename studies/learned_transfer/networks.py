@@ -1,6 +1,6 @@
 """The networks that are compared, each trained twice: on smooth surfaces and on tissue."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from simtest.detection.colour import ColourDetector
@@ -13,8 +13,8 @@ TAUGHT = (SMOOTH, TISSUE)
 
 CLASSICAL, COLOUR = ("bisector", "cloud"), "colour"
 
-Pair = tuple[Path, Path]
-"""Files of a task's network taught on smooth surfaces, and on tissue."""
+Files = Sequence[Path]
+"""Files of a task's network taught on smooth surfaces, and on tissue; one file is that of tissue."""
 
 
 def named(task: str, taught: str) -> str:
@@ -22,26 +22,31 @@ def named(task: str, taught: str) -> str:
     return f"{task}, {taught}"
 
 
-def estimators(spots: Pair | None, dense: Pair | None) -> Mapping[str, AnyEstimator]:
+def _taught(files: Files) -> Mapping[str, Path]:
+    """Return the files by what their networks were taught."""
+    return dict(zip(TAUGHT[-len(files) :], files, strict=True))
+
+
+def estimators(spots: Files | None, dense: Files | None) -> Mapping[str, AnyEstimator]:
     """Return the networks that state normals, and the classical estimators beside them."""
     made: dict[str, AnyEstimator] = {}
     if spots:
         from simtest.estimators.learned_spot import LearnedSpot
 
-        made |= {named("learned_spot", name): LearnedSpot(file) for name, file in zip(TAUGHT, spots, strict=True)}
+        made |= {named("learned_spot", name): LearnedSpot(file) for name, file in _taught(spots).items()}
     if dense:
         from simtest.estimators.learned_dense import LearnedDense
 
-        made |= {named("learned_dense", name): LearnedDense(file) for name, file in zip(TAUGHT, dense, strict=True)}
+        made |= {named("learned_dense", name): LearnedDense(file) for name, file in _taught(dense).items()}
     return {**made, **load_estimators(list(CLASSICAL))}
 
 
-def detectors(files: Pair | None) -> Mapping[str, Detector]:
+def detectors(files: Files | None) -> Mapping[str, Detector]:
     """Return the networks that find highlights, and the classical detector beside them."""
     made: dict[str, Detector] = {}
     if files:
         from simtest.detection.learned_detector import LearnedDetector
 
-        pairs = zip(TAUGHT, files, strict=True)
-        made |= {named("learned_detector", name): LearnedDetector(file) for name, file in pairs}
+        taught = _taught(files).items()
+        made |= {named("learned_detector", name): LearnedDetector(file, isolated=False) for name, file in taught}
     return {**made, COLOUR: ColourDetector(isolated=False)}

@@ -129,6 +129,11 @@ DETECTION_HEADS = (
 )  # fmt: skip
 
 
+NORMALS_HEADS = (
+    "frame", "way", "estimator", "detections", "answered", "refused", "answers on instrument, text, vessel, border",
+)  # fmt: skip
+
+
 def detection_line(frame: OutlinedFrame, name: str, detection: Detection, colour: Detection) -> str:
     """Return a detector's line of the table, beside the classical detector."""
     made = detection_score(frame, detection)
@@ -152,6 +157,16 @@ def refusals(found: Sequence[Specularity], name: str) -> Counter[str]:
     """Count an estimator's answers and its refusals by reason."""
     results = [each.estimates[name] for each in found if name in each.estimates]
     return Counter(why(result) if isinstance(result, Failure) else OK for result in results)
+
+
+def misplaced(frame: OutlinedFrame, found: Sequence[Specularity], name: str, picture: Image) -> str:
+    """Count the answers on each kind of what carries none, in the order of `FORBIDDEN`, on a reduced picture."""
+    height, width = frame.specular.shape
+    scale = np.array([width / picture.shape[1], height / picture.shape[0]])
+    answered = [result for each in found if isinstance(result := each.estimates.get(name), Estimate)]
+    columns, rows = np.array([result.look_px * scale for result in answered]).reshape(-1, 2).T.astype(int)
+    nowhere = np.zeros((height, width), dtype=bool)
+    return ", ".join(str(int(frame.forbidden.get(kind, nowhere)[rows, columns].sum())) for kind in FORBIDDEN)
 
 
 def agreements(

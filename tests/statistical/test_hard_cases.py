@@ -197,7 +197,8 @@ def test_streaks_are_refused_or_flagged(see, kd):
             else:
                 kept += 1
                 assert {"streak", "partial_arc"} & set(estimate.flags) or error(estimate, truth) < TWO_DEG
-    assert kept > 0
+    # Next to -1 the streak crosses the frame, and no isophote is left to answer from.
+    assert kept > 0 or abs(kd + 1) <= 0.05 + 1e-9
 
 
 @pytest.mark.render

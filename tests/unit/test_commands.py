@@ -49,7 +49,7 @@ def test_the_list_names_what_commands_take(here):
         for name in listed[kind]:
             if name != "published":  # a scene of validate alone
                 load(name)
-    assert list(listed["trainings"]) == ["spot_normals"]
+    assert list(listed["trainings"]) == ["dense_normals", "highlight_instances", "spot_normals"]
     assert list(listed["estimators"]) == ESTIMATORS.names()
     for name in listed["sensors"]:
         load_scene("plane", {"sensor.preset": name})

@@ -163,7 +163,7 @@ def test_maps_are_those_of_the_network(made):
 
 def test_the_pipeline_runs_it_beside_the_others(made):
     picture, _, _ = plane(300)
-    learned = LearnedDense(made[3], reflection=False)
+    learned = LearnedDense(made[3])
     found = run_pipeline(picture, calibration(), "peaks", {"one": learned}, None, 1.0)
     results = [each.estimates["one"] for each in found.specularities]
     assert results

@@ -20,11 +20,12 @@ from simtest.errors import Failure, InputError  # noqa: E402
 from simtest.estimators import Estimate  # noqa: E402
 from simtest.estimators.covariance_scale import CovarianceScale  # noqa: E402
 from simtest.estimators.learned_spot import LearnedSpot, log_deviation  # noqa: E402
-from simtest.estimators.spot_inputs import rays_of, spot_inputs  # noqa: E402
+from simtest.estimators.spot_inputs import EXTRAS, rays_of, spot_inputs  # noqa: E402
 from simtest.geometry import BrownConrady, Camera  # noqa: E402
 from simtest.geometry.vectors import angle_deg  # noqa: E402
 from simtest.reconstruction.pipeline import run_pipeline  # noqa: E402
 from simtest.runtime.onnx_model import METADATA  # noqa: E402
+from simtest.runtime.training_range import TrainingRange, inflation  # noqa: E402
 
 pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
@@ -90,16 +91,18 @@ def test_covariances_are_scaled_to_cover_95_percent_of_the_validation_split(made
     network, _, judged, path = made
     content = json.loads(onnxruntime.InferenceSession(path.read_bytes()).get_modelmeta().custom_metadata_map[METADATA])
     with torch.no_grad():
-        outputs, _ = network(judged["crops"], judged["extras"])
+        outputs, features = network(judged["crops"], judged["extras"])
+    inflated = inflation(TrainingRange.read(content, EXTRAS).distances(features.numpy()), content["feature_usual"])
+    assert (inflated == 1).mean() == pytest.approx(0.5, abs=0.02)
     for number, surface in enumerate(("base", "fine")):
         scale = CovarianceScale(**{key: tuple(values) for key, values in content["scales"][surface].items()})
-        factors = scale.at(log_deviation(outputs[:, number].numpy()))
+        factors = scale.at(log_deviation(outputs[:, number].numpy())) * inflated
         distances = squared_distance(outputs[:, number], judged[surface]).numpy() / factors
         assert 0.94 < (distances < 5.991).mean() < 0.98
         scale = CovarianceScale(**{key: tuple(values) for key, values in content["ratio_scales"][surface].items()})
         sure = outputs[:, number, 6]
         off = (judged[f"{surface}_ratio"] - torch.sigmoid(outputs[:, number, 5])) / torch.exp(sure)
-        assert 0.94 < (off.numpy() ** 2 < 3.842 * scale.at(sure.numpy())).mean() < 0.98
+        assert 0.94 < (off.numpy() ** 2 < 3.842 * inflated * scale.at(sure.numpy())).mean() < 0.98
     assert content["about"] == {"dataset": "drawn"}
 
 
@@ -156,17 +159,18 @@ def test_the_pipeline_runs_it_beside_the_others(made):
     crops, extras = spot_inputs(found.detection.frame, peaks)
     with torch.no_grad():
         outputs = network(torch.from_numpy(crops), torch.from_numpy(extras))[0].numpy()[:, 0]
+    inflated = learned._network.run(crops, extras)[1]
     rays = rays_of(calibration().camera, peaks)
-    for result, ray, row in zip(results, rays, outputs, strict=True):
+    for result, ray, row, more in zip(results, rays, outputs, inflated, strict=True):
         assert result.target == "base"
         assert 0 < result.axis_ratio < 1
-        wanted = np.exp(row[6]) * np.sqrt(learned._network.ratio_scales["base"].at(row[6]))
+        wanted = np.exp(row[6]) * np.sqrt(learned._network.ratio_scales["base"].at(row[6]) * more)
         assert result.axis_ratio_deviation == pytest.approx(wanted, rel=1e-4)
         # The network's rotation is the angle between the normal and the direction to the camera.
         turned = 0.1 * np.hypot(*row[:2])
         assert angle_deg(result.normal[None], -ray[None])[0] == pytest.approx(np.degrees(turned), abs=1e-4)
         # The map from rotations to normals keeps areas but for the angle's sine, so determinants agree.
-        factor = learned._network.scales["base"].at(log_deviation(row))
+        factor = learned._network.scales["base"].at(log_deviation(row)) * more
         wanted = (0.1**2 * np.exp(row[2] + row[4])) ** 2 * factor**2
         assert np.linalg.det(result.covariance) == pytest.approx(wanted * np.sinc(turned / np.pi) ** 2, rel=1e-3)
 
@@ -231,9 +235,10 @@ def scales(deviations, factors):
         (changed(scales=scales((1.0, 0.0), (1.0, 2.0))), "must ascend"),
         (changed(feature_mean=[0.0]), "does not fit"),
         (changed(low=3), "is no network of simtest train"),
+        (changed(feature_usual=0.0), "feature_usual = 0.0: must be above 0"),
     ],
     ids=["no metadata", "another format", "a scale missing", "a scale of an older form", "a scale of 0",
-         "too few scales", "scales in disorder", "other features", "no ranges"],
+         "too few scales", "scales in disorder", "other features", "no ranges", "a usual distance of 0"],
 )  # fmt: skip
 def test_another_model_is_refused_in_one_line(made, tmp_path, change, said):
     model = onnx.load(made[3])

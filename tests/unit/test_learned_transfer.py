@@ -192,6 +192,18 @@ def test_detections_on_real_frames_are_scored_alike_for_all_detectors():
     assert line == "| f | n | 1.000 | 1.000 | 0.500 | 2 | 0.50 | 1.00 | 0, 1, 0, 0 | no |"
 
 
+def test_answers_on_an_instrument_are_counted_in_the_frame_s_own_pixels():
+    tool = np.zeros((480, 640), dtype=bool)
+    tool[200:220, 300:320] = True
+    nothing = np.zeros_like(tool)
+    frame = OutlinedFrame("f", "figures", np.zeros((480, 640, 3), np.float32), nothing, nothing, {"instrument": tool})
+    on, off = (replace(an_estimate(), look_px=np.array(at)) for at in ([155.0, 105.0], [162.0, 105.0]))
+    found = [a_specularity({"n": each}) for each in (on, off, Failure(Reason.NO_PEAK, ""))]
+    half = np.zeros((240, 320, 3), dtype=np.float32)
+    assert real.misplaced(frame, found, "n", half) == "1, 0, 0, 0"
+    assert real.misplaced(frame, found[2:], "n", half) == "0, 0, 0, 0"
+
+
 def test_what_is_told_of_a_real_frame():
     picture = np.random.default_rng(0).random((300, 600, 3)).astype(np.float32)
     small = real.reduced(picture)

@@ -120,6 +120,18 @@ class TestMade:
         # Made again of the same file it is the same.
         assert write_card(file).read_text() == after
 
+    @pytest.mark.render
+    @pytest.mark.parametrize(("shorten", "said"), [("halved", "in half precision"), ("in_eight_bits", "in 8 bits")])
+    def test_weights_stored_in_short_are_counted(self, data, tmp_path, shorten, said):
+        import onnx
+
+        from simtest.dataset.learn import onnx_export
+        from simtest.dataset.learn.model_card import make_card
+
+        file = self.model(tmp_path, **self.about(data))
+        onnx.save(getattr(onnx_export, shorten)(onnx.load(file)), file)
+        assert f", of which 1,200 are stored {said}; computed in float32 |" in make_card(file)
+
     @pytest.mark.parametrize("damage", ["missing", "empty", "no model", "nothing about it", "no training"])
     def test_a_file_that_is_no_network_is_told_in_one_line(self, tmp_path, damage):
         from simtest.dataset.learn.model_card import make_card

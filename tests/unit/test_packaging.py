@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.metadata
+import json
 import subprocess
 import sys
 import tomllib
@@ -74,6 +75,20 @@ def test_every_file_of_a_release_has_its_sum(tmp_path):
     subprocess.run("sha256sum --check SHA256SUMS", shell=True, cwd=tmp_path / "dist", check=True, capture_output=True)
     listed = {line.split()[1] for line in (tmp_path / "dist/SHA256SUMS").read_text().splitlines()}
     assert listed == {"a.whl", "constraints-cp311.txt"}
+
+
+@pytest.mark.extra
+@pytest.mark.slow
+def test_pip_adds_nothing_to_a_cpu_build_for_the_extra_for_learning(tmp_path):
+    for name in ("torch", "safetensors", "onnx", "onnxruntime"):
+        pytest.importorskip(name)
+    # Without an index pip can add nothing, so its resolver must be content with what is there.
+    command = [sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", "--no-build-isolation", "--quiet"]
+    command += ["--report", str(tmp_path / "report.json"), "-c", str(ROOT / "constraints.txt"), f"{ROOT}[learn]"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [each["metadata"]["name"] for each in report["install"]] == ["simtest"]
 
 
 @pytest.mark.extra

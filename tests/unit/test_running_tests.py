@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import COLLECTED, LONGEST, SHARED, is_slow, matches
-from tests.slow_cases import SLOW
+from tests.slow_cases import MESHES, ONE_OF_A_KIND, SLOW
 
 TESTS = Path(__file__).resolve().parents[1]
 OF_SHARED_MESHES = ("[colon_*", "[liver*")
@@ -33,14 +33,20 @@ def test_every_slow_case_names_a_test_that_was_collected(request):
     if any("::" in argument for argument in request.config.args):
         pytest.skip("single tests of a file were asked for")
     for stem in COLLECTED.keys() & SLOW.keys():
-        for one in (one for names in SLOW[stem].values() for one in names):
+        for covered, one in ((covered, one) for covered, names in SLOW[stem].items() for one in names):
             if SHARED.is_dir() or not one.endswith(OF_SHARED_MESHES):
                 assert any(matches(one, name) for name in COLLECTED[stem]), (stem, one)
+            if covered in (ONE_OF_A_KIND, MESHES):
+                cases = f"{one.partition('[')[0]}["
+                assert [name for name, slow in COLLECTED[stem].items() if name.startswith(cases) and not slow], (
+                    stem,
+                    one,
+                )
 
 
 def test_a_slow_case_is_told_by_its_name_or_by_how_it_begins():
-    assert is_slow("test_cone_axis", "test_half_a_pixel_is_noticed[shift1-plane]")
-    assert not is_slow("test_cone_axis", "test_half_a_pixel_is_noticed[shift0-plane]")
+    assert is_slow("test_stopping", "test_an_output_that_is_full_is_told[schema scene]")
+    assert not is_slow("test_stopping", "test_an_output_that_is_full_is_told[list scenes]")
     assert is_slow("test_gate", "test_without_exact_pairs_the_test_is_unpaired[more]")
     assert not is_slow("test_gate", "test_without_exact_pairs_the_test_is_unpaired[more and more]")
     assert not is_slow("test_running_tests", "test_without_exact_pairs_the_test_is_unpaired[more]")

@@ -5,7 +5,8 @@
 `runs` trains a network as a file of `training` says: `engine` is the loop, with `checkpoint` and `page`, and knows a
 task of `tasks` alone. The task of `spot_task` learns from the highlights that `spots` reads; `spot_export` writes its
 network for `simtest.estimators.learned_spot`. The task of `dense_task` learns from the frames that `dense_frames`
-reads; `dense_export` writes its network for `simtest.estimators.learned_dense`.
+reads; `dense_export` writes its network for `simtest.estimators.learned_dense`. Both fit their uncertainty with
+`calibration` and write through `onnx_export`.
 
 `crops` and `network` are those of docs/gallery/learning.md: smooth colons, without uncertainty.
 """

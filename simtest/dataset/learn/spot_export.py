@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -12,7 +13,12 @@ from simtest.dataset.learn.tasks import Batch
 from simtest.estimators.covariance_scale import CovarianceScale
 from simtest.estimators.learned_spot import FORMAT, log_deviation
 from simtest.estimators.spot_inputs import EXTRAS, LOG_RANGE, RATIO, RATIO_DEVIATION, SURFACES
+from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
+from simtest.runtime.training_range import inflation
+
+USUAL = 0.5
+"""Share of the validation split's examples whose features lie within the usual distance (`inflation`)."""
 
 
 def export_spots(network: nn.Module, taught: Batch, judged: Batch, out: Path, about: dict[str, str]) -> Path:
@@ -31,20 +37,23 @@ def _calibration(network: nn.Module, taught: Batch, judged: Batch) -> JsonObject
     with torch.no_grad():
         outputs, features = network(judged["crops"], judged["extras"])
         own = network(taught["crops"], taught["extras"])[1]
+    taught_range = fitted_range(EXTRAS, taught["extras"].numpy(), own.numpy(), features.numpy())
+    distances = taught_range.distances(features.numpy())
+    usual = float(np.quantile(distances, USUAL))
+    inflated = inflation(distances, usual)
     scales, ratio_scales = {}, {}
     for number, surface in enumerate(SURFACES):
         known = torch.isfinite(judged[surface][:, 0])
         made = outputs[known, number]
-        distances = squared_distance(made, judged[surface][known]).double().numpy()
-        scales[surface] = fitted_scale(distances, log_deviation(made.double().numpy())).written()
-        ratio_scales[surface] = _ratio_scale(outputs[:, number], judged[f"{surface}_ratio"]).written()
-    taught_range = fitted_range(EXTRAS, taught["extras"].numpy(), own.numpy(), features.numpy())
-    return {"scales": scales, "ratio_scales": ratio_scales, **taught_range.written()}
+        gaps = squared_distance(made, judged[surface][known]).double().numpy() / inflated[known.numpy()]
+        scales[surface] = fitted_scale(gaps, log_deviation(made.double().numpy())).written()
+        ratio_scales[surface] = _ratio_scale(outputs[:, number], judged[f"{surface}_ratio"], inflated).written()
+    return {"scales": scales, "ratio_scales": ratio_scales, "feature_usual": usual, **taught_range.written()}
 
 
-def _ratio_scale(made: Tensor, ratio: Tensor) -> CovarianceScale:
+def _ratio_scale(made: Tensor, ratio: Tensor, inflated: Array) -> CovarianceScale:
     """Return the factor of the axis ratio's variance, where the ratio is known."""
     known = torch.isfinite(ratio)
     sure = made[known, RATIO_DEVIATION].clamp(*LOG_RANGE)
     off = (ratio[known] - torch.sigmoid(made[known, RATIO])) * torch.exp(-sure)
-    return fitted_scale((off * off).double().numpy(), sure.double().numpy(), dimensions=1)
+    return fitted_scale((off * off).double().numpy() / inflated[known.numpy()], sure.double().numpy(), dimensions=1)
