@@ -148,7 +148,7 @@ def compare(title: str, frames: Iterator[tuple[str, TissueFrame, Frame]], finder
     print(f"{'':46} " + " ".join(f"{f'from {low:g} px':>24}" for low in CLASSES))
     tables = {name: np.array(rows).reshape(-1, len(CLASSES), 3) for name, rows in made.items()}
     for name, table in tables.items():
-        for organ in [*sorted(set(organs)), "all"]:
+        for organ in [*(sorted(set(organs)) if len(set(organs)) > 1 else ()), "all"]:
             which = np.array([organ in (each, "all") for each in organs], dtype=bool)
             label = f"{name[-34:]}, {organ}" + f" ({refused[name]} refused)" * (organ == "all")
             print(f"{label:46} " + " ".join(_cell(row) for row in table[which].sum(axis=0)))

@@ -164,7 +164,7 @@ def test_files_of_trainings_are_checked(tmp_path):
         with pytest.raises(InputError, match=said) as raised:
             load_training(tmp_path / "own.toml")
         assert "\n" not in str(raised.value)
-    with pytest.raises(InputError, match=r"task = spot_normal: unknown; allowed: spot_normals, .*\(did you mean"):
+    with pytest.raises(InputError, match=r"task = spot_normal: unknown; allowed: .*spot_normals \(did you mean"):
         load_task("spot_normal")
     with pytest.raises(InputError, match="no dataset to read"):
         run_training(load_training("spot_normals"), tmp_path, tmp_path / "out")
