@@ -72,7 +72,7 @@ class OnnxModel:
         """Turn errors of a block that reads the metadata into an `InputError` that names the file."""
         try:
             yield
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
             raise InputError(
                 f"{shown(self._path)}: is no network of simtest train ({type(error).__name__}: {shown(error, 80)}); "
                 f"its metadata must hold {METADATA!r} of the form {self._form!r}"
@@ -91,13 +91,15 @@ class OnnxModel:
         Raises
         ------
         InputError
-            If the network has other inputs or outputs, or an output is not finite.
+            If the network has other inputs or outputs, or an output holds no floating-point numbers or is not finite.
         """
         try:
             made = [np.asarray(each) for each in self._session.run(list(shapes), dict(inputs))]
             for (name, shape), array in zip(shapes.items(), made, strict=True):
                 if len(shape) != array.ndim or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
                     raise ValueError(f"{name} has the shape {array.shape}; must be {_told(shape)}")
+                if array.dtype.kind != "f":
+                    raise ValueError(f"{name} holds {array.dtype}; must be floating-point numbers")
                 if not np.isfinite(array).all():
                     raise ValueError(f"{name} holds values that are not finite")
         except Exception as error:  # of ONNX Runtime, as above

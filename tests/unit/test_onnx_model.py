@@ -93,6 +93,26 @@ def test_other_metadata_are_refused_in_one_line(line, tmp_path, text, said):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize("limit", [10**400, [], None])
+def test_numbers_of_metadata_that_no_network_has_are_refused_in_one_line(line, limit):
+    model = OnnxModel(line[1], FORM, "line")
+    range_ = {"low": {"x": 0.0}, "high": {"x": 1.0}, "feature_mean": [0.0], "feature_precision": [1.0]}
+    with pytest.raises(InputError, match=r"line.onnx: is no network of simtest train \(") as raised, model.reading():
+        TrainingRange.read({**range_, "feature_limit": limit}, ["x"])
+    assert "\n" not in str(raised.value)
+
+
+def test_outputs_that_are_no_floating_point_numbers_are_refused(line, tmp_path):
+    helper, types = onnx.helper, onnx.TensorProto
+    value = [helper.make_tensor_value_info(name, kind, [2]) for name, kind in (("x", types.FLOAT), ("y", types.BOOL))]
+    graph = helper.make_graph([helper.make_node("Greater", ["x", "x"], ["y"])], "logical", value[:1], value[1:])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", onnx_export.OPSET)], ir_version=8)
+    helper.set_model_props(model, {METADATA: json.dumps({"format": FORM})})
+    onnx.save(model, tmp_path / "logical.onnx")
+    with pytest.raises(InputError, match=r"logical.onnx: cannot be run \(y holds bool; must be floating-point numbers"):
+        OnnxModel(tmp_path / "logical.onnx", FORM, "line").run({"x": np.zeros(2, np.float32)}, {"y": (2,)})
+
+
 def test_what_cannot_be_run_is_told_in_one_line(line, tmp_path):
     model = OnnxModel(line[1], FORM, "line")
     x = np.zeros((3, 40), np.float32)
