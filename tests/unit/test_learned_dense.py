@@ -19,7 +19,7 @@ from simtest.dataset.learn.engine import train  # noqa: E402
 from simtest.dataset.learn.likelihood import squared_distance  # noqa: E402
 from simtest.dataset.learn.training import Training, load_training  # noqa: E402
 from simtest.errors import Failure, InputError  # noqa: E402
-from simtest.estimators import Estimate, learned_dense  # noqa: E402
+from simtest.estimators import Estimate  # noqa: E402
 from simtest.estimators.dense_inputs import CELLS, DISTANCE_MM, camera_values, dense_inputs, output_centres  # noqa: E402
 from simtest.estimators.learned_dense import LearnedDense, interpolated, stated_deviation  # noqa: E402
 from simtest.estimators.spot_inputs import normal_of, rotation_of  # noqa: E402
@@ -257,19 +257,6 @@ def test_it_refuses_frames_unlike_those_of_its_training(made):
     assert "unlike the network's training" in refusal(made[3], blocks.repeat(12, axis=0).repeat(12, axis=1))
     found = run_pipeline(plane(1)[0], calibration(lights=()), "peaks", {"one": LearnedDense(made[3])}, None, 1.0)
     assert all("needs the lights" in each.estimates["one"].detail for each in found.specularities)
-
-
-@pytest.mark.parametrize(
-    ("off", "highlights", "answers"),
-    [(1.9, 4, True), (2.1, 4, False), (float("nan"), 4, False), (2.1, 3, True)],
-    ids=["within", "beyond", "not a number", "too few to tell"],
-)
-def test_it_refuses_frames_that_contradict_the_law_of_reflection(made, monkeypatch, off, highlights, answers):
-    monkeypatch.setattr(learned_dense, "reflection_distance", lambda *_: off)
-    frame, peaks = Frame(plane(1)[0], calibration(), 1.0), np.linspace(40, 100, 2 * highlights).reshape(-1, 2)
-    results = LearnedDense(made[3])._at(frame, list(peaks))
-    assert [isinstance(result, Estimate) for result in results] == [answers] * highlights
-    assert answers or all("contradicts the law of reflection" in result.detail for result in results)
 
 
 def changed(**values):
