@@ -28,7 +28,8 @@ from simtest.estimators.shading_maps import shading_maps
 from simtest.estimators.spot_inputs import normal_of
 from simtest.geometry.vectors import angle_deg, tangent_basis, tangent_coordinates
 from simtest.reconstruction.pipeline import run_pipeline
-from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.arrays import Array
+from studies.resampling import drawn_groups, interval_of_mean
 
 STEP = 4
 """Each so many pixels along each axis one is scored."""
@@ -238,12 +239,12 @@ def _pairs(pairs: dict[str, dict[tuple[int, int], list[Array]]]) -> Iterator[str
     yield "| pair | n | anatomies | mean difference, deg | 95 % interval |"
     yield "|---|---|---|---|---|"
     for name, own in pairs.items():
-        values = {anatomy: np.concatenate(parts) for anatomy, parts in own.items()}
-        sums = np.array([[np.nansum(each), np.isfinite(each).sum()] for each in values.values()])
-        drawn = sums[_draws(len(sums))].sum(axis=1)
-        low, high = np.percentile(drawn[:, 0] / drawn[:, 1], [2.5, 97.5])
-        mean = sums[:, 0].sum() / sums[:, 1].sum()
-        yield f"| {name} | {int(sums[:, 1].sum())} | {len(sums)} | {mean:+.2f} | {low:+.2f} to {high:+.2f} |"
+        parts = [np.concatenate(of_anatomy) for of_anatomy in own.values()]
+        values, groups = np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        values, groups = values[np.isfinite(values)], groups[np.isfinite(values)]
+        low, high = interval_of_mean(values, groups, DRAWS, SEED)
+        count = len(np.unique(groups))
+        yield f"| {name} | {len(values)} | {count} | {values.mean():+.2f} | {low:+.2f} to {high:+.2f} |"
 
 
 def _of(values: dict[tuple[int, int], list[Array]], family: int | None) -> dict[tuple[int, int], list[Array]]:
@@ -259,14 +260,10 @@ def _median_interval(values: dict[tuple[int, int], list[Array]]) -> tuple[float,
     whole = _joined(values)
     edges = np.linspace(0, float(whole.max()) + 1e-6, 2001)
     counts = np.array([np.histogram(np.concatenate(parts), edges)[0] for parts in values.values()])
-    drawn = counts[_draws(len(counts))].sum(axis=1).cumsum(axis=1)
+    drawn = counts[drawn_groups(len(counts), DRAWS, SEED)].sum(axis=1).cumsum(axis=1)
     at = (drawn < drawn[:, -1:] / 2).sum(axis=1)
     low, high = np.percentile(edges[at + 1], [2.5, 97.5])
     return float(low), float(high)
-
-
-def _draws(count: int) -> IntArray:
-    return np.random.default_rng(SEED).integers(count, size=(DRAWS, count))
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ from studies.detection.tissue import (
     score_frame,
 )
 from studies.detection.tissue_frames import TISSUES, TissueFrame
+from studies.resampling import drawn_groups
 
 DRAWS, LEVEL = 2000, 0.95
 
@@ -122,7 +123,7 @@ def difference(one: Table, other: Table, anatomies: Sequence[str]) -> list[tuple
     names = sorted(set(anatomies))
     by_anatomy = [np.array([name == each for each in anatomies]) for name in names]
     parts = np.array([[table[which].sum(axis=0) for which in by_anatomy] for table in (one, other)])
-    draws = np.random.default_rng(0).integers(len(names), size=(DRAWS, len(names)))
+    draws = drawn_groups(len(names), DRAWS, seed=0)
     gaps = f1(parts[0][draws].sum(axis=1)) - f1(parts[1][draws].sum(axis=1))
     middle = f1(one.sum(axis=0)) - f1(other.sum(axis=0))
     low, high = np.nanquantile(gaps, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)

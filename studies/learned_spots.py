@@ -28,6 +28,7 @@ from simtest.estimators.spot_inputs import rays_of
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import run_pipeline
 from simtest.runtime.arrays import Array
+from studies.resampling import interval_of_mean
 
 CHI2_95 = -2 * np.log(0.05)
 SEED, DRAWS = 2026, 2000
@@ -238,21 +239,12 @@ def _pairs(rows: list[Row]) -> Iterator[str]:
             continue
         values = np.array([[getattr(row, key) for row in pair] for pair in pairs])
         groups = np.array([10_000 * pair[1].family + pair[1].anatomy for pair in pairs])
-        low, high = _interval(values[:, 0] - values[:, 1], groups)
+        low, high = interval_of_mean(values[:, 0] - values[:, 1], groups, DRAWS, SEED)
         medians = " and ".join(f"{value:.2f}" for value in np.median(values, axis=0))
         yield (
             f"| {one} - {other} | {key[:4]} | {len(pairs)} | {len(set(groups.tolist()))} | "
             f"{np.mean(values[:, 0] - values[:, 1]):+.2f} | {low:+.2f} to {high:+.2f} | {medians} |"
         )
-
-
-def _interval(differences: Array, groups: Array) -> tuple[float, float]:
-    """Return the 95 % interval of the mean by bootstrap over anatomies, the independent units."""
-    rng = np.random.default_rng(SEED)
-    sums = np.array([[differences[groups == group].sum(), (groups == group).sum()] for group in np.unique(groups)])
-    drawn = sums[rng.integers(len(sums), size=(DRAWS, len(sums)))].sum(axis=1)
-    low, high = np.percentile(drawn[:, 0] / drawn[:, 1], [2.5, 97.5])
-    return float(low), float(high)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ from simtest.runtime.arrays import Array, Mask
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import Scene, load_scene
 from simtest.validation.depth_maps import depth_normals
+from studies.resampling import interval_of_mean
 
 EVERY = 6
 """The coarse maps hold every sixth pixel of a frame."""
@@ -188,9 +189,7 @@ def _angles(view: View, distance: Array) -> Array:
 
 def interval(values: Array) -> tuple[float, float]:
     """Return the 95 % interval of a mean by bootstrap over frames."""
-    picks = np.random.default_rng(1).integers(0, len(values), size=(RESAMPLES, len(values)))
-    low, high = np.quantile(values[picks].mean(axis=1), [0.025, 0.975])
-    return float(low), float(high)
+    return interval_of_mean(values, np.arange(len(values)), RESAMPLES, seed=1)
 
 
 def print_gains(rows: list[dict[str, object]]) -> None:
