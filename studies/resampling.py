@@ -10,7 +10,7 @@ def drawn_groups(count: int, draws: int, seed: int) -> IntArray:
     return np.random.default_rng(seed).integers(count, size=(draws, count))
 
 
-def interval_of_mean(values: Array, groups: Array, draws: int, seed: int) -> tuple[float, float]:
+def interval_of_mean(values: Array, groups: Array | IntArray, draws: int, seed: int) -> tuple[float, float]:
     """Return the 95 % interval of the mean of values by bootstrap over their groups.
 
     Parameters

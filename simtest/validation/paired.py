@@ -25,6 +25,8 @@ KEYS = (*FRAME, "target", "true_id")
 LEAST_FRAMES = 5
 """Distinct frames that each setting needs before the interval of a median is stated."""
 
+NO_VALUES: Array = np.empty(0)
+
 _ROUNDING = 1e-6
 _RESAMPLES = 1000
 _CHUNK = 2_000_000  # numbers in memory at once
@@ -124,7 +126,8 @@ def is_above_zero(differences: Array, settings: Array, frames: Array, certain: N
     settings, frames : ndarray
         Number of the setting and of the frame of each.
     certain : ndarray
-        Whether its setting has no spread; such highlights widen no interval.
+        Whether its setting has no spread; such highlights count in the mean, and widen its interval only where their mean
+        differs from that of the others.
     """
     if not len(differences):
         return False
@@ -132,11 +135,11 @@ def is_above_zero(differences: Array, settings: Array, frames: Array, certain: N
     if certain.all():
         return mean > 0
     drawn = ~certain
-    half = half_width(differences[drawn], settings[drawn], frames[drawn], len(differences))
+    half = half_width(differences[drawn], settings[drawn], frames[drawn], differences[certain])
     return half is not None and mean - half > 0
 
 
-def half_width(values: Array, settings: Array, frames: Array, total: int | None = None) -> float | None:
+def half_width(values: Array, settings: Array, frames: Array, others: Array = NO_VALUES) -> float | None:
     """Compute half the 95 % interval of the mean of values whose frames are the independent units.
 
     The number of values varies from frame to frame, and a frame with many of them draws the mean to its own. So the
@@ -148,8 +151,8 @@ def half_width(values: Array, settings: Array, frames: Array, total: int | None 
         Of each highlight.
     settings, frames : ndarray
         Number of the setting and of the frame of each.
-    total : int, optional
-        Values that the mean is over, where further ones have no spread; default these.
+    others : ndarray
+        Further values that the mean is over, without spread.
 
     Returns
     -------
@@ -166,7 +169,7 @@ def half_width(values: Array, settings: Array, frames: Array, total: int | None 
     seen = np.bincount(strata)[strata] > 1
     if not seen.any():
         return None
-    deviation = deviation_of_mean(totals, counts, strata, (total or len(values)) - len(values))
+    deviation = deviation_of_mean(totals, counts, strata, others)
     # Frames that are alone in their setting spread as the others do.
     deviation *= math.sqrt(len(totals) / np.count_nonzero(seen))
     return student_t.quantile((1 + CONFIDENCE) / 2, freedom_of(counts, strata)) * deviation
@@ -185,7 +188,7 @@ def freedom_of(counts: Array, strata: IntArray) -> int:
     return max(math.floor(free * float(weights.sum() ** 2 / (weights @ weights)) + _ROUNDING), 1)
 
 
-def deviation_of_mean(totals: Array, counts: Array, strata: IntArray, others: int = 0) -> float:
+def deviation_of_mean(totals: Array, counts: Array, strata: IntArray, others: Array = NO_VALUES) -> float:
     """Compute the standard deviation of the mean of all values by the jackknife over frames.
 
     It leaves out one frame of a stratum at a time, and the others of the stratum weigh more instead [Rao and Wu, J. Am.
@@ -197,14 +200,14 @@ def deviation_of_mean(totals: Array, counts: Array, strata: IntArray, others: in
         Sum and number of the values of each frame; 0 of a frame without any.
     strata : ndarray of int, shape (F,)
         Number of the stratum of each, from 0.
-    others : int
-        Further values that the mean is over, without spread.
+    others : ndarray
+        Further values that the mean is over, without spread. Where they differ from the mean of the frames', the number
+        of values in each frame moves the mean of all.
     """
-    size = np.bincount(strata)[strata]
-    # A value without spread moves the mean by its number alone.
-    number, mean = float(counts.sum()), float(totals.sum() / counts.sum())
-    off = _without_each(totals, strata) / _without_each(counts, strata) - mean
-    return math.sqrt(float(np.sum((1 - 1 / size) * off**2))) * number / (number + others)
+    size, fixed = np.bincount(strata)[strata], float(others.sum())
+    mean = float((totals.sum() + fixed) / (counts.sum() + len(others)))
+    off = (_without_each(totals, strata) + fixed) / (_without_each(counts, strata) + len(others)) - mean
+    return math.sqrt(float(np.sum((1 - 1 / size) * off**2)))
 
 
 def _without_each(values: Array, strata: IntArray) -> Array:
