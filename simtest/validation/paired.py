@@ -126,8 +126,8 @@ def is_above_zero(differences: Array, settings: Array, frames: Array, certain: N
     settings, frames : ndarray
         Number of the setting and of the frame of each.
     certain : ndarray
-        Whether its setting has no spread; such highlights count in the mean, and widen its interval only where their mean
-        differs from that of the others.
+        Whether its setting has no spread; such highlights count in the mean, and widen its interval only where their
+        mean differs from that of the others.
     """
     if not len(differences):
         return False
