@@ -4,7 +4,8 @@ python -m studies.learned_dense data/highlights scenes/learning/weights/learned_
 
 `--smooth` names a second network, trained on `highlights_smooth`. `--most` limits the frames of each anatomy: the
 anatomies are the independent units. Errors of each fourth pixel along each axis are against the base surface; those at
-highlights are taken where the detector by colour finds one. `--split` takes another split than test.
+highlights are taken where the detector by colour finds one. `--split` takes another split than test. `--networks`
+leaves the other methods out.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from simtest.dataset.reader import read_samples, sample_positions
 from simtest.dataset.sample import Sample
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
-from simtest.estimators.learned_dense import LEAST_HIGHLIGHTS, DenseMaps, LearnedDense
+from simtest.estimators.learned_dense import LEAST_HIGHLIGHTS, LearnedDense
 from simtest.estimators.shading_maps import shading_maps
 from simtest.estimators.spot_inputs import normal_of
 from simtest.geometry.vectors import angle_deg, tangent_basis, tangent_coordinates
@@ -70,8 +71,8 @@ def main() -> None:
             anatomy = (sample.meta["anatomy"]["family"], sample.meta["anatomy"]["number"])
             taken[anatomy] += 1
             if taken[anatomy] <= options.most:
-                _score_pixels(sample, anatomy, dense, pixels, pairs)
-                _score_spots(sample, anatomy, dense, spots, pairs)
+                _score_pixels(sample, anatomy, dense, pixels, pairs, others=not options.networks)
+                _score_spots(sample, anatomy, dense, spots, pairs, others=not options.networks)
             progress(number + 1, total + 1, f"{options.split} split: frames")
     print(f"{sum(min(n, options.most) for n in taken.values())} frames of {len(taken)} anatomies\n")
     for place, scores in (("each pixel", pixels), ("highlights", spots)):
@@ -91,12 +92,13 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--smooth", type=Path)
     parser.add_argument("--most", type=int, default=sys.maxsize)
     parser.add_argument("--split", default="test")
+    parser.add_argument("--networks", action="store_true")
     return parser.parse_args()
 
 
 def _score_pixels(
     sample: Sample, anatomy: tuple[int, int], dense: dict[str, LearnedDense], scores: dict[str, Scores],
-    pairs: dict[str, dict[tuple[int, int], list[Array]]],
+    pairs: dict[str, dict[tuple[int, int], list[Array]]], others: bool,
 ) -> None:  # fmt: skip
     """Score maps at each `STEP`-th pixel of a frame."""
     frame = sample_frame(sample)
@@ -109,20 +111,20 @@ def _score_pixels(
     rows, columns = points[:, 1].astype(int), points[:, 0].astype(int)
     errors = {}
     for name, estimator in dense.items():
-        maps = estimator.maps(frame.encoded, frame.calibration)
+        stated = estimator.stated(frame, points)
         scores[name].asked += 1
-        if isinstance(maps, DenseMaps):
-            made = maps.normal[rows, columns].astype(float)
+        if not isinstance(stated, Failure):
+            made, covariance, estimated, deviation = stated
             errors[name] = angle_deg(made, normal)
-            inside = _inside(made, normal, maps.covariance[rows, columns].astype(float))
+            inside = _inside(made, normal, covariance)
             _add(scores[name], anatomy, errors[name], inside)
-            off = maps.distance_mm[rows, columns] / distance
-            _add_distance(scores[name], anatomy, off, maps.deviation_mm[rows, columns] / distance)
-    made, shaded = shading_maps(frame.encoded, frame.calibration)
-    errors[SHADING] = angle_deg(made[rows, columns], normal)
-    scores[SHADING].asked += 1
-    _add(scores[SHADING], anatomy, errors[SHADING], None)
-    _add_distance(scores[SHADING], anatomy, shaded[rows, columns] / distance, None)
+            _add_distance(scores[name], anatomy, estimated / distance, deviation / distance)
+    if others:
+        made, shaded = shading_maps(frame.encoded, frame.calibration)
+        errors[SHADING] = angle_deg(made[rows, columns], normal)
+        scores[SHADING].asked += 1
+        _add(scores[SHADING], anatomy, errors[SHADING], None)
+        _add_distance(scores[SHADING], anatomy, shaded[rows, columns] / distance, None)
     for name, values in errors.items():
         if name != DENSE and DENSE in errors:
             pairs[f"each pixel: {DENSE} - {name}"][anatomy].append(errors[DENSE] - values)
@@ -130,17 +132,17 @@ def _score_pixels(
 
 def _score_spots(
     sample: Sample, anatomy: tuple[int, int], dense: dict[str, LearnedDense], scores: dict[str, Scores],
-    pairs: dict[str, dict[tuple[int, int], list[Array]]],
+    pairs: dict[str, dict[tuple[int, int], list[Array]]], others: bool,
 ) -> None:  # fmt: skip
     """Score estimators of the base's normal at the detected highlights of a frame, and pair them."""
     frame = sample_frame(sample)
-    estimators = {**load_estimators(["bisector", "learned_spot"]), **dense}
+    estimators = {**(load_estimators(["bisector", "learned_spot"]) if others else {}), **dense}
     found = run_pipeline(frame.encoded, frame.calibration, "colour", estimators, None, frame.smoothing_px)
     peaks = [each.patch.peak_px for each in found.specularities if not isinstance(each.patch, Failure)]
     if len(peaks) >= LEAST_HIGHLIGHTS:
         for name, estimator in dense.items():
-            told = estimator.contradiction(frame, np.array(peaks, dtype=float))
-            scores[name].contradictions += [] if isinstance(told, Failure) else [told]
+            told = estimator.contradictions(frame, np.array(peaks, dtype=float))
+            scores[name].contradictions += [] if isinstance(told, Failure) else [float(told.mean()) / 2]
     errors: dict[str, dict[int, float]] = defaultdict(dict)
     inside: dict[str, list[float]] = defaultdict(list)
     for number, each in enumerate(found.specularities):

@@ -23,16 +23,16 @@ from simtest.estimators.dense_inputs import (
     dense_inputs,
 )
 from simtest.estimators.protocol import Estimate
-from simtest.estimators.reflection_check import reflection_distance
+from simtest.estimators.reflection_check import reflection_distances
 from simtest.estimators.spot_inputs import LOG_RANGE
 from simtest.estimators.turned_normals import turned_normals
-from simtest.geometry import Array, Camera, Patch
+from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.runtime.arrays import Image
 from simtest.runtime.onnx_model import OnnxModel
 from simtest.runtime.resources import data_root, shown
-from simtest.runtime.training_range import TrainingRange
+from simtest.runtime.training_range import TrainingRange, inflation, read_usual
 
-FORMAT = "simtest dense_normals, version 1"
+FORMAT = "simtest dense_normals, version 2"
 
 SHIPPED = ("learning", "weights", "learned_dense.onnx")
 """Below the shipped scenes; its card lies beside it."""
@@ -48,6 +48,10 @@ LEAST_HIGHLIGHTS, REFLECTION_LIMIT = 4, 2.0
 
 `python -m studies.learned_dense DATA MODEL --split validation` prints how far the validation split's frames go.
 """
+
+HIGHLIGHT_LIMIT = 9.21
+"""Squared Mahalanobis distance from the law of reflection beyond which one highlight is refused: one in 100 goes so
+far where both states hold."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +83,10 @@ class LearnedDense:
     It sees the whole frame on a coarse grid, the sightlines and the lights. It states the base's normal and the
     distance everywhere (`maps`); as an estimator it answers for each detection. It refuses with ``no_estimate`` what
     lies outside the range that it was taught: another lens or other lights, a frame without colour, of an unusual
-    aspect or too small, and frames whose features lie far from those of the train split. As an estimator it refuses
-    frames too at whose highlights its normals contradict the law of reflection (`reflection_distance`).
+    aspect or too small, and frames whose features lie far from those of the train split. Short of that, what it states
+    grows less certain with the features' distance (`simtest.runtime.training_range.inflation`). At highlights it is
+    checked against the law of reflection (`simtest.estimators.reflection_check`): a frame, and a highlight alone, where
+    its normals contradict that law is refused.
 
     Parameters
     ----------
@@ -115,7 +121,9 @@ class LearnedDense:
     def _network(self) -> "_Network":
         return _Network(Path(self.model) if self.model else data_root("scenes").joinpath(*SHIPPED))
 
-    def maps(self, values: Image, calibration: Calibration) -> DenseMaps | Failure:
+    def maps(
+        self, values: Image, calibration: Calibration, highlights_px: Array | None = None, seen: Mask | None = None
+    ) -> DenseMaps | Failure:
         """Compute the normals and distances of a frame, or say why there are none.
 
         Parameters
@@ -124,28 +132,40 @@ class LearnedDense:
             The frame as encoded, in [0, 1].
         calibration : Calibration
             Camera, lights, response and falloff.
+        highlights_px : ndarray, shape (N, 2), optional
+            Peaks of detected highlights. Where they are four or more, the frame is checked against the law of
+            reflection. `simtest.reconstruction.learned_maps.learned_maps` detects them.
+        seen : ndarray of bool, shape (H, W), optional
+            The pixels in view; default the camera's view mask.
         """
-        frame = Frame(values, calibration, 0.0)
+        frame = Frame(values, calibration, 0.0, seen)
         outputs = self._outputs(frame)
         if isinstance(outputs, Failure):
             return outputs
         camera = frame.camera
+        if highlights_px is not None and len(highlights_px):
+            squared = _contradictions(self._stated(*outputs, camera, highlights_px), frame, highlights_px)
+            if refused := _contradicts(squared):
+                return refused
         shape = (camera.height, camera.width)
-        seen = np.ones(shape, dtype=bool) if frame.seen is None else frame.seen
-        stated = self._stated(outputs, camera, camera.pixel_centres()[seen])
+        shown_px = np.ones(shape, dtype=bool) if frame.seen is None else frame.seen
+        stated = self._stated(*outputs, camera, camera.pixel_centres()[shown_px])
         made = []
         for part in stated:
             whole = np.full((*shape, *part.shape[1:]), np.nan, dtype=np.float32)
-            whole[seen] = part
+            whole[shown_px] = part
             made.append(whole)
         return DenseMaps(*made)
 
-    def contradiction(self, frame: Frame, points_px: Array) -> float | Failure:
-        """Return how far the normals at highlights are from the law of reflection (`reflection_distance`)."""
+    def stated(self, frame: Frame, points_px: Array) -> tuple[Array, Array, Array, Array] | Failure:
+        """Return normals, covariances, distances, mm, and their deviations, mm, at pixel positions, shape (N, 2)."""
         outputs = self._outputs(frame)
-        if isinstance(outputs, Failure):
-            return outputs
-        return _contradiction(self._stated(outputs, frame.camera, points_px), frame, points_px)
+        return outputs if isinstance(outputs, Failure) else self._stated(*outputs, frame.camera, points_px)
+
+    def contradictions(self, frame: Frame, points_px: Array) -> Array | Failure:
+        """Return how far the normals at highlights are from the law of reflection (`reflection_distances`)."""
+        made = self.stated(frame, points_px)
+        return made if isinstance(made, Failure) else _contradictions(made, frame, points_px)
 
     def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
         """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
@@ -167,45 +187,61 @@ class LearnedDense:
         if isinstance(outputs, Failure):
             return [outputs] * len(peaks)
         points = np.asarray(peaks, dtype=float)
-        stated = self._stated(outputs, frame.camera, points)
-        normals, covariances, *_ = stated
-        off = _contradiction(stated, frame, points)
-        if len(points) >= LEAST_HIGHLIGHTS and off > REFLECTION_LIMIT:
-            told = (
-                f"contradicts the law of reflection at {len(points)} highlights: {off:.3g}, limit {REFLECTION_LIMIT:g}"
-            )
-            return [Failure(Reason.NO_ESTIMATE, told)] * len(points)
+        stated = self._stated(*outputs, frame.camera, points)
+        squared = _contradictions(stated, frame, points)
+        if refused := _contradicts(squared):
+            return [refused] * len(points)
         return [
-            Estimate(normal=normal, candidates=normal[None], look_px=point, covariance=covariance, target="base")
-            for normal, covariance, point in zip(normals, covariances, points, strict=True)
+            _refused_highlight(off)
+            or Estimate(normal=normal, candidates=normal[None], look_px=point, covariance=covariance, target="base")
+            for normal, covariance, point, off in zip(*stated[:2], points, squared.tolist(), strict=True)
         ]
 
-    def _outputs(self, frame: Frame) -> Array | Failure:
-        """Return the network's outputs, shape (7, 48, 64), or why the frame is refused."""
+    def _outputs(self, frame: Frame) -> tuple[Array, float] | Failure:
+        """Return the network's outputs, shape (7, 48, 64), and the covariances' factor, or why the frame is refused."""
         if not frame.calibration.priors.lights_mm:
             return Failure(Reason.NOT_KNOWN, "needs the lights' positions")
         return _unfit(frame) or self._network.run(frame)
 
-    def _stated(self, outputs: Array, camera: Camera, points_px: Array) -> tuple[Array, Array, Array, Array]:
+    def _stated(
+        self, outputs: Array, inflated: float, camera: Camera, points_px: Array
+    ) -> tuple[Array, Array, Array, Array]:
         """Return normals, covariances, distances, mm, and their deviations, mm, at pixel positions, shape (N, 2)."""
         layout, scales = Layout.of(camera.width, camera.height), self._network.scales
         made = interpolated(outputs, layout.to_cells(points_px, camera) / STRIDE - 0.5).T
         first, second = (np.exp(np.clip(made[:, column], *LOG_RANGE)) for column in (2, 4))
         root = np.zeros((len(made), 2, 2))
         root[:, 0, 0], root[:, 1, 0], root[:, 1, 1] = first, made[:, 3], second
-        root *= ROTATION_SCALE * np.sqrt(scales["base"].at(stated_deviation(made)))[:, None, None]
+        root *= ROTATION_SCALE * np.sqrt(inflated * scales["base"].at(stated_deviation(made)))[:, None, None]
         normals, covariances = turned_normals(camera.unproject(points_px), made[:, :2] * ROTATION_SCALE, root)
         distance = DISTANCE_MM * np.exp(DISTANCE_SCALE * made[:, 5])
         logarithm = np.clip(made[:, 6], *LOG_RANGE)
-        share = DISTANCE_SCALE * np.exp(logarithm) * np.sqrt(scales["distance"].at(logarithm))
+        share = DISTANCE_SCALE * np.exp(logarithm) * np.sqrt(inflated * scales["distance"].at(logarithm))
         return normals, covariances, distance, share * distance
 
 
-def _contradiction(stated: tuple[Array, Array, Array, Array], frame: Frame, points_px: Array) -> float:
+def _contradictions(stated: tuple[Array, Array, Array, Array], frame: Frame, points_px: Array) -> Array:
     """Return how far what is stated at highlights is from the law of reflection."""
     normals, covariances, distance, deviation = stated
     rays, lights = frame.camera.unproject(points_px), frame.calibration.priors.lights
-    return reflection_distance(normals, covariances, rays, distance, deviation / distance, lights)
+    return reflection_distances(normals, covariances, rays, distance, deviation / distance, lights)
+
+
+def _contradicts(squared: Array) -> Failure | None:
+    """Return why a frame is refused by its highlights' distances from the law of reflection, or None."""
+    off = float(np.mean(squared)) / 2
+    if len(squared) < LEAST_HIGHLIGHTS or off <= REFLECTION_LIMIT:
+        return None
+    told = f"contradicts the law of reflection at {len(squared)} highlights: {off:.3g}, limit {REFLECTION_LIMIT:g}"
+    return Failure(Reason.NO_ESTIMATE, told)
+
+
+def _refused_highlight(squared: float) -> Failure | None:
+    """Return why one highlight is refused by its distance from the law of reflection, or None."""
+    if squared <= HIGHLIGHT_LIMIT:
+        return None
+    told = f"contradicts the law of reflection: squared distance {squared:.3g}, limit {HIGHLIGHT_LIMIT:g}"
+    return Failure(Reason.NO_ESTIMATE, told)
 
 
 def stated_deviation(made: Array) -> Array:
@@ -250,16 +286,18 @@ class _Network:
             content = self._model.content
             self.scales = {name: CovarianceScale.read(content["scales"][name]) for name in ("base", "distance")}
             self._range = TrainingRange.read(content, CAMERA)
+            self._usual = read_usual(content)
 
-    def run(self, frame: Frame) -> Array | Failure:
-        """Return the outputs of a frame, shape (7, 48, 64), or why it is refused."""
+    def run(self, frame: Frame) -> tuple[Array, float] | Failure:
+        """Return the outputs of a frame, shape (7, 48, 64), and the covariances' factor, or why it is refused."""
         told = dict(zip(CAMERA, camera_values(frame).tolist(), strict=True))
         if refused := self._range.refusal(told):
             return refused
         shapes = {"outputs": (1, len(OUTPUTS), *CELLS), "features": (1, len(self._range.mean))}
         outputs, features = self._model.run({"planes": dense_inputs(frame)[None]}, shapes)
+        distances = self._range.distances(features)
         (refused,) = self._range.refusals(features)
-        return refused or np.asarray(outputs[0], dtype=float)
+        return refused or (np.asarray(outputs[0], dtype=float), float(inflation(distances, self._usual)[0]))
 
 
 learned_dense = LearnedDense()

@@ -27,7 +27,7 @@ from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
 from simtest.runtime.onnx_model import OnnxModel
 from simtest.runtime.resources import data_root, shown
-from simtest.runtime.training_range import TrainingRange, inflation
+from simtest.runtime.training_range import TrainingRange, inflation, read_usual
 
 FORMAT = "simtest spot_normals, version 3"
 
@@ -158,9 +158,7 @@ class _Network:
             self.scales = {surface: CovarianceScale.read(content["scales"][surface]) for surface in SURFACES}
             self.ratio_scales = {name: CovarianceScale.read(content["ratio_scales"][name]) for name in SURFACES}
             self._range = TrainingRange.read(content, EXTRAS)
-            self._usual = float(content["feature_usual"])
-            if not 0 < self._usual < np.inf:
-                raise ValueError(f"feature_usual = {self._usual}: must be above 0")
+            self._usual = read_usual(content)
         self._shapes = {"outputs": (None, len(SURFACES), len(OUTPUTS)), "features": (None, len(self._range.mean))}
 
     def run(self, crops: Image, extras: Image) -> tuple[Array, Array, list[Failure | None]]:

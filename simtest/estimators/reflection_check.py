@@ -12,14 +12,14 @@ On the validation split of `highlights` the median angle between both is 12.4 de
 """
 
 
-def reflection_distance(
+def reflection_distances(
     normals: Array, covariances: Array, rays: Array, distance_mm: Array, share: Array, lights_mm: Array
-) -> float:
-    """Return how far normals at highlights lie from the bisectors of light and camera.
+) -> Array:
+    """Return how far normals at highlights lie from the bisectors of light and camera, shape (N,).
 
     A highlight's fine normal bisects the directions to its light and to the camera; the base's lies within the relief's
-    slopes of it. The result is half of the mean squared Mahalanobis distance between the base's normals and the
-    bisectors, of the nearest light each: 1 where they differ as much as they may.
+    slopes of it. The result is the squared Mahalanobis distance between the base's normal and the bisector, of the
+    nearest light each: 2 on average where they differ as much as they may.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def reflection_distance(
         whole = covariances + RELIEF_RAD**2 * np.eye(2) + of_distance[:, :, None] * of_distance[:, None]
         squared = np.einsum("ni,ni->n", off, np.linalg.solve(whole, off[..., None])[..., 0])
         nearest = np.minimum(nearest, squared)
-    return float(nearest.mean() / 2)
+    return nearest
 
 
 def _bisectors(rays: Array, distance_mm: Array, light: Array) -> Array:

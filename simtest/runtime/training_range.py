@@ -86,11 +86,25 @@ class TrainingRange:
         return Failure(Reason.NO_ESTIMATE, told)
 
 
+def read_usual(content: JsonObject) -> float:
+    """Return the usual squared distance of a network's metadata (`inflation`).
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If it is missing or not a number above 0.
+    """
+    usual = float(content["feature_usual"])
+    if not 0 < usual < np.inf:
+        raise ValueError(f"feature_usual = {usual}: must be above 0")
+    return usual
+
+
 def inflation(distances: Array, usual: float) -> Array:
     """Return factors of covariances for features at squared distances from those of the train split.
 
     They are 1 up to the usual distance and proportional to the squared distance beyond: where the features say that a
-    highlight differs from those taught, the network is less sure than it states.
+    highlight or frame differs from those taught, the network is less sure than it states.
     """
     return np.maximum(1.0, distances / usual)
 

@@ -14,20 +14,30 @@ onnxruntime = pytest.importorskip("onnxruntime")
 from simtest.calibration import Calibration, Frame, Priors  # noqa: E402
 from simtest.dataset.learn import dense_network  # noqa: E402
 from simtest.dataset.learn.dense_export import dense_scales, evaluated  # noqa: E402
-from simtest.dataset.learn.dense_task import DenseNormals, disturbed, known_cells, without_factor  # noqa: E402
+from simtest.dataset.learn.dense_task import DenseNormals, cells_of, disturbed, known_cells, without_factor  # noqa: E402
 from simtest.dataset.learn.engine import train  # noqa: E402
 from simtest.dataset.learn.likelihood import squared_distance  # noqa: E402
 from simtest.dataset.learn.training import Training, load_training  # noqa: E402
 from simtest.errors import Failure, InputError  # noqa: E402
 from simtest.estimators import Estimate  # noqa: E402
-from simtest.estimators.dense_inputs import CELLS, DISTANCE_MM, camera_values, dense_inputs, output_centres  # noqa: E402
+from simtest.estimators import learned_dense as learned_dense_module  # noqa: E402
+from simtest.estimators.dense_inputs import (  # noqa: E402
+    CAMERA,
+    CELLS,
+    DISTANCE_MM,
+    camera_values,
+    dense_inputs,
+    output_centres,
+)
 from simtest.estimators.learned_dense import LearnedDense, interpolated, stated_deviation  # noqa: E402
 from simtest.estimators.spot_inputs import normal_of, rotation_of  # noqa: E402
 from simtest.estimators.turned_normals import turned_normals  # noqa: E402
 from simtest.geometry import BrownConrady, Camera  # noqa: E402
 from simtest.geometry.vectors import angle_deg, tangent_coordinates  # noqa: E402
+from simtest.reconstruction.learned_maps import learned_maps  # noqa: E402
 from simtest.reconstruction.pipeline import run_pipeline  # noqa: E402
 from simtest.runtime.onnx_model import METADATA  # noqa: E402
+from simtest.runtime.training_range import TrainingRange, inflation  # noqa: E402
 
 pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
@@ -124,19 +134,24 @@ def test_eight_bits_change_the_outputs_little(made, tmp_path):
 
 def test_scales_put_95_percent_of_the_validation_split_inside(made):
     trained, _, judged, path = made
-    outputs, _ = evaluated(trained.network, judged["planes"])
-    base, distance = dense_scales(outputs, judged)
+    outputs, features = evaluated(trained.network, judged["planes"])
     content = json.loads(onnxruntime.InferenceSession(path.read_bytes()).get_modelmeta().custom_metadata_map[METADATA])
+    distances = TrainingRange.read(content, CAMERA).distances(features.numpy())
+    # Half of the validation split's frames are less sure than the network states.
+    inflated = inflation(distances, content["feature_usual"])
+    assert (inflated > 1).sum() == len(inflated) // 2
+    base, distance = dense_scales(outputs, judged, inflated)
     assert content["scales"]["base"]["factor"] == pytest.approx(base.factor, rel=1e-5)
     assert content["about"] == {"dataset": "planes"}
     values, rotation, log_distance = known_cells(outputs, judged)
     stated = values.double().numpy()
     # 16 frames: the share that holds a seventeenth frame's at 95 % is larger.
-    inside = squared_distance(values, rotation).numpy() / base.at(stated_deviation(stated)) < 5.991
+    factors = np.repeat(inflated, cells_of(judged).numpy())
+    inside = squared_distance(values, rotation).numpy() / base.at(stated_deviation(stated)) / factors < 5.991
     assert 0.95 < inside.mean() <= 1
     logarithm = np.clip(stated[:, 6], -5, 2)
     off = (log_distance.numpy() - stated[:, 5]) / np.exp(logarithm)
-    assert 0.95 < (off**2 / distance.at(logarithm) < 3.8415).mean() <= 1
+    assert 0.95 < (off**2 / distance.at(logarithm) / factors < 3.8415).mean() <= 1
     # Without the factors it does not hold: the network was too sure.
     assert min(base.factor + distance.factor) != 1
 
@@ -227,6 +242,66 @@ def test_disturbed_frames_keep_truth_and_empty_cells(made):
     assert torch.equal(again["planes"], changed["planes"])
 
 
+def with_metadata(source, target, **values):
+    model = onnx.load(source)
+    changed(**values)(model)
+    onnx.save(model, target)
+    return LearnedDense(target)
+
+
+def test_far_features_make_maps_less_certain(made, tmp_path):
+    picture = plane(200)[0]
+    plain = LearnedDense(made[3])
+    network = plain._network
+    features = network._model.run(
+        {"planes": dense_inputs(Frame(picture, calibration(), 1.0))[None]},
+        {"outputs": (1, 7, *CELLS), "features": (1, 12)},
+    )[1]
+    (distance,) = network._range.distances(features)
+    near = with_metadata(made[3], tmp_path / "near.onnx", feature_usual=2 * distance).maps(picture, calibration())
+    far = with_metadata(made[3], tmp_path / "far.onnx", feature_usual=distance / 9).maps(picture, calibration())
+    assert np.allclose(far.covariance, 9 * near.covariance, rtol=1e-3)
+    assert np.allclose(far.deviation_mm, 3 * near.deviation_mm, rtol=1e-3)
+    assert np.array_equal(far.normal, near.normal)
+    assert np.array_equal(far.distance_mm, near.distance_mm)
+
+
+def test_maps_are_of_the_view_alone(made):
+    picture = plane(200)[0]
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    inside = (x - WIDTH / 2) ** 2 + (y - HEIGHT / 2) ** 2 < (0.48 * HEIGHT) ** 2
+    bordered = np.where(inside[..., None], picture, 0).astype(np.float32)
+    limitless = LearnedDense(made[3])
+    object.__setattr__(limitless._network._range, "limit", np.inf)
+    found = learned_maps(bordered, calibration(), limitless)
+    known = np.isfinite(found.distance_mm)
+    assert np.array_equal(known, np.isfinite(found.normal).all(axis=-1))
+    assert not known[~inside].any()
+    assert known.sum() > 0.85 * inside.sum()
+    # A whole picture keeps all its pixels.
+    assert np.isfinite(learned_maps(picture, calibration(), limitless).distance_mm).all()
+
+
+def test_maps_and_highlights_that_contradict_the_law_of_reflection_are_refused(made, monkeypatch):
+    picture = plane(300)[0]
+    learned = LearnedDense(made[3])
+    points = np.random.default_rng(3).uniform(20, 120, (6, 2))
+    assert not isinstance(learned.maps(picture, calibration(), points), Failure)
+    squared = learned.contradictions(Frame(picture, calibration(), 1.0), points)
+    assert squared.shape == (6,)
+    monkeypatch.setattr(learned_dense_module, "REFLECTION_LIMIT", 0.99 * squared.mean() / 2)
+    assert "contradicts the law of reflection at 6" in learned.maps(picture, calibration(), points).detail
+    assert not isinstance(learned.maps(picture, calibration(), points[:3]), Failure)
+    monkeypatch.setattr(learned_dense_module, "REFLECTION_LIMIT", 2.0)
+    monkeypatch.setattr(learned_dense_module, "HIGHLIGHT_LIMIT", float(np.sort(squared)[2:4].mean()))
+    answers = learned._at(Frame(picture, calibration(), 1.0), list(points))
+    refused = np.array([isinstance(answer, Failure) for answer in answers])
+    assert np.array_equal(refused, squared > np.median(squared))
+    assert all(
+        "contradicts the law of reflection: squared" in each.detail for each in answers if each.__class__ is Failure
+    )
+
+
 def refusal(path, picture=None, **changes):
     picture = plane(1)[0] if picture is None else picture
     made = LearnedDense(path).maps(picture, calibration(**changes))
@@ -285,10 +360,20 @@ def other_input(model):
             "above 0",
         ),
         (changed(low={}), "KeyError"),
+        (changed(feature_usual=0), "feature_usual = 0.0: must be above 0"),
         (changed(feature_mean=[0.0]), "does not fit"),
         (other_input, r"cannot be run \(.*planes"),
     ],
-    ids=["no metadata", "another task", "a scale missing", "a scale below 0", "no ranges", "other features", "inputs"],
+    ids=[
+        "no metadata",
+        "another task",
+        "a scale missing",
+        "a scale below 0",
+        "no ranges",
+        "usual 0",
+        "other features",
+        "inputs",
+    ],
 )
 def test_another_model_is_refused_in_one_line(made, tmp_path, change, said):
     model = onnx.load(made[3])
@@ -328,4 +413,4 @@ def test_whole_frames_reach_the_deepest_cells():
         outputs, features = network(planes)
     assert outputs.shape == (2, 7, *CELLS)
     assert not torch.equal(outputs[0, :, -1, -1], outputs[1, :, -1, -1])
-    assert features.shape == (2, 8)
+    assert features.shape == (2, 12)

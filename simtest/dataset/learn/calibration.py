@@ -15,6 +15,9 @@ COVERAGE = 0.95
 REFUSED = 0.005
 """Share of the validation split's examples whose features the network would refuse."""
 
+USUAL = 0.5
+"""Share of the validation split's examples whose features lie within the usual distance (`inflation`)."""
+
 SHRUNK = 0.1
 """Weight of the mean variance in the features' covariance, which has more dimensions than the examples fill."""
 

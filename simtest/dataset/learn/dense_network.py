@@ -13,7 +13,11 @@ CHANNELS = (16, 24, 24, 32)
 
 
 class DenseNetwork(nn.Module):
-    """A U-Net of four levels; what the deepest one sees of the whole frame goes into all its cells."""
+    """A U-Net of four levels; what the deepest one sees of the whole frame goes into all its cells.
+
+    Its features are the means, over the frame, of the first level and of the deepest: the one sees noise and texture,
+    the other shape.
+    """
 
     def __init__(self, mean: Tensor, spread: Tensor, width: float = 1.0) -> None:
         super().__init__()
@@ -27,17 +31,17 @@ class DenseNetwork(nn.Module):
         self.heads = nn.Conv2d(channels[0], len(OUTPUTS), 1)
 
     def forward(self, planes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return outputs, (N, 7, 48, 64), and features of the frame, (N, 32 width), for planes, (N, 10, 96, 128)."""
+        """Return outputs, (N, 7, 48, 64), and features of the frame, (N, 48 width), for planes, (N, 10, 96, 128)."""
         made, skipped = (planes - self.mean) / self.spread, []
         for level in self.down:
             made = level(made)
             skipped.append(made)
-        features = made.mean(dim=(2, 3))
-        made = functional.relu(made + self.whole(features)[:, :, None, None])
+        first, deepest = (each.mean(dim=(2, 3)) for each in (skipped[0], made))
+        made = functional.relu(made + self.whole(deepest)[:, :, None, None])
         for level, beside in zip(reversed(self.up), reversed(skipped[:-1]), strict=True):
             made = functional.interpolate(made, scale_factor=2.0, mode="bilinear", align_corners=False)
             made = level(torch.cat([made, beside], dim=1))
-        return self.heads(made), features
+        return self.heads(made), torch.cat([first, deepest], dim=1)
 
 
 def _convolution(before: int, after: int, stride: int = 1) -> nn.Sequential:

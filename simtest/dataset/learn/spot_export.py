@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from simtest.dataset.learn.calibration import fitted_range, fitted_scale
+from simtest.dataset.learn.calibration import USUAL, fitted_range, fitted_scale
 from simtest.dataset.learn.onnx_export import MODEL, export
 from simtest.dataset.learn.spot_task import squared_distance
 from simtest.dataset.learn.tasks import Batch
@@ -16,9 +16,6 @@ from simtest.estimators.spot_inputs import EXTRAS, LOG_RANGE, RATIO, RATIO_DEVIA
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
 from simtest.runtime.training_range import inflation
-
-USUAL = 0.5
-"""Share of the validation split's examples whose features lie within the usual distance (`inflation`)."""
 
 
 def export_spots(network: nn.Module, taught: Batch, judged: Batch, out: Path, about: dict[str, str]) -> Path:
