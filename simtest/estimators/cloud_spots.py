@@ -71,7 +71,7 @@ def find_spots(frame: Frame) -> Spots:
     weakest channel: what a wet surface mirrors is white, and tissue is not.
     """
     light, noise = _light(frame)
-    around, brightest_near = _background(light)
+    around, brightest_near = _background_of(frame, light)
     above = light - around
     if frame.light is not None:
         # Where a detector split the light there is none around: a spot is bright beside what it took off.
@@ -105,7 +105,7 @@ def specular_light(frame: Frame) -> Image:
 def _above(frame: Frame) -> tuple[Image, Mask]:
     """Return the light less that of the tissue around, and where this is no diffuse light, shape (H, W)."""
     light, noise = _light(frame)
-    around, _ = _background(light)
+    around, _ = _background_of(frame, light)
     above = light - around
     tissue = around if frame.light is None else np.maximum(around, _background(_tissue(frame))[0])
     return above, np.asarray(above > np.maximum(PART_CONTRAST * tissue, NOISE_FACTOR * noise))
@@ -128,6 +128,15 @@ def _tissue(frame: Frame) -> Image:
     gain, values = frame.corrected.gain, frame.channels
     values = values if values.ndim == 2 else values.min(axis=2)
     return smooth(values if gain is None else values * gain, SMOOTHING_PX, frame.seen)
+
+
+def _background_of(frame: Frame, light: Image) -> tuple[Image, Image]:
+    """Return the `_background` of a frame's light.
+
+    A detector's split may leave less than no light in the dark beside an organ. A gap in that is no light either.
+    """
+    around, near = _background(light)
+    return (around, near) if frame.light is None else (np.maximum(around, np.float32(0)), near)
 
 
 def _background(light: Image) -> tuple[Image, Image]:

@@ -13,7 +13,7 @@ from simtest.errors import Failure, Reason
 from simtest.estimators.cloud import CloudCentre, cloud, small_sample
 from simtest.estimators.cloud_mixture import fit_mixture, sampling_covariance, window_of
 from simtest.estimators.cloud_shape import slope_of
-from simtest.estimators.cloud_spots import find_spots
+from simtest.estimators.cloud_spots import find_spots, specular_light
 from simtest.estimators.dispatch import run_in_frame
 from simtest.estimators.protocol import CloudEstimator
 from simtest.geometry import Camera, chi_squared
@@ -102,6 +102,25 @@ def test_what_a_split_of_the_light_leaves_of_the_tissue_is_no_spot(coloured):
     gaps = np.linalg.norm(found[0.5].points_px[:, None] - points, axis=2)
     assert len(gaps) == 12
     assert gaps.min(axis=1).max() < 0.5
+
+
+def test_the_dark_beside_an_organ_has_no_spots():
+    """A split leaves less than no light around a limb: gaps in it, at no light or a little less, are no spots."""
+    rng = np.random.default_rng(4)
+    points = spread_points(rng, 8, extent=10.0)
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
+    organ = np.hypot(x - 160, y - 120) < 60
+    phase = np.arange(24) * np.pi / 12
+    gaps = np.stack([160 + 75 * np.cos(phase), 120 + 75 * np.sin(phase)], axis=1)
+    below = np.where(organ, 0.0, 0.5) * (1 - 0.95 * np.minimum(picture_of(gaps, noise=0.0), 1.0))
+    split = picture_of(points) - below.astype(np.float32)
+    picture = picture_of(points, noise=0.001, seed=1) + 0.3 * organ
+    calibration = Calibration(CAMERA, response=Response(), priors=LIGHT_AT_CAMERA)
+    frame = Frame(np.repeat(picture[..., None], 3, axis=2).astype(np.float32), calibration, 1.0, light=split)
+    found = find_spots(frame)
+    assert len(found.peaks) == 8
+    assert np.linalg.norm(found.points_px[:, None] - points, axis=2).min(axis=1).max() < 0.5
+    assert not specular_light(frame)[~organ].any()
 
 
 def test_faint_spots_do_not_count():
