@@ -183,6 +183,23 @@ def test_the_shipped_network_finds_highlights_by_its_name():
     assert made.detection.refusal is not None or made.specularities
 
 
+def test_the_shipped_network_refuses_noise_and_marks_nothing_on_a_broad_dull_lobe():
+    rng = np.random.default_rng(0)
+    detector = load_detector("learned_detector")
+    for noise in (rng.integers(0, 255, (360, 480, 3)), np.repeat(rng.integers(0, 255, (360, 480, 1)), 3, axis=2)):
+        found = detector.detect(frame_of(noise.astype(np.uint8)), None)
+        assert not found.regions
+        assert "unlike the network's training" in found.refusal.detail
+    y, x = np.mgrid[:360, :480] + 0.5
+    tissue = (0.16 + 0.04 * np.sin(x / 60) * np.cos(y / 50))[..., None] * [1.0, 0.45, 0.33]
+    for height, width in ((0.15, 120), (0.4, 120), (0.3, 60)):
+        lobe = height * np.exp(-((x - 240) ** 2 + (y - 180) ** 2) / width**2)
+        linear = tissue + lobe[..., None] + 0.002 * rng.standard_normal(tissue.shape)
+        dull = detector.detect(frame_of(np.rint(255 * srgb_encode(np.clip(linear, 0, 1))).astype(np.uint8)), None)
+        assert not dull.highlights
+        assert not dull.others
+
+
 # Labels, moves and instances
 
 

@@ -24,8 +24,11 @@ from simtest.runtime.arrays import AnyArray, Array, Image
 NEAR_PX = 1.5
 """A top within this distance of a highlight's pixels lies on it."""
 
-MOST_FRAMES = 120
-"""Frames of the train split, spread over it, from which the range is taken."""
+MOST_FRAMES = 60
+"""Frames of the train split, spread over it, from which the range of the features is taken."""
+
+PASSES, COARSE = 5, 4
+"""Moved pictures of each frame from which the range of the median light is taken; of each side's pixels every fourth."""
 
 RADII_PX = (1.0, 2.0, 4.0, 8.0)
 """Least radius of each class of highlights."""
@@ -46,11 +49,11 @@ def export_detector(network: nn.Module, taught: Batch, judged: Batch, out: Path,
     """Write model.onnx into a folder and return its path; `about` goes into the file's metadata."""
     network = network.cpu().eval()
     step = -(-len(taught["state"]) // MOST_FRAMES)
-    statistics, own = _seen(network, {name: values[::step] for name, values in taught.items()})
-    _, others = _seen(network, judged)
+    own = _seen(network, {name: values[::step] for name, values in taught.items()})
+    others = _seen(network, judged)
     longer_side = max(taught["state"].shape[1:])
     # Frames of the dataset have one size; crops were resized in training.
-    ends = np.array([[longer_side * zoom, median] for zoom in ZOOM for median in statistics[[0, -1], 1]])
+    ends = np.array([[longer_side * zoom, median] for zoom in ZOOM for median in light_range(taught)])
     content = {
         "format": FORMAT,
         "least_top": least_top(lambda inputs: _run(network, inputs)[0], judged),
@@ -67,21 +70,32 @@ def export_detector(network: nn.Module, taught: Batch, judged: Batch, out: Path,
     )
 
 
-def _seen(network: nn.Module, batch: Batch) -> tuple[Array, Array]:
-    """Return the statistics, by rising median light, and the features of frames as they are and as moved ones.
+def light_range(taught: Batch) -> tuple[float, float]:
+    """Return the ends of the logarithm of the median light in a few passes of the moved frames of the train split."""
+    generator = Generator().manual_seed(SEED)
+    reduced = (slice(None, None, COARSE), slice(None, None, COARSE))
+    medians = []
+    for picture, state in zip(taught["picture"].cpu().numpy(), taught["state"].cpu().numpy(), strict=True):
+        random = np.random.default_rng(int(torch.randint(2**31, (1,), generator=generator)))
+        for _ in range(PASSES):
+            linear = srgb_decode(other_camera(picture[reduced], random))
+            medians.append(frame_statistics(linear, state[reduced] != OUTSIDE, 1)[1])
+    return min(medians), max(medians)
+
+
+def _seen(network: nn.Module, batch: Batch) -> Array:
+    """Return the features of frames as they are and as moved ones.
 
     Moved frames are resized as crops are in training: another camera shows the same tissue finer or coarser.
     """
-    statistics, features = [], []
+    features = []
     generator = Generator().manual_seed(SEED)
     for picture, state in zip(batch["picture"].cpu().numpy(), batch["state"].cpu().numpy(), strict=True):
         random = np.random.default_rng(int(torch.randint(2**31, (1,), generator=generator)))
         plain = picture.astype(np.float32) / np.float32(FULL)
         for encoded, own in ((plain, state), _resized(other_camera(picture, random), state, random)):
-            statistics.append(frame_statistics(srgb_decode(encoded), own != OUTSIDE, max(state.shape)))
             features.append(_run(network, inputs_of(encoded, own))[1])
-    order = np.array(statistics)
-    return order[np.argsort(order[:, 1])], np.array(features)
+    return np.array(features)
 
 
 def _resized(encoded: Image, state: AnyArray, random: np.random.Generator) -> tuple[Image, AnyArray]:
