@@ -10,11 +10,14 @@ from simtest.geometry import Image, Mask
 DARKEST = 0.02
 """Share of the frame's median light that is added before the logarithm; what lies outside the view is this dark."""
 
+LIT = 0.003
+"""Share of full scale above which a pixel is lit, 10 of 255 steps of sRGB: a black background sets no scale."""
+
 SPECULAR_SCALE = 0.1
 """Specular light, share of the tissue's, below which its input is linear, and above logarithmic."""
 
 INPUTS = ("logarithm of red", "logarithm of green", "logarithm of blue", "specular light", "clipped")
-"""The channels. The first three are over the median of all light."""
+"""The channels. The first three are over the median light of the lit pixels."""
 
 
 def highlight_inputs(linear: Image, clipped: Mask, light: SplitLight, seen: Mask | None = None) -> Image:
@@ -44,9 +47,13 @@ def highlight_inputs(linear: Image, clipped: Mask, light: SplitLight, seen: Mask
 
 
 def median_light(linear: Image, inside: Mask) -> float:
-    """Return the median of the mean of the channels inside the view, from every other row and column."""
+    """Return the median of the mean of the channels of lit pixels inside the view, from every other row and column.
+
+    It is 1e-6 where none is lit.
+    """
     light = mean_channel(linear[::2, ::2])[inside[::2, ::2]]
-    return max(float(np.median(light)), 1e-6) if light.size else 1.0
+    light = light[light > LIT]
+    return float(np.median(light)) if light.size else 1e-6
 
 
 def frame_statistics(linear: Image, seen: Mask | None, longer_side_px: int) -> tuple[float, float]:

@@ -96,6 +96,10 @@ class LearnedDetector:
         """
         return self._network.detect(linear, clipped, seen)
 
+    def maps(self, inputs: Image) -> tuple[Image, Image]:
+        """Return both maps of the network, in [0, 1], shape (H, W), for the inputs of a frame (`highlight_inputs`)."""
+        return self._network.maps(inputs)[:2]
+
 
 class _Network:
     """The network with its threshold and the range that it was taught."""
@@ -115,7 +119,7 @@ class _Network:
         """Find the highlights of a frame (see `LearnedDetector.find`)."""
         light = split_light(linear, clipped, seen)
         inputs = highlight_inputs(linear, clipped, light, seen)
-        pixels, bumps, features, seen_size = self._maps(inputs)
+        pixels, bumps, features, seen_size = self.maps(inputs)
         statistics = dict(zip(RANGED, frame_statistics(linear, seen, seen_size), strict=True))
         refusal = self._range.refusal(statistics) or self._range.refusals(features)[0]
         if refusal is not None:
@@ -124,7 +128,7 @@ class _Network:
         basins, tops = basins_of(pixels, bumps, light, full[0], seen)
         return highlights_of(basins, tops >= self._least_top, light, linear, (clipped, *full), seen)
 
-    def _maps(self, inputs: Image) -> tuple[Image, Image, Image, int]:
+    def maps(self, inputs: Image) -> tuple[Image, Image, Image, int]:
         """Return both maps of probabilities at full size, the features, and the longer side as seen, px."""
         height, width = inputs.shape[1:]
         # A large frame is seen reduced by the least whole factor that fits the training.

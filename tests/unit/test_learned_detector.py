@@ -18,6 +18,7 @@ from simtest.dataset.learn.detector_task import HighlightInstances  # noqa: E402
 from simtest.dataset.learn.engine import train  # noqa: E402
 from simtest.dataset.learn.training import load_training  # noqa: E402
 from simtest.detection import load_detector  # noqa: E402
+from simtest.detection.highlight_inputs import frame_statistics, highlight_inputs  # noqa: E402
 from simtest.detection.learned_detector import LearnedDetector, basins_of  # noqa: E402
 from simtest.detection.light_split import SplitLight  # noqa: E402
 from simtest.errors import InputError, Reason  # noqa: E402
@@ -182,7 +183,38 @@ def test_the_shipped_network_finds_highlights_by_its_name():
     assert made.detection.refusal is not None or made.specularities
 
 
+def test_the_shipped_network_refuses_noise_and_marks_nothing_on_a_broad_dull_lobe():
+    rng = np.random.default_rng(0)
+    detector = load_detector("learned_detector")
+    for noise in (rng.integers(0, 255, (360, 480, 3)), np.repeat(rng.integers(0, 255, (360, 480, 1)), 3, axis=2)):
+        found = detector.detect(frame_of(noise.astype(np.uint8)), None)
+        assert not found.regions
+        assert "unlike the network's training" in found.refusal.detail
+    y, x = np.mgrid[:360, :480] + 0.5
+    tissue = (0.16 + 0.04 * np.sin(x / 60) * np.cos(y / 50))[..., None] * [1.0, 0.45, 0.33]
+    for height, width in ((0.15, 120), (0.4, 120), (0.3, 60)):
+        lobe = height * np.exp(-((x - 240) ** 2 + (y - 180) ** 2) / width**2)
+        linear = tissue + lobe[..., None] + 0.002 * rng.standard_normal(tissue.shape)
+        dull = detector.detect(frame_of(np.rint(255 * srgb_encode(np.clip(linear, 0, 1))).astype(np.uint8)), None)
+        assert not dull.highlights
+        assert not dull.others
+
+
 # Labels, moves and instances
+
+
+def test_a_black_background_sets_no_scale():
+    linear = np.random.default_rng(0).uniform(0.1, 0.3, (48, 64, 3)).astype(np.float32)
+    clipped, light = np.zeros((48, 64), dtype=bool), SplitLight(linear[..., 0] * 0.1, linear[..., 1], 0.001)
+    wide = np.zeros((48, 256, 3), dtype=np.float32)
+    wide[:, :64] = linear
+    padded = SplitLight(*(np.pad(part, ((0, 0), (0, 192))) for part in (light.specular, light.tissue)), 0.001)
+    plain = highlight_inputs(linear, clipped, light)
+    found = highlight_inputs(wide, np.pad(clipped, ((0, 0), (0, 192))), padded)
+    np.testing.assert_allclose(found[..., :64], plain, rtol=1e-6)
+    assert frame_statistics(wide, None, 256)[1] == pytest.approx(frame_statistics(linear, None, 64)[1])
+    # A frame without light has none.
+    assert frame_statistics(0 * wide, None, 256)[1] == pytest.approx(np.log(1e-6))
 
 
 def test_which_highlights_must_be_found():
@@ -246,6 +278,17 @@ def test_pixels_that_are_not_judged_do_not_change_the_loss():
 
 def test_the_threshold_with_the_best_f1_is_taken():
     heights, right = np.array([0.9, 0.8, 0.6, 0.4, 0.2]), np.array([True, True, False, True, False])
-    assert best_threshold(heights, right, 3) == pytest.approx(0.3)
-    assert best_threshold(heights, np.array([True, True, False, False, False]), 3) == pytest.approx(0.7)
-    assert best_threshold(heights, np.zeros(5, dtype=bool), 3) == 0.5
+    one, needed = np.zeros(5, dtype=int), np.array([3])
+    assert best_threshold(heights, right, one, needed) == pytest.approx(0.3)
+    assert best_threshold(heights, np.array([True, True, False, False, False]), one, needed) == pytest.approx(0.7)
+    assert best_threshold(heights, np.zeros(5, dtype=bool), one, needed) == 0.5
+
+
+def test_each_class_counts_alike_for_the_threshold_unless_it_has_few_highlights():
+    # 100 small ones, of which those below 0.5 are half false; 30 large ones, all of them between 0.2 and 0.4.
+    small, large = np.linspace(0.99, 0.1, 120), np.linspace(0.4, 0.2, 30)
+    heights, classes = np.append(small, large), np.repeat([0, 1], [120, 30])
+    right = np.append((small > 0.5) | (np.arange(120) % 2 == 0), np.ones(30, dtype=bool))
+    assert best_threshold(heights, right, classes, np.array([93, 30])) < 0.21
+    strict = np.append(small > 0.5, np.ones(30, dtype=bool))
+    assert best_threshold(heights, strict, classes, np.array([66, 10])) == pytest.approx(0.5, abs=0.01)

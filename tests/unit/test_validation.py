@@ -8,12 +8,12 @@ import polars as pl
 import pytest
 from scipy import stats
 
-from simtest.detection import Region
+from simtest.detection import Detection, Region
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate, load_estimators
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.pipeline import Specularity, reconstruct
+from simtest.reconstruction.pipeline import Specularity, reconstruct, run_pipeline
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, from_integer, generator, integer, key, sequence
 from simtest.simulation.rendered_view import render_view
@@ -430,3 +430,23 @@ def test_what_drowns_in_noise_is_missed():
     statuses = [row.status for row in made.rows if row.true_id is not None]
     assert statuses == ["missed"]
     assert all(isinstance(s.patch, Patch | Failure) for s in made.specularities)
+
+
+@pytest.mark.render
+def test_highlights_of_a_frame_that_the_detector_refuses_are_missed(monkeypatch):
+    class Refusing:
+        def detect(self, frame, camera, priors):
+            return Detection((), frame, refusal=Failure(Reason.NO_ESTIMATE, "unlike the training"))
+
+    def refused(frame, calibration, estimators, isolated):
+        made = run_pipeline(frame, calibration, Refusing(), estimators, None, 2.0)
+        assert made.detection.refusal is not None
+        return made.specularities
+
+    monkeypatch.setattr("simtest.validation.realisation.reconstruct", refused)
+    described = experiment(FIXED, realisations=1)
+    (case,) = expand(described)
+    scene, drawn = case.scene(described, 0)
+    session = Session(scene)
+    made = realise(session, described, case, 0, render_view(session, scene), drawn, load_estimators(["cone_axis"]))
+    assert [(row.status, row.true_id) for row in made.rows] == [("missed", 0)]

@@ -16,7 +16,7 @@ from simtest.runtime.arrays import AnyArray, Image
 CROP_PX, CROPS = 128, 3
 """Side of a crop, and crops of a frame in each pass."""
 
-CHANNEL_GAIN, LIGHT_GAIN, GAMMA = 0.05, 0.2, 0.15
+CHANNEL_GAIN, LIGHT_GAIN, GAMMA = 0.05, 0.5, 0.15
 """Logarithms: standard deviation of a channel's gain; largest gain of all light, and exponent of the encoded values."""
 
 SATURATION = (0.75, 1.2)
