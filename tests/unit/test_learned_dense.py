@@ -29,11 +29,10 @@ from simtest.estimators.dense_inputs import (  # noqa: E402
     dense_inputs,
     output_centres,
 )
-from simtest.estimators.learned_dense import LearnedDense, interpolated, stated_deviation  # noqa: E402
+from simtest.estimators.learned_dense import LearnedDense, stated_deviation  # noqa: E402
 from simtest.estimators.spot_inputs import normal_of, rotation_of  # noqa: E402
-from simtest.estimators.turned_normals import turned_normals  # noqa: E402
 from simtest.geometry import BrownConrady, Camera  # noqa: E402
-from simtest.geometry.vectors import angle_deg, tangent_coordinates  # noqa: E402
+from simtest.geometry.vectors import angle_deg  # noqa: E402
 from simtest.reconstruction.learned_maps import learned_maps  # noqa: E402
 from simtest.reconstruction.pipeline import run_pipeline  # noqa: E402
 from simtest.runtime.onnx_model import METADATA  # noqa: E402
@@ -192,23 +191,6 @@ def test_the_pipeline_runs_it_beside_the_others(made):
     assert isinstance(learned.estimate_frame(found.detection.frame, calibration().camera, Priors()), Failure)
     with pytest.raises(InputError, match=r"other.onnx: cannot be read"):
         learned.with_model("other.onnx")
-
-
-def test_turned_normals_have_the_covariance_of_drawn_rotations():
-    ray = np.array([[0.3, -0.2, 0.93]])
-    ray /= np.linalg.norm(ray)
-    turn, root = np.array([[0.6, -0.3]]), 0.02 * np.array([[[1.0, 0.0], [0.5, 0.7]]])
-    normals, covariances = turned_normals(ray, turn, root)
-    drawn = turn + np.random.default_rng(1).normal(size=(20000, 2)) @ root[0].T
-    others = normal_of(np.repeat(ray, len(drawn), axis=0), drawn)
-    off = np.array([tangent_coordinates(normals[0], other) for other in others[:4000]])
-    assert np.allclose(np.cov(off.T), covariances[0], rtol=0.1, atol=2e-5)
-
-
-def test_interpolation_is_exact_at_centres_and_between_them():
-    planes = np.arange(12.0).reshape(1, 3, 4)
-    points = np.array([[0, 0], [3, 2], [1.5, 1.0], [1.0, 0.5], [-4, 0], [9, 9]], dtype=float)
-    assert interpolated(planes, points)[0].tolist() == [0, 11, 5.5, 3, 0, 11]
 
 
 def test_a_factor_of_a_frame_is_no_error_of_its_shape(made):
