@@ -135,7 +135,7 @@ BAD_USE = {
     "fit none.png --recipe endoscopy --out x.toml": "--scene is needed where a recipe has several families",
     "fit none.png --recipe smooth --scene sea --out x.toml": "--scene sea; must name one of its base scenes",
     "dataset tiny": "--out: missing (",
-    "dataset kidney --out made": "kidney: no such file; shipped by name: endoscopy, highlights, learning, smooth",
+    "dataset kidney --out made": "kidney: no such file; shipped by name: endoscopy, highlights, highlights_smooth, ",
     "dataset tiny --out made --samples 0": "tiny.toml with replaced values: samples = 0: must be greater than or equal",
     "dataset tiny --out made --workers 0": "workers = 0: must be 1 to 256",
     "dataset tiny --out made --set sensor.bits=4": "sensor.bits = 4: must be greater than or equal to 8",

@@ -220,7 +220,7 @@ def test_a_broken_registration_is_refused_with_one_line(answer):
     assert "not installed" in refused["nobody:cone_axis"]
     assert "peaks" in refused["detector nobody"]
     assert (
-        "detector 'nobody': not installed; allowed: colour, other_constant, other_middle, peaks"
+        "detector 'nobody': not installed; allowed: colour, learned_detector, other_constant, other_middle, peaks"
         in refused["--detector nobody"]
     )
     assert "no object with a method detect" in refused["detector other_constant"]

@@ -193,14 +193,16 @@ def answered(**fields):
 
 def test_an_answer_is_an_estimate():
     found = answered(
-        candidates=[NORMAL.tolist(), [0, 0, -1]], axis_ratio=0.5, choice_margin=3, flags=["small"], target="base",
+        candidates=[NORMAL.tolist(), [0, 0, -1]], axis_ratio=0.5,
+        axis_ratio_deviation=0.1, choice_margin=3, flags=["small"], target="base",
         curvature={"directions": [[1, 0, 0], [0, 1, 0]], "axis_ratio": 0.25, "hypotheses": [[1.5, 1.0]]},
     )  # fmt: skip
     assert isinstance(found, Estimate)
     assert found.normal.tolist() == NORMAL.tolist()
     assert found.candidates.tolist() == [NORMAL.tolist(), [0, 0, -1]]
     assert found.look_px.tolist() == [10, 20.5]
-    assert (found.axis_ratio, found.choice_margin, found.flags, found.target) == (0.5, 3, ("small",), "base")
+    assert (found.axis_ratio, found.axis_ratio_deviation, found.choice_margin) == (0.5, 0.1, 3)
+    assert (found.flags, found.target) == (("small",), "base")
     assert found.curvature.gains.tolist() == [1.5, 1]
     assert found.covariance is None
 
@@ -259,7 +261,8 @@ def test_a_budget_is_kept_part_by_part():
     [
         {"normal": None}, {"normal": [True, 0, -1]}, {"normal": [[0, 0, -1]]}, {"normal": [0, 0, [-1]]},
         {"normal": {"x": 0}}, {"normal": [0, 0, 10**400]}, {"candidates": []}, {"candidates": [[0, 0, -1]] * 65},
-        {"axis_ratio": "0.5"}, {"axis_ratio": [0.5]}, {"target": ["fine"]}, {"flags": "small"}, {"flags": [3]},
+        {"axis_ratio_deviation": 0}, {"axis_ratio": "0.5"},
+        {"axis_ratio": [0.5]}, {"target": ["fine"]}, {"flags": "small"}, {"flags": [3]},
         {"flags": ["x" * 61]}, {"flags": ["a"] * 17}, {"curvature": 3}, {"curvature": {"axis_ratio": 0.5}},
         {"curvature": {"directions": [[1, 0, 0], [0, 1, 0]], "axis_ratio": 2}}, {"budget": []}, {"budget": {}},
         {"budget": {"a b": [[1, 0], [0, 1]]}}, {"budget": {"noise": [1, 2]}}, {"covariance": [[1, 2], [0, 1]]},

@@ -105,6 +105,7 @@ def _estimate(fields: Mapping[str, Any], camera: Camera, target: Target) -> Esti
         candidates,
         _look(fields, camera),
         axis_ratio=_ratio(fields, "axis_ratio"),
+        axis_ratio_deviation=_deviation(fields, "axis_ratio_deviation"),
         isophotes=_isophotes(fields.get("isophotes")),
         choice_margin=_number(fields, "choice_margin"),
         flags=_flags(fields.get("flags")),
@@ -236,6 +237,13 @@ def _ratio(fields: Mapping[str, Any], name: str) -> float | None:
     if ratio is not None and not 0 < ratio <= 1:
         raise _Refused(Reason.ESTIMATOR_ERROR, f"{name}: {ratio:g}; must be in (0, 1]")
     return ratio
+
+
+def _deviation(fields: Mapping[str, Any], name: str) -> float | None:
+    deviation = _number(fields, name)
+    if deviation is not None and not deviation > 0:
+        raise _Refused(Reason.ESTIMATOR_ERROR, f"{name}: {deviation:g}; must be above 0")
+    return deviation
 
 
 def _numbers(fields: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Array:
