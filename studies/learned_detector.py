@@ -49,7 +49,7 @@ from studies.detection.tissue_frames import TISSUES, TissueFrame
 
 DRAWS, LEVEL = 2000, 0.95
 
-SEEDS_OF_TISSUE = 980
+SEEDS_OF_TISSUE = 983
 """Where the seeds of `--tissue` begin: no split of `studies.detection.tissue_frames` has them."""
 
 Finder = Callable[[Frame], Sequence[Highlight] | Failure]
