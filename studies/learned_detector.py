@@ -50,7 +50,7 @@ from studies.resampling import drawn_groups
 
 DRAWS, LEVEL = 2000, 0.95
 
-SEEDS_OF_TISSUE = 980
+SEEDS_OF_TISSUE = 983
 """Where the seeds of `--tissue` begin: no split of `studies.detection.tissue_frames` has them."""
 
 Finder = Callable[[Frame], Sequence[Highlight] | Failure]

@@ -1,6 +1,7 @@
 """Writes a network of the task `highlight_instances` as ONNX, with its threshold and the range that it was taught."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -28,7 +29,7 @@ MOST_FRAMES = 60
 """Frames of the train split, spread over it, from which the range of the features is taken."""
 
 PASSES, COARSE = 5, 4
-"""Moved pictures of each frame from which the range of the median light is taken; of each side's pixels every fourth."""
+"""Moved pictures of each frame from which the range of the median light is taken, and the step between their pixels."""
 
 RADII_PX = (1.0, 2.0, 4.0, 8.0)
 """Least radius of each class of highlights."""
@@ -38,6 +39,9 @@ LEAST_NEEDED = 20
 
 LOWEST = 0.1
 """Lower bumps are no highlights, whatever the threshold."""
+
+UPPER = 2.576
+"""Standard deviations of a Gaussian above which 0.5 % lie."""
 
 SEED = 0
 """Of the moved frames from which the range is taken."""
@@ -54,10 +58,13 @@ def export_detector(network: nn.Module, taught: Batch, judged: Batch, out: Path,
     longer_side = max(taught["state"].shape[1:])
     # Frames of the dataset have one size; crops were resized in training.
     ends = np.array([[longer_side * zoom, median] for zoom in ZOOM for median in light_range(taught)])
+    fitted = fitted_range(RANGED, ends, own, others)
+    # Every second row is a frame as it is.
+    fitted = replace(fitted, limit=usual_limit(fitted.distances(others[::2])))
     content = {
         "format": FORMAT,
         "least_top": least_top(lambda inputs: _run(network, inputs)[0], judged),
-        **fitted_range(RANGED, ends, own, others).written(),
+        **fitted.written(),
         "about": about,
     }
     network = network.to(memory_format=torch.contiguous_format)
@@ -68,6 +75,16 @@ def export_detector(network: nn.Module, taught: Batch, judged: Batch, out: Path,
     return export(
         network, {"inputs": example}, ("outputs", "features"), {"inputs": free, "outputs": free}, content, out / MODEL
     )
+
+
+def usual_limit(distances: Array) -> float:
+    """Return the squared distance of features that 0.5 % of new frames would exceed, where its logarithm is Gaussian.
+
+    The validation split has a few anatomies with some frames each: a quantile so high would be the largest of these.
+    """
+    logarithms = np.log(np.maximum(distances, 1e-9))
+    spread = logarithms.std(ddof=1) if len(logarithms) > 1 else 0.0
+    return float(np.exp(logarithms.mean() + UPPER * spread))
 
 
 def light_range(taught: Batch) -> tuple[float, float]:
