@@ -105,14 +105,14 @@ def test_a_core_that_breaks_down_is_a_failure_and_the_next_highlight_has_a_new_c
     assert isinstance(failure, Failure), failure
     assert (failure.reason, words in failure.detail) == (Reason(reason), True), failure
     assert "\n" not in failure.detail
-    # Ended at once, with everything that it had started.
-    assert processes_with(mark) == []
+    # Killed, with everything that it had started; the system may take a moment to end what is none of our children.
+    assert wait_until(lambda: not processes_with(mark))
     assert list(folder.glob("simtest-core-*")) == []
     again = run(estimator, PATCH, CAMERA)
     assert isinstance(again, Failure)
     assert again.reason == reason
     core.close()
-    assert processes_with(mark) == []
+    assert wait_until(lambda: not processes_with(mark))
 
 
 @pytest.mark.parametrize(("fault", "reason", "words"), ANSWERS)
@@ -128,7 +128,7 @@ def test_a_malformed_answer_is_a_failure_of_its_highlight_and_the_core_goes_on(f
     # Its messages are in step, so it is the same process still.
     assert len(processes_with(mark)) == 1
     core.close()
-    assert processes_with(mark) == []
+    assert wait_until(lambda: not processes_with(mark))
 
 
 def answer_of(core):
@@ -146,7 +146,7 @@ def test_a_core_that_does_not_greet_as_it_must_is_told_at_the_start(folder, faul
         Core(command).start()
     assert caught.value.reason == reason
     assert words in caught.value.detail
-    assert processes_with(mark) == []
+    assert wait_until(lambda: not processes_with(mark))
 
 
 @pytest.mark.parametrize(("fault", "words"), [("none_found", ""), ("too_many", "20000 estimates of a frame")])
@@ -187,7 +187,7 @@ def test_a_core_that_breaks_down_after_an_answer_is_told_at_the_next_request(fol
     assert failures
     assert {each.reason for each in failures} <= {Reason.CORE_DIED, Reason.CORE_PROTOCOL}
     core.close()
-    assert processes_with(mark) == []
+    assert wait_until(lambda: not processes_with(mark))
 
 
 def test_after_some_faults_in_a_row_a_core_is_not_started_again(folder):
@@ -197,7 +197,7 @@ def test_after_some_faults_in_a_row_a_core_is_not_started_again(folder):
     made = [answer_of(core) for _ in range(MAX_FAULTS + 2)]
     assert {each.reason for each in made} == {Reason.CORE_DIED}
     assert [each.detail.startswith("not asked after 5 faults in a row") for each in made] == [False] * 5 + [True] * 2
-    assert processes_with(mark) == []
+    assert wait_until(lambda: not processes_with(mark))
     # The end of a run closes its cores; the next run asks again.
     core.close()
     assert "exit code 3" in answer_of(core).detail
@@ -305,7 +305,7 @@ def test_a_core_that_stays_after_its_input_closed_is_killed(folder, monkeypatch)
     core.start()
     assert isinstance(answer_of(core), Estimate)
     core.close()
-    assert processes_with(mark) == []
+    assert wait_until(lambda: not processes_with(mark))
 
 
 def test_a_core_that_was_closed_is_started_again_by_the_next_request(folder):
