@@ -15,7 +15,7 @@ help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
 	@echo "make docs      build/manual: the manual as a site; a warning or a dead link is an error"
 	@echo "make docs-commands  run the manual's commands as they stand; QUICK=--quick leaves out what takes minutes"
-	@echo "make test      fast tests (about 9 minutes on 2 cores)"
+	@echo "make test      fast tests (about 5 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
 	@echo "make test-ci   fast tests, the cases of tests/slow_cases.py and those of all extras, which it installs"
 	@echo "make bench     speeds, as ratios within one run"
