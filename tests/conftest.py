@@ -134,7 +134,7 @@ def matlab_here(monkeypatch):
 
 @pytest.fixture(scope="module")
 def one_torch_thread() -> Iterator[None]:
-    """Give PyTorch one thread: several take turns at small networks, and wait for each other."""
+    """Run PyTorch on one thread: several take turns at small networks, and wait for each other."""
     import torch
 
     before = torch.get_num_threads()
