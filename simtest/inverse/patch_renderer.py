@@ -33,6 +33,9 @@ REACH = 1.0
 LOG_SCALE = 5
 """Index of the log scale among the parameters."""
 
+ALIGNED = 64
+"""Bytes; Dr.Jit reads arrays at multiples of its vectors' size by other instructions."""
+
 GOLDEN = (0.7548776662466927, 0.5698402909980532)
 """Steps of the R2 sequence, evenly spread points of the unit square; the same for every pixel and evaluation."""
 
@@ -73,7 +76,7 @@ class PatchRenderer:
         """
         mi, columns, lanes = self.mi, int(sum(kept)), len(self._rays)
         # lanes: a copy of all pixels for each parameter
-        rays = mi.Vector3f(np.tile(self._rays.T, (1, columns)))
+        rays = self._vectors(np.tile(self._rays.T, (1, columns)))
         which = self._lanes(lanes * columns) // self._opaque(lanes, mi.UInt32)
         direct = _Surface(self, patch, self._parameters(patch, kept, which)).radiance(rays)
         image, slopes = (values.reshape(columns, lanes) for values in self._evaluated(direct))
@@ -92,7 +95,7 @@ class PatchRenderer:
         It is not differentiated by position and shape: where a concave patch focuses light, the derivatives of sampled
         paths are noise, while the intensities hardly move.
         """
-        rays = self.mi.Vector3f(np.ascontiguousarray(np.repeat(self._rays, self.samples, axis=0).T))
+        rays = self._vectors(np.repeat(self._rays, self.samples, axis=0).T)
         by_base = [False] * (len(kept) - 1) + [kept[-1]]
         surface = _Surface(self, patch, self._parameters(patch, by_base, self.mi.UInt32(0)))
         added = self._bounced(surface, rays)
@@ -126,6 +129,21 @@ class PatchRenderer:
     def _lanes(self, width: int) -> Any:
         """Return the lane numbers."""
         return self.dr.arange(self.mi.UInt32, width)
+
+    def _vectors(self, columns: Array) -> Any:
+        """Return vectors from their x, y and z, shape (3, n).
+
+        A kernel holds the length of one array of shape (3, n), and whether an array's address is a multiple of `ALIGNED`;
+        three arrays at such addresses compile nothing anew.
+        """
+        made = []
+        for values in columns:
+            memory = np.empty(4 * len(values) + ALIGNED, np.uint8)
+            first = -memory.ctypes.data % ALIGNED
+            held = memory[first : first + 4 * len(values)].view(np.float32)
+            held[:] = values
+            made.append(self.mi.Float(held))
+        return self.mi.Vector3f(*made)
 
     def _opaque(self, value: Any, kind: Any = None) -> Any:
         """Return a value that the kernel reads from memory, so that changing it compiles nothing."""

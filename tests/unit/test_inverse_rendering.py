@@ -203,7 +203,7 @@ def test_another_highlight_compiles_nothing(render):
             dr.kernel_history_clear()
             answers(session, frame_of(radiance, sigma), inverse=inverse_rendering)
             history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-        assert history
+        assert history, name
     assert all(kernel["cache_hit"] for kernel in history)
 
 
