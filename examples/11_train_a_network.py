@@ -17,12 +17,13 @@ from common import COLOURS, TRUTH, angle_deg, options, save
 
 import simtest
 from simtest.dataset import calibration_of, read
-from simtest.dataset.learn import Samples
 
 chosen = options(__doc__)
 if missing := [name for name in ("torch", "safetensors", "onnx", "onnxruntime") if find_spec(name) is None]:
     sys.exit(f'missing: {", ".join(missing)}; pip install ".[learn]" brings them (docs/start/install.md)')
-from torch.utils.data import DataLoader  # noqa: E402 (not before its absence is told)
+from torch.utils.data import DataLoader  # noqa: E402 (not before its absence is known)
+
+from simtest.dataset.learn import Samples  # noqa: E402
 
 folder, trained = chosen.out / "11_dataset", chosen.out / "11_training"
 few = ["--samples=6", "--set=samples_per_anatomy=2"] if chosen.quick else []

@@ -3,12 +3,12 @@
 import gc
 import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from tests.extras.needs import missing
 from tests.slow_cases import SLOW
 
 # No test depends on wall time; all else is as hypothesis has it, in CI for one.
@@ -32,6 +32,12 @@ def _without_waiting(descriptor):
 
 
 os.fsync = _without_waiting
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Name the folders of tests/extras that were left out."""
+    for line in missing().values():
+        terminalreporter.write_line(line)
 
 
 def pytest_collection_finish():
@@ -130,14 +136,3 @@ def matlab_here(monkeypatch):
             raise InputError(f"{path}: {error}") from error
 
     monkeypatch.setattr(matlab, "read_struct", read)
-
-
-@pytest.fixture(scope="module")
-def one_torch_thread() -> Iterator[None]:
-    """Run PyTorch on one thread: several take turns at small networks, and wait for each other."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)

@@ -147,4 +147,6 @@ def _python_faults(code: str) -> Iterator[str]:
 
 
 def _has(module: Any, path: str, name: str) -> bool:
-    return hasattr(module, name) or importlib.util.find_spec(f"{path}.{name}") is not None
+    # By its lists of names: what a package imports at first use may need an extra.
+    listed = {*dir(module), *getattr(module, "__all__", ())}
+    return name in listed or importlib.util.find_spec(f"{path}.{name}") is not None

@@ -23,7 +23,7 @@ from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, reconstruct, rec
 
 CAMERA = Camera.from_fov(60.0, WIDTH, HEIGHT)
 FRAMES = Path(__file__).resolve().parents[3] / "shared" / "data" / "frames"
-REAL = sorted(path.name for path in FRAMES.iterdir()) if FRAMES.is_dir() else []
+REAL = sorted(path.name for path in FRAMES.iterdir() if path.is_file()) if FRAMES.is_dir() else []
 
 
 def tissue():

@@ -158,19 +158,6 @@ def some_poses_at(folder, index):
     return read_poses(folder)[index][1]
 
 
-def test_pycolmap_reads_what_is_written(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-    poses = some_poses()
-    for which in ("pinhole", "brown", "rational", "fisheye"):
-        save_camera(CAMERAS[which], tmp_path / "cameras.txt", "colmap", poses)
-        model = pycolmap.Reconstruction(str(tmp_path))
-        seen = np.array(model.cameras[1].img_from_cam(RAYS))
-        np.testing.assert_allclose(CAMERAS[which].project(RAYS), seen, rtol=0, atol=PX)
-        for image in model.images.values():
-            matrix = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-            np.testing.assert_allclose(np.linalg.inv(matrix), dict(poses)[image.name], atol=1e-9)
-
-
 # NeRF -------------------------------------------------------------------------------------------------------------
 
 TRANSFORMS = {

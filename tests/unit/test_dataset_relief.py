@@ -176,19 +176,6 @@ def test_ranges_that_make_too_high_a_relief_are_refused():
         Plan(recipe(families=[wide]))
 
 
-def test_loader_passes_the_base_on(made):
-    torch = pytest.importorskip("torch")
-    from simtest.dataset.learn.samples import Samples
-
-    wanted = ("normal", "normal_base", "curvature_base", "pool")
-    for item in Samples(made, fields=wanted):
-        assert item["normal_base"].shape == (3, 48, 64)
-        assert item["curvature_base"].shape == (2, 48, 64)
-        assert item["pool"].dtype == torch.bool
-        same = torch.equal(torch.nan_to_num(item["normal"]), torch.nan_to_num(item["normal_base"]))
-        assert same == (item["meta"]["scene"]["surface"]["relief"] is None)
-
-
 @pytest.fixture(scope="module")
 def with_visible(tmp_path_factory):
     folder = tmp_path_factory.mktemp("visible") / "two"

@@ -1,6 +1,5 @@
 """The arithmetic of studies.learned_transfer: errors and refusals, pairing, overlap of regions, scores, kept frames."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -13,10 +12,8 @@ from simtest.detection.detector import Detection
 from simtest.detection.regions import Region
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.learned_spot import SHIPPED
 from simtest.geometry import Patch
 from simtest.reconstruction import Specularity
-from simtest.runtime.resources import data_root
 from studies.detection.real_frames import OutlinedFrame
 from studies.detection.tissue import Counts
 from studies.hard.cases import scene_of
@@ -290,17 +287,3 @@ def test_a_sheet_is_small_and_needles_point_as_normals_do(tmp_path):
 def test_without_files_the_classical_methods_alone_are_measured():
     assert tuple(networks.estimators(None, None)) == networks.CLASSICAL
     assert tuple(networks.detectors(None)) == (networks.COLOUR,)
-
-
-def test_a_network_without_its_limit_keeps_everything_else():
-    onnx = pytest.importorskip("onnx")
-    from studies.learned_transfer.unlimited import LIMIT, unlimited
-
-    model = onnx.load(data_root("scenes").joinpath(*SHIPPED))
-    made = unlimited(model)
-    before, after = ({prop.key: prop.value for prop in one.metadata_props} for one in (model, made))
-    contents = [json.loads(props.pop("simtest")) for props in (before, after)]
-    assert contents[0].pop("feature_limit") < contents[1].pop("feature_limit") == LIMIT
-    assert contents[0] == contents[1]
-    assert before == after
-    assert made.graph == model.graph

@@ -4,9 +4,7 @@ import dataclasses
 import inspect
 import json
 import re
-import shutil
 import tomllib
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -233,46 +231,3 @@ def test_dead_links_in_markdown_are_found(tmp_path):
         "page.md: #q: no such anchor",
         "page.md: no.png: no such file",
     ]
-
-
-@pytest.mark.parametrize(
-    ("tex", "parts"),
-    [
-        (r"\tfrac12", ["<mfrac", "<mn>1</mn>", "<mn>2</mn>"]),
-        (r"a = b \tag{4.4}", ["(4.4)", "<mi>a</mi>"]),
-        (r"\begin{cases} 1 & x > 0 \\ 0 \end{cases}", ["mtable"]),
-    ],
-)
-def test_equations_become_mathml(monkeypatch, tex, parts):
-    pytest.importorskip("sphinx", reason="sphinx is not installed: extra docs")
-    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
-    import mathml
-    from docutils import nodes
-
-    writer = SimpleNamespace(body=[])
-    with pytest.raises(nodes.SkipNode):
-        mathml.block(writer, nodes.math_block(tex, tex))
-    made = "".join(writer.body)
-    assert all(part in made for part in parts)
-    assert "\\" not in made
-
-
-@pytest.mark.extra
-@pytest.mark.slow
-def test_no_page_of_the_site_is_wider_than_the_screen():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra test")
-    chromium = shutil.which("chromium")
-    if chromium is None or not (SITE / "index.html").exists():
-        pytest.skip("no Chromium on this system, or no site in build/manual: make docs")
-    pages = sorted(path for path in SITE.rglob("*.html") if "_files" not in path.parts)
-    wide = []
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        for width in (1400, 1000, 390):
-            page = browser.new_context(viewport={"width": width, "height": 900}).new_page()
-            for path in pages:
-                page.goto(path.as_uri())
-                if page.evaluate("document.documentElement.scrollWidth") > width:
-                    wide.append((width, path.relative_to(SITE).as_posix()))
-        browser.close()
-    assert wide == []

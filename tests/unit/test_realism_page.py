@@ -185,28 +185,3 @@ def test_bad_options_are_one_line(tmp_path, against, more, words):
     cv2.imwrite(str(tmp_path / "0.png"), (frame(0) * 255).astype(np.uint8))
     with pytest.raises(InputError, match=words):
         realism([tmp_path / "0.png"], against=against, out=tmp_path / "out", **more)
-
-
-@pytest.mark.slow
-@pytest.mark.extra
-@pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this system")
-def test_page_in_a_browser(tmp_path):
-    """No complaint, nothing asked of the network, no sideways scrolling on a desktop and on a phone."""
-    driver = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra test")
-    page = write_comparison(compare(frames(5), frames(5, first=9)), tmp_path, "plain")
-    with driver.sync_playwright() as run:
-        browser = run.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        for width in (1280, 400):
-            tab, heard = browser.new_page(viewport={"width": width, "height": 900}), []
-            tab.on("console", lambda said, heard=heard: heard.append(said.text))
-            tab.on("pageerror", lambda error, heard=heard: heard.append(str(error)))
-            tab.on("request", lambda request, heard=heard: heard.append(request.url))
-            tab.goto(page.as_uri())
-            # Sections are folded on a phone.
-            tab.evaluate("document.querySelectorAll('details').forEach(section => { section.open = true })")
-            tab.wait_for_selector("[data-chart=distances] .main-svg", timeout=60_000)
-            tab.locator("[data-chart=column_noise]").scroll_into_view_if_needed()
-            tab.wait_for_selector("[data-chart=column_noise] .main-svg", timeout=60_000)
-            assert tab.evaluate("document.documentElement.scrollWidth") == width
-            assert [text for text in heard if not text.startswith(("file:", "data:", "blob:"))] == []
-        browser.close()

@@ -99,24 +99,6 @@ def test_the_unit_may_be_a_number_of_millimetres(tmp_path):
         np.testing.assert_allclose(read[:, :3, :3], trajectory.world_from_camera[:, :3, :3], atol=1e-12)
 
 
-def test_colmap_reads_the_export(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap, COLMAP's own reader, is not installed")
-    trajectory = random_trajectory()
-    files_of(tmp_path, trajectory)
-    model = pycolmap.Reconstruction(str(tmp_path / "colmap"))
-    by_name = {image.name: image for image in model.images.values()}
-    assert sorted(by_name) == sorted(trajectory.names)
-    point = np.array([0.3, -0.2, 12.0])
-    for name, T in trajectory.poses:
-        image = by_name[name]
-        pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
-        np.testing.assert_allclose(np.linalg.inv(T)[:3], pose.matrix(), atol=1e-9)
-        world = T[:3, :3] @ point + T[:3, 3]
-        np.testing.assert_allclose(
-            model.cameras[image.camera_id].img_from_cam(pose * world), CAMERA.project(point), atol=1e-9
-        )
-
-
 def test_a_file_that_cannot_be_written_is_no_lens_that_a_format_lacks(tmp_path):
     (tmp_path / "colmap" / "cameras.txt").mkdir(parents=True)
     held = Trajectory(["0.png"], np.eye(4)[None])

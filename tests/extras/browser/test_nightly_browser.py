@@ -1,11 +1,11 @@
 """The nightly page in a real browser: Chromium of the system, driven by playwright."""
 
 import re
-import shutil
 from datetime import UTC, datetime
 
 import polars as pl
 import pytest
+from playwright import sync_api as playwright
 from test_nightly_page import rows_of
 from test_report import make_item
 
@@ -13,12 +13,7 @@ from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.nightly.gate.compare import compare
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
-
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra test")
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
-pytestmark = [pytest.mark.extra, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this system")]
+from tests.extras.needs import program
 
 DESKTOP, PHONE = {"width": 1200, "height": 900}, {"width": 390, "height": 844}
 
@@ -36,7 +31,7 @@ def address(tmp_path_factory):
 @pytest.fixture(scope="module")
 def browser():
     with playwright.sync_playwright() as driver:
-        launched = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        launched = driver.chromium.launch(executable_path=program("chromium"), args=["--no-sandbox"])
         yield launched
         launched.close()
 

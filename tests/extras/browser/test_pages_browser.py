@@ -4,13 +4,13 @@ axe-core comes with the package axe-playwright-python (extra ci), which bundles 
 """
 
 import importlib.util
-import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from playwright import sync_api as playwright
 from test_nightly_page import rows_of
 from test_realism_page import frames
 from test_report import make_item, make_run
@@ -25,16 +25,9 @@ from simtest.reconstruction.picture import Options
 from simtest.report import write_report
 from simtest.report.view3d import grid_triangles
 from simtest.report.viewer import Content, write_scene_page
+from tests.extras.needs import program
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra test")
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
-pytestmark = [
-    pytest.mark.extra,
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this system"),
-]
+pytestmark = pytest.mark.slow
 
 PAGES = ("run", "nightly", "realism", "picture", "view")
 WIDTHS = (1400, 1000, 390)
@@ -132,7 +125,7 @@ def picture_page(folder: Path) -> Path:
 @pytest.fixture(scope="module")
 def browser():
     with playwright.sync_playwright() as driver:
-        launched = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        launched = driver.chromium.launch(executable_path=program("chromium"), args=["--no-sandbox"])
         yield launched
         launched.close()
 

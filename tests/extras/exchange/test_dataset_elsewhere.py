@@ -11,8 +11,11 @@ import tarfile
 import time
 from pathlib import Path
 
+import datasets
 import numpy as np
 import pytest
+import ray
+import webdataset
 from PIL import Image
 
 from simtest.dataset import fields, read
@@ -22,7 +25,7 @@ from simtest.runtime.engines import make_engine
 from simtest.spec import load_dataset
 
 # Others warn as they like.
-pytestmark = [pytest.mark.slow, pytest.mark.extra, pytest.mark.filterwarnings("ignore")]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
 
 # With an image of 16 bits that no picture library knows the meaning of.
@@ -87,7 +90,6 @@ def test_differences_are_told_by_sample_member_and_key(made, tmp_path):
 
 
 def test_hugging_face_reads_local_shards_offline(made, tmp_path, monkeypatch):
-    datasets = pytest.importorskip("datasets")
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     files = {split: str(made / f"{split}-*.tar") for split in ("train", "validation", "test")}
     loaded = datasets.load_dataset("webdataset", data_files=files, cache_dir=str(tmp_path / "cache"))
@@ -104,7 +106,6 @@ def test_hugging_face_reads_local_shards_offline(made, tmp_path, monkeypatch):
 
 
 def test_webdataset_reads_the_shards(made):
-    webdataset = pytest.importorskip("webdataset")
     files = [str(path) for path in sorted(made.glob("train-*.tar"))]
     rows = list(webdataset.WebDataset(files, shardshuffle=False))
     ours = {record["meta"]["key"]: record for record in read(made, "train")}
@@ -137,7 +138,6 @@ def test_killed_writers_and_workers_leave_no_trace(made, tmp_path):
 
 
 def test_a_ray_cluster_that_loses_a_node_writes_the_same_bytes(made, tmp_path):
-    ray = pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
     # Workers import the package from where this test does.
@@ -164,7 +164,6 @@ def test_a_ray_cluster_that_loses_a_node_writes_the_same_bytes(made, tmp_path):
 
 
 def test_ray_that_cannot_be_joined_is_told():
-    pytest.importorskip("ray")
     for address, said in (("127.0.0.1:1", "no Ray cluster answers"), ("here", "must be HOST:PORT")):
         with pytest.raises(InputError, match=said):
             list(make_engine("ray", address=address).run(len, [1], lambda: None))

@@ -6,20 +6,19 @@ from itertools import chain, islice
 import numpy as np
 import polars as pl
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
+import simtest
+from simtest.dataset import calibration_of, read
+from simtest.dataset.learn import Samples, read_crops
+from simtest.dataset.learn.network import propose, train
+from simtest.dataset.shard_writer import write_dataset
+from simtest.errors import InputError
+from simtest.geometry.vectors import angle_deg
+from simtest.runtime.engines import make_engine
+from simtest.spec import load_dataset
 
-import simtest  # noqa: E402
-from simtest.dataset import calibration_of, read  # noqa: E402
-from simtest.dataset.learn import Samples, read_crops  # noqa: E402
-from simtest.dataset.learn.network import propose, train  # noqa: E402
-from simtest.dataset.shard_writer import write_dataset  # noqa: E402
-from simtest.errors import InputError  # noqa: E402
-from simtest.geometry.vectors import angle_deg  # noqa: E402
-from simtest.runtime.engines import make_engine  # noqa: E402
-from simtest.spec import load_dataset  # noqa: E402
-
-pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
+pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
 
 @pytest.fixture(scope="module")

@@ -5,23 +5,22 @@ import subprocess
 import sys
 
 import numpy as np
+import onnx
+import onnxruntime
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-onnx = pytest.importorskip("onnx")
-onnxruntime = pytest.importorskip("onnxruntime")
-
-from simtest.calibration import Calibration, Frame, Priors  # noqa: E402
-from simtest.dataset.learn import dense_network  # noqa: E402
-from simtest.dataset.learn.dense_export import dense_scales, evaluated  # noqa: E402
-from simtest.dataset.learn.dense_task import DenseNormals, cells_of, disturbed, known_cells, without_factor  # noqa: E402
-from simtest.dataset.learn.engine import train  # noqa: E402
-from simtest.dataset.learn.likelihood import squared_distance  # noqa: E402
-from simtest.dataset.learn.training import Training, load_training  # noqa: E402
-from simtest.errors import Failure, InputError  # noqa: E402
-from simtest.estimators import Estimate  # noqa: E402
-from simtest.estimators import learned_dense as learned_dense_module  # noqa: E402
-from simtest.estimators.dense_inputs import (  # noqa: E402
+from simtest.calibration import Calibration, Frame, Priors
+from simtest.dataset.learn import dense_network
+from simtest.dataset.learn.dense_export import dense_scales, evaluated
+from simtest.dataset.learn.dense_task import DenseNormals, cells_of, disturbed, known_cells, without_factor
+from simtest.dataset.learn.engine import train
+from simtest.dataset.learn.likelihood import squared_distance
+from simtest.dataset.learn.training import Training, load_training
+from simtest.errors import Failure, InputError
+from simtest.estimators import Estimate
+from simtest.estimators import learned_dense as learned_dense_module
+from simtest.estimators.dense_inputs import (
     CAMERA,
     CELLS,
     DISTANCE_MM,
@@ -29,16 +28,16 @@ from simtest.estimators.dense_inputs import (  # noqa: E402
     dense_inputs,
     output_centres,
 )
-from simtest.estimators.learned_dense import LearnedDense, stated_deviation  # noqa: E402
-from simtest.estimators.spot_inputs import normal_of, rotation_of  # noqa: E402
-from simtest.geometry import BrownConrady, Camera  # noqa: E402
-from simtest.geometry.vectors import angle_deg  # noqa: E402
-from simtest.reconstruction.learned_maps import learned_maps  # noqa: E402
-from simtest.reconstruction.pipeline import run_pipeline  # noqa: E402
-from simtest.runtime.onnx_model import METADATA  # noqa: E402
-from simtest.runtime.training_range import TrainingRange, inflation  # noqa: E402
+from simtest.estimators.learned_dense import LearnedDense, stated_deviation
+from simtest.estimators.spot_inputs import normal_of, rotation_of
+from simtest.geometry import BrownConrady, Camera
+from simtest.geometry.vectors import angle_deg
+from simtest.reconstruction.learned_maps import learned_maps
+from simtest.reconstruction.pipeline import run_pipeline
+from simtest.runtime.onnx_model import METADATA
+from simtest.runtime.training_range import TrainingRange, inflation
 
-pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
+pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
 WIDTH, HEIGHT = 192, 144
 LIGHTS = ((3.0, 1.0, 0.0), (-3.0, 1.0, 0.0))

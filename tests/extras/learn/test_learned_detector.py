@@ -3,29 +3,27 @@
 import json
 
 import numpy as np
+import onnx
+import onnxruntime
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-onnx = pytest.importorskip("onnx")
-onnxruntime = pytest.importorskip("onnxruntime")
-pytest.importorskip("safetensors")
+from simtest.calibration import Calibration, Frame, Response, srgb_encode
+from simtest.dataset.learn.detector_export import best_threshold, usual_limit
+from simtest.dataset.learn.detector_frames import HIGHLIGHT, TISSUE, UNJUDGED, bumps, needs_be_found
+from simtest.dataset.learn.detector_moves import moved_crops
+from simtest.dataset.learn.detector_task import HighlightInstances
+from simtest.dataset.learn.engine import train
+from simtest.dataset.learn.training import load_training
+from simtest.detection import load_detector
+from simtest.detection.highlight_inputs import frame_statistics, highlight_inputs
+from simtest.detection.learned_detector import LearnedDetector, basins_of
+from simtest.detection.light_split import SplitLight
+from simtest.errors import InputError, Reason
+from simtest.geometry import Camera
+from simtest.runtime.onnx_model import METADATA
 
-from simtest.calibration import Calibration, Frame, Response, srgb_encode  # noqa: E402
-from simtest.dataset.learn.detector_export import best_threshold, usual_limit  # noqa: E402
-from simtest.dataset.learn.detector_frames import HIGHLIGHT, TISSUE, UNJUDGED, bumps, needs_be_found  # noqa: E402
-from simtest.dataset.learn.detector_moves import moved_crops  # noqa: E402
-from simtest.dataset.learn.detector_task import HighlightInstances  # noqa: E402
-from simtest.dataset.learn.engine import train  # noqa: E402
-from simtest.dataset.learn.training import load_training  # noqa: E402
-from simtest.detection import load_detector  # noqa: E402
-from simtest.detection.highlight_inputs import frame_statistics, highlight_inputs  # noqa: E402
-from simtest.detection.learned_detector import LearnedDetector, basins_of  # noqa: E402
-from simtest.detection.light_split import SplitLight  # noqa: E402
-from simtest.errors import InputError, Reason  # noqa: E402
-from simtest.geometry import Camera  # noqa: E402
-from simtest.runtime.onnx_model import METADATA  # noqa: E402
-
-pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
+pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
 SIDE = 160
 

@@ -5,29 +5,28 @@ import subprocess
 import sys
 
 import numpy as np
+import onnx
+import onnxruntime
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-onnx = pytest.importorskip("onnx")
-onnxruntime = pytest.importorskip("onnxruntime")
+from simtest.calibration import Calibration, Priors
+from simtest.dataset.learn.calibration import fitted_scale
+from simtest.dataset.learn.spot_export import export_spots
+from simtest.dataset.learn.spot_task import SpotNormals, squared_distance
+from simtest.dataset.learn.training import Training
+from simtest.errors import Failure, InputError
+from simtest.estimators import Estimate
+from simtest.estimators.covariance_scale import CovarianceScale
+from simtest.estimators.learned_spot import LearnedSpot, log_deviation
+from simtest.estimators.spot_inputs import EXTRAS, rays_of, spot_inputs
+from simtest.geometry import BrownConrady, Camera
+from simtest.geometry.vectors import angle_deg
+from simtest.reconstruction.pipeline import run_pipeline
+from simtest.runtime.onnx_model import METADATA
+from simtest.runtime.training_range import TrainingRange, inflation
 
-from simtest.calibration import Calibration, Priors  # noqa: E402
-from simtest.dataset.learn.calibration import fitted_scale  # noqa: E402
-from simtest.dataset.learn.spot_export import export_spots  # noqa: E402
-from simtest.dataset.learn.spot_task import SpotNormals, squared_distance  # noqa: E402
-from simtest.dataset.learn.training import Training  # noqa: E402
-from simtest.errors import Failure, InputError  # noqa: E402
-from simtest.estimators import Estimate  # noqa: E402
-from simtest.estimators.covariance_scale import CovarianceScale  # noqa: E402
-from simtest.estimators.learned_spot import LearnedSpot, log_deviation  # noqa: E402
-from simtest.estimators.spot_inputs import EXTRAS, rays_of, spot_inputs  # noqa: E402
-from simtest.geometry import BrownConrady, Camera  # noqa: E402
-from simtest.geometry.vectors import angle_deg  # noqa: E402
-from simtest.reconstruction.pipeline import run_pipeline  # noqa: E402
-from simtest.runtime.onnx_model import METADATA  # noqa: E402
-from simtest.runtime.training_range import TrainingRange, inflation  # noqa: E402
-
-pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
+pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
 
 SIZE = 96

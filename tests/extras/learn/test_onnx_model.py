@@ -3,20 +3,18 @@
 import json
 
 import numpy as np
+import onnx
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-onnx = pytest.importorskip("onnx")
-pytest.importorskip("onnxruntime")
+from simtest.dataset.learn import onnx_export
+from simtest.dataset.learn.calibration import fitted_range
+from simtest.errors import InputError, SimtestError
+from simtest.runtime import onnx_model
+from simtest.runtime.onnx_model import METADATA, OnnxModel
+from simtest.runtime.training_range import TrainingRange
 
-from simtest.dataset.learn import onnx_export  # noqa: E402
-from simtest.dataset.learn.calibration import fitted_range  # noqa: E402
-from simtest.errors import InputError, SimtestError  # noqa: E402
-from simtest.runtime import onnx_model  # noqa: E402
-from simtest.runtime.onnx_model import METADATA, OnnxModel  # noqa: E402
-from simtest.runtime.training_range import TrainingRange  # noqa: E402
-
-pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
+pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
 FORM = "simtest line, version 1"
 

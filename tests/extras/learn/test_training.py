@@ -4,19 +4,17 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("safetensors")
+from simtest.dataset.learn.checkpoint import BEST, LAST, read_state
+from simtest.dataset.learn.engine import train
+from simtest.dataset.learn.page import write_page
+from simtest.dataset.learn.runs import run_training
+from simtest.dataset.learn.tasks import load_task
+from simtest.dataset.learn.training import Training, load_training
+from simtest.errors import InputError
 
-from simtest.dataset.learn.checkpoint import BEST, LAST, read_state  # noqa: E402
-from simtest.dataset.learn.engine import train  # noqa: E402
-from simtest.dataset.learn.page import write_page  # noqa: E402
-from simtest.dataset.learn.runs import run_training  # noqa: E402
-from simtest.dataset.learn.tasks import load_task  # noqa: E402
-from simtest.dataset.learn.training import Training, load_training  # noqa: E402
-from simtest.errors import InputError  # noqa: E402
-
-pytestmark = [pytest.mark.extra, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
+pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
 
 SHORT = {"name": "line", "task": "line", "epochs": 4, "batch": 16, "learning_rate": 0.03, "patience": 0}

@@ -1,0 +1,53 @@
+"""A moved picture gives the network of spots moved inputs."""
+
+import numpy as np
+import pytest
+import test_spot_inputs
+import torch
+from test_spot_inputs import LIGHTS, PEAK, WIDTH, frame
+
+from simtest.dataset.learn import spot_task
+from simtest.estimators.spot_inputs import (
+    rays_of,
+    rotation_of,
+    spot_inputs,
+)
+
+picture = test_spot_inputs.picture
+
+
+@pytest.mark.parametrize(
+    ("change", "moved"),
+    [
+        (lambda p: p[:, ::-1], (True, False, False)),
+        (lambda p: p[::-1], (False, True, False)),
+        (lambda p: p.T, (False, False, True)),
+        (lambda p: p.T[::-1], (True, False, True)),
+    ],
+    ids=["mirrored", "upside down", "transposed", "turned"],
+)
+def test_a_moved_picture_gives_moved_inputs(picture, change, moved):
+    flip_x, flip_y, transpose = moved
+    # The move of the picture as a matrix, for lights, peak and normal: mirrored first, then transposed.
+    matrix = np.diag([-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0, 1.0])
+    matrix = matrix[[1, 0, 2]] if transpose else matrix
+    middle = WIDTH / 2
+    peak = (matrix[:2, :2] @ (PEAK - middle)) + middle
+    normal = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
+    before, after = frame(picture), frame(np.ascontiguousarray(change(picture)), LIGHTS @ matrix.T)
+    batch = {}
+    for name, seen, at, true in (("before", before, PEAK, normal), ("after", after, peak, matrix @ normal)):
+        crops, extras = spot_inputs(seen, [at])
+        rotation = rotation_of(rays_of(seen.camera, at[None]), true[None])
+        batch[name] = {
+            "crops": torch.from_numpy(crops), "extras": torch.from_numpy(extras),
+            "base": torch.from_numpy(rotation), "fine": torch.from_numpy(rotation),
+        }  # fmt: skip
+    turned = spot_task.moved(batch["before"], flip_x, flip_y, transpose)
+    assert torch.allclose(turned["crops"], batch["after"]["crops"], atol=1e-4)
+    # The basis follows the image's x, so off the axis a transposed one is turned by a small angle.
+    tolerance = 0.03 if transpose else 1e-5
+    for name in ("extras", "base", "fine"):
+        assert torch.allclose(turned[name], batch["after"][name], atol=tolerance), name
+    # What is compared does change with the move.
+    assert not torch.allclose(batch["before"]["extras"], batch["after"]["extras"], atol=0.05)
