@@ -1,23 +1,29 @@
 # Two commands for a start: `make demo` and `make test`. Everything runs in a virtual environment of its own.
 PYTHON ?= python3
 VENV ?= .venv
+EXTRAS ?= $(VENV)-extras
 WORKERS ?= auto
 BIN := $(VENV)/bin
 RELEASE_PYTHONS ?= all
-# A file's tests share what they render, so they stay in one process; tests/conftest.py names the long files, which come first.
-PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
-TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
+PIP = -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# A file's tests share what they render, so they stay in one process; tests/conftest.py puts the longest files first.
+PYTEST = -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: help demo docs docs-commands test test-all test-ci examples bench bench-cycles lint audit hashed-constraints \
-	release-check format clean
+# Containers often forbid bytecode, and each process would compile a thousand modules again.
+export PYTHONDONTWRITEBYTECODE :=
+
+.PHONY: help demo docs docs-commands test test-all test-ci test-extras examples bench bench-cycles lint audit \
+	hashed-constraints release-check format clean
 
 help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
 	@echo "make docs      build/manual: the manual as a site; a warning or a dead link is an error"
 	@echo "make docs-commands  run the manual's commands as they stand; QUICK=--quick leaves out what takes minutes"
-	@echo "make test      fast tests (about 5 minutes on 2 cores)"
+	@echo "make test      fast tests (about MINUTES minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
-	@echo "make test-ci   fast tests, the cases of tests/slow_cases.py and those of all extras, which it installs"
+	@echo "make test-extras  tests that need an extra, which it installs beside .venv, or another program"
+	@echo "make test-ci   what CI runs beyond make test: the cases marked ci, and those of test-extras"
 	@echo "make bench     speeds, as ratios within one run"
 	@echo "make bench-cycles  a labelled frame beside Blender's Cycles, which it installs (Python 3.11; 1 GB)"
 	@echo "make lint      ruff, mypy, import-linter"
@@ -29,28 +35,30 @@ help:
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
+# Compiled here and by all cores, so that no command of the user's compiles; pip would do it by one.
 $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
-	@# Most modules are never imported: bytecode is made at first use.
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e .
+	$(BIN)/python $(PIP) --no-compile -e .
+	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib simtest || true
 	@touch $@
 
 $(VENV)/.tests: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test]"
+	$(BIN)/python $(PIP) -e ".[test]"
 	@touch $@
 
 # The CPU build of torch comes from a wheel beside the registry or not at all: the registry's own drags in gigabytes of CUDA.
-$(VENV)/.ci: $(VENV)/.tests
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,ci]"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "torch==$(TORCH)+cpu" || \
+$(EXTRAS)/.extras: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(EXTRAS)
+	$(EXTRAS)/bin/python $(PIP) -e ".[test,test-extras]"
+	$(EXTRAS)/bin/python $(PIP) "torch==$(TORCH)+cpu" || \
 		echo "no CPU build of torch $(TORCH) was found: tests that need it are skipped"
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	$(BIN)/python $(PIP) -e ".[docs]"
 	@touch $@
 
 $(VENV)/.benchmarks: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bench]"
+	$(BIN)/python $(PIP) -e ".[bench]"
 	@touch $@
 
 $(VENV)-cycles/.installed: benchmarks/cycles-requirements.txt
@@ -71,13 +79,16 @@ docs-commands: $(VENV)/.docs
 
 # A few examples of each property; the others draw all.
 test: $(VENV)/.tests
-	SIMTEST_EXAMPLES=few $(PYTEST) -m "not slow"
+	SIMTEST_EXAMPLES=few $(BIN)/python $(PYTEST) -m "not slow and not ci"
 
 test-all: $(VENV)/.tests
-	$(PYTEST)
+	$(BIN)/python $(PYTEST)
 
-test-ci: $(VENV)/.ci
-	$(PYTEST) -m "not slow or extra" -rs
+test-extras: $(EXTRAS)/.extras
+	$(EXTRAS)/bin/python $(PYTEST) tests/extras
+
+test-ci: $(EXTRAS)/.extras
+	$(EXTRAS)/bin/python $(PYTEST) -m "ci or extra"
 
 bench: $(VENV)/.benchmarks
 	$(BIN)/python -m benchmarks
@@ -109,8 +120,8 @@ format: $(VENV)/.tests
 
 # The pictures of the manual are those that the examples make.
 # One of them trains a network, so all extras are installed, and PyTorch where its CPU build is found.
-examples: $(VENV)/.ci
-	for script in examples/[0-9]*.py; do $(BIN)/python $$script || exit 1; done
+examples: $(EXTRAS)/.extras
+	for script in examples/[0-9]*.py; do $(EXTRAS)/bin/python $$script || exit 1; done
 	for script in examples/[0-9]*.py; do \
 		name=$$(basename $$script .py); picture=$$(ls examples/output/$$name.*); \
 		cp $$picture docs/images/examples/$$(echo $$name | cut -c1-2).$${picture##*.}; \
@@ -121,4 +132,4 @@ release-check: $(BIN)/python
 	$(BIN)/python .ci/release_check.py --pythons $(RELEASE_PYTHONS) $(RELEASE_OPTIONS)
 
 clean:
-	rm -rf $(VENV) $(VENV)-cycles $(VENV)-audit reports/runs .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(EXTRAS) $(VENV)-cycles $(VENV)-audit reports/runs .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -14,6 +14,14 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
     return True if collection_path.parent.name == "extras" and collection_path.name in MISSING else None
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what stands here."""
+    for item in items:
+        if item.path.is_relative_to(Path(__file__).parent):
+            item.add_marker("extra")
+
+
 @pytest.fixture(scope="module")
 def one_torch_thread():
     """Run PyTorch on one thread: several take turns at small networks, and wait for each other."""
