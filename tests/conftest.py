@@ -9,7 +9,6 @@ import pytest
 from hypothesis import settings
 
 from tests.extras.needs import missing
-from tests.slow_cases import SLOW
 
 # No test depends on wall time; all else is as hypothesis has it, in CI for one.
 settings.register_profile("untimed", settings(), deadline=None)
@@ -62,32 +61,9 @@ LONGEST = (
 """Files of 4 s of processor time and more, the longest first."""
 
 
-COLLECTED: dict[str, dict[str, bool]] = {}
-"""Whether a test is slow, by name and file, of all that were collected; those that are not chosen too."""
-
-
-def matches(listed, name):
-    """Return whether a name of `SLOW` stands for a test."""
-    return name == listed or (listed[-1] == "*" and name.startswith(listed[:-1]))
-
-
-def is_slow(stem, name):
-    """Return whether `SLOW` names a test of a file."""
-    return any(matches(listed, name) for names in SLOW.get(stem, {}).values() for listed in names)
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark the cases that are slow, and put the longest files first: one that began last would leave workers idle.
-
-    What is chosen by marks is chosen afterwards. `make test-ci` runs these cases too.
-    """
-    for item in items:
-        if is_slow(item.path.stem, item.name):
-            item.add_marker("slow")
-            item.add_marker("extra")
-        own = COLLECTED.setdefault(item.path.stem, {})
-        own[item.name] = item.get_closest_marker("slow") is not None
+    """Put the longest files first: one that began last would leave workers idle."""
     order = {name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 

@@ -22,6 +22,7 @@ from simtest.simulation.rendered_view import render_view
 from simtest.spec import load_scene, scene_from_dict
 from simtest.validation.matching import match
 from simtest.validation.metrics import mahalanobis2
+from tests.marked import marked
 
 D = 10.0
 AXES = {"cone_axis": cone_axis, "curved": curved}
@@ -180,7 +181,7 @@ def test_what_the_view_mask_cuts_is_fitted_too(see):
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("kd", [-0.95, -1.1, *(pytest.param(kd, marks=pytest.mark.slow) for kd in (-0.9, -1.05))])
+@pytest.mark.parametrize("kd", marked([-0.95, -1.1, -0.9, -1.05], ci=[-1.1], slow=[-0.9, -1.05]))
 def test_streaks_are_refused_or_flagged(see, kd):
     """Seen from near its axis a tube shows a streak: no estimate off by more than 2 deg goes without a flag."""
     seen = see(surface=surface("cylinder", kd), sensor={"noise_sigma": 0.02})

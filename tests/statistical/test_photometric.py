@@ -22,6 +22,7 @@ from simtest.spec.paper import PaperSetting
 from simtest.validation.metrics import mahalanobis2
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.published_pipeline import Pipeline
+from tests.marked import marked
 
 ALPHA = 1e-3
 
@@ -58,7 +59,13 @@ def answers(setting, count):
     return [answer(setting, number) for number in range(count)]
 
 
-@pytest.mark.parametrize("values", [{}, {"sigma": 0.01}, {"sigma": 0.1}, {"theta_deg": 30.0}, {"theta_deg": 75.0}])
+@pytest.mark.parametrize(
+    "values",
+    marked(
+        [{}, {"sigma": 0.01}, {"sigma": 0.1}, {"theta_deg": 30.0}, {"theta_deg": 75.0}],
+        ci=[{"sigma": 0.01}, {"sigma": 0.1}, {"theta_deg": 30.0}],
+    ),
+)
 def test_published_protocol_is_solved_to_its_bound(values):
     """RMS angle within 1.2 of the Cramer-Rao bound; not below it by more than chance; the right candidate."""
     count, setting = 40, PaperSetting(**values)
@@ -96,7 +103,7 @@ def frames(surface, count, **sensor):
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("surface", marked(SURFACES, ci=["plane", "inside"]))
 def test_curved_surfaces_with_the_light_at_the_camera(surface):
     seen, noisy = frames(surface, 12)
     truth, errors, ratios = seen.highlights[0], [], []

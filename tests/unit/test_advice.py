@@ -388,7 +388,7 @@ def test_intervals_of_few_frames():
     assert ratio_interval(totals, counts, np.array([0, 0, 0, 0, 1]))[1] > 3.3
 
 
-@pytest.mark.parametrize("depends", [True, False])
+@pytest.mark.parametrize("depends", [pytest.param(True, marks=pytest.mark.ci), False])
 def test_the_gain_of_strata_is_that_of_planted_errors(depends):
     """Errors of 1 / abs(1 + d k) lie between strata; negative control: the same errors in another order do not.
 

@@ -317,7 +317,7 @@ def test_unknown_variants_name_the_allowed_ones(monkeypatch, name):
         assert "\n" not in text
 
 
-@pytest.mark.parametrize("first", ["nope", "cuda_ad_mono"])
+@pytest.mark.parametrize("first", [pytest.param("nope", marks=pytest.mark.ci), "cuda_ad_mono"])
 def test_a_variant_that_fails_leaves_the_next_one_usable(first):
     """Dr.Jit loads its libLLVM when it is imported, and that must not be one that ends the process."""
     code = (

@@ -470,6 +470,7 @@ def test_a_corrupt_record_starts_the_run_again(tmp_path, stopped):
         parts.mkdir()
 
 
+@pytest.mark.ci  # meanwhile: test_stopping: other commands whose reader has gone
 def test_a_reader_that_has_gone_is_no_error():
     read, write = os.pipe()
     os.close(read)

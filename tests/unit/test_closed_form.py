@@ -3,6 +3,8 @@
 Phong, as published and normalised, with and without a base, one point light wherever it may be: at every pixel.
 """
 
+from itertools import product
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -10,6 +12,7 @@ from scipy import stats
 from simtest.rendering import Session
 from simtest.rendering.materials import bsdf_dict
 from simtest.spec import scene_from_dict
+from tests.marked import marked
 
 pytestmark = pytest.mark.render
 
@@ -104,9 +107,13 @@ def session():
 
 
 @pytest.mark.parametrize(
-    "exponent", [10.0, pytest.param(50.0, marks=pytest.mark.slow), pytest.param(100.0, marks=pytest.mark.slow), 500.0]
+    ("name", "exponent"),
+    marked(
+        product(SURFACES, [10.0, 50.0, 100.0, 500.0]),
+        ci=[("plane", 500.0), ("sphere", 10.0)],
+        slow=product(SURFACES, [50.0, 100.0]),
+    ),
 )
-@pytest.mark.parametrize("name", SURFACES)
 def test_every_pixel_has_the_radiance_of_the_formula(session, name, exponent):
     surface, formula = SURFACES[name]
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)

@@ -11,6 +11,7 @@ from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, Polyp, load_recipe
 from simtest.surfaces.stalk import Stalk
+from tests.marked import marked
 
 ROOT = Path(__file__).resolve().parents[2]
 LOBE = "[[lobes]]\ncentre_mm = [0, 0, 0]\nsemi_axes_mm = [50, 40, %d]"
@@ -67,6 +68,7 @@ def central(f, h):
     return (m2 - 8 * m1 + 8 * p1 - p2) / (12 * h), (-m2 + 16 * m1 - 30 * z + 16 * p1 - p2) / (12 * h * h)
 
 
+@pytest.mark.parametrize("recipe", marked(MORE, ci=["pedunculated"]), indirect=True)
 def test_partial_derivatives_match_finite_differences(recipe):
     tube = build(recipe).tube
     rng = np.random.default_rng(1)
@@ -83,6 +85,7 @@ def test_partial_derivatives_match_finite_differences(recipe):
     np.testing.assert_allclose(jet.vv, dvv, atol=3e-3)  # rounding: 1e-14 * 100 mm / h_v^2
 
 
+@pytest.mark.parametrize("recipe", marked(MORE, ci=["pedunculated"]), indirect=True)
 def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
     """The normal from differenced positions; S from differenced normals, along the reported directions."""
     colon, tube = Colon(recipe, 0), build(recipe).tube
@@ -143,6 +146,7 @@ def test_points_at_the_seam_and_misses(recipe):
     assert np.abs(points.distance[1:] - 3).max() < 0.02
 
 
+@pytest.mark.parametrize("recipe", marked(MORE, ci=["shipped", "polyps and relief"]), indirect=True)
 def test_mesh_has_two_open_ends_and_normals_into_the_lumen(recipe):
     shape = Colon(recipe, 0).shape()
     mesh = shape.mesh

@@ -92,6 +92,7 @@ def test_many_normals_undo_the_error_and_vague_ones_leave_it(seed):
     assert gradient_error(vague, truth) > 0.8 * before
 
 
+@pytest.mark.ci  # meanwhile: test_many_normals_undo_the_error_and_vague_ones_leave_it
 def test_more_normals_help_more():
     truth = ball()[0]
     left = []

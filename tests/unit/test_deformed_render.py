@@ -67,7 +67,9 @@ def test_labels_follow_the_exact_truth_on_relief():
     assert np.median(np.linalg.norm(own - other, axis=1)) > 0.03
 
 
-@pytest.mark.parametrize("reflectance", [{"type": "phong", "exponent": 200.0}, TISSUE])
+@pytest.mark.parametrize(
+    "reflectance", [pytest.param({"type": "phong", "exponent": 200.0}, marks=pytest.mark.ci), TISSUE]
+)
 def test_a_rigid_motion_of_tissue_is_the_reverse_motion_of_the_camera(reflectance):
     """A film, relief and colour that move rigidly with a camera look as before."""
     rigid = {"type": "breathing", "amplitude_mm": 4.0, "period_s": 2.0, "direction": [0, 0, 1], "warp": 0.0}
@@ -109,7 +111,10 @@ RINGS = {"type": "contractions", "amplitude_mm": 2.0, "period_s": 2.0, "radius_m
          "spacing_mm": 30.0, "path_mm": [[0, -60, 15], [2, 0, 14], [0, 60, 15]]}  # fmt: skip
 
 
-@pytest.mark.parametrize(("surface", "part"), [(TUBE, RINGS), ({"type": "sphere", "radius_mm": 9.0}, DENT)])
+@pytest.mark.parametrize(
+    ("surface", "part"),
+    [(TUBE, RINGS), pytest.param({"type": "sphere", "radius_mm": 9.0}, DENT, marks=pytest.mark.ci)],
+)
 def test_analytic_surfaces_deform(surface, part):
     """The rendered mesh is the exact surface within its cells, deformed and at rest."""
     camera = {"width": 64, "height": 48, "fx": 56.0, "fy": 56.0, "cx": 32.0, "cy": 24.0}

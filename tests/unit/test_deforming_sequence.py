@@ -76,6 +76,7 @@ def test_control_followed_as_if_tissue_stood_still():
     assert [len(track.entries) for track in still.tracks] == [1, 1]
 
 
+@pytest.mark.ci  # meanwhile: test_flow for tissue at rest, test_deformed_render for tissue that moves
 def test_flow_is_that_of_the_tissue():
     """Forward and back is no way at all; and the flow is the motion of material points."""
     times = 0.1, 0.3

@@ -15,6 +15,7 @@ from simtest.rendering.rays import in_tiles
 from simtest.rendering.strokes import Strokes
 from simtest.spec import scene_from_dict
 from simtest.surfaces import TriangleMesh
+from tests.marked import marked
 
 HEIGHT, WIDTH = 24, 32
 Y, X = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
@@ -233,7 +234,7 @@ SHAPES = {
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", marked(SHAPES, ci=["saddle"]))
 def test_labels_need_no_second_trace(name):
     """Those from the hits of the radiance are, byte for byte, those of a trace of their own."""
     session = Session(scene(SHAPES[name]))

@@ -33,6 +33,9 @@ def cases(in_process):
         marks = [pytest.mark.slow, *([pytest.mark.extra] if in_process else []), lacks] if trains else []
         if not (in_process or trains or script.name.startswith("02_")):
             marks = [pytest.mark.slow]
+        elif not trains and not (in_process and script.name.startswith(("01_", "02_", "06_"))):
+            # `make examples` runs all.
+            marks = [pytest.mark.ci]
         yield pytest.param(script, marks=marks, id=script.stem)
 
 

@@ -14,6 +14,7 @@ from simtest.rendering.mitsuba_export import SAMPLES
 from simtest.spec import scene_from_dict
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.rig import LightSpec
+from tests.marked import marked
 
 pytestmark = pytest.mark.render
 
@@ -64,13 +65,15 @@ REFLECTANCES = {
     "albedo": {"type": "tissue", "film": {"index": 1.36, "alpha": 0.05}, "colour": [0.8, 0.4, 0.3]},
     "tissue GGX": {"type": "tissue", "film": {"index": 1.36, "alpha": 0.05, "distribution": "ggx"}},
 }
-CASES = [(name, "phong", AT_CAMERA if i % 2 else ASIDE) for i, name in enumerate(SURFACES) if name != "liver"]
-CASES.append(pytest.param("liver", "phong", ASIDE, marks=pytest.mark.slow))
+CASES = [(name, "phong", AT_CAMERA if i % 2 else ASIDE) for i, name in enumerate(SURFACES)]
 CASES += [("plane", name, ASIDE) for name in REFLECTANCES if name != "phong"]
 CASES += [("quadric", "rough plastic", ASIDE), ("quadric", "rough conductor", ASIDE)]
+SELDOM = [("quadric", "phong", ASIDE), ("quadric", "rough plastic", ASIDE)]
 
 
-@pytest.mark.parametrize(("surface", "reflectance", "light"), CASES, ids=str)
+@pytest.mark.parametrize(
+    ("surface", "reflectance", "light"), marked(CASES, ci=SELDOM, slow=[("liver", "phong", ASIDE)]), ids=str
+)
 def test_mitsuba_renders_the_same_picture(session, tmp_path, surface, reflectance, light):
     described = scene(SURFACES[surface], REFLECTANCES[reflectance], (light,))
     session.update(described)
@@ -99,7 +102,7 @@ SPREAD = {
 }
 
 
-@pytest.mark.parametrize("name", SPREAD)
+@pytest.mark.parametrize("name", marked(SPREAD, ci=["bounces off tissue"]))
 def test_sampled_pictures_have_the_same_mean(session, tmp_path, name):
     """Over all pixels together, within 3 standard errors; 1 % more would be seen."""
     render, lights, surface, reflectance = SPREAD[name]
@@ -126,7 +129,10 @@ def test_one_sample_where_it_cannot_do_becomes_many(tmp_path):
     assert sampler((ASIDE,), {"samples_per_pixel": 9}) == ("independent", 9)
 
 
-@pytest.mark.parametrize(("name", "shown"), [("phong", "Phong[exponent=40"), ("tissue GGX", "Tissue[alpha=0.05")])
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [pytest.param("phong", "Phong[exponent=40", marks=pytest.mark.ci), ("tissue GGX", "Tissue[alpha=0.05")],
+)
 def test_the_line_in_the_file_makes_it_load(session, tmp_path, name, shown):
     text = simtest.export(scene(SURFACES["quadric"], REFLECTANCES[name]), tmp_path)[0].read_text()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.xml", "surface.ply"]

@@ -1,5 +1,7 @@
 """Optical flow: closed on the exact surface, equal to a plane's homography, and hidden where the horizon says so."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -7,11 +9,12 @@ from simtest.rendering import Session
 from simtest.simulation.flow import HIDDEN, INSTRUMENT, NONE, OUT, SEEN, Flow, SeenSurface, flow_between
 from simtest.spec import scene_from_dict
 from simtest.spec.views import Moved
+from tests.marked import marked
 
 pytestmark = pytest.mark.render
 
 SIZE = 96
-LENS = {"type": "kannala_brandt", "k1": 0.02, "k2": -0.003}
+LENSES = {"pinhole": None, "fisheye": {"type": "kannala_brandt", "k1": 0.02, "k2": -0.003}}
 SURFACES = {
     "plane": {"type": "plane", "distance_mm": 10, "tilt_deg": 25, "azimuth_deg": 40},
     "sphere": {"type": "sphere", "distance_mm": 10, "radius_mm": 6},
@@ -49,10 +52,9 @@ def cycle_px(session, first, second, flow):
     return np.linalg.norm(first.project(points) - first.camera.pixel_centres()[seen], axis=1)
 
 
-@pytest.mark.parametrize("name", list(SURFACES))
-@pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "fisheye"])
-def test_the_cycle_closes(name, lens):
-    session, first, second = two_frames(scene_of(SURFACES[name], lens))
+@pytest.mark.parametrize(("lens", "name"), marked(product(LENSES, SURFACES), ci=[("fisheye", "saddle")]))
+def test_the_cycle_closes(lens, name):
+    session, first, second = two_frames(scene_of(SURFACES[name], LENSES[lens]))
     for a, b in ((first, second), (second, first)):
         flow = flow_between(session, a, b)
         assert np.count_nonzero(flow.state == SEEN) > SIZE * SIZE / 4

@@ -10,6 +10,7 @@ from gate_nights import changed, night, raised, rows
 from simtest.nightly.gate.compare import compare
 from simtest.nightly.gate.figures import digest, setting_figures
 from simtest.nightly.records import COMPARISONS, FIGURES, OUTCOMES, POOLED
+from tests.marked import marked
 
 FIRST_12 = pl.col("realisation") < 12
 
@@ -211,7 +212,7 @@ def test_with_other_versions_a_loss_is_told_and_not_judged():
     assert (verdict.state, one(verdict, "n")["outcome"]) == ("fine", "undecided")
 
 
-@pytest.mark.parametrize("cause", ["seeds", "versions", "more"])
+@pytest.mark.parametrize("cause", marked(["seeds", "versions", "more"], ci=["versions", "more"]))
 def test_without_exact_pairs_the_test_is_unpaired(cause):
     table, run = rows(), {}
     other = rows(seed=1) if cause == "seeds" else rows(count=25) if cause == "more" else raised(table, 1 + 1e-9)
@@ -294,7 +295,7 @@ def test_coverage_is_worse_where_it_falls():
     assert row["low"] < row["difference"] < row["high"] < 0
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("value", [float("nan"), pytest.param(float("inf"), marks=pytest.mark.ci)])
 def test_an_uncertainty_that_is_no_number_covers_nothing(value):
     table = changed(rows(), True, mahalanobis2=1.0)
     verdict = compare(night(changed(table, FIRST_12, mahalanobis2=value)), night(table))
@@ -302,9 +303,20 @@ def test_an_uncertainty_that_is_no_number_covers_nothing(value):
     assert one(verdict, "coverage95")["tonight"] == pytest.approx(0.4)
 
 
-@pytest.mark.parametrize(("lost", "quantity"), [("mahalanobis2", "no_region"), ("axis_ratio", "no_axis_ratio")])
-@pytest.mark.parametrize(("condition", "share"), [(FIRST_12, 0.6), (True, 1.0)], ids=["some", "all"])
-def test_an_uncertainty_that_is_no_longer_stated_is_seen(lost, quantity, condition, share):
+@pytest.mark.parametrize(
+    ("condition", "share", "lost", "quantity"),
+    [
+        (FIRST_12, 0.6, "mahalanobis2", "no_region"),
+        pytest.param(FIRST_12, 0.6, "axis_ratio", "no_axis_ratio", marks=pytest.mark.ci),
+        pytest.param(True, 1.0, "mahalanobis2", "no_region", marks=pytest.mark.ci),
+        (True, 1.0, "axis_ratio", "no_axis_ratio"),
+    ],
+    ids=[
+        "some-mahalanobis2-no_region", "some-axis_ratio-no_axis_ratio",
+        "all-mahalanobis2-no_region", "all-axis_ratio-no_axis_ratio",
+    ],
+)  # fmt: skip
+def test_an_uncertainty_that_is_no_longer_stated_is_seen(condition, share, lost, quantity):
     table = changed(rows(), True, mahalanobis2=1.0)
     verdict = compare(night(changed(table, condition, **{lost: None})), night(table))
     assert set(verdict.regressions["quantity"]) == {quantity}
@@ -312,7 +324,10 @@ def test_an_uncertainty_that_is_no_longer_stated_is_seen(lost, quantity, conditi
     assert (row["baseline"], row["tonight"]) == (0, pytest.approx(share))
 
 
-@pytest.mark.parametrize(("lost", "quantity"), [("mahalanobis2", "no_region"), ("axis_ratio", "no_axis_ratio")])
+@pytest.mark.parametrize(
+    ("lost", "quantity"),
+    [("mahalanobis2", "no_region"), pytest.param("axis_ratio", "no_axis_ratio", marks=pytest.mark.ci)],
+)
 def test_where_no_uncertainty_was_ever_stated_there_is_none_to_lose(lost, quantity):
     never = changed(rows(), True, **{"mahalanobis2": 1.0, lost: None})
     quiet = compare(night(raised(never, 1 + 1e-9)), night(never))

@@ -50,6 +50,7 @@ def test_more_wrong_signs_are_a_regression_and_fewer_must_be_explained():
     assert any("the share of wrong signs among those that motion told" in cause for cause in verdict.causes)
 
 
+@pytest.mark.ci  # meanwhile: test_more_wrong_signs_are_a_regression_and_fewer_must_be_explained
 def test_equal_signs_are_equal_and_one_wrong_sign_is_no_finding():
     assert compare(night(with_signs(told=0.5)), night(with_signs(told=0.5))).bit_equal
     verdict = compare(night(with_signs(wrong=0.002)), night(with_signs()))
@@ -93,6 +94,7 @@ def test_a_run_whose_motion_tells_nothing_does_not_pass_and_one_without_motion_h
     assert wrong_signs(rows()) == []
 
 
+@pytest.mark.ci  # meanwhile: test_the_canary_holds_told_signs_to_the_stated_rate, on made rows
 @pytest.mark.render
 def test_reversed_signs_are_seen_where_nothing_else_changes(tmp_path):
     whole = load_experiment("motion", {"realisations": 3})

@@ -323,7 +323,7 @@ def test_what_was_missed_and_what_was_refused_is_told():
     assert (row.answered, row.unanswered) == ("3 of 6", "2 missed, 1 refused")
 
 
-@pytest.mark.parametrize(("frames", "highlights"), [(12, 3), (8, 2)])
+@pytest.mark.parametrize(("frames", "highlights"), [pytest.param(12, 3, marks=pytest.mark.ci), (8, 2)])
 def test_the_interval_of_a_median_holds_it_in_95_of_100_samples_of_frames(frames, highlights):
     random, trials = np.random.default_rng(5), 150
     settings = np.zeros(frames * highlights, int)

@@ -27,6 +27,7 @@ from simtest.validation.cases import expand
 from simtest.validation.metrics import mahalanobis2
 from simtest.validation.realisation import realise
 from simtest.validation.runner import run_experiment
+from tests.marked import marked
 
 CAMERA = Camera(80, 60, 100.0, 100.0, 40.0, 30.0)
 GOOD = {"normal": np.array([0, 0, -1.0]), "candidates": np.array([[0, 0, -1.0]]), "look_px": np.array([40.0, 30.0])}
@@ -216,7 +217,8 @@ def test_false_detections_that_failed_are_counted():
 
 @pytest.mark.render
 @pytest.mark.parametrize(
-    "name", ["plane", "cylinder", "sphere", "saddle", pytest.param("anatomy", marks=pytest.mark.slow)]
+    "name",
+    marked(["plane", "cylinder", "sphere", "saddle", "anatomy"], ci=["cylinder", "sphere", "saddle"], slow=["anatomy"]),
 )
 def test_a_rendered_picture_can_be_reconstructed(name, tmp_path):
     """sRGB encoding lifts the noise of dark pixels: undone before detection."""

@@ -392,7 +392,14 @@ def test_lights_that_are_not_told_apart_are_in_the_budget():
     assert np.trace(found.budget["light_offset"]) == pytest.approx(half**2, rel=0.05)
 
 
-@pytest.mark.parametrize("prior", [None, Uniform(8.0, 60.0), Normal(30.0, 9.0)])
+@pytest.mark.parametrize(
+    "prior",
+    [
+        None,
+        pytest.param(Uniform(8.0, 60.0), marks=pytest.mark.ci),
+        pytest.param(Normal(30.0, 9.0), marks=pytest.mark.ci),
+    ],
+)
 def test_regions_hold_over_the_distance_where_lights_are_not_told_apart(prior):
     # Lights on both sides: their mean lies at the camera, so that the distance moves nothing of what it gives.
     lights = ((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))

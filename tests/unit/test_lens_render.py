@@ -303,7 +303,7 @@ SURFACES = [
     {"type": "sphere", "radius_mm": 30.0, "side": "inside"},
     {"type": "cylinder", "radius_mm": 20.0, "side": "inside"},
     {"type": "quadric", "k1_per_mm": 0.02, "k2_per_mm": -0.03},
-    {"type": "anatomy", "path": "colon"},
+    pytest.param({"type": "anatomy", "path": "colon"}, marks=pytest.mark.ci),
 ]
 
 

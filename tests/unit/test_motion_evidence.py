@@ -12,6 +12,7 @@ from simtest.estimators.moved_patch import FirstPicture
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.estimators.two_views import EXACT, WRONG_SHARE, MovedView, PoseError, rank_by_motions
 from simtest.geometry.vectors import basis_across, rotation
+from tests.marked import marked
 
 D, GAIN_SD, DISTANCE_SD, NORMAL_SD = 10.0, 0.03, 0.05, 1e-3
 PRIORS = Priors(distance_mm=Normal(D, DISTANCE_SD * D))
@@ -80,7 +81,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize("name", marked(CASES, ci=["short", "one"]))
 def test_a_told_sign_is_wrong_no_more_often_than_stated(name):
     motions, pose = CASES[name]
     trials = 100 // len(motions)

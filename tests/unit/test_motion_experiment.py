@@ -82,6 +82,7 @@ def test_malformed_views_are_refused(key, value):
         scene_from_dict({"surface": SADDLE, "views": {key: value}})
 
 
+@pytest.mark.ci  # meanwhile: test_motion_evidence and test_motion_sequence
 @pytest.mark.render
 def test_a_small_run_tells_right_signs_and_none_where_the_poses_are_backwards(tmp_path):
     whole = keep_label(load_experiment("motion", {"realisations": 2}), "saddle", sweep=({"views.length_mm": (0.5,)},))

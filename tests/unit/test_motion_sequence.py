@@ -15,6 +15,7 @@ from simtest.reconstruction.sequence import reconstruct_sequence
 from simtest.rendering import Session
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import scene_from_dict
+from tests.marked import marked
 
 CALIBRATION = """
 [camera]
@@ -85,7 +86,7 @@ def shapes_in(folder):
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("name", list(SHAPES))
+@pytest.mark.parametrize("name", marked(SHAPES, ci=["convex", "concave"]))
 def test_a_sequence_with_poses_tells_the_shape(film, name, tmp_path):
     folder, options = film(name)
     made = reconstruct_sequence(folder / "frames", tmp_path / "out", options)

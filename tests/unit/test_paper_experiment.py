@@ -77,6 +77,7 @@ def test_rows_do_not_depend_on_the_workers(run, tmp_path):
     assert (tmp_path / "two" / "results.parquet").read_bytes() == (run.folder / "results.parquet").read_bytes()
 
 
+@pytest.mark.ci  # meanwhile: test_cli: the same command goes on and gives the same results
 def test_a_run_cut_in_two_gives_the_same_bytes(run, tmp_path):
     def stop_in_the_second_setting(done, _total, _name):
         if done > 130:

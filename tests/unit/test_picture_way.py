@@ -13,7 +13,7 @@ def test_layers_are_those_of_the_contract():
     assert height["detection"] == height["estimators"]
 
 
-@pytest.mark.parametrize("detector", ["colour", "peaks"])
+@pytest.mark.parametrize("detector", [pytest.param("colour", marks=pytest.mark.ci), "peaks"])
 def test_a_picture_climbs_three_times_through_five_packages(tmp_path, detector):
     picture = frame() if detector == "colour" else np.repeat(frame().mean(axis=2)[:, :, None], 3, axis=2)
     file = save(tmp_path / "shot.png", picture)

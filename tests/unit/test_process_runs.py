@@ -23,6 +23,7 @@ from simtest.runtime.provenance import file_hash
 from simtest.spec.dataset_recipe import Dataset, load_dataset
 from simtest.spec.paper import PaperSetting
 from simtest.validation.paper.gallery_item import reproduce_command
+from tests.marked import marked
 from tests.unit.core_helpers import BAD_CORE, CORES, OWN_CORE, processes_with, wait_until
 
 EXPERIMENT = """
@@ -89,7 +90,7 @@ def same_but_for_the_name(results, first, second):
     assert differing == []
 
 
-@pytest.mark.parametrize("transport", ["", "--files"])
+@pytest.mark.parametrize("transport", ["", pytest.param("--files", marks=pytest.mark.ci)])
 def test_an_estimator_of_ours_gives_the_same_rows_as_a_core(tmp_path, published, transport):
     core = command(OWN_CORE, "cone_axis", transport)
     run = simtest.validate(published, tmp_path / "run", estimators=["cone_axis", core])
@@ -222,7 +223,9 @@ def test_a_guard_is_no_child_so_that_who_kills_all_children_leaves_it(tmp_path):
     assert wait_until(lambda: not processes_with(folder))
 
 
-@pytest.mark.parametrize("then", ["", "raise SystemExit(1)", "import os; os._exit(0)"])
+@pytest.mark.parametrize(
+    "then", marked(["", "raise SystemExit(1)", "import os; os._exit(0)"], ci=["", "import os; os._exit(0)"])
+)
 def test_a_core_ends_with_its_parent(tmp_path, then):
     mark = f"--mark={tmp_path.name}"
     started = parent(then, command(BAD_CORE, "none", mark))
@@ -262,7 +265,7 @@ def test_a_run_that_is_stopped_leaves_no_process(tmp_path, number, workers):
 
 
 @pytest.mark.filterwarnings("ignore:bad_core:RuntimeWarning")
-@pytest.mark.parametrize("kind", ["published", "experiment"])
+@pytest.mark.parametrize("kind", ["published", pytest.param("experiment", marks=pytest.mark.ci)])
 def test_a_run_closes_its_cores(tmp_path, kind, request):
     mark = f"--mark={tmp_path.name}"
     core = command(BAD_CORE, "none", mark)
@@ -326,7 +329,7 @@ def test_the_rows_of_a_core_that_breaks_down_depend_on_no_part_before(tmp_path, 
     assert not whole["flags"].str.contains("not asked").any()
 
 
-@pytest.mark.parametrize("extra", ["", "'$HOME' '\"!'"])
+@pytest.mark.parametrize("extra", [pytest.param("", marks=pytest.mark.ci), "'$HOME' '\"!'"])
 def test_the_command_that_makes_a_realisation_again_holds_the_core(extra):
     core = command(BAD_CORE, "none", extra)
     line = reproduce_command(PaperSetting(), (core,), 7)

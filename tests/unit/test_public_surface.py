@@ -98,7 +98,7 @@ SLOW = {"scipy", "polars", "matplotlib", "mitsuba", "drjit", "trimesh", "igl", "
 """Packages that reconstruction of a picture needs no more than a page of figures."""
 
 
-@pytest.mark.parametrize("known", ["camera", "fov"])
+@pytest.mark.parametrize("known", ["camera", pytest.param("fov", marks=pytest.mark.ci)])
 def test_a_picture_is_reconstructed_without_slow_packages(known, tmp_path):
     y, x = np.mgrid[:90, :120]
     picture = 40 + 180 * np.exp(-((x - 60) ** 2 / 300 + (y - 45) ** 2 / 200))

@@ -48,6 +48,7 @@ def test_two_halves_of_one_set_are_told_apart_on_nothing():
         assert all(d.verdict == "far" for d in far)
 
 
+@pytest.mark.ci  # meanwhile: test_the_command_says_too_few_scenes
 def test_few_scenes_carry_no_verdict():
     assert {d.verdict for d in distances(scenes(4), scenes(30, seed=1))} == {"too few scenes"}
     assert {d.verdict for d in distances(scenes(30), scenes(4, seed=1))} == {"too few scenes"}

@@ -1,6 +1,7 @@
 """The relief against 4th-order differences of its height, its told statistics, and the same inside a kernel."""
 
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from simtest.spec.relief import MAX_HEIGHT_MM, Relief
 from simtest.surfaces import forget_meshes
 from simtest.surfaces.relief_field import NODES, HeightJets, fine_normals, make_relief
 from tests.example_counts import examples
+from tests.marked import marked
 
 STENCIL = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))
 """Central differences of 4th order."""
@@ -118,8 +120,14 @@ def relative(found, curvature):
     return np.abs(found - curvature).max(axis=1) / np.maximum(np.abs(curvature).max(axis=1), 1e-3)
 
 
-@pytest.mark.parametrize("level", [None, -0.5])
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n == "liver" else []) for n in SURFACES])
+@pytest.mark.parametrize(
+    ("name", "level"),
+    marked(
+        product(SURFACES, [None, -0.5]),
+        ci=[("quadric", None), ("quadric", -0.5), ("colon", None)],
+        slow=[("liver", None), ("liver", -0.5)],
+    ),
+)
 def test_fine_normals_and_curvatures_are_those_of_the_height(name, level):
     session = Session(scene(SURFACES[name], RELIEF))
     session.surface.relief = make_relief(session.scene.surface.relief, level)
@@ -232,8 +240,13 @@ def plane_heights(field, normal, along, count=40_000, seed=1):
     return h0, first, second
 
 
-@pytest.mark.parametrize("kind", ["gaussian", "ridged", "pits"])
-@pytest.mark.parametrize("width", [0.05, 0.25, 0.5])
+@pytest.mark.parametrize(
+    ("width", "kind"),
+    marked(
+        product([0.05, 0.25, 0.5], ["gaussian", "ridged", "pits"]),
+        ci=[(0.05, "gaussian"), (0.05, "pits"), (0.25, "gaussian"), (0.25, "ridged"), (0.5, "ridged"), (0.5, "pits")],
+    ),
+)
 def test_slope_wavelength_and_height(kind, width):
     field = make(kind=kind, width=width)
     h, (hx, hy), (hxx, hyy) = plane_heights(field, [1, 2, 3], [3, 0, -1])
@@ -254,7 +267,7 @@ def test_theory_table_of_heights():
         assert 1e3 * field.deviation == pytest.approx(micrometres, rel=0.2)
 
 
-@pytest.mark.parametrize("anisotropy", [2.0, 5.0])
+@pytest.mark.parametrize("anisotropy", [2.0, pytest.param(5.0, marks=pytest.mark.ci)])
 def test_anisotropy_draws_waves_out_along_the_direction(anisotropy):
     field = make(anisotropy=anisotropy, direction=(0.0, 2.0, 1.0))
     _, (along, across), (along_2, across_2) = plane_heights(field, [1, 0, 0], [0, 2, 1])

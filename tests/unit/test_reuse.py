@@ -10,6 +10,7 @@ from simtest.simulation.rendered_view import has_quick_look, render_view, shows_
 from simtest.spec import scene_from_dict
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.spec_model import validate
+from tests.marked import marked
 
 pytestmark = pytest.mark.render
 
@@ -50,7 +51,7 @@ SEARCHED_AGAIN = {"lights", "camera", "back"}
 @pytest.mark.parametrize(
     ("surface", "steps"),
     [
-        pytest.param(COLON, ("reflectance", "lights"), id="colon"),
+        pytest.param(COLON, ("reflectance", "lights"), id="colon", marks=pytest.mark.ci),
         pytest.param(COLON, tuple(STEPS), id="colon, all", marks=pytest.mark.slow),
         pytest.param(ROUGH, tuple(STEPS), id="rough"),
     ],
@@ -75,7 +76,7 @@ def test_highlights_and_labels_are_those_of_a_fresh_session(surface, steps, monk
         assert labels_of(kept) == labels_of(fresh), name
 
 
-@pytest.mark.parametrize("surface", [COLON, ROUGH], ids=["colon", "rough"])
+@pytest.mark.parametrize("surface", [pytest.param(COLON, marks=pytest.mark.ci), ROUGH], ids=["colon", "rough"])
 def test_highlights_that_get_their_radiance_later_stand_as_if_found_with_it(surface):
     session = Session(scene(surface))
     radiance = session.radiance()
@@ -128,7 +129,7 @@ def recipe(family, **values):
     ("family", "least"),
     [
         pytest.param("colon", 3, marks=pytest.mark.slow),
-        pytest.param("liver", 3, marks=pytest.mark.slow),
+        pytest.param("liver", 3, marks=pytest.mark.ci),
         pytest.param("rough", 6, marks=pytest.mark.slow),
         ("one sample", 3),
     ],
@@ -150,7 +151,8 @@ def test_samples_are_the_same_bytes_without_reuse(family, least, monkeypatch):
         assert fresh.make(index).encode() == sample.encode()
 
 
-@pytest.mark.parametrize("family", ["colon", pytest.param("rough", marks=pytest.mark.slow)])
+# Meanwhile: test_a_quick_look_is_taken_where_it_costs_less_than_the_frame.
+@pytest.mark.parametrize("family", marked(["colon", "rough"], ci=["colon"], slow=["rough"]))
 def test_a_frame_that_is_not_rendered_shows_too_few_highlights(family):
     plan = Plan(recipe(family))
     session = Session(plan.draw(0).scene)
@@ -186,7 +188,7 @@ def test_a_quick_look_is_taken_where_it_costs_less_than_the_frame(samples, depth
     assert has_quick_look(drawn.model_copy(update={"render": effort})) is quick
 
 
-@pytest.mark.parametrize("tries", [8, 2])
+@pytest.mark.parametrize("tries", [pytest.param(8, marks=pytest.mark.ci), 2])
 def test_wide_sources_are_judged_by_the_frame_that_is_kept(tries, monkeypatch):
     bands = [{"slope_deg": 3.0, "wavelength_mm": 2.0}]
     wide = {"rig.lights": [{**LIGHTS[0], **DISC}], "render.samples_per_pixel": 4, "surface.relief": {"bands": bands}}

@@ -1,16 +1,14 @@
-"""How the tests themselves are run: long files first, slow cases left out, and nothing waits for the disk."""
+"""How the tests themselves are run: long files first, marks of single cases, and nothing waits for the disk."""
 
 import os
-import re
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import COLLECTED, LONGEST, SHARED, is_slow, matches
-from tests.slow_cases import MESHES, ONE_OF_A_KIND, SLOW
+from tests.conftest import LONGEST
+from tests.marked import marked
 
 TESTS = Path(__file__).resolve().parents[1]
-OF_SHARED_MESHES = ("[colon_*", "[liver*")
 
 
 def test_long_files_are_there_and_named_once():
@@ -18,38 +16,12 @@ def test_long_files_are_there_and_named_once():
     assert set(LONGEST) <= {path.stem for path in TESTS.rglob("test_*.py")}
 
 
-def test_slow_cases_are_tests_of_their_files():
-    files = {path.stem: path.read_text() for path in TESTS.rglob("test_*.py")}
-    for stem, groups in SLOW.items():
-        assert all(covered and names for covered, names in groups.items()), stem
-        for name in (name for names in groups.values() for name in names):
-            function = re.match(r"\w+", name).group()
-            ending = r"\w*" if name == f"{function}*" else ""
-            assert re.search(rf"^def {function}{ending}\(", files[stem], re.MULTILINE), name
-
-
-def test_every_slow_case_names_a_test_that_was_collected(request):
-    """Of the files of this run: all in `make test`."""
-    if any("::" in argument for argument in request.config.args):
-        pytest.skip("single tests of a file were asked for")
-    for stem in COLLECTED.keys() & SLOW.keys():
-        for covered, one in ((covered, one) for covered, names in SLOW[stem].items() for one in names):
-            if SHARED.is_dir() or not one.endswith(OF_SHARED_MESHES):
-                assert any(matches(one, name) for name in COLLECTED[stem]), (stem, one)
-            if covered in (ONE_OF_A_KIND, MESHES):
-                cases = f"{one.partition('[')[0]}["
-                assert [name for name, slow in COLLECTED[stem].items() if name.startswith(cases) and not slow], (
-                    stem,
-                    one,
-                )
-
-
-def test_a_slow_case_is_told_by_its_name_or_by_how_it_begins():
-    assert is_slow("test_stopping", "test_an_output_that_is_full_is_told[schema scene]")
-    assert not is_slow("test_stopping", "test_an_output_that_is_full_is_told[list scenes]")
-    assert is_slow("test_gate", "test_without_exact_pairs_the_test_is_unpaired[more]")
-    assert not is_slow("test_gate", "test_without_exact_pairs_the_test_is_unpaired[more and more]")
-    assert not is_slow("test_running_tests", "test_without_exact_pairs_the_test_is_unpaired[more]")
+def test_cases_bear_the_marks_under_which_they_are_listed():
+    cases = marked(["a", ("b", 1), "c"], ci=["a", ("b", 1)], slow=iter([("b", 1)]))
+    assert [case.values for case in cases] == [("a",), ("b", 1), ("c",)]
+    assert [[mark.name for mark in case.marks] for case in cases] == [["ci"], ["ci", "slow"], []]
+    with pytest.raises(AssertionError, match="d"):
+        marked(["a"], ci=["d"])
 
 
 def test_a_closed_file_cannot_be_flushed_to_the_disk(tmp_path):

@@ -145,7 +145,7 @@ def assert_equal(run, scored):
         assert ours[name].filter(single).equals(again[name].filter(single), null_equal=True), name
 
 
-@pytest.mark.parametrize("kind", ["csv", "parquet"])
+@pytest.mark.parametrize("kind", [pytest.param("csv", marks=pytest.mark.ci), "parquet"])
 def test_own_estimates_with_a_lens(lens, base, kind):
     table = base / f"lens.{kind}"
     own = own_answers(lens)

@@ -22,6 +22,7 @@ from simtest.spec import Experiment, load_calibration, scene_from_dict
 from simtest.validation import laws
 from simtest.validation.predicted import unknown_falloff
 from simtest.validation.runner import run_experiment
+from tests.marked import marked
 
 pytestmark = pytest.mark.render
 
@@ -56,7 +57,7 @@ def errors(session, described, seeds=(0,)):
 # Vignetting ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.05])
+@pytest.mark.parametrize("sigma", [0.0, pytest.param(0.05, marks=pytest.mark.ci)])
 def test_known_vignetting_is_undone(session, sigma):
     """cos^4, the highlight 20 deg off axis; the full-size frame, whose lobe is as wide as the project's others."""
     sensor = {"vignetting": COS4, "noise_sigma": sigma}
@@ -319,7 +320,7 @@ ENCODED = [
 ]
 
 
-@pytest.mark.parametrize("sensor", ENCODED, ids=range(len(ENCODED)))
+@pytest.mark.parametrize("sensor", marked(ENCODED, ci=[ENCODED[2]]), ids=range(len(ENCODED)))
 def test_pictures_read_back_as_the_frame(tmp_path, sensor):
     described = scene(sensor, size=240, focal=200.0)
     frame = render(described)

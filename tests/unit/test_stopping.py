@@ -127,7 +127,7 @@ def test_a_stop_while_the_command_is_loaded_is_silent():
 # The output ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", ["schema scene", "list", "doctor --help"])
+@pytest.mark.parametrize("command", [pytest.param("schema scene", marks=pytest.mark.ci), "list", "doctor --help"])
 def test_a_reader_that_has_gone_is_no_error(command):
     done = shell(f"$SIMTEST {command} | true; echo ${{PIPESTATUS[0]}}")
     assert (done.stdout, done.stderr) == ("0\n", "")
@@ -144,7 +144,7 @@ def test_a_reader_of_a_table_that_has_gone_is_no_error(tmp_path):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
-@pytest.mark.parametrize("command", ["schema scene", "list scenes"])
+@pytest.mark.parametrize("command", [pytest.param("schema scene", marks=pytest.mark.ci), "list scenes"])
 def test_an_output_that_is_full_is_told(command):
     done = shell(f"$SIMTEST {command} >/dev/full")
     assert done.returncode == 1

@@ -12,6 +12,7 @@ from simtest.surfaces.segment_table import make_table, seen_profile
 from simtest.surfaces.surface_samples import spread_points, surface_patch
 from simtest.surfaces.tissue_pattern import BLUR_PER_DEPTH, _make, make_pattern
 from simtest.surfaces.vessels import Segments, grow_vessels, segments
+from tests.marked import marked
 
 DEPTH_MM = TissueColour().vessels.depth_mm
 SMALL = {"width": 96, "height": 72, "fx": 90.0, "fy": 90.0}
@@ -35,7 +36,7 @@ def surface_of(name):
     return make_surface(scene(name).surface)
 
 
-@pytest.fixture(scope="module", params=["plane", "sphere", "inside a cylinder", "quadric", "colon"])
+@pytest.fixture(scope="module", params=list(SURFACES))
 def grown(request):
     surface = surface_of(request.param)
     return request.param, surface, grow_vessels(surface_patch(surface), TissueColour().vessels, 3)
@@ -44,6 +45,7 @@ def grown(request):
 # Trees -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("grown", marked(SURFACES, ci=["colon"]), indirect=True)
 def test_murray_holds_at_every_node(grown):
     _, _, forest = grown
     cubes = np.zeros(len(forest.parent))
@@ -221,7 +223,7 @@ def _brute(points, pieces, pattern):
     return found
 
 
-@pytest.mark.parametrize("name", ["plane", "inside a cylinder", "colon"])
+@pytest.mark.parametrize("name", ["plane", "inside a cylinder", pytest.param("colon", marks=pytest.mark.ci)])
 def test_the_table_finds_every_vessel(name):
     surface, spec = surface_of(name), TissueColour()
     pattern = make_pattern(surface, spec)
@@ -324,8 +326,17 @@ def test_there_is_no_seam_around_a_tube():
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono"])
-@pytest.mark.parametrize("name", ["plane", "sphere", "colon"])
+@pytest.mark.parametrize(
+    ("name", "variant"),
+    [
+        ("plane", "llvm_ad_rgb"),
+        ("sphere", "llvm_ad_mono"),
+        pytest.param("plane", "llvm_ad_mono", marks=pytest.mark.ci),
+        pytest.param("sphere", "llvm_ad_rgb", marks=pytest.mark.ci),
+        pytest.param("colon", "llvm_ad_rgb", marks=pytest.mark.ci),
+        pytest.param("colon", "llvm_ad_mono", marks=pytest.mark.ci),
+    ],
+)
 def test_the_kernel_is_the_reference(name, variant):
     session = Session(scene(name), variant)
     mi = session.mi

@@ -9,6 +9,7 @@ from simtest.rendering import Session
 from simtest.simulation.frame_files import write_frame
 from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import scene_from_dict
+from tests.marked import marked
 
 pytestmark = pytest.mark.render
 
@@ -66,7 +67,7 @@ def compare(session, turned, bent):
 
 
 @pytest.mark.parametrize("samples", [1, 3])
-@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize("name", marked(SURFACES, ci=["saddle", "colon"]))
 def test_labels_are_both_exact_truths_to_the_meshs_fineness(session, name, samples):
     surface, turned, bent = SURFACES[name]
     session.update(scene(surface, samples=samples))
@@ -75,7 +76,10 @@ def test_labels_are_both_exact_truths_to_the_meshs_fineness(session, name, sampl
 
 @pytest.mark.parametrize(
     ("file", "viewpoint"),
-    [pytest.param("colon_edingca_00090.ply", 1, marks=pytest.mark.slow), ("liver_sksurgery.ply", 0)],
+    [
+        pytest.param("colon_edingca_00090.ply", 1, marks=pytest.mark.slow),
+        pytest.param("liver_sksurgery.ply", 0, marks=pytest.mark.ci),
+    ],
 )
 def test_labels_of_a_users_mesh_are_both_truths(session, shared_data, file, viewpoint):
     mesh = {"type": "anatomy", "path": str(shared_data / "meshes" / file), "viewpoint": viewpoint}

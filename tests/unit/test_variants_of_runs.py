@@ -60,7 +60,7 @@ def alone(experiments, tmp_path_factory):
     return {name: run(experiments, [name], folder)[name] for name in experiments}
 
 
-@pytest.mark.parametrize("names", [("coloured", "grey"), ("grey", "coloured")])
+@pytest.mark.parametrize("names", [pytest.param(("coloured", "grey"), marks=pytest.mark.ci), ("grey", "coloured")])
 def test_an_experiment_beside_one_of_another_variant_has_the_rows_that_it_has_alone(
     names, experiments, alone, tmp_path
 ):

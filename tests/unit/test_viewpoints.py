@@ -13,10 +13,11 @@ from simtest.surfaces.liver import Liver
 from simtest.surfaces.mesh_surface import MeshSurface
 from simtest.surfaces.poses import AXIS_RANGE_MM, MeshProbe, lumen_pose, organ_pose
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
+from tests.marked import marked
 
 ROOT = Path(__file__).resolve().parents[2]
 MESHES = ROOT.parent / "shared/data/meshes"
-SURFACES = ["colon", pytest.param("liver", marks=pytest.mark.slow), "colon_edingca_00090", "liver_sksurgery"]
+SURFACES = marked(["colon", "liver", "colon_edingca_00090", "liver_sksurgery"], ci=["liver", "colon_edingca_00090"])
 
 
 def make(name, viewpoint):
