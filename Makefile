@@ -6,7 +6,7 @@ WORKERS ?= auto
 BIN := $(VENV)/bin
 RELEASE_PYTHONS ?= all
 PIP = -m pip install --quiet --disable-pip-version-check -c constraints.txt
-# A file's tests share what they render, so they stay in one process; tests/conftest.py puts the longest files first.
+# A file's tests share what they render, so they stay in one process; the largest files come first (tests/conftest.py).
 PYTEST = -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 

@@ -48,24 +48,17 @@ def pytest_collection_finish():
     gc.freeze()
 
 
-LONGEST = (
-    "test_examples", "test_relief", "test_gate_edits", "test_gate", "test_dataset", "test_nightly_run",
-    "test_process_runs", "test_cli", "test_colon", "test_core_check", "test_deformed_render", "test_tissue_colour",
-    "test_canaries", "test_photometric", "test_page_up_to_date", "test_dense_shading", "test_fit",
-    "test_nightly_page", "test_inverse_rendering", "test_reuse", "test_learn", "test_sensor_scenes", "test_export",
-    "test_dense_command", "test_mesh_surface", "test_motion_sequence", "test_gate_signs", "test_tracks",
-    "test_motion_evidence", "test_circle_pose", "test_process_faults", "test_nightly_browser", "test_dense_depths",
-    "test_curved", "test_stopping", "test_camera_path", "test_deforming_sequence", "test_anatomies", "test_glints",
-    "test_pages_browser",
-)  # fmt: skip
-"""Files of 4 s of processor time and more, the longest first."""
+def largest_first(files):
+    """Return files by their size: how long a file of tests takes is near enough, on 2 to 8 cores."""
+    return sorted(files, key=lambda file: -file.stat().st_size)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     """Put the longest files first: one that began last would leave workers idle."""
-    order = {name: number for number, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+    files = largest_first(dict.fromkeys(item.path for item in items))
+    order = {file: number for number, file in enumerate(files)}
+    items.sort(key=lambda item: order[item.path])
 
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared" / "data"

@@ -1,19 +1,18 @@
 """How the tests themselves are run: long files first, marks of single cases, and nothing waits for the disk."""
 
 import os
-from pathlib import Path
 
 import pytest
 
-from tests.conftest import LONGEST
+from tests.conftest import largest_first
 from tests.marked import marked
 
-TESTS = Path(__file__).resolve().parents[1]
 
-
-def test_long_files_are_there_and_named_once():
-    assert sorted(LONGEST) == sorted(set(LONGEST))
-    assert set(LONGEST) <= {path.stem for path in TESTS.rglob("test_*.py")}
+def test_large_files_come_first(tmp_path):
+    files = [tmp_path / name for name in ("small", "large", "as large")]
+    for file in files:
+        file.write_text("#" * (100 if "large" in file.name else 10))
+    assert [file.name for file in largest_first(files)] == ["large", "as large", "small"]
 
 
 def test_cases_bear_the_marks_under_which_they_are_listed():
