@@ -13,6 +13,7 @@ NEEDS = {
     "cores": ("Octave and a C++ compiler", ("octave-cli", "g++")),
     "docs": ("docs", ("sphinx",)),
     "exchange": ("test-extras", ("datasets", "webdataset", "mlcroissant", "ray", "pycolmap")),
+    "git": ("git", ("git",)),
     "learn": ("learn", ("torch", "safetensors", "onnx", "onnxruntime")),
     "video": ("video", ("av",)),
     "viewer": ("libEGL", ("EGL",)),

@@ -57,7 +57,7 @@ mkdir -p earlier/history/date=2026-01-01 && echo "$3" > earlier/history/date=202
 """)
     gh.chmod(0o755)
     path = f"{gh.parent}:{os.environ['PATH']}"
-    subprocess.run(["bash", "-e", "-c", script], cwd=tmp_path, env={"PATH": path}, check=True, capture_output=True)
+    subprocess.run(["/bin/bash", "-e", "-c", script], cwd=tmp_path, env={"PATH": path}, check=True, capture_output=True)
     found = tmp_path / "reports" / "history" / "date=2026-01-01" / "night"
     assert (found.read_text().strip() if found.exists() else None) == kept
     assert not (tmp_path / "earlier").exists()

@@ -333,7 +333,7 @@ def test_the_rows_of_a_core_that_breaks_down_depend_on_no_part_before(tmp_path, 
 def test_the_command_that_makes_a_realisation_again_holds_the_core(extra):
     core = command(BAD_CORE, "none", extra)
     line = reproduce_command(PaperSetting(), (core,), 7)
-    done = subprocess.run(["bash", "-c", line.replace("python -c", f"{sys.executable} -c", 1)], capture_output=True,
+    done = subprocess.run(["/bin/sh", "-c", line.replace("python -c", f"{sys.executable} -c", 1)], capture_output=True,
                           text=True, timeout=60, check=True)  # fmt: skip
     assert "bad_core" in done.stdout
     assert "Estimate(normal=(0, 0, -1)" in done.stdout

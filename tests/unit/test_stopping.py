@@ -29,7 +29,7 @@ def script(code, *arguments, **options):
 
 def shell(line, folder=None):
     environment = {**os.environ, "SIMTEST": f"{sys.executable} -m simtest"}
-    return subprocess.run(["bash", "-c", line], cwd=folder, capture_output=True, text=True, timeout=60, check=False,
+    return subprocess.run(["/bin/bash", "-c", line], cwd=folder, capture_output=True, text=True, timeout=60, check=False,
                           env=environment)  # fmt: skip
 
 

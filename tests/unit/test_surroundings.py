@@ -53,7 +53,7 @@ def test_a_terminal_too_narrow_for_tables_counts_as_one_of_no_stated_width(monke
 
 def test_a_closed_output_is_no_error():
     command = f"{sys.executable} -m simtest schema scene >&-"
-    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(["/bin/sh", "-c", command], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
 
 
