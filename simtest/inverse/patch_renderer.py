@@ -14,6 +14,7 @@ import numpy as np
 from simtest.geometry import Array
 from simtest.rendering import backend, phong
 from simtest.rendering.direct import Material
+from simtest.rendering.lobes import channel_mean
 
 if TYPE_CHECKING:
     from simtest.inverse.rendered_quadric import RenderedQuadric
@@ -32,9 +33,6 @@ REACH = 1.0
 
 LOG_SCALE = 5
 """Index of the log scale among the parameters."""
-
-ALIGNED = 64
-"""Bytes; Dr.Jit reads arrays at multiples of its vectors' size by other instructions."""
 
 GOLDEN = (0.7548776662466927, 0.5698402909980532)
 """Steps of the R2 sequence, evenly spread points of the unit square; the same for every pixel and evaluation."""
@@ -63,7 +61,8 @@ class PatchRenderer:
         plugin = phong.register(mi, str(mi.variant()))
         self.mi, self.dr, self.count, self.depth = mi, drjit, len(rays), path_depth
         self.samples = samples
-        self._rays = np.ascontiguousarray(rays, dtype=np.float32)
+        # Gathered: a kernel keeps the length of an array of shape (n, 3), and whether its address is aligned.
+        self._rays = [mi.Float(np.ascontiguousarray(part, dtype=np.float32)) for part in rays.T]
         # Lobe and base of unit strength: their factors are differentiated outside of the BSDF.
         self._bsdf = mi.load_dict(
             {"type": plugin, "specular": 1.0, "diffuse_reflectance": {"type": "rgb", "value": [1.0] * 3}}
@@ -74,12 +73,11 @@ class PatchRenderer:
 
         `kept` holds a bool for each of the eight parameters: s (2), stretch (3), log scale, log n, base.
         """
-        mi, columns, lanes = self.mi, int(sum(kept)), len(self._rays)
         # lanes: a copy of all pixels for each parameter
-        rays = self._vectors(np.tile(self._rays.T, (1, columns)))
-        which = self._lanes(lanes * columns) // self._opaque(lanes, mi.UInt32)
-        direct = _Surface(self, patch, self._parameters(patch, kept, which)).radiance(rays)
-        image, slopes = (values.reshape(columns, lanes) for values in self._evaluated(direct))
+        columns, count = int(sum(kept)), self._opaque(self.count, self.mi.UInt32)
+        lane = self._lanes(self.count * columns)
+        direct = _Surface(self, patch, self._parameters(patch, kept, lane // count)).radiance(self._seen(lane % count))
+        image, slopes = (values.reshape(columns, self.count) for values in self._evaluated(direct))
         intensity, J = image[0], slopes.T
         if self.depth > 2:
             intensity, J = self._with_bounces(patch, kept, intensity, J)
@@ -95,7 +93,7 @@ class PatchRenderer:
         It is not differentiated by position and shape: where a concave patch focuses light, the derivatives of sampled
         paths are noise, while the intensities hardly move.
         """
-        rays = self._vectors(np.repeat(self._rays, self.samples, axis=0).T)
+        rays = self._seen(self._lanes(self.count * self.samples) // self._opaque(self.samples, self.mi.UInt32))
         by_base = [False] * (len(kept) - 1) + [kept[-1]]
         surface = _Surface(self, patch, self._parameters(patch, by_base, self.mi.UInt32(0)))
         added = self._bounced(surface, rays)
@@ -130,20 +128,9 @@ class PatchRenderer:
         """Return the lane numbers."""
         return self.dr.arange(self.mi.UInt32, width)
 
-    def _vectors(self, columns: Array) -> Any:
-        """Return vectors from their x, y and z, shape (3, n).
-
-        A kernel holds the length of one array of shape (3, n), and whether an array's address is a multiple of `ALIGNED`;
-        three arrays at such addresses compile nothing anew.
-        """
-        made = []
-        for values in columns:
-            memory = np.empty(4 * len(values) + ALIGNED, np.uint8)
-            first = -memory.ctypes.data % ALIGNED
-            held = memory[first : first + 4 * len(values)].view(np.float32)
-            held[:] = values
-            made.append(self.mi.Float(held))
-        return self.mi.Vector3f(*made)
+    def _seen(self, pixel: Any) -> Any:
+        """Return the sightlines of pixels by their number."""
+        return self.mi.Vector3f(*(self.dr.gather(self.mi.Float, part, pixel) for part in self._rays))
 
     def _opaque(self, value: Any, kind: Any = None) -> Any:
         """Return a value that the kernel reads from memory, so that changing it compiles nothing."""
@@ -276,13 +263,13 @@ class _Surface:
             towards = light - si.p
             squared = dr.squared_norm(towards)
             lobe, base = self.material.parts(mi, si, si.to_local(towards * dr.rsqrt(squared)), mi.Bool(lit))
-            radiance += (dr.mean(lobe) + self.base * dr.mean(base)) / squared * self.distance**2
+            radiance += (channel_mean(lobe) + self.base * channel_mean(base)) / squared * self.distance**2
         return radiance
 
     def reflected(self, si: Any, local: Any) -> Any:
         """Return f cos(theta) of lobe and base together."""
         lobe, base = self.material.parts(self.mi, si, local, self.mi.Bool(True))
-        return self.dr.mean(lobe) + self.base * self.dr.mean(base)
+        return channel_mean(lobe) + self.base * channel_mean(base)
 
     def sample(self, si: Any, first: Any, second: Any) -> tuple[Any, Any]:
         """Draw directions, local and not differentiated, with their densities."""

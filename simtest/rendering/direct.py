@@ -9,6 +9,7 @@ from simtest.rendering import emission
 from simtest.rendering.albedo import AlbedoKernel
 from simtest.rendering.hits import Hit
 from simtest.rendering.light_points import DRAWN, Draw, Drawer, point
+from simtest.rendering.lobes import channel_mean
 from simtest.rendering.rays import Lanes
 from simtest.spec.rig import Rig, is_at_camera
 
@@ -191,7 +192,7 @@ class DirectLight:
             lobe, base = self._from(i, None, material, hit, position)
             specular += weight * lobe
             diffuse += weight * base
-            whole += weight * dr.mean(lobe + base)
+            whole += weight * channel_mean(lobe + base)
             reached.append((position, mi.Float(whole)))
         # The shadow ray's target: the first point up to which the share of the choice has come together.
         share, (target, _) = draw.choice(mi, i) * whole, reached[-1]

@@ -1,4 +1,4 @@
-"""Powers of a cosine in single precision, for narrow lobes."""
+"""Powers of a cosine in single precision, for narrow lobes, and the mean of a spectrum."""
 
 from typing import Any
 
@@ -25,3 +25,12 @@ def log_cosine(first: Any, second: Any) -> tuple[Any, Any]:
     squared = dr.squared_norm(first - second) / dr.squared_norm(first + second)
     ahead = squared < 1
     return -2 * dr.atanh(dr.select(ahead, squared, 0)), ahead
+
+
+def channel_mean(spectrum: Any) -> Any:
+    """Return the mean of a spectrum's channels.
+
+    `drjit.mean` multiplies by the length of the launch and divides by it again, and keeps both in the kernel, so that
+    each other length compiles another kernel.
+    """
+    return sum(spectrum) / len(spectrum)

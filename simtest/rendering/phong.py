@@ -77,7 +77,7 @@ def _make_class(mi: Any, variant: str) -> Any:
             if not (glossy and diffuse):
                 return mi.Float(float(glossy))
             lobe = self.specular if self.normalised else self.specular * dr.two_pi / (self.exponent + 1)
-            base = dr.mean(self._albedo(si, active))
+            base = lobes.channel_mean(self._albedo(si, active))
             whole = lobe + base
             return dr.detach(dr.select(whole > 0, lobe / dr.select(whole > 0, whole, 1), 0.5))
 

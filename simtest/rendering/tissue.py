@@ -5,6 +5,7 @@ from functools import cache
 from typing import Any
 
 from simtest.rendering.lobe_over_base import lobe_over_base
+from simtest.rendering.lobes import channel_mean
 
 PLUGIN = "simtest_tissue"
 
@@ -125,7 +126,7 @@ def _share(bsdf: Any, ctx: Any, si: Any, wi: Any, active: Any) -> Any:
     if not (glossy and diffuse):
         return mi.Float(float(glossy))
     film = mi.fresnel(wi.z, bsdf.index)[0]
-    base = (1 - film) * (1 - bsdf.returned) * dr.mean(bsdf._lift(bsdf._albedo(si, active)))
+    base = (1 - film) * (1 - bsdf.returned) * channel_mean(bsdf._lift(bsdf._albedo(si, active)))
     return dr.detach(film / (film + base))
 
 
