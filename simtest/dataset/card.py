@@ -27,7 +27,7 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
     """Return the card's text, which depends on the dataset alone."""
     dataset = plan.dataset
     # samples and shards of each split
-    counts: dict[str, list[int]] = {name: [0, 0] for name in dataset.splits.shares}
+    counts: dict[str, list[int]] = {name: [0, 0] for name in plan.splits}
     for shard in plan.shards:
         counts[shard.split][0] += len(shard.indices)
         counts[shard.split][1] += 1
@@ -40,6 +40,7 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
     return environment.get_template("card.md.j2").render(
         dataset=dataset,
         counts=counts,
+        made_small=plan.made_small,
         fields=[field for field in FIELDS if field.name not in plan.fields_left_out],
         has_relief=plan.has_relief,
         has_instruments=plan.has_instruments,

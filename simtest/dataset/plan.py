@@ -114,8 +114,19 @@ class Plan:
         for k, family in enumerate(dataset.families):
             self._check(k, family)
         self._check_shared()
+        self.splits, self.samples_per_anatomy = _made_small(dataset)
         self._blocks = self._lay_out()
         self._splits = self._assign()
+
+    @cached_property
+    def made_small(self) -> str:
+        """What a dataset of few samples has fewer of than its recipe asks for; empty where it lacks nothing."""
+        asked, what = self.dataset, []
+        if self.samples_per_anatomy < asked.samples_per_anatomy:
+            what.append(f"samples_per_anatomy is {self.samples_per_anatomy}, not {asked.samples_per_anatomy}")
+        if empty := [name for name in asked.splits.shares if name not in self.splits]:
+            what.append(f"{' and '.join(empty)}: no sample")
+        return f"samples = {asked.samples}, few for the splits: {'; '.join(what)}" if what else ""
 
     @cached_property
     def has_relief(self) -> bool:
@@ -208,7 +219,7 @@ class Plan:
     def _lay_out(self) -> list[Anatomy]:
         """Return the anatomy of each block of `samples_per_anatomy` samples."""
         dataset = self.dataset
-        count = -(-dataset.samples // dataset.samples_per_anatomy)
+        count = -(-dataset.samples // self.samples_per_anatomy)
         counts = _shared(count, [family.weight for family in dataset.families])
         blocks = []
         for k, (family, wanted) in enumerate(zip(dataset.families, counts, strict=True)):
@@ -232,11 +243,11 @@ class Plan:
         sizes: dict[Anatomy, int] = {}
         for block, anatomy in enumerate(self._blocks):
             sizes[anatomy] = sizes.get(anatomy, 0) + len(self._block_indices(block))
-        shares = self.dataset.splits.shares
+        shares = self.splits
         if len(sizes) < len(shares):
             raise InputError(
                 f"splits: {len(sizes)} anatomies for {len(shares)} splits ({', '.join(shares)}); no anatomy may be in "
-                "two: give more samples or seeds, a smaller samples_per_anatomy, or fewer splits"
+                "two: give more families or seeds, or fewer splits"
             )
         lacking = {name: share * self.dataset.samples for name, share in shares.items()}
         assigned: dict[Anatomy, str] = {}
@@ -251,12 +262,12 @@ class Plan:
         return assigned
 
     def _block_indices(self, block: int) -> range:
-        size = self.dataset.samples_per_anatomy
+        size = self.samples_per_anatomy
         return range(block * size, min((block + 1) * size, self.dataset.samples))
 
     def anatomy(self, index: int) -> Anatomy:
         """Return the anatomy of a sample."""
-        return self._blocks[index // self.dataset.samples_per_anatomy]
+        return self._blocks[index // self.samples_per_anatomy]
 
     def split(self, index: int) -> str:
         """Return the split of a sample."""
@@ -275,7 +286,7 @@ class Plan:
     @cached_property
     def shards(self) -> tuple[Shard, ...]:
         """All shards."""
-        indices: dict[str, list[int]] = {name: [] for name in self.dataset.splits.shares}
+        indices: dict[str, list[int]] = {name: [] for name in self.splits}
         for block, anatomy in enumerate(self._blocks):
             indices[self._splits[anatomy]] += self._block_indices(block)
         size = self.samples_per_shard
@@ -311,6 +322,15 @@ class Plan:
         where = f"{dataset.name}, sample {index}"
         data = apply_settings(self._bases[anatomy.family], {**values, **seeds}, where)
         return Drawn(scene_from_dict(data, where), anatomy, values)
+
+
+def _made_small(dataset: Dataset) -> tuple[dict[str, float], int]:
+    """Return the shares of the splits, and the samples of an anatomy; of both there are fewer where samples are few."""
+    shares, each = dataset.splits.shares, dataset.samples_per_anatomy
+    if dataset.samples > each * (len(shares) - 1):
+        return shares, each
+    largest = sorted(shares, key=lambda name: -shares[name])[: dataset.samples]
+    return {name: share for name, share in shares.items() if name in largest}, max(1, dataset.samples // len(shares))
 
 
 def _draw(drawn: Mapping[str, Distribution], rng: np.random.Generator) -> dict[str, JsonValue]:

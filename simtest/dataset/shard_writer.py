@@ -2,6 +2,7 @@
 
 import errno
 import os
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -81,6 +82,8 @@ def write_dataset(
         If the dataset cannot be made as described, or the folder holds something else or cannot be written.
     """
     plan = Plan(dataset)
+    if plan.made_small:
+        warnings.warn(plan.made_small, stacklevel=2)
     # Refused before anything is written; who reads the dataset needs neither packages nor cores.
     load_estimators(dataset.estimators)
     with _one_line_errors(folder), exclusive_folder(folder):

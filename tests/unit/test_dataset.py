@@ -72,23 +72,34 @@ def test_plan_shares_samples_out_once_and_no_anatomy_twice(samples, each, seed, 
     colon = {"scene": "anatomy", "set": {"surface.path": "colon"}, "seeds": {"low": 5, "high": 10_000}}
     liver = {"scene": "anatomy", "set": {"surface.path": "liver"}, "seeds": {"high": 400}, "weight": weight}
     described = {"name": "d", "samples": samples, "samples_per_anatomy": each, "seed": seed, "families": [colon, liver]}
-    if -(-samples // each) < 3:
-        with pytest.raises(InputError, match="anatomies for 3 splits"):
-            Plan(validate(Dataset, described, "d"))
-        return
     plan = Plan(validate(Dataset, described, "d"))
+    assert bool(plan.made_small) == (-(-samples // each) < 3)
     everything = [index for shard in plan.shards for index in shard.indices]
     assert sorted(everything) == list(range(samples))
     splits: dict[object, set[str]] = {}
     for index in range(samples):
         splits.setdefault(plan.anatomy(index), set()).add(plan.split(index))
     assert all(len(found) == 1 for found in splits.values())
-    assert {split for found in splits.values() for split in found} == {"train", "validation", "test"}
+    names = ("train", "validation", "test")[: min(samples, 3)]
+    assert {split for found in splits.values() for split in found} == set(names)
     seeds = [(anatomy.family, anatomy.seed) for anatomy in splits]
     assert len(set(seeds)) == len(seeds)
     # A split misses its share by less than two anatomies.
     train = sum(plan.split(index) == "train" for index in range(samples))
-    assert abs(train - 0.8 * samples) <= 2 * each
+    assert abs(train - 0.8 * samples) <= 2 * max(plan.samples_per_anatomy, 1) or samples < 3
+
+
+@pytest.mark.render
+def test_a_first_try_of_few_samples_is_a_whole_dataset_and_says_what_it_lacks(tmp_path):
+    recipe = tiny(samples=4, samples_per_anatomy=20, estimators=())
+    with pytest.warns(UserWarning, match="^samples = 4, few for the splits: samples_per_anatomy is 1, not 20$"):
+        write_dataset(recipe, tmp_path / "few", make_engine())
+    assert verify(tmp_path / "few") == []
+    assert {path.name.split("-")[0] for path in (tmp_path / "few").glob("*.tar")} == {"train", "validation", "test"}
+    assert "A small dataset: samples = 4" in (tmp_path / "few" / "README.md").read_text()
+    plan = Plan(tiny(samples=1, samples_per_anatomy=20))
+    assert plan.made_small.endswith("samples_per_anatomy is 1, not 20; validation and test: no sample")
+    assert plan.split(0) == "train"
 
 
 def test_draws_hang_on_index_and_attempt_alone():
@@ -135,7 +146,7 @@ BAD = {
     "no such key": ("per_sample", {"sensor.noise": {"low": 0.0, "high": 0.1}}, "sensor.noise = 0.0: unknown key"),
     "log of 0": ("per_sample", {"sensor.noise_sigma": {"low": 0, "high": 0.1, "log": True}}, "must be above 0"),
     "splits": ("splits", {"train": 0.5, "test": 0.1}, r"train \+ validation \+ test = 0.7: must be 1"),
-    "few anatomies": ("samples_per_anatomy", 12, "1 anatomies for 3 splits"),
+    "few anatomies": ("families", [{"scene": "plane"}], "1 anatomies for 3 splits"),
     "estimator": ("estimators", ["cone"], "cone"),
     "weights": ("per_sample", {"sensor.seed": {"choose": [1, 2], "weights": [1]}}, "must be as many"),
     "twice": ("per_sample", {"surface.radius_mm": {"low": 5, "high": 6}}, "drawn twice"),
