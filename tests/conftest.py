@@ -3,6 +3,7 @@
 import gc
 import os
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -18,8 +19,10 @@ settings.load_profile("untimed")
 if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
     os.environ.setdefault("SIMTEST_THREADS", "1")
 
-# Tests change constants and functions that the key of a kept array does not know of.
-os.environ["SIMTEST_CACHE"] = "off"
+# One folder of kept arrays for all workers of a run, so that an anatomy is grown once. It ends with the run.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    _KEPT = tempfile.TemporaryDirectory(prefix="simtest-tests-", ignore_cleanup_errors=True)
+    os.environ["SIMTEST_CACHE"] = _KEPT.name
 
 
 def _without_waiting(descriptor):

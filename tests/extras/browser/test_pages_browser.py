@@ -1,6 +1,6 @@
 """Run, nightly, realism, picture and 3D pages in a real browser: nothing overflows or is overprinted, axe is content.
 
-axe-core comes with the package axe-playwright-python (extra ci), which bundles axe.min.js.
+axe-core comes with the package axe-playwright-python (extra test-extras), which bundles axe.min.js.
 """
 
 import importlib.util
@@ -180,8 +180,6 @@ def test_a_phone_shows_at_most_eight_screens_before_more(opened, name):
 @pytest.mark.parametrize("name", PAGES)
 def test_axe_finds_nothing_serious(opened, name, width, scheme):
     found = importlib.util.find_spec("axe_playwright_python")
-    if found is None:
-        pytest.skip("axe-playwright-python is not installed: extra ci")
     page = opened(name, width, scheme)
     open_all(page)
     page.evaluate(Path(found.submodule_search_locations[0], "axe.min.js").read_text(encoding="utf-8"))
@@ -193,8 +191,6 @@ def test_axe_finds_nothing_serious(opened, name, width, scheme):
 
 def test_axe_sees_a_planted_fault(opened):
     found = importlib.util.find_spec("axe_playwright_python")
-    if found is None:
-        pytest.skip("axe-playwright-python is not installed: extra ci")
     page = opened("realism", 1400)
     page.evaluate("document.querySelector('img').removeAttribute('alt')")
     page.evaluate(Path(found.submodule_search_locations[0], "axe.min.js").read_text(encoding="utf-8"))
