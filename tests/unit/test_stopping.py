@@ -29,8 +29,9 @@ def script(code, *arguments, **options):
 
 def shell(line, folder=None):
     environment = {**os.environ, "SIMTEST": f"{sys.executable} -m simtest"}
-    return subprocess.run(["/bin/bash", "-c", line], cwd=folder, capture_output=True, text=True, timeout=60, check=False,
-                          env=environment)  # fmt: skip
+    return subprocess.run(
+        ["/bin/bash", "-c", line], cwd=folder, capture_output=True, text=True, timeout=60, check=False, env=environment
+    )
 
 
 def test_a_compiled_file_that_a_full_disk_cut_short_is_named(tmp_path):
