@@ -145,7 +145,7 @@ def _environment(scratch: Path) -> dict[str, str]:
 def _shell(command: str, scratch: Path, timeout_s: float) -> tuple[bool, str]:
     """Run a line in a shell; return whether it succeeded, and what it printed."""
     child = subprocess.Popen(
-        ["bash", "-c", command], cwd=scratch, env=_environment(scratch), stdin=subprocess.DEVNULL, text=True,
+        ["/bin/bash", "-c", command], cwd=scratch, env=_environment(scratch), stdin=subprocess.DEVNULL, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
     )  # fmt: skip
     try:

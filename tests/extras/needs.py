@@ -27,7 +27,9 @@ def program(name: str) -> str | None:
 
 
 def _is_there(name: str) -> bool:
-    if name.isidentifier() and find_spec(name) is not None:
+    # A folder of that name, as tests/extras/git, is no package: it has no origin.
+    spec = find_spec(name) if name.isidentifier() else None
+    if spec is not None and spec.origin is not None:
         return True
     return program(name) is not None or ctypes.util.find_library(name) is not None
 
