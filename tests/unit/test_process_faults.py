@@ -30,7 +30,7 @@ TRANSPORT = [
     ("ignores_term", "core_timeout", "no answer within"),
     ("reads_nothing", "core_timeout", "no answer within"),
     ("half_line", "core_timeout", "begun (25 bytes)"),
-    ("half_array", "core_timeout", "begun (5 bytes)"),
+    pytest.param("half_array", "core_timeout", "begun (5 bytes)", marks=pytest.mark.ci),  # waits 4 s, as half_line does
     ("late", "core_timeout", "no answer within"),
     ("closes_stdin", "core_protocol", "closed its standard input but did not end"),
     ("closes_stdout", "core_protocol", "closed its standard output but did not end"),
@@ -68,7 +68,7 @@ ANSWERS = [
 STARTS = [
     ("exit_at_start", "core_died", "exit code 4; its last words: no such model"),
     ("hang_at_start", "core_timeout", "no answer within"),
-    ("half_hello", "core_timeout", "begun (16 bytes)"),
+    pytest.param("half_hello", "core_timeout", "begun (16 bytes)", marks=pytest.mark.ci),  # waits 2 s
     ("no_hello", "core_protocol", "Welcome to the core!"),
     ("protocol", "core_protocol", "protocol 2; simtest speaks 1"),
     ("kind", "core_protocol", "kind 'film'; must be patch or frame"),
