@@ -24,6 +24,7 @@ from simtest.validation.paired import (
     targets_of,
     units,
 )
+from simtest.validation.row_kinds import is_false
 from simtest.validation.situations import Situation
 from simtest.validation.statistics import CONFIDENCE, Interval
 
@@ -157,15 +158,15 @@ def read_results(results: pl.DataFrame, frames: int) -> Found:
 def _counted(rows: pl.DataFrame) -> tuple[int, int, int, int]:
     """Return visible highlights, those found, detections, and false ones, from the rows of one method."""
     detected = rows.filter(pl.col("specularity").is_not_null())
+    false = detected.filter(is_false(detected)).height
     if rows["frame_visible"].null_count() == rows.height:
         # On a smooth surface a visible highlight is a true one.
         true = rows.filter(pl.col("true_id").is_not_null())
-        hit = true.filter(pl.col("status") != "missed").height
-        return true.height, hit, detected.height, detected.filter(pl.col("true_id").is_null()).height
+        # Without a detection a highlight is not found, whatever its status: in the dark it is no missed one.
+        return true.height, true.drop_nulls("specularity").height, detected.height, false
     visible = rows.group_by(FRAME).agg(pl.col("frame_visible").max())["frame_visible"].sum()
     hit = detected.drop_nulls("visible_id").unique([*FRAME, "visible_id"]).height
-    nothing = pl.col("visible_id").is_null() & pl.col("true_id").is_null()
-    return int(visible), hit, detected.height, detected.filter(nothing).height
+    return int(visible), hit, detected.height, false
 
 
 def _asked(rows: pl.DataFrame, target: str) -> pl.DataFrame:

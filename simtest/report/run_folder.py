@@ -147,6 +147,8 @@ class EstimatorFigures(BaseModel):
     n_failed_by_reason: Annotated[dict[str, int], BeforeValidator(lambda v: v or {})] = Field({}, title="failed")
     n_missed: int | None = Field(None, title="missed")
     n_false: int | None = Field(None, title="false")
+    n_in_spot: int | None = Field(None, title="in spots")
+    n_instrument: int | None = Field(None, title="on instruments")
     mean_deg: float | None = Field(None, title="mean\u00a0°")
     mean_oracle_deg: float | None = Field(None, title="mean, better candidate\u00a0°")
     rms_deg: float | None = Field(None, title="RMS\u00a0°")
