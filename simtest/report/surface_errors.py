@@ -72,7 +72,7 @@ def surface_errors(run: Run, has_figures: bool) -> SurfaceErrors | None:
 
 def _apart(results: pl.DataFrame) -> pl.DataFrame:
     """Name a surface twice where it is lit from the camera and from beside it: their errors differ in kind."""
-    beside = (pl.col("eps_over_d").mean().over("surface", "setting") > CO_LOCATED).fill_null(False)
+    beside = (pl.col("eps_over_d").max().over("surface", "setting") > CO_LOCATED).fill_null(False)
     results = results.with_columns(beside=beside)
     both = pl.col("beside").any().over("surface") & ~pl.col("beside").all().over("surface")
     name = pl.when(both & pl.col("beside")).then(pl.col("surface") + ", offset").otherwise("surface")
