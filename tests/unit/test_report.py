@@ -151,8 +151,8 @@ def make_item(path, radius=10.0, size=(64, 48), tilt=0.3, estimator="circle_pose
         common | {"estimator": "cone_axis", "error_deg": 0.01, "normal": (-s).tolist(), "candidates": [(-s).tolist()],
                   "isophotes": contours, "curves": []},
         common | {"estimator": "brightest_point", "specularity": 1, "true_id": None, "status": "no_peak",
-                  "error_deg": None, "normal": None, "candidates": [], "look_px": None, "isophotes": [],
-                  "curves": []},
+                  "kind": "false", "error_deg": None, "normal": None, "candidates": [], "look_px": None,
+                  "isophotes": [], "curves": []},
     ]  # fmt: skip
     meta = {
         "surface": "cylinder", "setting": f"R = {radius:g} mm", "label": "cylinder outside", "sigma": 0.02,
