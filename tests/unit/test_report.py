@@ -342,6 +342,21 @@ def test_a_law_of_another_reflectance_is_drawn_from_the_rows(tmp_path):
         np.testing.assert_allclose(curve.law_x, curve.x)
 
 
+@pytest.mark.parametrize("values", [np.linspace(0.5, 0.74, 7), np.linspace(-0.74, -0.5, 7), [0.5, 0.51, 2.0]])
+def test_neighbouring_settings_have_cells_of_their_own(tmp_path, values):
+    rng, rows = np.random.default_rng(0), []
+    for kd in values:
+        for eps in (0.05, 0.1):
+            # The offset moves the highlight, and so its curvature, a little.
+            own = rows_of_setting(rng, "sphere", f"{kd:.3f}, {eps}", float(kd) + 0.001 * eps, eps, 4)
+            rows += [row | {"experiment": "grid"} for row in own]
+    maps = heat_maps(read_run(make_run(tmp_path, "grid", rows, items=0)))
+    assert len(maps) == len(ESTIMATORS)
+    for item in maps:
+        assert item.mean_deg.shape == (2, len(values))
+        np.testing.assert_allclose(item.kd, values, atol=1e-3)
+
+
 def test_grid_gives_heat_maps_and_slices(tmp_path):
     path = make_run(tmp_path, "grid", items=0)
     run = read_run(path)
