@@ -14,16 +14,9 @@ import polars as pl
 from simtest.geometry import student_t
 from simtest.runtime.arrays import Array, IntArray
 from simtest.validation.guide import Advice, MethodFigures, advice_of
-from simtest.validation.paired import (
-    FRAME,
-    deviation_of_mean,
-    distinct_frames,
-    freedom_of,
-    half_width,
-    side_by_side,
-    targets_of,
-    units,
-)
+from simtest.validation.paired import FRAME, deviation_of_mean, freedom_of, targets_of, units
+from simtest.validation.ranking import Pair, best_of
+from simtest.validation.row_kinds import is_false
 from simtest.validation.situations import Situation
 from simtest.validation.statistics import CONFIDENCE, Interval
 
@@ -157,15 +150,15 @@ def read_results(results: pl.DataFrame, frames: int) -> Found:
 def _counted(rows: pl.DataFrame) -> tuple[int, int, int, int]:
     """Return visible highlights, those found, detections, and false ones, from the rows of one method."""
     detected = rows.filter(pl.col("specularity").is_not_null())
+    false = detected.filter(is_false(detected)).height
     if rows["frame_visible"].null_count() == rows.height:
         # On a smooth surface a visible highlight is a true one.
         true = rows.filter(pl.col("true_id").is_not_null())
-        hit = true.filter(pl.col("status") != "missed").height
-        return true.height, hit, detected.height, detected.filter(pl.col("true_id").is_null()).height
+        # Without a detection a highlight is not found, whatever its status: in the dark it is no missed one.
+        return true.height, true.drop_nulls("specularity").height, detected.height, false
     visible = rows.group_by(FRAME).agg(pl.col("frame_visible").max())["frame_visible"].sum()
     hit = detected.drop_nulls("visible_id").unique([*FRAME, "visible_id"]).height
-    nothing = pl.col("visible_id").is_null() & pl.col("true_id").is_null()
-    return int(visible), hit, detected.height, detected.filter(nothing).height
+    return int(visible), hit, detected.height, false
 
 
 def _asked(rows: pl.DataFrame, target: str) -> pl.DataFrame:
@@ -264,26 +257,25 @@ def _choices(rows: pl.DataFrame) -> list[Choice]:
     if asked.is_empty():
         return []
     situation = Situation("", "", tuple(map(str, asked["setting"].unique(maintain_order=True))))
-    return [_choice(advice, asked) for advice in advice_of(situation, asked)]
+    return [_choice(advice) for advice in advice_of(situation, asked)]
 
 
-def _choice(advice: Advice, asked: pl.DataFrame) -> Choice:
+def _choice(advice: Advice) -> Choice:
     ties = (*advice.ties, *advice.unranked)
     by_distance = {float(setting.split()[0]): figures for setting, figures in advice.by_setting.items()}
     others = [name for name in advice.methods if name != advice.best and advice.methods[name].answered]
     following = None
     if advice.best is not None and others:
-        second = min(others, key=lambda name: advice.methods[name].mean_penalised_deg)
-        following = _difference(asked, advice.target, advice.best, second, second in ties)
+        second = best_of(advice.pairs, others)
+        pair = next(pair for pair in advice.pairs if {pair.first, pair.second} == {advice.best, second})
+        following = _difference(pair, second, second in ties)
     return Choice(advice.target, advice.best, ties, following, by_distance)
 
 
-def _difference(asked: pl.DataFrame, target: str, best: str, other: str, tied: bool) -> Difference | None:
-    wide = distinct_frames(side_by_side(asked, {best: target, other: target})).wide
-    both = wide.drop_nulls([f"of {best}", f"of {other}"])
-    if both.is_empty():
+def _difference(pair: Pair, other: str, tied: bool) -> Difference | None:
+    mean, (low, high) = pair.difference_deg, pair.interval_deg
+    if mean is None:
         return None
-    values: Array = both[f"of {other}"].to_numpy() - both[f"of {best}"].to_numpy()
-    mean, half = float(np.mean(values)), half_width(values, *units(both))
-    interval: Interval = (None, None) if half is None else (mean - half, mean + half)
-    return Difference(other, mean, interval, len(values), tied)
+    if other == pair.first or low is None or high is None:
+        return Difference(other, mean if other == pair.first else -mean, (low, high), pair.n, tied)
+    return Difference(other, -mean, (-high, -low), pair.n, tied)

@@ -1,7 +1,7 @@
 """Makes samples: a scene is drawn and rendered, seen by the sensor, and estimated on."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -14,8 +14,9 @@ from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta,
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample import Sample, sample_key
 from simtest.errors import Failure, InputError
-from simtest.estimators import load_estimators
+from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.process.naming import forgive_cores
+from simtest.estimators.protocol import laws_of
 from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Frame, Session, backend
@@ -162,7 +163,7 @@ class Maker:
     ) -> list[EstimateMeta]:
         """Return the rows of results.parquet; true_id is the highlight's index in the list of all."""
         estimates = []
-        for row in self.rows(index, session, seen, specularities, list(self._estimators)):
+        for row in self.rows(index, session, seen, specularities, self._estimators):
             columns = row.to_row()
             if row.status == MISSED:
                 # Shards list a missed highlight's status before its estimator.
@@ -172,7 +173,7 @@ class Maker:
 
     def rows(
         self, index: int, session: Session, seen: RenderedView, specularities: Sequence[Specularity],
-        estimators: Sequence[str],
+        estimators: Mapping[str, AnyEstimator],
     ) -> list[ResultRow]:  # fmt: skip
         """Measure the estimates of a sample, at whose scene the session is; true_id is the index in the list of all."""
         scene = session.scene
@@ -187,7 +188,8 @@ class Maker:
             rough = rough_truth(session, seen, counted, found)
         matched = match(specularities, [truth.bp_px for truth in truths])
         metal = on_instruments(specularities, matched, seen)
-        made = rows(session, common, specularities, truths, matched, estimators, rough=rough, on_instrument=metal)
+        declared = {name: laws_of(estimator) for name, estimator in estimators.items()}
+        made = rows(session, common, specularities, truths, matched, declared, rough=rough, on_instrument=metal)
         return [replace(row, true_id=None if row.true_id is None else counted[row.true_id]) for row in made]
 
     def _images(self, drawn: Drawn, seen: RenderedView, frame: Frame, picture: AnyArray) -> dict[str, AnyArray]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeGuard
+from typing import ClassVar, TypeGuard
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from simtest.estimators.budget import Budget, line_covariance
 from simtest.estimators.highlight_fit import HighlightAxis, fit_highlight, fit_highlights
 from simtest.estimators.light_assignment import light_of_highlight
 from simtest.estimators.prior_parts import add_common_parts, told_light_part
-from simtest.estimators.protocol import Estimate
+from simtest.estimators.protocol import Estimate, Law
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
 
@@ -50,6 +50,7 @@ class Bisector:
     """
 
     isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
+    laws: ClassVar[tuple[Law, ...]] = ("bisector", "axis_ratio_seen")
 
     def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
         """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""

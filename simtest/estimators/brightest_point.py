@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from simtest.estimators.family_fit import fit_isophote_family
 from simtest.estimators.highlight_fit import Fitted, fit_highlight, fit_highlights, fit_small
 from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.prior_parts import add_untold_parts
-from simtest.estimators.protocol import Estimate
+from simtest.estimators.protocol import Estimate, Law
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.gaussian_smoothing import slope_divisor_px2
 
@@ -36,6 +37,8 @@ class BrightestPoint:
     It assumes that the peak is in the picture. What the priors leave open is added to the budget
     (`simtest.estimators.prior_parts`).
     """
+
+    laws: ClassVar[tuple[Law, ...]] = ("sightline",)
 
     def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
         """Fit the isophotes of several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""

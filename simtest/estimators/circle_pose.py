@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from simtest.errors import Failure
 from simtest.estimators.highlight_fit import fit_small, isophote_of_each
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.pose_uncertainty import pose_region
-from simtest.estimators.protocol import Estimate
+from simtest.estimators.protocol import Estimate, Law
 from simtest.geometry import Array, Camera, CirclePoses, Mask, Patch, circle_poses
 from simtest.geometry.gaussian_smoothing import slope_divisor_px2
 
@@ -77,6 +78,7 @@ class CirclePoseEstimator:
 
     isovalue: float = CIRCLE_POSE_ISOVALUE
     with_region: bool = True
+    laws: ClassVar[tuple[Law, ...]] = ("circle_pose", "axis_ratio_seen")
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate the normal (see `simtest.estimators.Estimator`); of the priors `plane` alone is used.

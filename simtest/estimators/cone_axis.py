@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
 from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
 from simtest.estimators.prior_parts import add_untold_parts
-from simtest.estimators.protocol import Estimate
+from simtest.estimators.protocol import Estimate, Law
 from simtest.geometry import Camera, Patch
 
 
@@ -25,6 +26,7 @@ class ConeAxis:
     """
 
     isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
+    laws: ClassVar[tuple[Law, ...]] = ("sightline", "axis_ratio_seen")
 
     def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
         """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from simtest.errors import Failure, Reason
 from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
 from simtest.estimators.isophote_family import STREAK_RATIO, IsophoteFamily
 from simtest.estimators.prior_parts import add_untold_parts
-from simtest.estimators.protocol import Estimate, EstimatedCurvature
+from simtest.estimators.protocol import Estimate, EstimatedCurvature, Law
 from simtest.estimators.small_spot import SmallSpot
 from simtest.geometry import Array, Camera, Patch
 
@@ -42,6 +43,7 @@ class Curved:
     """
 
     isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
+    laws: ClassVar[tuple[Law, ...]] = ("sightline",)
 
     def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
         """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.lobe_fit import fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
 from simtest.estimators.prior_parts import add_untold_parts
-from simtest.estimators.protocol import Estimate
+from simtest.estimators.protocol import Estimate, Law
 from simtest.estimators.small_spot import SmallSpot
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.geometry.vectors import basis_across
@@ -71,6 +72,8 @@ class Photometric:
 
     What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
     """
+
+    laws: ClassVar[tuple[Law, ...]] = ("sightline",)
 
     def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
         """Fit the isophotes of several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""

@@ -18,6 +18,11 @@ from simtest.runtime.short_repr import LONGEST, clipped, vector
 
 Target = Literal["fine", "base"]
 
+Law = Literal["sightline", "bisector", "circle_pose", "axis_ratio_seen"]
+"""What an estimator may say of its answers in an attribute `laws`, so that results hold the errors that theory.md
+section 4 predicts: the normal is the reversed sightline through the BP, or bisects the directions to camera and light,
+or is a pose of one isophote taken for a circle; the axis ratio is that of the isophotes as they are."""
+
 
 @dataclass(frozen=True)
 class EstimatedCurvature:
@@ -244,3 +249,8 @@ class RegionEstimator(FrameEstimator, Protocol):
 
 
 AnyEstimator = Estimator | FrameEstimator
+
+
+def laws_of(estimator: object) -> tuple[Law, ...]:
+    """Return the laws that an estimator says it follows; none where it says nothing."""
+    return tuple(getattr(estimator, "laws", ()))

@@ -1,6 +1,7 @@
 """`inverse_rendering`: a quadric patch fitted by differentiating the renderer, as a reference for the others."""
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from simtest.estimators.lobe_fit import LobeFit, fit_lobe
 from simtest.estimators.near_misses import near_miss_parts
 from simtest.estimators.photometric import HighlightPixels, highlight_pixels
 from simtest.estimators.prior_parts import add_common_parts, light_offset_part, mean_light_part
-from simtest.estimators.protocol import Estimate, EstimatedCurvature
+from simtest.estimators.protocol import Estimate, EstimatedCurvature, Law
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
 from simtest.inverse.patch_renderer import PatchRenderer
@@ -63,6 +64,7 @@ class InverseRendering:
     base: bool = True
     exponent: bool = False
     variant: str | None = None
+    laws: ClassVar[tuple[Law, ...]] = ("bisector",)
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate normal and curvature (see `simtest.estimators.Estimator`).

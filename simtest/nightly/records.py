@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import polars as pl
 from pydantic import BaseModel, ConfigDict
 
+from simtest.validation.row_kinds import counts
+
 if TYPE_CHECKING:
     # It makes frames; whoever only judges runs needs no renderer.
     from simtest.validation.worst import WorstCase
@@ -226,19 +228,16 @@ class JudgedRun:
         )
 
     def by_experiment(self) -> pl.DataFrame:
-        """Count by experiment: `rows` (true highlights), those `answered` and `missed`, `false` detections, `OUTCOMES`.
+        """Count by experiment: `rows` (true highlights), those `answered`, the other `KINDS` of rows, and `OUTCOMES`.
 
         All estimators are counted together. An experiment that the baseline alone has is counted by its outcomes.
         """
-        true = pl.col("true_id").is_not_null()
-        counts = self.run.rows.group_by("experiment", maintain_order=True).agg(
-            rows=true.sum(), answered=(true & (pl.col("status") == "ok")).sum(),
-            missed=(true & (pl.col("status") == "missed")).sum(), false=(~true).sum(),
-        )  # fmt: skip
+        numbers = self.run.rows.group_by("experiment", maintain_order=True).agg(**counts(self.run.rows))
+        numbers = numbers.rename({"true": "rows", "ok": "answered"})
         # Without a baseline there are no outcomes to count.
         judged = self.comparisons if self.verdict.baseline is not None else self.comparisons.clear()
         outcomes = judged.group_by("experiment").agg((pl.col("outcome") == name).sum().alias(name) for name in OUTCOMES)
-        both = counts.join(
+        both = numbers.join(
             outcomes.sort("experiment"), on="experiment", how="full", coalesce=True, maintain_order="left_right"
         )
         return both.with_columns(pl.col(OUTCOMES).fill_null(0))

@@ -14,7 +14,7 @@ from simtest.pages.chart import Bars, Chart, Mark, Panel, Picture
 from simtest.pages.sheet import Pixels, Sheet, text_width
 from simtest.runtime.arrays import Array
 
-__all__ = ["DPI", "Pixels", "draw", "draw_legend"]
+__all__ = ["DPI", "Pixels", "draw"]
 
 DPI = 150
 PX = 0.78  # points a px of the page

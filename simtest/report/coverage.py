@@ -4,9 +4,11 @@ from typing import NamedTuple
 
 import polars as pl
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.pages.style import estimator_order
 from simtest.report.run_folder import Run
 from simtest.report.series import LEAST_LAW, TOLERANCE_DEG, TOLERANCE_SHARE
+from simtest.validation.row_kinds import counts
 
 VIEWPOINT = "surface.viewpoint"
 PATH_SHARE = "surface.path_share"
@@ -18,7 +20,7 @@ _MEASURES = (("error", "error_oracle_deg", "error_law_deg", "°", TOLERANCE_DEG)
 class Coverage(NamedTuple):
     """Two tables of a run over views of anatomies, a row for each setting and for each measure of it with a law."""
 
-    found: pl.DataFrame  # setting, true (isolated highlights), missed, found, false, coverage, false_share
+    found: pl.DataFrame  # setting, found (true highlights), detections, `row_kinds.counts`, coverage, false_share
     laws: pl.DataFrame  # setting, estimator, measure, unit, n, met (within tolerance), median, median_law, median_gap
 
 
@@ -31,15 +33,15 @@ def coverage(run: Run) -> Coverage | None:
     """Compute the tables; None for a run that is not over views of anatomies, or has no rows."""
     if not is_anatomical(run) or run.results.is_empty():
         return None
-    true = pl.col("true_id").is_not_null()
-    # Detections are the same for all estimators.
+    # Detections are the same for all estimators of single highlights.
     own = run.results.filter(pl.col("estimator") == pl.col("estimator").first().over("setting"))
-    counts = own.group_by("setting", maintain_order=True).agg(
-        true=true.sum(), missed=(true & (pl.col("status") == "missed")).sum(), false=(~true).sum()
+    # Without a detection, a highlight is not found whatever its status: in the dark it is no missed one.
+    detected = pl.col("specularity").is_not_null()
+    found = own.group_by("setting", maintain_order=True).agg(
+        found=(detected & pl.col("true_id").is_not_null()).sum(), detections=detected.sum(), **counts(own)
     )
-    found = counts.with_columns(found=pl.col("true") - pl.col("missed"))
-    # Shares of nothing are null.
-    detections = pl.col("found") + pl.col("false")
+    # What shines on an instrument is no detection of tissue. Shares of nothing are null.
+    detections = pl.col("detections") - pl.col(ON_INSTRUMENT)
     found = found.with_columns(
         coverage=pl.when(pl.col("true") > 0).then(pl.col("found") / pl.col("true")),
         false_share=pl.when(detections > 0).then(pl.col("false") / detections),

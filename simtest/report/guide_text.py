@@ -6,17 +6,9 @@ from typing import Any
 
 from simtest.estimators.descriptions import is_own
 from simtest.pages.style import estimator_order, number
-from simtest.validation.guide import (
-    BREAK_DEG,
-    LEAST_ANSWERED,
-    MATTERS_DEG,
-    MATTERS_SHARE,
-    Advice,
-    Guide,
-    MethodFigures,
-)
+from simtest.validation.guide import BREAK_DEG, LEAST_ANSWERED, Advice, Guide, MethodFigures
 from simtest.validation.paired import LEAST_FRAMES
-from simtest.validation.statistics import PENALTY_DEG
+from simtest.validation.ranking import MATTERS_DEG, MATTERS_SHARE
 
 HEADS = ("situation", "best method", "median error", "answered", "where it breaks")
 
@@ -29,15 +21,14 @@ RULES = (
     "Answered: of the true highlights that the method had to answer for. Missed ones were not detected; refused ones "
     "were, and the method gave a reason instead of a normal; failed ones were, and its code or process stopped with an "
     "error.",
-    "Best method: the lowest mean error, where a highlight without an answer counts as "
-    f"{PENALTY_DEG:g}°. A method is tied with it where their mean difference is below {MATTERS_DEG:g}° or "
-    f"{100 * MATTERS_SHARE:g} % of the better one's mean error, or where the 95 % interval of that difference on the "
-    "same highlights holds 0. Frames are its independent units, and spread between settings does not widen it. A "
-    "method that breaks is not tied with one that does not.",
+    "Best method: no other has a smaller mean error on the highlights that both answered. Two methods are tied where "
+    f"that difference is below {MATTERS_DEG:g}° or {100 * MATTERS_SHARE:g} % of the better one's mean error, or where "
+    "its 95 % interval holds 0. Frames are its independent units, and spread between settings does not widen it. "
+    "Highlights without an answer count in their column alone, but a method that answers fewer than "
+    f"{100 * LEAST_ANSWERED:g} % is not the best where another answers more, and one that breaks is not tied with one "
+    "that does not.",
     f"Fewer than {LEAST_FRAMES} distinct frames are too few to rank by: methods whose difference they leave open are "
     "not called tied.",
-    "bisector corrects for a light beside the camera. Where the light is at the camera it is the cone's axis, and is "
-    "not ranked.",
     "Frames whose errors are the same to the last bit, as without noise, count as one frame.",
     "Methods that state the normal of the base, the surface without its relief, are ranked in rows of their own.",
     f"A method breaks where the mean error of its answers exceeds {BREAK_DEG:g}°, or where it answers fewer than "
@@ -161,7 +152,9 @@ def _standing(advice: Advice, name: str) -> str:
 
 
 def _unranked(advice: Advice) -> str:
-    return "too few highlights to rank" if advice.unranked else ""
+    if not advice.unranked:
+        return ""
+    return "too few highlights to rank" + ("" if advice.few else f" beside {', '.join(advice.unranked)}")
 
 
 def _surface(advice: Advice) -> str:
@@ -191,11 +184,11 @@ def _breaks(advice: Advice) -> str:
     """Return in words in which settings a situation's best method breaks, or how far it is from that."""
     settings = advice.by_setting
     if not advice.broken:
-        where = f", at {_short(advice, advice.worst)}" if len(settings) > 1 else ""
         seen = "this highlight" if advice.n == 1 else f"these {advice.n} highlights"
-        nowhere = (
-            f"{f'not in {seen}' if advice.few else 'nowhere here'} (worst: {_mean(settings[advice.worst])}{where})"
-        )
+        nowhere = f"not in {seen}" if advice.few else "nowhere here"
+        if len(settings) > 1:
+            median = number(settings[advice.worst].median_deg, 2)
+            nowhere += f" (largest median: {median}°, at {_short(advice, advice.worst)})"
         best = advice.methods[advice.best or ""]
         silent_share = 1 - best.answered / best.n
         if silent_share <= NOTABLE_SHARE:

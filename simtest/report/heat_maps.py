@@ -19,6 +19,10 @@ _COLOURS = cv2.COLORMAP_CIVIDIS  # perceptually uniform and colour-blind-safe
 _EMPTY, _DARK, _HALF = "#888888", 0.55, 0.49
 """Colour of a cell without a value, share of the scale below which text is white, and half a cell's side."""
 
+_WIDTHS, _LEAST_WIDTH = (0.1, 0.03, 0.01, 0.003), 2e-3
+"""Width of a column or row as a share of its values, the widest that melts no more settings than the narrowest; and the
+least width."""
+
 _SWATCH = Symbol("s", "square", "■")
 
 
@@ -47,7 +51,7 @@ def heat_maps(run: Run) -> list[HeatMap]:
         means = rows.group_by("setting", maintain_order=True).agg(pl.col("kd").mean(), pl.col("eps_over_d").mean())
         if scattered(rows, "kd") or not (varies(means["kd"]) and varies(means["eps_over_d"])):
             continue
-        means = means.with_columns(column=_clusters(means["kd"]), row=_clusters(means["eps_over_d"]))
+        means = _gridded(means)
         if means["column"].n_unique() < 2 or means["row"].n_unique() < 2:
             continue
         rows = rows.join(means.select("setting", "column", "row"), on="setting")
@@ -55,14 +59,24 @@ def heat_maps(run: Run) -> list[HeatMap]:
     return [item for item in maps if np.isfinite(item.mean_deg).any()]
 
 
-def _clusters(values: pl.Series) -> pl.Series:
+def _gridded(means: pl.DataFrame) -> pl.DataFrame:
+    """Assign columns and rows to settings, as wide as leaves settings that differ in cells of their own."""
+    grids = [
+        means.with_columns(column=_clusters(means["kd"], share), row=_clusters(means["eps_over_d"], share))
+        for share in _WIDTHS
+    ]
+    cells = [grid.select("column", "row").n_unique() for grid in grids]
+    return grids[cells.index(max(cells))]
+
+
+def _clusters(values: pl.Series, share: float) -> pl.Series:
     """Assign one number to nearly equal values: a swept value moves a little as the other quantity changes."""
-    data = values.to_numpy().astype(float)
-    order = np.argsort(data, kind="stable")
-    gaps = np.diff(data[order]) > np.maximum(2e-3, 0.1 * np.abs(data[order][1:]))
-    numbers = np.empty(data.size, int)
-    numbers[order] = np.concatenate([[0], np.cumsum(gaps)])
-    return pl.Series(numbers)
+    numbers, first = {}, None
+    for value in values.unique().sort():
+        if first is None or value - first > max(_LEAST_WIDTH, share * abs(value)):
+            first = value
+        numbers[value] = first
+    return values.replace_strict(numbers).rank("dense").cast(pl.Int64) - 1
 
 
 def _heat_map(rows: pl.DataFrame, means: pl.DataFrame, estimator: str, label: str) -> HeatMap:

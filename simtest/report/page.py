@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.estimators.descriptions import DESCRIPTIONS
-from simtest.pages import chart_web, pixels, style
+from simtest.pages import chart_web, style
 from simtest.pages.html import environment
 from simtest.report import sentences
 from simtest.report.coverage import coverage, is_anatomical
@@ -27,8 +27,7 @@ from simtest.report.series import line_chart, line_figures
 from simtest.report.summary_table import HEADINGS, table_rows
 from simtest.report.surface_errors import surface_chart, surface_errors
 from simtest.report.triangle_cost import fineness_charts, read_study
-from simtest.report.view3d import View3D, view_3d, view_json
-from simtest.report.view3d_picture import view_picture
+from simtest.report.view3d import view_3d, view_json
 from simtest.report.visible_figures import visible_figures
 from simtest.report.write import Progress
 
@@ -82,7 +81,6 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
     view = view_3d(run, colours)
     if view is not None:
         figures.json[view.key] = view_json(view)
-    still = None if view is None else figures.start(view.key, _draw_view, figures, view)
 
     headline = sentences.headline(run, curves)
     headline += ([paper.headline] if paper else []) + ([sentence(results)] if laws else [])
@@ -92,7 +90,7 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
         "lines": [(curve, chart, sentences.measured(curve)) for curve, chart in lines], "relief": relief,
         "heat": [(chart, sentences.heat_line(item)) for chart, item in zip(heat, maps, strict=True)],
         "surfaces": surfaces, "boxes": boxes, "coverage": coverage(run), "study": study, "fineness": fineness,
-        "pairs": pairs(run), "cards": cards, "view": view, "still": still, "summary": table_rows(run),
+        "pairs": pairs(run), "cards": cards, "view": view, "summary": table_rows(run),
         "colours": {name: colours[name] for name in style.estimator_order(colours)},
     }  # fmt: skip
 
@@ -115,22 +113,15 @@ def _draw_frame(figures: FigureFiles, index: int, item: GalleryItem, colours: Ma
     return shown
 
 
-def _draw_view(figures: FigureFiles, view: View3D) -> str:
-    picture = view_picture(view)
-    figures.write(view.key, pixels.png(picture))
-    return pixels.data_address(picture)
-
-
 def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
     """Fill in the page's template."""
     summary = run.summary
-    cards, still = sections["cards"], sections["still"]
     return environment().get_template("run.html.j2").render(
         {
             **sections,
             "run": run, "title": summary.title or run.experiment, "description": summary.description,
             "realism": summary.realism, "meshes": summary.meshes, "faults": summary.faults,
-            "gallery": [card.result() for card in cards], "still": still.result() if still else "",
+            "gallery": [card.result() for card in sections["cards"]],
             "first": _FIRST_CARDS, "isophotes": isophote_keys(run.gallery), "truth_colour": style.TRUTH,
             "columns": HEADINGS, **_guide(guide_json(run)),
             "length_units": " or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",

@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.pages.style import degrees
@@ -27,6 +28,11 @@ _FLOAT = (
     "error_deg", "error_oracle_deg", "error_look_deg", "error_law_deg", "kd_min", "kd_max", "eps_over_d", "isovalue",
     "axis_ratio", "axis_ratio_law", "noise_sigma", "peak_snr", "distance_mm",
 )  # fmt: skip
+
+_NO_HIGHLIGHT = {
+    "false": "false detection", "in_spot": "in a spot of several glints or of none", ON_INSTRUMENT: "on an instrument",
+}  # fmt: skip
+"""Kinds of detections that are of no true highlight, in words."""
 
 # What a run leaves out is null; it reads as empty.
 Text = Annotated[str, BeforeValidator(lambda value: value or "")]
@@ -66,6 +72,7 @@ class KeptEstimate(BaseModel):
 
     estimator: str
     status: str  # "ok" or the failure's reason
+    kind: str = "ok"  # what its row of results counts as
     specularity: int | None = None  # which detection
     true_id: int | None = None  # the true highlight that it was matched to
     bp_px: Pixel | None = None  # brightest point that was found
@@ -78,10 +85,10 @@ class KeptEstimate(BaseModel):
 
     @property
     def result(self) -> str:
-        """What the estimate came to: an error, a failure's reason or a false detection."""
+        """What the estimate came to: an error, a failure's reason, or that it is of no true highlight."""
         ok, value, better = self.status == "ok", degrees(self.error_deg), degrees(self.error_oracle_deg)
-        if self.true_id is None:
-            return "false detection" if ok else f"{self.status} (false detection)"
+        if self.kind in _NO_HIGHLIGHT:
+            return _NO_HIGHLIGHT[self.kind] if ok else f"{self.status} ({_NO_HIGHLIGHT[self.kind]})"
         told = len(self.normals) > 1 and better not in ("–", value)
         return self.status if not ok else f"{value} (better candidate {better})" if told else value
 
@@ -147,6 +154,8 @@ class EstimatorFigures(BaseModel):
     n_failed_by_reason: Annotated[dict[str, int], BeforeValidator(lambda v: v or {})] = Field({}, title="failed")
     n_missed: int | None = Field(None, title="missed")
     n_false: int | None = Field(None, title="false")
+    n_in_spot: int | None = Field(None, title="in spots")
+    n_instrument: int | None = Field(None, title="on instruments")
     mean_deg: float | None = Field(None, title="mean\u00a0°")
     mean_oracle_deg: float | None = Field(None, title="mean, better candidate\u00a0°")
     rms_deg: float | None = Field(None, title="RMS\u00a0°")

@@ -2,10 +2,12 @@
 
 import polars as pl
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.pages.style import degrees, number
 from simtest.report.heat_maps import HeatMap
 from simtest.report.run_folder import Run
 from simtest.report.series import LineFigure, law_misses
+from simtest.validation.row_kinds import counts, row_kind
 
 
 def headline(run: Run, figures: list[LineFigure]) -> list[str]:
@@ -29,19 +31,16 @@ def _plural(word: str, count: int) -> str:
 
 
 def _counts(rows: pl.DataFrame) -> str:
-    unmatched = rows["true_id"].is_null() & (rows["status"] != "missed").fill_null(True)
-    # On a relief a spot may melt several glints, or hold none: it is no single highlight, but it is there.
-    melted = unmatched & rows["visible_id"].is_not_null() if "visible_id" in rows.columns else unmatched & False
-    false = unmatched & ~melted
-    missed = (rows["status"] == "missed").fill_null(False)
-    failed = rows.filter((pl.col("status") != "ok") & (pl.col("status") != "missed") & ~unmatched)
+    count = rows.select(**counts(rows)).row(0, named=True)
     total = rows.height
-    reasons = failed["status"].value_counts(sort=True).iter_rows()
-    detail = f" ({', '.join(f'{name} {count}' for name, count in reasons)})" if failed.height else ""
-    parts = [f"{failed.height} gave no normal{detail}", f"{int(missed.sum())} missed a true highlight"]
-    if melted.any():
-        parts.append(f"{int(melted.sum())} belong to spots of several glints or of none")
-    parts.append(f"{int(false.sum())} belong to false detections")
+    reasons = rows.filter(row_kind(rows) == "failed")["status"].value_counts(sort=True).iter_rows()
+    detail = f" ({', '.join(f'{name} {number}' for name, number in reasons)})" if count["failed"] else ""
+    parts = [f"{count['failed']} gave no normal{detail}", f"{count['missed']} missed a true highlight"]
+    if count["in_spot"]:
+        parts.append(f"{count['in_spot']} belong to spots of several glints or of none")
+    if count[ON_INSTRUMENT]:
+        parts.append(f"{count[ON_INSTRUMENT]} lie on instruments")
+    parts.append(f"{count['false']} belong to false detections")
     return f"Of {total} {_plural('row', total)}, {', '.join(parts[:-1])} and {parts[-1]}."
 
 

@@ -12,6 +12,7 @@ from simtest.pages.style import Symbol, degrees, estimator_order
 from simtest.report.coverage import is_anatomical
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
+from simtest.validation.row_kinds import counts, row_kind
 from simtest.validation.situations import CO_LOCATED
 
 _LEAST_DEG = 1e-6  # errors of exactly zero still show on a logarithmic axis
@@ -40,7 +41,7 @@ class SurfaceErrors(NamedTuple):
 
     surfaces: list[str]
     boxes: list[Box]
-    table: pl.DataFrame  # surface, estimator, n, ok, failed, missed, false (counts), mean, median, p95, max (deg)
+    table: pl.DataFrame  # surface, estimator, `row_kinds.counts`, mean, median, p95, max (deg)
 
 
 def surface_errors(run: Run, has_figures: bool) -> SurfaceErrors | None:
@@ -53,12 +54,9 @@ def surface_errors(run: Run, has_figures: bool) -> SurfaceErrors | None:
     results = _apart(run.results)
     surfaces = [str(s) for s in results["surface"].unique(maintain_order=True)]
     names = estimator_order(run.results["estimator"].to_list())
-    ok, missed = ((pl.col("status") == which).fill_null(False) for which in ("ok", "missed"))
-    true = pl.col("true_id").is_not_null()
-    errors = pl.col("error_oracle_deg").filter(ok & true).drop_nulls()
+    errors = pl.col("error_oracle_deg").filter(row_kind(results) == "ok").drop_nulls()
     table = results.group_by("surface", "estimator").agg(
-        n=true.sum(), ok=(true & ok).sum(), failed=(true & ~ok & ~missed).sum(), missed=missed.sum(),
-        false=(~true).sum(), mean=errors.mean(), median=errors.median(), p95=errors.quantile(0.95, "linear"),
+        **counts(results), mean=errors.mean(), median=errors.median(), p95=errors.quantile(0.95, "linear"),
         max=errors.max(), errors=errors.sort(),
     )  # fmt: skip
     ranks = [pl.col(key).replace_strict(order, range(len(order)), return_dtype=pl.Int64)
@@ -74,7 +72,7 @@ def surface_errors(run: Run, has_figures: bool) -> SurfaceErrors | None:
 
 def _apart(results: pl.DataFrame) -> pl.DataFrame:
     """Name a surface twice where it is lit from the camera and from beside it: their errors differ in kind."""
-    beside = (pl.col("eps_over_d").mean().over("surface", "setting") > CO_LOCATED).fill_null(False)
+    beside = (pl.col("eps_over_d").max().over("surface", "setting") > CO_LOCATED).fill_null(False)
     results = results.with_columns(beside=beside)
     both = pl.col("beside").any().over("surface") & ~pl.col("beside").all().over("surface")
     name = pl.when(both & pl.col("beside")).then(pl.col("surface") + ", offset").otherwise("surface")

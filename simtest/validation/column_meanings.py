@@ -19,7 +19,7 @@ MEANINGS: dict[str, str] = {
     "setting": "name of the setting: its swept parameters with their values",
     "realisation": "number of the realisation, from 0",
     "specularity": "number of the detection in the frame, the brightest first; null where the highlight was missed",
-    "true_id": "number of the true highlight; null for a false detection",
+    "true_id": "number of the true highlight; null for a detection that matches none",
     "seed": "seed of the realisation; `--set sensor.seed=SEED` makes its noise again",
     "estimator": "name of the estimator",
     "status": "`ok`, `missed`, or the reason of the failure",

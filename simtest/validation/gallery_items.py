@@ -10,6 +10,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 import numpy.typing as npt
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.estimators.protocol import drawable
@@ -21,6 +22,8 @@ from simtest.spec import Experiment, camera_table
 from simtest.validation.cases import Case
 from simtest.validation.matching import peak_px
 from simtest.validation.realisation import Realisation
+from simtest.validation.results_table import table
+from simtest.validation.row_kinds import row_kind
 
 Vector = list[float]
 
@@ -63,12 +66,15 @@ class DrawnEstimate:
         Index of the detection, and of the true highlight that it was matched to, if any.
     bp_px : list of float or None
         The detection's peak, px.
+    kind : str
+        What its row of results counts as (`simtest.validation.row_kinds`).
     """
 
     specularity: int
     true_id: int | None
     bp_px: Vector | None
     estimator: str
+    kind: str = "ok"
     error_deg: float | None = None
     error_oracle_deg: float | None = None
     normal: Vector | None = None
@@ -79,9 +85,9 @@ class DrawnEstimate:
     status: str = ""
 
     def answered(
-        self, result: Estimate | Failure, patch: Patch | Failure, camera: Camera, truth: npt.ArrayLike | None
+        self, result: Estimate | Failure, patch: Patch | Failure, camera: Camera, truth: npt.ArrayLike | None = None
     ) -> "DrawnEstimate":
-        """Fill in the answer on a patch; `truth` is the true normal, shape (3,), where there is one."""
+        """Fill in the answer on a patch, and its errors where the true normal, shape (3,), is given."""
         if isinstance(result, Failure):
             return replace(self, status=str(result.reason))
         made = replace(
@@ -165,6 +171,12 @@ def save(
 ) -> None:
     """Write the gallery item of a realisation, at whose scene the session must be; `why` says why it is kept."""
     camera, scene = session.camera, made.view.scene
+    # Errors and counts are those of the results: a cloud's truth is the base's, and none of the highlights here.
+    held = table(made.rows, {ON_INSTRUMENT: False})
+    rows = {
+        (row["specularity"], row["estimator"]): (row["kind"], row["error_deg"], row["error_oracle_deg"])
+        for row in held.with_columns(kind=row_kind(held)).iter_rows(named=True)
+    }
     # Thinned maps: enough for arrows and the 3D view.
     truth = session.truth(stride=max(1, max(camera.width, camera.height) // MAP_SIDE))
     meta = GalleryMeta(
@@ -178,7 +190,13 @@ def save(
             DrawnTruth(j, h.bp_px.tolist(), h.normal.tolist(), h.position.tolist(), h.kd_min, h.kd_max, h.isolated)
             for j, h in enumerate(made.truths)
         ],
-        estimates=[estimate for i in range(len(made.specularities)) for estimate in _estimates(i, made, camera)],
+        estimates=[
+            DrawnEstimate(
+                i, made.matched.get(i), peak_px(specularity).tolist(), name, *rows.get((i, name), ("failed",))
+            ).answered(result, specularity.patch, camera)
+            for i, specularity in enumerate(made.specularities)
+            for name, result in specularity.estimates.items()
+        ],
         lights=scene.rig.true_mm().tolist(),
         why=why,
     )
@@ -214,15 +232,3 @@ def _write_npz(path: Path, arrays: Mapping[str, npt.NDArray[np.generic]]) -> Non
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
-
-
-def _estimates(i: int, made: Realisation, camera: Camera) -> list[DrawnEstimate]:
-    """Return the answers at one detection."""
-    specularity, true_id = made.specularities[i], made.matched.get(i)
-    normal = None if true_id is None else made.truths[true_id].normal
-    return [
-        DrawnEstimate(i, true_id, peak_px(specularity).tolist(), name).answered(
-            result, specularity.patch, camera, normal
-        )
-        for name, result in specularity.estimates.items()
-    ]

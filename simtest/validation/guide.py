@@ -5,12 +5,11 @@ share one. Settings that differ in degree do, and where a method breaks among th
 state the normal of the base are ranked apart from those that state the fine surface's: their errors are of other
 normals, and of other highlights.
 
-The best method of a situation has the lowest mean error, a highlight without an answer counting `PENALTY_DEG`. A
-method ties with it where the two differ by less than `MATTERS_DEG` or `MATTERS_SHARE`, or where the 95 % interval of
-their mean difference over the same highlights holds 0 (`simtest.validation.paired`).
-A method that breaks never ties with one that does not. Fewer than `LEAST_FRAMES` distinct frames make no tie: what they
-cannot tell apart is not ranked. `bisector` is not ranked where the light is at the camera: it then has nothing to
-correct.
+Methods are ranked in pairs, on the highlights that both answered (`simtest.validation.ranking`): no other one is better
+than the best, or the fewest are. A method ties with it where neither is better. What a method refuses or misses is
+counted apart: one that answers fewer than `LEAST_ANSWERED` of the highlights is not the best where another answers
+more. A method that breaks never ties with one that does not. Fewer than `LEAST_FRAMES` distinct frames make no tie:
+what they cannot tell apart is not ranked.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,20 +21,18 @@ import polars as pl
 from simtest.conventions import MOTION
 from simtest.errors import FAULTS
 from simtest.estimators.descriptions import is_own
-from simtest.runtime.arrays import Array
-from simtest.runtime.entry_points import OWN
 from simtest.validation.paired import (
     FRAME,
     LEAST_FRAMES,
     Distinct,
     distinct_frames,
-    is_above_zero,
     median_interval,
     side_by_side,
     targets_of,
     units,
 )
-from simtest.validation.situations import Situation, is_co_located, situations_of
+from simtest.validation.ranking import Pair, best_of, compare
+from simtest.validation.situations import Situation, situations_of
 from simtest.validation.statistics import PENALTY_DEG, Interval
 
 BREAK_DEG = 5.0
@@ -43,12 +40,6 @@ BREAK_DEG = 5.0
 
 LEAST_ANSWERED = 0.5
 """... or where it answers less than this share of the highlights."""
-
-MATTERS_DEG = 0.01
-"""A smaller difference between two methods decides nothing, ..."""
-
-MATTERS_SHARE = 0.05
-"""... nor one below this share of the better method's mean error."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +91,7 @@ class Advice:
     few: bool = False  # whether its frames are too few for an interval
     unranked: tuple[str, ...] = ()  # methods that so few frames cannot tell from the best
     guests: Mapping[str, Mapping[str, MethodFigures]] = field(default_factory=dict)  # by setting, of methods elsewhere
+    pairs: Sequence[Pair] = ()  # of methods that answered
 
     @property
     def broken(self) -> dict[str, MethodFigures]:
@@ -108,8 +100,8 @@ class Advice:
 
     @property
     def worst(self) -> str:
-        """The setting where the mean error of the best method's answers is largest."""
-        return max(self.by_setting, key=lambda setting: self.by_setting[setting].mean_deg or 0.0)
+        """The setting where the median error of the best method's answers is largest."""
+        return max(self.by_setting, key=lambda setting: self.by_setting[setting].median_deg or 0.0)
 
 
 @dataclass(frozen=True)
@@ -143,8 +135,8 @@ def guide_of(results: pl.DataFrame, conditions: Mapping[str, Mapping[str, object
     shared, found = situations_of(true, conditions or {})
     held = {setting for situation in found for setting in situation.settings}
     left = [str(name) for name in results["setting"].unique(maintain_order=True) if name not in held]
-    seen = true.filter(pl.col("target").fill_null("fine") == "fine") if "target" in true.columns else true
-    counts = (seen.select(key).n_unique() for key in ([*FRAME, "true_id"], [*FRAME]))
+    # A cloud's number is that of the base's highlight: it counts where its frame has no glint of that number.
+    counts = (true.select(key).n_unique() for key in ([*FRAME, "true_id"], [*FRAME]))
     return Guide(shared, tuple(advice for each in found for advice in advice_of(each, true)), tuple(left), *counts)
 
 
@@ -159,28 +151,27 @@ def advice_of(situation: Situation, true: pl.DataFrame) -> list[Advice]:
     for target in sorted(set(targets.values()), reverse=True):
         names = [name for name, own in targets.items() if own == target]
         wide = side_by_side(rows, dict.fromkeys(names, target))
-        made.append(_ranked(situation, target, distinct_frames(wide), names, is_co_located(rows)))
+        made.append(_ranked(situation, target, distinct_frames(wide), names))
     return made
 
 
-def _ranked(
-    situation: Situation, target: str, distinct: Distinct, names: Sequence[str], at_camera: bool
-) -> Advice:  # fmt: skip
+def _ranked(situation: Situation, target: str, distinct: Distinct, names: Sequence[str]) -> Advice:
     wide = distinct.wide
     methods = {name: _figures(name, wide) for name in names}
     guests = {name: _by_setting(name, wide) for name in names if not is_own(name)}
-    ranked = sorted(methods.values(), key=lambda each: each.mean_penalised_deg)
-    if not any(each.answered for each in ranked):
+    answering = [each for each in methods.values() if each.answered]
+    if not answering:
         return Advice(situation, target, wide.height, methods, None, (), {}, guests=guests)
-    # Without an offset the bisector is the cone's axis under another name.
-    ranked = [each for each in ranked if each.answered and not (at_camera and _is_bisector(each.estimator))] or ranked
-    first = ranked[0]
-    alike = [each for each in ranked[1:] if each.answered and not _is_worse(each.estimator, first.estimator, distinct)]
-    ties = tuple(each.estimator for each in alike if first.breaks or not each.breaks)
-    few, best = _is_few(distinct), first.estimator
+    # Of methods that the pairs leave alike, the one that answers more is best, then that of the smaller mean.
+    answering.sort(key=lambda each: (-each.answered, each.mean_deg))
+    order = [each.estimator for each in answering]
+    pairs = compare(distinct, order)
+    best = best_of(pairs, [name for name in order if not methods[name].is_silent] or order)
+    open_pairs = {pair.other(best): pair.few for pair in pairs if best in (pair.first, pair.second) and not pair.better}
+    alike = [name for name in order if name in open_pairs and (methods[best].breaks or not methods[name].breaks)]
     return Advice(
-        situation, target, wide.height, methods, best, () if few else ties, _by_setting(best, wide), few,
-        ties if few else (), guests,
+        situation, target, wide.height, methods, best, tuple(name for name in alike if not open_pairs[name]),
+        _by_setting(best, wide), _is_few(distinct), tuple(name for name in alike if open_pairs[name]), guests, pairs,
     )  # fmt: skip
 
 
@@ -189,10 +180,6 @@ def _by_setting(name: str, wide: pl.DataFrame) -> dict[str, MethodFigures]:
         str(setting): _figures(name, part)
         for (setting,), part in wide.drop_nulls(f"status {name}").group_by("setting", maintain_order=True)
     }
-
-
-def _is_bisector(name: str) -> bool:
-    return name.removeprefix(f"{OWN}:") == "bisector"
 
 
 def _is_few(distinct: Distinct) -> bool:
@@ -208,25 +195,7 @@ def _figures(name: str, wide: pl.DataFrame) -> MethodFigures:
     mean = float(np.mean(answers)) if len(answers) else None
     missed = int((own[f"status {name}"] == "missed").sum())
     failed = int(own[f"status {name}"].is_in(list(map(str, FAULTS))).sum())
-    penalised = float(np.mean(_penalised(own, name))) if own.height else PENALTY_DEG
+    penalised = float(np.mean(own[f"of {name}"].fill_null(PENALTY_DEG).to_numpy())) if own.height else PENALTY_DEG
     median = float(np.median(answers)) if len(answers) else None
     interval = median_interval(answers, *units(answered))
     return MethodFigures(name, own.height, len(answers), missed, failed, median, interval, mean, penalised)
-
-
-def _penalised(wide: pl.DataFrame, name: str) -> Array:
-    return wide[f"of {name}"].fill_null(PENALTY_DEG).to_numpy()
-
-
-def _is_worse(name: str, best: str, distinct: Distinct) -> bool:
-    """Whether a method is worse than the best by more than chance, and by enough to matter."""
-    # What only one of them was asked compares nothing.
-    both = distinct.wide.drop_nulls([f"status {name}", f"status {best}"])
-    if both.is_empty():
-        return False
-    at_best = _penalised(both, best)
-    differences = _penalised(both, name) - at_best
-    if np.mean(differences) < max(MATTERS_DEG, MATTERS_SHARE * float(np.mean(at_best))):
-        return False
-    certain = both["setting"].is_in(list(distinct.copied)).to_numpy()
-    return is_above_zero(differences, *units(both), certain)

@@ -1,6 +1,6 @@
 """Measures estimates against the truth: a row of results for each estimator at each detected or missed highlight."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +9,7 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE, ON_INSTRUMENT
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.estimators.budget import deviations
+from simtest.estimators.protocol import Law
 from simtest.geometry import Patch
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import Specularity
@@ -30,7 +31,7 @@ def rows(
     specularities: Sequence[Specularity],
     truths: Sequence[TrueHighlight],
     matched: Mapping[int, int],
-    estimators: Sequence[str],
+    estimators: Mapping[str, Collection[Law]],
     unfound: str = MISSED,
     rough: RoughTruth | None = None,
     on_instrument: Sequence[bool] | None = None,
@@ -47,8 +48,10 @@ def rows(
         Detections with their estimates, and the highlights that count as true.
     matched : mapping
         Index of the truth by index of the detection.
-    estimators, unfound
-        Names and status for the rows of truths that no detection found.
+    estimators : mapping
+        Laws that each estimator declares (`simtest.estimators.protocol.laws_of`), by name.
+    unfound : str
+        Status for the rows of truths that no detection found.
     rough : RoughTruth, optional
         What stands beside the true highlights on a surface with relief.
     on_instrument : sequence of bool, optional
@@ -76,7 +79,7 @@ def rows(
             made.append(
                 answered
                 if truth is None
-                else _error_row(answered, scene, patch, result, truth, look_normals.get((i, name)))
+                else _error_row(answered, scene, estimators[name], patch, result, truth, look_normals.get((i, name)))
             )
     # Truths without a row of some estimator: no detection found them, or one of a frame estimator alone.
     held = {(row.true_id, row.estimator) for row in made}
@@ -173,6 +176,7 @@ def _look_normals(
 def _error_row(
     row: ResultRow,
     scene: Scene,
+    declared: Collection[Law],
     patch: Patch | Failure,
     estimate: Estimate,
     truth: TrueHighlight,
@@ -189,14 +193,14 @@ def _error_row(
     curvature = curvature_errors(estimate, truth)
     smoothing_px = 0.0 if isinstance(patch, Failure) else patch.smoothing_px
     return row.having(
-        axis_ratio_seen_law=axis_ratio_seen(scene, estimate, truth, smoothing_px),
+        axis_ratio_seen_law=axis_ratio_seen(scene, declared, estimate, truth, smoothing_px),
         error_deg=float(to_truth[0]),
         error_fine_deg=float(angle_deg(estimate.normal, truth.normal)),
         error_base_deg=float(angle_deg(estimate.normal, truth.normal_base)),
         error_oracle_deg=float(to_truth.min()),
         error_look_deg=error_look_deg,
-        error_law_deg=law_deg(scene, estimate, truth),
-        error_look_law_deg=look_law_deg(scene, estimate, truth),
+        error_law_deg=law_deg(scene, declared, estimate, truth),
+        error_look_law_deg=look_law_deg(scene, declared, estimate, truth),
         error_base_law_deg=base_law_deg(scene),
         rank_correct=int(to_truth.argmin()),
         mahalanobis2=mahalanobis2(estimate, stated),

@@ -116,27 +116,26 @@ def units(wide: pl.DataFrame) -> tuple[Array, Array]:
     return numbered.to_series(0).to_numpy().astype(int), numbered.to_series(1).to_numpy().astype(int)
 
 
-def is_above_zero(differences: Array, settings: Array, frames: Array, certain: NDArray[np.bool_]) -> bool:
-    """Return whether the 95 % interval of the mean of differences lies above 0.
+def difference_interval(differences: Array, frames: Array, settings: Array, certain: NDArray[np.bool_]) -> Interval:
+    """Compute the 95 % interval of the mean of differences; None without any, or with a single frame.
 
     Parameters
     ----------
     differences : ndarray
         Of each highlight, deg.
-    settings, frames : ndarray
-        Number of the setting and of the frame of each.
+    frames, settings : ndarray
+        Number of the frame and of the setting of each.
     certain : ndarray
         Whether its setting has no spread; such highlights count in the mean, and widen its interval only where their
         mean differs from that of the others.
     """
     if not len(differences):
-        return False
-    mean = float(np.mean(differences))
+        return None, None
+    mean, drawn = float(np.mean(differences)), ~certain
     if certain.all():
-        return mean > 0
-    drawn = ~certain
+        return mean, mean
     half = half_width(differences[drawn], settings[drawn], frames[drawn], differences[certain])
-    return half is not None and mean - half > 0
+    return (None, None) if half is None else (mean - half, mean + half)
 
 
 def half_width(values: Array, settings: Array, frames: Array, others: Array = NO_VALUES) -> float | None:

@@ -1,12 +1,12 @@
 """Predictions of the laws of theory.md sections 4 and 7 for an estimate at a true highlight."""
 
+from collections.abc import Collection
 from functools import lru_cache
 
 import numpy as np
 
 from simtest.estimators import Estimate
-from simtest.geometry.circle_from_cone import circle_poses
-from simtest.geometry.vectors import angle_deg
+from simtest.estimators.protocol import Law
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array
 from simtest.spec.falloff import CosineProfile
@@ -16,20 +16,16 @@ from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.validation import laws, relief_laws
 
-SAME_DEG = 1e-4
-"""Directions that differ by less are equal up to rounding."""
-
 EQUAL_KD = 1e-3
 """Principal curvatures times distance that differ by less are those of a plane or a sphere."""
 
 
-def law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint) -> float | None:
-    """Predict the error of an estimate, deg; None where no law of theory.md section 4 applies.
+def law_deg(scene: Scene, declared: Collection[Law], estimate: Estimate, highlight: HighlightPoint) -> float | None:
+    """Predict the error of an estimate, deg; None where none of the laws that its estimator declares applies.
 
-    With a light at the camera: circle pose (two candidates) on a curved surface without falloff; the shift by unknown
-    vignetting and emission for estimators of one candidate. With an offset light: half the angle between light and
-    camera for those that take the reversed sightline for the normal; for others, which were told a distance, the
-    effect of the distance's error.
+    With a light at the camera: circle pose on a curved surface without falloff; the shift by unknown vignetting and
+    emission for the others. With an offset light: half the angle between light and camera for the reversed sightline;
+    for the bisector with a given distance, the effect of the distance's error.
     """
     # The lobe of a source of finite size is another one: no law.
     if scene.rig.lights[highlight.light].source is not None:
@@ -39,12 +35,11 @@ def law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint) -> floa
     offset, power = not is_at_camera(light), unknown_falloff(scene, highlight.light)
     if power is None or (offset and power > 0):
         return None
-    # Estimators of one candidate take the peak or the axis; two candidates come from circle pose.
-    if len(estimate.candidates) == 1:
+    if "sightline" in declared or "bisector" in declared:
         if offset:
-            return _offset_law_deg(scene, estimate, highlight, light)
+            return _offset_law_deg(scene, declared, highlight, light)
         return _vignetting_law_deg(scene, estimate, highlight, power) if power > 0 else None
-    if offset or power > 0 or len(estimate.isophotes) != 1:
+    if "circle_pose" not in declared or offset or power > 0 or len(estimate.isophotes) != 1:
         return None
     a, b = laws.isophote_half_axes(
         estimate.isophotes[0].isovalue, lobe_curvature(scene), highlight.kd_min, highlight.kd_max
@@ -65,14 +60,6 @@ def unknown_falloff(scene: Scene, light: int) -> float | None:
     return None if None in powers else float(sum(power for power in powers if power))
 
 
-def _reverses_sightline(scene: Scene, estimate: Estimate) -> bool:
-    """Return whether the proposed normal is the reversed sightline that the estimate looks along."""
-    if not np.isfinite(estimate.look_px).all():
-        return False
-    sightline = scene.camera.model().unproject(estimate.look_px)
-    return bool(angle_deg(estimate.normal, -sightline) < SAME_DEG)
-
-
 def _vignetting_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint, power: float) -> float | None:
     """Predict the shift by unknown falloff cos^power, deg; None where the curvatures differ."""
     if abs(highlight.kd_max - highlight.kd_min) > EQUAL_KD:
@@ -90,20 +77,24 @@ def lobe_curvature(scene: Scene) -> float:
     return known or 1e6
 
 
-def _offset_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint, light: Array) -> float | None:
-    """Predict the error of one candidate with a light beside the camera, deg."""
-    if _reverses_sightline(scene, estimate):
+def _offset_law_deg(
+    scene: Scene, declared: Collection[Law], highlight: HighlightPoint, light: Array
+) -> float | None:  # fmt: skip
+    """Predict the error of the reversed sightline or of the bisector with a light beside the camera, deg."""
+    priors = scene.calibration(highlight.distance).priors
+    if "sightline" in declared or not priors.lights_mm:
         return float(np.degrees(laws.bisector_angle(highlight.position, light)))
-    # Others take the bisector at the distance that they were told.
     # With several lights the estimate may assume another light, and another distance, than the highlight's.
-    told = scene.calibration(highlight.distance).priors.distance_mm
-    if told is None or len(scene.rig.lights) > 1:
+    if priors.distance_mm is None or len(scene.rig.lights) > 1:
         return None
-    return float(np.degrees(laws.bisector_residual(highlight.position, light, told.mean / highlight.distance - 1)))
+    share = priors.distance_mm.mean / highlight.distance - 1
+    return float(np.degrees(laws.bisector_residual(highlight.position, light, share)))
 
 
-def axis_ratio_seen(scene: Scene, estimate: Estimate, highlight: HighlightPoint, smoothing_px: float) -> float | None:
-    """Predict the axis ratio of an estimate that takes the isophotes as they are; None for others.
+def axis_ratio_seen(
+    scene: Scene, declared: Collection[Law], estimate: Estimate, highlight: HighlightPoint, smoothing_px: float
+) -> float | None:
+    """Predict the axis ratio of an estimator that takes the isophotes as they are; None for others.
 
     For a Phong lobe without a base under a light at the camera, mean of the estimate's isovalues.
     """
@@ -113,7 +104,7 @@ def axis_ratio_seen(scene: Scene, estimate: Estimate, highlight: HighlightPoint,
         return None
     light = scene.rig.lights[highlight.light]
     at_camera = is_at_camera(scene.rig.true_mm()[highlight.light]) and light.source is None
-    if not (isovalues and at_camera and _takes_ratio_as_seen(estimate)):
+    if not (isovalues and at_camera and "axis_ratio_seen" in declared):
         return None
     curvatures, pixel = (highlight.kd_min, highlight.kd_max), _pixel_angle(scene, highlight)
     return _mean_ratio_seen(isovalues, reflectance.exponent, curvatures, smoothing_px, pixel)
@@ -128,30 +119,22 @@ def _mean_ratio_seen(
     return float(ratios.mean()) if np.isfinite(ratios).all() else None
 
 
-def _takes_ratio_as_seen(estimate: Estimate) -> bool:
-    """Return whether an estimate's axis ratio is that of its cones."""
-    if estimate.axis_ratio is None or not estimate.isophotes:
-        return False
-    # All poses at once: each alone costs as much.
-    cones = np.array([isophote.cone for isophote in estimate.isophotes])
-    poses = circle_poses(cones, np.array([isophote.sightline for isophote in estimate.isophotes]))
-    sound = [i for i in range(len(poses)) if i not in poses.failures]
-    return bool(sound) and bool(np.isclose(np.mean(poses.axis_ratios[sound]), estimate.axis_ratio, atol=1e-9))
-
-
 def _pixel_angle(scene: Scene, highlight: HighlightPoint) -> float:
     """Compute the angle of a pixel at a BP, rad: the root of its solid angle."""
     steps = scene.camera.model().step_of_pixels(highlight.bp_px)
     return float(np.sqrt(np.linalg.norm(np.cross(*steps))))
 
 
-def look_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPoint) -> float | None:
+def look_law_deg(
+    scene: Scene, declared: Collection[Law], estimate: Estimate, highlight: HighlightPoint
+) -> float | None:  # fmt: skip
     """Predict the error where an estimate looks: abs((I + dS) w) of its own miss w, deg (theory.md section 4).
 
-    For estimators that take the reversed sightline for the normal under a light at the camera; None for others.
+    For estimators that take the reversed sightline for the normal, as the bisector is under a light at the camera; None
+    for others, and elsewhere.
     """
     at_camera = is_at_camera(scene.rig.true_mm()[highlight.light])
-    if not at_camera or not _reverses_sightline(scene, estimate):
+    if not at_camera or not {"sightline", "bisector"} & set(declared) or not np.isfinite(estimate.look_px).all():
         return None
     look = scene.camera.model().unproject(estimate.look_px)
     sightline = highlight.position / np.linalg.norm(highlight.position)

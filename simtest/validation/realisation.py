@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from simtest.errors import Reason
 from simtest.estimators import AnyEstimator
+from simtest.estimators.protocol import laws_of
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
@@ -126,9 +127,10 @@ def realise(
     )
     unfound = str(Reason.NO_LIGHT) if dark else MISSED
     metal = on_instruments(singles, matched, view)
-    single_names = [name for name in estimators if name not in cloud_names]
-    single_names += [] if motion is None else [MOTION]
-    made = rows(session, common, singles, truths, matched, single_names, unfound, rough, metal)
+    declared = {name: laws_of(estimator) for name, estimator in estimators.items() if name not in cloud_names}
+    # Motion is asked for signs; its normals are those of another estimator.
+    declared |= {} if motion is None else {MOTION: ()}
+    made = rows(session, common, singles, truths, matched, declared, unfound, rough, metal)
     if motion is not None:
         made = [motion.filled(row, view.scene, truths) if row.estimator == MOTION else row for row in made]
     if cloud_names:

@@ -15,7 +15,7 @@ CO_LOCATED = 1e-3
 SMALL_SPOT_PX = 3.0
 """Radius at half height below which isophotes carry no shape (`simtest.estimators.small_spot`)."""
 
-FAR_BESIDE = 0.105
+FAR_BESIDE = 0.11
 """Light offset over distance above which a light counts as far beside the camera: 0.1, and what a tilt adds to it."""
 
 MIXED = "mixed curvature"
@@ -132,12 +132,6 @@ def _sign(values: np.ndarray) -> int | None:
     return found.pop() if len(found) == 1 else None
 
 
-def is_co_located(rows: pl.DataFrame) -> bool:
-    """Whether every light of some highlights counts as at the camera; False where their frames were computed."""
-    largest = rows["eps_over_d"].abs().max() if "eps_over_d" in rows.columns else None
-    return largest is not None and float(largest) <= CO_LOCATED  # type: ignore[arg-type]
-
-
 def _light(rows: pl.DataFrame, told: Mapping[str, object]) -> str:
     lights = rows["n_lights"].drop_nulls() if "n_lights" in rows.columns else pl.Series([1])
     count = int(lights[0]) if lights.len() else 1
@@ -145,8 +139,7 @@ def _light(rows: pl.DataFrame, told: Mapping[str, object]) -> str:
     largest = rows["eps_over_d"].abs().max()
     if largest is None or float(largest) <= CO_LOCATED:  # type: ignore[arg-type]
         return f"{name} at the camera"
-    middle = float(rows["eps_over_d"].abs().mean())  # type: ignore[arg-type]
-    degree = "ε/d up to 0.1" if middle <= FAR_BESIDE else "ε/d above 0.1"
+    degree = "ε/d up to 0.1" if float(largest) <= FAR_BESIDE else "ε/d above 0.1"  # type: ignore[arg-type]
     return ", ".join(part for part in (f"{name} beside the camera ({degree})", str(told.get("told") or "")) if part)
 
 

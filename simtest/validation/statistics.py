@@ -11,6 +11,7 @@ from simtest.conventions import ON_INSTRUMENT
 from simtest.geometry import chi_squared, student_t
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import Json
+from simtest.validation.row_kinds import counts, row_kind
 
 Interval = tuple[float | None, float | None]
 
@@ -32,8 +33,9 @@ class Figures:
         Of these, how many were answered and how many were missed.
     n_failed_by_reason : dict
         Of these, how many failed.
-    n_false : int
-        False detections, answered or not, which count nowhere else.
+    n_false, n_in_spot : int
+        False detections, answered or not, and detections in spots of a relief that melt several glints or hold none;
+        they count nowhere else (`simtest.validation.row_kinds`).
     n_instrument : int or None
         Detections that show an instrument, which count nowhere else; None in a run without instruments.
     mean_deg, mean_oracle_deg, rms_deg, std_deg, median_deg, p95_deg, max_deg : float or None
@@ -53,6 +55,7 @@ class Figures:
     n_failed_by_reason: dict[str, int]
     n_missed: int
     n_false: int
+    n_in_spot: int
     mean_deg: float | None
     mean_base_deg: float | None
     mean_oracle_deg: float | None
@@ -84,22 +87,20 @@ def summarise(results: pl.DataFrame) -> dict[str, dict[str, Figures]]:
 
 def figures(rows: pl.DataFrame) -> Figures:
     """Compute the figures of the rows of one setting and estimator."""
-    has_instruments = ON_INSTRUMENT in rows.columns
-    metal = rows.filter(pl.col(ON_INSTRUMENT).fill_null(False)).height if has_instruments else None
-    # Of the true highlights: answered, failed, missed.
-    true = rows.filter(pl.col("true_id").is_not_null())
-    answered = true.filter(pl.col("status") == "ok")
-    failed = true.filter(~pl.col("status").is_in(["ok", "missed"]))["status"].value_counts()
+    count = rows.select(**counts(rows)).row(0, named=True)
+    answered = rows.filter(row_kind(rows) == "ok")
+    failed = rows.filter(row_kind(rows) == "failed")["status"].value_counts()
     # Errors of the answers, and the penalty of the others.
     errors = answered["error_deg"].to_numpy()
-    penalised = np.concatenate([errors, np.full(true.height - len(errors), PENALTY_DEG)])
+    penalised = np.concatenate([errors, np.full(count["true"] - len(errors), PENALTY_DEG)])
     distances = answered["mahalanobis2"].drop_nulls().to_numpy()
     return Figures(
-        n=true.height,
-        n_ok=len(errors),
+        n=count["true"],
+        n_ok=count["ok"],
         n_failed_by_reason=dict(sorted(failed.iter_rows())),
-        n_missed=true.filter(pl.col("status") == "missed").height,
-        n_false=rows.filter(pl.col("true_id").is_null() & _sees_nothing(rows)).height,
+        n_missed=count["missed"],
+        n_false=count["false"],
+        n_in_spot=count["in_spot"],
         mean_deg=_or_none(np.mean, errors),
         mean_base_deg=_or_none(np.mean, answered["error_base_deg"].drop_nulls().to_numpy())
         if "error_base_deg" in rows.columns
@@ -113,14 +114,8 @@ def figures(rows: pl.DataFrame) -> Figures:
         mean_penalised_deg=_or_none(np.mean, penalised),
         ci95_deg=mean_interval(errors),
         coverage95=float(np.mean(distances <= chi_squared.quantile(CONFIDENCE, 2))) if len(distances) else None,
-        n_instrument=metal,
+        n_instrument=count[ON_INSTRUMENT] if ON_INSTRUMENT in rows.columns else None,
     )
-
-
-def _sees_nothing(rows: pl.DataFrame) -> pl.Expr:
-    """Return where a detection shows nothing visible: on a relief a spot may melt several glints, or hold none."""
-    nothing = pl.col("visible_id").is_null() if "visible_id" in rows.columns else pl.lit(True)
-    return nothing & ~pl.col(ON_INSTRUMENT).fill_null(False) if ON_INSTRUMENT in rows.columns else nothing
 
 
 def _or_none(statistic: Callable[[Array], Any], values: Array) -> float | None:

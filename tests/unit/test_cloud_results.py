@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 
 from simtest.estimators.cloud import CloudCentre, cloud
+from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry.vectors import angle_deg
+from simtest.pages.style import degrees
+from simtest.report.run_folder import read_item
 from simtest.simulation import clouds as regions
 from simtest.spec import Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
 from simtest.validation.cloud_rows import match_cloud
+from simtest.validation.gallery_items import save
 from simtest.validation.realisation import Realiser
 
 PLANE = {
@@ -48,6 +52,27 @@ def test_a_cloud_is_measured_against_the_base():
     # Where no estimate is of it, the vote is empty.
     estimate = made.specularities[-1].estimates["cloud"]
     assert match_cloud(session, made.view, estimate) == [row.cloud]
+
+
+@pytest.mark.render
+def test_the_card_of_a_frame_says_what_the_results_say(tmp_path):
+    """A cloud is no false detection there, nor is a spot of several glints."""
+    group = {"scene": "plane", "set": PLANE}
+    experiment = validate(Experiment, {"name": "clouds", "seed": 3, "realisations": 1, "groups": [group]}, "experiment")
+    realiser, (case,) = Realiser(None), expand(experiment)
+    made = realiser.make(experiment, case, 0, {"cone_axis": cone_axis, "cloud": cloud})
+    save(tmp_path / "item.npz", realiser.session, experiment, case, made)
+    shown = {(each.specularity, each.estimator): each for each in read_item(tmp_path / "item.npz").meta.estimates}
+    told = {(row.specularity, row.estimator): row for row in made.rows if row.specularity is not None}
+    assert shown.keys() == told.keys()
+    for key, row in told.items():
+        assert (shown[key].error_deg, shown[key].status) == (row.error_deg, row.status)
+    (of_cloud,) = [each for (_, name), each in shown.items() if name == "cloud"]
+    assert of_cloud.result == degrees(of_cloud.error_deg) != "–"
+    results = [each.result for (_, name), each in shown.items() if name == "cone_axis"]
+    assert sum("in a spot of several glints or of none" in result for result in results) == sum(
+        row.true_id is None and row.visible_id is not None for row in told.values() if row.estimator == "cone_axis"
+    ) > 0  # fmt: skip
 
 
 @pytest.mark.render

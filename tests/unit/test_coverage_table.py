@@ -11,7 +11,8 @@ from simtest.report.coverage import coverage
 def row(estimator, true_id, status, error=None, law=None, ratio=None, ratio_law=None, setting="a"):
     return {
         "setting": setting, "estimator": estimator, "true_id": true_id, "status": status, "error_oracle_deg": error,
-        "error_law_deg": law, "axis_ratio": ratio, "axis_ratio_law": ratio_law, "surface.viewpoint": 0.0,
+        "specularity": None if status == "missed" else 0, "error_law_deg": law,
+        "axis_ratio": ratio, "axis_ratio_law": ratio_law, "surface.viewpoint": 0.0,
     }  # fmt: skip
 
 

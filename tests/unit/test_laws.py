@@ -1,14 +1,23 @@
 """The closed-form laws: theory.md's numbers, independent derivations, and noise-free renders."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from simtest.estimators import Estimate
+from simtest.estimators.bisector import bisector
+from simtest.estimators.brightest_point import brightest_point
+from simtest.estimators.cone_axis import cone_axis
+from simtest.estimators.curved import curved
+from simtest.estimators.protocol import laws_of
 from simtest.geometry import circle_pose
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 from simtest.validation import laws
+from simtest.validation.predicted import law_deg
 
 C_PHONG = 4 * 50.0
 D = 10.0
@@ -158,6 +167,31 @@ def measure():
         return found.estimates, highlight
 
     return run
+
+
+def predicted(estimator, sample, scene):
+    """What the laws predict for an answer of an estimator at a highlight of a plane 10 mm ahead."""
+    highlight = SimpleNamespace(light=0, position=np.array([0.0, 0.0, D]), distance=D, kd_min=0.0, kd_max=0.0)
+    return law_deg(scene_from_dict({"surface": {"type": "plane"}, **scene}), laws_of(estimator), sample, highlight)
+
+
+BESIDE = {"rig": {"lights": [{"offset_mm": 1.0}]}, "known": {"lights": True, "distance_error": -0.2}}
+FADING = {"sensor": {"vignetting": {"type": "cosine", "power": 4.0}, "vignetting_known": False}}
+
+
+def test_a_law_is_predicted_for_the_estimators_that_declare_it():
+    """A method that answers anything, always the same, follows none."""
+    always = Estimate(np.array([0.3, 0.0, -1.0]), np.array([[0.3, 0.0, -1.0]]), np.array([100.0, 100.0]))
+    foreign = SimpleNamespace()
+    assert (predicted(foreign, always, BESIDE), predicted(foreign, always, FADING)) == (None, None)
+    half = float(np.degrees(laws.bisector_angle(np.array([0.0, 0.0, D]), np.array([1.0, 0.0, 0.0]))))
+    for estimator in (cone_axis, brightest_point, curved):
+        assert predicted(estimator, always, BESIDE) == pytest.approx(half)
+        assert predicted(estimator, always, FADING) == 0.0
+    told = laws.bisector_residual(np.array([0.0, 0.0, D]), np.array([1.0, 0.0, 0.0]), -0.2)
+    assert predicted(bisector, always, BESIDE) == pytest.approx(float(np.degrees(told)))
+    # What an estimator of one's own declares.
+    assert predicted(SimpleNamespace(laws=("sightline",)), always, BESIDE) == pytest.approx(half)
 
 
 def cylinder(ratio, side):

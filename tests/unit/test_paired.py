@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.geometry import student_t
-from simtest.validation.paired import deviation_of_mean, half_width, is_above_zero
+from simtest.validation.paired import deviation_of_mean, difference_interval, half_width
 from tests.unit.given_numbers import of_given_numbers
 
 TRIALS, MOST = 300, 31
@@ -93,12 +93,12 @@ def test_values_without_spread_leave_the_spread_of_the_mean_of_all(other):
     assert (np.sqrt(np.mean(shares)) < 0.8 * np.std(means)) == (other > 0)
 
 
-def test_a_mean_is_above_zero_only_beyond_its_interval():
+def test_the_interval_of_differences_is_that_of_their_mean_over_frames():
     rng = np.random.default_rng(4)
-    values, frames = rng.normal(0.0, 1.0, 40), np.arange(40)
+    values, frames = rng.normal(0.0, 1.0, 40), np.arange(40) // 2
     settings, certain = np.zeros(40, int), np.zeros(40, bool)
-    values -= values.mean()
-    half = half_width(values, settings, frames)
-    assert is_above_zero(values + 1.01 * half, settings, frames, certain)
-    assert not is_above_zero(values + 0.99 * half, settings, frames, certain)
-    assert not is_above_zero(values[:0], settings[:0], frames[:0], certain[:0])
+    half, mean = half_width(values, settings, frames), values.mean()
+    assert difference_interval(values, frames, settings, certain) == pytest.approx((mean - half, mean + half))
+    assert difference_interval(values, frames, settings, ~certain) == (mean, mean)
+    assert difference_interval(values[:0], frames[:0], settings[:0], certain[:0]) == (None, None)
+    assert difference_interval(values[:2], frames[:2], settings[:2], certain[:2]) == (None, None)

@@ -159,7 +159,7 @@ def test_rows_of_truths_that_nothing_found_have_a_target_and_no_error():
     from simtest.simulation.true_highlights import TrueHighlight
 
     truths = [TrueHighlight(**vars(point), peak_snr=50.0, why_not="") for point in view[:2]]
-    made = rows(session, ResultRow(experiment="e", setting="s"), [], truths, {}, ["cone_axis"])
+    made = rows(session, ResultRow(experiment="e", setting="s"), [], truths, {}, {"cone_axis": ()})
     found = table(made, {})
     assert found.columns == list(SCHEMA)
     assert found["status"].to_list() == ["missed"] * len(truths)

@@ -5,7 +5,6 @@ import itertools
 import json
 import re
 import zlib
-from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -15,15 +14,14 @@ import pytest
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.pages.axes import Axis
-from simtest.pages.style import colours, number, rgb
+from simtest.pages.style import colours, number
 from simtest.report import write_report
 from simtest.report.curves import Curve
 from simtest.report.heat_maps import heat_maps, heat_range
 from simtest.report.run_folder import read_run
 from simtest.report.series import _join_mark, law_misses, line_chart, line_figures
 from simtest.report.surface_errors import _apart
-from simtest.report.view3d import CURVATURE_COLOURS, view_3d, view_json
-from simtest.report.view3d_picture import view_picture
+from simtest.report.view3d import view_3d, view_json
 from simtest.validation import laws
 
 ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
@@ -151,8 +149,8 @@ def make_item(path, radius=10.0, size=(64, 48), tilt=0.3, estimator="circle_pose
         common | {"estimator": "cone_axis", "error_deg": 0.01, "normal": (-s).tolist(), "candidates": [(-s).tolist()],
                   "isophotes": contours, "curves": []},
         common | {"estimator": "brightest_point", "specularity": 1, "true_id": None, "status": "no_peak",
-                  "error_deg": None, "normal": None, "candidates": [], "look_px": None, "isophotes": [],
-                  "curves": []},
+                  "kind": "false", "error_deg": None, "normal": None, "candidates": [], "look_px": None,
+                  "isophotes": [], "curves": []},
     ]  # fmt: skip
     meta = {
         "surface": "cylinder", "setting": f"R = {radius:g} mm", "label": "cylinder outside", "sigma": 0.02,
@@ -290,7 +288,7 @@ def test_the_3d_view_is_coloured_by_curvature_where_the_run_kept_it(tmp_path):
 def test_overview_figures_are_written(overview):
     path, _ = overview
     names = {file.name for file in (path / "figures").iterdir()}
-    expected = {"error_vs_curvature.png", "axis_ratio.png", "error_vs_offset.png", "surface3d.png", "gallery_000.png"}
+    expected = {"error_vs_curvature.png", "axis_ratio.png", "error_vs_offset.png", "gallery_000.png"}
     assert expected | {"gallery_001.png"} == names
     for name in names:
         width, height = png_size(path / "figures" / name)
@@ -340,6 +338,21 @@ def test_a_law_of_another_reflectance_is_drawn_from_the_rows(tmp_path):
     for curve in figure.curves:
         np.testing.assert_allclose(curve.law_y, 33.0)
         np.testing.assert_allclose(curve.law_x, curve.x)
+
+
+@pytest.mark.parametrize("values", [np.linspace(0.5, 0.74, 7), np.linspace(-0.74, -0.5, 7), [0.5, 0.51, 2.0]])
+def test_neighbouring_settings_have_cells_of_their_own(tmp_path, values):
+    rng, rows = np.random.default_rng(0), []
+    for kd in values:
+        for eps in (0.05, 0.1):
+            # The offset moves the highlight, and so its curvature, a little.
+            own = rows_of_setting(rng, "sphere", f"{kd:.3f}, {eps}", float(kd) + 0.001 * eps, eps, 4)
+            rows += [row | {"experiment": "grid"} for row in own]
+    maps = heat_maps(read_run(make_run(tmp_path, "grid", rows, items=0)))
+    assert len(maps) == len(ESTIMATORS)
+    for item in maps:
+        assert item.mean_deg.shape == (2, len(values))
+        np.testing.assert_allclose(item.kd, values, atol=1e-3)
 
 
 def test_grid_gives_heat_maps_and_slices(tmp_path):
@@ -484,22 +497,6 @@ def test_style():
     ticks = dict(axis.ticks(*ends))
     assert {"−0.3", "0", "1"} <= set(ticks.values())
     assert all(ends[0] <= at <= ends[1] for at in ticks)
-
-
-def test_the_3d_view_in_a_file_shows_the_surface_in_its_colours(tmp_path):
-    path = make_run(tmp_path, items=0)
-    make_item(path / "gallery" / "item_00.npz", radius=4.0, curved=True)
-    view = view_3d(read_run(path), colours(ESTIMATORS))
-    curved, shaded = view_picture(view), view_picture(replace(view, curvature=None))
-    # A sphere seen from outside is convex all over, at the end of the scale: the last of its colours.
-    end = np.array(rgb(CURVATURE_COLOURS[-1]), int)
-    surface = (np.abs(curved[:, :600].astype(int) - end).max(axis=-1) < 3).mean()
-    assert surface > 0.02
-    assert (np.abs(shaded.astype(int) - end).max(axis=-1) < 3).mean() < 0.001
-    # Segments lie on the surface, in the colours of their kinds.
-    for part in view.segments:
-        assert (np.abs(curved.astype(int) - rgb(part.colour)).max(axis=-1) < 60).any(), part.name
-    np.testing.assert_array_equal(curved, view_picture(view))
 
 
 def test_no_chord_joins_unlike_settings(tmp_path):

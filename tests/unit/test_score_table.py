@@ -80,12 +80,13 @@ sweep = [{ "surface.relief.bands.0.slope_deg" = [2.0, 6.0] }]
 """
 
 NOT_IN_A_TABLE = (
-    "isovalue", "isovalues", "axis_ratio_seen_law", "gain_1", "gain_2", "gain_error", "gain_oracle_error",
+    "isovalue", "isovalues", "axis_ratio_seen_law", "error_law_deg", "error_look_law_deg",
+    "gain_1", "gain_2", "gain_error", "gain_oracle_error",
     "direction_error_deg",
 )  # fmt: skip
 """Columns of what a table does not state, beside the parts of the budget: isophotes and curvature."""
 
-OF_CANDIDATES = ("error_oracle_deg", "n_candidates", "rank_correct", "error_law_deg")
+OF_CANDIDATES = ("error_oracle_deg", "n_candidates", "rank_correct")
 """Columns of estimators with two candidates, of which results.parquet holds the proposed one alone."""
 
 ANSWER = (

@@ -111,7 +111,7 @@ def test_rows_count_matched_false_and_missed():
         detection(100, 80, 20, 20, (110, 90), {"a": estimate(NORTH), "b": estimate(NORTH)}),
     ]
     truths = [truth_at(21, 21), truth_at(75, 100)]
-    made = rows(*context(), found, truths, matched_to(found, truths), ["a", "b"])
+    made = rows(*context(), found, truths, matched_to(found, truths), {"a": (), "b": ()})
     frame = table(made, {})
     assert frame.columns == list(SCHEMA)
     assert len(frame) == 6
@@ -144,7 +144,7 @@ def test_errors_of_a_row():
     """The proposed candidate, the better one, and the surface where the estimate looks."""
     result = estimate(leaned(5), [leaned(5), leaned(1, 180)])
     found = [detection(0, 0, 50, 50, (20, 20), {"a": result})]
-    (row,) = rows(*context(leaned(7)), found, [truth_at(20, 20)], {0: 0}, ["a"])
+    (row,) = rows(*context(leaned(7)), found, [truth_at(20, 20)], {0: 0}, {"a": ()})
     assert row.error_deg == pytest.approx(5)
     assert row.error_oracle_deg == pytest.approx(1)
     assert row.error_look_deg == pytest.approx(2)

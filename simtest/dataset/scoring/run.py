@@ -262,4 +262,4 @@ def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[ResultRow]:
     maker = maker_of(views.dataset.model_dump_json(), views.variant)
     dark = each.view.full_scale <= 0
     found = [] if dark else reconstruct(each.image, each.view.calibration, estimators)
-    return maker.rows(each.number, each.session, each.view, found, list(estimators))
+    return maker.rows(each.number, each.session, each.view, found, estimators)

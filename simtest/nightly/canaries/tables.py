@@ -72,7 +72,7 @@ def counts(session: Session) -> list[Figure]:
     made = _realised(session, 0.0)
     own = [made.specularities[i] for i in made.matched]
     aside = [truth.bp_px + np.array([40.0, 0.0]) for truth in made.truths]
-    missed = rows(session, ResultRow(), [], made.truths, {}, ("cone_axis", "curved"))
+    missed = rows(session, ResultRow(), [], made.truths, {}, {"cone_axis": (), "curved": ()})
     states = [row.status for row in missed]
     return [
         canary("counts", "matched", "", len(made.matched), 1, 1, about="the one highlight of a plane"),
@@ -195,7 +195,7 @@ def _candidates(made: Realisation) -> list[Figure]:
     both = replace(own, normal=other, candidates=np.array([other, truth.normal]), budget=None, covariance=None)
     specularity = replace(made.specularities[next(iter(made.matched))], estimates={"both": both})
     session = _Still(made)
-    (row, *_) = rows(session, ResultRow(), [specularity], [truth], {0: 0}, ("both",))  # type: ignore[arg-type]
+    (row, *_) = rows(session, ResultRow(), [specularity], [truth], {0: 0}, {"both": ()})  # type: ignore[arg-type]
     gap = max(abs(_value(row.error_deg) - 5.0), abs(_value(row.error_oracle_deg)), abs(_value(row.rank_correct) - 1))
     about = "the second of two candidates is the truth, the first 5 deg off"
     return [canary("columns", "oracle_off", "deg", gap, 1e-6, about=about)]

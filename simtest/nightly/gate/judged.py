@@ -127,6 +127,7 @@ SUMMARY: dict[str, Judged | NotJudged] = {
     "n_failed_by_reason": Judged("single answers, published failed", f"{_SAME_SEEDS}; their sum is {_ROWS}"),
     "n_missed": Judged(f"missed, {_WITH_TESTS}", f"{_RATE}; {_ROWS}"),
     "n_false": Judged(f"false, single false, {_WITH_TESTS}", f"{_RATE} a frame; {_ROWS}"),
+    "n_in_spot": NotJudged("Detections in spots of several glints or of none count nowhere else; see `visible_id`."),
     "n_instrument": NotJudged("Detections on an instrument count nowhere else; the definition and the seeds fix them."),
     "mean_deg": Judged(f"mean_deg, {_WITH_TESTS}", f"{_ERROR}; {_ROWS}"),
     "mean_base_deg": Judged(f"base_deg, {_WITH_TESTS}", f"{_ERROR}; {_ROWS}"),

@@ -8,8 +8,9 @@ import polars as pl
 from scipy import stats
 
 from simtest.nightly.gate.figures import digests_of
-from simtest.nightly.gate.quantities import ANSWERED, COVERED, IS_TRUE, RATIO_OFF, is_false
+from simtest.nightly.gate.quantities import ANSWERED, COVERED, IS_TRUE, RATIO_OFF
 from simtest.nightly.records import CELL
+from simtest.validation.row_kinds import is_false
 from simtest.validation.statistics import CONFIDENCE, PENALTY_DEG
 
 PUBLISHED = "published "

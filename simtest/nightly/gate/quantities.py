@@ -9,6 +9,7 @@ from simtest.conventions import MOTION, ON_INSTRUMENT
 from simtest.nightly.gate.limits import Limits
 from simtest.nightly.records import CELL
 from simtest.validation.results_table import BUDGET_COLUMNS
+from simtest.validation.row_kinds import is_false
 from simtest.validation.statistics import CONFIDENCE, PENALTY_DEG
 
 COVERED = float(stats.chi2.ppf(CONFIDENCE, 2))
@@ -197,19 +198,6 @@ def with_optional(rows: pl.DataFrame) -> pl.DataFrame:
     return rows.with_columns(
         pl.lit(None, dtype).alias(name) for name, dtype in OPTIONAL_COLUMNS.items() if name not in rows.columns
     )
-
-
-def is_false(rows: pl.DataFrame) -> pl.Expr:
-    """Return which rows are false detections: neither a highlight, nor a visible spot of a relief, nor an instrument.
-
-    As `simtest.validation.statistics.figures` counts them.
-    """
-    found = pl.col("true_id").is_null()
-    if "visible_id" in rows.columns:
-        found &= pl.col("visible_id").is_null()
-    if ON_INSTRUMENT in rows.columns:
-        found &= ~pl.col(ON_INSTRUMENT).fill_null(False)
-    return found
 
 
 def told_twice(rows: pl.DataFrame, cells: pl.DataFrame) -> pl.DataFrame:

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import polars as pl
 
-from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE, REGION_DEG, is_false
+from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE, REGION_DEG
 from simtest.nightly.records import CELL
+from simtest.validation.row_kinds import is_false
 
 
 class Step(NamedTuple):

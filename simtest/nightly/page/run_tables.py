@@ -9,6 +9,7 @@ from simtest.nightly.phrases import MEANINGS, bounds, interval, joined, measure,
 from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
 from simtest.pages.style import estimator_order, number
 from simtest.report.run_folder import flattened
+from simtest.validation.row_kinds import counts, row_kind
 
 MOST_ROWS = 800
 """Rows of the table; equal and equivalent ones are left out first. verdict.json holds all."""
@@ -103,20 +104,16 @@ def results(run: NightlyRun, apart: bool = False) -> Table:
 
     Experiments are counted together, or `apart`.
     """
-    true, ok, missed = pl.col("true_id").is_not_null(), pl.col("status") == "ok", pl.col("status") == "missed"
     # Enumerations sort in the order of their names.
     by = [pl.col("estimator").cast(pl.Enum(estimator_order(run.rows["estimator"])))]
     if apart:
         by.insert(0, pl.col("experiment").cast(pl.Enum(run.rows["experiment"].unique(maintain_order=True))))
     # Squared Mahalanobis distances of stated regions
-    held = pl.col("mahalanobis2").filter(ok & true).drop_nulls()
-    counts = run.rows.group_by(by).agg(
-        true=true.sum(), ok=(ok & true).sum(), failed=(true & ~ok & ~missed).sum(), missed=missed.sum(),
-        false=(~true).sum(), with_region=held.len(), covered=(held <= COVERED).sum(),
-    )  # fmt: skip
+    held = pl.col("mahalanobis2").filter(row_kind(run.rows) == "ok").drop_nulls()
+    table = run.rows.group_by(by).agg(**counts(run.rows), with_region=held.len(), covered=(held <= COVERED).sum())
     names = ("experiment", "estimator")[-len(by) :]
     entries = []
-    for row in counts.sort(names).iter_rows(named=True):
+    for row in table.sort(names).iter_rows(named=True):
         numbers = (
             row["true"], row["ok"], _percent(row["ok"], row["true"]), row["failed"], row["missed"], row["false"],
             row["with_region"], _percent(row["covered"], row["with_region"]),
@@ -135,11 +132,11 @@ def _percent(part: int, whole: int) -> str:
 
 def failures(run: NightlyRun) -> Table:
     """Count the failures by reason, the commonest first, and estimator."""
-    failed = run.rows.filter(pl.col("true_id").is_not_null() & ~pl.col("status").is_in(["ok", "missed"]))
+    failed = run.rows.filter(row_kind(run.rows) == "failed")
     reasons = failed.group_by("status").len().sort("len", "status", descending=[True, False])["status"].to_list()
-    counts = {(name, reason): count for name, reason, count in failed.group_by("estimator", "status").len().rows()}
+    numbers = {(name, reason): count for name, reason, count in failed.group_by("estimator", "status").len().rows()}
     entries = [
-        [Entry(name, "text estimator", head=True), *(Entry(counts.get((name, reason), "–")) for reason in reasons)]
+        [Entry(name, "text estimator", head=True), *(Entry(numbers.get((name, reason), "–")) for reason in reasons)]
         for name in estimator_order(failed["estimator"])
     ]
     return Table("Failures by reason", ("=estimator", *(reason.replace("_", " ") for reason in reasons)), entries)
