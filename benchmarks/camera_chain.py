@@ -14,7 +14,7 @@ from benchmarks.measuring import Figure
 from simtest.calibration import Response
 from simtest.geometry import Camera, ViewMask, smooth
 from simtest.runtime.arrays import Image
-from simtest.runtime.measuring import times_in_turns
+from benchmarks.timing import times_in_turns
 from simtest.simulation import camera_chain, mosaic, video_processor
 from simtest.spec.sensor import Sensor
 from simtest.spec.sensor_presets import PRESETS

@@ -130,8 +130,6 @@ class GalleryMeta:
         Calibration, the highlights that count, and the answers at each detection.
     lights : list of list of float, optional
         Positions, camera frame, mm.
-    why : str, optional
-        Why the item is kept.
     published : PublishedDetails, optional
         For the published protocol.
     """
@@ -145,7 +143,6 @@ class GalleryMeta:
     truth: Sequence[DrawnTruth]
     estimates: Sequence[DrawnEstimate]
     lights: list[Vector] | None = None
-    why: str | None = None
     published: PublishedDetails | None = None
 
     def to_json(self) -> dict[str, Json]:
@@ -160,10 +157,8 @@ class GalleryMeta:
         }
 
 
-def save(
-    path: Path, session: Session, experiment: Experiment, case: Case, made: Realisation, why: str | None = None
-) -> None:
-    """Write the gallery item of a realisation, at whose scene the session must be; `why` says why it is kept."""
+def save(path: Path, session: Session, experiment: Experiment, case: Case, made: Realisation) -> None:
+    """Write the gallery item of a realisation, at whose scene the session must be."""
     camera, scene = session.camera, made.view.scene
     # Thinned maps: enough for arrows and the 3D view.
     truth = session.truth(stride=max(1, max(camera.width, camera.height) // MAP_SIDE))
@@ -180,7 +175,6 @@ def save(
         ],
         estimates=[estimate for i in range(len(made.specularities)) for estimate in _estimates(i, made, camera)],
         lights=scene.rig.true_mm().tolist(),
-        why=why,
     )
     # Pictures are encoded once more where they are drawn.
     linear = scene.sensor.response.model().decode(made.frame)

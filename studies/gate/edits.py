@@ -7,7 +7,7 @@ reports/nightly/quick), and one that is drawn from the bank, which is compared w
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -163,16 +163,6 @@ def some_missed(rows: pl.DataFrame, rng: np.random.Generator) -> pl.DataFrame:
     return _unanswered(rows, pl.lit(chosen), "missed")
 
 
-def medians(run: NightlyRun) -> NightlyRun:
-    """Publish the median of the errors as their mean."""
-    key = ["experiment", "label", "surface", "setting", "estimator"]
-    other = run.figures.filter(pl.col("quantity") == "median_deg").select(*key, median="value")
-    table = run.figures.join(other, on=key, how="left", nulls_equal=True, maintain_order="left")
-    is_mean = pl.col("quantity") == "mean_deg"
-    table = table.with_columns(value=pl.when(is_mean).then(pl.coalesce("median", "value")).otherwise("value"))
-    return replace(run, figures=table.drop("median"))
-
-
 EDITS: dict[str, Edit] = {
     "all estimators failing in 4 settings": failing,
     "errors of one cell five times larger": one_cell_five_times,
@@ -192,8 +182,6 @@ EDITS: dict[str, Edit] = {
     "answers missed in 5 %": some_missed,
 }
 """Edits of rows by name."""
-
-MEDIANS = "mean replaced by median"
 
 
 @dataclass(frozen=True)
@@ -224,7 +212,6 @@ def edited(tonight: pl.DataFrame, other: pl.DataFrame | None, seed: int = 0) -> 
     runs = {"none": run_of(tonight)}
     for name, edit in EDITS.items():
         runs[name] = run_of(edit(tonight, np.random.default_rng(seed)))
-    runs[MEDIANS] = medians(runs["none"])
     unedited, fresh = runs["none"], None if other is None else run_of(other)
     return [
         Edited(
