@@ -1,6 +1,5 @@
 """The pieces of work whose growth is measured, each at several sizes."""
 
-import dataclasses
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping

@@ -1,4 +1,4 @@
-"""The nightly page with the longest history that it shows: its size, how long it takes to make, how soon it can be used."""
+"""The nightly page with its longest history: its size, how long it takes to make, how soon it can be used."""
 
 import tempfile
 import time

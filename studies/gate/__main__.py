@@ -6,7 +6,7 @@ from collections.abc import Callable
 from benchmarks.measuring import print_figures
 from studies.gate import figures, proof
 from studies.gate.bank import frames_of, load_bank
-from studies.gate.edits import night_folder, of_last_night, of_the_bank, said, told
+from studies.gate.edits import night_folder, of_last_night, said, told
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
@@ -58,17 +58,10 @@ def noise() -> str:
 
 def edits() -> str:
     """Return the table of results that were edited without touching the code."""
-    night, drawn = of_last_night(night_folder()), of_the_bank(load_bank(proof.bank_folder()), proof.N)
-    rows = [
-        (one.name, said(one, one.same), said(other, other.same), said(other, other.fresh), told(one.same))
-        for one, other in zip(night, drawn, strict=True)
-    ]
-    fine = [row[0] for row in rows[1:] if row[1] in ("fine", "-")]
-    lines = (
-        f"{len(rows) - 1 - len(fine)} of {len(rows) - 1} edits of the night are not called fine, of the same seeds.\n"
-    )
-    head = ("edit", "quick night, same seeds", "drawn night, same seeds", "drawn night, other seeds", "first cause")
-    return lines + "\n" + _table(head, rows)
+    rows = [(one.name, said(one), told(one.same)) for one in of_last_night(night_folder())]
+    fine = [name for name, verdict, _ in rows[1:] if verdict in ("fine", "-")]
+    lines = f"{len(rows) - 1 - len(fine)} of {len(rows) - 1} edits of the night are not called fine.\n"
+    return lines + "\n" + _table(("edit", "quick night, same seeds", "first cause"), rows)
 
 
 SECTIONS: dict[str, Callable[[], str]] = {

@@ -1,8 +1,7 @@
 """Results that were edited without touching the code: what the gate says of each.
 
 `python -m studies.gate edits` prints the table. A night is edited, and the gate compares it with the same night as it
-was (same seeds): the last one of the profile quick, from the folder that GATE_NIGHT names (default:
-reports/nightly/quick), and one that is drawn from the bank, which is compared with a night of other seeds too.
+was: the last one of the profile quick, from the folder that GATE_NIGHT names (default: reports/nightly/quick).
 """
 
 import os
@@ -18,7 +17,6 @@ from simtest.nightly.gate.figures import setting_figures
 from simtest.nightly.records import NightlyRun, RunRecord, Verdict
 from simtest.nightly.storage import LATEST_ROWS, load_run
 from simtest.validation.results_table import SCHEMA
-from studies.gate.nights import Source
 
 OK = (pl.col("status") == "ok") & pl.col("true_id").is_not_null()
 OF_ANSWERS = (
@@ -222,13 +220,6 @@ def edited(tonight: pl.DataFrame, other: pl.DataFrame | None, seed: int = 0) -> 
     ]  # fmt: skip
 
 
-def of_the_bank(bank: pl.DataFrame, count: int, seed: int = 0) -> list[Edited]:
-    """Edit a night of so many realisations a setting that is drawn from the bank."""
-    source = Source.of(bank)
-    ranks = source.ranks(np.random.default_rng(seed))
-    return edited(source.chosen(ranks < count), source.chosen((ranks >= count) & (ranks < 2 * count)), seed)
-
-
 def night_folder() -> Path:
     """Return the folder of the night that is edited."""
     return Path(os.environ.get("GATE_NIGHT") or Path("reports") / "nightly" / "quick")
@@ -239,12 +230,12 @@ def of_last_night(folder: Path) -> list[Edited]:
     return edited(load_run(folder, LATEST_ROWS).rows, None)
 
 
-def said(one: Edited, verdict: Verdict | None) -> str:
-    """Return a verdict in a word, with the number of findings."""
-    if verdict is None or not (one.changes or one.name == "none"):
+def said(one: Edited) -> str:
+    """Return the verdict against the same seeds in a word, with the number of findings."""
+    if not (one.changes or one.name == "none"):
         return "-"
-    found = verdict.regressions.height + verdict.unexplained.height
-    return f"{verdict.state} ({found})" if found else verdict.state
+    found = one.same.regressions.height + one.same.unexplained.height
+    return f"{one.same.state} ({found})" if found else one.same.state
 
 
 def told(verdict: Verdict) -> str:

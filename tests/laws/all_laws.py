@@ -51,8 +51,9 @@ def measures() -> dict[str, Callable[[], list[Law]]]:
     def session() -> Session:
         return Session(rendered.described(rendered.PLANE))
 
-    made: dict[str, Callable[[], list[Law]]] = {measure.__name__: measure for measure in ALONE + RENDERING}
-    return made | {measure.__name__: partial(_in, session, measure) for measure in IN_SESSION}
+    made: dict[str, Callable[[], list[Law]]] = {measure.__name__: measure for measure in ALONE}
+    made |= {measure.__name__: partial(_in, session, measure) for measure in IN_SESSION}
+    return made | {measure.__name__: measure for measure in RENDERING}
 
 
 def _in(session: Callable[[], Session], measure: Callable[[Session], list[Law]]) -> list[Law]:

@@ -116,9 +116,9 @@ def test_causes_name_the_part_of_the_budget_that_moved():
     )
     verdict = compare(night(wider), night(table))
     assert (verdict.state, verdict.regressions.height) == ("changed", 0)
-    told = [cause for cause in verdict.causes if "the size of the stated regions" in cause]
+    told = [cause for cause in verdict.causes if "the size of the reported regions" in cause]
     assert "curved in e, " in told[0]
-    assert "Of the stated uncertainty the part shape is 1.2 deg, was 0.4 deg." in told[0]
+    assert "Of the reported uncertainty the part shape is 1.2 deg, was 0.4 deg." in told[0]
     assert not any(cause.startswith("cone_axis") for cause in verdict.causes)
 
 

@@ -28,9 +28,9 @@ WORDS = {
     "direction_deg": "the error of the curvature's direction",
     "eps_over_d": "the light's distance over the surface's",
     "peak_snr": "the highlights' peak over the noise",
-    "region_deg": "the size of the stated regions",
-    "noise_part_deg": "the noise's part of the stated uncertainty",
-    "truth_in_region": "the truth's place in the stated regions (0.5 where they are right, 1 where too wide)",
+    "region_deg": "the size of the reported regions",
+    "noise_part_deg": "the noise's part of the reported uncertainty",
+    "truth_in_region": "the truth's place in the reported regions (0.5 where they are right, 1 where too wide)",
     "unanswered": "the share of unanswered highlights",
     "missed": "the share of missed highlights",
     "false": "the number of false detections a frame",
@@ -162,7 +162,7 @@ def _reasons(row: Mapping[str, object], tonight: NightlyRun, baseline: NightlyRu
 
 
 def _budget(row: Mapping[str, object], tonight: NightlyRun, baseline: NightlyRun | None) -> str:
-    """Return which part of the stated uncertainty moved most."""
+    """Return which part of the reported uncertainty moved most."""
     before, after = _own(baseline, row), _own(tonight, row)
     if row["quantity"] not in _LINKED or before is None or after is None:
         return ""
@@ -176,7 +176,7 @@ def _budget(row: Mapping[str, object], tonight: NightlyRun, baseline: NightlyRun
     if apart <= 0.02 * max(first, second):
         return ""
     part = name.removeprefix("budget_").removesuffix("_deg")
-    return f" Of the stated uncertainty the part {part} is {second:.3g} deg, was {first:.3g} deg."
+    return f" Of the reported uncertainty the part {part} is {second:.3g} deg, was {first:.3g} deg."
 
 
 def _number(value: object) -> str:
