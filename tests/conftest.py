@@ -46,7 +46,7 @@ def pytest_collection_finish():
 LONGEST = (
     "test_examples", "test_relief", "test_gate_edits", "test_gate", "test_dataset", "test_nightly_run",
     "test_process_runs", "test_cli", "test_colon", "test_core_check", "test_deformed_render", "test_tissue_colour",
-    "test_laws", "test_results", "test_photometric", "test_page_up_to_date", "test_dense_shading", "test_fit",
+    "test_all_laws", "test_result_rules", "test_photometric", "test_page_up_to_date", "test_dense_shading", "test_fit",
     "test_nightly_page", "test_inverse_rendering", "test_reuse", "test_learn", "test_sensor_scenes", "test_export",
     "test_dense_command", "test_mesh_surface", "test_motion_sequence", "test_gate_signs", "test_tracks",
     "test_motion_evidence", "test_circle_pose", "test_process_faults", "test_nightly_browser", "test_dense_depths",
