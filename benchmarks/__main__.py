@@ -17,7 +17,6 @@ ON_REQUEST = (
     "cores",
     "memory",
     "ray_nodes",
-    "history",
     "dataset_memory",
     "nightly_page",
     "run_page",

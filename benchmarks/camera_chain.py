@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 
 from benchmarks.measuring import Figure
+from benchmarks.timing import times_in_turns
 from simtest.calibration import Response
 from simtest.geometry import Camera, ViewMask, smooth
 from simtest.runtime.arrays import Image
-from simtest.runtime.measuring import times_in_turns
 from simtest.simulation import camera_chain, mosaic, video_processor
 from simtest.spec.sensor import Sensor
 from simtest.spec.sensor_presets import PRESETS

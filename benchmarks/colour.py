@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.measuring import Figure
+from benchmarks.timing import in_turns, times_in_turns
 from simtest.calibration import Calibration, srgb_encode
 from simtest.geometry import Camera
 from simtest.reconstruction import detect_in_picture, reconstruct_colour
 from simtest.reconstruction.pipeline import default_estimators
-from simtest.runtime.measuring import in_turns, times_in_turns
 
 WIDTH, HEIGHT, HIGHLIGHTS = 1280, 720, 30
 MANY = 110

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.measuring import Figure
+from benchmarks.timing import times_in_turns
 from simtest.rendering import Session
-from simtest.runtime.measuring import times_in_turns
 from simtest.simulation.flow import SEEN, Flow, SeenSurface, flow_between
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import Scene, load_scene

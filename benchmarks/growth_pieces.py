@@ -1,6 +1,5 @@
 """The pieces of work whose growth is measured, each at several sizes."""
 
-import dataclasses
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -12,14 +11,11 @@ from pathlib import Path
 import polars as pl
 
 from benchmarks.colour import spotted
-from benchmarks.nights import history_of, run_of, verdict_of
+from benchmarks.nights import run_of
 from benchmarks.transfers import smooth_scene
 from simtest.calibration import Calibration
 from simtest.geometry import Camera
 from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.history import TREND_COLUMNS, TRENDS, append, history_rows, read_history
-from simtest.nightly.page import write_nightly_page
-from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
 from simtest.nightly.verdict import verdict_on
 from simtest.reconstruction import detect_in_picture, reconstruct_colour
 from simtest.reconstruction.pipeline import default_estimators
@@ -46,8 +42,6 @@ WAVELENGTHS_MM = (2.8, 2.0, 1.4, 1.0, 0.7, 0.5)
 COPIES = (4, 16, 64, 128, 256)
 SETTINGS = (1, 2, 4, 8, 16)
 """Copies of the rows, as further realisations or as further settings."""
-
-NIGHTS = (16, 64, 256, 512, 1024)
 
 
 @dataclass(frozen=True)
@@ -82,8 +76,6 @@ def pieces() -> Iterator[Piece]:
         yield Piece(name, "rows", _results(of_rows, False))
         yield Piece(name, "settings", _results(of_rows, True))
     yield Piece("page of a run", "rows", _pages)
-    yield Piece("history read", "nights", _histories(False))
-    yield Piece("history read and page of the night", "nights", _histories(True))
 
 
 # Triangles ----------------------------------------------------------------------------------------------------------
@@ -276,38 +268,3 @@ def _reported(run: Path) -> None:
     (run / "index.html").unlink(missing_ok=True)
     shutil.rmtree(run / "figures", ignore_errors=True)
     write_report(run)
-
-
-# Nights -------------------------------------------------------------------------------------------------------------
-
-
-def _histories(page: bool) -> Callable[[], AbstractContextManager[Works]]:
-    @contextmanager
-    def opened() -> Iterator[Works]:
-        with tempfile.TemporaryDirectory() as scratch:
-            folder = Path(scratch)
-            run = run_of(_rows(folder / "run", 1))
-            works: Works = {}
-            for nights in NIGHTS:
-                reports = folder / str(nights)
-                _write_history(reports, run, nights)
-                works[float(nights)] = lambda reports=reports: _night(run, reports, page)  # type: ignore[misc]
-            yield works
-
-    return opened
-
-
-def _write_history(folder: Path, run: NightlyRun, nights: int) -> None:
-    """Write a history of so many nights, a file each, as the nightly does."""
-    verdict = Verdict("fine", False, verdict_of(run).comparisons.clear(), (), None)
-    for own in history_of(run, nights).partition_by("run_id"):
-        values = {"id": own["run_id"][0], "started": own["started"][0].isoformat(), "commit": own["commit"][0]}
-        record = run.record.model_copy(update=values)
-        figures = own.select(run.figures.columns)
-        append(folder, history_rows(dataclasses.replace(run, record=record, figures=figures), verdict))
-
-
-def _night(run: NightlyRun, reports: Path, page: bool) -> None:
-    history, _ = read_history(reports, run.record.profile, TREND_COLUMNS, TRENDS)
-    if page:
-        write_nightly_page(reports.with_suffix(".page"), JudgedRun(run, verdict_on(run, run), history))

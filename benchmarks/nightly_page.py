@@ -1,8 +1,7 @@
-"""The nightly page with a history of 1,000 nights: its size, how long it takes to make, how soon it can be used."""
+"""The nightly page with its longest history: its size, how long it takes to make, how soon it can be used."""
 
 import tempfile
 import time
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,14 +10,12 @@ import polars as pl
 from benchmarks.browser import OPENINGS, openings
 from benchmarks.measuring import Figure
 from benchmarks.nights import history_of, run_of, verdict_of
-from simtest.nightly.ladder import ladder_figures
+from simtest.nightly.history import NEWEST
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
 from simtest.spec import load_experiment
 from simtest.validation.runner import run_experiment
-from simtest.validation.worst import save_worst, worst_cases
 
-NIGHTS = 1000
 FIGURES_A_NIGHT = 3000
 """As many as a full night has: the real rows stand several times, under other names."""
 
@@ -30,7 +27,7 @@ FILTERED = """
   const started = performance.now(), choice = document.getElementById("filter-outcome");
   choice.value = "worse";
   choice.dispatchEvent(new Event("change", {bubbles: true}));
-  document.getElementById("trend-quantity").dispatchEvent(new Event("change"));
+  document.querySelector("[data-switch=trends]").dispatchEvent(new Event("change"));
   document.body.getBoundingClientRect();
   return performance.now() - started;
 }
@@ -46,7 +43,7 @@ def figures() -> list[Figure]:
         wall, processor = time.monotonic(), time.process_time()
         page = write_nightly_page(folder / "page", judged)
         wall, processor = time.monotonic() - wall, time.process_time() - processor
-        about = f"{NIGHTS} nights of {judged.run.figures.height} figures, {len(judged.gallery)} worst cases"
+        about = f"{NEWEST} nights of {judged.run.figures.height} figures"
         made = [
             Figure("nightly page: size", page.stat().st_size / MB, 8.0, unit="MB", about=about),
             Figure("nightly page: time to make", wall, 20.0, unit="s", about=f"{processor:.1f} s of processor"),
@@ -55,10 +52,9 @@ def figures() -> list[Figure]:
 
 
 def _judged(folder: Path) -> JudgedRun:
-    """Run a small experiment, and return it as a whole nightly run with its verdict, history and worst cases."""
+    """Run a small experiment, and return it as a whole nightly run with its verdict and history."""
     experiment = load_experiment("overview", {"realisations": 1})
     rows = run_experiment(experiment, folder / "run").results
-    gallery = save_worst(worst_cases(rows), [experiment], folder / "worst")
     copies = 1
     run = run_of(rows, STARTED)
     while run.figures.height < FIGURES_A_NIGHT:
@@ -67,13 +63,12 @@ def _judged(folder: Path) -> JudgedRun:
             rows.with_columns(pl.format("{} {}", "experiment", pl.lit(i)).alias("experiment")) for i in range(copies)
         ]
         run = run_of(pl.concat(named), STARTED)
-    run = replace(run, figures=pl.concat([run.figures, ladder_figures()]))
-    return JudgedRun(run, verdict_of(run), history_of(run, NIGHTS), tuple(gallery))
+    return JudgedRun(run, verdict_of(run), history_of(run, NEWEST))
 
 
 def _opened(page: Path) -> list[Figure]:
     """Open the page, and use it."""
-    times, processor, used = openings(page, "#trend-chart .main-svg", FILTERED)
+    times, processor, used = openings(page, "#trends .main-svg", FILTERED)
     middle = OPENINGS // 2
     about = f"of {OPENINGS} openings; the page's thread {processor[middle]:.2f} s of processor"
     return [

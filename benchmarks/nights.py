@@ -10,19 +10,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest.nightly.canaries.canary import canary
 from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.records import (
-    CELL,
-    COMPARISONS,
-    FIGURES,
-    Cell,
-    Figure,
-    NightlyRun,
-    RunRecord,
-    Verdict,
-    figure_table,
-)
+from simtest.nightly.history import HISTORY, TREND_COLUMNS, trend_rows
+from simtest.nightly.records import CELL, COMPARISONS, NightlyRun, RunRecord, Verdict
 from simtest.runtime import provenance
 
 FIRST = datetime(2024, 2, 1, 2, 30, tzinfo=UTC)
@@ -49,15 +39,7 @@ def run_of(rows: pl.DataFrame, started: datetime = FIRST, profile: str = "full")
         id="made", profile=profile, started=started.isoformat(timespec="seconds"), duration_s=1234.5,
         command=f"simtest nightly --profile {profile}", **provenance.environment(),
     )  # fmt: skip
-    made = [
-        canary("axis of a plane", "error_deg", "deg", 0.0031, 0.01, about="cone_axis on a noise-free plane"),
-        canary("noise hashes", "distinct hashes", "", 20.0, 20.0, 20.0, about="20 realisations, 20 different noises"),
-        canary("far ellipse", "radius", "px", 3.21, 3.01, 2.99, about="a circle of r = 3 px at (5000, 5000)"),
-    ]
-    for i, name in enumerate(rows["experiment"].unique(maintain_order=True)):
-        made.append(Figure("cost", Cell(name), "run time", "×", *(share * (i + 1) for share in (10.0, 9.5, 10.5))))
-    made.append(Figure("cost", Cell("all"), "peak memory", "MB", 812.0))
-    return NightlyRun(record, rows, pl.concat([setting_figures(rows), figure_table(made)]))
+    return NightlyRun(record, rows, setting_figures(rows))
 
 
 def history_of(run: NightlyRun, runs: int, seed: int = 0, noise: float = 0.05) -> pl.DataFrame:
@@ -77,10 +59,10 @@ def history_of(run: NightlyRun, runs: int, seed: int = 0, noise: float = 0.05) -
     Returns
     -------
     polars.DataFrame
-        As the history's files hold it.
+        As `read_history` returns it.
     """
     rng = np.random.default_rng(seed)
-    held = run.figures.filter(pl.col("value").is_not_null())
+    held = run.figures
     values = held["value"].to_numpy()
     drift = np.cumsum(rng.normal(0, 0.004, (runs, len(values))), axis=0)[::-1]
     parts: list[pl.DataFrame] = []
@@ -88,19 +70,17 @@ def history_of(run: NightlyRun, runs: int, seed: int = 0, noise: float = 0.05) -
         started = run.record.start - timedelta(days=runs - i)
         factor = np.exp(drift[i] + rng.normal(0, noise, len(values)))
         commit = f"{rng.integers(2**48):012x}" if i % 3 == 0 or not parts else parts[-1]["commit"][0]
-        constants = {"run_id": f"night-{i:05d}", "commit": commit, "profile": run.record.profile,
-                     "state": "regression" if rng.random() < 0.02 else "fine", "bit_equal": i % 3 != 0,
-                     "processor": "made up", "versions": "made up", "duration_s": 1200.0,
-                     "source_hash": "made up", "started": started}  # fmt: skip
+        constants = {"run_id": f"night-{i:05d}", "commit": commit, "started": started,
+                     "state": "regression" if rng.random() < 0.02 else "fine"}  # fmt: skip
         own = held.with_columns(pl.Series("value", np.where(values == 0, 0.0, values * factor)))
-        parts.append(own.with_columns(pl.lit(value).alias(name) for name, value in constants.items()))
-    return pl.concat(parts) if parts else pl.DataFrame(schema=FIGURES)
+        parts.append(trend_rows(own.with_columns(pl.lit(value).alias(name) for name, value in constants.items())))
+    return pl.concat(parts) if parts else pl.DataFrame(schema=HISTORY).select(TREND_COLUMNS)
 
 
 def verdict_of(run: NightlyRun, seed: int = 0, state: str = "regression") -> Verdict:
     """Make up a verdict with every outcome; of state "fine", one where all is the same bytes."""
     rng = np.random.default_rng(seed)
-    held = run.figures_of("setting").filter(pl.col("value").is_not_null())
+    held = run.figures
     rows = [
         _compared(row, rng if state == "regression" else None, i) for i, row in enumerate(held.iter_rows(named=True))
     ]

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 
 from benchmarks.measuring import Figure
+from benchmarks.timing import PeakMemory, in_turns, times_in_turns
 from simtest.geometry import Camera, circle_poses, cone_of_conic, fit_ellipses
-from simtest.runtime.measuring import PeakMemory, in_turns, times_in_turns
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import from_integer
 from simtest.spec import load_experiment

@@ -17,8 +17,8 @@ from typing import Any
 
 from benchmarks.measuring import Figure
 from benchmarks.mitsuba_frames import references
+from benchmarks.timing import in_turns, times_in_turns
 from simtest.rendering import Session, backend
-from simtest.runtime.measuring import in_turns, times_in_turns
 from simtest.spec import Scene, scene_from_dict
 
 ROUNDS = 7

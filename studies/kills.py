@@ -41,9 +41,7 @@ realisations = 4
 set = { "camera.width" = 64, "camera.height" = 48, "camera.fx" = 48.0, "camera.fy" = 48.0 }
 sweep = [{ "surface.tilt_deg" = [0, 3, 6, 9, 12] }]
 """
-PROFILE = """canaries = false
-costs = false
-[[experiments]]
+PROFILE = """[[experiments]]
 experiment = "x.toml"
 realisations = 40
 """

@@ -19,7 +19,7 @@ def picture(browser: Browser, page: Path, out: Path, section: str | None, **cont
     """Take one picture: of what is seen first, or of a section."""
     tab = browser.new_context(**context).new_page()  # type: ignore[arg-type]
     tab.goto(page.resolve().as_uri())
-    tab.wait_for_selector("#trend-chart .main-svg")
+    tab.wait_for_selector("#trends .main-svg")
     if section:
         tab.locator(section).scroll_into_view_if_needed()
         tab.wait_for_timeout(500)
@@ -43,7 +43,6 @@ def main(page: Path, folder: Path) -> None:
         picture(browser, page, folder / "nightly.png", None, **desktop)
         picture(browser, page, folder / "nightly_phone.png", None, **phone)
         picture(browser, page, folder / "nightly_trends.png", "#trends", **desktop)
-        picture(browser, page, folder / "nightly_ladder.png", "#ladder", **desktop)
         browser.close()
 
 

@@ -2,9 +2,9 @@
 
 `run` calls the three stages, each of which hands one record of `records` to the next:
 
-    run = measure_run(...)      # measure: experiments, canaries/, ladder, cost -> NightlyRun
+    run = measure_run(...)      # measure: experiments -> NightlyRun
     judged = judge(run, ...)    # judge: gate/ against the baseline, history -> JudgedRun
-    draw(judged, ...)           # draw: page/, outputs/ (JSON, JUnit, Markdown, badge)
+    draw(judged, ...)           # draw: reports, page/, outputs/ (JSON, Markdown)
 
 `storage` writes a run, `baseline` accepts one, `history` keeps the figures of all, `layout` names the folders.
 """

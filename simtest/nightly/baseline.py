@@ -8,7 +8,15 @@ from pathlib import Path
 
 from simtest.errors import InputError
 from simtest.nightly.gate.quantities import OLDEST_COLUMNS, OPTIONAL_COLUMNS, RESULT_COLUMNS
-from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
+from simtest.nightly.layout import (
+    Reports,
+    current,
+    exclusive_replacement,
+    new_run_id,
+    remove_dead,
+    replace_folder,
+    scratch,
+)
 from simtest.nightly.records import CELL, NightlyRun, RunRecord
 from simtest.nightly.small_rows import small, whole
 from simtest.nightly.storage import (
@@ -46,11 +54,11 @@ def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
         If a file of it is missing or damaged, lacks what `simtest.nightly.gate.compare` reads, or is another profile's;
         the message names it.
     """
-    folder = reports.baseline(profile)
-    with exclusive_replacement(folder):
-        if not folder.is_dir():
-            return None
-        run = load_run(folder, BASELINE_ROWS)
+    # Without a lock: the folder is kept in git, and whoever reads it writes nothing there.
+    folder = current(reports.baseline(profile))
+    if not folder.is_dir():
+        return None
+    run = load_run(folder, BASELINE_ROWS)
     if run.record.profile != profile:
         raise InputError(
             f"{shown(folder / RUN_FILE)}: profile = {shown(run.record.profile)}; the baseline of this night must be "

@@ -1,16 +1,15 @@
-"""The history of runs: an immutable Parquet file each, which is never changed once it is there."""
+"""The history of runs: a Parquet file each in the folder of its profile, never changed once it is there."""
 
 import hashlib
 import json
+import os
 import warnings
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
 import polars as pl
 
-from simtest.nightly.phrases import short_commit
 from simtest.nightly.records import CELL, FIGURES, NightlyRun, Verdict
 from simtest.runtime.files import require_plain, sync_folder, write_atomically
 from simtest.runtime.resources import shown
@@ -22,20 +21,17 @@ HISTORY: dict[str, pl.DataType] = {
 }  # fmt: skip
 """Columns of the history: a run's figures, and what is the same in all its rows."""
 
-_NEVER_NULL = ("run_id", "started", "profile")
-_NEEDED = ("kind", "experiment", "estimator", "quantity", "value", *_NEVER_NULL)
-"""Columns without which a file is none of the history; the others, which a later version may have added, may lack."""
-
 DIGEST_DIGITS = 16
 """Digits of a cell's hash that are kept: enough to see whether two runs are the same."""
 
 TRENDS = ("mean_deg", "unanswered", "coverage95")
-"""Quantities of settings whose course over the runs the page shows."""
+"""Quantities whose course over the runs the page shows."""
 
-TREND_COLUMNS = (
-    "kind", *CELL, "quantity", "unit", "value", "run_id", "started", "commit", "state", "profile",
-)  # fmt: skip
-"""Columns of the history that the page needs: all columns of 1,000 runs would take gigabytes."""
+TREND_COLUMNS = (*CELL, "quantity", "unit", "value", "run_id", "started", "commit", "state")
+"""Columns of the history that the page needs."""
+
+NEWEST = 400
+"""Runs that the page shows: it neither grows nor takes longer with each night."""
 
 MAX_NAMED = 5
 """Damaged files that the notes name one by one."""
@@ -60,53 +56,47 @@ def versions_hash(versions: Mapping[str, str]) -> str:
     return hashlib.sha256(json.dumps(dict(versions), sort_keys=True).encode()).hexdigest()[:12]
 
 
-def append(folder: Path, rows: pl.DataFrame) -> Path:
-    """Write a run's rows (see `history_rows`) into the history; the file is whole on disk, or not there at all."""
-    run_id, started, commit = rows.select("run_id", "started", "commit").row(0)
-    partition = folder / f"date={started:%Y-%m-%d}" / f"commit={short_commit(commit)}"
-    partition.mkdir(parents=True, exist_ok=True)
-    file = partition / f"{run_id}.parquet"
-    write_atomically(file, lambda part: rows.write_parquet(part, compression="zstd"))
+def append(folder: Path, rows: pl.DataFrame, scratch: Path) -> Path:
+    """Write a run's rows (see `history_rows`) into a profile's history; the file is whole there, or not at all.
+
+    It is made in `scratch`, on the same file system: whoever reads ``*.parquet`` never meets half of one.
+    """
+    name = f"{rows['run_id'][0]}.parquet"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(scratch / name, lambda part: rows.write_parquet(part, compression="zstd"))
+    os.replace(scratch / name, folder / name)
     # The new names outlast a loss of power.
-    for made in (partition, partition.parent, folder):
+    for made in (folder, folder.parent):
         sync_folder(made)
-    return file
+    return folder / name
 
 
-def read_history(
-    folder: Path,
-    profile: str | None = None,
-    columns: Sequence[str] = tuple(HISTORY),
-    quantities: Sequence[str] | None = None,
-) -> tuple[pl.DataFrame, list[str]]:
-    """Read the history; files that are damaged or foreign are skipped, with a warning each.
+def trend_rows(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows and columns of the history that `read_history` returns."""
+    return rows.filter(pl.col("quantity").is_in(TRENDS)).select(*TREND_COLUMNS)
+
+
+def read_history(folder: Path, newest: int = NEWEST) -> tuple[pl.DataFrame, list[str]]:
+    """Read what the page shows of a profile's history; damaged and foreign files are skipped, with a warning each.
 
     Parameters
     ----------
     folder : Path
-        The history; may be missing.
-    profile : str, optional
-        Only the runs of this profile.
-    columns : sequence of str
-        Of `HISTORY`, `run_id`, `started`, `profile`, `kind` and `quantity` among them.
-    quantities : sequence of str, optional
-        Of the settings' figures, only these; default all.
+        The profile's history; may be missing.
+    newest : int
+        Files that are read, the last ones by name, which begins with the run's start.
 
     Returns
     -------
     rows : polars.DataFrame
-        The columns, run after run in the order of their start, whatever their folders are called.
+        `TREND_COLUMNS` of the quantities `TRENDS`, run after run in the order of their start.
     notes : list of str
         What was skipped, for the page.
     """
-    files = sorted(path for path in folder.glob("date=*/commit=*/*.parquet") if not path.name.startswith("."))
-    # Reading waits for the disk more than it works.
-    with ThreadPoolExecutor(4) as pool:
-        read = list(pool.map(lambda file: _read(file, columns, quantities), files))
-    # Skip what cannot be used, and copies
     runs: dict[str, pl.DataFrame] = {}
     skipped = []
-    for file, found in zip(files, read, strict=True):
+    for file in sorted(folder.glob("*.parquet"))[-newest:]:
+        found = _read(file)
         if not isinstance(found, str) and found["run_id"][0] in runs:
             found = "a night that another file holds already"
         if isinstance(found, str):
@@ -114,18 +104,10 @@ def read_history(
             skipped.append(f"{shown(file.relative_to(folder))} ({found})")
         else:
             runs[found["run_id"][0]] = found
-    wanted = [run for run in runs.values() if profile in (None, run["profile"][0])]
-    wanted.sort(key=lambda run: (run["started"][0], run["run_id"][0]))
-    return pl.concat([pl.DataFrame(schema=HISTORY).select(columns), *wanted]), _skipped_note(skipped)
-
-
-def trend_columns(
-    rows: pl.DataFrame, columns: Sequence[str] = TREND_COLUMNS, quantities: Sequence[str] | None = None
-) -> pl.DataFrame:
-    """Return the columns and figures of some rows of the history that `read_history` would return."""
-    if quantities is not None:
-        rows = rows.filter((pl.col("kind") != "setting") | pl.col("quantity").is_in(quantities))
-    return rows.select(columns)
+    # The run's id may be of a clock that went back.
+    ordered = sorted(runs.values(), key=lambda run: (run["started"][0], run["run_id"][0]))
+    none = pl.DataFrame(schema=HISTORY).select(*TREND_COLUMNS)
+    return pl.concat([none, *map(trend_rows, ordered)]), _skipped_note(skipped)
 
 
 def _skipped_note(skipped: list[str]) -> list[str]:
@@ -136,30 +118,17 @@ def _skipped_note(skipped: list[str]) -> list[str]:
     return [f"History: {len(skipped)} {files} skipped: {'; '.join(skipped[:MAX_NAMED])}{more}."]
 
 
-def _read(file: Path, columns: Sequence[str], quantities: Sequence[str] | None) -> pl.DataFrame | str:
+def _read(file: Path) -> pl.DataFrame | str:
     """Read one run's file; return the reason where it cannot be used."""
     try:
-        held = pl.read_parquet_schema(require_plain(file))
-        if missing := [name for name in _NEEDED if name not in held]:
-            return f"no night's figures: no column {missing[0]}"
-        wanted = [name for name in columns if name in held]
-        found = pl.read_parquet(file, columns=wanted, hive_partitioning=False, memory_map=False)
+        found = pl.read_parquet(require_plain(file), columns=list(TREND_COLUMNS), memory_map=False)
+        found = found.cast({name: HISTORY[name] for name in TREND_COLUMNS})
     except (pl.exceptions.PolarsError, OSError, ValueError) as error:
-        return f"not a readable Parquet file: {_first_line(error)}"
-    # Columns that a later version added are null.
-    try:
-        found = found.select(
-            (pl.col(name) if name in wanted else pl.lit(None)).cast(HISTORY[name]).alias(name) for name in columns
-        )
-    except pl.exceptions.PolarsError as error:
-        return f"no night's figures: {_first_line(error)}"
-    if found["run_id"].n_unique() != 1 or any(found.select(_NEVER_NULL).null_count().row(0)):
-        return "no night's figures: must be those of one run, with its id, start and profile"
-    return trend_columns(found, columns, quantities)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:160]
+        first = (str(error).splitlines() or [type(error).__name__])[0][:160]
+        return f"not a night's figures: {first}"
+    if found["run_id"].n_unique() != 1 or any(found.select("run_id", "started").null_count().row(0)):
+        return "not a night's figures: must be those of one run, with its id and start"
+    return found
 
 
 def clock_note(history: pl.DataFrame, started: datetime) -> str | None:

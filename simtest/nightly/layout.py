@@ -25,10 +25,9 @@ class Reports:
 
     root: Path
 
-    @property
-    def history(self) -> Path:
-        """Figures of all runs, a file each; never changed."""
-        return self.root / "history"
+    def history(self, profile: str) -> Path:
+        """Return the folder of a profile's history: the figures of all runs, a file each, never changed."""
+        return self.root / "history" / profile
 
     @property
     def work(self) -> Path:
@@ -73,18 +72,12 @@ def scratch(reports: Reports, run_id: str) -> Iterator[Path]:
 
 def remove_dead(reports: Reports) -> list[str]:
     """Remove the leftovers of killed runs and return their names; living runs hold a lock and are left alone."""
-    dead, alive = [], set()
+    dead = []
     with waiting_for(reports.work / _ENTRY):
         for folder in sorted(path for path in reports.work.iterdir() if path.is_dir()):
-            if is_held(folder / LOCK):
-                alive.add(folder.name)
-            else:
+            if not is_held(folder / LOCK):
                 shutil.rmtree(folder, ignore_errors=True)
                 dead.append(folder.name)
-        # Half-written files of the history bear the name of their run.
-        for part in reports.history.glob("date=*/commit=*/.*.part.parquet"):
-            if not any(part.name.startswith(f".{name}.") for name in alive):
-                part.unlink(missing_ok=True)
     return dead
 
 
@@ -100,14 +93,15 @@ def only_night(reports: Reports, profile: str) -> Iterator[None]:
 def exclusive_replacement(folder: Path) -> Iterator[None]:
     """Lock the folder for replacement; first roll back an interrupted swap."""
     with waiting_for(folder.parent / f".{folder.name}.{LOCK}"):
-        old = _old(folder)
-        # A kill between the two renames of `replace_folder` left the old folder aside.
-        if old.is_dir():
-            if folder.is_dir():
-                shutil.rmtree(old)
-            else:
-                old.rename(folder)
+        if (where := current(folder)) != folder:
+            where.rename(folder)
+        shutil.rmtree(_old(folder), ignore_errors=True)
         yield
+
+
+def current(folder: Path) -> Path:
+    """Return where a folder lies: aside, where a kill between the two renames of `replace_folder` left it."""
+    return _old(folder) if _old(folder).is_dir() and not folder.is_dir() else folder
 
 
 def replace_folder(new: Path, folder: Path) -> None:

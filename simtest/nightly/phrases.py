@@ -1,6 +1,6 @@
 """Numbers, names and sentences of a judged run, for terminal, files and page alike.
 
-The page writes numbers with three digits and typographic signs (`measure`, `signed`, `interval`, `bounds`), the files
+The page writes numbers with three digits and typographic signs (`measure`, `signed`, `interval`), the files
 with four digits in plain characters (`plain`).
 """
 
@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 
 import polars as pl
 
-from simtest.nightly.records import JudgedRun, NightlyRun, RunRecord, Verdict
+from simtest.nightly.records import RunRecord, Verdict
 from simtest.pages.style import degrees, labelled, number
 
 STATES = {
@@ -20,8 +20,8 @@ STATES = {
 MARKS = {"fine": "✓", "changed": "≠", "regression": "✗", "no baseline": "○"}
 
 MEANINGS = {
-    "worse": "beyond the margin, at the corrected level, missing, or contradicting the results: a regression",
-    "better": "beyond the margin the other way: to be explained, unless it is a cost",
+    "worse": "beyond the margin, at the corrected level, or missing: a regression",
+    "better": "beyond the margin the other way: to be explained",
     "changed": "a level or a single result moved: to be explained",
     "gone": "in the baseline, but not tonight",
     "new": "tonight, but not in the baseline",
@@ -81,28 +81,18 @@ def interval(low: float | None, high: float | None) -> str:
     return "–" if low is None and high is None else f"{number(low)} to {number(high)}".replace("-", "−")
 
 
-def bounds(low: float | None, high: float | None) -> str:
-    """Write the bounds of a value."""
-    if low is not None and low == high:
-        return f"exactly {number(low)}"
-    if number(high) == "–":
-        return "–" if number(low) == "–" else f"at least {number(low)}"
-    return f"at most {number(high)}" if number(low) == "–" else interval(low, high)
-
-
 def headline(verdict: Verdict) -> str:
     """Return the verdict in a few words."""
     worse, other = verdict.regressions.height, verdict.unexplained.height
     if verdict.state == "regression":
-        return f"regression: {worse} figure{'s' * (worse != 1)} worse" if worse else "regression"
+        return f"regression: {worse} figure{'s' * (worse != 1)} worse"
     if verdict.state == "changed":
         return f"changed: {other} figure{'s' * (other != 1)} to explain"
     return "fine, bit-equal" if verdict.state == "fine" and verdict.bit_equal else verdict.state
 
 
-def headline_sentence(judged: JudgedRun) -> str:
-    """Return the verdict in a sentence, with the estimators or canaries to blame."""
-    verdict = judged.verdict
+def headline_sentence(verdict: Verdict) -> str:
+    """Return the verdict in a sentence, with the estimators to blame."""
     if verdict.state == "changed":
         found = verdict.unexplained
         verb = "has" if found.height == 1 else "have"
@@ -112,15 +102,12 @@ def headline_sentence(judged: JudgedRun) -> str:
         )
     if verdict.state != "regression":
         return STATES[verdict.state]
-    worse, out = verdict.regressions, out_of_bounds(judged.run)
-    if worse.is_empty():
-        verb = "canary is" if len(out) == 1 else "canaries are"
-        why = f"{len(out)} {verb} out of bounds: {labelled(out)}" if out else "the gate says so"
-        return f"Regression: no figure is worse than the baseline, but {why}."
+    worse = verdict.regressions
     verb = "is" if worse.height == 1 else "are"
-    which = _blamed(worse)
-    than = "worse than the baseline" if verdict.baseline is not None else "wrong"
-    return f"Regression: {worse.height} of {verdict.comparisons.height} figures {verb} {than}{which}."
+    return (
+        f"Regression: {worse.height} of {verdict.comparisons.height} figures {verb} worse than the baseline"
+        f"{_blamed(worse)}."
+    )
 
 
 def _blamed(found: pl.DataFrame) -> str:
@@ -131,23 +118,14 @@ def _blamed(found: pl.DataFrame) -> str:
     return f": {labelled(names)}" if names else ""
 
 
-def out_of_bounds(run: NightlyRun) -> list[str]:
-    """Return the names of the canaries that did not pass."""
-    return run.failed_canaries["experiment"].unique(maintain_order=True).to_list()
-
-
-def verdict_lines(judged: JudgedRun) -> list[tuple[str, str]]:
+def verdict_lines(verdict: Verdict) -> list[tuple[str, str]]:
     """Return the verdict's further lines as (name, text)."""
     equal = {
         None: "not known without a baseline",
         True: "yes: all rows are identical to the baseline's, byte by byte",
         False: "no: some rows differ from the baseline's",
-    }[judged.verdict.bit_equal]
-    made = [("Bit-equal", equal), ("Baseline", _baseline(judged.verdict.baseline))]
-    if count := judged.run.figures_of("canary").height:
-        out = out_of_bounds(judged.run)
-        made.append(("Canaries", f"out of bounds: {labelled(out)}" if out else f"all {count} figures within bounds"))
-    return made
+    }[verdict.bit_equal]
+    return [("Bit-equal", equal), ("Baseline", _baseline(verdict.baseline))]
 
 
 def _baseline(record: RunRecord | None) -> str:

@@ -1,19 +1,14 @@
 """The records that the nightly's stages hand on: `NightlyRun` (measure), `Verdict` (judge), `JudgedRun` (draw)."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import polars as pl
 from pydantic import BaseModel, ConfigDict
 
 from simtest.validation.row_kinds import counts
-
-if TYPE_CHECKING:
-    # It makes frames; whoever only judges runs needs no renderer.
-    from simtest.validation.worst import WorstCase
 
 
 class Cell(NamedTuple):
@@ -36,15 +31,12 @@ of one over all experiments."""
 _CELL_TYPES: dict[str, pl.DataType] = dict.fromkeys(CELL, pl.String())
 
 FIGURES: dict[str, pl.DataType] = {
-    "kind": pl.String(), **_CELL_TYPES, "quantity": pl.String(), "unit": pl.String(),
-    "value": pl.Float64(), "low": pl.Float64(), "high": pl.Float64(), "n": pl.Int64(), "passed": pl.Boolean(),
-    "digest": pl.String(), "about": pl.String(),
+    **_CELL_TYPES, "quantity": pl.String(), "unit": pl.String(), "value": pl.Float64(), "low": pl.Float64(),
+    "high": pl.Float64(), "n": pl.Int64(), "digest": pl.String(),
 }  # fmt: skip
-"""Columns of a run's figures, a row a number.
+"""Columns of a run's figures, a row a number of an estimator in a setting.
 
-`kind` is "setting" (an estimator's figure in a setting; `low`, `high` its 95 % interval, `digest` the hash of the
-cell's results, the same for all figures of a cell), "canary" (`experiment` the canary's name, `low`, `high` its bounds,
-`passed`), "cost" (run time as ratio to the reference kernel, memory) or "ladder" (see `simtest.nightly.ladder`).
+`low`, `high` are its 95 % interval, `digest` is the hash of the cell's results, the same for all figures of a cell.
 """
 
 COMPARISONS: dict[str, pl.DataType] = {
@@ -56,35 +48,27 @@ COMPARISONS: dict[str, pl.DataType] = {
 """Columns of the gate's comparisons, a row a cell and quantity.
 
 `method` is "equal" (the same bytes: no test is made), "paired", "unpaired", "single" (results one by one, `n` that
-moved), "check" (results against themselves, `n` rows), "rows" (figures against rows), "ladder" or "none".
-`difference` is tonight less the baseline, `low`, `high` its 95 % interval, `margin` the harmless size of a difference;
-`p` one-sided for "changed by more than the margin" to the surer side, `p_holm` corrected over the family. `outcome` is
-one of `OUTCOMES`. Rows over many settings (`POOLED`) of a quantity with a relative margin have the unit "x": the
-baseline is 1, the difference the mean share of the settings'. Canaries (`experiment` the canary's name, `low`, `high`
-its bounds) and costs have the method "none".
+moved) or "none". `difference` is tonight less the baseline, `low`, `high` its 95 % interval, `margin` the harmless size
+of a difference; `p` one-sided for "changed by more than the margin" to the surer side, `p_holm` corrected over the
+family. `outcome` is one of `OUTCOMES`. Rows over many settings (`POOLED`) of a quantity with a relative margin have the
+unit "x": the baseline is 1, the difference the mean share of the settings'.
 """
 
 OUTCOMES = ("same", "equivalent", "undecided", "better", "changed", "worse", "new", "gone")
-"""same: equal bytes, and the same figures of them; equivalent: the interval, or every single pair, lies within the
-margin; worse: beyond the margin at the corrected level, a cell, highlights or a canary that tonight lacks, another
-figure of the same results, or results that contradict each other (a regression); better: its mirror image; changed: a
+"""same: equal bytes; equivalent: the interval, or every single pair, lies within the margin; worse: beyond the margin
+at the corrected level, or a cell or highlights that tonight lacks (a regression); better: its mirror image; changed: a
 quantity of which neither side is better, or a single result, moved; undecided: neither shown; new: the baseline lacks
 it; gone: tonight has nothing to say of the quantity."""
 
 
 def to_explain() -> pl.Expr:
-    """Return which comparisons are no regression, and yet must be explained: errors that fell, and what changed.
-
-    A cost that fell needs no reason.
-    """
-    outcome = pl.col("outcome")
-    return (outcome == "changed") | ((outcome == "better") & (pl.col("method") != "none"))
+    """Return which comparisons are no regression, and yet must be explained: errors that fell, and what changed."""
+    return pl.col("outcome").is_in(["changed", "better"])
 
 
 class Figure(NamedTuple):
     """A number that a run measured: a row of `FIGURES`, whose columns the fields are."""
 
-    kind: str
     cell: Cell
     quantity: str
     unit: str
@@ -92,13 +76,11 @@ class Figure(NamedTuple):
     low: float | None = None
     high: float | None = None
     n: int | None = None
-    passed: bool | None = None
     digest: str | None = None
-    about: str = ""
 
     def to_row(self) -> tuple[Any, ...]:
         """Return the values of the columns `FIGURES`."""
-        return (self.kind, *self.cell, *self[2:])
+        return (*self.cell, *self[1:])
 
 
 def figure_table(figures: Iterable[Figure]) -> pl.DataFrame:
@@ -122,7 +104,6 @@ class RunRecord(BaseModel):
     title: str = ""
     started: str = ""
     duration_s: float | None = None
-    experiments_s: float | None = None
     workers: int | None = None
     definitions: dict[str, str] = {}
     command: str = ""
@@ -157,15 +138,6 @@ class NightlyRun:
     rows: pl.DataFrame  # results of all experiments, the columns of `simtest.validation.results_table.SCHEMA`
     figures: pl.DataFrame  # columns `FIGURES`
 
-    def figures_of(self, kind: str) -> pl.DataFrame:
-        """Return the figures of a kind."""
-        return self.figures.filter(pl.col("kind") == kind)
-
-    @property
-    def failed_canaries(self) -> pl.DataFrame:
-        """The figures of canaries that are out of bounds, or could not be measured."""
-        return self.figures_of("canary").filter(~pl.col("passed").fill_null(False))
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -195,10 +167,7 @@ class Verdict:
 
     @property
     def exit_code(self) -> int:
-        """1 for a regression, or for a change that nobody has accepted, else 0.
-
-        A run without a baseline is fine unless a canary failed, or its results contradict each other.
-        """
+        """1 for a regression, or for a change that nobody has accepted, else 0."""
         return 1 if self.state in ("regression", "changed") else 0
 
 
@@ -208,22 +177,12 @@ class JudgedRun:
 
     run: NightlyRun
     verdict: Verdict
-    history: pl.DataFrame  # columns `simtest.nightly.history.TREND_COLUMNS`, the run's own rows among them
-    gallery: tuple[Path, ...] = ()  # items of the worst cases, the worst first (see `simtest.validation.worst`)
-    cases: "tuple[WorstCase, ...]" = ()  # what the items show, in the same order
-    before: pl.DataFrame = field(default_factory=pl.DataFrame)  # the baseline's rows
-
-    @property
-    def comparisons(self) -> pl.DataFrame:
-        """The verdict's comparisons without those of canaries, which are judged by their bounds."""
-        # By all names of the figure: a canary may bear the name of the experiment that it watches.
-        key = (*CELL, "quantity")
-        canaries = self.run.figures_of("canary").select(key)
-        return self.verdict.comparisons.join(canaries, on=key, how="anti", nulls_equal=True, maintain_order="left")
+    history: pl.DataFrame  # columns `simtest.nightly.history.HISTORY`, the run's own rows among them
+    reports: tuple[str, ...] = ()  # experiments with findings whose own page lies in reports/NAME, the worst first
 
     def with_outcome(self, outcome: str) -> pl.DataFrame:
-        """Return the `comparisons` of an outcome, the surest first."""
-        return self.comparisons.filter(pl.col("outcome") == outcome).sort(
+        """Return the comparisons of an outcome, the surest first."""
+        return self.verdict.comparisons.filter(pl.col("outcome") == outcome).sort(
             "p_holm", "experiment", "label", "setting", "estimator", "quantity", nulls_last=True, maintain_order=True
         )
 
@@ -234,9 +193,9 @@ class JudgedRun:
         """
         numbers = self.run.rows.group_by("experiment", maintain_order=True).agg(**counts(self.run.rows))
         numbers = numbers.rename({"true": "rows", "ok": "answered"})
-        # Without a baseline there are no outcomes to count.
-        judged = self.comparisons if self.verdict.baseline is not None else self.comparisons.clear()
-        outcomes = judged.group_by("experiment").agg((pl.col("outcome") == name).sum().alias(name) for name in OUTCOMES)
+        outcomes = self.verdict.comparisons.group_by("experiment").agg(
+            (pl.col("outcome") == name).sum().alias(name) for name in OUTCOMES
+        )
         both = numbers.join(
             outcomes.sort("experiment"), on="experiment", how="full", coalesce=True, maintain_order="left_right"
         )

@@ -53,20 +53,20 @@ def run_nightly(profile: Profile, reports: Reports, options: RunOptions = DEFAUL
         with scratch(reports, run_id) as folder:
             run = measure_run(profile, folder, run_id, options, planned)
             judged = judge(run, baseline, reports)
-            judged = draw(judged, profile, folder / "tonight", options.variant)
+            judged = draw(judged, folder / "tonight")
             return _published(reports, judged, folder / "tonight")
 
 
 def _published(reports: Reports, judged: JudgedRun, page: Path) -> Outcome:
     """Add a run that is whole to the history, and replace the last page by its own."""
     record = judged.run.record
-    target = reports.latest(record.profile)
+    target, history = reports.latest(record.profile), reports.history(record.profile)
     try:
-        file = append(reports.history, history_rows(judged.run, judged.verdict))
+        file = append(history, history_rows(judged.run, judged.verdict), page.parent)
         with exclusive_replacement(target):
             replace_folder(page, target)
     except KeyboardInterrupt:
-        if any(reports.history.glob(f"date=*/commit=*/{record.id}.parquet")):
+        if (history / f"{record.id}.parquet").exists():
             raise KeyboardInterrupt("this night is in the history; its page may not have been published") from None
         raise
     return Outcome(judged, target, file)

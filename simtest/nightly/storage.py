@@ -1,7 +1,6 @@
 """A run as files: the rows, the figures, and the run's record with their hashes."""
 
 import contextlib
-import errno
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ import polars as pl
 from simtest.errors import InputError, SimtestError
 from simtest.nightly.records import FIGURES, NightlyRun, RunRecord
 from simtest.runtime.files import require_plain, sync_folder, write_atomically, write_json
+from simtest.runtime.machine_errors import disk_problem
 from simtest.runtime.provenance import file_hash
 from simtest.runtime.resources import shown
 
@@ -21,11 +21,6 @@ LATEST_ROWS, BASELINE_ROWS = "rows.parquet", "night.parquet"
 _FAST: dict[str, Any] = {"compression": "zstd", "compression_level": 19}
 _SMALL: dict[str, Any] = {"compression": "brotli", "compression_level": 11}
 """4 % smaller, in seven times the time: for baselines, which stand in git."""
-
-_OF_THE_DISK = {
-    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ENOTDIR,
-    errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG,
-}  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -37,12 +32,12 @@ def disk_errors_in_one_line(root: Path, what: str, left: str) -> Iterator[None]:
     """
     try:
         yield
-    except (OSError, pl.exceptions.PolarsError) as error:
-        # Polars' own errors, such as of a missing column, have nothing to do with the disk.
-        of_the_disk = isinstance(error, OSError) and error.errno in _OF_THE_DISK
-        if not of_the_disk and "(os error " not in str(error):
+    except (OSError, pl.exceptions.PolarsError, SimtestError) as error:
+        # A full disk under an experiment's scratch folder is told by the name of that; the user gave the reports'.
+        cause = error.__cause__ if type(error) is SimtestError else error
+        why = None if cause is None or isinstance(cause, SimtestError) else disk_problem(cause, root)
+        if why is None:
             raise
-        why = " ".join(((isinstance(error, OSError) and error.strerror) or str(error)).split())[:200]
         raise SimtestError(f"--reports {shown(root)}: {what} ({why}); {left}") from error
 
 
@@ -70,7 +65,8 @@ def load_run(folder: Path, rows_file: str) -> NightlyRun:
     # A table of another run has another hash.
     rows, figures = (_table(folder / name, hashes) for name in (rows_file, FIGURES_FILE))
     check_columns(folder / FIGURES_FILE, figures, FIGURES)
-    return NightlyRun(record, rows, figures.select(*FIGURES))
+    # An older version's have canaries and costs among them, which are of no cell and have no hash.
+    return NightlyRun(record, rows, figures.select(*FIGURES).drop_nulls("digest"))
 
 
 def check_columns(path: Path, table: pl.DataFrame, schema: Mapping[str, pl.DataType]) -> None:

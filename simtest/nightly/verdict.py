@@ -6,7 +6,7 @@ import polars as pl
 
 from simtest.nightly.baseline import log_note
 from simtest.nightly.gate.compare import compare
-from simtest.nightly.history import TREND_COLUMNS, TRENDS, clock_note, history_rows, read_history, trend_columns
+from simtest.nightly.history import clock_note, history_rows, read_history, trend_rows
 from simtest.nightly.layout import Reports
 from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
 
@@ -14,12 +14,11 @@ from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
 def judge(run: NightlyRun, baseline: NightlyRun | None, reports: Reports) -> JudgedRun:
     """Compare a run with its profile's baseline, if there is one, and read the history that it belongs to."""
     verdict = verdict_on(run, baseline)
-    history, skipped = read_history(reports.history, run.record.profile, TREND_COLUMNS, TRENDS)
+    history, skipped = read_history(reports.history(run.record.profile))
     told = [clock_note(history, run.record.start), log_note(reports, run.record.profile)]
     verdict = dataclasses.replace(verdict, notes=(*verdict.notes, *filter(None, told), *skipped))
-    own = trend_columns(history_rows(run, verdict), quantities=TRENDS)
-    before = pl.DataFrame() if baseline is None else baseline.rows
-    return JudgedRun(run, verdict, pl.concat([history, own]), before=before)
+    own = trend_rows(history_rows(run, verdict))
+    return JudgedRun(run, verdict, pl.concat([history, own]))
 
 
 def verdict_on(run: NightlyRun, baseline: NightlyRun | None) -> Verdict:

@@ -1,8 +1,6 @@
 """Draws gallery frames: isophotes, fitted ellipses, brightest points and normals over the frame."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +13,6 @@ from simtest.runtime.arrays import Array
 
 HEIGHT_PX, PAGE_PX = 400, 300  # height of a picture in its file and in the page
 _GAP_PX = 6
-THREADS = 4
 
 _ARROW, _ARROW_ENLARGED = 0.2, 0.4
 """Length of a normal over the distance in the frame, and over the width that the enlargement shows."""
@@ -29,19 +26,6 @@ class Shown(NamedTuple):
 
     item: GalleryItem
     pictures: list[tuple[str, float]]
-
-
-def draw_gallery(items: Sequence[GalleryItem], colours: Mapping[str, str], folder: Path) -> list[Shown]:
-    """Write gallery_000.png, ... into a folder, which must exist, and return what the page shows of them."""
-
-    def drawn(index: int) -> Shown:
-        shown, content = draw_shown(items[index], colours)
-        (folder / f"{file_name(index)}.png").write_bytes(content)
-        return shown
-
-    # OpenCV and the encoders leave Python's lock to others.
-    with ThreadPoolExecutor(THREADS) as pool:
-        return list(pool.map(drawn, range(len(items))))
 
 
 def file_name(index: int) -> str:

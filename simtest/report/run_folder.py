@@ -110,7 +110,6 @@ class GalleryMeta(BaseModel):
     setting: Text = ""
     sigma: float | None = None  # noise, share of full scale
     command: Text = ""  # makes the frame again
-    why: Text = ""  # it is kept
     length_unit: str = "mm"
     lights: list[Vector] = []  # positions, camera frame
     paper: PaperSetting | None = None  # of the published protocol, as all that follows

@@ -36,10 +36,6 @@ class Profile(Spec):
     title: str = ""
     description: str = ""
     experiments: tuple[ProfileEntry, ...] = Field(min_length=1, max_length=100)
-    canaries: bool = Field(
-        True, description="run the canaries, which see faults that error figures do not show, and the error ladder"
-    )
-    costs: bool = Field(True, description="measure run time and memory too")
 
     @model_validator(mode="after")
     def _told_apart(self) -> "Profile":

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import polars as pl
 
 from simtest.errors import FAULTS
-from simtest.runtime.files import Json
+from simtest.runtime.files import JsonObject
 
 MOST_TEXTS = 5
 """Different texts of one estimator that are listed; a number within the text may make every one of them new."""
@@ -18,7 +18,7 @@ MOST_CHARACTERS = 300
 """Of a text that is listed."""
 
 
-def faults_of(results: pl.DataFrame) -> list[Json]:
+def faults_of(results: pl.DataFrame) -> list[JsonObject]:
     """List the faults of a run by estimator, reason and text.
 
     Parameters
@@ -38,7 +38,7 @@ def faults_of(results: pl.DataFrame) -> list[Json]:
     text = pl.col("flags").cast(pl.String) if "flags" in results.columns else pl.lit(None, pl.String)
     found = results.filter(pl.col("status").is_in(list(map(str, FAULTS)))).with_columns(_one_line(text).alias("_text"))
     counts = found.group_by("estimator", "status", "_text", maintain_order=True).len()
-    listed: list[Json] = []
+    listed: list[JsonObject] = []
     for (name,), own in counts.group_by("estimator", maintain_order=True):
         ranked = list(own.sort("len", descending=True, maintain_order=True).iter_rows())
         for _, reason, told, count in ranked[:MOST_TEXTS]:

@@ -136,8 +136,6 @@ class GalleryMeta:
         Calibration, the highlights that count, and the answers at each detection.
     lights : list of list of float, optional
         Positions, camera frame, mm.
-    why : str, optional
-        Why the item is kept.
     published : PublishedDetails, optional
         For the published protocol.
     """
@@ -151,7 +149,6 @@ class GalleryMeta:
     truth: Sequence[DrawnTruth]
     estimates: Sequence[DrawnEstimate]
     lights: list[Vector] | None = None
-    why: str | None = None
     published: PublishedDetails | None = None
 
     def to_json(self) -> dict[str, Json]:
@@ -166,10 +163,8 @@ class GalleryMeta:
         }
 
 
-def save(
-    path: Path, session: Session, experiment: Experiment, case: Case, made: Realisation, why: str | None = None
-) -> None:
-    """Write the gallery item of a realisation, at whose scene the session must be; `why` says why it is kept."""
+def save(path: Path, session: Session, experiment: Experiment, case: Case, made: Realisation) -> None:
+    """Write the gallery item of a realisation, at whose scene the session must be."""
     camera, scene = session.camera, made.view.scene
     # Errors and counts are those of the results: a cloud's truth is the base's, and none of the highlights here.
     held = table(made.rows, {ON_INSTRUMENT: False})
@@ -198,7 +193,6 @@ def save(
             for name, result in specularity.estimates.items()
         ],
         lights=scene.rig.true_mm().tolist(),
-        why=why,
     )
     # Pictures are encoded once more where they are drawn.
     linear = scene.sensor.response.model().decode(made.frame)

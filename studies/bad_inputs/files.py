@@ -41,9 +41,7 @@ set = { "camera.width" = 64, "camera.height" = 48, "camera.fx" = 48.0, "camera.f
 [per_sample]
 "surface.tilt_deg" = { low = 0.0, high = 20.0 }
 """
-PROFILE = """canaries = false
-costs = false
-[[experiments]]
+PROFILE = """[[experiments]]
 experiment = "overview"
 realisations = 1
 labels = ["plane"]

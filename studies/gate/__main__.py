@@ -4,10 +4,9 @@ import sys
 from collections.abc import Callable
 
 from benchmarks.measuring import print_figures
-from simtest.nightly.gate.judged import COLUMNS, SUMMARY, Judged, NotJudged
 from studies.gate import figures, proof
 from studies.gate.bank import frames_of, load_bank
-from studies.gate.edits import night_folder, of_last_night, of_the_bank, said, told
+from studies.gate.edits import night_folder, of_last_night, said, told
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
@@ -43,53 +42,31 @@ def faults() -> str:
     """Return the table of planted faults."""
     rows = []
     for caught in proof.faults():
-        canaries = ", ".join(caught.canaries[:3]) + (
-            f" and {len(caught.canaries) - 3} more" * (len(caught.canaries) > 3)
-        )
+        laws = ", ".join(caught.laws[:3]) + f" and {len(caught.laws) - 3} more" * (len(caught.laws) > 3)
         stops = "; the night stops" if caught.stops else ""
-        rows.append((caught.name + stops, canaries or "none", _percent(caught.paired), _percent(caught.fresh)))
-    return _table(("planted fault", "canaries that fail", "gate, same seeds", "gate, fresh seeds"), rows)
+        rows.append((caught.name + stops, laws or "none", _percent(caught.paired), _percent(caught.fresh)))
+    return _table(("planted fault", "laws that do not hold", "gate, same seeds", "gate, fresh seeds"), rows)
 
 
 def noise() -> str:
-    """Return the table of the canaries that hold noise."""
-    sound, reused = proof.noise_canaries()
-    return _table(("canaries of noise", "fail"), [("code as it is", _percent(sound)), (reused.name, _percent(reused))])
+    """Return the table of the laws of noise."""
+    sound, reused = proof.noise_laws()
+    return _table(
+        ("laws of noise", "do not hold"), [("code as it is", _percent(sound)), (reused.name, _percent(reused))]
+    )
 
 
 def edits() -> str:
     """Return the table of results that were edited without touching the code."""
-    night, drawn = of_last_night(night_folder()), of_the_bank(load_bank(proof.bank_folder()), proof.N)
-    rows = [
-        (one.name, said(one, one.same), said(other, other.same), said(other, other.fresh), told(one.same))
-        for one, other in zip(night, drawn, strict=True)
-    ]
-    fine = [row[0] for row in rows[1:] if row[1] in ("fine", "-")]
-    lines = (
-        f"{len(rows) - 1 - len(fine)} of {len(rows) - 1} edits of the night are not called fine, of the same seeds.\n"
-    )
-    head = ("edit", "quick night, same seeds", "drawn night, same seeds", "drawn night, other seeds", "first cause")
-    return lines + "\n" + _table(head, rows)
-
-
-def judged() -> str:
-    """Return the tables of what is judged, and of what is not and why."""
-    made = []
-    for title, table in {"results.parquet": COLUMNS, "summary.json": SUMMARY}.items():
-        own = [(name, entry) for name, entry in table.items() if isinstance(entry, Judged)]
-        rest = [(name, entry) for name, entry in table.items() if isinstance(entry, NotJudged)]
-        made.append(f"{len(own)} of {len(table)} of {title} are judged, {len(rest)} are not.\n")
-        made.append(_table((title, "judged by", "limit"), [(f"`{name}`", e.quantity, e.limit) for name, e in own]))
-        by_reason: dict[str, list[str]] = {}
-        for name, entry in rest:
-            by_reason.setdefault(entry.reason, []).append(f"`{name}`")
-        made.append(_table((title, "not judged, for"), [(", ".join(n), reason) for reason, n in by_reason.items()]))
-    return "\n".join(made)
+    rows = [(one.name, said(one), told(one.same)) for one in of_last_night(night_folder())]
+    fine = [name for name, verdict, _ in rows[1:] if verdict in ("fine", "-")]
+    lines = f"{len(rows) - 1 - len(fine)} of {len(rows) - 1} edits of the night are not called fine.\n"
+    return lines + "\n" + _table(("edit", "quick night, same seeds", "first cause"), rows)
 
 
 SECTIONS: dict[str, Callable[[], str]] = {
     "alarms": alarms, "harmless": harmless, "rises": rises, "faults": faults, "noise": noise,
-    "edits": edits, "judged": judged,
+    "edits": edits,
 }  # fmt: skip
 
 

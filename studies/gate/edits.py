@@ -1,13 +1,12 @@
 """Results that were edited without touching the code: what the gate says of each.
 
 `python -m studies.gate edits` prints the table. A night is edited, and the gate compares it with the same night as it
-was (same seeds): the last one of the profile quick, from the folder that GATE_NIGHT names (default:
-reports/nightly/quick), and one that is drawn from the bank, which is compared with a night of other seeds too.
+was: the last one of the profile quick, from the folder that GATE_NIGHT names (default: reports/nightly/quick).
 """
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from simtest.nightly.gate.figures import setting_figures
 from simtest.nightly.records import NightlyRun, RunRecord, Verdict
 from simtest.nightly.storage import LATEST_ROWS, load_run
 from simtest.validation.results_table import SCHEMA
-from studies.gate.nights import Source
 
 OK = (pl.col("status") == "ok") & pl.col("true_id").is_not_null()
 OF_ANSWERS = (
@@ -163,16 +161,6 @@ def some_missed(rows: pl.DataFrame, rng: np.random.Generator) -> pl.DataFrame:
     return _unanswered(rows, pl.lit(chosen), "missed")
 
 
-def medians(run: NightlyRun) -> NightlyRun:
-    """Publish the median of the errors as their mean."""
-    key = ["experiment", "label", "surface", "setting", "estimator"]
-    other = run.figures.filter(pl.col("quantity") == "median_deg").select(*key, median="value")
-    table = run.figures.join(other, on=key, how="left", nulls_equal=True, maintain_order="left")
-    is_mean = pl.col("quantity") == "mean_deg"
-    table = table.with_columns(value=pl.when(is_mean).then(pl.coalesce("median", "value")).otherwise("value"))
-    return replace(run, figures=table.drop("median"))
-
-
 EDITS: dict[str, Edit] = {
     "all estimators failing in 4 settings": failing,
     "errors of one cell five times larger": one_cell_five_times,
@@ -192,8 +180,6 @@ EDITS: dict[str, Edit] = {
     "answers missed in 5 %": some_missed,
 }
 """Edits of rows by name."""
-
-MEDIANS = "mean replaced by median"
 
 
 @dataclass(frozen=True)
@@ -224,7 +210,6 @@ def edited(tonight: pl.DataFrame, other: pl.DataFrame | None, seed: int = 0) -> 
     runs = {"none": run_of(tonight)}
     for name, edit in EDITS.items():
         runs[name] = run_of(edit(tonight, np.random.default_rng(seed)))
-    runs[MEDIANS] = medians(runs["none"])
     unedited, fresh = runs["none"], None if other is None else run_of(other)
     return [
         Edited(
@@ -233,13 +218,6 @@ def edited(tonight: pl.DataFrame, other: pl.DataFrame | None, seed: int = 0) -> 
         )
         for name, run in runs.items()
     ]  # fmt: skip
-
-
-def of_the_bank(bank: pl.DataFrame, count: int, seed: int = 0) -> list[Edited]:
-    """Edit a night of so many realisations a setting that is drawn from the bank."""
-    source = Source.of(bank)
-    ranks = source.ranks(np.random.default_rng(seed))
-    return edited(source.chosen(ranks < count), source.chosen((ranks >= count) & (ranks < 2 * count)), seed)
 
 
 def night_folder() -> Path:
@@ -252,12 +230,12 @@ def of_last_night(folder: Path) -> list[Edited]:
     return edited(load_run(folder, LATEST_ROWS).rows, None)
 
 
-def said(one: Edited, verdict: Verdict | None) -> str:
-    """Return a verdict in a word, with the number of findings."""
-    if verdict is None or not (one.changes or one.name == "none"):
+def said(one: Edited) -> str:
+    """Return the verdict against the same seeds in a word, with the number of findings."""
+    if not (one.changes or one.name == "none"):
         return "-"
-    found = verdict.regressions.height + verdict.unexplained.height
-    return f"{verdict.state} ({found})" if found else verdict.state
+    found = one.same.regressions.height + one.same.unexplained.height
+    return f"{one.same.state} ({found})" if found else one.same.state
 
 
 def told(verdict: Verdict) -> str:

@@ -63,7 +63,7 @@ def run_of(rows: pl.DataFrame, name: str, equal: pl.DataFrame | None = None) -> 
             *CELL, digest=pl.coalesce("same", "digest")
         )
     columns = [pl.lit(None, dtype).alias(column) for column, dtype in FIGURES.items() if column not in cells.columns]
-    figures = cells.with_columns(columns).with_columns(kind=pl.lit("setting"), quantity=pl.lit("n"))
+    figures = cells.with_columns(columns).with_columns(quantity=pl.lit("n"))
     return NightlyRun(RunRecord(), rows, figures.select(list(FIGURES)))
 
 

@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,8 +10,6 @@ import polars as pl
 
 from benchmarks.measuring import Figure
 from simtest.errors import SimtestError
-from simtest.nightly.canaries import run_canaries
-from simtest.nightly.canaries.randomness import noises
 from simtest.nightly.gate.contrasts import margin_of
 from simtest.nightly.gate.limits import Limits
 from simtest.nightly.gate.quantities import quantities
@@ -20,11 +19,14 @@ from simtest.validation.runner import run_experiment
 from studies.gate.bank import COLUMNS, experiment, frames_of, load_bank
 from studies.gate.faults import FAULTS, HARMLESS, Mutation, planted
 from studies.gate.nights import Draw, Found, Fresh, Paired, Source, equal_cells, judge_many, raised
+from tests.laws.all_laws import measures
+from tests.laws.law import Law
+from tests.laws.randomness import noises
 
 FRESH_NIGHTS = int(os.environ.get("GATE_NIGHTS") or 1000)
 """Nights of fresh seeds of each kind; GATE_NIGHTS changes it."""
 
-PAIRED_NIGHTS, DETECTION_NIGHTS, CANARY_SEEDS = 200, 100, 100
+PAIRED_NIGHTS, DETECTION_NIGHTS, LAW_SEEDS = 200, 100, 100
 N = 10
 """Realisations of each setting in a night."""
 
@@ -75,8 +77,8 @@ class Caught:
     ----------
     name : str
         Of the fault.
-    canaries : tuple of str
-        Those that failed.
+    laws : tuple of str
+        Those that do not hold.
     paired, fresh : Rate
         Of nights of the same seeds, and of others.
     stops : bool
@@ -84,15 +86,15 @@ class Caught:
     """
 
     name: str
-    canaries: tuple[str, ...]
+    laws: tuple[str, ...]
     paired: Rate
     fresh: Rate
     stops: bool
 
     @property
     def share(self) -> float:
-        """Share of nights in which the fault is seen: canaries see it in each."""
-        return 1.0 if self.canaries else self.paired.share
+        """Share of nights in which the fault is seen: laws see it always."""
+        return 1.0 if self.laws else self.paired.share
 
 
 def bank_folder() -> Path:
@@ -199,7 +201,7 @@ def proof_experiments(realisations: int = 2 * N) -> list[Experiment]:
 
 
 def faults(nights: int = DETECTION_NIGHTS, names: tuple[str, ...] = tuple(FAULTS)) -> list[Caught]:
-    """Plant each fault, and ask canaries and gate; the first of the list is the code as it is."""
+    """Plant each fault, and ask the laws and the gate; the first of the list is the code as it is."""
     sound = _made(proof_experiments())
     before = Source.of(sound)
     made = []
@@ -210,9 +212,7 @@ def faults(nights: int = DETECTION_NIGHTS, names: tuple[str, ...] = tuple(FAULTS
         except SimtestError as error:
             stopped = f"the night stops: {error}"
         with planted(*mutations):
-            canaries = run_canaries(rows)
-        failed = canaries.filter(~pl.col("passed").fill_null(False))
-        watch = tuple(f"{e} {q}" for e, q in failed.select("experiment", "quantity").iter_rows())
+            watch = tuple(broken for name, measure in measures().items() for broken in _broken(name, measure))
         if rows is None:
             both = (Rate(name, nights, nights, stopped),) * 2
         else:
@@ -223,16 +223,24 @@ def faults(nights: int = DETECTION_NIGHTS, names: tuple[str, ...] = tuple(FAULTS
     return made
 
 
+def _broken(name: str, measure: Callable[[], list[Law]]) -> list[str]:
+    """Return which laws do not hold; an error breaks all that it stops."""
+    try:
+        return [f"{law.name} {law.quantity}" for law in measure() if not law.holds]
+    except Exception:
+        return [f"{name} error"]
+
+
 def _draws(before: Source, after: Source, equal: pl.DataFrame | None) -> tuple[Draw, Draw]:
     return Paired(before, after, N, equal), Fresh(before, N, after)
 
 
-def noise_canaries(seeds: int = CANARY_SEEDS) -> tuple[Rate, Rate]:
-    """Ask the canaries that hold noise, with many seeds: of the code as it is, and with the noise seed reused."""
+def noise_laws(seeds: int = LAW_SEEDS) -> tuple[Rate, Rate]:
+    """Ask the laws of noise, with many seeds: of the code as it is, and with the noise seed reused."""
     rates = []
     for name in ("none", "noise seed reused"):
         with planted(*FAULTS.get(name, ())):
-            failed = [any(not canary.passed for canary in noises(seed=seed)) for seed in range(seeds)]
+            failed = [any(not law.holds for law in noises(seed=seed)) for seed in range(seeds)]
         rates.append(Rate(name, seeds, sum(failed)))
     return rates[0], rates[1]
 
@@ -247,15 +255,15 @@ def figures() -> list[Figure]:
         made.append(_detection(f"{name}, same seeds", paired, LEAST_DETECTION if clear else None))
         made.append(Figure(f"{name}, fresh seeds", fresh.share, unit="", about=fresh.about))
     for caught in faults():
-        about = ", ".join(caught.canaries) or caught.paired.about
+        about = ", ".join(caught.laws) or caught.paired.about
         if caught.name == "none":
-            made.append(Figure("code as it is: canaries that fail", len(caught.canaries), 0, unit="", about=about))
+            made.append(Figure("code as it is: laws that do not hold", len(caught.laws), 0, unit="", about=about))
             made.append(_alarm("code as it is, gate, fresh seeds", caught.fresh))
         else:
             made.append(Figure(caught.name, caught.share, LEAST_DETECTION, True, "", about))
-    sound, reused = noise_canaries()
-    made.append(_alarm("canaries of noise, code as it is", sound))
-    made.append(_detection("canaries of noise, seed reused", reused))
+    sound, reused = noise_laws()
+    made.append(_alarm("laws of noise, code as it is", sound))
+    made.append(_detection("laws of noise, seed reused", reused))
     return made
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
-
 from simtest.nightly.canaries import measures
 from simtest.nightly.canaries.canary import or_failed_canary
+
 from simtest.nightly.measure import measured_ladder
 from simtest.nightly.records import CELL, FIGURES, NightlyRun, RunRecord
 from studies.gate.faults import planted

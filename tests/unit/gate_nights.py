@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 
 from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.records import FIGURES, NightlyRun, RunRecord
+from simtest.nightly.records import NightlyRun, RunRecord
 from simtest.validation.results_table import SCHEMA
 
 RUN = {"id": "x", "versions": {"numpy": "2.4", "simtest": "0.1"}, "processor": "one"}
@@ -30,20 +30,9 @@ def rows(count=20, level=1.0, seed=0, estimators=("cone_axis",), settings=("a",)
     return pl.DataFrame(made, schema=SCHEMA)
 
 
-def night(table, canaries=(), costs=(), **run):
-    """Return a run of rows; canaries as (name, value, high), costs as (name, quantity, value, low, high)."""
-    extra = [
-        {"kind": "canary", "experiment": name, "label": "", "surface": "", "setting": "", "estimator": "",
-         "quantity": "off", "unit": "", "value": value, "low": 0.0, "high": high, "n": 1,
-         "passed": value is not None and value <= high}
-        for name, value, high in canaries
-    ] + [
-        {"kind": "cost", "experiment": name, "label": "", "surface": "", "setting": "", "estimator": "",
-         "quantity": quantity, "unit": "x", "value": value, "low": low, "high": high, "n": 9}
-        for name, quantity, value, low, high in costs
-    ]  # fmt: skip
-    figures = pl.concat([setting_figures(table), pl.DataFrame(extra, schema=FIGURES)])
-    return NightlyRun(RunRecord(**{**RUN, **run}), table, figures)
+def night(table, **run):
+    """Return a run of rows."""
+    return NightlyRun(RunRecord(**{**RUN, **run}), table, setting_figures(table))
 
 
 def changed(table, condition, **values):

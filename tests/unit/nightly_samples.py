@@ -6,7 +6,7 @@ from itertools import product
 import polars as pl
 
 from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.records import CELL, COMPARISONS, FIGURES, JudgedRun, NightlyRun, RunRecord, Verdict
+from simtest.nightly.records import CELL, COMPARISONS, JudgedRun, NightlyRun, RunRecord, Verdict
 from simtest.validation.results_table import SCHEMA
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)
@@ -38,22 +38,14 @@ def make_rows(count=4, error_deg=1.0):
     return pl.DataFrame(made, schema=SCHEMA)
 
 
-def canary(name="axis ratio", value=1.0, passed=True):
-    return {
-        "kind": "canary", "experiment": name, "label": "", "surface": "", "setting": "", "estimator": "cone_axis",
-        "quantity": "axis_ratio", "unit": "", "value": value, "low": 0.9, "high": 1.1, "n": 1, "passed": passed,
-    }  # fmt: skip
-
-
-def make_run(record=None, rows=None, canaries=()):
+def make_run(record=None, rows=None):
     rows = make_rows() if rows is None else rows
-    figures = pl.concat([setting_figures(rows), pl.DataFrame(list(canaries) or [canary()], schema=FIGURES)])
-    return NightlyRun(RunRecord(**{**RUN, **(record or {})}), rows, figures)
+    return NightlyRun(RunRecord(**{**RUN, **(record or {})}), rows, setting_figures(rows))
 
 
 def compared(run, outcomes, **more):
     """Return comparisons of a run's cells, with outcomes in turn."""
-    cells = run.figures_of("setting").select(CELL).unique(maintain_order=True).rows()
+    cells = run.figures.select(CELL).unique(maintain_order=True).rows()
     made = [
         dict(zip(CELL, cell, strict=True))
         | {"quantity": "mean_deg", "unit": "deg", "method": "paired", "n": 4, "baseline": 1.0, "tonight": 1.1,

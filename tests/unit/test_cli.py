@@ -202,7 +202,7 @@ def test_an_unexpected_error_gives_one_line(here, monkeypatch):
         ("scene", {"surface", "reflectance", "rig", "camera", "sensor", "render"}),
         ("experiment", {"groups", "realisations", "seed", "estimators"}),
         ("camera", {"width", "height", "fx", "fy", "cx", "cy", "skew"}),
-        ("profile", {"experiments", "canaries", "costs"}),
+        ("profile", {"experiments", "description", "title"}),
     ],
 )
 def test_schemas_are_json(here, of, keys):

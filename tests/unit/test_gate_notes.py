@@ -1,4 +1,4 @@
-"""What a verdict counts and says: frames, rungs of the ladder, notes and causes."""
+"""What a verdict counts and says: frames, notes and causes."""
 
 from dataclasses import replace
 
@@ -8,16 +8,16 @@ from gate_nights import changed, night, raised, rows, whole
 
 from simtest.nightly.gate.compare import compare
 from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.limits import Limits
+from simtest.nightly.gate.pairing import with_all_frames
+from simtest.nightly.gate.quantities import HARMS, quantities
 from simtest.nightly.measure import frames_of
-from simtest.nightly.records import FIGURES, Cell, Figure, figure_table
 from simtest.spec import Experiment
 from simtest.validation.cases import expand
 
 
 def with_frames(table, count, **run):
-    made = night(table, **run)
-    rest = made.figures.filter(pl.col("kind") != "setting")
-    return replace(made, figures=pl.concat([setting_figures(table, {("e", "a"): count}), rest]))
+    return replace(night(table, **run), figures=setting_figures(table, {("e", "a"): count}))
 
 
 def false_in(table, numbers):
@@ -64,32 +64,22 @@ def test_frames_are_counted_by_experiment_and_setting():
     assert {name for name, _ in counted} == {"x"}
 
 
-def ladder(value, low=None, high=None):
-    cell = Cell("error ladder", "plane", None, "plane", "cone_axis")
-    return figure_table([Figure("ladder", cell, "no noise", "deg", value, low, high, 1, about="the frame")])
+def test_frames_are_counted_on_only_where_realisations_are_a_count():
+    """Realisations 0, 2 and 4 of three frames name no frame that is missing."""
+    frames = pl.DataFrame({"cell": [0, 1], "frames": [3, 3]})
+
+    def values(cell, *realisations):
+        return pl.DataFrame({"cell": cell, "quantity": "false", "realisation": realisations, "value": 1.0})
+
+    chosen, counted = values(0, 0, 2, 4), values(1, 0, 2)
+    both = pl.concat([chosen, counted])
+    made = with_all_frames(both, frames, both)
+    assert made.filter(pl.col("cell") == 0).height == 3
+    assert made.filter(pl.col("cell") == 1, pl.col("value") == 0)["realisation"].to_list() == [1]
 
 
-def with_ladder(value, low=None, high=None, **run):
-    made = night(rows(), **run)
-    return replace(made, figures=pl.concat([made.figures, ladder(value, low, high).select(*FIGURES)]))
-
-
-@pytest.mark.parametrize(
-    ("now", "versions", "outcome"),
-    [
-        (1.0, {}, "same"), (1.01, {}, "equivalent"), (1.05, {}, "worse"), (0.9, {}, "better"), (None, {}, "worse"),
-        (1.05, {"versions": {"numpy": "9"}}, "undecided"), (1.5, {"versions": {"numpy": "9"}}, "worse"),
-    ],
-)  # fmt: skip
-def test_rungs_are_compared_by_value(now, versions, outcome):
-    interval = (None, None) if now is None else (now - 0.1, now + 0.1)
-    verdict = compare(with_ladder(now, *interval, **versions), with_ladder(1.0, 0.9, 1.1))
-    row = verdict.comparisons.filter(method="ladder").row(0, named=True)
-    assert row["outcome"] == outcome
-    states = {"worse": "regression", "better": "changed"}
-    assert verdict.state == states.get(outcome, "fine")
-    if outcome == "worse":
-        assert "cone_axis in error ladder, plane: the mean error on the rung 'no noise'" in verdict.causes[0]
+def test_every_quantity_has_a_value_of_rows():
+    assert set(quantities(Limits())) - {"false"} == set(HARMS)
 
 
 def test_what_changed_in_kind_is_named_only_where_it_was_measured():
@@ -110,7 +100,8 @@ def test_causes_name_estimator_experiment_setting_what_it_was_and_the_reason():
     gone = dict.fromkeys(("error_deg", "mahalanobis2", "axis_ratio", "normal_x", "cov_11"))
     failed = changed(table, cell, status="estimator_error", flags="ValueError: no root", **gone)
     verdict = compare(night(failed), night(table))
-    assert verdict.causes[0].startswith("curved in e, c: ")
+    assert verdict.causes[0] == "curved: ValueError: no root, 10 times."
+    assert verdict.causes[1].startswith("curved in e, c: ")
     assert any("is 0, was 10" in cause for cause in verdict.causes)
     assert any("10 more than before: estimator_error (ValueError: no root)." in cause for cause in verdict.causes)
 
@@ -125,32 +116,10 @@ def test_causes_name_the_part_of_the_budget_that_moved():
     )
     verdict = compare(night(wider), night(table))
     assert (verdict.state, verdict.regressions.height) == ("changed", 0)
-    told = [cause for cause in verdict.causes if "the size of the stated regions" in cause]
+    told = [cause for cause in verdict.causes if "the size of the reported regions" in cause]
     assert "curved in e, " in told[0]
-    assert "Of the stated uncertainty the part shape is 1.2 deg, was 0.4 deg." in told[0]
+    assert "Of the reported uncertainty the part shape is 1.2 deg, was 0.4 deg." in told[0]
     assert not any(cause.startswith("cone_axis") for cause in verdict.causes)
-
-
-def test_causes_hold_what_stopped_a_canary():
-    broken = night(rows(), canaries=[("bird", 2.0, 1.0)])
-    error = pl.DataFrame(
-        [
-            {
-                "kind": "canary",
-                "experiment": "cage",
-                "quantity": "error",
-                "passed": False,
-                "about": "ValueError: no bars",
-            }
-        ],
-        schema=FIGURES,
-    )
-    verdict = compare(replace(broken, figures=pl.concat([broken.figures, error])), None)
-    assert verdict.causes[:2] == (
-        "The canary bird: off is 2, must be 0 to 1.",
-        "The canary cage could not be measured: ValueError: no bars.",
-    )
-    assert verdict.exit_code == 1
 
 
 def test_many_findings_are_counted_in_one_line():

@@ -4,7 +4,7 @@ import subprocess
 import sys
 import time
 
-from simtest.runtime.measuring import PeakMemory, in_turns, memory_of_tree_mib, times_in_turns
+from benchmarks.timing import PeakMemory, in_turns, memory_of_tree_mib, times_in_turns
 
 
 def test_functions_are_timed_in_turns():

@@ -3,8 +3,8 @@
 import json
 
 import pytest
-
 from simtest.nightly.canaries import measures
+
 from studies.mutants import judging
 from studies.mutants.__main__ import main, table
 from studies.mutants.catalogue import BY_NAME, MUTANTS, UNCHANGED

@@ -15,7 +15,7 @@ from simtest.errors import InputError
 from simtest.nightly import layout
 from simtest.nightly.baseline import accept, load_baseline, log_note
 from simtest.nightly.gate.quantities import OLDEST_COLUMNS
-from simtest.nightly.history import HISTORY, TREND_COLUMNS, append, clock_note, history_rows, read_history
+from simtest.nightly.history import HISTORY, TREND_COLUMNS, TRENDS, append, clock_note, history_rows, read_history
 from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
 from simtest.nightly.phrases import short_commit
 from simtest.nightly.records import CELL
@@ -28,41 +28,54 @@ def keep(folder, number, **more):
     """Append a night; gives its file."""
     started = STARTED + timedelta(days=number)
     record = {"id": f"{started:%Y%m%dT%H%M%SZ}-1-{number:08x}", "started": started.isoformat(), **more}
-    return append(folder, history_rows(make_run(record), no_baseline()))
+    scratch_folder = folder.with_name("work")
+    scratch_folder.mkdir(exist_ok=True)
+    return append(folder, history_rows(make_run(record), no_baseline()), scratch_folder)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "quick"
 
 
 # History ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_night_reads_back_as_it_was_written(tmp_path):
-    file = keep(tmp_path, 0)
-    assert file.relative_to(tmp_path).as_posix() == (
-        "date=2026-03-01/commit=0123456789ab+/20260301T023000Z-1-00000000.parquet"
-    )
-    read, notes = read_history(tmp_path)
+def test_a_night_reads_back_as_it_was_written(folder):
+    file = keep(folder, 0)
+    assert file == folder / "20260301T023000Z-1-00000000.parquet"
+    written = history_rows(make_run({"id": file.stem}), no_baseline())
+    assert_frame_equal(pl.read_parquet(folder / "*.parquet"), written)
+    assert written.schema == pl.Schema(HISTORY)
+    read, notes = read_history(folder)
     assert notes == []
-    assert read.schema == pl.Schema(HISTORY)
-    assert_frame_equal(read, history_rows(make_run({"id": file.stem}), no_baseline()))
-    assert read["started"].unique().to_list() == [STARTED]
-    assert read["state"].unique().to_list() == ["no baseline"]
+    assert_frame_equal(read, written.filter(pl.col("quantity").is_in(TRENDS)).select(TREND_COLUMNS))
+    assert 0 < read.height < written.height
 
 
-def test_an_empty_history_has_the_columns(tmp_path):
-    for folder in (tmp_path, tmp_path / "none"):
-        read, notes = read_history(folder)
-        assert (read.schema, read.height, notes) == (pl.Schema(HISTORY), 0, [])
+def test_an_empty_history_has_the_columns(folder, tmp_path):
+    for empty in (tmp_path, folder):
+        read, notes = read_history(empty)
+        assert (read.columns, read.height, notes) == (list(TREND_COLUMNS), 0, [])
 
 
-def test_nights_come_in_the_order_of_their_start_and_by_profile(tmp_path):
-    keep(tmp_path, 2)
-    keep(tmp_path, 0, commit=None)
-    keep(tmp_path, 1, profile="full")
-    read, _ = read_history(tmp_path, "quick")
-    assert read["run_id"].unique(maintain_order=True).to_list() == [
-        "20260301T023000Z-1-00000000", "20260303T023000Z-1-00000002",
-    ]  # fmt: skip
-    assert read_history(tmp_path)[0]["run_id"].n_unique() == 3
-    assert (tmp_path / "date=2026-03-01" / "commit=unknown").is_dir()
+def test_the_newest_runs_come_in_the_order_of_their_start(folder):
+    for number in (2, 0, 1):
+        keep(folder, number)
+    names = ["20260301T023000Z-1-00000000", "20260302T023000Z-1-00000001", "20260303T023000Z-1-00000002"]
+    assert read_history(folder)[0]["run_id"].unique(maintain_order=True).to_list() == names
+    assert read_history(folder, newest=2)[0]["run_id"].unique(maintain_order=True).to_list() == names[1:]
+
+
+def test_what_is_not_shown_is_not_read(folder, monkeypatch):
+    """Neither the files of other profiles, nor older ones than the page shows."""
+    files = [keep(folder, number) for number in range(3)]
+    keep(folder.with_name("full"), 0)
+    read, opened = pl.read_parquet, []
+    monkeypatch.setattr(pl, "read_parquet", lambda file, **how: (opened.append((file, how)), read(file, **how))[1])
+    read_history(folder, newest=2)
+    assert [file for file, _ in opened] == files[1:]
+    assert all(how["columns"] == list(TREND_COLUMNS) for _, how in opened)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +88,7 @@ def test_a_commit_is_a_safe_name(commit, short):
 
 
 def foreign(file):
-    pl.DataFrame({"kind": ["setting"], "value": [1.0]}).write_parquet(file)
+    pl.DataFrame({"quantity": ["mean_deg"], "value": [1.0]}).write_parquet(file)
 
 
 def wrong_types(file):
@@ -105,72 +118,77 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_file_is_named_and_skipped(tmp_path, kind):
-    bad = keep(tmp_path, 1)
-    keep(tmp_path, 2)
+def test_a_damaged_file_is_named_and_skipped(folder, kind):
+    bad = keep(folder, 1)
+    keep(folder, 2)
     DAMAGE[kind](bad)
     before = bad.read_bytes()
     with pytest.warns(UserWarning, match=rf"{bad.name}: .*; skipped") as told:
-        read, (note,) = read_history(tmp_path)
+        read, (note,) = read_history(folder)
     assert len(told) == 1
     assert read["run_id"].unique().to_list() == ["20260303T023000Z-1-00000002"]
     assert note.startswith("History: 1 file skipped: ")
-    assert bad.relative_to(tmp_path).as_posix() in note
+    assert bad.relative_to(folder).as_posix() in note
     assert bad.read_bytes() == before
 
 
 @pytest.mark.filterwarnings("ignore:.*; skipped")
-def test_many_damaged_files_make_a_short_note(tmp_path):
+def test_many_damaged_files_make_a_short_note(folder):
     for number in range(8):
-        os.truncate(keep(tmp_path, number), 9)
-    read, (note,) = read_history(tmp_path)
+        os.truncate(keep(folder, number), 9)
+    read, (note,) = read_history(folder)
     assert read.height == 0
     assert note.startswith("History: 8 files skipped: ")
     assert note.endswith(" and 3 more.")
 
 
-def test_a_copy_of_a_night_counts_once(tmp_path):
-    file = keep(tmp_path, 0)
-    copy = tmp_path / "date=2026-03-09" / "commit=unknown" / "copy.parquet"
-    copy.parent.mkdir(parents=True)
-    copy.write_bytes(file.read_bytes())
+def test_a_copy_of_a_night_counts_once(folder):
+    file = keep(folder, 0)
+    (folder / "copy.parquet").write_bytes(file.read_bytes())
+    once = keep(folder.with_name("other"), 0).parent
     with pytest.warns(UserWarning, match="another file holds already"):
-        read, notes = read_history(tmp_path)
-    assert read.height == make_run().figures.height
+        read, notes = read_history(folder)
+    assert read.equals(read_history(once)[0])
     assert len(notes) == 1
 
 
-def test_half_written_and_other_files_are_no_nights(tmp_path, recwarn):
-    file = keep(tmp_path, 0)
-    file.with_name(f".{file.stem}.12.part.parquet").write_bytes(b"half")
-    (tmp_path / "notes.txt").write_text("mine")
-    assert read_history(tmp_path)[1] == []
+@pytest.mark.parametrize("step", ["os.fsync", "os.replace"])
+def test_whoever_reads_the_history_never_meets_half_of_a_night(folder, monkeypatch, step):
+    """The process is killed in the middle: nothing tidies up, and the documented glob matches whole files alone."""
+    keep(folder, 0)
+    before = pl.read_parquet(folder / "*.parquet")
+    killed = RuntimeError("killed")
+    monkeypatch.setattr(f"simtest.runtime.files.{step}", lambda *_: (_ for _ in ()).throw(killed))
+    monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)
+    with pytest.raises(RuntimeError):
+        keep(folder, 1)
+    monkeypatch.undo()
+    assert pl.read_parquet(folder / "*.parquet").equals(before)
+    assert pl.read_parquet(folder.parent / "quick" / "**" / "*.parquet").equals(before)
+
+
+def test_other_files_are_no_nights(folder, recwarn):
+    keep(folder, 0)
+    (folder / "notes.txt").write_text("mine")
+    assert read_history(folder)[1] == []
     assert not recwarn.list
 
 
-def test_a_column_that_an_older_night_lacks_is_null(tmp_path):
-    file = keep(tmp_path, 0)
-    pl.read_parquet(file).drop("digest", "source_hash").write_parquet(file)
-    read, notes = read_history(tmp_path)
+def test_a_file_of_other_columns_is_read_in_what_is_shown(folder):
+    """An older version's holds more kinds of figures, a later one's perhaps other columns."""
+    file = keep(folder, 0)
+    expected = read_history(folder)[0]
+    older = pl.read_parquet(file).drop("digest", "source_hash").with_columns(kind=pl.lit("setting"))
+    cost = older.head(1).with_columns(kind=pl.lit("cost"), quantity=pl.lit("run_time"))
+    pl.concat([older, cost]).write_parquet(file)
+    read, notes = read_history(folder)
     assert notes == []
-    assert read["digest"].null_count() == read.height > 0
+    assert_frame_equal(read, expected)
 
 
-def test_the_page_reads_what_it_shows(tmp_path):
-    keep(tmp_path, 0)
-    keep(tmp_path, 1)
-    every, _ = read_history(tmp_path)
-    few, _ = read_history(tmp_path, None, TREND_COLUMNS, ("median_deg",))
-    assert few.columns == list(TREND_COLUMNS)
-    kept = every.filter((pl.col("kind") != "setting") | (pl.col("quantity") == "median_deg"))
-    assert_frame_equal(few, kept.select(TREND_COLUMNS))
-    assert 0 < few.height < every.height
-    assert read_history(tmp_path / "none", None, TREND_COLUMNS)[0].columns == list(TREND_COLUMNS)
-
-
-def test_a_clock_that_went_back_is_told(tmp_path):
-    keep(tmp_path, 3)
-    read, _ = read_history(tmp_path)
+def test_a_clock_that_went_back_is_told(folder):
+    keep(folder, 3)
+    read, _ = read_history(folder)
     note = clock_note(read, STARTED)
     assert note is not None
     assert "2026-03-01 02:30:00 UTC" in note
@@ -178,8 +196,8 @@ def test_a_clock_that_went_back_is_told(tmp_path):
     assert clock_note(read, STARTED + timedelta(days=4)) is None
     assert clock_note(read.head(0), STARTED) is None
     # The night is kept all the same, in its place by the time it tells.
-    keep(tmp_path, 0)
-    assert read_history(tmp_path)[0]["started"].is_sorted()
+    keep(folder, 0)
+    assert read_history(folder)[0]["started"].is_sorted()
 
 
 def test_names_of_nights_differ_whatever_the_clock_says():
@@ -187,17 +205,17 @@ def test_names_of_nights_differ_whatever_the_clock_says():
     assert len({new_run_id(now) for _ in range(1000)}) == 1000
 
 
-def test_a_full_disk_leaves_no_half_of_a_night(tmp_path, monkeypatch):
-    keep(tmp_path, 0)
-    before = contents(tmp_path)
+def test_a_full_disk_leaves_no_half_of_a_night(folder, monkeypatch):
+    keep(folder, 0)
+    before = contents(folder)
 
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("simtest.runtime.files.os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        keep(tmp_path, 1)
-    assert contents(tmp_path) == before
+        keep(folder, 1)
+    assert contents(folder) == before
 
 
 def contents(folder):
@@ -239,6 +257,28 @@ def test_a_baseline_is_the_last_night_with_a_reason(reports):
     assert_frame_equal(found.rows, kept)
     assert {"error_deg", "seed", "true_id", "realisation"} <= set(kept.columns)
     assert not list(reports.work.glob("2*"))
+
+
+def test_reading_a_baseline_writes_nothing(reports):
+    accept(reports, "quick", "first")
+    for path in reports.baseline("quick").parent.glob(".*"):
+        path.unlink()
+    load_baseline(reports, "quick")
+    load_baseline(reports, "full")
+    assert [path.name for path in reports.baseline("quick").parent.iterdir()] == ["quick"]
+
+
+def test_a_baseline_of_an_older_version_has_figures_that_are_of_no_cell(reports):
+    accept(reports, "quick", "first")
+    held = load_baseline(reports, "quick")
+    cost = held.figures.head(1).with_columns(
+        experiment=pl.lit("cost"), quantity=pl.lit("run_time"), digest=pl.lit(None, pl.String)
+    )
+    older = pl.concat([held.figures, cost]).with_columns(kind=pl.lit("setting"), passed=None, about=pl.lit(""))
+    save_run(reports.baseline("quick"), replace(held, figures=older), BASELINE_ROWS)
+    found = load_baseline(reports, "quick")
+    assert_frame_equal(found.figures, held.figures)
+    assert judge(make_run(), found, reports).verdict.bit_equal
 
 
 def test_all_acceptances_are_kept(reports):
@@ -365,22 +405,12 @@ def test_what_dead_nights_left_is_removed_and_the_living_are_left_alone(tmp_path
     dead.mkdir(parents=True)
     (dead / "lock").touch()
     (dead / "rows").write_text("half")
-    file = keep(reports.history, 0)
-    stale = file.with_name(".20260101T000000Z-1-dead.1.part.parquet")
-    stale.write_bytes(b"half")
     with scratch(reports, "20260102T000000Z-1-alive") as alive:
-        writing = file.with_name(f".{alive.name}.1.part.parquet")
-        writing.write_bytes(b"half")
         assert remove_dead(reports) == [dead.name]
         assert alive.is_dir()
-        assert writing.is_file()
     assert not alive.exists()
     assert not dead.exists()
-    assert not stale.exists()
-    assert file.is_file()
     assert remove_dead(reports) == []
-    remove_dead(reports)
-    assert not writing.exists()
 
 
 def test_a_folder_is_replaced_whole(tmp_path):

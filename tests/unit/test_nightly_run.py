@@ -22,18 +22,19 @@ from simtest.nightly import measure
 from simtest.nightly import run as run_module
 from simtest.nightly import verdict as verdict_module
 from simtest.nightly.baseline import accept, load_baseline
+from simtest.nightly.gate.figures import setting_figures
 from simtest.nightly.history import read_history
 from simtest.nightly.layout import Reports
 from simtest.nightly.measure import RunOptions
-from simtest.nightly.records import FIGURES
 from simtest.nightly.run import run_nightly
 from simtest.nightly.storage import BASELINE_ROWS, save_run
 from simtest.runtime.resources import data_root
 from simtest.spec import Profile, experiments_of, load_profile
 from simtest.validation.cases import expand
 from simtest.validation.fingerprints import definition
+from simtest.validation.results_table import SCHEMA
 from tests.marked import marked
-from tests.unit.nightly_samples import STARTED, canary, make_rows, make_run, regression
+from tests.unit.nightly_samples import STARTED, make_rows, make_run, regression
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -41,7 +42,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked wit
 
 SMALL = """
 title = "Small"
-canaries = false
 [[experiments]]
 experiment = "planes.toml"
 [[experiments]]
@@ -103,8 +103,6 @@ def measured(monkeypatch):
 
     monkeypatch.setattr(run_module, "measure_run", measure_run)
     monkeypatch.setattr(run_module, "plan_run", planned)
-    # Their experiments are made up.
-    monkeypatch.setattr(draw_module, "worst_cases", lambda *_: ())
     return runs
 
 
@@ -224,26 +222,43 @@ def test_a_night_is_measured_kept_and_published(small, reports):
     assert steps[0][0] == 0
     assert steps[-1] == (total, total, "done")
     files = {path.name for path in first.folder.iterdir()}
-    assert {"index.html", "verdict.json", "junit.xml", "summary.md", "badge.svg", "run.json", "rows.parquet",
-            "figures.parquet"} <= files  # fmt: skip
-    history, _ = read_history(reports.history)
+    assert files == {"index.html", "verdict.json", "summary.md", "run.json", "rows.parquet", "figures.parquet"}
+    history, _ = read_history(reports.history("small"))
     assert set(history["run_id"]) == {first.judged.run.record.id}
-    assert {"setting", "cost"} <= set(history["kind"])
-    costs = history.filter(pl.col("kind") == "cost")
-    assert {"cone_axis", "reconstruct", "night"} <= set(costs["estimator"])
-    assert costs["value"].is_between(0, 1e5, closed="none").all()
     assert json.loads((first.folder / "run.json").read_text())["command"] == "simtest nightly"
     assert not [path for path in reports.work.iterdir() if path.is_dir()]
 
     accept(reports, "small", "first")
-    second = run_nightly(profile.model_copy(update={"costs": False}), reports)
-    # Costs that are no longer measured are missed, and nothing else.
-    assert set(second.judged.verdict.regressions["experiment"]) == {"costs"}
+    second = run_nightly(profile, reports)
+    assert (second.judged.verdict.state, second.judged.verdict.bit_equal) == ("fine", True)
     assert second.judged.run.rows.equals(first.judged.run.rows)
-    settings = [outcome.judged.run.figures_of("setting") for outcome in (first, second)]
-    assert settings[0].equals(settings[1])
-    assert read_history(reports.history)[0]["run_id"].n_unique() == 2
+    assert second.judged.run.figures.equals(first.judged.run.figures)
+    assert read_history(reports.history("small"))[0]["run_id"].n_unique() == 2
     assert second.judged.verdict.baseline.reason == "first"
+
+
+@pytest.mark.render
+def test_experiments_with_findings_have_their_report(small, reports, monkeypatch):
+    profile = load_profile(small)
+    run_nightly(profile, reports)
+    accept(reports, "small", "first")
+    moved = lambda run, *_: replace(  # noqa: E731
+        run,
+        rows=run.rows.with_columns(pl.when(experiment="planes").then(9.0).otherwise("error_deg").alias("error_deg")),
+    )
+    compare = verdict_module.compare
+    monkeypatch.setattr(verdict_module, "compare", lambda tonight, before: compare(refigured(moved(tonight)), before))
+    outcome = run_nightly(profile, reports)
+    assert outcome.judged.verdict.state == "regression"
+    assert outcome.judged.reports == ("planes",)
+    assert (outcome.folder / "reports" / "planes" / "index.html").is_file()
+    assert json.loads((outcome.folder / "verdict.json").read_text())["reports"] == ["planes"]
+    assert 'href="reports/planes/index.html"' in (outcome.folder / "index.html").read_text()
+
+
+def refigured(run):
+    """Return a run with the figures of its rows."""
+    return replace(run, figures=setting_figures(run.rows))
 
 
 def test_a_regression_exits_1(measured, reports, monkeypatch):
@@ -252,19 +267,47 @@ def test_a_regression_exits_1(measured, reports, monkeypatch):
     outcome = run_nightly(quick(), reports)
     assert outcome.judged.verdict.exit_code == 1
     assert json.loads((outcome.folder / "verdict.json").read_text())["exit_code"] == 1
-    history, _ = read_history(reports.history, "quick")
+    history, _ = read_history(reports.history("quick"))
     assert history.filter(pl.col("run_id") == outcome.judged.run.record.id)["state"].unique().to_list() == [
         "regression"
     ]
 
 
-def test_a_failed_canary_is_a_regression_without_a_baseline(measured, reports):
-    measured.insert(0, make_run(canaries=[canary("rotated camera", 0.5, False)]))
-    outcome = run_nightly(quick(), reports)
-    assert outcome.judged.verdict.exit_code == 1
-    text = (outcome.folder / "summary.md").read_text()
-    assert "### Canaries failed: 1" in text
-    assert "| rotated camera |" in text
+def own_rows(**values):
+    """Return rows of an estimator of a user's that gives one normal, whatever the noise."""
+    normal = {"normal_x": 0.3, "normal_y": 0.0, "normal_z": -(0.91**0.5)}
+    values = {"estimator": "mine", "noise_sigma": 0.05, **normal, "error_deg": 0.7, "status": "ok", **values}
+    return (
+        make_rows()
+        .filter(estimator="cone_axis")
+        .with_columns(pl.lit(value).alias(name) for name, value in values.items())
+        .cast(SCHEMA)
+    )
+
+
+def test_an_estimator_of_a_users_is_fine_where_nothing_changed(measured, reports):
+    measured[:] = [make_run(rows=own_rows())] * 2
+    accept_first(reports)
+    verdict = run_nightly(quick(), reports).judged.verdict
+    assert (verdict.state, verdict.bit_equal, verdict.exit_code) == ("fine", True, 0)
+    assert verdict.causes == ()
+
+
+BROKEN = {"status": "estimator_error", "flags": "the first candidate must be the proposed normal", "error_deg": None}
+
+
+def test_an_error_inside_an_estimator_is_the_first_cause(measured, reports):
+    broken = make_run(rows=own_rows(**BROKEN))
+    measured[:] = [make_run(rows=own_rows()), broken, broken, broken]
+    accept_first(reports)
+    said = f"mine: {BROKEN['flags']}, {own_rows().height} times"
+    assert run_nightly(quick(), reports).judged.verdict.causes[0] == f"{said}."
+    # What the accepted run has as often needs no reason; without a baseline it is said.
+    accept(reports, "quick", "it is known to fail")
+    verdict = run_nightly(quick(), reports).judged.verdict
+    assert (verdict.state, verdict.causes) == ("fine", ())
+    alone = verdict_module.verdict_on(broken, None)
+    assert (alone.state, alone.causes) == ("no baseline", (f"{said}.",))
 
 
 @pytest.mark.filterwarnings("ignore:.*; skipped")
@@ -274,7 +317,7 @@ def test_damage_in_the_history_is_told_on_the_page_and_the_night_goes_on(measure
     second = run_nightly(quick(), reports)
     assert [note for note in second.judged.verdict.notes if first.history_file.name in note]
     assert first.history_file.stat().st_size == 50
-    assert set(read_history(reports.history)[0]["run_id"]) == {second.judged.run.record.id}
+    assert set(read_history(reports.history("quick"))[0]["run_id"]) == {second.judged.run.record.id}
 
 
 def test_a_clock_that_goes_back_is_told_and_nothing_is_overwritten(measured, reports):
@@ -282,7 +325,7 @@ def test_a_clock_that_goes_back_is_told_and_nothing_is_overwritten(measured, rep
     first, second = (run_nightly(quick(), reports) for _ in range(2))
     assert [note for note in second.judged.verdict.notes if note.startswith("The clock went back")]
     assert not [note for note in first.judged.verdict.notes if "clock" in note]
-    history, _ = read_history(reports.history)
+    history, _ = read_history(reports.history("quick"))
     assert history["run_id"].unique(maintain_order=True).to_list() == [o.judged.run.record.id for o in (second, first)]
 
 
@@ -334,7 +377,9 @@ def test_a_full_disk_is_told_and_nothing_is_lost(measured, reports, monkeypatch,
         fsync(descriptor)
 
     monkeypatch.setattr("simtest.runtime.files.os.fsync", full)
-    with pytest.raises(SimtestError, match=r"the night could not be written .No space left on device.; what earlier"):
+    with pytest.raises(
+        SimtestError, match=r"the night could not be written .*No space left on device; .* free.*; what earlier"
+    ):
         run_nightly(quick(), reports)
     monkeypatch.undo()
     after = contents(reports.root)
@@ -358,12 +403,16 @@ def fails_with(error):
     return fails
 
 
-def test_a_night_without_its_pictures_is_kept_and_says_so(measured, reports, monkeypatch):
-    monkeypatch.setattr(draw_module, "save_worst", fails_with(RuntimeError("no such\nframe")))
+def test_a_night_whose_report_cannot_be_drawn_is_kept_and_says_so(measured, reports, monkeypatch):
+    accept_first(reports)
+    monkeypatch.setattr(draw_module, "write_report", fails_with(RuntimeError("no such\nframe")))
+    monkeypatch.setattr(Path, "is_dir", lambda path, own=Path.is_dir: path.name in ("first", "second") or own(path))
+    measured[:] = [make_run(rows=make_rows().with_columns(pl.col("error_deg") * 1.5))]
     outcome = run_nightly(quick(), reports)
-    said = "The worst cases could not be made again (RuntimeError: no such frame)."
+    said = "The report of first could not be drawn (RuntimeError: no such frame)."
     assert said in outcome.judged.verdict.notes
     assert said in json.loads((outcome.folder / "verdict.json").read_text())["notes"]
+    assert outcome.judged.reports == ()
     assert outcome.history_file.is_file()
 
 
@@ -393,7 +442,7 @@ def test_a_ctrl_c_after_the_history_says_what_is_kept(measured, here, monkeypatc
     code, output, errors = here()
     assert (code, output) == (130, "")
     assert errors[-1] == "simtest: stopped; this night is in the history; its page may not have been published"
-    assert read_history(tmp_path / "reports" / "history")[0].height
+    assert read_history(tmp_path / "reports" / "history" / "quick")[0].height
 
 
 def test_a_fault_is_not_taken_for_a_full_disk(measured, reports, monkeypatch):
@@ -403,7 +452,7 @@ def test_a_fault_is_not_taken_for_a_full_disk(measured, reports, monkeypatch):
             run_nightly(quick(), reports)
     monkeypatch.setattr(run_module, "measure_run", fails_with(
         pl.exceptions.ComputeError("No space left on device (os error 28)")))  # fmt: skip
-    with pytest.raises(SimtestError, match=r"the night could not be written .No space left"):
+    with pytest.raises(SimtestError, match=r"the night could not be written .*No space left"):
         run_nightly(quick(), reports)
 
 
@@ -411,16 +460,14 @@ def test_an_acceptance_on_a_full_disk_is_told_in_one_line(measured, reports, mon
     accept_first(reports)
     before = contents(reports.root)
     monkeypatch.setattr("simtest.runtime.files.os.fsync", fails_with(OSError(errno.ENOSPC, "No space left on device")))
-    with pytest.raises(SimtestError, match=r"the baseline could not be written .No space left on device.; the last"):
+    with pytest.raises(
+        SimtestError, match=r"the baseline could not be written .*No space left on device; .* free.*; the last"
+    ):
         accept(reports, "quick", "second")
     assert contents(reports.root) == before
 
 
 # Measuring -------------------------------------------------------------------------------------------------------
-
-
-def figure_of(kind, name):
-    return pl.DataFrame([{"kind": kind, "experiment": name, "value": 1.0, "passed": True}], schema=FIGURES)
 
 
 @pytest.fixture(scope="module")
@@ -431,26 +478,16 @@ def finished():
 
 @pytest.fixture
 def parts(monkeypatch, finished):
-    """Have a run whose parts but the experiments do nothing; return the order in which they are asked."""
-    told, experiments = [], measure.run_experiments
-
-    def tells(name, result):
-        return lambda *_, **__: (told.append(name), result)[1]
+    """Have experiments that were run already."""
+    experiments = measure.run_experiments
 
     def work(*arguments):
-        told.append("experiments")
         described = tuple(experiment.model_dump_json() for experiment, _ in arguments[0])
         if described not in finished:
             finished[described] = experiments(*arguments)
         return finished[described]
 
-    monkeypatch.setattr(measure, "run_canaries", tells("canaries", figure_of("canary", "pose")))
-    monkeypatch.setattr(measure, "ladder_figures", tells("ladder", figure_of("ladder", "error ladder")))
-    monkeypatch.setattr(measure, "ladder_values", lambda figures: figures.clear())
     monkeypatch.setattr(measure, "run_experiments", work)
-    monkeypatch.setattr(measure.noise, "noises_of", tells("noises_of", []))
-    monkeypatch.setattr(measure.cost, "run_times", tells("costs", figure_of("cost", "cost")))
-    return told
 
 
 PAPER = '[[experiments]]\nexperiment = "paper"\nlabels = ["noise"]\nrealisations = 1\n'
@@ -463,38 +500,19 @@ def night_of(tmp_path, text=PAPER):
 
 
 def test_a_run_that_measured_nothing_is_refused(tmp_path):
-    """No highlight lies in view, and nothing else is measured: history and gate would have no figure at all."""
+    """No highlight lies in view: history and gate would have no figure at all."""
     (tmp_path / "blank.toml").write_text(
         'realisations = 1\nestimators = ["brightest_point"]\n[[groups]]\nscene = "plane"\n'
         'set = { "surface.tilt_deg" = 60.0, "reflectance.diffuse" = 0.3, "camera.width" = 32, "camera.height" = 32 }\n'
     )
-    blank = 'canaries = false\ncosts = false\n[[experiments]]\nexperiment = "blank.toml"\n'
-    with pytest.raises(InputError, match="profile mine: its experiments gave no rows, and canaries and costs are off"):
+    blank = '[[experiments]]\nexperiment = "blank.toml"\n'
+    with pytest.raises(InputError, match="profile mine: its experiments gave no rows; give it a setting"):
         night_of(tmp_path, blank)
-
-
-def test_canaries_come_first(parts, tmp_path):
-    run = night_of(tmp_path)
-    assert parts == ["canaries", "ladder", "experiments", "noises_of", "costs"]
-    assert run.record.variants == {"paper": "llvm_ad_mono"}
-    assert run.failed_canaries.height == 0
-    assert set(run.figures["kind"]) == {"setting", "canary", "ladder", "cost"}
-
-
-@pytest.mark.parametrize("part", ["ladder_figures", "noises_of", "run_times"])
-@pytest.mark.parametrize("error", [AssertionError("odd"), BackendError("odd")])
-def test_a_part_that_breaks_is_a_failed_canary_of_a_night_that_is_kept(parts, tmp_path, monkeypatch, part, error):
-    monkeypatch.setattr({"noises_of": measure.noise, "run_times": measure.cost}.get(part, measure), part,
-                        fails_with(error))  # fmt: skip
-    run = night_of(tmp_path)
-    assert run.rows.height
-    (failed,) = run.failed_canaries.to_dicts()
-    names = {"ladder_figures": "error ladder", "noises_of": "noises_of", "run_times": "costs"}
-    assert (failed["experiment"], failed["about"]) == (names[part], f"{type(error).__name__}: odd")
 
 
 def test_the_record_says_what_ran(parts, tmp_path):
     first, again, more = (night_of(tmp_path, text) for text in (PAPER, PAPER, PAPER + "seed = 3\n"))
+    assert first.record.variants == {"paper": "llvm_ad_mono"}
     assert set(first.record.definitions) == {"paper"}
     assert re.fullmatch("[0-9a-f]{64}", first.record.definitions["paper"])
     assert first.record.definitions == again.record.definitions
@@ -620,18 +638,3 @@ def test_help_names_the_profiles(here):
     code, output, _ = here("--help")
     assert code == 0
     assert "shipped one: quick, full." in " ".join(output.replace("│", " ").split())
-
-
-def test_the_bar_moves_one_way():
-    """Each part of a night has its share of the bar."""
-    told = []
-    steps = measure._Steps(lambda *step: told.append(step), 10)
-    move = steps.within("experiments")
-    for done in range(11):
-        move(done, 10, "plane")
-    steps.show("costs")
-    steps.end()
-    assert told[0] == (0, 13, "plane")
-    assert told[10] == (10, 13, "experiments")
-    assert told[-1] == (13, 13, "done")
-    assert measure._Steps(None, 10).within("experiments") is None

@@ -53,12 +53,12 @@ def test_the_history_outlasts_a_lost_cache(tmp_path, kept):
 if [ "$2" = list ]; then echo 13; echo 12; echo 11; exit; fi
 [ "$3" = 13 ] && mkdir -p earlier/nightly && exit
 [ "$3" = "{kept}" ] || exit 1
-mkdir -p earlier/history/date=2026-01-01 && echo "$3" > earlier/history/date=2026-01-01/night
+mkdir -p earlier/history/full && echo "$3" > earlier/history/full/night
 """)
     gh.chmod(0o755)
     path = f"{gh.parent}:{os.environ['PATH']}"
     subprocess.run(["/bin/bash", "-e", "-c", script], cwd=tmp_path, env={"PATH": path}, check=True, capture_output=True)
-    found = tmp_path / "reports" / "history" / "date=2026-01-01" / "night"
+    found = tmp_path / "reports" / "history" / "full" / "night"
     assert (found.read_text().strip() if found.exists() else None) == kept
     assert not (tmp_path / "earlier").exists()
 

@@ -298,7 +298,7 @@ def test_an_experiment_and_a_nightly_profile_name_a_core(tmp_path, published):
     assert simtest.load_experiment(published).estimators == (core,)
     profile = tmp_path / "profile.toml"
     entry = f'[[experiments]]\nexperiment = "{published}"\nestimators = ["cone_axis", {json.dumps(core)}]\n'
-    profile.write_text(f"canaries = false\ncosts = false\n{entry}")
+    profile.write_text(entry)
     planned = plan_run(load_profile(profile))
     made = measure_run(load_profile(profile), tmp_path / "scratch", "a", planned=planned)
     assert set(made.figures["estimator"]) >= {"cone_axis", "bad_core"}

@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import polars as pl
 import pytest
 
 from simtest.runtime.engines import make_engine
@@ -12,7 +11,6 @@ from simtest.validation.case_work import by_variant
 from simtest.validation.cases import expand
 from simtest.validation.jobs import make_jobs, variant_of
 from simtest.validation.runner import run_experiments
-from simtest.validation.worst import WorstCase, save_worst
 
 pytestmark = pytest.mark.render
 
@@ -96,18 +94,3 @@ def test_the_variant_is_that_of_the_scenes_unless_one_is_named(experiments):
         assert variant_of(cases) == VARIANTS[name]
         assert variant_of(cases, "cuda") == VARIANTS[name].replace("llvm", "cuda")
         assert variant_of(cases, "llvm_ad_mono") == "llvm_ad_mono"
-
-
-def test_worst_cases_are_rendered_in_the_variant_of_their_experiment(experiments, alone, tmp_path):
-    names = ("grey", "coloured", "grey_too")
-    settings = {name: alone[name]["setting"][0] for name in names}
-    worst = [WorstCase(name, settings[name], 0, "cone_axis", "why") for name in names]
-    files = save_worst(worst, experiments.values(), tmp_path)
-    for name, file in zip(names, files, strict=True):
-        with np.load(file) as data:
-            estimates = json.loads(str(data["meta"]))["estimates"]
-        rows = alone[name].filter(pl.col("setting") == settings[name], realisation=0)
-        for estimate in estimates:
-            own = rows.filter(estimator=estimate["estimator"], true_id=estimate["true_id"])
-            assert own["error_deg"].to_list() == [estimate["error_deg"]]
-        assert estimates

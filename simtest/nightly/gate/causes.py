@@ -4,11 +4,11 @@ from collections.abc import Mapping
 
 import polars as pl
 
-from simtest.nightly.gate.checks import RULES
-from simtest.nightly.gate.published import PUBLISHED
+from simtest.errors import FAULTS
 from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE
 from simtest.nightly.gate.single_results import SINGLE
 from simtest.nightly.records import CELL, POOLED, NightlyRun, to_explain
+from simtest.validation.faults import fault_sentences, faults_of
 from simtest.validation.results_table import BUDGET_COLUMNS
 
 MOST = 8
@@ -28,9 +28,9 @@ WORDS = {
     "direction_deg": "the error of the curvature's direction",
     "eps_over_d": "the light's distance over the surface's",
     "peak_snr": "the highlights' peak over the noise",
-    "region_deg": "the size of the stated regions",
-    "noise_part_deg": "the noise's part of the stated uncertainty",
-    "truth_in_region": "the truth's place in the stated regions (0.5 where they are right, 1 where too wide)",
+    "region_deg": "the size of the reported regions",
+    "noise_part_deg": "the noise's part of the reported uncertainty",
+    "truth_in_region": "the truth's place in the reported regions (0.5 where they are right, 1 where too wide)",
     "unanswered": "the share of unanswered highlights",
     "missed": "the share of missed highlights",
     "false": "the number of false detections a frame",
@@ -41,8 +41,6 @@ WORDS = {
     "flagged": "the share of answers with a flag",
     "wrong_sign": "the share of wrong signs among those that motion told",
     "n": "the number of true highlights",
-    "run_time": "the run time",
-    "peak_memory": "the peak memory",
     "single answers": "the number of answers",
     "single flags": "the number of answers with a flag",
     "single false": "the number of false detections",
@@ -59,45 +57,36 @@ def causes(
 ) -> tuple[str, ...]:
     """Return what the findings among a verdict's comparisons are, a sentence each, those of the surest cause first.
 
-    First canaries with their error, then results that contradict themselves, what is missing, what tests show to be
-    worse, single results, and what is better or else and must be explained. Of each estimator, experiment and quantity
-    the setting that moved farthest is named, and how many others there are.
+    First errors inside estimators, with their text, then what is missing, what tests show to be worse, single results,
+    and what is better or else and must be explained. Of each estimator, experiment and quantity the setting that moved
+    farthest is named, and how many others there are.
     """
-    made = list(_canaries(tonight))
-    for group in _groups(comparisons, tonight):
-        made.append(_sentence(group, tonight, baseline))
+    made = [f"{fault}." for fault in _faults(tonight, baseline)]
+    made += [_sentence(group, tonight, baseline) for group in _groups(comparisons)]
     left = len(made) - most
     return tuple(made[:most] + ([f"And {left} more findings of this kind; the table has all."] if left > 0 else []))
 
 
-def _canaries(run: NightlyRun) -> list[str]:
-    made = []
-    for row in run.failed_canaries.iter_rows(named=True):
-        if row["quantity"] == "error":
-            made.append(f"The canary {row['experiment']} could not be measured: {row['about']}.")
-            continue
-        value = "no number" if row["value"] is None else f"{row['value']:.3g}"
-        unit = f" {row['unit']}" if row["unit"] else ""
-        allowed = " to ".join("-" if row[key] is None else f"{row[key]:.3g}" for key in ("low", "high"))
-        about = f" ({row['about']})" if row["about"] else ""
-        made.append(f"The canary {row['experiment']}: {row['quantity']} is {value}{unit}, must be {allowed}{about}.")
-    return made
-
-
-def _groups(comparisons: pl.DataFrame, tonight: NightlyRun) -> list[dict[str, object]]:
-    """Return the findings by kind, experiment, estimator and quantity, each as the setting that moved farthest."""
-    canaries = tonight.figures_of("canary").select(*CELL, "quantity")
-    found = comparisons.filter((pl.col("outcome") == "worse") | to_explain())
-    found = found.join(canaries, on=(*CELL, "quantity"), how="anti", nulls_equal=True, maintain_order="left")
-    rank = {"check": 0, "rows": 1, "equal": 1, "none": 2, "ladder": 5, SINGLE: 4}
-    worse = pl.col("outcome") == "worse"
-    kind = pl.col("method").replace_strict(rank, default=3, return_dtype=pl.Int64) + pl.when(worse).then(0).otherwise(
-        10
+def _faults(tonight: NightlyRun, baseline: NightlyRun | None) -> list[str]:
+    """Return the errors inside the estimators that have more of them than in the baseline."""
+    found = pl.col("status").is_in(list(map(str, FAULTS)))
+    now, was = (
+        {} if run is None else dict(run.rows.filter(found)["estimator"].value_counts().iter_rows())
+        for run in (tonight, baseline)
     )
-    lost = worse & (pl.col("quantity") == "n")
+    more = [name for name, count in now.items() if count > was.get(name, 0)]
+    return fault_sentences(faults_of(tonight.rows.filter(pl.col("estimator").is_in(more))))
+
+
+def _groups(comparisons: pl.DataFrame) -> list[dict[str, object]]:
+    """Return the findings by kind, experiment, estimator and quantity, each as the setting that moved farthest."""
+    found = comparisons.filter((pl.col("outcome") == "worse") | to_explain())
+    worse = pl.col("outcome") == "worse"
+    # First what is missing, then what tests show, then single results
+    kind = pl.when(pl.col("quantity") == "n").then(1).when(pl.col("method") == SINGLE).then(3).otherwise(2)
     scale = pl.max_horizontal(pl.col("margin").abs(), pl.col("baseline").abs(), pl.lit(1e-9))
     found = found.with_columns(
-        kind=pl.when(lost).then(2).otherwise(kind), size=(pl.col("difference").abs() / scale).fill_null(0.0),
+        kind=kind + pl.when(worse).then(0).otherwise(10), size=(pl.col("difference").abs() / scale).fill_null(0.0),
         # A row over many settings names none.
         own=pl.col("setting") != POOLED,
     )  # fmt: skip
@@ -110,23 +99,12 @@ def _sentence(row: Mapping[str, object], tonight: NightlyRun, baseline: NightlyR
     quantity, unit = str(row["quantity"]), f" {row['unit']}" if row["unit"] else ""
     where = _where(row)
     was, now = (_number(row[key]) + unit for key in ("baseline", "tonight"))
-    if quantity in RULES:
-        return f"{where}: {_number(row['tonight'])} of {row['n']} results break the rule that {RULES[quantity]}."
-    if quantity.startswith(PUBLISHED):
-        name = quantity.removeprefix(PUBLISHED)
-        if name == "digest":
-            return f"{where}: the results are not those that were measured (another hash)."
-        return f"{where}: {name} is published as {now}, the results give {was}."
-    if row["method"] == "equal":
-        return f"{where}: {quantity} is {now}, was {was}, of the same results: it is computed in another way."
     if quantity == "n" and row["method"] == "none":
         return f"{where}: the cell is missing tonight (it had {was} true highlights)."
     outcome = {"worse": "worse", "better": "better: explain", "changed": "changed: explain"}[str(row["outcome"])]
     pooled = row["unit"] == "x" and row["setting"] == POOLED
     told = f"is {now} of the baseline's" if pooled else f"is {now}, was {was}"
     words = WORDS.get(quantity) or quantity
-    if row["method"] == "ladder":
-        words = f"the mean error on the rung {quantity!r}"
     if row["method"] == SINGLE:
         told, words = _of_single(row, was, now, words)
     text = f"{where}: {words} {told} ({outcome})."
@@ -184,7 +162,7 @@ def _reasons(row: Mapping[str, object], tonight: NightlyRun, baseline: NightlyRu
 
 
 def _budget(row: Mapping[str, object], tonight: NightlyRun, baseline: NightlyRun | None) -> str:
-    """Return which part of the stated uncertainty moved most."""
+    """Return which part of the reported uncertainty moved most."""
     before, after = _own(baseline, row), _own(tonight, row)
     if row["quantity"] not in _LINKED or before is None or after is None:
         return ""
@@ -198,7 +176,7 @@ def _budget(row: Mapping[str, object], tonight: NightlyRun, baseline: NightlyRun
     if apart <= 0.02 * max(first, second):
         return ""
     part = name.removeprefix("budget_").removesuffix("_deg")
-    return f" Of the stated uncertainty the part {part} is {second:.3g} deg, was {first:.3g} deg."
+    return f" Of the reported uncertainty the part {part} is {second:.3g} deg, was {first:.3g} deg."
 
 
 def _number(value: object) -> str:

@@ -7,17 +7,14 @@ import numpy as np
 import polars as pl
 
 from simtest.nightly.gate.causes import causes
-from simtest.nightly.gate.checks import inconsistent
 from simtest.nightly.gate.contrasts import Outcomes, paired, unpaired
-from simtest.nightly.gate.expectations import canaries, costs, rungs
 from simtest.nightly.gate.holm import holm
 from simtest.nightly.gate.limits import Limits
 from simtest.nightly.gate.missing_results import digests, lost_highlights, missing_cells
-from simtest.nightly.gate.notes import large_and_undecided, notes_on, nothing_to_compare, redefined
+from simtest.nightly.gate.notes import large_and_undecided, notes_on, redefined
 from simtest.nightly.gate.pairing import frames_taken, pairing, pairs, with_all_frames
 from simtest.nightly.gate.pairing_units import paired_sums, sums
 from simtest.nightly.gate.pooling import pooled
-from simtest.nightly.gate.published import unlike_rows
 from simtest.nightly.gate.quantities import (
     OPTIONAL_COLUMNS,
     RESULT_COLUMNS,
@@ -34,16 +31,13 @@ from simtest.validation.results_table import SCHEMA
 
 DEFAULTS = Limits()
 
-ROUNDING = 1e-12
-"""Two figures of the same results that differ by less, as a share, are the same: sums may be taken in another order."""
-
 _WORK = {**COMPARISONS, "better": pl.Float64(), "within": pl.Boolean()}
 """Columns of comparisons before `_judged`: `p` is that of a rise, `better` that of a fall, `within` as in `Outcomes`;
 an outcome that is set already stands."""
 
 
 def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = DEFAULTS) -> Verdict:
-    """Compare a run with the baseline, if there is one; canaries and the run's own consistency are judged all the same.
+    """Compare a run with the baseline; without one there is nothing to compare, and the causes are faults alone.
 
     Cells whose results are the same bytes are the same; the others are tested, pair by pair where seeds and versions
     are the same, with all tests as one family (docs/concepts/gate.md).
@@ -51,50 +45,31 @@ def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = D
     Returns
     -------
     Verdict
-        "regression" where a comparison is worse, "changed" where one is better or has changed, else "no baseline" or
-        "fine". What tonight lacks (a cell, true highlights of a cell whose seeds are the same, a canary) is worse.
+        "regression" where a comparison is worse, "changed" where one is better or has changed, else "fine"; "no
+        baseline" without one. What tonight lacks (a cell, true highlights of a cell whose seeds are the same) is worse.
     """
-    before = None if baseline is None else baseline.figures
-    same_machine = baseline is None or _machine(baseline.record) == _machine(tonight.record)
-    same_processor = baseline is None or baseline.record.processor == tonight.record.processor
-    made = [
-        canaries(tonight.figures, before),
-        costs(tonight.figures, before, limits, same_processor),
-        inconsistent(tonight.rows, None if baseline is None else baseline.rows),
-        unlike_rows(tonight.figures, tonight.rows),
-    ]
-    bit_equal, notes = None, nothing_to_compare(tonight)
-    if baseline is not None:
-        same_versions = _versions(baseline.record) == _versions(tonight.record)
-        first, second = digests(baseline.figures), digests(tonight.figures)
-        bit_equal = first.select(*CELL, "digest").equals(second.select(*CELL, "digest"))
-        shared = first.join(second, on=CELL, suffix="_2", maintain_order="left")
-        equal = pl.col("digest") == pl.col("digest_2")
-        made += [
-            rungs(tonight.figures, baseline.figures, limits, same_versions),
-            missing_cells(first, second),
-            _same(shared.filter(equal).select(CELL), baseline.figures, tonight.figures, limits),
-        ]
-        aligned, absent = _aligned(baseline, tonight)
-        tested, unmatched, short = _tested(*aligned, shared.filter(~equal).select(CELL), limits, same_machine)
-        made += tested
-        notes = notes_on(baseline, tonight, bit_equal, unmatched, short, absent, limits)
+    if baseline is None:
+        none = pl.DataFrame(schema=COMPARISONS)
+        return Verdict("no baseline", None, none, (), None, causes(none, tonight, None))
+    same_machine = _machine(baseline.record) == _machine(tonight.record)
+    first, second = digests(baseline.figures), digests(tonight.figures)
+    bit_equal = first.select(*CELL, "digest").equals(second.select(*CELL, "digest"))
+    shared = first.join(second, on=CELL, suffix="_2", maintain_order="left")
+    equal = pl.col("digest") == pl.col("digest_2")
+    aligned, absent = _aligned(baseline, tonight)
+    tested, unmatched, short = _tested(*aligned, shared.filter(~equal).select(CELL), limits, same_machine)
+    made = [missing_cells(first, second), _same(shared.filter(equal).select(CELL), tonight.figures), *tested]
     held = [table for table in made if table.height]
     comparisons = _judged(pl.concat([pl.DataFrame(schema=_WORK), *held], how="diagonal_relaxed"), limits)
-    if baseline is None:
-        # All would be new: nothing was compared.
-        comparisons = comparisons.filter(pl.col("outcome") != "new")
+    notes = notes_on(baseline, tonight, bit_equal, unmatched, short, absent, limits)
     notes += large_and_undecided(comparisons)
-    record = None if baseline is None else baseline.record
     found = causes(comparisons, tonight, baseline)
-    return Verdict(_state(comparisons, baseline), bit_equal, comparisons, notes, record, found)
+    return Verdict(_state(comparisons), bit_equal, comparisons, notes, baseline.record, found)
 
 
-def _state(comparisons: pl.DataFrame, baseline: NightlyRun | None) -> str:
+def _state(comparisons: pl.DataFrame) -> str:
     if (comparisons["outcome"] == "worse").any():
         return "regression"
-    if baseline is None:
-        return "no baseline"
     return "changed" if comparisons.filter(to_explain()).height else "fine"
 
 
@@ -122,34 +97,12 @@ def _aligned(baseline: NightlyRun, tonight: NightlyRun) -> tuple[tuple[NightlyRu
     return (replace(baseline, rows=both[0]), replace(tonight, rows=both[1])), absent
 
 
-def _same(equal: pl.DataFrame, baseline: pl.DataFrame, tonight: pl.DataFrame, limits: Limits) -> pl.DataFrame:
-    """Compare the figures of cells whose results are the same bytes, each run's as it is stored.
-
-    From the same results the same figures come. One that differs, or is missing tonight, was computed in another way,
-    and is worse until it is accepted: what is published has changed.
-    """
-    margins = pl.DataFrame(
-        [(name, own.unit, own.relative, own.absolute) for name, own in quantities(limits).items()],
-        schema=["quantity", "unit", "relative", "absolute"], orient="row",
-    )  # fmt: skip
-    key = (*CELL, "quantity")
-    before, after = (
-        run.filter(pl.col("kind") == "setting").select(*key, "n", "value").join(equal, on=CELL, how="semi")
-        for run in (baseline, tonight)
-    )
-    both = before.join(after, on=key, how="full", coalesce=True, suffix="_2", maintain_order="left_right")
-    found = both.join(margins, on="quantity", how="left", maintain_order="left")
-    was, now, zero = pl.col("value"), pl.col("value_2"), pl.lit(0.0)
-    alike = (now - was).abs() <= ROUNDING * pl.max_horizontal(was.abs(), now.abs())
-    outcome = (
-        pl.when(was.is_null()).then(pl.lit("new"))
-        .when(alike & (pl.col("n") == pl.col("n_2"))).then(pl.lit("same")).otherwise(pl.lit("worse"))
-    )  # fmt: skip
-    difference = pl.when(alike).then(zero).otherwise(now - was)
-    return found.select(
-        *CELL, "quantity", pl.col("unit").fill_null(""), pl.coalesce("n_2", "n").alias("n"), method=pl.lit("equal"),
-        baseline=was, tonight=now, difference=difference, low=difference, high=difference,
-        margin=pl.max_horizontal(pl.col("relative") * was, "absolute"), outcome=outcome,
+def _same(equal: pl.DataFrame, figures: pl.DataFrame) -> pl.DataFrame:
+    """Return the figures of cells whose results are the same bytes as comparisons: the same rows give the same ones."""
+    value = pl.col("value")
+    return figures.join(equal, on=CELL, how="semi", nulls_equal=True).select(
+        *CELL, "quantity", "unit", "n", method=pl.lit("equal"), baseline=value, tonight=value, difference=pl.lit(0.0),
+        outcome=pl.lit("same"),
     )  # fmt: skip
 
 

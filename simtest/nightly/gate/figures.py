@@ -45,7 +45,7 @@ def setting_figures(rows: pl.DataFrame, frames: Frames | None = None) -> pl.Data
     Returns
     -------
     polars.DataFrame
-        Columns `FIGURES`, kind "setting", in the order of the rows: of each cell `frames`, `n` (true highlights),
+        Columns `FIGURES`, in the order of the rows: of each cell `frames`, `n` (true highlights),
         `n_ok`, `failed`, `missed`, `unanswered` (shares of n), `false` (detections a frame), `mean_deg`, `rms_deg`,
         `std_deg`, `median_deg`, `p95_deg`, `max_deg`, `mean_oracle_deg`, `mean_base_deg`, `mean_penalised_deg`,
         `coverage95`, `axis_ratio` (mean deviation from the law over the law, at most 1 a row) and `axis_ratio_median`.
@@ -68,15 +68,15 @@ def _cell_figures(cell: Cell, rows: pl.DataFrame, taken: int, hashed: str) -> It
 
     def figure(
         quantity: str, unit: str, value: float | None, n: int,
-        interval: tuple[float | None, float | None] = (None, None), about: str = "",
+        interval: tuple[float | None, float | None] = (None, None),
     ) -> Iterator[Figure]:  # fmt: skip
         # A result that is no number makes a figure of its cell unknown.
         value, low, high = (float(v) if v is not None and np.isfinite(v) else None for v in (value, *interval))
         if value is not None:
-            yield Figure("setting", cell, quantity, unit, value, low, high, n, None, hashed, about)
+            yield Figure(cell, quantity, unit, value, low, high, n, hashed)
 
     def share(quantity: str, count: int, n: int) -> Iterator[Figure]:
-        return figure(quantity, "", count / n, n, share_interval(count, n), f"{count} of {n}")
+        return figure(quantity, "", count / n, n, share_interval(count, n))
 
     # Counts and shares
     found, frames = figures(rows), max(taken, rows["realisation"].n_unique())
@@ -102,9 +102,8 @@ def _cell_figures(cell: Cell, rows: pl.DataFrame, taken: int, hashed: str) -> It
     # Axis ratios against their law
     off = rows.select(off=RATIO_OFF)["off"].drop_nulls().to_numpy()
     if len(off):
-        about = "abs(axis ratio / law - 1)"
-        yield from figure("axis_ratio", "", float(np.mean(off)), len(off), student_interval(off), about)
-        yield from figure("axis_ratio_median", "", float(np.median(off)), len(off), about=about)
+        yield from figure("axis_ratio", "", float(np.mean(off)), len(off), student_interval(off))
+        yield from figure("axis_ratio_median", "", float(np.median(off)), len(off))
 
 
 def _results_with_region(rows: pl.DataFrame) -> int:

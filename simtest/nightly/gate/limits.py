@@ -15,7 +15,5 @@ class Limits:
     absolute_snr: float = 0.1  # by which a peak over its noise may change
     rate: float = 0.02  # by which shares of highlights, and false detections a frame, may change
     coverage: float = 0.02  # by which coverage, and the truth's mean place in the regions, may change
-    run_time: float = 0.5  # share by which the run time of a piece of work, over the reference kernel's, may rise
-    memory: float = 0.25  # share by which peak memory may rise
     pooled_weight: float = 0.5  # share of alpha, in [0, 1), of all comparisons over many settings together
     medians_deg: float = 1e-3  # medians of errors that differ by no more are equal, on another processor too

@@ -7,9 +7,8 @@ from simtest.nightly.records import CELL
 
 def digests(figures: pl.DataFrame) -> pl.DataFrame:
     """Return each cell's hash, in the order of the cells' names, and its number of true highlights, `highlights`."""
-    own = figures.filter(pl.col("kind") == "setting")
-    counted = own.filter(pl.col("quantity") == "n").select(*CELL, highlights="value").unique(CELL)
-    return own.select(*CELL, "digest").unique(CELL).join(counted, on=CELL, how="left").sort(CELL)
+    counted = figures.filter(pl.col("quantity") == "n").select(*CELL, highlights="value").unique(CELL)
+    return figures.select(*CELL, "digest").unique(CELL).join(counted, on=CELL, how="left").sort(CELL)
 
 
 def missing_cells(baseline: pl.DataFrame, tonight: pl.DataFrame) -> pl.DataFrame:

@@ -55,11 +55,8 @@ def notes_on(
     was, now = (", ".join(f"{name} {own.get(name, 'missing')}" for name in names) for own in (first, second))
     # simtest's own version is what the gate judges: its change alone leaves the pairs.
     unpaired = "" if set(names) <= {"simtest"} else "All cells were compared unpaired."
-    made = [
-        _changed("Versions", was, now, unpaired),
-        _changed("The processor", before.processor, after.processor, "Costs were not judged."),
-    ]
-    for key in ("profile", "variant", "llvm", "python"):
+    made = [_changed("Versions", was, now, unpaired)]
+    for key in ("processor", "profile", "variant", "llvm", "python"):
         # A record that lacks a key says nothing of it.
         if getattr(before, key) and getattr(after, key):
             made.append(_changed(f"The {key}", getattr(before, key), getattr(after, key)))
@@ -87,15 +84,6 @@ def _other_variants(before: RunRecord, after: RunRecord) -> list[str]:
     # A change of the run's own variant is told once.
     pairs = {name: pair for name, pair in pairs.items() if pair != (before.variant, after.variant)}
     return [_changed(f"The variant of {name}", was, now) for name, (was, now) in pairs.items()]
-
-
-def nothing_to_compare(tonight: NightlyRun) -> tuple[str, ...]:
-    """Return the note of a run without a baseline: what was judged all the same."""
-    count, agree = tonight.figures_of("canary").height, "whether the results agree with each other"
-    if not count:
-        return (f"There is no baseline. Judged was {agree}; canaries were not measured.",)
-    canaries = "canary" if count == 1 else "canaries"
-    return (f"There is no baseline. Judged were the {count} {canaries}, and {agree}.",)
 
 
 def _changed(what: str, before: str | None, after: str | None, consequence: str = "") -> str:

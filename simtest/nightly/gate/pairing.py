@@ -70,9 +70,7 @@ def frames_taken(first: pl.DataFrame, second: pl.DataFrame, cells: pl.DataFrame)
     Cells of which a run does not know it are left out. `cells` numbers the names of the cells as `cell`.
     """
     held = [
-        run.filter(pl.col("kind") == "setting", pl.col("quantity") == "frames").select(
-            *CELL, pl.col("value").alias(name)
-        )
+        run.filter(pl.col("quantity") == "frames").select(*CELL, pl.col("value").alias(name))
         for run, name in ((first, "before"), (second, "after"))
     ]
     found = cells.join(held[0], on=CELL).join(held[1], on=CELL)

@@ -1,4 +1,4 @@
-"""The verdict without the page: JSON, JUnit XML, Markdown, a badge (docs/howto/run_in_ci.md)."""
+"""The verdict without the page: JSON and Markdown (docs/howto/run_in_ci.md)."""
 
 import math
 from pathlib import Path
@@ -6,25 +6,22 @@ from typing import Any
 
 import polars as pl
 
-from simtest.nightly.outputs.badge import badge
-from simtest.nightly.outputs.junit import junit
 from simtest.nightly.outputs.summary import summary
 from simtest.nightly.phrases import headline
 from simtest.nightly.records import JudgedRun
 from simtest.runtime.files import write_atomically, write_json
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
-FILES = VERDICT, JUNIT, SUMMARY, BADGE = "verdict.json", "junit.xml", "summary.md", "badge.svg"
+FILES = VERDICT, SUMMARY = "verdict.json", "summary.md"
 """Names of the files, which lie beside the page."""
 
 
 def write_outputs(folder: Path, judged: JudgedRun) -> None:
     """Write the `FILES` into a folder; the same run gives the same bytes."""
     write_json(folder / VERDICT, _verdict_json(judged))
-    for name, make in {JUNIT: junit, SUMMARY: summary, BADGE: badge}.items():
-        data = make(judged).encode()
-        write_atomically(folder / name, lambda part, data=data: part.write_bytes(data))  # type: ignore[misc]
+    text = summary(judged)
+    write_atomically(folder / SUMMARY, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def _verdict_json(judged: JudgedRun) -> dict[str, Any]:
@@ -41,8 +38,7 @@ def _verdict_json(judged: JudgedRun) -> dict[str, Any]:
         "run": run.record.to_json(),
         "baseline": None if verdict.baseline is None else verdict.baseline.to_json(),
         "counts": verdict.counts,
-        "canaries": {"n": run.figures_of("canary").height, "failed": _rows_json(run.failed_canaries)},
-        "costs": _rows_json(run.figures_of("cost")),
+        "reports": list(judged.reports),
         "comparisons": _rows_json(verdict.comparisons.filter(pl.col("outcome") != "same")),
     }
 

@@ -27,7 +27,6 @@ def summary(judged: JudgedRun) -> str:
         _compared(verdict),
         *(["\n".join(notes)] if notes else []),
         *_changes("Worse", judged.with_outcome("worse")),
-        *_canaries(judged.run.failed_canaries),
         *_changes("Changed, to be explained", judged.with_outcome("changed")),
         *_changes("Better", judged.with_outcome("better")),
         "### By experiment",
@@ -65,17 +64,6 @@ def _changes(title: str, changes: pl.DataFrame) -> list[str]:
     head = ("experiment", "cell", "figure", "baseline", "tonight", "difference [95 %]", "p (Holm)")
     more = [f"... and {changes.height - MAX_ROWS} more; the page has them."] if changes.height > MAX_ROWS else []
     return [f"### {title}: {changes.height}", _table(head, rows), *more]
-
-
-def _canaries(failed: pl.DataFrame) -> list[str]:
-    if not failed.height:
-        return []
-    rows = [
-        (row["experiment"], row["setting"], row["quantity"], plain(row["value"], row["unit"]),
-         f"{plain(row['low'])} to {plain(row['high'])}")
-        for row in failed.head(MAX_ROWS).iter_rows(named=True)
-    ]  # fmt: skip
-    return [f"### Canaries failed: {failed.height}", _table(("canary", "setting", "figure", "value", "allowed"), rows)]
 
 
 def _by_experiment(judged: JudgedRun) -> str:

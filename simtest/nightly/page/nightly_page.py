@@ -1,22 +1,18 @@
 """Writes the page of a judged run: one HTML file that needs nothing else."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-
-import polars as pl
 
 from simtest.nightly import phrases
 from simtest.nightly.page import run_tables as tables
-from simtest.nightly.page.error_figures import error_figures
-from simtest.nightly.page.ladder_figures import ladder
-from simtest.nightly.page.trends import LEFT_OUT, MEDIAN, NEWEST, Trends, trends
-from simtest.nightly.page.worst_cases import read_cases
-from simtest.nightly.records import JudgedRun, Verdict
+from simtest.nightly.page.trends import trends
+from simtest.nightly.records import JudgedRun
 from simtest.pages import chart_web, style
 from simtest.pages.html import environment
-from simtest.report.gallery import draw_gallery, isophote_keys
-from simtest.report.run_folder import GalleryItem
 from simtest.runtime.files import write_atomically
+
+REPORTS = "reports"
+"""Folder beside the page with the run folders of experiments that have findings."""
 
 
 def write_nightly_page(folder: Path, judged: JudgedRun, files: Sequence[str] = ()) -> Path:
@@ -25,9 +21,9 @@ def write_nightly_page(folder: Path, judged: JudgedRun, files: Sequence[str] = (
     Parameters
     ----------
     folder : pathlib.Path
-        Gets index.html, and the worst cases as ``figures/*.png``; those of an earlier page go.
+        Gets index.html.
     judged : JudgedRun
-        The run. Its history may hold runs of any profile, and lack the run's own.
+        The run.
     files : sequence of str
         Names of the files that lie beside the page, to link.
 
@@ -37,26 +33,19 @@ def write_nightly_page(folder: Path, judged: JudgedRun, files: Sequence[str] = (
         The page.
     """
     folder = Path(folder)
-    figures = folder / "figures"
-    figures.mkdir(parents=True, exist_ok=True)
-    for old in figures.glob("*.png"):
-        old.unlink()
-    html = _render(judged, files, figures)
+    folder.mkdir(parents=True, exist_ok=True)
+    html = _render(judged, files)
     page = folder / "index.html"
     write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
     return page
 
 
-def _render(judged: JudgedRun, files: Sequence[str], figures: Path) -> str:
-
+def _render(judged: JudgedRun, files: Sequence[str]) -> str:
     run, verdict, record = judged.run, judged.verdict, judged.run.record
-    # Read and draw
-    items, unread = read_cases(judged)
-    past = trends(judged.history, run)
-    colours = style.colours(_estimators(judged, items, past))
-    groups, steps = error_figures(run, colours), ladder(run, colours)
-    charts = [figure.chart for group in groups for figure in group.figures] + ([steps.chart] if steps else [])
-    # Fill in
+    names = [name for name in run.rows["estimator"].drop_nulls().unique(maintain_order=True) if name]
+    past = [] if judged.history.is_empty() else judged.history["estimator"].drop_nulls().unique().sort().to_list()
+    colours = style.colours(dict.fromkeys([*names, *past]))
+    charts = trends(judged.history, verdict.baseline, colours)
     return environment().get_template("nightly.html.j2").render(
         title=f"Nightly accuracy, {record.profile} profile",
         started=phrases.when(record.started),
@@ -64,53 +53,19 @@ def _render(judged: JudgedRun, files: Sequence[str], figures: Path) -> str:
         duration_s=record.duration_s,
         state=verdict.state,
         mark=phrases.MARKS[verdict.state],
-        headline=phrases.headline_sentence(judged),
-        lines=phrases.verdict_lines(judged),
+        headline=phrases.headline_sentence(verdict),
+        lines=phrases.verdict_lines(verdict),
         causes=verdict.causes,
-        notes=[*verdict.notes, *unread],
+        notes=verdict.notes,
+        reports={name: f"{REPORTS}/{name}/index.html" for name in judged.reports},
         counts=phrases.counts(verdict),
         compared=tables.comparisons(verdict),
-        canaries=tables.canaries(run),
-        trends=past,
-        trend_data=None if past is None else _trend_data(past, verdict, colours),
-        trend_gap=LEFT_OUT,
-        newest=NEWEST,
-        groups=groups,
-        ladder=steps,
-        gallery=draw_gallery(items, colours, figures),
-        isophotes=isophote_keys(items),
-        truth_colour=style.TRUTH,
+        trends=charts,
         results=tables.results(run),
         results_apart=tables.results(run, apart=True),
-        failures=tables.failures(run),
-        costs=tables.costs(judged),
         provenance=tables.provenance(judged),
         files=files,
-        colours={name: colours[name] for name in style.estimator_order(_names(run.rows))},
+        colours={name: colours[name] for name in style.estimator_order(names)},
         figures=chart_web.packed({chart.key: chart_web.figure(chart) for chart in charts}),
-        plotly=chart_web.packed_plotly() if charts or past else None,
+        plotly=chart_web.packed_plotly() if charts else None,
     )  # fmt: skip
-
-
-def _names(table: pl.DataFrame) -> list[str]:
-    return [name for name in table["estimator"].drop_nulls().unique(maintain_order=True) if name]
-
-
-def _estimators(judged: JudgedRun, items: Iterable[GalleryItem], past: Trends | None) -> list[str]:
-    """Return all names that need a colour."""
-    names = [*_names(judged.run.rows), *_names(judged.run.figures), *_names(judged.verdict.comparisons)]
-    names += [estimate.estimator for item in items for estimate in item.meta.estimates]
-    return list(dict.fromkeys(names + ([] if past is None else past.data["names"]["estimator"])))
-
-
-def _trend_data(past: Trends, verdict: Verdict, colours: dict[str, str]) -> str:
-    """Return what the page's script needs of the trends, packed; they open with the first finding, if any."""
-    names = ("experiment", "quantity", "setting")
-    findings = pl.concat([verdict.regressions, verdict.unexplained])
-    data = past.data | {
-        "colours": [colours[name] for name in past.data["names"]["estimator"]],
-        "start": next(findings.select(names).iter_rows(named=True), dict.fromkeys(names)),
-        "baseline": None if verdict.baseline is None else verdict.baseline.started,
-        "median": MEDIAN,
-    }
-    return chart_web.packed(data)

@@ -1,11 +1,11 @@
-"""The page's tables: comparisons, canaries, results and failures, costs, provenance."""
+"""The page's tables: comparisons, results, provenance."""
 
 from typing import NamedTuple
 
 import polars as pl
 
 from simtest.nightly.gate.quantities import COVERED
-from simtest.nightly.phrases import MEANINGS, bounds, interval, joined, measure, signed
+from simtest.nightly.phrases import MEANINGS, interval, measure, signed
 from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
 from simtest.pages.style import estimator_order, number
 from simtest.report.run_folder import flattened
@@ -19,7 +19,7 @@ class Entry(NamedTuple):
     """An entry of a table."""
 
     text: str | int
-    css: str = ""  # "text": aligned left; "wrap": may be broken; "trend": a link to it; "estimator": with its colour
+    css: str = ""  # "text": aligned left; "wrap": may be broken; "estimator": with its colour
     value: float | None = None  # sorts the entry in the place of its text
     head: bool = False  # whether it names its row
     sign: str = ""  # outcome whose sign and colour the text has
@@ -55,7 +55,7 @@ def comparisons(verdict: Verdict, most: int = MOST_ROWS) -> Comparisons:
         unit, difference = row["unit"], row["difference"]
         rows.append(
             [Entry(row["outcome"], "text", sign=row["outcome"]), Entry(row["experiment"], "text"),
-             Entry(row["setting"], "text wrap"), Entry(row["estimator"], "text"), Entry(row["quantity"], "text trend"),
+             Entry(row["setting"], "text wrap"), Entry(row["estimator"], "text"), Entry(row["quantity"], "text"),
              _number(signed(difference, unit), difference), Entry(interval(row["low"], row["high"])),
              _share(difference, row["baseline"]), _number(measure(row["baseline"], unit), row["baseline"]),
              _number(measure(row["tonight"], unit), row["tonight"]), _number(number(row["margin"]), row["margin"]),
@@ -84,19 +84,6 @@ def _share(difference: float | None, baseline: float | None) -> Entry:
     if abs(share) >= 1000:
         return _number(f"{'+' if share > 0 else '−'}×{number(abs(difference / baseline) + 1, 2)}", share)
     return _number(f"{signed(float(f'{share:.2g}'))}\u00a0%", share)
-
-
-def canaries(run: NightlyRun) -> Table:
-    """Return the canaries, those out of bounds first."""
-    rows = run.figures_of("canary").with_columns(pl.col("passed").fill_null(False)).sort("passed", maintain_order=True)
-    entries = [
-        [Entry("within", "text", sign="passed") if row["passed"] else Entry("out of bounds", "text", sign="worse"),
-         Entry(joined(row["experiment"] or "–", row["setting"] or row["label"]), "text", head=True),
-         Entry(row["quantity"] or "–", "text"), _number(measure(row["value"], row["unit"]), row["value"]),
-         Entry(bounds(row["low"], row["high"])), Entry(row["about"] or "", "text wrap")]
-        for row in rows.iter_rows(named=True)
-    ]  # fmt: skip
-    return Table("Canaries", ("=result", "=canary", "=quantity", "value", "allowed", "=about"), entries)
 
 
 def results(run: NightlyRun, apart: bool = False) -> Table:
@@ -140,21 +127,6 @@ def failures(run: NightlyRun) -> Table:
         for name in estimator_order(failed["estimator"])
     ]
     return Table("Failures by reason", ("=estimator", *(reason.replace("_", " ") for reason in reasons)), entries)
-
-
-def costs(judged: JudgedRun) -> Table:
-    """Return run time and memory, beside the baseline's where the gate compared them."""
-    key = ("experiment", "setting", "estimator", "quantity")
-    before = judged.verdict.comparisons.select(*key, "baseline").unique(key, keep="last")
-    rows = judged.run.figures_of("cost").join(before, on=key, how="left", nulls_equal=True, maintain_order="left")
-    entries = [
-        [Entry(joined(*dict.fromkeys(row[name] for name in key[:3])) or "–", "text", head=True),
-         Entry(row["quantity"] or "–", "text"), _number(measure(row["value"], row["unit"]), row["value"]),
-         Entry(interval(row["low"], row["high"])), Entry(measure(row["baseline"], row["unit"])),
-         Entry(row["about"] or "", "text wrap")]
-        for row in rows.iter_rows(named=True)
-    ]  # fmt: skip
-    return Table("Run time and memory", ("=of", "=quantity", "tonight", "interval", "baseline", "=about"), entries)
 
 
 def provenance(judged: JudgedRun) -> Table:

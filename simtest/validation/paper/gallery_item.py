@@ -30,11 +30,11 @@ TEXTURE_STEP = 2
 """The texture is smooth: every other sample is enough to look at."""
 
 
-def save_realisation(path: Path, experiment: Experiment, case: Case, number: int, why: str | None = None) -> None:
+def save_realisation(path: Path, experiment: Experiment, case: Case, number: int) -> None:
     """Write the gallery item of one realisation, with the pictures `texture`, `clean` and `smoothed`.
 
     The picture with noise is the item's frame: noise is drawn in and around the region of interest alone, as nothing
-    else of the frame is used. `why` says why the item is kept.
+    else of the frame is used.
     """
     setting, seed = case.paper_setting(), case.noise_seed(experiment, number)
     pipeline = pipeline_with(setting, experiment.estimators)
@@ -60,7 +60,6 @@ def save_realisation(path: Path, experiment: Experiment, case: Case, number: int
             DrawnEstimate(0, 0, peak, name).answered(result, patch, camera, normal)
             for name, (result,) in pipeline.reconstruct([patch]).items()
         ],
-        why=why,
         published=PublishedDetails(
             length_unit=LENGTH_UNIT,
             paper=setting.model_dump(),

@@ -13,7 +13,7 @@ import pytest
 from playwright import sync_api as playwright
 from test_nightly_page import rows_of
 from test_realism_page import frames
-from test_report import make_item, make_run
+from test_report import make_run
 
 from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.api import reconstruct_picture
@@ -85,8 +85,7 @@ def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pages")
     made = {"run": write_report(make_run(folder / "run", items=3))}
     run = run_of(rows_of("overview", "noise"), datetime(2026, 3, 1, 2, 30, tzinfo=UTC))
-    make_item(folder / "worst-00.npz", detail=3)
-    judged = JudgedRun(run, verdict_of(run), history_of(run, 30), (folder / "worst-00.npz",))
+    judged = JudgedRun(run, verdict_of(run), history_of(run, 30))
     made["nightly"] = write_nightly_page(folder / "nightly", judged)
     made["realism"] = write_comparison(compare(frames(5), frames(5, first=9)), folder / "realism", "plain")
     made["picture"] = picture_page(folder)

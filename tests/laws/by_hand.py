@@ -1,4 +1,4 @@
-"""Rays, normals and radiance computed from docs/concepts/theory.md: canaries share no code with what they watch."""
+"""Rays, normals and radiance computed from docs/concepts/theory.md: laws share no code with what they watch."""
 
 import math
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 from simtest.runtime.arrays import Array
 
 CAMERA: dict[str, Any] = {"width": 160, "height": 128, "fx": 150.0, "fy": 150.0, "cx": 83.0, "cy": 61.0}
-"""Camera of the rendered canaries."""
+"""Camera of the rendered laws."""
 
 FINE = {name: 3 * value for name, value in CAMERA.items()}
 """The same view in three times as many pixels, where smoothing would spoil the smaller one."""

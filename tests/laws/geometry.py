@@ -4,15 +4,14 @@ import numpy as np
 
 from simtest.errors import Failure
 from simtest.geometry import Camera, Patch, circle_pose, cone_axes, cone_of_conic, ellipse_of_conic, fit_ellipse
-from simtest.nightly.canaries.canary import canary
-from simtest.nightly.records import Figure
 from simtest.runtime.arrays import Array
+from tests.laws.law import Law, law
 
 FX, FY, CX, CY = 500.0, 480.0, 330.25, 229.75
 """Intrinsics of a camera whose numbers all differ."""
 
 
-def sightlines() -> list[Figure]:
+def sightlines() -> list[Law]:
     """Compare the sightlines of pixels with those computed from K by hand."""
     camera = Camera(640, 480, FX, FY, CX, CY)
     pixels = np.array([[CX, CY], [CX + 300.0, CY], [CX, CY - 200.0], [10.5, 470.5]])
@@ -23,13 +22,13 @@ def sightlines() -> list[Figure]:
     first = camera.pixel_centres()[0, 0]
     about = "K by hand; rounding is 1e-16 of a sightline and 1e-13 px"
     return [
-        canary("sightlines", "off", "", float(off), 1e-12, n=len(pixels), about=about),
-        canary("sightlines", "pixels_off", "px", float(back), 1e-9, n=len(pixels), about=about),
-        canary("sightlines", "first_centre", "px", float(first.mean()), 0.5, 0.5, about="centres at integer + 0.5"),
+        law("sightlines", "off", "", float(off), 1e-12, n=len(pixels), about=about),
+        law("sightlines", "pixels_off", "px", float(back), 1e-9, n=len(pixels), about=about),
+        law("sightlines", "first_centre", "px", float(first.mean()), 0.5, 0.5, about="centres at integer + 0.5"),
     ]
 
 
-def conditioning() -> list[Figure]:
+def conditioning() -> list[Law]:
     """Fit a circle of 3 px far from the origin, where plain moments would cancel."""
     phase = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     centre, radius = np.array([5000.0, 5000.0]), 3.0
@@ -44,10 +43,10 @@ def conditioning() -> list[Figure]:
         radii = np.array([ellipse.semi_major, ellipse.semi_minor]) / scale
         off = float(max(np.abs(found - centre).max(), np.abs(radii - radius).max()))
     about = "circle of radius 3 px at (5000, 5000); the points themselves are rounded by 1e-12 px"
-    return [canary("conditioning", "circle_off", "px", float(off), 1e-9, n=len(phase), about=about)]
+    return [law("conditioning", "circle_off", "px", float(off), 1e-9, n=len(phase), about=about)]
 
 
-def ellipse() -> list[Figure]:
+def ellipse() -> list[Law]:
     """Fit a turned ellipse from its own points, and compare centre, half-axes and direction with what drew it."""
     centre, major, minor, angle = np.array([41.0, 57.0]), 19.0, 7.0, 0.6
     phase = np.linspace(0, 2 * np.pi, 40, endpoint=False)
@@ -63,12 +62,12 @@ def ellipse() -> list[Figure]:
         off, turned = max(*axes, *np.abs(found.centre - centre)), abs(found.angle - angle)
     about = "half-axes 19 and 7 px, turned by 0.6 rad from x to y"
     return [
-        canary("ellipse", "off", "px", float(off), 1e-9, n=len(phase), about=about),
-        canary("ellipse", "angle_off", "rad", float(turned), 1e-9, n=len(phase), about=about),
+        law("ellipse", "off", "px", float(off), 1e-9, n=len(phase), about=about),
+        law("ellipse", "angle_off", "rad", float(turned), 1e-9, n=len(phase), about=about),
     ]
 
 
-def pose() -> list[Figure]:
+def pose() -> list[Law]:
     """Project a circle in space point by point, and compare its plane and its cone's axis with the true ones."""
     camera = Camera(640, 480, FX, FY, CX, CY)
     # A circle of radius 1.5 mm about a point 12 mm away, and its picture
@@ -92,8 +91,8 @@ def pose() -> list[Figure]:
         outside = float(np.abs(cone @ axis - along * axis).max())
     about = "a circle of radius 1.5 mm 12 mm away, its picture by hand; rounding leaves 1e-8 deg"
     return [
-        canary("circle_pose", "normal_off", "deg", float(off), 1e-5, n=len(phase), about=about),
-        canary("circle_pose", "axis_off", "", float(outside), 1e-9, n=len(phase), about="residual of the eigenvector"),
+        law("circle_pose", "normal_off", "deg", float(off), 1e-5, n=len(phase), about=about),
+        law("circle_pose", "axis_off", "", float(outside), 1e-9, n=len(phase), about="residual of the eigenvector"),
     ]
 
 
@@ -101,7 +100,7 @@ WIDTH_PX, CENTRE_PX = 15.0, (50.3, 40.7)
 """Standard deviation and centre of the drawn spot."""
 
 
-def isophotes() -> list[Figure]:
+def isophotes() -> list[Law]:
     """Trace isophotes of a Gaussian spot, whose radii and centre are known."""
     x, y = np.meshgrid(np.arange(100) + 0.5, np.arange(90) + 0.5)
     spot = np.exp(-((x - CENTRE_PX[0]) ** 2 + (y - CENTRE_PX[1]) ** 2) / (2 * WIDTH_PX**2))
@@ -125,8 +124,8 @@ def isophotes() -> list[Figure]:
             centres.append(float(np.abs(ellipse.centre - CENTRE_PX).max()))
     about = "Gaussian spot of 15 px; linear interpolation between pixels leaves 1e-3 of the radius and 0.01 px"
     return [
-        canary("isovalue", "radius_off", "", float(np.max(radii)), 2e-3, n=3, about=about),
-        canary("sub_pixel", "place_off", "px", float(np.max(centres)), 0.02, n=4, about=about),
+        law("isovalue", "radius_off", "", float(np.max(radii)), 2e-3, n=3, about=about),
+        law("sub_pixel", "place_off", "px", float(np.max(centres)), 0.02, n=4, about=about),
     ]
 
 

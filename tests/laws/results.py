@@ -1,18 +1,19 @@
-"""Results against themselves: what must hold among the columns of one run, whatever its errors are.
+"""Rules that hold among the columns of a run's results, whatever its errors are.
 
-Each check counts the rows of a cell that break a rule. Formulas are written anew in NumPy and polars, so that results
-that were edited, or a column that was computed otherwise, do not agree with the other columns. Columns that a table
-lacks, such as those of an older baseline, break no rule.
+Each counts the rows that break it. Formulas are written anew in NumPy and polars, so that a column that was computed
+otherwise does not agree with the other columns. Columns that a table lacks break no rule.
 """
 
 from collections.abc import Callable
 
 import numpy as np
 import polars as pl
+from scipy import stats
 
 from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE, REGION_DEG
 from simtest.nightly.records import CELL
 from simtest.runtime.arrays import Array, Mask
+from simtest.validation.motion_counts import motion_rows
 from simtest.validation.results_table import BUDGET_COLUMNS, SCHEMA
 
 ANGLE_DEG = 1e-5
@@ -27,54 +28,20 @@ ZERO_DEG = 1e-9
 FEW = 5
 """Answers of a cell, at least, of which not all may have the same axis ratio."""
 
-NEEDED = (*CELL, "realisation", "specularity", "true_id", "seed", "status")
+MOTION_RATE = 0.04
+"""Chance that one of the two signs that motion tells of a highlight is wrong, at most: 2 % each (docs/howto/motion.md).
+"""
 
-RULES = {
-    "check: errors": "error_deg, error_fine_deg and error_oracle_deg are those of the normals",
-    "check: numbers": "answers have errors that are finite numbers",
-    "check: zero errors": "no answer is exact",
-    "check: regions": "mahalanobis2 is that of normal, truth and covariance",
-    "check: budget": "the budget's parts add up to the covariance",
-    "check: axis ratio law": "axis_ratio_law is that of kd_min and kd_max",
-    "check: axis ratios": "axis ratios lie in 0 to 1, and differ",
-    "check: gains": "gain_error is that of gains and curvatures",
-    "check: seeds": "each frame has a seed of its own",
-    "check: repeated answers": "no noisy answer repeats another of its experiment",
-    "check: highlights": "all estimators of a frame have the same highlights, each once",
-}
-"""What is checked, by quantity."""
+ALPHA = 1e-4
+"""Chance that signs at this rate break the rule. Measured rates lie far below it, and this level lets three highlights,
+all wrong, break it."""
 
 
-def broken_rules(rows: pl.DataFrame) -> pl.DataFrame:
-    """Count the rows that break a rule: `CELL`, `quantity`, `broken`, `rows`; a row where some do."""
+def broken_rules(rows: pl.DataFrame) -> dict[str, int]:
+    """Count the rows that break a rule of `RULES`, by its name; rules that hold are left out."""
     missing = [pl.lit(None, dtype).alias(name) for name, dtype in SCHEMA.items() if name not in rows.columns]
     table = rows.with_columns(missing)
-    marks = {name: pl.Series(name, check(table)) for name, check in _CHECKS.items()}
-    counted = table.select(CELL).with_columns(marks.values()).group_by(CELL, maintain_order=True)
-    made = counted.agg(pl.col(list(marks)).sum(), rows=pl.len())
-    made = made.unpivot(list(marks), index=[*CELL, "rows"], variable_name="quantity", value_name="broken")
-    return made.filter(pl.col("broken") > 0)
-
-
-def inconsistent(tonight: pl.DataFrame, baseline: pl.DataFrame | None) -> pl.DataFrame:
-    """Compare how many rows break a rule in two runs' rows: worse where it is a larger share of a cell tonight.
-
-    Without a baseline, no row may. Columns that the baseline lacks are not held against tonight's.
-    """
-    now = broken_rules(tonight)
-    if now.is_empty():
-        return pl.DataFrame()
-    key = (*CELL, "quantity")
-    before = broken_rules(baseline) if baseline is not None else now.clear()
-    both = now.join(before, on=key, how="left", nulls_equal=True, maintain_order="left", suffix="_2")
-    share, was = pl.col("broken") / pl.col("rows"), (pl.col("broken_2") / pl.col("rows_2")).fill_null(0.0)
-    more = both.filter(share > was)
-    count = pl.col("broken").cast(pl.Float64)
-    return more.select(
-        *key, unit=pl.lit("rows"), method=pl.lit("check"), n=pl.col("rows").cast(pl.Int64),
-        baseline=pl.col("broken_2").fill_null(0).cast(pl.Float64), tonight=count,
-        difference=count - pl.col("broken_2").fill_null(0), margin=pl.lit(0.0), outcome=pl.lit("worse"),
-    )  # fmt: skip
+    return {name: int(mark.sum()) for name, check in RULES.items() if (mark := check(table)).any()}
 
 
 def _vectors(table: pl.DataFrame, name: str) -> Array:
@@ -197,9 +164,31 @@ def _highlights(table: pl.DataFrame) -> Mask:
     return _mask(table, IS_TRUE & (present | twice))
 
 
-_CHECKS: dict[str, Callable[[pl.DataFrame], Mask]] = {
-    "check: errors": _errors, "check: numbers": _numbers, "check: zero errors": _zero, "check: regions": _regions,
-    "check: budget": _budget, "check: axis ratio law": _axis_ratio_law, "check: axis ratios": _axis_ratios,
-    "check: gains": _gains, "check: seeds": _seeds, "check: repeated answers": _repeated,
-    "check: highlights": _highlights,
-}  # fmt: skip
+def _wrong_signs(table: pl.DataFrame) -> Mask:
+    """Mark the wrong signs among those that motion told of a highlight where there are more than the method reports."""
+    signs = [pl.col(f"motion_sign_{i}").fill_null(0) for i in (1, 2)]
+    judged = motion_rows(table)
+    if judged.is_empty():
+        return np.zeros(0, dtype=bool)
+    told = judged.filter((signs[0] != 0) | (signs[1] != 0))
+    # The unit is the highlight, since its two signs hang together.
+    wrong = _mask(told, pl.any_horizontal(sign * pl.col(f"motion_gain_{i}") < 0 for i, sign in enumerate(signs, 1)))
+    silent = told.is_empty()
+    return np.ones(1, dtype=bool) if silent else wrong & (wrong.sum() > stats.binom.isf(ALPHA, len(wrong), MOTION_RATE))
+
+
+RULES: dict[str, Callable[[pl.DataFrame], Mask]] = {
+    "error_deg, error_fine_deg and error_oracle_deg are those of the normals": _errors,
+    "answers have errors that are finite numbers": _numbers,
+    "no answer is exact": _zero,
+    "mahalanobis2 is that of normal, truth and covariance": _regions,
+    "the budget's parts add up to the covariance": _budget,
+    "axis_ratio_law is that of kd_min and kd_max": _axis_ratio_law,
+    "axis ratios lie in 0 to 1, and differ": _axis_ratios,
+    "gain_error is that of gains and curvatures": _gains,
+    "each frame has a seed of its own": _seeds,
+    "no noisy answer repeats another of its experiment": _repeated,
+    "all estimators of a frame have the same highlights, each once": _highlights,
+    "signs that motion tells are right at the rate that it reports": _wrong_signs,
+}
+"""What marks the rows that break a rule, by what it says."""

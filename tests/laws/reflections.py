@@ -5,9 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from simtest.nightly.canaries import by_hand
-from simtest.nightly.canaries.canary import canary
-from simtest.nightly.records import Figure
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.spec import scene_from_dict
@@ -17,6 +14,8 @@ from simtest.spec.reflectance import (
     RoughPlasticReflectance,
     TissueReflectance,
 )
+from tests.laws import by_hand
+from tests.laws.law import Law, law
 
 DISTANCE_MM, TILT_DEG, AZIMUTH_DEG = 10.0, 14.0, 130.0
 CAMERA = {"width": 80, "height": 64, "fx": 75.0, "fy": 75.0, "cx": 41.5, "cy": 30.5}
@@ -34,7 +33,7 @@ MARGIN = 1 / 40
 """Share of the light through the film that is given up per unit of alpha (docs/concepts/tissue.md)."""
 
 
-def lobes(session: Session) -> list[Figure]:
+def lobes(session: Session) -> list[Law]:
     """Compare lobes of GGX and Beckmann facets with D G F / (4 cos), and the base below the film with its series."""
     facets = _Facets(np.array(LIGHT_MM))
     conductor = {"type": "rough_conductor", "alpha": 0.2}
@@ -54,7 +53,7 @@ def lobes(session: Session) -> list[Figure]:
     return [*made, _grazing(session), *_widths()]
 
 
-def _grazing(session: Session) -> Figure:
+def _grazing(session: Session) -> Law:
     """Compare a film's lobe at grazing light and view, where facets hide each other, with D G F / (4 cos_o)."""
     normal, view = by_hand.anchor_normal(GRAZING_DEG, AZIMUTH_DEG), np.array([0.0, 0.0, -1.0])
     # In the mirror direction from the anchor, as far as the camera
@@ -67,10 +66,10 @@ def _grazing(session: Session) -> Figure:
     near = np.s_[row - 2 : row + 3, column - 2 : column + 3]
     off = float(np.abs(seen[near] / lobe[near] - 1).max())
     about = f"25 pixels about an anchor tilted by {GRAZING_DEG:g} deg; single precision"
-    return canary("film", "grazing_off", "", off, 2e-3, n=25, about=about)
+    return law("film", "grazing_off", "", off, 2e-3, n=25, about=about)
 
 
-def emission(session: Session) -> list[Figure]:
+def emission(session: Session) -> list[Law]:
     """Compare a matt plane under a cosine, a tabled and a spot light, each turned aside, with the closed form."""
     facets, axis = _Facets(np.array(LIGHT_MM)), np.array([-0.2, 0.3, 1.0])
     cosine = -(facets.to_light @ axis) / math.sqrt(axis @ axis)
@@ -89,7 +88,7 @@ def emission(session: Session) -> list[Figure]:
         seen = _rendered(session, {"type": "phong", "specular": 0.0, "diffuse": ALBEDO}, light)
         off = np.abs(seen.diffuse - 2.0 * factor * matt).max() / (2.0 * matt.max())
         about = f"albedo/pi cos over squared distance, a {name} light of power 2; single precision"
-        made.append(canary("emission", f"{name}_off", "", float(off), 2e-5, n=angle.size, about=about))
+        made.append(law("emission", f"{name}_off", "", float(off), 2e-5, n=angle.size, about=about))
     # The normalised lobe: (n + 2)/(2 pi) cos^n(beta) cos(theta).
     shape = {"type": "phong", "exponent": 20.0, "specular": 0.4, "normalised": True}
     mirrored = 2 * facets.cos_light[..., None] * facets.normal - facets.to_light
@@ -99,7 +98,7 @@ def emission(session: Session) -> list[Figure]:
     return [*made, _residual("phong_lobe", "normalised", found, expected, "(n + 2)/(2 pi) cos^n(beta) cos(theta)")]
 
 
-def bounces(variant: str | None) -> list[Figure]:
+def bounces() -> list[Law]:
     """Render an integrating sphere: after k bounces the irradiance is albedo^k I / R^2 everywhere.
 
     With the light at the centre each path brings exactly that, so that the series is met to rounding at every depth.
@@ -120,9 +119,9 @@ def bounces(variant: str | None) -> list[Figure]:
                 "reflectance": {"type": "phong", "specular": 0.0, "diffuse": albedo},
                 "render": {"path_depth": depth, "samples_per_pixel": samples},
             },
-            "canary",
+            "law",
         )
-        session = session or Session(scene, variant)
+        session = session or Session(scene)
         session.update(scene)
         seen = session.radiance()
         expected = unit * sum(albedo**k for k in range(1, depth - 1))
@@ -130,15 +129,13 @@ def bounces(variant: str | None) -> list[Figure]:
         if name == "aside":
             gap = 5 * float(share.std()) / math.sqrt(share.size)
             about = "mean of the second bounce over albedo^2 I / (pi R^2); 5 standard errors"
-            made.append(canary("bounces", name, "x", float(share.mean()), 1 + gap, 1 - gap, share.size, about))
+            made.append(law("bounces", name, "x", float(share.mean()), 1 + gap, 1 - gap, share.size, about))
             continue
         off = float(np.abs(share - 1).max())
         about = "every pixel over the series of albedo^k; single precision"
-        made.append(canary("bounces", f"{name}_off", "", off, 1e-4, n=share.size, about=about))
+        made.append(law("bounces", f"{name}_off", "", off, 1e-4, n=share.size, about=about))
         direct = float(np.abs(seen.diffuse / unit - 1).max())
-        made.append(
-            canary("bounces", f"{name}_direct_off", "", direct, 1e-4, n=share.size, about="albedo I / (pi R^2)")
-        )
+        made.append(law("bounces", f"{name}_direct_off", "", direct, 1e-4, n=share.size, about="albedo I / (pi R^2)"))
     return made
 
 
@@ -203,7 +200,7 @@ def _fresnel(cosine: Array, index: float) -> Array:
     return np.asarray((parallel**2 + across**2) / 2)
 
 
-def _widths() -> list[Figure]:
+def _widths() -> list[Law]:
     """Compare the half-widths and curvatures that reflectances state with those of densities written down by hand."""
 
     def ggx(t: Array, alpha: float) -> Array:
@@ -233,7 +230,7 @@ def _widths() -> list[Figure]:
     for name, (reflectance, width) in stated.items():
         ratio = reflectance.half_width / width
         about = "half-angle over the density's own, by bisection"
-        made.append(canary("lobe_width", name, "x", ratio, 1 + 1e-9, 1 - 1e-9, about=about))
+        made.append(law("lobe_width", name, "x", ratio, 1 + 1e-9, 1 - 1e-9, about=about))
     # Second derivative of -log f at 0, by differences; Beckmann's f cos(theta) is exp(-tan^2/alpha^2) / cos^5.
     step = 1e-3
     phong = -40 * 2 * math.log(math.cos(2 * step)) / step**2
@@ -244,7 +241,7 @@ def _widths() -> list[Figure]:
         ("beckmann_curvature", wet or math.nan, beckmann),
     ):
         about = "second derivative of the lobe's logarithm, by differences of 1e-3 rad"
-        made.append(canary("lobe_width", name, "x", found / wanted, 1 + 1e-4, 1 - 1e-4, about=about))
+        made.append(law("lobe_width", name, "x", found / wanted, 1 + 1e-4, 1 - 1e-4, about=about))
     return made
 
 
@@ -257,11 +254,11 @@ def _rendered(
         "rig": {"lights": [light or {"position_mm": list(LIGHT_MM)}]},
         "reflectance": reflectance,
     }
-    session.update(scene_from_dict(scene, "canary"))
+    session.update(scene_from_dict(scene, "law"))
     return session.radiance()
 
 
-def _residual(name: str, quantity: str, found: Any, expected: Array, about: str) -> Figure:
+def _residual(name: str, quantity: str, found: Any, expected: Array, about: str) -> Law:
     bright = expected > 1e-3 * expected.max()
     off = float(np.abs(found.astype(float)[bright] / expected[bright] - 1).max())
-    return canary(name, f"{quantity}_off", "", off, 3e-4, n=int(bright.sum()), about=f"{about}; single precision")
+    return law(name, f"{quantity}_off", "", off, 3e-4, n=int(bright.sum()), about=f"{about}; single precision")

@@ -16,13 +16,12 @@ from simtest.estimators import Estimate
 from simtest.estimators.curved import gain_of_stiffness
 from simtest.estimators.prior_parts import light_offset_part
 from simtest.geometry import Camera
-from simtest.nightly.canaries import by_hand
-from simtest.nightly.canaries.canary import canary
-from simtest.nightly.records import Figure
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.arrays import Array
 from simtest.validation.metrics import estimate_row
 from simtest.validation.results_table import ResultRow
+from tests.laws import by_hand
+from tests.laws.law import Law, law
 
 FRAMES, SIGMA, EXPONENT = 400, 0.05, 60.0
 CAMERA: dict[str, Any] = {"width": 72, "height": 64, "fx": 130.0, "fy": 130.0, "cx": 30.0, "cy": 36.0}
@@ -36,7 +35,7 @@ whole covariance it is lower: what may be more than noise is stated too, and on 
 found with several seeds; 2 would be a covariance a fifth smaller."""
 
 
-def coverage() -> list[Figure]:
+def coverage() -> list[Law]:
     """Reconstruct a plane in many noises; compare the errors with the covariances that are stated beside them.
 
     The squared distance of a Gaussian error of two components from its centre, in units of its covariance, is 2 on
@@ -49,15 +48,15 @@ def coverage() -> list[Figure]:
         count = len(stated)
         held = float((stated <= -2 * math.log(0.05)).mean()) if count else math.nan
         about = "share of true normals in the stated 95 % region"
-        made.append(canary("coverage", f"{name}_share", "", held, 0.99, 0.94, count, about))
+        made.append(law("coverage", f"{name}_share", "", held, 0.99, 0.94, count, about))
         for part, bounds in (("noise", NOISE_DISTANCE2), ("stated", STATED_DISTANCE2)):
             mean = float(found[name, part].mean()) if count else math.nan
             about = f"squared distance of the true normal by the covariance, {part}"
-            made.append(canary("coverage", f"{name}_{part}_distance2", "", mean, *bounds, count, about))
+            made.append(law("coverage", f"{name}_{part}_distance2", "", mean, *bounds, count, about))
     return made
 
 
-def budgets() -> list[Figure]:
+def budgets() -> list[Law]:
     """Check that a covariance is the sum of its parts, and two of these parts by the draws that they stand for."""
     camera = Camera(**CAMERA)
     # A guessed camera and a light that nobody told: several parts.
@@ -79,9 +78,9 @@ def budgets() -> list[Figure]:
     roots = {f"budget_{name}_deg": math.degrees(math.sqrt(np.trace(part))) for name, part in _parts(estimate).items()}
     apart = max((abs(stated.get(name, math.nan) / root - 1) for name, root in roots.items()), default=math.nan)
     return [
-        canary("budget", "columns_off", "", float(apart), 1e-9, n=parts, about="root of a part's trace, deg"),
-        canary("budget", "sum_off", "", gap, 1e-12, n=parts, about=about),
-        canary("budget", "parts", "", parts, 8, 4, about="noise, light offset, camera and response at least"),
+        law("budget", "columns_off", "", float(apart), 1e-9, n=parts, about="root of a part's trace, deg"),
+        law("budget", "sum_off", "", gap, 1e-12, n=parts, about=about),
+        law("budget", "parts", "", parts, 8, 4, about="noise, light offset, camera and response at least"),
         *_camera_part(camera, estimate), _light_part(), _gains(),
     ]  # fmt: skip
 
@@ -90,10 +89,10 @@ def _parts(estimate: Estimate | Failure) -> Mapping[str, Array]:
     return {} if isinstance(estimate, Failure) or estimate.budget is None else estimate.budget
 
 
-def _camera_part(camera: Camera, estimate: Estimate | Failure) -> list[Figure]:
+def _camera_part(camera: Camera, estimate: Estimate | Failure) -> list[Law]:
     """Compare the part by focal length and centre with the turn of the sightline by each, added in squares."""
     if isinstance(estimate, Failure) or estimate.budget is None:
-        return [canary("budget", "camera", "x", math.nan, 1.0, about="no estimate")]
+        return [law("budget", "camera", "x", math.nan, 1.0, about="no estimate")]
     x, y = estimate.look_px.tolist()
 
     def sightline(dx: float, dy: float) -> Array:
@@ -107,10 +106,10 @@ def _camera_part(camera: Camera, estimate: Estimate | Failure) -> list[Figure]:
     ]
     ratio = float(np.trace(estimate.budget.get("camera", np.zeros((2, 2))))) / sum(float(a) ** 2 for a in angles)
     about = "trace of the part over squared turns by 10 % of the focal length and 3 px of the centre"
-    return [canary("budget", "camera", "x", ratio, 1.02, 0.98, about=about)]
+    return [law("budget", "camera", "x", ratio, 1.02, 0.98, about=about)]
 
 
-def _light_part() -> Figure:
+def _light_part() -> Law:
     """Draw lights and distances from the priors; count how often the moved normal lies in the part's 95 % region."""
     rng, count = np.random.default_rng(41), 20_000
     offset, distance = Uniform(0.0, 4.0), Normal(20.0, 2.0)
@@ -124,14 +123,14 @@ def _light_part() -> Figure:
     distances = np.einsum("ni,ij,nj->n", moves, np.linalg.inv(part), moves)
     held = float((distances <= -2 * math.log(0.05)).mean())
     about = "share of drawn lights whose bisector lies in the part's 95 % region"
-    return canary("budget", "light_offset", "", held, 0.96, 0.94, count, about)
+    return law("budget", "light_offset", "", held, 0.96, 0.94, count, about)
 
 
-def _gains() -> Figure:
+def _gains() -> Law:
     """Solve c m^2 + 2 m for m where m is known."""
     known, c = np.array([0.3, 1.0, 2.5]), 30.0
     off = float(np.abs(gain_of_stiffness(c * known**2 + 2 * known, c) / known - 1).max())
-    return canary("curvature", "gain_off", "", off, 1e-12, n=3, about="m of c m^2 + 2 m, falloff included")
+    return law("curvature", "gain_off", "", off, 1e-12, n=3, about="m of c m^2 + 2 m, falloff included")
 
 
 @lru_cache(maxsize=1)

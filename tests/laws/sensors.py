@@ -12,12 +12,11 @@ from simtest.calibration import Calibration, NoiseModel, Response, estimate_nois
 from simtest.geometry import Camera, smooth
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.geometry.gaussian_smoothing import share_of_noise
-from simtest.nightly.canaries import by_hand
-from simtest.nightly.canaries.canary import canary
-from simtest.nightly.records import Figure
 from simtest.runtime.arrays import Array, Image
 from simtest.simulation.camera_chain import capture, collect, to_uint8
 from simtest.spec.sensor import Sensor
+from tests.laws import by_hand
+from tests.laws.law import Law, law
 
 SIDE_PX = 192
 LEVELS = (0.15, 0.4, 0.8)
@@ -32,7 +31,7 @@ SRGB = ((0.001, 0.01292), (0.05, 0.247801), (0.18, 0.461356), (0.5, 0.735357), (
 """Linear light and value of sRGB (IEC 61966-2-1), worked out apart from this package, to six digits."""
 
 
-def photon_noise() -> list[Figure]:
+def photon_noise() -> list[Law]:
     """Compare variances of pixels with the Poisson law: the variance of electrons is their mean."""
     rng = np.random.default_rng(20)
     count = len(LEVELS) * SIDE_PX**2
@@ -42,15 +41,15 @@ def photon_noise() -> list[Figure]:
         shares = [np.mean((_captured(level, sensor, rng) - level) ** 2) * FULL_WELL / level for level in LEVELS]
         bounds = _about(1.0, 5 * math.sqrt(2 / count))
         about = f"{FULL_WELL:g} electrons at full scale; 5 standard errors of {count} numbers"
-        made.append(canary("shot_noise", name, "x", float(np.mean(shares)), *bounds, count, about))
+        made.append(law("shot_noise", name, "x", float(np.mean(shares)), *bounds, count, about))
     dark = _captured(0.0, Sensor(full_well=FULL_WELL, read_noise=READ_NOISE), rng)
     bounds = _about(1.0, 5 / math.sqrt(2 * dark.size))
     left = float(np.std(dark)) * FULL_WELL / READ_NOISE
     about = f"{READ_NOISE:g} electrons without light; 5 standard errors"
-    return [*made, canary("read_noise", "sigma", "x", left, *bounds, dark.size, about)]
+    return [*made, law("read_noise", "sigma", "x", left, *bounds, dark.size, about)]
 
 
-def stated_noise() -> list[Figure]:
+def stated_noise() -> list[Law]:
     """Compare the noise that reconstruction is told, and the one it estimates, with variances added by hand."""
     levels = np.array([0.0, 0.02, 0.2, 0.6, 0.95])
     told = NoiseModel(0.01, FULL_WELL, READ_NOISE, 8, Response("gamma", GAMMA)).at(levels, 3)
@@ -63,13 +62,13 @@ def stated_noise() -> list[Figure]:
     noisy = 0.3 + 0.5 * x**2 - 0.2 * x * y + 0.02 * np.random.default_rng(21).standard_normal(x.shape)
     found = estimate_noise(noisy) / 0.02
     return [
-        canary("noise_model", "sigma_off", "", off, 1e-9, n=len(levels), about="variances of all parts, added by hand"),
-        canary("noise_estimate", "sigma", "x", found, *_about(1.0, 0.03), noisy.size,
+        law("noise_model", "sigma_off", "", off, 1e-9, n=len(levels), about="variances of all parts, added by hand"),
+        law("noise_estimate", "sigma", "x", found, *_about(1.0, 0.03), noisy.size,
                "white noise of 0.02 on a parabola; the median's own error is 0.006"),
     ]  # fmt: skip
 
 
-def curves() -> list[Figure]:
+def curves() -> list[Law]:
     """Compare values and light of the response curves with powers taken by hand, and with sRGB's table."""
     light = np.linspace(0, 1, 23)
     picture = light.astype(np.float32)[None]
@@ -91,13 +90,13 @@ def curves() -> list[Figure]:
     whole = max(float(np.abs(capture(picture, 1.0, s, None)[0] - values).max()) for s in sensors)
     about = "light^(1/2.2) and back; tables of 16 bits leave 5e-5"
     return [
-        canary("response", "gamma_off", "", float(off), 1e-4, n=4 * light.size, about=about),
-        canary("response", "srgb_off", "", float(off_srgb), 2e-5, n=4 * len(SRGB), about="IEC 61966-2-1, six digits"),
-        canary("response", "sensor_off", "", whole, 1e-5, n=2 * light.size, about="frames of a sensor with that gamma"),
+        law("response", "gamma_off", "", float(off), 1e-4, n=4 * light.size, about=about),
+        law("response", "srgb_off", "", float(off_srgb), 2e-5, n=4 * len(SRGB), about="IEC 61966-2-1, six digits"),
+        law("response", "sensor_off", "", whole, 1e-5, n=2 * light.size, about="frames of a sensor with that gamma"),
     ]
 
 
-def quantisation() -> list[Figure]:
+def quantisation() -> list[Law]:
     """Check the rounding of 8 bits: whole numbers, at most half a step off, on average none; no light above 1."""
     light = np.linspace(0, 1.2, 50_001, dtype=np.float32)[None]
     counts = capture(light, 1.0, Sensor(bits=8), None).astype(float) * 255
@@ -105,15 +104,13 @@ def quantisation() -> list[Figure]:
     whole = float(np.abs(counts - np.rint(counts)).max())
     gap = counts - wanted
     return [
-        canary("quantisation", "not_whole", "", whole, 1e-4, n=light.size, about="values times 255; single precision"),
-        canary("quantisation", "off", "", float(np.abs(gap).max()), 0.5 + 1e-4, n=light.size, about="half a step"),
-        canary(
-            "quantisation", "mean_off", "", float(abs(gap.mean())), 1e-3, n=light.size, about="rounded, not cut off"
-        ),
+        law("quantisation", "not_whole", "", whole, 1e-4, n=light.size, about="values times 255; single precision"),
+        law("quantisation", "off", "", float(np.abs(gap).max()), 0.5 + 1e-4, n=light.size, about="half a step"),
+        law("quantisation", "mean_off", "", float(abs(gap.mean())), 1e-3, n=light.size, about="rounded, not cut off"),
     ]
 
 
-def vignetting() -> list[Figure]:
+def vignetting() -> list[Law]:
     """Compare the falloff of an even picture with powers of the sightlines' cosine, and its correction with 1."""
     camera = Camera(**by_hand.CAMERA)
     even = np.ones((camera.height, camera.width), dtype=np.float32)
@@ -129,13 +126,13 @@ def vignetting() -> list[Figure]:
     mended = calibration.correct((cosine**3).astype(np.float32)).intensity
     about = "cos^3 of the angle off the axis, pixel by pixel; single precision"
     return [
-        canary("vignetting", "power_off", "", off, 1e-6, n=even.size, about=about),
-        canary("vignetting", "table_off", "", float(np.abs(tabled - wanted).max()), 1e-6, n=even.size, about="a table"),
-        canary("vignetting", "left", "", float(np.abs(mended - 1).max()), 1e-6, n=even.size, about="cos^3, undone"),
+        law("vignetting", "power_off", "", off, 1e-6, n=even.size, about=about),
+        law("vignetting", "table_off", "", float(np.abs(tabled - wanted).max()), 1e-6, n=even.size, about="a table"),
+        law("vignetting", "left", "", float(np.abs(mended - 1).max()), 1e-6, n=even.size, about="cos^3, undone"),
     ]
 
 
-def widths() -> list[Figure]:
+def widths() -> list[Law]:
     """Measure second moments of a point after lens and smoothing: the squared widths that are stated."""
     point = np.zeros((81, 81), dtype=np.float32)
     point[40, 40] = 1.0
@@ -147,10 +144,10 @@ def widths() -> list[Figure]:
     left = math.sqrt(float((smoothed.astype(float) ** 2).sum()))
     about = "root of the second moment, over what is stated; the kernel ends at 4 of its widths"
     return [
-        canary("point_spread", "width", "x", _width(spread) / 2.5, *_about(1.0, 0.005), about=about),
-        canary("smoothing", "width", "x", _width(smoothed) / 3.0, *_about(1.0, 0.005), about=about),
-        canary("smoothing", "at_mask", "", float(np.abs(inside - 1).max()), 1e-5, n=inside.size, about="1 inside"),
-        canary("smoothing", "noise_left", "x", share_of_noise(3.0) / left, *_about(1.0, 0.01),
+        law("point_spread", "width", "x", _width(spread) / 2.5, *_about(1.0, 0.005), about=about),
+        law("smoothing", "width", "x", _width(smoothed) / 3.0, *_about(1.0, 0.005), about=about),
+        law("smoothing", "at_mask", "", float(np.abs(inside - 1).max()), 1e-5, n=inside.size, about="1 inside"),
+        law("smoothing", "noise_left", "x", share_of_noise(3.0) / left, *_about(1.0, 0.01),
                about="root of the kernel's sum of squares; the formula is that of a wide kernel"),
     ]  # fmt: skip
 

@@ -8,10 +8,6 @@ import numpy as np
 from simtest.calibration import NoiseModel
 from simtest.detection.regions import detect, half_height_component
 from simtest.estimators import Estimate, load_estimators
-from simtest.nightly.canaries import by_hand
-from simtest.nightly.canaries.canary import canary
-from simtest.nightly.canaries.rendered import AZIMUTH_DEG, DISTANCE_MM, LIGHT_MM, PLANE, TILT_DEG, described
-from simtest.nightly.records import Figure
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.simulation.rendered_view import render_view
@@ -26,6 +22,9 @@ from simtest.validation.paper.rows import paper_rows
 from simtest.validation.realisation import Realisation, realise
 from simtest.validation.results_table import ResultRow, table
 from simtest.validation.statistics import figures
+from tests.laws import by_hand
+from tests.laws.law import Law, law
+from tests.laws.rendered import AZIMUTH_DEG, DISTANCE_MM, LIGHT_MM, PLANE, TILT_DEG, described
 
 ERRORS = (0.2, 0.4, 0.5, 0.9, 1.1, 1.6, 2.0, 3.1, 4.2, 9.0)
 """Ten errors, deg, whose mean, median and quantiles all differ."""
@@ -33,7 +32,7 @@ ERRORS = (0.2, 0.4, 0.5, 0.9, 1.1, 1.6, 2.0, 3.1, 4.2, 9.0)
 SIGMA = 0.02
 
 
-def statistics() -> list[Figure]:
+def statistics() -> list[Law]:
     """Compare the figures of thirteen rows with numbers worked out apart from this package."""
     count = len(ERRORS)
     made = [
@@ -54,7 +53,7 @@ def statistics() -> list[Figure]:
     }  # fmt: skip
     about = "ten answers, a miss, a failure and a false detection; worked out by hand"
     return [
-        canary(
+        law(
             "statistics",
             f"{name}_off",
             "",
@@ -67,7 +66,7 @@ def statistics() -> list[Figure]:
     ]
 
 
-def counts(session: Session) -> list[Figure]:
+def counts(session: Session) -> list[Law]:
     """Check that a miss has a row, and that a detection beside a highlight is not matched to it."""
     made = _realised(session, 0.0)
     own = [made.specularities[i] for i in made.matched]
@@ -75,15 +74,13 @@ def counts(session: Session) -> list[Figure]:
     missed = rows(session, ResultRow(), [], made.truths, {}, {"cone_axis": (), "curved": ()})
     states = [row.status for row in missed]
     return [
-        canary("counts", "matched", "", len(made.matched), 1, 1, about="the one highlight of a plane"),
-        canary("counts", "matched_aside", "", len(match(own, aside)), 0, about="to a point 40 px away"),
-        canary(
-            "counts", "missed", "", states.count("missed"), 2, 2, about="rows of two estimators without a detection"
-        ),
+        law("counts", "matched", "", len(made.matched), 1, 1, about="the one highlight of a plane"),
+        law("counts", "matched_aside", "", len(match(own, aside)), 0, about="to a point 40 px away"),
+        law("counts", "missed", "", states.count("missed"), 2, 2, about="rows of two estimators without a detection"),
     ]
 
 
-def columns(session: Session) -> list[Figure]:
+def columns(session: Session) -> list[Law]:
     """Compare the columns of a plane's rows under a light aside with the plane's own geometry."""
     made = _realised(session, SIGMA)
     wanted = [row for row in made.rows if row.estimator == "cone_axis" and row.status == "ok"]
@@ -113,24 +110,20 @@ def columns(session: Session) -> list[Figure]:
     }  # fmt: skip
     about = "cone_axis on a plane under a light 1 mm aside, its geometry by hand"
     figures_ = [
-        canary("columns", name, "", abs(_value(value) - right), close, about=about)
+        law("columns", name, "", abs(_value(value) - right), close, about=about)
         for name, (value, right, close) in off.items()
     ]
     # The peak stands on black, a little lower for its smoothing.
     snr = _value(row.peak_snr) * SIGMA
-    figures_.append(
-        canary("columns", "peak_snr", "x", snr, 1.02, 0.85, about="peak over the noise; smoothing lowers it")
-    )
+    figures_.append(law("columns", "peak_snr", "x", snr, 1.02, 0.85, about="peak over the noise; smoothing lowers it"))
     # Of a bent surface: curvatures in their order, and the ratio of 1 + d k
     bent = scene_row(made.view.scene, ResultRow(), replace(made.truths[0], kd_min=-0.3, kd_max=0.8))
     gap = abs(_value(bent.kd_min) + 0.3) + abs(_value(bent.kd_max) - 0.8) + abs(_value(bent.axis_ratio_law) - 0.7 / 1.8)
-    figures_.append(
-        canary("columns", "bent_off", "", gap, 1e-12, n=3, about="k d of -0.3 and 0.8, as they were put in")
-    )
+    figures_.append(law("columns", "bent_off", "", gap, 1e-12, n=3, about="k d of -0.3 and 0.8, as they were put in"))
     return [*figures_, *_candidates(made), *_of_protocol(), *_curvature_errors(made), _distance(made)]
 
 
-def thresholds(session: Session) -> list[Figure]:
+def thresholds(session: Session) -> list[Law]:
     """Detect spots of known height in known noise; cut one at half its height; judge points by their peaks."""
     x, y = np.meshgrid(np.arange(240) + 0.5, np.arange(60) + 0.5)
     heights = (6.0, 9.0, 9.7, 10.3, 11.0, 14.0)
@@ -148,10 +141,10 @@ def thresholds(session: Session) -> list[Figure]:
     levels = [Examined(1.0, 10.5 * SIGMA, ""), Examined(1.0, 9.5 * SIGMA, "")]
     judged = verdicts([points[0]] * 2, levels, NoiseModel(SIGMA), 1.0, 1)
     return [
-        canary("detection", "found", "", len(found), 3, 3, about="spots of 10.3 to 14 standard deviations, of six"),
-        canary("detection", "lowest", "sigma", lowest, 10.35, 10.0, about="the lowest one that counts stands at 10"),
-        canary("detection", "area", "x", area, 1.05, 0.95, n=1, about="2 pi ln 2 s^2 of a Gaussian; whole pixels"),
-        canary("detection", "isolated", "", float(judged[0].isolated) + 2 * float(judged[1].isolated), 1, 1,
+        law("detection", "found", "", len(found), 3, 3, about="spots of 10.3 to 14 standard deviations, of six"),
+        law("detection", "lowest", "sigma", lowest, 10.35, 10.0, about="the lowest one that counts stands at 10"),
+        law("detection", "area", "x", area, 1.05, 0.95, n=1, about="2 pi ln 2 s^2 of a Gaussian; whole pixels"),
+        law("detection", "isolated", "", float(judged[0].isolated) + 2 * float(judged[1].isolated), 1, 1,
                about="10.5 standard deviations count, 9.5 do not"),
     ]  # fmt: skip
 
@@ -161,7 +154,7 @@ MEASURED = ((1000.0, 2.4), (100.0, 8.0), (10.0, 24.6), (3.0, 41.3), (1.0, 59.9),
 section 4): n = 50, t = 0.5, without noise."""
 
 
-def law_values() -> list[Figure]:
+def law_values() -> list[Law]:
     """Compare the laws with figures that a program apart from this package measured, and with limits by hand."""
     kd = np.array([1 / r for r, _ in MEASURED])
     a, b = laws.isophote_half_axes(0.5, 200.0, np.zeros_like(kd), kd)
@@ -176,29 +169,29 @@ def law_values() -> list[Figure]:
     shift = math.degrees(float(laws.vignetting_shift(math.radians(10.0), 4.0, 200.0)))
     look = laws.look_error(np.array([0.01, 0.02]), 1.0, -0.5)
     return [
-        canary("laws", "circle_pose_off", "", float(pose.max()), 1.0, n=len(MEASURED), about="over 0.3 deg or 3 %"),
-        canary("laws", "axis_ratio_off", "", float(np.abs(ratios - [1 / 1.01, 1 / 1.1, 0.5, 1 / 3]).max()), 1e-12, n=4,
+        law("laws", "circle_pose_off", "", float(pose.max()), 1.0, n=len(MEASURED), about="over 0.3 deg or 3 %"),
+        law("laws", "axis_ratio_off", "", float(np.abs(ratios - [1 / 1.01, 1 / 1.1, 0.5, 1 / 3]).max()), 1e-12, n=4,
                about="R/(R + d)"),
-        canary("laws", "offset_off", "deg", float(np.abs(offsets - halves).max()), 1e-9, n=3, about="atan(eps/d) / 2"),
-        canary("laws", "vignetting", "deg", shift, 0.203, 0.195, about="k tan(phi)/(4 n + 2), cos^4 at 10 deg: 0.20"),
-        canary("laws", "look_off", "", abs(float(look) - math.hypot(0.02, 0.01)), 1e-12, about="abs((I + dS) w)"),
+        law("laws", "offset_off", "deg", float(np.abs(offsets - halves).max()), 1e-9, n=3, about="atan(eps/d) / 2"),
+        law("laws", "vignetting", "deg", shift, 0.203, 0.195, about="k tan(phi)/(4 n + 2), cos^4 at 10 deg: 0.20"),
+        law("laws", "look_off", "", abs(float(look) - math.hypot(0.02, 0.01)), 1e-12, about="abs((I + dS) w)"),
     ]  # fmt: skip
 
 
-def _candidates(made: Realisation) -> list[Figure]:
+def _candidates(made: Realisation) -> list[Law]:
     """Check error and better error of two candidates, one of which is the truth."""
     truth = made.truths[0]
     other = by_hand.anchor_normal(TILT_DEG + 5.0, AZIMUTH_DEG)
     own = next(iter(made.specularities[next(iter(made.matched))].estimates.values()))
     if not isinstance(own, Estimate):
-        return [canary("columns", "oracle_off", "deg", math.nan, 0, about="no estimate to change")]
+        return [law("columns", "oracle_off", "deg", math.nan, 0, about="no estimate to change")]
     both = replace(own, normal=other, candidates=np.array([other, truth.normal]), budget=None, covariance=None)
     specularity = replace(made.specularities[next(iter(made.matched))], estimates={"both": both})
     session = _Still(made)
     (row, *_) = rows(session, ResultRow(), [specularity], [truth], {0: 0}, {"both": ()})  # type: ignore[arg-type]
     gap = max(abs(_value(row.error_deg) - 5.0), abs(_value(row.error_oracle_deg)), abs(_value(row.rank_correct) - 1))
     about = "the second of two candidates is the truth, the first 5 deg off"
-    return [canary("columns", "oracle_off", "deg", gap, 1e-6, about=about)]
+    return [law("columns", "oracle_off", "deg", gap, 1e-6, about=about)]
 
 
 class _Still:
@@ -215,7 +208,7 @@ class _Still:
         return (Nothing(),)
 
 
-def _of_protocol() -> list[Figure]:
+def _of_protocol() -> list[Law]:
     """Compare the published protocol's errors with the angles between its columns."""
     made = paper_rows(PaperSetting(size=200, sigma=0.02, isovalue=0.5), ResultRow(), range(2), [3, 4], ("circle_pose",))
     stated = made.select("normal_x", "normal_y", "normal_z").to_numpy()
@@ -224,12 +217,12 @@ def _of_protocol() -> list[Figure]:
     true = by_hand.angle_deg(made.select("truth_x", "truth_y", "truth_z").to_numpy(), slanted).max()
     about = "angle between the stated normal and a plane slanted by 58 deg"
     return [
-        canary("columns", "protocol_error_off", "deg", float(gap), 1e-6, n=made.height, about=about),
-        canary("columns", "protocol_truth_off", "deg", float(true), 1e-6, n=made.height, about="the slanted plane"),
+        law("columns", "protocol_error_off", "deg", float(gap), 1e-6, n=made.height, about=about),
+        law("columns", "protocol_truth_off", "deg", float(true), 1e-6, n=made.height, about="the slanted plane"),
     ]
 
 
-def _curvature_errors(made: Realisation) -> list[Figure]:
+def _curvature_errors(made: Realisation) -> list[Law]:
     """Check gain errors and direction errors of an estimate that is 10 % and 30 deg off."""
     from simtest.estimators.protocol import EstimatedCurvature
 
@@ -244,10 +237,10 @@ def _curvature_errors(made: Realisation) -> list[Figure]:
     errors = curvature_errors(estimate, truth)
     gap = abs(_value(errors.gain_error) - 0.1) + abs(_value(errors.gain_oracle_error))
     gap += abs(_value(errors.direction_error_deg) - 30.0)
-    return [canary("columns", "curvature_errors_off", "", gap, 1e-9, about="10 %, 0 and 30 deg, by construction")]
+    return [law("columns", "curvature_errors_off", "", gap, 1e-9, about="10 %, 0 and 30 deg, by construction")]
 
 
-def _distance(made: Realisation) -> Figure:
+def _distance(made: Realisation) -> Law:
     """Compare a Mahalanobis distance with that of a covariance along and across a tilt by hand."""
     normal = np.array([0.0, 0.0, -1.0])
     # About this normal the tangent basis is along x and y, up to sign: variances stay with their axes.
@@ -255,13 +248,13 @@ def _distance(made: Realisation) -> Figure:
     truth = np.array([math.sin(0.02), 0.0, -math.cos(0.02)]), np.array([0.0, math.sin(0.02), -math.cos(0.02)])
     found = [mahalanobis2(estimate, each) for each in truth]
     gap = max(abs(_value(found[0]) - 0.25), abs(_value(found[1]) - 4.0))
-    return canary("coverage", "distance_off", "", gap, 1e-9, n=2, about="0.02 rad over 0.04, and over 0.01, squared")
+    return law("coverage", "distance_off", "", gap, 1e-9, n=2, about="0.02 rad over 0.04, and over 0.01, squared")
 
 
 def _realised(session: Session, sigma: float) -> Realisation:
     """Make one realisation of the plane under a light aside, which no estimator is told."""
     scene = described(PLANE, LIGHT_MM, sensor={"noise_sigma": sigma})
-    experiment = Experiment(name="canary", realisations=1, groups=[{"scene": "plane", "isolated": False}])
+    experiment = Experiment(name="law", realisations=1, groups=[{"scene": "plane", "isolated": False}])
     (case,) = expand(experiment)
     names = ("cone_axis",)
     return realise(session, experiment, case, 0, render_view(session, scene), {}, load_estimators(names))

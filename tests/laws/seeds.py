@@ -5,18 +5,17 @@ from hashlib import blake2b
 
 import numpy as np
 
-from simtest.nightly.canaries.canary import canary
-from simtest.nightly.records import Figure
 from simtest.runtime import seeds
 from simtest.runtime.seeds import Stage
 from simtest.spec import Experiment
 from simtest.validation.cases import Case, expand
+from tests.laws.law import Law, law
 
 REALISATIONS = 4
 RELIEF = {"bands": [{"slope_deg": 3.0, "wavelength_mm": 2.0}]}
 
 
-def branches() -> list[Figure]:
+def branches() -> list[Law]:
     """Count the seeds of two experiments' settings and realisations that are the same: none may be."""
     cases = [(own, case) for own in _experiments() for case in expand(own)]
     made = []
@@ -24,17 +23,15 @@ def branches() -> list[Figure]:
         found = [draw(own, case, number) for own, case in cases for number in range(REALISATIONS)]
         shared = len(found) - len(set(found))
         about = "the same in two realisations, settings, experiments or runs of another seed"
-        made.append(canary("seeds", f"{name}_shared", "", shared, 0, n=len(found), about=about))
+        made.append(law("seeds", f"{name}_shared", "", shared, 0, n=len(found), about=about))
         again = [draw(own, case, number) for own, case in cases for number in range(REALISATIONS)]
         made.append(
-            canary(
-                "seeds", f"{name}_changed", "", sum(map(_differ, found, again)), 0, n=len(found), about="drawn twice"
-            )
+            law("seeds", f"{name}_changed", "", sum(map(_differ, found, again)), 0, n=len(found), about="drawn twice")
         )
     return [*made, *_tree()]
 
 
-def _tree() -> list[Figure]:
+def _tree() -> list[Law]:
     """Compare branches of the seed tree with NumPy's seed sequences and a hash, put together by hand."""
     names = ("e", "plane, sigma=0.1 | part 0")
     keys = [int.from_bytes(blake2b(name.encode(), digest_size=8).digest(), "little") for name in names]
@@ -47,10 +44,8 @@ def _tree() -> list[Figure]:
     differ = sum(a != b for a, b in zip(found, wanted, strict=True))
     about = "SeedSequence of seed, hashed names, realisation and stage"
     return [
-        canary(
-            "seeds", "stages_shared", "", apart, 0, n=len(found), about="two stages of one realisation on one branch"
-        ),
-        canary("seeds", "tree_changed", "", differ, 0, n=len(found), about=about),
+        law("seeds", "stages_shared", "", apart, 0, n=len(found), about="two stages of one realisation on one branch"),
+        law("seeds", "tree_changed", "", differ, 0, n=len(found), about=about),
     ]
 
 

@@ -6,9 +6,6 @@ from typing import Any
 import numpy as np
 
 from simtest.geometry import Camera
-from simtest.nightly.canaries import by_hand
-from simtest.nightly.canaries.canary import canary
-from simtest.nightly.records import Figure
 from simtest.rendering import Session
 from simtest.rendering.subsurface import spread, transfer
 from simtest.runtime.arrays import Array, Mask
@@ -17,22 +14,24 @@ from simtest.spec.relief import Relief
 from simtest.spec.translucency import Translucency
 from simtest.surfaces.relief_field import make_relief
 from simtest.validation.relief_laws import cloud_covariance, glint_count, relief_error
+from tests.laws import by_hand
+from tests.laws.law import Law, law
 
 SLOPE_DEG, WAVE_MM = 5.0, 1.5
 RELIEF: dict[str, Any] = {"bands": [{"slope_deg": SLOPE_DEG, "wavelength_mm": WAVE_MM}], "seed": 3}
 POINTS = 12_000
 
 
-def relief(session: Session) -> list[Figure]:
+def relief(session: Session) -> list[Law]:
     """Measure slope and wavelength of reliefs by differences of their heights, and the fine normals that one makes."""
     slope, wave = _section(RELIEF)
     # Bands are independent, so that their squared slopes add.
     both, _ = _section({**RELIEF, "bands": [*RELIEF["bands"], {"slope_deg": 4.0, "wavelength_mm": 3.0}]})
     about = "differences of heights on planes of all orientations; of a field of 16 waves a side"
     return [
-        canary("relief", "slope", "x", slope / SLOPE_DEG, 1.04, 0.96, POINTS, about),
-        canary("relief", "wavelength", "x", wave / WAVE_MM, 1.04, 0.96, POINTS, about),
-        canary("relief", "slope_of_two", "x", both / math.hypot(SLOPE_DEG, 4.0), 1.04, 0.96, POINTS, about),
+        law("relief", "slope", "x", slope / SLOPE_DEG, 1.04, 0.96, POINTS, about),
+        law("relief", "wavelength", "x", wave / WAVE_MM, 1.04, 0.96, POINTS, about),
+        law("relief", "slope_of_two", "x", both / math.hypot(SLOPE_DEG, 4.0), 1.04, 0.96, POINTS, about),
         _fine_normals(session),
     ]
 
@@ -60,11 +59,11 @@ def _section(described: dict[str, Any]) -> tuple[float, float]:
     return math.degrees(math.atan(math.sqrt(m2 / 2))), 2 * math.pi * math.sqrt(m2 / m4)
 
 
-def _fine_normals(session: Session) -> Figure:
+def _fine_normals(session: Session) -> Law:
     """Compare the true fine normals of a plane with differences of the height along it."""
     camera = {"width": 40, "height": 40, "fx": 60.0, "fy": 60.0, "cx": 20.0, "cy": 20.0}
     surface = {"type": "plane", "distance_mm": 10.0, "relief": RELIEF}
-    session.update(scene_from_dict({"surface": surface, "camera": camera}, "canary"))
+    session.update(scene_from_dict({"surface": surface, "camera": camera}, "law"))
     truth, field = session.truth(), make_relief(Relief.model_validate(RELIEF))
     points = truth.position[truth.mask]
     step = 1e-3
@@ -78,10 +77,10 @@ def _fine_normals(session: Session) -> Figure:
     normal = np.stack([-x, -y, -np.ones_like(x)], axis=-1)
     off = by_hand.angle_deg(truth.normal[truth.mask], normal).max()
     about = "a rise of the height turns the normal away from it; differences of 1e-3 mm"
-    return canary("relief", "normal_off", "deg", float(off), 1e-3, n=len(points), about=about)
+    return law("relief", "normal_off", "deg", float(off), 1e-3, n=len(points), about=about)
 
 
-def translucency() -> list[Figure]:
+def translucency() -> list[Law]:
     """Compare the spread of stripes below a plane with the diffusion approximation, written down by hand."""
     spec = Translucency.model_validate({"index": 1.0})
     waves = np.array([0.1, 0.4, 1.0, 3.0])
@@ -107,13 +106,11 @@ def translucency() -> list[Figure]:
             _transfer(np.array([wave]), spec.scattering_per_mm[channel], spec.absorption_per_mm[channel], 1.0)[0]
         )
         about = "contrast left to stripes of 2 mm; a sum of fitted Gaussians leaves 7 %"
-        made.append(
-            canary("translucency", f"{name}_contrast", "x", 2 * float(contrast) / wanted, 1.12, 0.88, about=about)
-        )
+        made.append(law("translucency", f"{name}_contrast", "x", 2 * float(contrast) / wanted, 1.12, 0.88, about=about))
     mean = float(seen[middle].mean() / image[middle].mean())
     return [
-        canary("translucency", "transfer_off", "", float(off), 1e-9, n=24, about="Cuccia 2009, by hand"),
-        canary("translucency", "mean", "x", mean, 1.01, 0.99, about="light spreads, none is lost"),
+        law("translucency", "transfer_off", "", float(off), 1e-9, n=24, about="Cuccia 2009, by hand"),
+        law("translucency", "mean", "x", mean, 1.01, 0.99, about="light spreads, none is lost"),
         *made,
     ]
 
@@ -139,7 +136,7 @@ def _transfer(wave: Array, scattering: float, absorption: float, index: float) -
     return np.asarray(share + (1 - share) * diffused(wave, index) / diffused(0.0, index))
 
 
-def glints() -> list[Figure]:
+def glints() -> list[Law]:
     """Compare the laws of glints with draws of a Gaussian relief's second derivatives and slopes."""
     slope, wave, distance, count = math.radians(4.0), 1.5, 20.0, 200_000
     rng = np.random.default_rng(51)
@@ -156,15 +153,15 @@ def glints() -> list[Figure]:
         error = float(determinant.std()) / math.sqrt(count) / float(determinant.mean())
         about = "E abs det(M/d - H) d^2 / det M by draws; 5 standard errors"
         ratio = glint_count(slope, wave, distance, gains) / drawn
-        made.append(canary("glints", f"{name}_count", "x", ratio, 1 + 5 * error, 1 - 5 * error, count, about))
+        made.append(law("glints", f"{name}_count", "x", ratio, 1 + 5 * error, 1 - 5 * error, count, about))
     slopes = slope * rng.standard_normal((2, count))
     mean = float(np.sqrt((slopes**2).sum(axis=0)).mean())
     wide = np.cov(distance * slopes / np.array([[0.5], [2.0]]))
     spread_off = np.abs(np.diag(cloud_covariance(slope, distance, (0.5, 2.0))) / np.diag(wide) - 1).max()
     return [
         *made,
-        canary(
+        law(
             "glints", "mean_slope", "x", float(relief_error(slope)) / mean, 1.01, 0.99, count, "mean length of a slope"
         ),
-        canary("glints", "cloud_off", "", float(spread_off), 0.02, n=count, about="d^2 M^-1 Sigma M^-T by draws"),
+        law("glints", "cloud_off", "", float(spread_off), 0.02, n=count, about="d^2 M^-1 Sigma M^-T by draws"),
     ]

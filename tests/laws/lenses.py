@@ -8,12 +8,11 @@ import numpy as np
 
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Scaramuzza, ViewMask
 from simtest.geometry.vectors import bisect
-from simtest.nightly.canaries.canary import canary
-from simtest.nightly.records import Figure
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.spec import load_camera, scene_from_dict
 from simtest.spec.rig import Rig
+from tests.laws.law import Law, law
 
 FX, FY, CX, CY, SKEW = 310.0, 300.0, 163.3, 117.8, 7.0
 BROWN = {"k1": -0.21, "k2": 0.06, "p1": 0.004, "p2": -0.006, "k3": -0.02, "k4": 0.03, "k5": -0.015, "k6": 0.012}
@@ -24,7 +23,7 @@ SMALL = {"width": 48, "height": 36, "fx": 31.0, "fy": 30.0, "cx": 25.3, "cy": 17
 DISTANCE_MM, TILT_DEG, AZIMUTH_DEG = 10.0, 12.0, 40.0
 
 
-def lenses() -> list[Figure]:
+def lenses() -> list[Law]:
     """Project directions through all lenses with all coefficients and a skew, by hand, and back."""
     x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.45, 0.45, 9), np.linspace(-0.35, 0.35, 7)))
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -44,13 +43,13 @@ def lenses() -> list[Figure]:
         back = float(np.abs(camera.unproject(pixels) - seen).max())
         about = "all coefficients and a skew; the model's formula by hand"
         made += [
-            canary("lens", f"{name}_off", "px", off, 1e-9, n=len(seen), about=about),
-            canary("lens", f"{name}_back", "", back, 1e-9, n=len(seen), about="pixels by hand back to directions"),
+            law("lens", f"{name}_off", "px", off, 1e-9, n=len(seen), about=about),
+            law("lens", f"{name}_back", "", back, 1e-9, n=len(seen), about="pixels by hand back to directions"),
         ]
     return made
 
 
-def lens_rays(variant: str | None) -> list[Figure]:
+def lens_rays() -> list[Law]:
     """Trace a tilted plane through a skewed pinhole, fisheye and omnidirectional lens; compare with rays by hand."""
     tilt, azimuth = math.radians(TILT_DEG), math.radians(AZIMUTH_DEG)
     normal = np.array([math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), -math.cos(tilt)])
@@ -61,9 +60,9 @@ def lens_rays(variant: str | None) -> list[Figure]:
         ("omni", {"type": "scaramuzza", **OMNI}),
     ):
         surface = {"type": "plane", "distance_mm": DISTANCE_MM, "tilt_deg": TILT_DEG, "azimuth_deg": AZIMUTH_DEG}
-        scene = scene_from_dict({"surface": surface, "camera": {**SMALL, "distortion": lens}}, "canary")
+        scene = scene_from_dict({"surface": surface, "camera": {**SMALL, "distortion": lens}}, "law")
         if session is None:
-            session = Session(scene, variant)
+            session = Session(scene)
         session.update(scene)
         rays = _rays(name)
         along = DISTANCE_MM * normal[2] / (rays @ normal)
@@ -71,11 +70,11 @@ def lens_rays(variant: str | None) -> list[Figure]:
         points = session.frame().labels.position.astype(float)
         off = np.abs(points - rays * along[..., None])[seen].max()
         about = "single precision leaves 1e-6 of the distance"
-        made.append(canary("lens_rays", f"{name}_off", "mm", float(off), 2e-4, n=int(seen.sum()), about=about))
+        made.append(law("lens_rays", f"{name}_off", "mm", float(off), 2e-4, n=int(seen.sum()), about=about))
     return made
 
 
-def view_masks() -> list[Figure]:
+def view_masks() -> list[Law]:
     """Count the pixels of a round view and of an octagon, whose borders are simple to write down."""
     x, y = np.meshgrid(np.arange(120) + 0.5 - 63.0, np.arange(100) + 0.5 - 47.0)
     wanted = {
@@ -87,13 +86,11 @@ def view_masks() -> list[Figure]:
     for name, (mask, by_hand) in wanted.items():
         seen = Camera(120, 100, 100.0, 100.0, 60.0, 50.0, view_mask=mask).seen
         differ = float("nan") if seen is None else float((seen != by_hand).sum())
-        made.append(
-            canary("view_mask", f"{name}_pixels_off", "", differ, 0, n=x.size, about="pixels in or out, by hand")
-        )
+        made.append(law("view_mask", f"{name}_pixels_off", "", differ, 0, n=x.size, about="pixels in or out, by hand"))
     return made
 
 
-def camera_files() -> list[Figure]:
+def camera_files() -> list[Law]:
     """Read a camera from files of OpenCV, ROS, MATLAB and COLMAP, whose first pixels are centred at 0, 0, 1 and 0.5."""
     from scipy.io import savemat
 
@@ -129,11 +126,11 @@ def camera_files() -> list[Figure]:
             found += [getattr(d, key, math.nan) for key in ("k1", "k2", "p1", "p2", "k3")]
             off = float(np.abs(np.array(found) - wanted).max())
             about = "every number of the file; the principal point moves by half a pixel"
-            made.append(canary("camera files", f"{path.suffix[1:]}_off", "", off, 1e-12, n=len(wanted), about=about))
+            made.append(law("camera files", f"{path.suffix[1:]}_off", "", off, 1e-12, n=len(wanted), about=about))
     return made
 
 
-def rigs() -> list[Figure]:
+def rigs() -> list[Law]:
     """Compare lights on a ring, by an angle, or drawn, with trigonometry by hand; and a bisector with its angles."""
     one = Rig.model_validate({"lights": [{"offset_mm": 2.0, "azimuth_deg": 35.0}]}).nominal_mm()[0]
     by_angle = [2 * math.cos(35 / 180 * math.pi), 2 * math.sin(35 / 180 * math.pi), 0.0]
@@ -155,14 +152,10 @@ def rigs() -> list[Figure]:
     cosines = [middle @ (to - point) / math.sqrt(((to - point) ** 2).sum()) for to in (light, np.zeros(3))]
     aside = abs(float(middle @ np.cross(light - point, -point)))
     return [
-        canary("rig", "position_off", "mm", float(off), 1e-12, n=4, about="azimuth from x to y, at right angles to z"),
-        canary("rig", "power_off", "", float(np.abs(powers - 2.0).max()), 1e-12, n=3, about="6 shared by three lights"),
-        canary(
-            "rig", "sigma", "x", sigma, 1 + gap, 1 - gap, drawn.size, "drawn deviations of 0.5 mm; 5 standard errors"
-        ),
-        canary(
-            "bisector", "angles_off", "", abs(cosines[0] - cosines[1]) + aside, 1e-12, about="equal angles, one plane"
-        ),
+        law("rig", "position_off", "mm", float(off), 1e-12, n=4, about="azimuth from x to y, at right angles to z"),
+        law("rig", "power_off", "", float(np.abs(powers - 2.0).max()), 1e-12, n=3, about="6 shared by three lights"),
+        law("rig", "sigma", "x", sigma, 1 + gap, 1 - gap, drawn.size, "drawn deviations of 0.5 mm; 5 standard errors"),
+        law("bisector", "angles_off", "", abs(cosines[0] - cosines[1]) + aside, 1e-12, about="equal angles, one plane"),
     ]
 
 

@@ -12,9 +12,6 @@ import numpy as np
 from simtest.dataset.fields import BY_NAME
 from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
-from simtest.nightly.canaries import by_hand
-from simtest.nightly.canaries.canary import canary
-from simtest.nightly.records import Figure
 from simtest.rendering import Session
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.simulation.frame_files import encoded_png, write_frame
@@ -22,12 +19,14 @@ from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import scene_from_dict
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.sensor import Sensor
+from tests.laws import by_hand
+from tests.laws.law import Law, law
 
 CAMERA = {"width": 60, "height": 48, "fx": 55.0, "fy": 55.0, "cx": 31.2, "cy": 22.8}
 DISTANCE_MM, RADIUS_MM = 10.0, 3.0
 
 
-def surfaces(session: Session) -> list[Figure]:
+def surfaces(session: Session) -> list[Law]:
     """Compare truth and traced labels of a sphere from outside, one from inside and a cylinder with rays by hand."""
     made = []
     for side, radius in (("outside", RADIUS_MM), ("inside", 14.0)):
@@ -50,21 +49,21 @@ def surfaces(session: Session) -> list[Figure]:
             }
             for quantity, (value, unit, scale) in off.items():
                 label = f"{side}_{name}_{quantity}"
-                made.append(canary("labels", label, unit, float(value), close * scale, n=int(hit.sum()), about=about))
+                made.append(law("labels", label, unit, float(value), close * scale, n=int(hit.sum()), about=about))
         # The light is at the camera: the highlight is the point nearest to it.
         at = [(own.distance - DISTANCE_MM, own.kd_min - k * DISTANCE_MM, own.kd_max - k * DISTANCE_MM)
               for own in session.highlights()]  # fmt: skip
         gap = float(np.abs(at).max()) if len(at) == 1 else math.nan
         about = "distance, and distance times curvatures, of the one highlight"
-        made.append(canary("labels", f"{side}_highlight_off", "", gap, 1e-6, about=about))
+        made.append(law("labels", f"{side}_highlight_off", "", gap, 1e-6, about=about))
         covered = {"exact": truth.mask, "traced": labels.instance == 0, "depth": np.isfinite(labels.depth)}
         for name, mask in covered.items():
             wrong = float((mask != hit).sum())
-            made.append(canary("mask", f"{side}_{name}_pixels_off", "", wrong, 0, n=hit.size, about="rays that hit it"))
+            made.append(law("mask", f"{side}_{name}_pixels_off", "", wrong, 0, n=hit.size, about="rays that hit it"))
     return [*made, _directions(session)]
 
 
-def frame_files(session: Session) -> list[Figure]:
+def frame_files(session: Session) -> list[Law]:
     """Write a labelled frame, and read its files as another program would."""
     scene = _scene({"type": "cylinder", "radius_mm": 4.0, "spin_deg": 90.0, "tilt_deg": 6.0})
     with tempfile.TemporaryDirectory() as folder:
@@ -89,17 +88,17 @@ def frame_files(session: Session) -> list[Figure]:
     read: Any = cv2.imdecode(np.frombuffer(encoded_png(red, Sensor()), np.uint8), cv2.IMREAD_COLOR)
     decoded = read[0, 0].tolist()
     return [
-        canary("labels", "file_depth_off", "mm", float(along), 2e-5, n=len(points), about="length of position_mm"),
-        canary("labels", "file_rays_off", "deg", float(aside), 1e-4, n=len(points), about="on the sightline"),
-        canary("labels", "file_curvature_off", "1/mm", float(bent), 1e-6, n=len(points), about="0 and 1/4"),
-        canary("labels", "file_normals_behind", "", behind, 0, n=len(points), about="normals facing the camera"),
-        canary("labels", "file_highlight_off", "px", float(gap), 1.01, about="brightest pixel at the listed highlight"),
-        canary("encoding", "png_colour_off", "", float(np.abs(np.array(decoded) - [0, 128, 255]).max()), 0.5,
+        law("labels", "file_depth_off", "mm", float(along), 2e-5, n=len(points), about="length of position_mm"),
+        law("labels", "file_rays_off", "deg", float(aside), 1e-4, n=len(points), about="on the sightline"),
+        law("labels", "file_curvature_off", "1/mm", float(bent), 1e-6, n=len(points), about="0 and 1/4"),
+        law("labels", "file_normals_behind", "", behind, 0, n=len(points), about="normals facing the camera"),
+        law("labels", "file_highlight_off", "px", float(gap), 1.01, about="brightest pixel at the listed highlight"),
+        law("encoding", "png_colour_off", "", float(np.abs(np.array(decoded) - [0, 128, 255]).max()), 0.5,
                about="linear red 1, green 0.21586 and blue 0 are blue 0, green 128 and red 255 for OpenCV"),
     ]  # fmt: skip
 
 
-def encodings() -> list[Figure]:
+def encodings() -> list[Law]:
     """Decode each image of a sample by its documented formula from a PNG that OpenCV reads, and by the package."""
     rng = np.random.default_rng(30)
     normal = rng.standard_normal((24, 20, 3))
@@ -136,14 +135,14 @@ def encodings() -> list[Figure]:
             about = "half a step of the documented encoding; NaN stays"
             value = math.nan if lost else float(off)
             made.append(
-                canary(
+                law(
                     "encoding", f"{name}_{reader}_off", "", value, quantum * (1 + 1e-3), n=int(sound.sum()), about=about
                 )
             )
     return made
 
 
-def dataset(variant: str | None) -> list[Figure]:
+def dataset() -> list[Law]:
     """Make one sample of a plane, and compare its pictures, parts, regions and depth with the radiance by hand."""
     described = {
         "samples": 1, "highlights": 0, "shard_mb": 1.0, "splits": {"train": 1.0, "validation": 0.0, "test": 0.0},
@@ -153,8 +152,8 @@ def dataset(variant: str | None) -> list[Figure]:
             "surface.distance_mm": 10.0,
         }}],
     }  # fmt: skip
-    plan = Plan(Dataset.model_validate({"name": "canary", "estimators": ["brightest_point"], **described}))
-    sample = Maker(plan, variant).make(0)
+    plan = Plan(Dataset.model_validate({"name": "law", "estimators": ["brightest_point"], **described}))
+    sample = Maker(plan).make(0)
     meta: Any = sample.meta
     images = {name: np.asarray(image) for name, image in sample.images.items()}
     rays = _rays()
@@ -178,14 +177,14 @@ def dataset(variant: str | None) -> list[Figure]:
     deep = float(np.nanmax(np.abs(images["depth"] - depth)))
     return [
         *(
-            canary("encoding", f"{name}_picture_off", "", value, 0.6, n=total.size, about=about)
+            law("encoding", f"{name}_picture_off", "", value, 0.6, n=total.size, about=about)
             for name, value in off.items()
         ),
-        canary("encoding", "sample_depth_off", "mm", deep, 1e-4, n=total.size, about="along the ray"),
-        canary("instances", "number_at_peak", "", at_peak, 1, 1, about="1 + the index of the only highlight"),
-        canary("instances", "others", "", float((region > 1).sum()), 0, n=region.size, about="0 or 1"),
-        canary("instances", "pixels_off", "", differ, 2, n=region.size, about="above half, smoothed by 2 px"),
-        canary("instances", "listed", "", len(listed), 1, 1, about="isolated highlights of a plane"),
+        law("encoding", "sample_depth_off", "mm", deep, 1e-4, n=total.size, about="along the ray"),
+        law("instances", "number_at_peak", "", at_peak, 1, 1, about="1 + the index of the only highlight"),
+        law("instances", "others", "", float((region > 1).sum()), 0, n=region.size, about="0 or 1"),
+        law("instances", "pixels_off", "", differ, 2, n=region.size, about="above half, smoothed by 2 px"),
+        law("instances", "listed", "", len(listed), 1, 1, about="isolated highlights of a plane"),
     ]  # fmt: skip
 
 
@@ -195,7 +194,7 @@ def _scene(surface: dict[str, Any]) -> Any:
             "surface": {"distance_mm": DISTANCE_MM, **surface}, "camera": CAMERA,
             "reflectance": {"type": "phong", "exponent": 60.0}, "sensor": {"noise_sigma": 0.0},
         },
-        "canary",
+        "law",
     )  # fmt: skip
 
 
@@ -217,7 +216,7 @@ def _sphere(radius: float, inside: bool) -> tuple[Array, Array]:
     return depth, -normal if inside else normal
 
 
-def _directions(session: Session) -> Figure:
+def _directions(session: Session) -> Law:
     """Compare the principal directions of a cylinder with its axis and the direction around it."""
     spin = 25.0 * math.pi / 180
     session.update(_scene({"type": "cylinder", "radius_mm": 6.0, "spin_deg": 25.0}))
@@ -226,7 +225,7 @@ def _directions(session: Session) -> Figure:
     axis = np.array([-math.sin(spin), math.cos(spin), 0.0])
     along, around = maps.direction_min[maps.mask], maps.direction_max[maps.mask]
     off = max(float((1 - np.abs(along @ axis)).max()), float(np.abs(around @ axis).max()))
-    return canary("labels", "directions_off", "", off, 1e-9, n=len(along), about="the flat direction is the axis")
+    return law("labels", "directions_off", "", off, 1e-9, n=len(along), about="the flat direction is the axis")
 
 
 def _png(name: str, image: AnyArray) -> AnyArray:
