@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,22 @@ from simtest.validation import runner
 
 ROOT = Path(__file__).resolve().parents[2]
 MAIN = "from simtest.cli.main import main; main()"
+STOPPED_AFTER_A_CASE = """
+import os, signal
+
+replace = os.replace
+
+
+def and_stop(source, target, **more):
+    replace(source, target, **more)
+    if os.fspath(target).endswith("case-00000.parquet"):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+os.replace = and_stop
+"""
+"""A process that is stopped by Ctrl-C once its first case is kept, however fast it is."""
+
 SLOW_MODULES = {"mitsuba", "drjit", "vtk", "vtkmodules", "torch", "pyvista", "polars", "matplotlib", "plotly"}
 SMALL = {"camera.width": 96, "camera.height": 96, "camera.fx": 96.0, "camera.fy": 96.0}
 SET_SMALL = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
@@ -392,16 +407,9 @@ def stopped(tmp_path_factory):
     folder = tmp_path_factory.mktemp("stopped")
     (folder / "tiny.toml").write_text(EXPERIMENT)
     out = folder / "run"
-    process = subprocess.Popen(
-        [sys.executable, "-c", MAIN, "validate", "tiny.toml", "--out", str(out)],
-        cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    end = time.monotonic() + 300
-    while not (out / "parts" / "case-00000.parquet").exists() and process.poll() is None and time.monotonic() < end:
-        time.sleep(0.002)
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=300)
-    return out, folder / "tiny.toml", process.returncode, output, errors
+    command = [sys.executable, "-c", STOPPED_AFTER_A_CASE + MAIN, "validate", "tiny.toml", "--out", str(out)]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
+    return out, folder / "tiny.toml", done.returncode, done.stdout, done.stderr
 
 
 @pytest.mark.render
