@@ -147,4 +147,5 @@ def _python_faults(code: str) -> Iterator[str]:
 
 
 def _has(module: Any, path: str, name: str) -> bool:
-    return hasattr(module, name) or importlib.util.find_spec(f"{path}.{name}") is not None
+    # The list first: what an extra brings is there by name and cannot be imported without it.
+    return name in dir(module) or hasattr(module, name) or importlib.util.find_spec(f"{path}.{name}") is not None
