@@ -148,4 +148,8 @@ def _python_faults(code: str) -> Iterator[str]:
 
 def _has(module: Any, path: str, name: str) -> bool:
     # The list first: what an extra brings is there by name and cannot be imported without it.
-    return name in getattr(module, "__all__", ()) or hasattr(module, name) or importlib.util.find_spec(f"{path}.{name}") is not None
+    return (
+        name in getattr(module, "__all__", ())
+        or hasattr(module, name)
+        or importlib.util.find_spec(f"{path}.{name}") is not None
+    )
