@@ -10,6 +10,8 @@ from pathlib import Path
 import polars as pl
 
 from benchmarks.measuring import print_markdown
+from simtest.report.error_laws import law_results
+from simtest.report.run_folder import Run, read_run
 
 Rows = Iterator[Sequence[str]]
 
@@ -18,8 +20,9 @@ OK = pl.col("status") == "ok"
 _GAIN = "sensor.exposure.gain"
 
 
-def curvature(results: pl.DataFrame) -> Rows:
+def curvature(run: Run) -> Rows:
     """Yield docs/concepts/theory.md, section 3: a row for each setting."""
+    results = run.results
     yield ["surface", "d k", "axis ratio: law (3.2)", "axis ratio: measured", "circle pose: law (4.1), deg",
            "circle pose, better candidate, deg", "brightest point, deg", "cone axis, deg"]  # fmt: skip
     for _, rows in results.group_by("setting", maintain_order=True):
@@ -37,8 +40,9 @@ def curvature(results: pl.DataFrame) -> Rows:
         ]
 
 
-def sensor(results: pl.DataFrame) -> Rows:
+def sensor(run: Run) -> Rows:
     """Yield docs/gallery/experiments_measured.md, "The sensor": means of cone_axis, a row for each sweep."""
+    results = run.results
     yield ["sweep", "plane", "cylinder"]
     answered = _of(results.filter(OK), "cone_axis")
     gains = [0.9, 1.5, 2, 4]
@@ -60,8 +64,9 @@ def sensor(results: pl.DataFrame) -> Rows:
     yield ["8 to 16 bits, without noise: linear; gamma 2.2 known or unknown", "", f"at most {_number(coded, 4)}"]
 
 
-def rig(results: pl.DataFrame) -> Rows:
+def rig(run: Run) -> Rows:
     """Yield docs/gallery/experiments_measured.md, "Rigs": medians, a row for each surface and rig."""
+    results = run.results
     yield ["surface", "rig", "true highlights", "found", "law, deg", "brightest_point, deg", "cone_axis, deg"]
     true = results.filter(pl.col("true_id").is_not_null())
     for (label, setting), rows in true.group_by("label", "setting", maintain_order=True):
@@ -76,8 +81,9 @@ def rig(results: pl.DataFrame) -> Rows:
         ]  # fmt: skip
 
 
-def interreflection(results: pl.DataFrame) -> Rows:
+def interreflection(run: Run) -> Rows:
     """Yield docs/gallery/experiments_measured.md, "Inter-reflections": medians of cone_axis."""
+    results = run.results
     yield ["radius, mm", "albedo", "direct", "bounces"]
     keys = "surface.radius_mm", "reflectance.diffuse"
     for at, rows in _of(results, "cone_axis").filter(OK).group_by(*keys, maintain_order=True):
@@ -86,8 +92,9 @@ def interreflection(results: pl.DataFrame) -> Rows:
         yield [*(f"{value:g}" for value in at), *(_number(median, 3) for median in medians)]
 
 
-def camera(results: pl.DataFrame) -> Rows:
+def camera(run: Run) -> Rows:
     """Yield docs/gallery/experiments_measured.md, "Lenses": means of cone_axis, and in brackets of circle_pose."""
+    results = run.results
     angles = [0.5, 10.0, 20.0, 40.0, 60.0]
     yield ["lens", *(f"{angle:g} deg" for angle in angles)]
     for (label, k1), rows in results.filter(OK).group_by("label", "camera.distortion.k1", maintain_order=True):
@@ -100,16 +107,18 @@ def camera(results: pl.DataFrame) -> Rows:
         yield [lens, *("" if axis is None else f"{axis:.3f} ({circle:.1f})" for axis, circle in pairs)]
 
 
-def known_light(results: pl.DataFrame) -> Rows:
+def known_light(run: Run) -> Rows:
     """Yield docs/concepts/which_method.md, "Light beside the camera": mean errors of bisector."""
+    results = run.results
     yield ["distance given", "cone_axis", "bisector"]
     for (setting,), rows in results.filter(OK).group_by("setting", maintain_order=True):
         means = (_of(rows, name)["error_deg"].mean() for name in ("cone_axis", "bisector"))
         yield [str(setting), *(_number(mean, 3) for mean in means)]
 
 
-def relief(results: pl.DataFrame) -> Rows:
+def relief(run: Run) -> Rows:
     """Yield docs/gallery/experiments_measured.md, "Relief": mean errors, a row for each sweep."""
+    results = run.results
     yield ["sweep", "highlights", "cone_axis", "brightest_point", "circle_pose (answers)", "cone_axis over the law"]
     answered = results.filter(OK & pl.col("true_id").is_not_null())
     sweeps = {
@@ -128,8 +137,9 @@ def relief(results: pl.DataFrame) -> Rows:
         yield [sweep, str(axis.height), *means, f"{circle['error_fine_deg'].mean():.0f} ({circle.height})", over]
 
 
-def reflectance(results: pl.DataFrame) -> Rows:
+def reflectance(run: Run) -> Rows:
     """Yield docs/gallery/experiments_measured.md, "Other reflectances": answers and errors of each estimator."""
+    results = run.results
     yield ["estimator", "answers", "why none", "error, deg: median (largest) of how many"]
     for name in ("cone_axis", "brightest_point", "circle_pose"):
         rows = _of(results.filter(pl.col("true_id").is_not_null()), name)
@@ -148,9 +158,16 @@ def reflectance(results: pl.DataFrame) -> Rows:
         yield [name, f"{ok.height} of {rows.height}", ", ".join(reasons), ", ".join(shown)]
 
 
-TABLES: dict[str, Callable[[pl.DataFrame], Rows]] = {
+def laws(run: Run) -> Rows:
+    """Yield docs/gallery/experiments_measured.md, "The error laws"."""
+    yield ["law", "settings met", "predicted", "largest departure, as a share of the law", "where"]
+    for result in law_results(run):
+        yield [result.law.title, *(result.cells[key] for key in ("met", "range", "share", "where"))]
+
+
+TABLES: dict[str, Callable[[Run], Rows]] = {
     table.__name__: table
-    for table in (curvature, sensor, rig, interreflection, camera, known_light, relief, reflectance)
+    for table in (curvature, sensor, rig, interreflection, camera, known_light, relief, reflectance, laws)
 }
 
 
@@ -169,4 +186,4 @@ def _answer(rows: pl.DataFrame, column: str, digits: int) -> str:
 
 
 if __name__ == "__main__":
-    print_markdown(list(TABLES[sys.argv[1]](pl.read_parquet(Path(sys.argv[2]) / "results.parquet"))))
+    print_markdown(list(TABLES[sys.argv[1]](read_run(Path(sys.argv[2])))))
