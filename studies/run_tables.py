@@ -165,9 +165,32 @@ def laws(run: Run) -> Rows:
         yield [result.law.title, *(result.cells[key] for key in ("met", "range", "share", "where"))]
 
 
+def compare(run: Run) -> Rows:
+    """Yield docs/gallery/estimators_measured.md, "All estimators on the same frames": means, a row for each surface."""
+    normals = ("cone_axis", "bisector", "photometric", "inverse_rendering")
+    curvatures = ("curved", "inverse_rendering")
+    heads = [*normals, *(f"gains: {name}" for name in curvatures), f"direction: {', '.join(curvatures)}"]
+    yield ["surface", *heads]
+    surfaces = {
+        "plane": "plane, tilted by 0.5 and 15 deg",
+        "cylinder outside": "cylinder outside, d k = 0.1, 1, 3",
+        "cylinder inside": "cylinder inside, d k = -1/3, -1/2, -2/3",
+        "saddle": "saddle, d k = (0.3, -0.3), (1, -0.5)",
+        "light beside the camera": "cylinder outside, light 1 mm beside the camera",
+        "base under the lobe": "cylinder outside, a diffuse base of half the lobe's strength",
+    }
+    for label, surface in surfaces.items():
+        rows = run.results.filter(OK & (pl.col("label") == label))
+        errors = [_of(rows, name)["error_deg"].mean() for name in normals]
+        gains = [100 * _of(rows, name)["gain_error"].mean() for name in curvatures]
+        directions = [_number(_of(rows, name)["direction_error_deg"].mean(), 2) for name in curvatures]
+        cells = [*(_number(error, 3 if error < 1 else 2) for error in errors), *(f"{gain:.1f} %" for gain in gains)]
+        yield [surface, *cells, ", ".join(filter(None, directions))]
+
+
 TABLES: dict[str, Callable[[Run], Rows]] = {
     table.__name__: table
-    for table in (curvature, sensor, rig, interreflection, camera, known_light, relief, reflectance, laws)
+    for table in (curvature, sensor, rig, interreflection, camera, known_light, relief, reflectance, laws, compare)
 }
 
 
