@@ -134,6 +134,7 @@ def check_figures(pages: Sequence[Path] | None, cheap: bool, timeout_s: float) -
     failed = 0
     with tempfile.TemporaryDirectory(prefix="manual-") as folder:
         scratch = Path(folder)
+        (scratch / "out").mkdir()
         copy_checkout(scratch)
         printed: dict[str, tuple[bool, str]] = {}
         for table in tables:
