@@ -188,18 +188,6 @@ def compare(run: Run) -> Rows:
         yield [surface, *cells, ", ".join(filter(None, directions))]
 
 
-def anatomy_sensor(run: Run) -> Rows:
-    """Yield docs/gallery/estimators_measured.md, "Anatomy through a sensor": medians, and the share answered."""
-    names = ("cone_axis", "curved", "photometric", "brightest_point")
-    yield ["surface", "true highlights", *(f"{name}: median error, deg (answered)" for name in names)]
-    for (label,), rows in run.results.filter(pl.col("true_id").is_not_null()).group_by("label", maintain_order=True):
-        of = [_of(rows, name) for name in names]
-        answered = [each.filter(OK) for each in of]
-        cells = (f"{_number(ok['error_deg'].median(), 3)} ({ok.height / each.height:.0%})"
-                 for ok, each in zip(answered, of, strict=True))  # fmt: skip
-        yield [str(label), str(of[0].height), *cells]
-
-
 TABLES: dict[str, Callable[[Run], Rows]] = {
     table.__name__: table
     for table in (
