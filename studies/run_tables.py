@@ -201,7 +201,6 @@ TABLES: dict[str, Callable[[Run], Rows]] = {
         reflectance,
         laws,
         compare,
-        anatomy_sensor,
     )
 }
 
