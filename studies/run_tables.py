@@ -188,6 +188,35 @@ def compare(run: Run) -> Rows:
         yield [surface, *cells, ", ".join(filter(None, directions))]
 
 
+def motion(run: Run) -> Rows:
+    """Yield docs/howto/motion.md, "How accurate": shares of the signs that are given."""
+    lengths = [0.2, 0.5, 1.0, 2.0, 5.0]
+    yield ["surface, d k", *(f"{length:g} mm" for length in lengths)]
+    surfaces = {
+        "sphere outside": "sphere from outside, 1 and 1",
+        "sphere inside": "sphere from inside, -0.5 and -0.5",
+        "concave beyond its centre": "concave beyond its centre, -2.4 and -2.7",
+        "saddle": "saddle, 0.5 and -0.5",
+        "saddle beyond its centre": "saddle beyond its centre, 0.6 and -3.2",
+        "cylinder, across its axis": "cylinder, moved across its axis: one of two signs",
+        "cylinder, along its axis": "cylinder, moved along its axis: one of two signs",
+        "colon": "colon, distance known to 30 %",
+        "colon with relief": "colon with a relief of 2 deg, wavelength 4 mm",
+        "liver": "liver, 40 to 150 mm away",
+    }
+    rows = _of(run.results, "motion").filter(pl.col("true_id").is_not_null())
+    # A sign of 0 is left open.
+    signs = [pl.col(f"motion_sign_{i}").fill_null(0) for i in (1, 2)]
+    given = sum(((sign != 0).cast(pl.Int64) for sign in signs), pl.lit(0))
+    for label, surface in surfaces.items():
+        of = [rows.filter((pl.col("label") == label) & (pl.col("views.length_mm") == length)) for length in lengths]
+        shares = (None if part.is_empty() else 50 * part.select(given.mean()).item() for part in of)
+        yield [surface, *(_number(share, 0) for share in shares)]
+    wrong = sum(rows.filter(sign * pl.col(f"motion_gain_{i}") < 0).height for i, sign in enumerate(signs, 1))
+    total = rows.select(given.sum()).item()
+    yield [f"{total} signs of {2 * rows.height} are given, {wrong} of them are wrong", *[""] * len(lengths)]
+
+
 TABLES: dict[str, Callable[[Run], Rows]] = {
     table.__name__: table
     for table in (
@@ -201,6 +230,7 @@ TABLES: dict[str, Callable[[Run], Rows]] = {
         reflectance,
         laws,
         compare,
+        motion,
     )
 }
 
