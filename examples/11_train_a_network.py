@@ -2,7 +2,7 @@
 
 `simtest dataset` renders 50 frames of ten colons. `simtest train` learns the normals at the highlights of six colons,
 chooses the epoch on two, and writes model.onnx, which runs by its name wherever an estimator does; the last two test
-it. No GPU is needed, but the extra learn: pip install ".[learn]" (docs/start/install.md says how without CUDA).
+it. No GPU is needed, but the extra learn: pip install -e ".[learn]" (docs/start/install.md says how without CUDA).
 
 Picture: a test frame with the network's normals, and all errors. Takes 100 s of processor time.
 """
@@ -20,7 +20,7 @@ from simtest.dataset import calibration_of, read
 
 chosen = options(__doc__)
 if missing := [name for name in ("torch", "safetensors", "onnx", "onnxruntime") if find_spec(name) is None]:
-    sys.exit(f'missing: {", ".join(missing)}; pip install ".[learn]" brings them (docs/start/install.md)')
+    sys.exit(f'missing: {", ".join(missing)}; pip install -e ".[learn]" brings them (docs/start/install.md)')
 from torch.utils.data import DataLoader  # noqa: E402 (not before its absence is known)
 
 from simtest.dataset.learn import Samples  # noqa: E402

@@ -78,7 +78,7 @@ def _toml_files(begun: str) -> dict[str, str]:
     return {f"{head}{path.name}{'/' * path.is_dir()}": "" for path in found if path.is_dir() or path.suffix == ".toml"}
 
 
-SceneName = Annotated[str, named("scenes", files=True, help="A scene file, or the name of a shipped scene.")]
+SceneName = Annotated[str, named("scenes", files=True, help="A scene file, a sample's JSON, or a shipped scene.")]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON.")]
 Settings = Annotated[list[str] | None, replacing("surface.radius_mm=5")]
 Variant = Annotated[

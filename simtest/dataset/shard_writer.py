@@ -11,9 +11,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import IO
 
+import polars as pl
+
 from simtest.dataset.card import CARD, write_card
 from simtest.dataset.croissant import CROISSANT, write_croissant
-from simtest.dataset.index import TABLES, write_shard_tables, write_tables
+from simtest.dataset.index import SAMPLES, TABLES, write_shard_tables, write_tables
 from simtest.dataset.maker import Maker, colour_variant
 from simtest.dataset.manifest import (
     NAME,
@@ -80,6 +82,11 @@ def write_dataset(
     ------
     InputError
         If the dataset cannot be made as described, or the folder holds something else or cannot be written.
+
+    Warns
+    -----
+    UserWarning
+        Of samples that show fewer isolated highlights than the recipe asks for, with their number.
     """
     plan = Plan(dataset)
     if plan.made_small:
@@ -89,6 +96,13 @@ def write_dataset(
     with _one_line_errors(folder), exclusive_folder(folder):
         manifest = _open(folder, plan, colour_variant(variant))
         _complete(plan, manifest, folder, engine, progress)
+        isolated = pl.read_parquet(folder / SAMPLES, columns=["n_isolated"])["n_isolated"]
+    if few := int((isolated < dataset.highlights).sum()):
+        warnings.warn(
+            f"{few} of {len(isolated)} samples show fewer isolated highlights than highlights = {dataset.highlights} "
+            f"asks for; the last of tries = {dataset.tries} draws was taken",
+            stacklevel=2,
+        )
     return manifest
 
 

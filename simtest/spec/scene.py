@@ -8,10 +8,12 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
+from simtest.errors import InputError
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.limits import check_limit
-from simtest.runtime.resources import find
+from simtest.runtime.resources import find, shown
 from simtest.runtime.short_repr import short_repr
+from simtest.spec.camera_formats.common import read_json
 from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.deformation import MOST_DEFORMATIONS, Deformation
 from simtest.spec.instrument import Instrument
@@ -224,7 +226,7 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     Parameters
     ----------
     name : str or Path
-        A path, or the name of a shipped scene.
+        A path, or the name of a shipped scene; of JSON, such as a dataset's sample or frame.json, the key ``scene``.
     settings : mapping, optional
         Values that replace those of the file, by key path; a new type of a table drops the keys of the former one.
 
@@ -240,6 +242,16 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     5.0
     """
     path = find(name, "scenes")
-    data = replace_values(Scene, read_toml(path), settings or {}, str(path))
+    data = replace_values(Scene, _tables(path), settings or {}, str(path))
     data.setdefault("name", path.stem[:80])
     return scene_from_dict(data, source_name(path, settings))
+
+
+def _tables(path: Path) -> dict[str, Any]:
+    """Return the tables of a scene file, or those under ``scene`` in a JSON file."""
+    if path.suffix.lower() != ".json":
+        return read_toml(path)
+    scene = read_json(path, "scene").get("scene")
+    if not isinstance(scene, dict):
+        raise InputError(f"{shown(path)}: scene: must be a table, as in a dataset's sample or in frame.json")
+    return scene

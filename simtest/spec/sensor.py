@@ -93,8 +93,8 @@ class Exposure(Spec):
         None,
         gt=0,
         lt=1,
-        description="automatic: the mean value of the picture, clipped and encoded, inside the view mask, where a "
-        "surface is seen; tissue keeps its level, and highlights clip",
+        description="automatic: the mean of the pixels' grey light, clipped and encoded, inside the view mask, where a "
+        "surface is seen; tissue keeps its level, and highlights clip. The mean over the encoded channels is lower",
     )
     gain: float = Field(1.0, ge=1e-6, le=1e6, description="exposure over that of the rule; 2 halves full scale")
 

@@ -64,7 +64,7 @@ def _run_page(
     blocks: list[tuple[Block, Shown | None]], scratch: Path, quick: bool, timeout_s: float, log: TextIO | None
 ) -> int:
     """Run the blocks of a page in a copy of the checkout; return how many failed or printed something else."""
-    _copy_checkout(scratch)
+    copy_checkout(scratch)
     failed = 0
     unmade: list[str] = []
     with _Python(scratch) as python:
@@ -79,7 +79,7 @@ def _run_page(
                     _tell(f"{'left out':>8}         {block.place}: {_first(command)}", log)
                     continue
                 started = time.monotonic()
-                run = python.run if block.language == "python" else _shell
+                run = python.run if block.language == "python" else shell
                 succeeded, text = run(command, scratch, timeout_s)
                 # Of a session it counts what is printed.
                 ok = succeeded or block.is_session
@@ -127,7 +127,7 @@ def reads(command: str, paths: list[str]) -> bool:
     return any(re.search(rf"(?<![\w./-]){re.escape(path)}(?![\w-])", command) for path in paths)
 
 
-def _copy_checkout(scratch: Path) -> None:
+def copy_checkout(scratch: Path) -> None:
     """Copy the files that are in git, or would be."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
     listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
@@ -142,7 +142,7 @@ def _environment(scratch: Path) -> dict[str, str]:
     return {**os.environ, "PATH": programs, "PYTHONPATH": str(scratch), "COLUMNS": WIDTH}
 
 
-def _shell(command: str, scratch: Path, timeout_s: float) -> tuple[bool, str]:
+def shell(command: str, scratch: Path, timeout_s: float) -> tuple[bool, str]:
     """Run a line in a shell; return whether it succeeded, and what it printed."""
     child = subprocess.Popen(
         ["/bin/bash", "-c", command], cwd=scratch, env=_environment(scratch), stdin=subprocess.DEVNULL, text=True,

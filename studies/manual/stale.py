@@ -147,6 +147,9 @@ def _python_faults(code: str) -> Iterator[str]:
 
 
 def _has(module: Any, path: str, name: str) -> bool:
-    # By its lists of names: what a package imports at first use may need an extra.
-    listed = {*dir(module), *getattr(module, "__all__", ())}
-    return name in listed or importlib.util.find_spec(f"{path}.{name}") is not None
+    # The list first: what an extra brings is there by name and cannot be imported without it.
+    return (
+        name in getattr(module, "__all__", ())
+        or hasattr(module, name)
+        or importlib.util.find_spec(f"{path}.{name}") is not None
+    )

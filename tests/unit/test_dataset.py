@@ -6,6 +6,7 @@ import shutil
 import tarfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import polars as pl
 import pytest
@@ -13,6 +14,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import simtest
 from simtest.cli.main import main
 from simtest.dataset import fields, read
 from simtest.dataset.card import make_card
@@ -20,6 +22,7 @@ from simtest.dataset.index import TABLES, write_shard_tables, write_tables
 from simtest.dataset.manifest import NAME, FileEntry, _digest, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
 from simtest.dataset.reproduce import compare, reproduce_sample
+from simtest.dataset.sample import sample_key
 from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
 from simtest.dataset.shard_writer import _write_shards, write_dataset
 from simtest.dataset.verify import repair_files, verify
@@ -27,7 +30,8 @@ from simtest.errors import InputError, SimtestError
 from simtest.pages.markdown import escaped, yaml_string
 from simtest.runtime.engines import make_engine
 from simtest.runtime.engines.cluster import cores_per_task
-from simtest.spec import load_dataset, scene_from_dict
+from simtest.simulation.frame_files import write_frame
+from simtest.spec import load_dataset, load_scene, scene_from_dict
 from simtest.spec.dataset_recipe import Dataset, Distribution, Splits
 from simtest.spec.spec_model import validate
 from tests.marked import marked
@@ -719,6 +723,45 @@ def test_commands(made, tmp_path, monkeypatch, capsys):
     code, said = run("verify", "made", "--repair")
     assert (code, said[-1]) == (0, "mended")
     assert contents(tmp_path / "made") == contents(made)
+
+
+def test_samples_below_the_recipes_number_of_highlights_are_counted(tmp_path):
+    # The highlight of a plane tilted by 60 deg is out of view.
+    small = {"camera.width": 64, "camera.height": 64, "camera.fx": 64, "camera.fy": 64, "reflectance.diffuse": 0.3}
+    families = [{"scene": "plane", "set": {**small, "surface.tilt_deg": tilt}} for tilt in (0.0, 60.0, 60.0)]
+    values = {"name": "few", "samples": 3, "samples_per_anatomy": 1, "tries": 3, "families": families}
+    split = {"train": 1, "validation": 0, "test": 0}
+    dataset = validate(Dataset, {**values, "splits": split, "estimators": ["cone_axis"]}, "few")
+    with pytest.warns(UserWarning, match=r"^2 of 3 samples show fewer isolated highlights than highlights = 1 asks"):
+        write_dataset(dataset, tmp_path / "few", make_engine())
+
+
+@pytest.mark.parametrize("index", [0, 3])
+def test_a_samples_metadata_are_a_scene_that_is_rendered_again(made, tmp_path, index):
+    reproduce_sample(made, index, tmp_path)
+    variant = read_manifest(made).origin["variant"]
+    frame = simtest.render(tmp_path / f"{sample_key(index)}.json", variant=variant)
+    write_frame(frame, tmp_path / "frame")
+    stored, again = (cv2.imread(str(tmp_path / name)) for name in (f"{sample_key(index)}.image.png", "frame/frame.png"))
+    np.testing.assert_array_equal(again, stored)
+    # frame.json is a scene as well.
+    assert load_scene(tmp_path / "frame" / "frame.json") == frame.scene
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not valid JSON"),
+        ("[1]", "must be an object"),
+        ('{"camera": {}}', "scene: must be a table, as in a dataset's sample"),
+        ('{"scene": 1}', "scene: must be a table"),
+        ('{"scene": {"surface": {"type": "cube"}}}', "surface"),
+    ],
+)
+def test_metadata_without_a_scene_are_refused_by_name(tmp_path, text, message):
+    (tmp_path / "frame.json").write_text(text)
+    with pytest.raises(InputError, match=f"frame.json.* {message}"):
+        load_scene(tmp_path / "frame.json")
 
 
 def test_a_dataset_of_another_version_is_sound_as_well(copy):

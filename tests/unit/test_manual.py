@@ -72,6 +72,15 @@ def test_every_page_stands_in_a_table_of_contents():
     assert sorted(page.relative_to(DOCS).as_posix() for page in pages - reached) == []
 
 
+def test_installing_an_extra_keeps_the_editable_install_of_make_demo():
+    files = [*manual_pages(), *(ROOT / "examples").glob("*.py"), ROOT / "Makefile"]
+    of_checkout = r"pip install (?:[^`\n]* )?[\"']?\.(?:\[\w+\][\"']?)?(?=[\s`;)]|$)"
+    found = {file: re.findall(of_checkout, file.read_text(encoding="utf-8"), re.MULTILINE) for file in files}
+    assert sum(map(len, found.values())) > 8
+    copies = [f"{file.relative_to(ROOT)}: {line}" for file in found for line in found[file] if " -e " not in line]
+    assert copies == []
+
+
 def test_generated_pages_are_not_in_git():
     ignored = (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
     assert {f"docs/{name}" for name in PAGES} <= set(ignored)

@@ -119,7 +119,7 @@ def test_blocks_are_read_as_they_stand(tmp_path):
 
 
 def test_blocks_run_in_order_and_failures_are_counted(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("studies.manual.runner._copy_checkout", lambda scratch: None)
+    monkeypatch.setattr("studies.manual.runner.copy_checkout", lambda scratch: None)
     page = written(
         tmp_path,
         "```sh\necho 1 > made.txt\n```\n```python\ntext = open('made.txt').read()\n```\n"

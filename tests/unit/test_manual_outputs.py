@@ -102,7 +102,7 @@ def test_outputs_belong_to_the_block_before_them(tmp_path):
 
 
 def test_a_session_shows_its_own_output(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("studies.manual.runner._copy_checkout", lambda scratch: None)
+    monkeypatch.setattr("studies.manual.runner.copy_checkout", lambda scratch: None)
     page = tmp_path / "page.md"
     session = "```console\n$ echo 1; exit 2\n1\n$ echo b /x\nb /y\n```\n"
     page.write_text(session, encoding="utf-8")
@@ -115,7 +115,7 @@ def test_a_session_shows_its_own_output(tmp_path, monkeypatch, capsys):
 
 
 def test_a_page_that_shows_another_output_fails(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("studies.manual.runner._copy_checkout", lambda scratch: None)
+    monkeypatch.setattr("studies.manual.runner.copy_checkout", lambda scratch: None)
     page = tmp_path / "page.md"
     page.write_text(PAGE.replace("/srv", "/home/me"), encoding="utf-8")
     assert run_pages([page], quick=True, timeout_s=60, log=None) == 1

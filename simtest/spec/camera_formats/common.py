@@ -35,10 +35,10 @@ MOST_SHOWN = 12
 """Cameras of a file that a message lists."""
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, kind: str = "camera") -> dict[str, Any]:
     """Read a JSON object; raise `InputError` where the file holds none."""
     # Programs write these files, too, with a pose for each of many frames.
-    where, text = shown(path), read_text(path, "camera", "record_bytes")
+    where, text = shown(path), read_text(path, kind, "record_bytes")
     try:
         data = parse_json(text)
     except RecursionError:
