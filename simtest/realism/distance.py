@@ -152,6 +152,17 @@ def mean_distribution(scenes: Scenes, column: str, at: Array) -> Array:
     return np.asarray(np.mean([np.searchsorted(np.sort(v), at, side="right") / len(v) for v in held], axis=0))
 
 
+def quartiles(scenes: Scenes, column: str) -> tuple[float, float, float] | None:
+    """Return where `mean_distribution` reaches 1/4, 1/2 and 3/4; None without a scene."""
+    held = [values[column] for values in scenes.values() if len(values[column])]
+    if not held:
+        return None
+    weights = np.concatenate([np.full(len(values), 1 / len(values)) for values in held])
+    found = np.quantile(np.concatenate(held), (0.25, 0.5, 0.75), weights=weights, method="inverted_cdf")
+    low, middle, high = (float(value) for value in found)
+    return low, middle, high
+
+
 def _steps(values: Array, grid: Array) -> Array:
     """Return the distribution function of values on the grid's intervals."""
     return np.asarray(np.searchsorted(np.sort(values), grid[:-1], side="right") / len(values))

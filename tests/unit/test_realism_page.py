@@ -67,6 +67,16 @@ def test_what_is_drawn_is_what_the_distance_compares():
     assert mean_distribution(real, "radius", x)[at] == pytest.approx(curves["real"].y, abs=0.02)
 
 
+def test_quartiles_lie_on_the_curve_that_is_drawn_beside_them():
+    """One frame of many small highlights among frames of few large ones: each scene has the same weight."""
+    rng = np.random.default_rng(4)
+    side = {str(i): {name: rng.lognormal(i / 4, 0.3, 20 if i else 400) for name in COLUMNS} for i in range(8)}
+    found = SetOfFrames(side, len(side), 0, []).quartiles("radius")
+    assert mean_distribution(side, "radius", np.array(found)) == pytest.approx([0.25, 0.5, 0.75], abs=0.01)
+    nothing = {"0": {name: np.empty(0) for name in COLUMNS}}
+    assert SetOfFrames(nothing, 1, 0, []).quartiles("radius") is None
+
+
 def test_every_verdict_has_its_own_symbol_and_every_statistic_its_row():
     real, generated = scenes(8, 1), scenes(8, 2)
     for values in generated.values():
