@@ -101,8 +101,9 @@ def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> li
     """Open the generated side: a dataset's folder, a folder or film of frames, or a scene to be rendered.
 
     Of a dataset at most `count` samples are taken, of as many anatomies as possible; its anatomies are the scenes. Of a
-    folder's pictures `count` are taken, evenly spread. `surfaces` names those that are taken, by default all. A scene is rendered `count` times, from another viewpoint
-    and with another seed of relief, pattern and noise each time; each frame counts as a scene.
+    folder's pictures `count` are taken, evenly spread. `surfaces` names those that are taken of a dataset, by default
+    all. A scene is rendered `count` times, from another viewpoint and with another seed of relief, pattern and noise
+    each time; each frame counts as a scene.
 
     Raises
     ------

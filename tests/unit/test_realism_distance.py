@@ -72,8 +72,22 @@ def test_what_no_frame_tells_is_a_stated_gap():
 def test_equal_real_scenes_have_no_spread():
     same = {str(i): {name: np.ones(3) for name in COLUMNS} for i in range(5)}
     other = {str(i): {name: np.full(3, 2.0) for name in COLUMNS} for i in range(5)}
-    assert all(d.distance == 0 for d in distances(same, same))
-    assert all(np.isinf(d.distance) for d in distances(same, other))
+    assert all((d.distance, d.verdict) == (0, "near") for d in distances(same, same))
+    # Infinitely many spreads are the strongest difference, not too few scenes.
+    assert all((d.distance, d.interval, d.verdict) == (np.inf, (np.inf, np.inf), "far") for d in distances(same, other))
+    # One generated scene of five that differs may differ by chance.
+    other = same | {"0": other["0"]}
+    assert all((d.distance, d.interval, d.verdict) == (np.inf, (0, np.inf), "between") for d in distances(same, other))
+
+
+def test_columns_that_vary_together_do_not_narrow_the_interval():
+    """Six columns that hold the same numbers have the interval of one."""
+    sides = scenes(8), scenes(8, shift=1.0, seed=1)
+    for side in sides:
+        for values in side.values():
+            values |= {name: values["radius"] for name in COLUMNS}
+    found = {d.statistic.name: d for d in distances(*sides)}
+    assert found["colour"].interval == pytest.approx(found["radius"].interval)
 
 
 def picture(path, seed, size=(96, 128)):

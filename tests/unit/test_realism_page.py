@@ -92,6 +92,20 @@ def test_every_verdict_has_its_own_symbol_and_every_statistic_its_row():
     assert draw([chart])[0].std() > 5
 
 
+def test_an_infinite_distance_is_drawn_at_the_end_and_written(tmp_path):
+    real, generated = ({str(i): {name: np.full(3, value) for name in COLUMNS} for i in range(6)} for value in (1, 2))
+    found = of_scenes(real, generated)
+    marks = [mark for mark in distance_chart(found).panels[0].marks if mark.hover]
+    assert len(marks) == 12
+    assert all("far\ndistance ∞\n95 % interval ∞ to ∞" in mark.hover[0] for mark in marks)
+    assert "12 are far" in found.verdict
+    html = write_comparison(found, tmp_path, "plain").read_text()
+    assert "∞ to ∞" in html
+    assert {
+        (row["distance"], row["verdict"]) for row in json.loads((tmp_path / "realism.json").read_text())["statistics"]
+    } == {(None, "far")}
+
+
 def test_page_holds_verdict_numbers_frames_and_reasons(tmp_path):
     def broken():
         raise InputError("x.png: no <picture>")
