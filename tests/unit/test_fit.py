@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -214,7 +215,10 @@ def test_frames_of_several_sizes_and_without_highlights_are_noted(tmp_path, bank
     assert list(seen[2]) == ["grey.png"]
     dataset = small()
     found = fit_to_bank(seen, dataset, fitted_parameters(dataset), bank_of_two(bank), repeats=5)
-    assert any("several sizes (96 x 80, 128 x 96)" in note for note in found.notes())
+    assert any("frames of 96 x 80, 128 x 96 px, the recipe's of 406 x 406 px" in note for note in found.notes())
+    # Frames of one size that is not the recipe's are noted too; those of the recipe's size are not.
+    assert any("frames of 96 x 80 px, the recipe's" in note for note in replace(found, sizes={(96, 80)}).notes())
+    assert not any("px" in note for note in replace(found, sizes={(406, 406)}).notes())
     report = report_json(found)
     json.dumps(report, allow_nan=False)
     assert [p["key"] for p in report["parameters"]] == ["surface.distance_mm", "sensor.noise_sigma"]
