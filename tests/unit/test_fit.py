@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from simtest.errors import InputError
 from simtest.realism.fitting import inference
 from simtest.realism.fitting.bank import Bank, count_made, make_bank, read_bank
-from simtest.realism.fitting.emulator import features, learn
+from simtest.realism.fitting.emulator import FOLDS, PENALTIES, features, learn
 from simtest.realism.fitting.fit import fit_to_bank, ranges, summarise_scenes
 from simtest.realism.fitting.outcome import check_out, recipe_toml, report_json, write_fit
 from simtest.realism.fitting.parameters import Parameter, fitted_parameters, missing_kinds, narrowed, one_family
@@ -148,6 +148,22 @@ def planted(emulator, number, rng, repeats):
     return (found.interval[:, 0] <= truth) & (truth <= found.interval[:, 1])
 
 
+def test_columns_are_fitted_as_if_alone_and_share_their_matrices(bank, monkeypatch):
+    summaries = bank.summaries.copy()
+    summaries[::7, 4] = np.nan
+    summaries[5:, 6] = np.nan
+    gaps = Bank(bank.shares, summaries, bank.radiance)
+    solve, solved = np.linalg.solve, []
+    monkeypatch.setattr(np.linalg, "solve", lambda *told: solved.append(1) or solve(*told))
+    together = learn(gaps, from_integer(0), 3)
+    # For columns with gaps and without: folds times penalties, and each penalty that is taken.
+    assert len(solved) <= 2 * (FOLDS + 1) * len(PENALTIES)
+    for column in (0, 4, 6, 9):
+        alone = learn(Bank(bank.shares, summaries[:, [column]], bank.radiance), from_integer(0), 3)
+        assert together.weights[:, [column]] == pytest.approx(alone.weights, abs=1e-10)
+        assert together.draws[:, :, [column]] == pytest.approx(alone.draws, abs=1e-10)
+
+
 def test_what_frames_do_not_show_is_not_told(emulator):
     assert planted(emulator, 0, np.random.default_rng(3), 5).sum() >= 2
 
@@ -215,7 +231,7 @@ def test_frames_of_several_sizes_and_without_highlights_are_noted(tmp_path, bank
     assert list(seen[2]) == ["grey.png"]
     dataset = small()
     found = fit_to_bank(seen, dataset, fitted_parameters(dataset), bank_of_two(bank), repeats=5)
-    assert any("frames of 96 x 80, 128 x 96 px, the recipe's of 406 x 406 px" in note for note in found.notes())
+    assert any("frames of 96 x 80, 128 x 96 px, the recipe's of 406 x 406: what" in note for note in found.notes())
     # Frames of one size that is not the recipe's are noted too; those of the recipe's size are not.
     assert any("frames of 96 x 80 px, the recipe's" in note for note in replace(found, sizes={(96, 80)}).notes())
     assert not any("px" in note for note in replace(found, sizes={(406, 406)}).notes())

@@ -85,7 +85,7 @@ class FittedRecipe:
         if self.sizes != {(camera.width, camera.height)}:
             sizes = ", ".join(f"{width} x {height}" for width, height in sorted(self.sizes))
             notes.append(
-                f"frames of {sizes} px, the recipe's of {camera.width} x {camera.height} px: what is measured in pixels "
+                f"frames of {sizes} px, the recipe's of {camera.width} x {camera.height}: what is measured in pixels "
                 "(halos, noise, spectrum) differs with the size"
             )
         return notes
