@@ -116,8 +116,8 @@ class Question:
 
     @property
     def per_distance(self) -> int:
-        """Frames at each distance."""
-        return max(1, round((self.frames or affordable(self)) / DISTANCES))
+        """Frames at each distance: as many at each, so that there are at least as many in all as asked for."""
+        return math.ceil((self.frames or affordable(self)) / DISTANCES)
 
     @property
     def middle_mm(self) -> float:

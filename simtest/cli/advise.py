@@ -59,7 +59,11 @@ def advise(
     ] = None,
     bound: Annotated[float, Parameter(help="Error beyond which a method counts as broken, deg.")] = 5.0,
     frames: Annotated[
-        int | None, Parameter(help="Frames of the organ; default as many as two minutes allow.", converter=whole_number)
+        int | None,
+        Parameter(
+            help="Frames of the organ, rounded up to as many at each of 8 distances; default what two minutes allow.",
+            converter=whole_number,
+        ),
     ] = None,
     seed: Seed = None,
     workers: Annotated[int, Parameter(help="Processes that work at once.", converter=whole_number)] = 2,
@@ -101,6 +105,7 @@ def advise(
 
 def _print(found: "Advised") -> None:
     from simtest.advice.page import NOTHING, interval, sentence
+    from simtest.advice.plan import DISTANCES
     from simtest.cli.printing import print_lines, print_table
     from simtest.pages.style import number
 
@@ -111,6 +116,7 @@ def _print(found: "Advised") -> None:
     ]  # fmt: skip
     columns = ("method", "states", "answered", "error, fine", "95 % interval", "error, base", "95 % interval")
     print_table(columns, rows)
+    print(f"{found.found.frames} frames, {found.question.per_distance} at each of {DISTANCES} distances")
     breaks = [
         (b.point.title, b.point.method, f"{b.point.quantity} {number(b.point.value)} {b.point.unit}".strip(),
          "refuses" if b.point.expected is None else number(b.point.expected), number(b.rendered.mean_deg), b.verdict)

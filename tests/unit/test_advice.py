@@ -270,6 +270,12 @@ def test_spots_shrink_with_relief_and_have_the_smooth_size_without():
     assert smooth.shapeless_beyond_mm == math.inf
 
 
+@pytest.mark.parametrize(("asked", "planned"), [(8, 8), (12, 16), (20, 24), (40, 40)])
+def test_at_least_the_frames_that_are_asked_for_are_planned(asked, planned):
+    question = Question(read_scope("laparoscope"), "plane", (20.0, 60.0), frames=asked)
+    assert len(main_experiment(question).groups[0].pool[0]["surface.distance_mm"]) == planned
+
+
 def test_large_pictures_and_rough_walls_get_fewer_frames(tmp_path):
     large, tiny = read_scope("colonoscope_2"), read_scope(written(tmp_path, CAMERA))
     smooth = replace(large, relief=ReliefPrior(slope_deg=0.0))

@@ -15,7 +15,7 @@ from simtest.advice.twin import bank as banks
 from simtest.advice.twin.bank import BankFrame, all_spots, frames_for
 from simtest.advice.twin.matching import TWINS, Matcher
 from simtest.advice.twin.patches import ANCHOR_MM, MOST_TILT_DEG, REACH_MM, TissuePatch, look_at, make_pool
-from simtest.advice.twin.run import TwinResult, match_spots, twin_picture, twins_of
+from simtest.advice.twin.run import TwinResult, _drawn, match_spots, twin_picture, twins_of
 from simtest.advice.twin.scenes import Look, SceneDraws, _distance, drawn_camera, look_of
 from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot, usable_spots
 from simtest.advice.twin.tissue import NAMES, WIDER, tissue_of
@@ -104,6 +104,14 @@ def test_a_told_organ_has_its_relief_and_film_and_form(organ):
             assert band.wavelength_mm[0] <= made["wavelength_mm"] <= band.wavelength_mm[1]
             assert band.slope_deg[0] <= made["slope_deg"] <= band.slope_deg[1]
     assert tissue != tissue_of(None)
+
+
+def test_what_no_option_narrows_says_so():
+    told = {organ: " ".join(map(str, _drawn(organ, tissue_of(organ)))) for organ in (None, "colon")}
+    assert "light exits: discs of 0.5 to 1.3 mm radius; lights of one power (to narrow: not possible" in told["colon"]
+    assert "to narrow: --organ" in told[None]
+    assert "--organ" not in told["colon"]
+    assert not any("not yet" in text for text in told.values())
 
 
 def test_an_organ_that_nobody_knows_is_refused_before_anything_is_rendered(framed):
