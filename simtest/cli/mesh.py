@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import AsJson, named_path, replacing, seed_number, whole_number
+from simtest.cli.options import AsJson, named_path, replacing, seed_number
 
 mesh = App(name="mesh", help="Check a mesh of yours, or make a colon or liver from its recipe.")
 
