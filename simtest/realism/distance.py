@@ -112,10 +112,11 @@ def _distance(statistic: Statistic, real: Scenes, generated: Scenes, seed: int) 
 def _column_distance(
     real: list[Array], generated: list[Array], real_rows: IntArray, generated_rows: IntArray, dealt: IntArray
 ) -> tuple[Array, Array, Array]:
-    """Return the distance over the real scenes' spread, that of resampled scenes, and those of scenes dealt anew.
+    """Return the distance over the real scenes' spread, that of resampled scenes, and how far sides dealt anew differ.
 
-    The last ones are over the spread of all scenes, and the first of them is that of the scenes as they are. Rows have
-    shape (RESAMPLES, N): of each side, and of both together, those that stand for the real ones.
+    The last are mean differences of the distribution functions over all values, which the largest do not rule; the
+    first of them is that of the sides as they are. Rows have shape (RESAMPLES, N): of each side, and of both together,
+    those that stand for the real ones.
     """
     grid = _grid([*real, *generated])
     # Distribution functions of all scenes on one grid: each resample is then a mean of rows.
@@ -130,11 +131,11 @@ def _column_distance(
         rest = (scenes.sum(axis=0) - scenes) / (len(scenes) - 1)
         return float(gap(scenes, rest).mean())
 
-    value, spread, common = gap(own.mean(axis=0), other.mean(axis=0)), spread_of(own), spread_of(both)
+    value, spread = gap(own.mean(axis=0), other.mean(axis=0)), spread_of(own)
     samples = gap(_means(own, real_rows), _means(other, generated_rows))
-    first = _means(both, dealt)
-    anew = gap(first, (both.sum(axis=0) - len(own) * first) / len(other))
-    exchanged = np.append(value, anew) / (common or 1.0)
+    first = np.concatenate([own.mean(axis=0)[None], _means(both, dealt)])
+    second = (both.sum(axis=0) - len(own) * first) / len(other)
+    exchanged = np.abs(first - second) @ np.diff(both.mean(axis=0), prepend=0.0)
     if spread <= 0:
         # All real scenes are alike: any difference is infinitely many spreads.
         some = 1e-9 * widths.sum()
@@ -150,8 +151,8 @@ def _column_distance(
 def _interval(value: float, samples: Array, exchanged: Array, scenes: int) -> tuple[float, float]:
     """Return the 95 % interval of a distance; `scenes` are those of the smaller side.
 
-    Of two sets of one distribution each estimate is above 0. So 0 is the lower end where scenes that were dealt anew to
-    both sides are often as far from each other.
+    Of two sets of one distribution each estimate is above 0. So 0 is the lower end where sides to which the scenes were
+    dealt anew often differ as much (`exchanged`, see `_column_distance`).
     """
     if np.isfinite(samples).all():
         low, high = widened(value, samples, scenes)
