@@ -25,7 +25,7 @@ from simtest.estimators.accumulated import CHI95, base_normal
 from simtest.estimators.cloud import cloud
 from simtest.estimators.sightings import Plane, Sighting, fine_map, light_of, spots_of
 from simtest.geometry import Array
-from simtest.geometry.vectors import angle_deg, rotation
+from simtest.geometry.vectors import angle_deg, deviation_deg, rotation
 from simtest.rendering import Session
 from simtest.simulation.rendered_view import render_picture
 from simtest.spec import Scene, scene_from_dict
@@ -119,7 +119,7 @@ def answer(row: Row, name: str, sightings: list[Sighting], plane: Plane, error: 
         return
     row[f"{name} error"] = float(angle_deg(found.normal, UP))
     row[f"{name} d2"] = found.squared_mahalanobis(UP)
-    row[f"{name} stated"] = float(np.degrees(np.sqrt(np.trace(found.covariance))))
+    row[f"{name} stated"] = deviation_deg(found.covariance)
     row[f"{name} slope"] = float(np.degrees(found.slope))
 
 
