@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from simtest.errors import InputError
+from simtest.realism.fitting import bank as banks
 from simtest.realism.fitting import inference
 from simtest.realism.fitting.bank import Bank, count_made, make_bank, read_bank
 from simtest.realism.fitting.emulator import FOLDS, PENALTIES, features, learn
@@ -273,7 +274,7 @@ def test_summaries_of_a_frame_without_highlights_have_gaps():
     assert np.isnan(told["radius"])
 
 
-def test_a_folder_of_another_bank_and_a_damaged_one_are_refused(tmp_path):
+def test_a_folder_of_another_bank_and_a_damaged_one_are_refused(tmp_path, monkeypatch):
     dataset = small()
     parameters = fitted_parameters(dataset)
     for index in range(3):
@@ -282,8 +283,13 @@ def test_a_folder_of_another_bank_and_a_damaged_one_are_refused(tmp_path):
     made = make_bank(dataset, parameters, tmp_path, 3, chains=1)
     assert made.shares.tolist() == [[0.0, 0.0]] * 3
     assert count_made(tmp_path) == 3
-    with pytest.raises(InputError, match="holds the bank of another recipe, seed or size"):
+    with pytest.raises(InputError, match="holds the bank of another recipe, seed, size or release"):
         make_bank(dataset.model_copy(update={"seed": 9}), parameters, tmp_path, 3, chains=1)
+    # Its frames were rendered and measured by other code.
+    with monkeypatch.context() as other:
+        other.setattr(banks, "source_hash", lambda: "of other code")
+        with pytest.raises(InputError, match="or release of simtest"):
+            make_bank(dataset, parameters, tmp_path, 3, chains=1)
     (tmp_path / "000001.json").write_text("[{]")
     with pytest.raises(InputError, match=r"000001\.json: no file of a bank"):
         read_bank(tmp_path, 3, parameters)
