@@ -44,9 +44,6 @@ __all__ = [
     "validate",
 ]
 
-OWN_KEYS = ("realisations", "seed", "estimators")
-"""Keys of an experiment that an override may name."""
-
 TRIES = 10
 """Viewpoints that are tried for each view wanted."""
 
@@ -334,6 +331,7 @@ def _experiment(
 ) -> "Experiment":
     """Return the described experiment with values replaced; those of an `Experiment` are its own already."""
     from simtest.spec import Experiment, load_experiment
+    from simtest.spec.experiment import OWN_KEYS
 
     if isinstance(experiment, Experiment):
         if settings or overrides:

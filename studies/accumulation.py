@@ -25,11 +25,12 @@ from simtest.estimators.accumulated import CHI95, base_normal
 from simtest.estimators.cloud import cloud
 from simtest.estimators.sightings import Plane, Sighting, fine_map, light_of, spots_of
 from simtest.geometry import Array
-from simtest.geometry.vectors import angle_deg, rotation
+from simtest.geometry.vectors import angle_deg, deviation_deg, rotation
 from simtest.rendering import Session
 from simtest.simulation.rendered_view import render_picture
 from simtest.spec import Scene, scene_from_dict
 from studies.hard.table import wilson
+from studies.kept import code_hash
 
 SLOPES = 2.0, 4.0, 6.0
 FRAMES = 1, 5, 10, 30
@@ -118,7 +119,7 @@ def answer(row: Row, name: str, sightings: list[Sighting], plane: Plane, error: 
         return
     row[f"{name} error"] = float(angle_deg(found.normal, UP))
     row[f"{name} d2"] = found.squared_mahalanobis(UP)
-    row[f"{name} stated"] = float(np.degrees(np.sqrt(np.trace(found.covariance))))
+    row[f"{name} stated"] = deviation_deg(found.covariance)
     row[f"{name} slope"] = float(np.degrees(found.slope))
 
 
@@ -241,7 +242,9 @@ def main() -> None:
     options = parser.parse_args()
     rows: list[Row] = []
     if options.rows is not None and options.rows.is_file():
-        rows = json.loads(options.rows.read_text())
+        held = json.loads(options.rows.read_text())
+        # Rows of other code are made again.
+        rows = held["rows"] if held["code"] == code_hash() else []
     done = {row["seed"] for row in rows}
     for seed in range(options.first, options.first + options.scenes):
         if seed in done:
@@ -249,7 +252,7 @@ def main() -> None:
         for slope in SLOPES:
             rows += one_film(slope, seed)
         if options.rows is not None:
-            options.rows.write_text(json.dumps(rows))
+            options.rows.write_text(json.dumps({"code": code_hash(), "rows": rows}))
         print(f"{seed - options.first + 1} of {options.scenes} films", file=sys.stderr, flush=True)
     print(tables(rows))
 

@@ -1,10 +1,10 @@
-"""Whether two processors agree on the benchmark: medians, statuses and bits of two folders of `studies.bench_seeds`.
+"""Whether two processors agree on the benchmark: medians, statuses and bits of two folders of `simtest bench run`.
 
-``python -m studies.bench_processors FIRST SECOND`` compares what ``python -m studies.bench_seeds FIRST --sealed 0``
-wrote on one processor with what the same command wrote on another. A processor can be emulated, at 15 times the cost::
+``python -m studies.bench_processors FIRST SECOND`` compares what ``simtest bench run --core CORE --out FIRST`` wrote on
+one processor with what the same command wrote on another. A processor can be emulated, at 15 times the cost::
 
     export NPY_DISABLE_CPU_FEATURES=X86_V3
-    qemu-x86_64 -cpu Haswell .venv/bin/python -m studies.bench_seeds SECOND --sealed 0 --scenes 1
+    qemu-x86_64 -cpu Haswell .venv/bin/python -m simtest bench run --core CORE --part smooth --out SECOND
 
 LLVM, OpenBLAS and NumPy then use the instructions of that processor. (The variable keeps NumPy from AVX2, whose gather
 crashes in version 7.2 of the emulator.)
@@ -25,9 +25,9 @@ TOLERANCE_DEG = 1e-3
 
 def compare(first: Path, second: Path) -> Iterator[tuple[bool, str]]:
     """Yield for each part and estimator whether two runs agree, and a line that says by how much they differ."""
-    parts = [{path.parent.name for path in folder.glob("public/*/results.parquet")} for folder in (first, second)]
+    parts = [{path.parent.name for path in folder.glob("*/results.parquet")} for folder in (first, second)]
     for part in sorted(set.intersection(*parts)):
-        tables = [pl.read_parquet(folder / "public" / part / "results.parquet") for folder in (first, second)]
+        tables = [pl.read_parquet(folder / part / "results.parquet") for folder in (first, second)]
         for estimator in tables[0]["estimator"].unique(maintain_order=True):
             yield _line(part, estimator, *(table.filter(pl.col("estimator") == estimator) for table in tables))
 

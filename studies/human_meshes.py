@@ -28,6 +28,7 @@ from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import load_scene
 from simtest.validation.matching import match, peak_px
 from simtest.validation.metrics import mahalanobis2
+from studies.hard.measure import semi_axis_deg
 
 MESHES = Path(__file__).resolve().parents[2] / "shared" / "data" / "meshes"
 ESTIMATORS = ("cone_axis", "curved", "brightest_point", "photometric")
@@ -161,7 +162,7 @@ def _add(answers: list[Answer], result: Estimate | Failure, normal: Array) -> No
         return
     distance = mahalanobis2(result, normal)
     if distance is not None:
-        semi = float(np.degrees(np.sqrt(np.trace(result.covariance) / 2)))
+        semi = semi_axis_deg(result.covariance)
         answers.append((float(angle_deg(result.normal, normal)), distance, semi))
 
 

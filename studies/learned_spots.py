@@ -190,7 +190,7 @@ def _table(rows: list[Row]) -> Iterator[str]:
 
 def _fifths(rows: list[Row]) -> Iterator[str]:
     """Yield the base's errors in five groups by stated deviation, by what the detection shows, by tilt."""
-    yield "| answers | n | stated deviation, deg | base: median, deg | 95 % below | inside its 95 % ellipse |"
+    yield "| answers | n | reported deviation, deg | base: median, deg | 95 % below | inside its 95 % ellipse |"
     yield "|---|---|---|---|---|---|"
     order = np.argsort([row.stated_deg for row in rows], kind="stable")
     names = ("surest fifth", "second", "third", "fourth", "least sure fifth")

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.realism.distance import NEAR, by_scene
+from simtest.realism.distance import NEAR, by_scene, quartiles
 from simtest.realism.fitting.bank import count_made, make_bank, read_bank
 from simtest.realism.fitting.fit import fit_to_bank, summarise_scenes
 from simtest.realism.fitting.frames import FrameMaker
@@ -67,8 +67,7 @@ def rows_of(real: dict[str, Measured], sets: dict[str, Measured]) -> Iterator[tu
 def quartile_rows(real: dict[str, Measured], sets: dict[str, Measured]) -> Iterator[str]:
     """Yield whether the median of the frames lies inside the real frames' quartiles."""
     for column in QUARTILED:
-        low, high = np.quantile(np.concatenate([v[column] for v in real.values()]), [0.25, 0.75])
-        middle = float(np.median(np.concatenate([v[column] for v in sets.values()])))
+        (low, _, high), (_, middle, _) = (quartiles(side, column) or (np.nan,) * 3 for side in (real, sets))
         yield f"{column}: median {middle:.3g}, real quartiles {low:.3g} to {high:.3g}, {low <= middle <= high}"
 
 

@@ -11,8 +11,6 @@ from simtest.runtime.files import write_json
 from simtest.spec import load_scene
 from simtest.spec.toml_files import toml_tables
 
-COMMITMENT = "5" * 64
-
 SUITE_TEXT = """
 name = "tiny"
 title = "Tiny"

@@ -2,21 +2,14 @@
 
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from simtest.advice.break_points import (
-    Confirmed,
-    SpotSize,
-    break_experiment,
-    break_points,
-    confirm,
-    spot_size,
-)
+from simtest.advice.break_points import BreakPoint, SpotSize, break_points, spot_size
 from simtest.advice.figures import Found, read_results
 from simtest.advice.plan import Question, main_experiment, surroundings, write_experiment
 from simtest.errors import InputError
@@ -29,8 +22,7 @@ from simtest.spec import Experiment, load_scene
 from simtest.spec.toml_files import toml_tables
 from simtest.validation.runner import run_experiments
 
-MAIN, BREAKS, SCENE, FRAME = "experiment.toml", "breaks.toml", "scene.toml", "frame.png"
-RUN, BREAKS_RUN = "run", "breaks"
+MAIN, SCENE, FRAME, RUN = "experiment.toml", "scene.toml", "frame.png", "run"
 
 Progress = Callable[[int, int, str], None]
 
@@ -45,8 +37,8 @@ class Advised:
         What was asked.
     found : Found
         Errors and answers in frames of the organ.
-    breaks : list of Confirmed
-        Break-points with their renders.
+    breaks : list of BreakPoint
+        Where methods fail, by the laws.
     spots : SpotSize
         Size of highlights by the laws.
     spot_radius_px : float or None
@@ -54,14 +46,14 @@ class Advised:
     picture : ndarray of uint8, shape (H, W, 3)
         A frame as the scope shows it.
     commands : dict
-        What makes each figure again: ``errors``, ``break_points``, ``picture``.
+        What makes each figure again: ``errors``, ``picture``.
     drawn : dict
         What is drawn, by key path, with its ends.
     """
 
     question: Question
     found: Found
-    breaks: list[Confirmed]
+    breaks: list[BreakPoint]
     spots: SpotSize
     spot_radius_px: float | None
     picture: Pixels
@@ -73,14 +65,14 @@ class Advised:
         asked, scope = self.question, self.question.scope
         question = {
             "scope": scope.name, **scope.tables, "organ": asked.organ,
-            "mesh": None if asked.mesh is None else str(asked.mesh), "distances_mm": asked.distances_mm,
+            "distances_mm": asked.distances_mm,
             "bound_deg": asked.bound_deg, "seed": asked.seed,
         }  # fmt: skip
         spots = {"smooth_px": self.spots.smooth_px, "relief_px": self.spots.relief_px,
                  "shapeless_beyond_mm": _finite(self.spots.shapeless_beyond_mm),
                  "rendered_px": self.spot_radius_px}  # fmt: skip
         return {"question": question, "drawn": self.drawn, **self.found.to_json(),
-                "break_points": [each.to_json() for each in self.breaks], "spot_radius": spots,
+                "break_points": [asdict(each) for each in self.breaks], "spot_radius": spots,
                 "commands": self.commands}  # fmt: skip
 
 
@@ -96,8 +88,8 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
     question : Question
         What is asked.
     out : Path
-        Folder; gets the files of the experiments and the scene, their runs, and frame.png. Runs that are there and
-        are the same are kept.
+        Folder; gets the files of the experiment and the scene, the run, and frame.png. A run that is there and is
+        the same is kept.
     progress : callable, optional
         Called with steps done, steps in all, and what is done.
     workers : int
@@ -112,11 +104,9 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
     """
     engine = make_engine(workers=workers)
     make_folder(out)
-    points = break_points(question)
-    written = [path for path in (out / MAIN, out / BREAKS, out / SCENE) if not path.exists()]
+    written = [path for path in (out / MAIN, out / SCENE) if not path.exists()]
     try:
         main = write_experiment(main_experiment(question), out / MAIN)
-        tests = write_experiment(break_experiment(question, points), out / BREAKS)
         # The frame first: what cannot be rendered is found before the long part.
         frame = make_frame(load_scene(write_scene(question, main, out / SCENE)))
     except InputError:
@@ -124,12 +114,12 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
             path.unlink(missing_ok=True)
         raise
     picture = np.asarray(np.round(255 * displayed(frame.image, frame.scene.sensor)), dtype=np.uint8)
-    runs = run_experiments([(main, out / RUN), (tests, out / BREAKS_RUN)], "", None, progress, engine)
-    results = runs[0].results
+    (run,) = run_experiments([(main, out / RUN)], "", None, progress, engine)
+    results = run.results
     count = sum(len(next(iter(table.values()))) for group in main.groups for table in group.pool) * main.realisations
     _write_picture(out / FRAME, picture)
     return Advised(
-        question, read_results(results, count), confirm(points, runs[1].results), spot_size(question),
+        question, read_results(results, count), break_points(question), spot_size(question),
         _median_radius(results), picture, _commands(out),
         surroundings(question).random,
     )  # fmt: skip
@@ -138,11 +128,7 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
 def write_scene(question: Question, main: Experiment, path: Path) -> Path:
     """Write the scene of the picture: the organ itself, with its vessels, through the scope; return its path."""
     group = main.groups[0]
-    if question.mesh is not None:
-        surface: dict[str, Any] = dict(group.set["surface"])
-    else:
-        surface = _organ_surface(question, group.set["surface"])
-    settings = {**group.set, "surface": surface}
+    settings = {**group.set, "surface": _organ_surface(question, group.set["surface"])}
     # The colours of the frames that are measured have no vessels.
     settings.pop("reflectance.albedo", None)
     described = load_scene(question.kind.scene, settings)
@@ -185,6 +171,5 @@ def _commands(out: Path) -> dict[str, str]:
 
     return {
         "errors": words("validate", out / MAIN, "--out", out / RUN),
-        "break_points": words("validate", out / BREAKS, "--out", out / BREAKS_RUN),
         "picture": words("render", out / SCENE, "--out", out / "frame"),
     }

@@ -47,7 +47,7 @@ def write_advice(found: Advised, out: Path, command: str = "") -> Path:
     html = environment().get_template("advice.html.j2").render(
         found=found, answers=[sentence(found, choice) for choice in found.found.choices] or [NOTHING],
         chart=chart, picture=pixels.data_address(found.picture, PICTURE_HEIGHT_PX), command=command,
-        narrower=narrower(found, command),
+        narrower=narrower(found, command), distances=DISTANCES,
         interval=interval, surfaces=_SURFACES,
         parts=list(dict.fromkeys(name for each in found.found.methods for name in each.budget_deg)),
         provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"], "python": made_by["python"]},

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from simtest.advice.draws import drawn_values, in_free_space
-from simtest.advice.organs import ORGANS, Organ, Surroundings, is_smooth, rough, wall
+from simtest.advice.organs import ORGANS, Organ, Surroundings, is_smooth, wall
 from simtest.advice.scope import Interval, Scope
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
@@ -36,9 +36,6 @@ BUDGET_S = 140.0
 ROUGH_S, SMOOTH_S = (0.6, 5.0), (0.35, 2.5)
 """Processor time of a frame of a wall with relief, and of one without: so much, and so much more a million pixels."""
 
-FIRST_VIEWPOINT = 1000
-"""Number of a mesh's first viewpoint: scenes that are shown begin at 0."""
-
 SAMPLES = 4
 """Rays a pixel."""
 
@@ -59,8 +56,6 @@ class Question:
         One of `ORGANS`.
     distances_mm : (float, float)
         Range of the wall's distance along the optical axis, mm.
-    mesh : Path, optional
-        Mesh, mm, that the frames show in place of the organ's wall; the distances are then its viewpoints' own.
     bound_deg : float
         Error beyond which a method counts as broken.
     frames : int, optional
@@ -77,7 +72,6 @@ class Question:
     scope: Scope
     organ: str = "colon"
     distances_mm: Interval = (20.0, 60.0)
-    mesh: Path | None = None
     bound_deg: float = 5.0
     frames: int | None = None
     seed: int = 0
@@ -86,8 +80,6 @@ class Question:
         if self.organ not in ORGANS:
             known = ", ".join(ORGANS)
             raise InputError(f"--organ {shown(self.organ)}: unknown; organs: {known}{suggestion(self.organ, ORGANS)}")
-        if self.mesh is not None and not self.mesh.is_file():
-            raise InputError(f"--mesh {shown(self.mesh)}: no such file; must be a mesh, mm: PLY, OBJ, STL or VTK")
         near, far = self.distances_mm
         for value in (near, far):
             check_number("--distances", value, above=0)
@@ -116,8 +108,8 @@ class Question:
 
     @property
     def per_distance(self) -> int:
-        """Frames at each distance."""
-        return max(1, round((self.frames or affordable(self)) / DISTANCES))
+        """Frames at each distance: as many at each, so that there are at least as many in all as asked for."""
+        return math.ceil((self.frames or affordable(self)) / DISTANCES)
 
     @property
     def middle_mm(self) -> float:
@@ -133,7 +125,7 @@ class Question:
     def title(self) -> str:
         """What is asked, as one phrase."""
         near, far = self.distances_mm
-        return f"{self.scope.name}, {self.mesh.name if self.mesh else self.organ}, {near:g} to {far:g} mm"
+        return f"{self.scope.name}, {self.organ}, {near:g} to {far:g} mm"
 
 
 def affordable(question: Question) -> int:
@@ -158,33 +150,22 @@ def estimators_of(scope: Scope) -> tuple[str, ...]:
 
 def surroundings(question: Question) -> Surroundings:
     """Return what the frames set of the surface, and what is drawn for each of them."""
-    relief = question.scope.relief
-    if question.mesh is None:
-        return wall(question.kind, relief, question.view_mm)
-    held, drawn = rough(question.kind, relief)
-    surface = {"type": "anatomy", "path": str(question.mesh.resolve())}
-    if "surface.relief" in held:
-        surface["relief"] = held.pop("surface.relief")
-    return Surroundings({"surface": surface, **held}, drawn)
+    return wall(question.kind, question.scope.relief, question.view_mm)
 
 
 def main_experiment(question: Question) -> Experiment:
     """Return the experiment whose results are the expected errors; its name is that of its file."""
-    around, frames = surroundings(question), question.per_distance * DISTANCES
-    told = seen_through(question)
-    pool: dict[str, Any] = {"surface.viewpoint": list(range(FIRST_VIEWPOINT, FIRST_VIEWPOINT + frames))}
+    around, told = surroundings(question), seen_through(question)
     values = drawn_values(around, question.seed, question.per_distance, DISTANCES)
-    if question.mesh is None:
-        # Each distance once, then all again.
-        distances = distances_of(question) * question.per_distance
-        scene = load_scene(question.kind.scene, {**around.set, **told})
-        values = in_free_space(values, scene, distances, around.random, question.seed)
-        pool = {"surface.distance_mm": distances}
+    # Each distance once, then all again.
+    distances = distances_of(question) * question.per_distance
+    scene = load_scene(question.kind.scene, {**around.set, **told})
+    values = in_free_space(values, scene, distances, around.random, question.seed)
     group = {
-        "scene": question.kind.scene, "label": question.mesh.stem if question.mesh else question.organ,
+        "scene": question.kind.scene, "label": question.organ,
         # Whatever is found gets an answer, not isolated highlights alone.
         "isolated": False,
-        "set": {**around.set, **told}, "pool": [pool | values],
+        "set": {**around.set, **told}, "pool": [{"surface.distance_mm": distances} | values],
     }  # fmt: skip
     return Experiment.model_validate({
         "name": "experiment", "title": f"Advice: {question.title}", "realisations": 1, "seed": question.seed,

@@ -130,12 +130,7 @@ def ends(value: float | Interval) -> Interval:
     return value if isinstance(value, tuple) else (value, value)
 
 
-def read_scope(
-    name: str,
-    camera: Path | None = None,
-    fov_deg: float | None = None,
-    lights_mm: Sequence[Sequence[float]] | None = None,
-) -> Scope:
+def read_scope(name: str, camera: Path | None = None) -> Scope:
     """Read a scope.
 
     Parameters
@@ -145,27 +140,16 @@ def read_scope(
         In ``[rig]``, ``lights_mm`` may give the positions alone, as in a calibration file.
     camera : Path, optional
         Camera file that replaces the scope's camera.
-    fov_deg : float, optional
-        Horizontal field of view, deg: that of a pinhole of the scope's size, which replaces its camera.
-    lights_mm : sequence, optional
-        Positions of the lights, camera frame, mm, which replace the scope's.
 
     Raises
     ------
     InputError
         If there is no such scope, or something does not fit.
     """
-    if camera is not None and fov_deg is not None:
-        raise InputError("--camera and --fov exclude each other; give one of them")
     scope = _named(name)
-    tables = dict(scope.tables)
-    if camera is not None:
-        tables["camera"] = dict(camera_table(load_camera(camera)))
-    if fov_deg is not None:
-        tables["camera"] = dict(camera_table(Camera.from_fov(fov_deg, *scope.size)))
-    if lights_mm:
-        tables["rig"] = _listed(lights_mm, "--light")
-    return replace(scope, tables=tables)
+    if camera is None:
+        return scope
+    return replace(scope, tables={**scope.tables, "camera": dict(camera_table(load_camera(camera)))})
 
 
 def _named(name: str) -> Scope:

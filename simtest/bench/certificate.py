@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.bench.certificate_form import CertificateForm
-from simtest.bench.suite import SUITES, Suite, digest_of
+from simtest.bench.suite import SUITES, Suite, digest_of, layout_of
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.files import JsonObject, require_plain, write_json
@@ -17,7 +17,7 @@ from simtest.spec.spec_model import validate
 
 CERTIFICATE = "certificate.json"
 KIND = "simtest-bench certificate"
-FORMAT = 1
+FORMAT = 2
 
 OF_CERTIFICATE = "sha256"
 """Key of the hash of everything else."""
@@ -52,12 +52,6 @@ class Certificate:
     def parts(self) -> dict[str, JsonObject]:
         """Figures by part."""
         return dict(self.content["parts"])
-
-    @property
-    def commitment(self) -> str | None:
-        """Commitment to the sealed seeds; None where the seeds are public."""
-        held = self.content["seeds"].get("commitment")
-        return None if held is None else str(held)
 
 
 def environment() -> JsonObject:
@@ -134,7 +128,7 @@ def _parsed(text: str) -> Any:
 
 
 def check_suite(certificate: Certificate, suite: Suite) -> None:
-    """Raise `InputError` where a certificate is of other cases than a suite's."""
+    """Raise `InputError` where a certificate is of other cases or scenes than a suite's."""
     told = certificate.content["suite"]
     if told.get("version") != suite.version:
         own = SUITES.get(suite.version, suite.version)
@@ -152,3 +146,8 @@ def check_suite(certificate: Certificate, suite: Suite) -> None:
             )
     if told.get("sha256") != suite.digest:
         raise InputError(f"{shown(certificate.path)}: its suite's hash is not that of {SUITES[suite.version]}")
+    for part, figures in certificate.parts.items():
+        layout = {case: scenes for case, (scenes, _) in layout_of(suite, part).items()}
+        if {case: len(held) for case, held in figures["scenes"].items()} != layout:
+            wanted = ", ".join(f"{count} of {case}" for case, count in layout.items())
+            raise InputError(f"{shown(certificate.path)}: parts.{part}.scenes: must be {wanted}")

@@ -1,4 +1,4 @@
-"""The form of a certificate's content: what the table and a verification read. A stranger may have written it."""
+"""The form of a certificate's content: what the table reads."""
 
 from typing import Annotated, Literal
 
@@ -36,20 +36,6 @@ class SuiteForm(Form):
     name: Text
     version: Text
     sha256: Hash
-
-
-class SeedsForm(Form):
-    """Public seeds, or the commitment to sealed ones."""
-
-    kind: Literal["public", "sealed"]
-    seed: Annotated[int, Field(ge=0, lt=2**63)] | None = None
-    commitment: Hash | None = None
-
-    @model_validator(mode="after")
-    def _one_of_them(self) -> "SeedsForm":
-        if (self.seed is None, self.commitment is None) != ((False, True) if self.kind == "public" else (True, False)):
-            raise ValueError(f"kind = {self.kind}: public seeds have a seed, sealed ones a commitment")
-        return self
 
 
 class ProgramForm(Form):
@@ -168,22 +154,6 @@ class OverallForm(Form):
     score_interval: Interval | None
 
 
-class RequestForm(Form):
-    """How long a request took."""
-
-    unit: Literal["highlight", "frame"]
-    n: Count
-    median_ms: Figure | None
-    max_ms: Figure | None
-
-
-class TimingForm(Form):
-    """What is of the machine alone."""
-
-    request: RequestForm
-    parts_s: dict[Text, Figure] = Field(default_factory=dict)
-
-
 class CertificateForm(Form):
     """The whole content, without its own hash."""
 
@@ -191,9 +161,7 @@ class CertificateForm(Form):
     format: int
     suite: SuiteForm
     cases: dict[str, Hash]
-    seeds: SeedsForm
     core: CoreForm
     environment: EnvironmentForm
     parts: Annotated[dict[str, PartForm], Field(min_length=1)]
     overall: OverallForm
-    timing: TimingForm

@@ -1,8 +1,7 @@
-"""From a suite and its seeds to experiments: which scenes and frames a part has."""
+"""From a suite and its seed to experiments: which scenes and frames a part has."""
 
 import hashlib
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 from simtest.bench.suite import CaseSpec, Draw, Suite
@@ -13,30 +12,10 @@ DIGITS = 6
 """Of a drawn value: mathematical libraries differ in the last ones."""
 
 
-@dataclass(frozen=True)
-class Seeds:
-    """Where the randomness of a run comes from.
-
-    Parameters
-    ----------
-    root : str
-        Text that all seeds hang on: the public seed, or a secret.
-    commitment : str or None
-        Of a secret (`simtest.bench.seal`); None where the seeds are public.
-    """
-
-    root: str
-    commitment: str | None = None
-
-    def of_part(self, suite: Suite, part: str) -> int:
-        """Return the seed of a part, in [0, 2^63)."""
-        text = f"{suite.spec.name} {suite.version} | {part} | {self.root}"
-        return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
-
-
-def public_seeds(suite: Suite) -> Seeds:
-    """Return the seeds that stand in the repository."""
-    return Seeds(str(suite.spec.seed))
+def part_seed(suite: Suite, part: str) -> int:
+    """Return the seed of a part, in [0, 2^63)."""
+    text = f"{suite.spec.name} {suite.version} | {part} | {suite.spec.seed}"
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
 
 def experiment_name(suite: Suite, part: str) -> str:
@@ -44,12 +23,12 @@ def experiment_name(suite: Suite, part: str) -> str:
     return f"{suite.spec.name}-{suite.version}-{part}"
 
 
-def experiment_of(suite: Suite, part: str, core: str, seeds: Seeds) -> Experiment:
+def experiment_of(suite: Suite, part: str, core: str) -> Experiment:
     """Return a part as an experiment of one estimator.
 
     Each drawn scene is a pooled value of its case, so that a case is one setting of the results.
     """
-    seed, name = seeds.of_part(suite, part), experiment_name(suite, part)
+    seed, name = part_seed(suite, part), experiment_name(suite, part)
     groups = []
     for case in suite.of_part(part):
         pool = pooled(seed, name, case.spec)

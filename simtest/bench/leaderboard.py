@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from simtest.bench.certificate import CERTIFICATE, Certificate, check_suite, read_certificate
-from simtest.bench.phrases import COLUMNS, NONE, degrees, part_cells, spanned
+from simtest.bench.phrases import COLUMNS, NONE, part_cells, spanned
 from simtest.bench.ranking import ALPHA, CAP_DEG, rank
 from simtest.bench.run import parts_of_overall
 from simtest.bench.suite import Suite
-from simtest.bench.verified import mark_of
-from simtest.bench.verify import check_quick
 from simtest.errors import InputError
 from simtest.pages.html import environment
 from simtest.runtime import provenance
@@ -43,32 +41,24 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Board:
-    """The certificates of one set of seeds, ranked over all parts and by part.
+    """Certificates, ranked over all parts and by part.
 
     Parameters
     ----------
-    seeds : str
-        "public seed N", or the commitment.
     overall : list of Ranked
         By the mean of the parts' scores.
     parts : dict
         By each part's score.
-    verified : dict
-        Whether certificates that were run again hold, by their hashes.
     """
 
-    seeds: str
     overall: list[Ranked]
     parts: dict[str, list[Ranked]]
-    verified: dict[str, bool]
 
     def to_json(self) -> JsonObject:
         """Return the ranks by core."""
         return {
-            "seeds": self.seeds,
             "overall": _names(self.overall),
             "parts": {part: _names(rows) for part, rows in self.parts.items()},
-            "verified": {_name(row.certificate): mark_of(row.certificate, self.verified) for row in self.overall},
         }
 
     @property
@@ -97,29 +87,23 @@ def _name(certificate: Certificate) -> str:
     return f"{certificate.core['name']} {certificate.core['version'] or ''}".strip()
 
 
-def read_entries(folder: Path, suite: Suite, verified: dict[str, bool] | None = None) -> list[Board]:
-    """Read the certificates below a folder and rank them; those of different seeds are ranked apart.
-
-    `verified` says which of them hold after a run again (`simtest.bench.verified`).
+def read_entries(folder: Path, suite: Suite) -> Board:
+    """Read the certificates below a folder and rank them.
 
     Raises
     ------
     InputError
-        If there are none, or one was altered, is inconsistent, or is of another version.
+        If there are none, or one was altered, is malformed, or is of another version.
     """
     if not folder.is_dir():
         raise InputError(f"{shown(folder)}: must be a folder that holds certificates")
     files = sorted(file for file in folder.rglob("*.json") if _is_certificate(file))
     if not files or len(files) > MOST_CERTIFICATES:
         raise InputError(f"{shown(folder)}: holds {len(files)} certificates; must be 1 to {MOST_CERTIFICATES}")
-    entries: dict[str, list[Certificate]] = {}
-    for file in files:
-        certificate = read_certificate(file)
+    certificates = [read_certificate(file) for file in files]
+    for certificate in certificates:
         check_suite(certificate, suite)
-        if problems := check_quick(certificate, suite).problems:
-            raise InputError(f"{shown(file)}: {problems[0]}")
-        entries.setdefault(_seeds(certificate), []).append(certificate)
-    return [_board(suite, seeds, held, verified or {}) for seeds, held in sorted(entries.items())]
+    return _board(suite, certificates)
 
 
 def _is_certificate(file: Path) -> bool:
@@ -133,12 +117,7 @@ def _is_certificate(file: Path) -> bool:
         return False
 
 
-def _seeds(certificate: Certificate) -> str:
-    told = certificate.content["seeds"]
-    return f"public seed {told['seed']}" if certificate.commitment is None else f"sealed, {certificate.commitment}"
-
-
-def _board(suite: Suite, seeds: str, certificates: list[Certificate], verified: dict[str, bool]) -> Board:
+def _board(suite: Suite, certificates: list[Certificate]) -> Board:
     def score_on(part: str) -> Figure:
         return lambda certificate: certificate.parts[part]["score_deg"]
 
@@ -150,7 +129,7 @@ def _board(suite: Suite, seeds: str, certificates: list[Certificate], verified: 
         if any(part.name in entry.parts for entry in certificates)
     }
     overall = ranked(certificates, parts_of_overall(suite), lambda entry: entry.content["overall"]["score_deg"])
-    return Board(seeds, overall, parts, verified)
+    return Board(overall, parts)
 
 
 def ranked(certificates: list[Certificate], parts: Sequence[str], score: Figure) -> list[Ranked]:
@@ -167,13 +146,13 @@ def ranked(certificates: list[Certificate], parts: Sequence[str], score: Figure)
     return held + [Ranked(entry, None, None) for entry in order[len(scored) :]]
 
 
-def write_leaderboard(suite: Suite, boards: list[Board], out: Path) -> Path:
+def write_leaderboard(suite: Suite, board: Board, out: Path) -> Path:
     """Write the page of ranked certificates; `out` is an HTML file, or a folder that gets index.html."""
     page = out if out.suffix == ".html" else out / PAGE
     make_folder(page.parent)
     made_by = provenance.environment()
     html = environment().get_template("leaderboard.html.j2").render(
-        suite=suite, boards=boards, columns=COLUMNS, cells=part_cells, headline=_headline, about=_about, mark=mark_of,
+        suite=suite, board=board, columns=COLUMNS, cells=part_cells, headline=_headline, about=_about,
         cap=f"{CAP_DEG:g}", risk=f"{100 * ALPHA:g}",
         provenance={"commit": made_by["commit"] or NONE, "simtest": made_by["version"]},
     )  # fmt: skip
@@ -189,12 +168,10 @@ def _headline(certificate: Certificate) -> str:
 def _about(certificate: Certificate) -> dict[str, Any]:
     """Return what a row tells of the core and its machine."""
     told, core = certificate.content, certificate.core
-    request = told["timing"]["request"]
     return {
         "name": core["name"],
         "version": core["version"] or NONE,
         "hash": (core["sha256"] or "")[:12],
         "processor": told["environment"]["processor"],
-        "time": NONE if request["median_ms"] is None else f"{degrees(request['median_ms'])} ms a {request['unit']}",
         "verdicts": {part: figures["uncertainty"]["verdict"] for part, figures in certificate.parts.items()},
     }

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from simtest.bench.draws import Seeds, experiment_of
+from simtest.bench.draws import experiment_of
 from simtest.bench.suite import Layout, Suite, digest_of, layout_of
 from simtest.bench.uncertainty import UNTESTED, UncertaintyScore
 from simtest.dataset.export import check_exportable, export_run
@@ -33,17 +33,15 @@ OF_RUN = "brightest_point"
 """The quickest estimator: the run is there for its frames."""
 
 
-def export_frames(
-    suite: Suite, folder: Path, seeds: Seeds, engine: Engine | None = None, progress: Progress | None = None
-) -> Path:
-    """Write the frames of the dense part without their truth; return the folder that a stranger gets.
+def export_frames(suite: Suite, folder: Path, engine: Engine | None = None, progress: Progress | None = None) -> Path:
+    """Write the frames of the dense part without their truth; return their folder.
 
     Raises
     ------
     InputError
         If the folder holds something else.
     """
-    experiment = experiment_of(suite, PART, OF_RUN, seeds)
+    experiment = experiment_of(suite, PART, OF_RUN)
     check_exportable(experiment)
     chosen = engine or make_engine()
     (run,) = run_experiments([(experiment, folder / RUN)], "", None, progress, chosen)
@@ -52,14 +50,14 @@ def export_frames(
 
 
 def score_dense(
-    suite: Suite, maps: str | Path, folder: Path, seeds: Seeds, options: MapOptions | None = None,
+    suite: Suite, maps: str | Path, folder: Path, options: MapOptions | None = None,
     engine: Engine | None = None, progress: Progress | None = None,
 ) -> tuple[DenseScore, JsonObject]:  # fmt: skip
     """Score maps on the frames of the dense part; return the whole score, and the part's figures for a certificate.
 
     Parameters
     ----------
-    suite, seeds, engine, progress
+    suite, engine, progress
         As of `simtest.bench.run.run_bench`.
     maps : str or Path
         Folder of the maps, each called as its frame, or "shading".
@@ -68,7 +66,7 @@ def score_dense(
     options : MapOptions, optional
         What is stated of the maps.
     """
-    export_frames(suite, folder, seeds, engine, progress)
+    export_frames(suite, folder, engine, progress)
 
     def tell(done: int, total: int, what: str) -> None:
         if progress:
@@ -123,16 +121,9 @@ def _scene_sums(score: DenseScore, source: str, layout: Layout) -> JsonObject:
 
 
 def stated_record(options: MapOptions | None) -> JsonObject:
-    """Return what was stated of the maps, null where it was found out: a verification must read them alike."""
+    """Return what was stated of the maps, null where it was found out."""
     stated = vars(options or MapOptions())
     return {key: stated[key] for key in STATED}
-
-
-def stated_options(name: str, told: JsonObject) -> MapOptions:
-    """Return the options of a method's maps from the figures of its part (`stated_record`)."""
-    stated = told.get("stated")
-    held = stated if isinstance(stated, dict) else {}
-    return MapOptions(name, *(held.get(key) for key in STATED))
 
 
 def _zone(score: DenseScore, source: str, label: str) -> JsonObject:

@@ -14,8 +14,8 @@ another only where three things agree:
    sections 2.11, 5.6 and 6.11), and its degrees of freedom are Satterthwaite's. The level is Bonferroni's over all
    pairs of a table: `ALPHA` is the stated risk that a table of one part holds any order that new scenes would not
    confirm.
-3. **The margin.** The difference must exceed what a verification lets both figures move, 5 % of each and 0.001 deg
-   (`simtest.bench.compare`). What is smaller, a run on another processor may turn round.
+3. **The margin.** The difference must exceed what another processor may move both figures by, 5 % of each and 0.001 deg
+   (`FIGURES`, `MEDIAN_DEG`): what is smaller, a run there may turn round.
 
 Two cores that neither is ranked above the other are tied.
 """
@@ -26,11 +26,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from simtest.bench.compare import FIGURES, MEDIAN_DEG
 from simtest.runtime.arrays import Array
 
 CAP_DEG = 10.0
 """What a highlight counts at most, deg, and what a refused or missed one counts."""
+
+FIGURES, MEDIAN_DEG = 0.05, 1e-3
+"""Share of itself, and deg, by which another processor may move a score: contours change their topology."""
 
 ALPHA = 0.05
 """Risk that a table of one part holds any order beyond the margin that is not so."""
@@ -117,20 +119,8 @@ def rank(parts: Sequence[Part], alpha: float = ALPHA) -> Ranking:
 
 
 def margin(first: Array, second: Array) -> Array:
-    """Return how far two scores must lie apart, deg: what a verification lets both move."""
+    """Return how far two scores must lie apart, deg: what another processor may move both by."""
     return np.asarray(2 * MEDIAN_DEG + FIGURES * (first + second))
-
-
-def agreement(first: IntMatrix, second: IntMatrix) -> float:
-    """Return Kendall's tau-b of two tables' pairs; tied pairs count in its norm alone (NaN where all are tied).
-
-    It is the correlation of the pairs' signs (Daniels 1944, Biometrika 33), which needs no ranks: "tied" is not
-    transitive.
-    """
-    upper = np.triu_indices(len(first), 1)
-    one, other = first[upper].astype(float), second[upper].astype(float)
-    norm = np.sqrt(np.count_nonzero(one) * np.count_nonzero(other))
-    return float(one @ other / norm) if norm else float("nan")
 
 
 def _residuals(part: Part) -> tuple[Array, list[Array]]:

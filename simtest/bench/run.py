@@ -1,15 +1,14 @@
 """Runs the benchmark: each part by the ordinary runner, then the figures and the certificate."""
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from simtest.bench.certificate import FORMAT, KIND, cases_of, environment, suite_record, write_certificate
-from simtest.bench.cores import check_core, core_record, time_core
-from simtest.bench.draws import Seeds, experiment_of
+from simtest.bench.cores import check_core, core_record
+from simtest.bench.draws import experiment_of
 from simtest.bench.scores import score_part
 from simtest.bench.suite import Suite, layout_of
 from simtest.errors import InputError
@@ -64,7 +63,6 @@ def run_bench(
     suite: Suite,
     core: str,
     folder: Path,
-    seeds: Seeds,
     parts: Sequence[str] | None = None,
     engine: Engine | None = None,
     progress: Progress | None = None,
@@ -80,8 +78,6 @@ def run_bench(
         An installed estimator, or a command.
     folder : Path
         Gets a run's folder for each part, and certificate.json.
-    seeds : Seeds
-        Public or sealed.
     parts : sequence of str, optional
         Default all that are scored by highlights.
     engine, progress, variant
@@ -97,23 +93,18 @@ def run_bench(
     told = core_record(core)
     make_folder(folder)
     scores: dict[str, JsonObject] = {}
-    durations: dict[str, float] = {}
     for part in chosen:
-        clock = time.monotonic()
-        experiment = experiment_of(suite, part, core, seeds)
+        experiment = experiment_of(suite, part, core)
         # Part by part: the colours that one part needs are not those that another is rendered in.
         (run,) = run_experiments([(experiment, folder / part)], "", variant, progress, engine)
-        durations[part] = round(time.monotonic() - clock, 1)
         scores[part] = score_part(run.results, layout_of(suite, part)).to_json()
-    timing: JsonObject = {"parts_s": durations, "request": time_core(suite, chosen[0], core, seeds, variant)}
-    return _certified(suite, seeds, folder, told, scores, timing)
+    return _certified(suite, folder, told, scores)
 
 
 def run_maps(
     suite: Suite,
     maps: str | Path,
     folder: Path,
-    seeds: Seeds,
     options: "MapOptions | None" = None,
     engine: Engine | None = None,
     progress: Progress | None = None,
@@ -124,38 +115,24 @@ def run_maps(
     """
     from simtest.bench.maps import PART, maps_record, score_dense
 
-    clock = time.monotonic()
     make_folder(folder)
-    score, figures = score_dense(suite, maps, folder / PART, seeds, options, engine, progress)
-    durations = {PART: round(time.monotonic() - clock, 1)}
-    timing: JsonObject = {"parts_s": durations, "request": {"unit": "frame", "n": 0, "median_ms": None, "max_ms": None}}
-    return _certified(suite, seeds, folder, maps_record(maps, score), {PART: figures}, timing)
+    score, figures = score_dense(suite, maps, folder / PART, options, engine, progress)
+    return _certified(suite, folder, maps_record(maps, score), {PART: figures})
 
 
-def _certified(
-    suite: Suite, seeds: Seeds, folder: Path, core: JsonObject, scores: dict[str, JsonObject], timing: JsonObject
-) -> BenchRun:
+def _certified(suite: Suite, folder: Path, core: JsonObject, scores: dict[str, JsonObject]) -> BenchRun:
     """Write the certificate of a run's figures by part."""
     content: JsonObject = {
         "kind": KIND,
         "format": FORMAT,
         "suite": suite_record(suite),
         "cases": cases_of(suite, scores),
-        "seeds": _seeds_record(suite, seeds),
         "core": core,
         "environment": environment(),
         "parts": scores,
         "overall": overall_of(suite, scores),
-        # Of this machine; nothing that a verification compares.
-        "timing": timing,
     }
     return BenchRun(write_certificate(folder, content), content)
-
-
-def _seeds_record(suite: Suite, seeds: Seeds) -> JsonObject:
-    if seeds.commitment is None:
-        return {"kind": "public", "seed": suite.spec.seed}
-    return {"kind": "sealed", "commitment": seeds.commitment}
 
 
 def overall_of(suite: Suite, parts: "dict[str, JsonObject]") -> JsonObject:

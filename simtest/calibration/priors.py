@@ -52,8 +52,8 @@ class CameraPrior:
     centre_sd_px : float
         Standard deviation of the principal point along each axis, px.
     distortion_sd : float
-        Standard deviation of a radial distortion k1 that is left out: it moves a point at r focal lengths from the
-        principal point by k1 r^3 focal lengths.
+        Standard deviation of the radial distortion k1, about that of a given lens or none: an error of it moves a point
+        at r focal lengths from the principal point by k1 r^3 focal lengths.
     guessed : bool
         Whether these are guesses, because nobody stated them. It changes no estimate and does not count in comparisons.
 

@@ -22,11 +22,6 @@ def _numbers(_: Any, tokens: Sequence[Token]) -> tuple[float, ...]:
         raise ValueError(f"{tokens[0].value!r}: must be numbers separated by commas, such as 20,60") from None
 
 
-def _positions(_: Any, tokens: Sequence[Token]) -> list[tuple[float, ...]]:
-    """Convert a repeated option to positions."""
-    return [_numbers(None, [token]) for token in tokens]
-
-
 def advise(
     rig: str,
     /,
@@ -40,26 +35,16 @@ def advise(
             negative="", converter=_numbers, n_tokens=1, allow_leading_hyphen=True,
         ),
     ] = (20.0, 60.0),
-    mesh: Annotated[
-        Path | None,
-        Parameter(help="Mesh in mm whose viewpoints take the place of the organ's wall.", converter=named_path),
-    ] = None,
     camera: Annotated[
         Path | None, Parameter(help="Camera file in place of the scope's camera.", converter=named_path)
     ] = None,
-    fov: Annotated[
-        float | None, Parameter(help="Horizontal field of view, deg, of a pinhole in place of the scope's camera.")
-    ] = None,
-    lights: Annotated[
-        list[tuple[float, ...]] | None,
-        Parameter(
-            name="--light", negative="", help="Position x,y,z of a light, camera frame, mm; may be repeated.",
-            converter=_positions, n_tokens=1, allow_leading_hyphen=True,
-        ),
-    ] = None,
     bound: Annotated[float, Parameter(help="Error beyond which a method counts as broken, deg.")] = 5.0,
     frames: Annotated[
-        int | None, Parameter(help="Frames of the organ; default as many as two minutes allow.", converter=whole_number)
+        int | None,
+        Parameter(
+            help="Frames of the organ, rounded up to as many at each of 8 distances; default what two minutes allow.",
+            converter=whole_number,
+        ),
     ] = None,
     seed: Seed = None,
     workers: Annotated[int, Parameter(help="Processes that work at once.", converter=whole_number)] = 2,
@@ -86,8 +71,8 @@ def advise(
 
     if len(distances) != 2:
         raise InputError(f"--distances: {len(distances)} numbers; must be two, the nearest and the farthest, mm")
-    scope = read_scope(rig, camera, fov, lights)
-    question = Question(scope, organ, (distances[0], distances[1]), mesh, bound, frames, seed or 0)
+    scope = read_scope(rig, camera)
+    question = Question(scope, organ, (distances[0], distances[1]), bound, frames, seed or 0)
     command = shlex.join(["simtest", *sys.argv[1:]])
     with exclusive_folder(out), progress_bar("writing the page") as progress:
         found = run(question, out, progress, workers)
@@ -101,6 +86,7 @@ def advise(
 
 def _print(found: "Advised") -> None:
     from simtest.advice.page import NOTHING, interval, sentence
+    from simtest.advice.plan import DISTANCES
     from simtest.cli.printing import print_lines, print_table
     from simtest.pages.style import number
 
@@ -111,10 +97,11 @@ def _print(found: "Advised") -> None:
     ]  # fmt: skip
     columns = ("method", "states", "answered", "error, fine", "95 % interval", "error, base", "95 % interval")
     print_table(columns, rows)
+    print(f"{found.found.frames} frames, {found.question.per_distance} at each of {DISTANCES} distances")
     breaks = [
-        (b.point.title, b.point.method, f"{b.point.quantity} {number(b.point.value)} {b.point.unit}".strip(),
-         "refuses" if b.point.expected is None else number(b.point.expected), number(b.rendered.mean_deg), b.verdict)
+        (b.title, b.method, f"{b.quantity} {number(b.value)} {b.unit}".strip(),
+         "refuses" if b.expected is None else number(b.expected))
         for b in found.breaks
     ]  # fmt: skip
-    print_table(("what breaks", "method", "at", "law, deg", "rendered, deg", "verdict"), breaks)
+    print_table(("what breaks", "method", "at", "law, deg"), breaks)
     print_lines([sentence(found, choice) for choice in found.found.choices] or [NOTHING])

@@ -33,7 +33,7 @@ COMMANDS = {
     "validate": "Run an experiment and write its report.",
     "score": "Score normals that were estimated elsewhere on exported frames.",
     "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
-    "bench": "Run the frozen benchmark, verify its certificates, make a table of them.",
+    "bench": "Run the frozen benchmark, make a table of its certificates.",
     "dataset": "Make a labelled dataset for learning, check it, look at it.",
     "train": "Train a network on a dataset.",
     "camera": "Show what a camera file means, or convert it to another program's format.",

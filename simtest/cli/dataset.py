@@ -11,7 +11,10 @@ dataset = App(name="dataset", help="Make a labelled dataset for learning, check 
 
 Folder = Annotated[Path, Parameter(help="The dataset's folder.", converter=named_path)]
 Settings = Annotated[list[str] | None, replacing("samples_per_anatomy=5 or sensor.noise_sigma=0")]
-Variant = Annotated[str | None, Parameter(help="llvm (default), cuda on an NVIDIA GPU, or a Mitsuba variant by name.")]
+Variant = Annotated[
+    str | None,
+    Parameter(help="llvm, cuda on an NVIDIA GPU, or a Mitsuba variant by name; default SIMTEST_VARIANT, else llvm."),
+]
 Samples = Annotated[int | None, Parameter(help="Number of samples; default the file's.", converter=whole_number)]
 
 
@@ -50,8 +53,7 @@ def make(
     }
     wanted = load_dataset(described, values)
     with progress_bar("writing the tables") as progress:
-        gpu = variant is not None and needs_gpu(variant)
-        chosen = make_engine(engine, workers, address, gpu, SHARDS_PER_PROCESS)
+        chosen = make_engine(engine, workers, address, needs_gpu(variant), SHARDS_PER_PROCESS)
         write_dataset(wanted, out, chosen, variant, progress)
     print_files([out / "README.md"], as_json, dataset=wanted.name, samples=wanted.samples)
 

@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from simtest.cli.options import AsJson, named_path, replacing, whole_number
+from simtest.cli.options import AsJson, named_path, replacing, seed_number
 
 mesh = App(name="mesh", help="Check a mesh of yours, or make a colon or liver from its recipe.")
 
-Seed = Annotated[int | None, Parameter(help="Seed of the shape; default the recipe's.", converter=whole_number)]
+Seed = Annotated[int | None, Parameter(help="Seed of the shape; default the recipe's.", converter=seed_number)]
 
 
 @mesh.command

@@ -19,6 +19,14 @@ def whole_number(_: Any, tokens: Sequence[Token]) -> int:
         raise ValueError(f"{tokens[0].value} is not a whole number") from None
 
 
+def seed_number(_: Any, tokens: Sequence[Token]) -> int:
+    """Convert an option to a seed, which files hold in signed 64 bits."""
+    seed = whole_number(_, tokens)
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"{seed} is no seed; must be a whole number from 0 to {2**63 - 1}")
+    return seed
+
+
 def named_path(_: Any, tokens: Sequence[Token]) -> Path:
     """Convert an option to a path; an empty one would be the current folder, which nobody has named."""
     if not tokens[0].value.strip():
@@ -105,7 +113,7 @@ Views = Annotated[
     int | None,
     Parameter(help="Viewpoints of each group that varies them, the first ones; default all.", converter=whole_number),
 ]
-Seed = Annotated[int | None, Parameter(help="Seed of the run.", converter=whole_number)]
+Seed = Annotated[int | None, Parameter(help="Seed of the run.", converter=seed_number)]
 Workers = Annotated[
     int, Parameter(help="Processes that work at once; each takes its share of the cores.", converter=whole_number)
 ]

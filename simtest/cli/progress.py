@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from simtest.cli.manners import MANNERS
 from simtest.cli.remaining import Remaining
+from simtest.pages import WRITTEN
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -57,9 +58,9 @@ class Display(Protocol):
 def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[int, int, str], None]]:
     """Show a bar, or lines, while the body runs, and yield the callable that moves it: (done, total, what).
 
-    `afterwards` is what the body does once all steps are done, unless the last step says itself how it ended: with a
-    text that ends in "written". A single step shows no bar. What comes after all steps of a bar, such as the steps of
-    a page, has a bar of its own below.
+    `afterwards` is what the body does once all steps are done, unless the last step is that of a page (`WRITTEN`):
+    nothing follows it. A single step shows no bar. What comes after all steps of a bar, such as the steps of a page,
+    has a bar of its own below.
     """
     display: Display | None = None
     with stop_between_steps() as check:
@@ -72,7 +73,7 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
                     return
                 # Not before the first step: bad input is reported in one line, and nothing to do takes no time.
                 display = _display()
-            display.show(done, total, afterwards if done == total and not what.endswith("written") else what)
+            display.show(done, total, afterwards if done == total and what != WRITTEN else what)
 
         try:
             yield move

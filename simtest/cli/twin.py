@@ -45,12 +45,10 @@ def twin(
     from simtest.advice.twin.writing import to_json, write_twins
     from simtest.cli.progress import progress_bar
     from simtest.errors import InputError
-    from simtest.geometry.checks import check_integer
     from simtest.runtime.locks import exclusive_folder
 
     if frames is not None and not FEWEST <= frames <= MOST:
         raise InputError(f"--frames {frames}: must be {FEWEST} to {MOST}")
-    check_integer("--seed", seed or 0, 0)
     options = known.checked()
     command = shlex.join(["simtest", *sys.argv[1:]])
     with exclusive_folder(out):

@@ -40,8 +40,12 @@ MAX_INSTANCES = 255
 
 
 def colour_variant(variant: str | None = None) -> str:
-    """Return the variant of a dataset: the default, and a device alone, have three channels. Learners want colour."""
-    return backend.requested_variant(variant or backend.COLOUR_VARIANT, coloured=True)
+    """Return the variant of a dataset: three channels, since learners want colour, unless `variant` names it whole.
+
+    Without one, the device is that of the environment's SIMTEST_VARIANT.
+    """
+    name = backend.requested_variant(variant, coloured=True)
+    return name if variant else name.replace("_mono", "_rgb")
 
 
 class Maker:

@@ -14,6 +14,7 @@ from simtest.estimators.cloud_shape import CloudShape
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.pose_region import PoseRegion
+from simtest.geometry.vectors import deviation_deg
 from simtest.runtime.short_repr import LONGEST, clipped, vector
 
 Target = Literal["fine", "base"]
@@ -116,10 +117,8 @@ class Estimate:
 
     @property
     def deviation_deg(self) -> float | None:
-        """Standard deviation of the normal, deg: the square root of the covariance's trace, where one is stated."""
-        if self.covariance is None:
-            return None
-        return float(np.degrees(np.sqrt(max(np.trace(self.covariance), 0.0))))
+        """Standard deviation of the normal, deg: the square root of the covariance's trace, where one is reported."""
+        return None if self.covariance is None else deviation_deg(self.covariance)
 
     def __repr__(self) -> str:
         deviation = self.deviation_deg

@@ -52,6 +52,15 @@ def covariance_across(normal: Array, covariance: Array) -> Array:
     return np.asarray(basis.T @ covariance @ basis)
 
 
+def deviation_deg(covariance: Array) -> float:
+    """Return the reported deviation of a normal, deg, from its covariance across it, rad^2.
+
+    It is the root of the trace: what the root of the mean squared angle is where the covariance is right. Along one
+    axis, as the semi-axes of regions are told, it is 1 / sqrt(2) of that.
+    """
+    return float(np.degrees(np.sqrt(max(np.trace(covariance), 0.0))))
+
+
 def tilt_deg(normal: Array) -> float:
     """Return the angle between a unit normal, camera frame, and the direction against the optical axis, deg."""
     return float(np.degrees(np.arccos(np.clip(-normal[2], -1, 1))))

@@ -4,3 +4,6 @@
 `chart_png` in a file, on a `sheet` (OpenCV and Pillow). `pixels` draws on enlarged frames. `style` holds colours,
 symbols and number formats, `html` the templates; `vendor/` holds plotly's bundle.
 """
+
+WRITTEN = "page written"
+"""Text of the last step of writing a page: nothing follows it."""

@@ -9,7 +9,7 @@ from simtest.pages.chart import NOTHING, Chart, Line, Mark, Panel
 from simtest.pages.palette import NEUTRAL, SERIES
 from simtest.pages.style import Symbol, number, symbols
 from simtest.realism.comparison import Comparison, Quartiles, SetOfFrames, statistic_of
-from simtest.realism.distance import NEAR, VERDICTS, StatisticDistance, mean_distribution
+from simtest.realism.distance import NEAR, VERDICTS, StatisticDistance, distance_text, mean_distribution
 from simtest.realism.frame_statistics import COLUMNS
 from simtest.runtime.arrays import Array
 
@@ -47,9 +47,10 @@ def distance_chart(found: Comparison) -> Chart:
 
 def _distance_marks(row: int, d: StatisticDistance) -> list[Mark]:
     colour, told = VERDICT_COLOURS[d.verdict], f"{d.statistic.title}: {d.verdict}"
-    if not np.isfinite(d.distance):
+    if np.isnan(d.distance):
         return []
-    told += f"\ndistance {number(d.distance)}\n95 % interval {number(d.interval[0])} to {number(d.interval[1])}"
+    low, high = map(distance_text, d.interval)
+    told += f"\ndistance {distance_text(d.distance)}\n95 % interval {low} to {high}"
     value, *interval = np.clip([d.distance, *d.interval], LEAST_DISTANCE, MOST_DISTANCE)
     return [
         Mark(interval, [row, row], colour, line="solid", width=2.5),

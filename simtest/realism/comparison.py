@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.realism.distance import LEAST_SCENES, StatisticDistance, by_scene, distances
+from simtest.realism.distance import LEAST_SCENES, StatisticDistance, by_scene, distances, quartiles
 from simtest.realism.frame_sets import NamedFrame
 from simtest.realism.frame_statistics import COLUMNS, STATISTICS, Measured, Statistic, measure
 from simtest.runtime.arrays import Image, Picture
@@ -56,12 +56,8 @@ class SetOfFrames:
     pictures: list[tuple[str, Picture]]
 
     def quartiles(self, column: str) -> Quartiles | None:
-        """Return the quartiles of a column over all its values; None where no frame tells it."""
-        values = np.concatenate([values[column] for values in self.scenes.values()])
-        if not len(values):
-            return None
-        low, middle, high = (float(v) for v in np.quantile(values, [0.25, 0.5, 0.75]))
-        return low, middle, high
+        """Return the quartiles of a column, each scene with the same weight; None where no frame tells it."""
+        return quartiles(self.scenes, column)
 
     @property
     def counts(self) -> dict[str, Json]:

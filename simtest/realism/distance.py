@@ -7,12 +7,14 @@ its two distributions over the spread of the real scenes: the mean distance of e
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.geometry import student_t
 from simtest.realism.frame_statistics import COLUMNS, STATISTICS, Measured, Statistic
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.seeds import from_integer
 
 VERDICTS = ("near", "between", "far", "too few scenes")
@@ -41,11 +43,12 @@ class StatisticDistance:
     statistic : Statistic
         Which.
     distance : float
-        Mean over the statistic's columns; NaN where a side has fewer than two scenes that tell it.
+        Mean over the statistic's columns; NaN where a side has too few scenes that tell it (two real ones, one
+        generated), infinite where all real scenes are alike and the generated ones differ.
     interval : tuple of float
         95 % interval by bootstrap over the scenes of both sides.
     n_real, n_generated : int
-        Scenes that tell it.
+        Scenes that tell it, all of its columns.
     """
 
     statistic: Statistic
@@ -57,7 +60,7 @@ class StatisticDistance:
     @property
     def verdict(self) -> str:
         """Whether it is "near" or "far", "between", or judged by "too few scenes"."""
-        if min(self.n_real, self.n_generated) < LEAST_SCENES or not np.isfinite(self.distance):
+        if min(self.n_real, self.n_generated) < LEAST_SCENES or np.isnan(self.distance):
             return "too few scenes"
         if self.distance <= NEAR:
             return "near"
@@ -90,45 +93,93 @@ def distances(real: Scenes, generated: Scenes, seed: int = 0) -> list[StatisticD
 
 def _distance(statistic: Statistic, real: Scenes, generated: Scenes, seed: int) -> StatisticDistance:
     rng = from_integer(seed)
-    sides = [[[values[c] for values in scenes.values() if len(values[c])] for c in statistic.columns]
+    sides = [[values for values in scenes.values() if all(len(values[c]) for c in statistic.columns)]
              for scenes in (real, generated)]  # fmt: skip
-    counts = [min(len(scenes) for scenes in side) for side in sides]
-    if counts[0] < 2 or counts[1] < 1:
-        return StatisticDistance(statistic, np.nan, (np.nan, np.nan), *counts)
-    columns = [_column_distance(a, b, rng) for a, b in zip(*sides, strict=True)]
-    value, samples = np.mean([c[0] for c in columns]), np.mean([c[1] for c in columns], axis=0)
-    # Order statistics: between infinite distances nothing can be interpolated.
-    low, high = np.quantile(samples, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], method="nearest")
-    return StatisticDistance(statistic, float(value), (float(low), float(high)), *counts)
+    n, m = counts = (len(sides[0]), len(sides[1]))
+    if n < 2 or m < 1:
+        return StatisticDistance(statistic, np.nan, (np.nan, np.nan), n, m)
+    # The same scenes for all columns, which vary together: drawn again from each side, and dealt anew to both.
+    drawn = [rng.integers(count, size=(RESAMPLES, count)) for count in counts]
+    dealt = rng.permuted(np.tile(np.arange(n + m), (RESAMPLES, 1)), axis=1)[:, :n]
+    columns = []
+    for name in statistic.columns:
+        held, made = ([values[name] for values in side] for side in sides)
+        columns.append(_column_distance(held, made, drawn[0], drawn[1], dealt))
+    value, samples, exchanged = (np.mean(parts, axis=0) for parts in zip(*columns, strict=True))
+    return StatisticDistance(statistic, float(value), _interval(value, samples, exchanged, min(n, m)), n, m)
 
 
-def _column_distance(real: list[Array], generated: list[Array], rng: np.random.Generator) -> tuple[float, Array]:
-    """Return the distance over the real scenes' spread, and that of resampled scenes, shape (RESAMPLES,)."""
+def _column_distance(
+    real: list[Array], generated: list[Array], real_rows: IntArray, generated_rows: IntArray, dealt: IntArray
+) -> tuple[Array, Array, Array]:
+    """Return the distance over the real scenes' spread, that of resampled scenes, and how far sides dealt anew differ.
+
+    The last are mean differences of the distribution functions over all values, which the largest do not rule; the
+    first of them is that of the sides as they are. Rows have shape (RESAMPLES, N): of each side, and of both together,
+    those that stand for the real ones.
+    """
     grid = _grid([*real, *generated])
     # Distribution functions of all scenes on one grid: each resample is then a mean of rows.
-    own, other = (np.stack([_steps(v, grid) for v in side]) for side in (real, generated))
+    both = np.stack([_steps(v, grid) for v in (*real, *generated)])
+    own, other = both[: len(real)], both[len(real) :]
     widths = np.diff(grid)
 
     def gap(first: Array, second: Array) -> Array:
         return np.asarray(np.abs(first - second) @ widths)
 
-    n = len(real)
-    rest = (own.sum(axis=0) - own) / (n - 1)
-    spread = float(gap(own, rest).mean())
+    def spread_of(scenes: Array) -> float:
+        rest = (scenes.sum(axis=0) - scenes) / (len(scenes) - 1)
+        return float(gap(scenes, rest).mean())
+
+    value, spread = gap(own.mean(axis=0), other.mean(axis=0)), spread_of(own)
+    samples = gap(_means(own, real_rows), _means(other, generated_rows))
+    first = np.concatenate([own.mean(axis=0)[None], _means(both, dealt)])
+    second = (both.sum(axis=0) - len(own) * first) / len(other)
+    exchanged = np.abs(first - second) @ np.diff(both.mean(axis=0), prepend=0.0)
     if spread <= 0:
         # All real scenes are alike: any difference is infinitely many spreads.
-        same = gap(own.mean(axis=0), other.mean(axis=0)) <= 0
-        return (0.0, np.zeros(RESAMPLES)) if same else (np.inf, np.full(RESAMPLES, np.inf))
-    value = float(gap(own.mean(axis=0), other.mean(axis=0))) / spread
-    return value, gap(*(_resampled(side, rng) for side in (own, other))) / spread
+        some = 1e-9 * widths.sum()
+        return np.where(value > some, np.inf, 0.0), np.where(samples > some, np.inf, 0.0), exchanged
+    # The spread varies with the scenes too, by what each of them adds to it (jackknife): a scene that is drawn twice
+    # would be near to itself. In the logarithm, so that it stays positive.
+    pull = np.zeros(len(own))
+    if len(own) > 2:
+        pull = (len(own) - 1) * (1 - np.array([spread_of(np.delete(own, i, axis=0)) for i in range(len(own))]) / spread)
+    return value / spread, samples / spread * np.exp(-pull[real_rows].mean(axis=1)), exchanged
 
 
-def _resampled(scenes: Array, rng: np.random.Generator) -> Array:
-    """Return the mean of as many scenes drawn again, RESAMPLES times: shape (RESAMPLES, grid)."""
-    drawn = rng.integers(len(scenes), size=(RESAMPLES, len(scenes)))
+def _interval(value: float, samples: Array, exchanged: Array, scenes: int) -> tuple[float, float]:
+    """Return the 95 % interval of a distance; `scenes` are those of the smaller side.
+
+    Of two sets of one distribution each estimate is above 0. So 0 is the lower end where sides to which the scenes were
+    dealt anew often differ as much (`exchanged`, see `_column_distance`).
+    """
+    if np.isfinite(samples).all():
+        low, high = widened(value, samples, scenes)
+    else:
+        # Order statistics: between infinite distances nothing can be interpolated.
+        low, high = np.quantile(samples, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], method="nearest")
+    alike = np.mean(exchanged >= exchanged[0] * (1 - 1e-9)) > 1 - LEVEL
+    return 0.0 if alike else max(float(low), 0.0), float(high)
+
+
+def widened(values: Array | float, samples: Array, scenes: int) -> Array:
+    """Return 95 % intervals of values, shape (2, ...), from resampled ones, shape (R, ...).
+
+    Their quantiles about their median are moved to the value. Few scenes resample too narrowly: the deviations are
+    widened from a normal to Student's distribution.
+    """
+    share = (1 + LEVEL) / 2
+    wider = student_t.quantile(share, scenes - 1) / NormalDist().inv_cdf(share) * np.sqrt(scenes / (scenes - 1))
+    low, middle, high = np.quantile(samples, [1 - share, 0.5, share], axis=0)
+    return np.stack([values + (low - middle) * wider, values + (high - middle) * wider])
+
+
+def _means(scenes: Array, rows: IntArray) -> Array:
+    """Return the mean of some rows of scenes for each draw, shape (draws, grid)."""
     # In blocks: all of them at once would not fit into memory.
-    blocks = np.array_split(drawn, max(1, scenes.size * RESAMPLES // BLOCK_VALUES))
-    return np.concatenate([scenes[rows].mean(axis=1) for rows in blocks])
+    blocks = np.array_split(rows, max(1, scenes.size * len(rows) // BLOCK_VALUES))
+    return np.concatenate([scenes[block].mean(axis=1) for block in blocks])
 
 
 def _grid(values: list[Array]) -> Array:
@@ -150,6 +201,17 @@ def mean_distribution(scenes: Scenes, column: str, at: Array) -> Array:
     if not held:
         return np.full(len(at), np.nan)
     return np.asarray(np.mean([np.searchsorted(np.sort(v), at, side="right") / len(v) for v in held], axis=0))
+
+
+def quartiles(scenes: Scenes, column: str) -> tuple[float, float, float] | None:
+    """Return where `mean_distribution` reaches 1/4, 1/2 and 3/4; None without a scene."""
+    held = [values[column] for values in scenes.values() if len(values[column])]
+    if not held:
+        return None
+    weights = np.concatenate([np.full(len(values), 1 / len(values)) for values in held])
+    found = np.quantile(np.concatenate(held), (0.25, 0.5, 0.75), weights=weights, method="inverted_cdf")
+    low, middle, high = (float(value) for value in found)
+    return low, middle, high
 
 
 def _steps(values: Array, grid: Array) -> Array:

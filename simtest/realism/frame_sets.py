@@ -12,6 +12,7 @@ from simtest.dataset.reader import read_samples, shard_names
 from simtest.errors import InputError
 from simtest.reconstruction.image_io import Source, is_sequence, open_source, read_picture
 from simtest.runtime.arrays import AnyArray, Image
+from simtest.runtime.kept_arrays import only_reading
 from simtest.runtime.limits import check_count, check_file
 from simtest.runtime.resources import shown
 from simtest.spec.scene import Scene, load_scene
@@ -57,10 +58,10 @@ def open_frames(paths: Sequence[Path]) -> list[NamedFrame]:
         if source.is_video:
             film = _Film(source)
             frames += [NamedFrame(str(path), f"{path.name}#{index}", partial(film.read, index))
-                       for index in _spread(range(source.count))]  # fmt: skip
+                       for index in _spread(range(source.count), FILM_FRAMES)]  # fmt: skip
         else:
             one = path.suffix == ".film"
-            kept = _spread(source.files) if one else source.files
+            kept = _spread(source.files, FILM_FRAMES) if one else source.files
             frames += [NamedFrame(str(path if one else file), file.name, partial(read_picture, file))
                        for file in kept]  # fmt: skip
     return frames
@@ -89,19 +90,20 @@ def _as_values(picture: AnyArray) -> Image:
     return np.asarray(picture.astype(np.float32) / np.float32(255))
 
 
-def _spread(items: Sequence[Item]) -> Sequence[Item]:
-    """Return at most `FILM_FRAMES` items, evenly spread."""
-    if len(items) <= FILM_FRAMES:
+def _spread(items: Sequence[Item], most: int) -> Sequence[Item]:
+    """Return at most so many items, evenly spread."""
+    if len(items) <= most:
         return items
-    return [items[int(i)] for i in np.linspace(0, len(items) - 1, FILM_FRAMES)]
+    return [items[int(i)] for i in np.linspace(0, len(items) - 1, most)]
 
 
 def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> list[NamedFrame]:
     """Open the generated side: a dataset's folder, a folder or film of frames, or a scene to be rendered.
 
-    Of a dataset at most `count` samples are taken, of as many anatomies as possible; its anatomies are the scenes.
-    `surfaces` names those that are taken, by default all. A scene is rendered `count` times, from another viewpoint
-    and with another seed of relief, pattern and noise each time; each frame counts as a scene.
+    Of a dataset at most `count` samples are taken, of as many anatomies as possible; its anatomies are the scenes. Of a
+    folder's pictures `count` are taken, evenly spread. `surfaces` names those that are taken of a dataset, by default
+    all. A scene is rendered `count` times, from another viewpoint and with another seed of relief, pattern and noise
+    each time; each frame counts as a scene.
 
     Raises
     ------
@@ -117,7 +119,7 @@ def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> li
     if surfaces:
         raise InputError(f"--surface {shown(surfaces[0])}: only of a dataset, and {shown(against)} is none")
     if path.exists() and path.suffix != ".toml":
-        return open_frames([path])[:count]
+        return list(_spread(open_frames([path]), count))
     return rendered_frames(load_scene(against), count)
 
 
@@ -187,5 +189,7 @@ class _Rendered:
         from simtest.simulation.rendered_view import render_picture
 
         scene = varied(self.base, number)
-        self.session = self.session or Session(scene, colour_variant())
-        return displayed(render_picture(self.session, scene), scene.sensor)
+        # Each frame has a relief of its own: none is kept in the user's cache.
+        with only_reading("relief"):
+            self.session = self.session or Session(scene, colour_variant())
+            return displayed(render_picture(self.session, scene), scene.sensor)

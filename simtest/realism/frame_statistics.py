@@ -4,6 +4,7 @@ Lengths are shares of the frame's width or of a highlight's radius where frames 
 spectrum and the noise are those of the recorded pixels.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -35,6 +36,9 @@ MID_GREY = (0.3, 0.7)
 
 NOISE_BLOCK, NOISE_PERCENTILE = 8, 20.0
 """Noise is that of the smoothest fifth of blocks of so many pixels along a side: the others hold detail."""
+
+NOISE_SHOWN = 0.853
+"""Share of the deviation of white noise that the smoothest fifth of blocks shows (570,000 blocks of planted noise)."""
 
 VESSEL_SHARES = (1 / 400, 1 / 100)
 """Standard deviations of the two Gaussians whose difference is the band of vessels, shares of the width."""
@@ -247,13 +251,13 @@ def _vessels(linear: Image, tissue: Mask) -> Array:
 
 
 def _spectrum(luma: Image, seen: Mask) -> Array:
-    """Return the slope of the power spectrum between wavelengths of 4 and 64 px, in the largest square of the view."""
-    side, (top, left) = _largest_square(seen)
+    """Return the slope of the power spectrum between wavelengths of 4 and 64 px, over squares that cover the view."""
+    side, corners = _largest_squares(seen)
     if side < LEAST_SIDE:
         return np.empty(0)
     window = np.outer(np.hanning(side), np.hanning(side))
-    values = luma[top : top + side, left : left + side].astype(float)
-    power = np.abs(np.fft.rfft2((values - values.mean()) * window)) ** 2
+    squares = [luma[top : top + side, left : left + side].astype(float) for top, left in corners]
+    power = np.mean([np.abs(np.fft.rfft2((values - values.mean()) * window)) ** 2 for values in squares], axis=0)
     frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
     # Means over rings that are even in the logarithm.
     low, high = (1 / v for v in reversed(WAVELENGTHS_PX))
@@ -267,13 +271,22 @@ def _spectrum(luma: Image, seen: Mask) -> Array:
     return np.array([np.polyfit(np.log(centres[known]), np.log(means[known]), 1)[0]])
 
 
-def _largest_square(seen: Mask) -> tuple[int, tuple[int, int]]:
-    """Return the side of a large square inside the view, centred where its border is farthest, and its first pixel."""
+def _largest_squares(seen: Mask) -> tuple[int, list[tuple[int, int]]]:
+    """Return the side of the largest squares about the view's middle line, and the first pixels of those that cover it.
+
+    A wide view has many such squares, one beside the other: one of them would show a part of it.
+    """
     padded = np.pad(seen.astype(np.uint8), 1)
     away = cv2.distanceTransform(padded, cv2.DIST_C, 3)[1:-1, 1:-1]
-    row, column = np.unravel_index(int(away.argmax()), away.shape)
-    half = int(away[row, column]) - 1
-    return 2 * half, (int(row) - half, int(column) - half)
+    half = int(away.max()) - 1
+    centres = np.argwhere(away == away.max())
+    extent = np.ptp(centres, axis=0)
+    # From end to end of the line of centres.
+    ordered = centres[np.argsort(centres[:, int(extent.argmax())], kind="stable")]
+    # Of an even number of rows the middle two are centres alike.
+    count = 1 + math.ceil((int(extent.max()) - 1) / max(2 * half, 1))
+    chosen = ordered[np.linspace(0, len(ordered) - 1, count).round().astype(int)]
+    return 2 * half, [(int(row) - half, int(column) - half) for row, column in chosen]
 
 
 def _noise(luma: Image, tissue: Mask) -> Array:
@@ -287,4 +300,6 @@ def _noise(luma: Image, tissue: Mask) -> Array:
     share = cv2.resize(grey[cropped].astype(np.float32), size, interpolation=cv2.INTER_AREA)
     power = cv2.resize(np.square(detail[cropped]), size, interpolation=cv2.INTER_AREA)
     blocks = power[share > 0.99]
-    return np.array([np.sqrt(np.percentile(blocks, NOISE_PERCENTILE))]) if len(blocks) >= 20 else np.empty(0)
+    if len(blocks) < 20:
+        return np.empty(0)
+    return np.array([np.sqrt(np.percentile(blocks, NOISE_PERCENTILE)) / NOISE_SHOWN])

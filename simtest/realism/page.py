@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from simtest.pages import chart_png, chart_web, pixels
+from simtest.pages import WRITTEN, chart_png, chart_web, pixels
 from simtest.pages.html import environment
 from simtest.realism import charts
 from simtest.realism.comparison import Comparison, Progress, SetOfFrames, plain
@@ -70,7 +70,7 @@ def write_comparison(
     write_json(out / RESULT, {**found.to_json(), "run": record})
     write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
     if progress:
-        progress(len(_STEPS), len(_STEPS), "page written")
+        progress(len(_STEPS), len(_STEPS), WRITTEN)
     return out / PAGE
 
 

@@ -29,7 +29,7 @@ def draw_strip(rows: Sequence[tuple[str, Named]], height: int) -> Pixels:
     widths = [sum(picture.shape[1] + GAP_PX for _, picture in held) for _, held in fitted]
     titles = [round(text_width(title, 0.7 * TITLE_PX)) + GAP_PX for title, _ in rows]
     line = TITLE_PX + height + CAPTION_PX + 2 * GAP_PX
-    sheet = Sheet.white(max(*widths, *titles) + GAP_PX, line * len(rows) + GAP_PX)
+    sheet = Sheet.white(max([*widths, *titles], default=0) + GAP_PX, line * len(rows) + GAP_PX)
     for number, (title, held) in enumerate(fitted):
         x, y = GAP_PX, GAP_PX + number * line
         sheet.text((x, y), title, 0.7 * TITLE_PX, _INK, across=0.0, down=0.0, bold=True)

@@ -15,6 +15,7 @@ from simtest.errors import Failure, InputError
 from simtest.estimators.accumulated import PatchNormal, base_normal
 from simtest.estimators.cloud import UNEVEN
 from simtest.estimators.sightings import FineMap, Plane, Sighting, fine_map, light_of, plane_axes, spots_of
+from simtest.geometry.vectors import deviation_deg
 from simtest.reconstruction.choices import DEFAULT_SMOOTHING_PX
 from simtest.reconstruction.image_io import open_source
 from simtest.reconstruction.output_files import write_csv
@@ -81,7 +82,7 @@ class AccumulatedPatch:
         if isinstance(self.base, Failure):
             return f"patch: no normal of the base ({self.base.detail})"
         x, y, z = self.base.normal
-        stated = float(np.degrees(np.sqrt(np.trace(self.base.covariance))))
+        stated = deviation_deg(self.base.covariance)
         return (
             f"patch: normal of the base {x:.3f} {y:.3f} {z:.3f} (world) ± {stated:.2f} deg, slopes "
             f"{np.degrees(self.base.slope):.1f} deg, {len(self.fine.frame)} fine normals from {self.frames} frames"
@@ -100,7 +101,7 @@ class AccumulatedPatch:
         if isinstance(self.base, Failure):
             return {**told, "status": str(self.base.reason), "detail": self.base.detail}
         base = self.base
-        budget = {name: float(np.degrees(np.sqrt(np.trace(part)))) for name, part in base.budget.items()}
+        budget = {name: deviation_deg(part) for name, part in base.budget.items()}
         return {
             **told,
             "status": "ok",
@@ -108,7 +109,7 @@ class AccumulatedPatch:
             "tangents_world": base.tangents,
             "covariance_rad2": base.covariance,
             "budget_deg": budget,
-            "stated_deg": float(np.degrees(np.sqrt(np.trace(base.covariance)))),
+            "stated_deg": deviation_deg(base.covariance),
             "slope_deg": float(np.degrees(base.slope)),
             "cells": base.cells,
         }

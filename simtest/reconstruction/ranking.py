@@ -9,6 +9,7 @@ import numpy as np
 from simtest.errors import Failure
 from simtest.estimators.budget import deviations, dominant
 from simtest.estimators.protocol import Estimate, Target
+from simtest.geometry import vectors
 
 WITHOUT_UNCERTAINTY = ("bisector", "curved", "photometric", "cone_axis", "brightest_point")
 """Order of estimates that state no uncertainty, so that nothing else can rank them: that which knows the lights, those
@@ -19,7 +20,7 @@ and `circle_pose` last, which takes a curved surface for a plane."""
 def deviation_deg(estimate: Estimate) -> float | None:
     """Return the standard deviation of a normal, deg: the square root of the covariance's trace."""
     # Computed here: a picture's way does not climb back to the estimators.
-    return None if estimate.covariance is None else float(np.degrees(np.sqrt(max(np.trace(estimate.covariance), 0))))
+    return None if estimate.covariance is None else vectors.deviation_deg(estimate.covariance)
 
 
 @dataclass(frozen=True)

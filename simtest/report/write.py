@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from simtest.pages import WRITTEN
 from simtest.report.up_to_date import GUIDE, is_up_to_date, page_key, signed
 from simtest.runtime.files import write_atomically, write_json
 from simtest.runtime.provenance import file_hash
@@ -52,5 +53,5 @@ def write_report(run: Path, progress: Progress | None = None) -> Path:
     note = signed(html, key, figures, file_hash(run / GUIDE))
     write_atomically(page, lambda part: part.write_text(note, encoding="utf-8"))
     if progress:
-        progress(steps, steps, "page written")
+        progress(steps, steps, WRITTEN)
     return page

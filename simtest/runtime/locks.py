@@ -59,14 +59,19 @@ def exclusive_folder(folder: Path, option: str = "--out") -> Iterator[None]:
 
 @contextlib.contextmanager
 def exclusive_file(path: Path, option: str = "--out") -> Iterator[None]:
-    """Keep a file for results to this run, by a lock beside it; raise `InputError` as `exclusive_folder` does."""
-    if not path.name or path.name == "..":
-        raise InputError(f"{option} {shown(path)}: is a folder; must be a file")
-    if path.parent.is_dir():
-        with _exclusive(path.with_name(f".{path.name[:200]}{LOCK}"), f"{option} {shown(path)}"):
-            yield
-    else:
-        # Nobody can write there; whoever writes says so.
+    """Keep a file for results to this run, by a lock beside it; its folder must be there.
+
+    Raises `InputError` as `exclusive_folder` does.
+    """
+    what = f"{option} {shown(path)}"
+    if path.name in ("", ".."):
+        raise InputError(f"{what}: is a folder; must be a file")
+    try:
+        if not path.parent.is_dir():
+            raise InputError(f"{what}: no such folder {shown(path.parent)}")
+    except OSError as error:
+        raise cannot_write(error, what, path) from error
+    with _exclusive(path.with_name(f".{path.name[:200]}{LOCK}"), what):
         yield
 
 

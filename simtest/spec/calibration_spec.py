@@ -116,7 +116,7 @@ class UncertaintyCalibration(Spec):
     focal_sd: float = Field(0.0, ge=0, le=1, description="standard deviation of the focal length, share of it")
     centre_sd_px: float = Field(0.0, ge=0, le=1e6, description="standard deviation of the principal point an axis, px")
     distortion_sd: float = Field(
-        0.0, ge=0, le=10, description="standard deviation of a radial distortion k1 that the camera leaves out"
+        0.0, ge=0, le=10, description="standard deviation of the radial distortion k1, about the camera's or none"
     )
     falloff_power: Interval | None = Field(
         None,

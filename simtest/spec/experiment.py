@@ -95,7 +95,8 @@ class Experiment(Spec):
 
 
 VIEWPOINT = "surface.viewpoint"
-_EXPERIMENT_KEYS = frozenset({"realisations", "seed", "estimators", "title", "description"})
+OWN_KEYS = ("description", "estimators", "realisations", "seed", "title", "views")
+"""Settings of the experiment itself; all others are keys of its scenes."""
 
 
 def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None) -> Experiment:
@@ -124,8 +125,8 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     path = find(name, "scenes", "experiments")
     # The experiment's own keys; all others are keys of the scenes.
     settings = dict(settings or {})
-    own = {key: settings.pop(key) for key in list(settings) if key in _EXPERIMENT_KEYS}
-    views = settings.pop("views", None)
+    own = {key: settings.pop(key) for key in list(settings) if key in OWN_KEYS}
+    views = own.pop("views", None)
     changes = [f"{key}={value}" for key, value in settings.items()]
     _check_first_parts(settings)
     experiment = load(Experiment, path, own)
@@ -153,9 +154,8 @@ def _check_first_parts(settings: Mapping[str, Any]) -> None:
     for path in settings:
         first = path.partition(".")[0]
         if first not in scene:
-            own = sorted([*_EXPERIMENT_KEYS, "views"])
-            meant = suggestion(first, [*own, *scene])
-            allowed = f"allowed: {', '.join(own)}, and of the scenes {', '.join(scene)}"
+            meant = suggestion(first, [*OWN_KEYS, *scene])
+            allowed = f"allowed: {', '.join(OWN_KEYS)}, and of the scenes {', '.join(scene)}"
             raise InputError(f"--set {shown(path, 60)}: unknown key; {allowed}{meant}")
 
 

@@ -271,14 +271,12 @@ def _told(error: Exception) -> str:
 
 
 def check_target(path: Path) -> None:
-    """Raise `InputError` if a mesh cannot be written to a path; called before any work is done."""
+    """Raise `InputError` if no mesh can be written to a path; called before any work is done."""
     if path.suffix.lower() not in WRITTEN_SUFFIXES:
         raise InputError(f"--out {shown(path)}: suffix {path.suffix!r}; allowed: {', '.join(WRITTEN_SUFFIXES)}")
     try:
         if path.is_dir():
             raise InputError(f"--out {shown(path)}: is a folder; must be a file")
-        if not path.parent.is_dir():
-            raise InputError(f"--out {shown(path)}: no such folder {shown(path.parent)}")
     except OSError as error:
         raise cannot_write(error, f"--out {shown(path)}", path) from error
 

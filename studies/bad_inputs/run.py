@@ -159,8 +159,8 @@ def _names(folder: Path) -> frozenset[str]:
 def _watch(own: _Running) -> None:
     """Kill a case that hangs or eats the machine's memory."""
     try:
-        with psutil.Process(own.pid).oneshot() as _:
-            process = psutil.Process(own.pid)
+        process = psutil.Process(own.pid)
+        with process.oneshot():
             memory = process.memory_info().rss / 2**20
             times = process.cpu_times()
     except psutil.Error:

@@ -16,6 +16,7 @@ from simtest.simulation import clouds
 from simtest.simulation.rendered_view import expose_picture
 from simtest.spec import load_scene, scene_from_dict
 from simtest.spec.scene import Scene
+from studies.kept import of_this_code
 
 PICTURE_TABLE = ((3.0, 1.5), (6.0, 1.5), (6.0, 3.0))
 """Slope, deg, and wavelength, mm, of theory.md's table of clouds from a picture."""
@@ -161,6 +162,7 @@ def tissue(organ: str, seed: int, two_lights: bool = False) -> Case:
 
 def load(case: Case, folder: Path, session: Session | None) -> tuple[BaseFrame, Session | None]:
     """Return the frame of a case from a folder, or render it there; with the session, for the next one."""
+    folder = of_this_code(folder)
     file = folder / f"{case.group.replace(' ', '_').replace(',', '')}_{case.seed}.npz"
     if not file.exists():
         frame, session = _render(case, session)

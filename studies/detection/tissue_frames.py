@@ -12,6 +12,7 @@ from simtest.runtime.files import make_folder, write_atomically
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import load_scene
+from studies.kept import of_this_code
 
 TISSUES = ("colon", "stomach", "liver", "gallbladder")
 
@@ -58,6 +59,7 @@ class TissueFrame:
 
 def tissue_frames(split: str, count: int, folder: Path, tissues: tuple[str, ...] = TISSUES) -> Iterator[TissueFrame]:
     """Yield so many frames of each tissue; what the folder does not hold is rendered and kept there."""
+    folder = of_this_code(folder)
     make_folder(folder)
     for tissue in tissues:
         session: Session | None = None

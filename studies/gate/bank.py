@@ -9,6 +9,7 @@ from simtest.runtime.files import write_atomically
 from simtest.spec import Experiment, load_experiment
 from simtest.validation.results_table import SCHEMA
 from simtest.validation.runner import run_experiment
+from studies.kept import of_this_code
 
 CONTENT = {"paper": 320, "curvature": 60, "light_offset": 60, "compare": 40, "anatomy": 2}
 """Realisations of each setting, by shipped experiment: 20,400 in all; an anatomy's are of each of 20 views."""
@@ -34,13 +35,14 @@ def load_bank(folder: Path) -> pl.DataFrame:
     Parameters
     ----------
     folder : Path
-        Holds bank.parquet, and while it is made a run of each experiment.
+        Holds the bank of each version of the code, and while it is made a run of each experiment.
 
     Returns
     -------
     polars.DataFrame
         `COLUMNS`.
     """
+    folder = of_this_code(folder)
     file = folder / "bank.parquet"
     if not file.is_file():
         engine = make_engine("local", WORKERS)

@@ -3,10 +3,10 @@
     python -m studies.hard --out FOLDER [--split test] [--scenes 48] [--first 0] [--row NAME]...
         [--judged-from 0] [--estimator NAME]...
 
-The highlights of each scene's frames are kept in FOLDER, one file a scene: a run that was ended goes on where it
-stopped, and another one judges estimators without rendering. The table is printed at the end, of all scenes that are
-there. With `--row` those rows alone are rendered and judged; a later run adds other rows to the files. Scenes of the
-split `train` are for fitting: no figure is quoted on them.
+The highlights of each scene's frames are kept in a folder of this code below FOLDER (`studies.kept`), one file a scene:
+a run that was ended goes on where it stopped, and another one judges estimators without rendering. The table is printed
+at the end, of all scenes that are there. With `--row` those rows alone are rendered and judged; a later run adds other
+rows to the files. Scenes of the split `train` are for fitting: no figure is quoted on them.
 """
 
 import argparse
@@ -28,6 +28,7 @@ from studies.hard.measure import Frames, Record, record
 from studies.hard.rows import GROUPS, ROWS, Row
 from studies.hard.scenes import SPLITS, kind_of
 from studies.hard.table import lines, text
+from studies.kept import of_this_code
 
 MOST = 8
 """Highlights of one frame that are judged."""
@@ -47,14 +48,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--estimator", action="append", dest="estimators")
     given = parser.parse_args(arguments)
     rows = [row for row in ROWS if not given.rows or row.name in given.rows]
-    make_folder(given.out)
+    out = of_this_code(given.out)
+    make_folder(out)
     for number in range(given.first, given.first + given.scenes):
-        _render(SPLITS[given.split] + number, given.out / f"{given.split}_{number:05d}.npz", rows)
+        _render(SPLITS[given.split] + number, out / f"{given.split}_{number:05d}.npz", rows)
     loaded = load_estimators(list(given.estimators or ESTIMATORS))
     # Those of whole frames are measured by studies of their own.
     estimators = {name: each for name, each in loaded.items() if isinstance(each, Estimator)}
     records: list[Record] = []
-    for file in sorted(given.out.glob(f"{given.split}_*.npz")):
+    for file in sorted(out.glob(f"{given.split}_*.npz")):
         number = int(file.stem.rpartition("_")[2])
         if number >= given.judged_from:
             kept = _first_of_each_row(load(file))
@@ -62,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             records += [answer for case in kept for answer in _answers(of_scene, case, rows, estimators)]
     if records:
         table = pl.DataFrame(records, infer_schema_length=None)
-        table.write_parquet(given.out / f"{given.split}.parquet")
+        table.write_parquet(out / f"{given.split}.parquet")
         print(text(lines(table, [row.name for row in rows], GROUPS)))
     return 0
 

@@ -11,9 +11,10 @@ from simtest.detection.colour import ColourDetector
 from simtest.detection.peaks import PeakDetector
 from simtest.errors import Failure
 from simtest.estimators import Estimate
-from simtest.geometry.vectors import angle_deg
+from simtest.geometry.vectors import angle_deg, deviation_deg
 from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, Specularity, run_pipeline
 from simtest.rendering import Radiance, Session
+from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import key as hashed
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.true_highlights import TrueHighlight
@@ -87,6 +88,11 @@ def _judged(
         yield specularity, near, len(glints), spot.radius_px
 
 
+def semi_axis_deg(covariance: Array) -> float:
+    """Return the mean semi-axis of a normal's covariance, deg: its deviation along one axis."""
+    return deviation_deg(covariance) / math.sqrt(2)
+
+
 def record(number: int, kind: str, case: Case, name: str, result: Estimate | Failure) -> Record:
     """Return one answer as a row of the study's table."""
     made: Record = {
@@ -101,9 +107,9 @@ def record(number: int, kind: str, case: Case, name: str, result: Estimate | Fai
         flags.append("saturated")
     made |= {"flags": ",".join(flags), "target": result.target}
     if result.covariance is not None:
-        made["semi_deg"] = math.degrees(math.sqrt(max(float(np.trace(result.covariance)) / 2, 0.0)))
+        made["semi_deg"] = semi_axis_deg(result.covariance)
         for part, covariance in (result.budget or {}).items():
-            made[f"budget_{part}_deg"] = math.degrees(math.sqrt(max(float(np.trace(covariance)) / 2, 0.0)))
+            made[f"budget_{part}_deg"] = semi_axis_deg(covariance)
     truth = case.normal if result.target == "fine" else case.normal_base
     if truth is None:
         return made

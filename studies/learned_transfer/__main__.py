@@ -23,6 +23,7 @@ from simtest.estimators import AnyEstimator
 from simtest.runtime.files import make_folder
 from studies.detection.real_frames import outlined_frames
 from studies.detection.tissue import Counts
+from studies.kept import of_this_code
 from studies.learned_transfer import real, sheet, tables
 from studies.learned_transfer.answers import OK, Answer
 from studies.learned_transfer.frames import FIRST, GUIDES, ONE_LIGHT, ROWS, hard_frames
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     normals, finders = estimators(given.spots, given.dense), detectors(given.detectors)
     both = given.hard == given.real
     if given.hard or both:
-        for line in _hard(range(FIRST, FIRST + given.scenes), given.kept, normals, finders):
+        for line in _hard(range(FIRST, FIRST + given.scenes), of_this_code(given.kept), normals, finders):
             print(line, flush=True)
     if given.real or both:
         for line in _real(normals, finders, given.overlays, given.sheet):

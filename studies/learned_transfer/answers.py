@@ -43,7 +43,7 @@ class Answer:
     inside : float
         1 where the truth of the surface that it states lies inside its 95 % region, else 0; NaN where unknown.
     stated_deg : float
-        Stated deviation: root of the mean of the covariance's two variances, deg; NaN where none is stated.
+        Reported deviation (`Estimate.deviation_deg`), deg; NaN where none is reported.
     """
 
     row: str
@@ -63,13 +63,6 @@ def why(failure: Failure) -> str:
     detail = failure.detail or ""
     told = detail.split(" is ")[0].split(" at ")[0]
     return told if told.startswith(("outside", "unlike")) else failure.reason.value
-
-
-def deviation_deg(estimate: Estimate) -> float:
-    """Return the root of the mean of the two stated variances, deg; NaN where an estimate states none."""
-    if estimate.covariance is None:
-        return math.nan
-    return math.degrees(math.sqrt(max(float(np.trace(estimate.covariance)) / 2, 0.0)))
 
 
 def answers(frame: HardFrame, estimators: Mapping[str, AnyEstimator]) -> Iterator[Answer]:
@@ -124,5 +117,5 @@ def _scored(
         *common, OK, float(angle_deg(result.normal, base)),
         math.nan if fine is None else float(angle_deg(result.normal, fine)),
         math.nan if distance is None else float(distance <= CHI2_95),
-        deviation_deg(result),
+        math.nan if result.deviation_deg is None else result.deviation_deg,
     )  # fmt: skip

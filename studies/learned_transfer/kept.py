@@ -1,7 +1,7 @@
 """Keeps the answers of each method on each frame, so that a run that was ended goes on, and a new network is added.
 
-A network's answers are known by the hash of its file. Those of the classical methods are known by their names alone:
-after a change of their code remove the folder `answers`.
+A network's answers are known by the hash of its file, those of the classical methods by their names: the folder is of
+one version of the code (`studies.kept`).
 """
 
 import hashlib

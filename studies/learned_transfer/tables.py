@@ -59,7 +59,7 @@ def paired(answers: Sequence[Answer], first: str, second: str) -> Paired:
 def summary(answers: Sequence[Answer], rows: Mapping[str, Sequence[str]], names: Sequence[str]) -> Iterator[str]:
     """Yield the table of each group of rows and estimator."""
     heads = ("rows", "estimator", "detections", "answered", "refused", "base: median, deg", "95 % below",
-             "stated, median", "inside 95 % (n)")  # fmt: skip
+             "reported deviation, median", "inside 95 % (n)")  # fmt: skip
     yield from head(heads)
     for group, members in rows.items():
         for name in names:

@@ -25,6 +25,10 @@ def fails(number, tell):
     raise InputError(f"no such number: {number}")
 
 
+def breaks(number, tell):
+    raise TypeError(f"no such kind: {number}")
+
+
 def meets_a_full_disk(number, tell):
     raise OSError(28, "No space left on device")
 

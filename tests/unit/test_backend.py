@@ -289,7 +289,11 @@ def test_a_device_alone_has_as_many_channels_as_the_scene_needs(monkeypatch):
         assert requested_variant(coloured=True) == f"{device}_ad_rgb"
         assert backend.needs_gpu() is (device == "cuda")
         assert backend.needs_llvm() is (device == "llvm")
-    # A dataset has three channels unless its variant is named whole, whatever the variable says.
+        # A dataset has three channels unless its own option names the variant whole; the variable names the device.
+        for told in (device, f"{device}_ad_mono", f"{device}_ad_rgb"):
+            monkeypatch.setenv(backend.VARIANT_VARIABLE, told)
+            assert colour_variant() == f"{device}_ad_rgb"
+    monkeypatch.delenv(backend.VARIANT_VARIABLE)
     assert colour_variant() == "llvm_ad_rgb"
     assert colour_variant("llvm_ad_mono") == "llvm_ad_mono"
     assert not backend.needs_gpu("llvm_ad_rgb")

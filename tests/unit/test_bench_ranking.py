@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.bench.ranking import ALPHA, SceneSums, agreement, margin, rank
+from simtest.bench.ranking import ALPHA, SceneSums, margin, rank
 from studies.bench_ranking import claims, cores, rankings, with_any
 
 
@@ -78,14 +78,3 @@ def test_ranks_are_those_of_the_claims() -> None:
     better = rank([cores(1, [1.0, 1.0, 3.0, 0.1])])
     assert better.first.tolist() == [2, 2, 4, 1]
     assert better.last.tolist() == [3, 3, 4, 1]
-
-
-def test_agreement_counts_reversed_and_changed_pairs() -> None:
-    full = np.sign(np.arange(4)[None, :] - np.arange(4)[:, None]).astype(np.int8)
-    assert agreement(full, full) == 1.0
-    assert agreement(full, -full) == -1.0
-    tied = full.copy()
-    tied[0, 1] = tied[1, 0] = 0
-    # 5 of 6 pairs agree and one is tied in one table alone
-    assert agreement(full, tied) == pytest.approx(5 / np.sqrt(6 * 5))
-    assert np.isnan(agreement(full, np.zeros_like(full)))

@@ -1,6 +1,5 @@
 """The frozen benchmark: its cases are pinned, and a changed one is refused."""
 
-import io
 import json
 import shutil
 from pathlib import Path
@@ -9,8 +8,7 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from simtest.bench.draws import Seeds, experiment_of, public_seeds
-from simtest.bench.seal import COMMITMENT, SEALED, commitment_of, open_seal, seal
+from simtest.bench.draws import experiment_of
 from simtest.bench.suite import (
     SUITE,
     CaseSpec,
@@ -28,7 +26,6 @@ from simtest.spec import scene_from_dict
 from simtest.surfaces.factory import make_surface
 from simtest.validation.cases import expand
 from tests.bench_tiny import tiny_suite
-from tests.marked import marked
 
 V1 = "d4ca908db0cf32f945db653d3cdff8a803ddec1b4946d63b1fee0de21422a6b3"
 """Never changed: a changed case, seed or part is a new version of the suite."""
@@ -110,26 +107,17 @@ def test_presets_and_recipes_are_written_out(suite: Suite) -> None:
             assert len(case.scene["surface"]["recipe"]) > 5
 
 
-def test_public_seeds_draw_pinned_scenes(suite: Suite) -> None:
-    experiment = experiment_of(suite, "smooth", "cone_axis", public_seeds(suite))
+def test_the_seed_draws_pinned_scenes(suite: Suite) -> None:
+    experiment = experiment_of(suite, "smooth", "cone_axis")
     assert experiment.seed == 4242855185012620933
     assert experiment.groups[0].pool[0]["surface.distance_mm"][:3] == (13.0514, 16.64, 13.8769)
-    hard = experiment_of(suite, "hard", "cone_axis", public_seeds(suite))
+    hard = experiment_of(suite, "hard", "cone_axis")
     assert hard.groups[0].pool[0]["surface.seed"][::12] == (958227, 286475, 670874)
 
 
-def test_other_seeds_draw_other_scenes(suite: Suite) -> None:
-    public = experiment_of(suite, "hard", "cone_axis", public_seeds(suite))
-    sealed = experiment_of(suite, "hard", "cone_axis", Seeds("secret", "c"))
-    assert public.seed != sealed.seed
-    for one, other in zip(public.groups, sealed.groups, strict=True):
-        assert not set(one.pool[0]["rig.lights.0.offset_mm"]) & set(other.pool[0]["rig.lights.0.offset_mm"])
-
-
-@pytest.mark.parametrize("secret", marked(["22", "first", "second"], ci=["first", "second"]))
-def test_every_drawn_scene_is_valid(suite: Suite, secret: str) -> None:
+def test_every_drawn_scene_is_valid(suite: Suite) -> None:
     for part in suite.spec.parts:
-        for case in expand(experiment_of(suite, part.name, "cone_axis", Seeds(secret))):
+        for case in expand(experiment_of(suite, part.name, "cone_axis")):
             scene_from_dict(case.data, case.where)
 
 
@@ -138,71 +126,6 @@ def test_a_part_or_version_that_is_unknown_is_told(suite: Suite) -> None:
         suite.part("smoth")
     with pytest.raises(InputError, match="allowed: v1"):
         load_suite("v9")
-
-
-def test_a_seal_opens_to_its_commitment(suite: Suite, tmp_path: Path) -> None:
-    commitment = seal(suite, tmp_path)
-    assert json.loads((tmp_path / COMMITMENT).read_text())["commitment"] == commitment
-    assert (tmp_path / SEALED).stat().st_mode & 0o077 == 0
-    seeds = open_seal(suite, tmp_path / SEALED)
-    held = json.loads((tmp_path / SEALED).read_text())
-    assert seeds.commitment == commitment == commitment_of(suite, held["secret"], held["salt"])
-    assert held["secret"] not in (tmp_path / COMMITMENT).read_text()
-    # another secret has another commitment
-    held["secret"] = held["secret"][::-1]
-    (tmp_path / SEALED).write_text(json.dumps(held))
-    assert open_seal(suite, tmp_path / SEALED).commitment != commitment
-    with pytest.raises(InputError, match="never replaced"):
-        seal(suite, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("content", "told"),
-    [
-        ("no JSON", "cannot be read as sealed seeds"),
-        ("[]", "cannot be read as sealed seeds"),
-        ("{}", "no key 'kind'"),
-        ('{"kind": "x", "suite": "", "secret": "s", "salt": "t"}', "kind = 'x'; must be"),
-        ('{"kind": "simtest-bench sealed seeds", "suite": "other", "secret": "s", "salt": "t"}', "of another suite"),
-    ],
-)
-def test_what_is_no_sealed_file_is_refused(suite: Suite, tmp_path: Path, content: str, told: str) -> None:
-    path = tmp_path / "seeds.json"
-    path.write_text(content)
-    with pytest.raises(InputError, match=told):
-        open_seal(suite, path)
-
-
-@pytest.mark.parametrize("key", ["secret", "salt"])
-def test_a_commitment_cannot_be_opened_in_two_ways(suite: Suite, tmp_path: Path, key: str) -> None:
-    """The same text, split into salt and secret elsewhere, is another commitment, and the form of both is fixed."""
-    seal(suite, tmp_path)
-    held = json.loads((tmp_path / SEALED).read_text())
-    assert commitment_of(suite, "b c", "a") != commitment_of(suite, "c", "a b")
-    wrong = (
-        "b c",
-        held[key][:-1],
-        held[key].upper() + "G",
-        "22",
-        "\ud800",
-        held[key] + "\n",
-        None,
-        [held[key]],
-        10**63,
-    )
-    for value in wrong:
-        (tmp_path / "forged.json").write_text(json.dumps({**held, key: value}))
-        told = f"has {len(value)} characters" if isinstance(value, str) else "is no text"
-        with pytest.raises(InputError, match=f"{key} {told}; must be 64 of 0-9a-f$"):
-            open_seal(suite, tmp_path / "forged.json")
-
-
-def test_a_seal_is_read_from_standard_input(suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    commitment = seal(suite, tmp_path)
-    monkeypatch.setattr("sys.stdin", io.StringIO((tmp_path / SEALED).read_text()))
-    assert open_seal(suite, Path("-")).commitment == commitment
-    with pytest.raises(InputError, match="--sealed -: cannot be read"):
-        open_seal(suite, Path("-"))
 
 
 SURFACES = {
@@ -217,7 +140,7 @@ SURFACES = {
 @pytest.mark.parametrize("name", list(SURFACES))
 def test_frozen_scenes_keep_their_surfaces(suite: Suite, name: str) -> None:
     """The hashes pin what is asked of the program that makes meshes; this pins what it makes of it."""
-    experiment = experiment_of(suite, "tissue", "cone_axis", public_seeds(suite))
+    experiment = experiment_of(suite, "tissue", "cone_axis")
     case = next(case for case in expand(experiment) if case.setting == name)
     surface = make_surface(case.scene(experiment, 0)[0].surface)
     mesh = surface.shape().mesh

@@ -162,7 +162,19 @@ BAD_USE = {
     "validate plain": "plain: no such file; shipped by name: anatomy, anatomy_sensor, camera, colon, compare",
     "validate overview --realisations many": "Invalid value for --realisations: many is not a whole number",
     "validate overview --realisations 0": "with replaced values: realisations = 0: must be greater than or equal to 1",
-    "validate overview --seed -1": "overview.toml with replaced values: seed = -1: must be greater than or equal to 0",
+    **{
+        f"{command} --seed {seed}": f"Invalid value for --seed: {seed} is no seed; must be a whole number from 0 to 922"
+        for seed in (-1, 2**63)
+        for command in (
+            "validate overview",
+            "dataset tiny --out x",
+            "mesh colon --out x.ply",
+            "twin x.png --out x",
+            "advise laparoscope --out x",
+            "realism x.png --against plane --out x",
+            "fit x.png --recipe smooth --out x.toml",
+        )
+    },
     "validate overview --estimator magic": "estimator 'magic': not installed; allowed: ",
     "validate overview --set surface.typo=1": "surface.typo = 1: unknown key; allowed: ",
     "validate overview --set typo": "--set typo: must be key=value",

@@ -35,6 +35,7 @@ from simtest.spec import load_dataset, load_scene, scene_from_dict
 from simtest.spec.dataset_recipe import Dataset, Distribution, Splits
 from simtest.spec.spec_model import validate
 from tests.marked import marked
+from tests.unit.engine_tasks import breaks, dies_once, fails, meets_a_full_disk, square
 
 ROOT = Path(__file__).resolve().parents[2]
 SIX = {"samples": 6, "samples_per_anatomy": 1}
@@ -670,8 +671,6 @@ def test_engines_are_checked():
 
 
 def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
-    from tests.unit.engine_tasks import dies_once, fails, meets_a_full_disk, square
-
     told = []
     got = dict(make_engine(workers=2).run(square, range(5), lambda: told.append(1)))
     assert got == {i: i * i for i in range(5)}
@@ -682,6 +681,16 @@ def test_processes_give_the_same_results_and_dead_ones_are_replaced(tmp_path):
         list(make_engine(workers=2).run(fails, [1, 2], lambda: None))
     with pytest.raises(OSError, match="No space left on device"):
         list(make_engine(workers=2).run(meets_a_full_disk, [1, 2], lambda: None))
+
+
+def test_an_error_of_a_worker_tells_where_it_came_up():
+    """The message stays one line; `--traceback` prints the note."""
+    with pytest.raises(SimtestError) as raised:
+        list(make_engine(workers=2).run(breaks, [1, 1], lambda: None))
+    assert str(raised.value) == "a worker failed (TypeError: no such kind: 1)"
+    (note,) = raised.value.__notes__
+    assert "engine_tasks.py" in note
+    assert 'raise TypeError(f"no such kind' in note
 
 
 @pytest.mark.parametrize(

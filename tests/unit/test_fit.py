@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from simtest.errors import InputError
+from simtest.realism.fitting import bank as banks
 from simtest.realism.fitting import inference
 from simtest.realism.fitting.bank import Bank, count_made, make_bank, read_bank
-from simtest.realism.fitting.emulator import features, learn
+from simtest.realism.fitting.emulator import FOLDS, PENALTIES, features, learn
 from simtest.realism.fitting.fit import fit_to_bank, ranges, summarise_scenes
 from simtest.realism.fitting.outcome import check_out, recipe_toml, report_json, write_fit
 from simtest.realism.fitting.parameters import Parameter, fitted_parameters, missing_kinds, narrowed, one_family
@@ -147,6 +149,22 @@ def planted(emulator, number, rng, repeats):
     return (found.interval[:, 0] <= truth) & (truth <= found.interval[:, 1])
 
 
+def test_columns_are_fitted_as_if_alone_and_share_their_matrices(bank, monkeypatch):
+    summaries = bank.summaries.copy()
+    summaries[::7, 4] = np.nan
+    summaries[5:, 6] = np.nan
+    gaps = Bank(bank.shares, summaries, bank.radiance)
+    solve, solved = np.linalg.solve, []
+    monkeypatch.setattr(np.linalg, "solve", lambda *told: solved.append(1) or solve(*told))
+    together = learn(gaps, from_integer(0), 3)
+    # For columns with gaps and without: folds times penalties, and each penalty that is taken.
+    assert len(solved) <= 2 * (FOLDS + 1) * len(PENALTIES)
+    for column in (0, 4, 6, 9):
+        alone = learn(Bank(bank.shares, summaries[:, [column]], bank.radiance), from_integer(0), 3)
+        assert together.weights[:, [column]] == pytest.approx(alone.weights, abs=1e-10)
+        assert together.draws[:, :, [column]] == pytest.approx(alone.draws, abs=1e-10)
+
+
 def test_what_frames_do_not_show_is_not_told(emulator):
     assert planted(emulator, 0, np.random.default_rng(3), 5).sum() >= 2
 
@@ -214,7 +232,10 @@ def test_frames_of_several_sizes_and_without_highlights_are_noted(tmp_path, bank
     assert list(seen[2]) == ["grey.png"]
     dataset = small()
     found = fit_to_bank(seen, dataset, fitted_parameters(dataset), bank_of_two(bank), repeats=5)
-    assert any("several sizes (96 x 80, 128 x 96)" in note for note in found.notes())
+    assert any("frames of 96 x 80, 128 x 96 px, the recipe's of 406 x 406: what" in note for note in found.notes())
+    # Frames of one size that is not the recipe's are noted too; those of the recipe's size are not.
+    assert any("frames of 96 x 80 px, the recipe's" in note for note in replace(found, sizes={(96, 80)}).notes())
+    assert not any("px" in note for note in replace(found, sizes={(406, 406)}).notes())
     report = report_json(found)
     json.dumps(report, allow_nan=False)
     assert [p["key"] for p in report["parameters"]] == ["surface.distance_mm", "sensor.noise_sigma"]
@@ -253,7 +274,7 @@ def test_summaries_of_a_frame_without_highlights_have_gaps():
     assert np.isnan(told["radius"])
 
 
-def test_a_folder_of_another_bank_and_a_damaged_one_are_refused(tmp_path):
+def test_a_folder_of_another_bank_and_a_damaged_one_are_refused(tmp_path, monkeypatch):
     dataset = small()
     parameters = fitted_parameters(dataset)
     for index in range(3):
@@ -262,8 +283,13 @@ def test_a_folder_of_another_bank_and_a_damaged_one_are_refused(tmp_path):
     made = make_bank(dataset, parameters, tmp_path, 3, chains=1)
     assert made.shares.tolist() == [[0.0, 0.0]] * 3
     assert count_made(tmp_path) == 3
-    with pytest.raises(InputError, match="holds the bank of another recipe, seed or size"):
+    with pytest.raises(InputError, match="holds the bank of another recipe, seed, size or release"):
         make_bank(dataset.model_copy(update={"seed": 9}), parameters, tmp_path, 3, chains=1)
+    # Its frames were rendered and measured by other code.
+    with monkeypatch.context() as other:
+        other.setattr(banks, "source_hash", lambda: "of other code")
+        with pytest.raises(InputError, match="or release of simtest"):
+            make_bank(dataset, parameters, tmp_path, 3, chains=1)
     (tmp_path / "000001.json").write_text("[{]")
     with pytest.raises(InputError, match=r"000001\.json: no file of a bank"):
         read_bank(tmp_path, 3, parameters)

@@ -9,8 +9,9 @@ import pytest
 from simtest.errors import Failure, Reason
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Patch
+from simtest.geometry.vectors import deviation_deg
 from studies.hard.cases import Case, calibration_of, load, rows_in, save, scene_of
-from studies.hard.measure import record
+from studies.hard.measure import record, semi_axis_deg
 from studies.hard.rows import GROUPS, ROWS
 from studies.hard.scenes import KINDS, SPLITS, base_scene
 from studies.hard.table import CHI2_95, lines, text, wilson
@@ -38,6 +39,17 @@ def test_every_row_of_every_kind_is_a_scene(number):
         priors = calibration_of(number, row, (10.0, 20.0)).priors
         assert bool(priors.lights_mm) == row.told.light
         assert priors.camera.is_exact == row.told.focal
+
+
+def test_a_reported_deviation_is_the_rms_of_the_angle_and_a_semi_axis_that_along_one_axis():
+    covariance = np.array([[4e-4, 1e-4], [1e-4, 1e-4]])
+    off = np.random.default_rng(0).multivariate_normal([0, 0], covariance, 20_000)
+    angles = np.degrees(np.hypot(*off.T))
+    assert deviation_deg(covariance) == pytest.approx(np.sqrt(np.mean(angles**2)), rel=0.02)
+    assert semi_axis_deg(covariance) == pytest.approx(np.sqrt(np.mean(angles**2) / 2), rel=0.02)
+    ahead = np.array([[0.0, 0.0, -1.0]])
+    estimate = Estimate(ahead[0], ahead, np.zeros(2), covariance=covariance)
+    assert estimate.deviation_deg == deviation_deg(covariance)
 
 
 def test_cases_are_read_as_they_were_written(tmp_path):

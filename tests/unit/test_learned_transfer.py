@@ -92,7 +92,8 @@ def test_an_answer_is_judged_against_the_surface_that_it_states(monkeypatch):
     assert made["base"].fine_deg == pytest.approx(math.degrees(0.08), abs=1e-6)
     assert (made["base"].inside, made["sure"].inside, made["fine"].inside) == (1, 0, 1)
     assert made["fine"].base_deg == pytest.approx(math.degrees(0.1), abs=1e-6)
-    assert made["fine"].stated_deg == pytest.approx(math.degrees(0.001))
+    # On one scale with the errors, which are angles.
+    assert made["fine"].stated_deg == pytest.approx(math.degrees(0.001) * math.sqrt(2))
     assert made["refuses"].status == "unlike the network's training: features"
     assert math.isnan(made["refuses"].base_deg)
 

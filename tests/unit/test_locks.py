@@ -307,6 +307,14 @@ def test_each_command_is_refused_a_file_in_use(tmp_path, run_here, name):
     assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
 
 
+@pytest.mark.parametrize("name", FILES.keys() - {"nightly"})
+def test_each_command_refuses_a_file_in_a_missing_folder_in_the_same_words(tmp_path, run_here, name):
+    *words, held = FILES[name]
+    code, lines = run_here(*words, f"nowhere/{held}")
+    assert (code, lines) == (2, [f"simtest: {words[-1]} nowhere/{held}: no such folder nowhere"])
+    assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
+
+
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EACCES])
 def test_full_disks_end_every_command_alike(tmp_path, number):
     error = OSError(number, os.strerror(number), str(tmp_path / "out" / "x.png"))

@@ -92,7 +92,7 @@ BAD = {
     "edge": (("colon", "--edge-mm", 0, "--out", "x.ply"), "edge_mm = 0: must be 0.01 to 20"),
     "many": (("colon", "--edge-mm", 0.02, "--out", "x.ply"), "at most 5000000 are allowed"),
     "cells": (("liver", "--edge-mm", 0.1, "--out", "x.ply"), "make the lobes smaller or the edges longer"),
-    "seed": (("colon", "--seed", -1, "--out", "x.ply"), "seed = -1"),
+    "seed": (("colon", "--seed", -1, "--out", "x.ply"), "-1 is no seed"),
     "key": (("colon", "--set", "radius=3", "--out", "x.ply"), "unknown key"),
     "curvature": (("colon", "--curvature", "--out", "x.stl"), "--curvature: .stl files hold none"),
     "missing": (("check", "none.ply"), "none.ply: no such file"),

@@ -38,7 +38,7 @@ def test_a_page_has_a_bar_of_its_own_below_that_of_the_work(bars):
         (bar,) = bars
         assert shown(bar) == [(0, 3, "starting with plane")]
         move(2, 3, "sphere")
-        move(3, 3, "done")
+        move(3, 3, "unwritten")
         assert shown(bar) == [(3, 3, "writing the report")]
         move(0, 1, "reading the results")
         move(1, 5, "drawing frame 1")

@@ -7,13 +7,18 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import simtest.rendering
 from simtest.cli.realism import realism
 from simtest.errors import InputError
 from simtest.realism.comparison import compare
 from simtest.realism.distance import distances
+from simtest.realism.fitting.frames import FrameMaker
+from simtest.realism.fitting.parameters import one_family
 from simtest.realism.frame_sets import NamedFrame, open_frames, open_generated, varied
 from simtest.realism.frame_statistics import COLUMNS
+from simtest.runtime.kept_arrays import kept
 from simtest.spec import load_scene
+from simtest.spec.dataset_recipe import load_dataset
 
 SPREAD = 0.3
 """Of the scenes' means, where a scene's own values spread by 1."""
@@ -68,8 +73,22 @@ def test_what_no_frame_tells_is_a_stated_gap():
 def test_equal_real_scenes_have_no_spread():
     same = {str(i): {name: np.ones(3) for name in COLUMNS} for i in range(5)}
     other = {str(i): {name: np.full(3, 2.0) for name in COLUMNS} for i in range(5)}
-    assert all(d.distance == 0 for d in distances(same, same))
-    assert all(np.isinf(d.distance) for d in distances(same, other))
+    assert all((d.distance, d.verdict) == (0, "near") for d in distances(same, same))
+    # Infinitely many spreads are the strongest difference, not too few scenes.
+    assert all((d.distance, d.interval, d.verdict) == (np.inf, (np.inf, np.inf), "far") for d in distances(same, other))
+    # One generated scene of five that differs may differ by chance.
+    other = same | {"0": other["0"]}
+    assert all((d.distance, d.interval, d.verdict) == (np.inf, (0, np.inf), "between") for d in distances(same, other))
+
+
+def test_columns_that_vary_together_do_not_narrow_the_interval():
+    """Six columns that hold the same numbers have the interval of one."""
+    sides = scenes(8), scenes(8, shift=1.0, seed=1)
+    for side in sides:
+        for values in side.values():
+            values |= {name: values["radius"] for name in COLUMNS}
+    found = {d.statistic.name: d for d in distances(*sides)}
+    assert found["colour"].interval == pytest.approx(found["radius"].interval)
 
 
 def picture(path, seed, size=(96, 128)):
@@ -95,6 +114,47 @@ def test_sets_of_files(tmp_path):
     assert len({frame.scene for frame in frames}) == 1
     assert len(frames) == 20
     assert frames[0].read().shape == (96, 128, 3)
+
+
+def test_of_a_folder_the_generated_frames_are_evenly_spread(tmp_path):
+    """Frames of one film beside each other show one place."""
+    for i in range(30):
+        picture(tmp_path / f"{i:02d}.png", i)
+    taken = [int(frame.name[:2]) for frame in open_generated(str(tmp_path), 5)]
+    assert taken == [0, 7, 14, 21, 29]
+    assert len(open_generated(str(tmp_path), 40)) == 30
+
+
+class StoringSession:
+    """Stands for a session: makes what a surface makes, an anatomy and a relief, and renders nothing."""
+
+    def __init__(self, scene, variant):
+        self.update(scene)
+
+    def update(self, scene):
+        for kind in ("colon", "relief"):
+            kept(kind, scene.model_dump_json(), lambda: {"a": np.zeros(1)})
+
+    def radiance(self):
+        raise InputError("renders nothing")
+
+
+def test_rendered_frames_keep_no_relief(tmp_path, monkeypatch):
+    monkeypatch.setenv("SIMTEST_CACHE", str(tmp_path / "kept"))
+    monkeypatch.setattr(simtest.rendering, "Session", StoringSession)
+    for frame in open_generated("tissue_colon", 2):
+        with pytest.raises(InputError, match="renders nothing"):
+            frame.read()
+    assert {path.name.split("-")[0] for path in (tmp_path / "kept").iterdir()} == {"colon"}
+
+
+def test_a_bank_of_a_fit_keeps_neither_reliefs_nor_anatomies(tmp_path, monkeypatch):
+    monkeypatch.setenv("SIMTEST_CACHE", str(tmp_path / "kept"))
+    monkeypatch.setattr(simtest.realism.fitting.frames, "Session", StoringSession)
+    maker = FrameMaker(one_family(load_dataset("endoscopy"), "tissue_colon"))
+    with pytest.raises(InputError, match="renders nothing"):
+        next(maker.frames(0, 1))
+    assert not (tmp_path / "kept").exists()
 
 
 def test_the_command_says_too_few_scenes(tmp_path, capsys):

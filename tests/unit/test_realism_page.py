@@ -67,6 +67,16 @@ def test_what_is_drawn_is_what_the_distance_compares():
     assert mean_distribution(real, "radius", x)[at] == pytest.approx(curves["real"].y, abs=0.02)
 
 
+def test_quartiles_lie_on_the_curve_that_is_drawn_beside_them():
+    """One frame of many small highlights among frames of few large ones: each scene has the same weight."""
+    rng = np.random.default_rng(4)
+    side = {str(i): {name: rng.lognormal(i / 4, 0.3, 20 if i else 400) for name in COLUMNS} for i in range(8)}
+    found = SetOfFrames(side, len(side), 0, []).quartiles("radius")
+    assert mean_distribution(side, "radius", np.array(found)) == pytest.approx([0.25, 0.5, 0.75], abs=0.01)
+    nothing = {"0": {name: np.empty(0) for name in COLUMNS}}
+    assert SetOfFrames(nothing, 1, 0, []).quartiles("radius") is None
+
+
 def test_every_verdict_has_its_own_symbol_and_every_statistic_its_row():
     real, generated = scenes(8, 1), scenes(8, 2)
     for values in generated.values():
@@ -80,6 +90,20 @@ def test_every_verdict_has_its_own_symbol_and_every_statistic_its_row():
     assert len({symbol.text for symbol in shown.values()}) == len(shown)
     assert "too few scenes" in {key.name for key in chart.keys}
     assert draw([chart])[0].std() > 5
+
+
+def test_an_infinite_distance_is_drawn_at_the_end_and_written(tmp_path):
+    real, generated = ({str(i): {name: np.full(3, value) for name in COLUMNS} for i in range(6)} for value in (1, 2))
+    found = of_scenes(real, generated)
+    marks = [mark for mark in distance_chart(found).panels[0].marks if mark.hover]
+    assert len(marks) == 12
+    assert all("far\ndistance ∞\n95 % interval ∞ to ∞" in mark.hover[0] for mark in marks)
+    assert "12 are far" in found.verdict
+    html = write_comparison(found, tmp_path, "plain").read_text()
+    assert "∞ to ∞" in html
+    assert {
+        (row["distance"], row["verdict"]) for row in json.loads((tmp_path / "realism.json").read_text())["statistics"]
+    } == {(None, "far")}
 
 
 def test_page_holds_verdict_numbers_frames_and_reasons(tmp_path):

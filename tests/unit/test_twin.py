@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ from simtest.advice.twin import bank as banks
 from simtest.advice.twin.bank import BankFrame, all_spots, frames_for
 from simtest.advice.twin.matching import TWINS, Matcher
 from simtest.advice.twin.patches import ANCHOR_MM, MOST_TILT_DEG, REACH_MM, TissuePatch, look_at, make_pool
-from simtest.advice.twin.run import TwinResult, match_spots, twin_picture, twins_of
+from simtest.advice.twin.run import TwinResult, _drawn, match_spots, twin_picture, twins_of
 from simtest.advice.twin.scenes import Look, SceneDraws, _distance, drawn_camera, look_of
 from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot, usable_spots
 from simtest.advice.twin.tissue import NAMES, WIDER, tissue_of
@@ -24,12 +25,15 @@ from simtest.errors import InputError, SimtestError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
 from simtest.geometry.angular_profile import AngularProfile
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.kept_arrays import kept
 from simtest.spec import load_scene
+from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.spec_model import validate
 from simtest.surfaces.factory import make_surface
 
 CAMERA = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)
@@ -102,6 +106,14 @@ def test_a_told_organ_has_its_relief_and_film_and_form(organ):
     assert tissue != tissue_of(None)
 
 
+def test_what_no_option_narrows_says_so():
+    told = {organ: " ".join(map(str, _drawn(organ, tissue_of(organ)))) for organ in (None, "colon")}
+    assert "light exits: discs of 0.5 to 1.3 mm radius; lights of one power (to narrow: not possible" in told["colon"]
+    assert "to narrow: --organ" in told[None]
+    assert "--organ" not in told["colon"]
+    assert not any("not yet" in text for text in told.values())
+
+
 def test_an_organ_that_nobody_knows_is_refused_before_anything_is_rendered(framed):
     with pytest.raises(InputError, match="--organ brain: must be one of colon, stomach, liver, gallbladder"):
         twin_picture(framed, Options(fov_deg=60.0), organ="brain")
@@ -162,6 +174,18 @@ def test_a_guessed_camera_is_drawn_about_the_guess():
     assert np.std([each["fx"] for each in made]) == pytest.approx(10.0, rel=0.2)
     assert np.std([each["cx"] for each in made]) == pytest.approx(2.0, rel=0.2)
     assert np.std([each["distortion"]["k1"] for each in made]) == pytest.approx(0.05, rel=0.2)
+
+
+@pytest.mark.parametrize("lens", [None, BrownConrady(0.1), KannalaBrandt(0.02), Scaramuzza(-0.1)])
+def test_a_given_lens_is_drawn_about_what_is_given(lens):
+    """The prior moves a point at r focal lengths by k1 r^3 focal lengths, whatever the lens."""
+    camera = replace(CAMERA, distortion=lens)
+    pixel = np.array([camera.cx + 0.3 * camera.fx, camera.cy])
+    made = [validate(SceneCamera, drawn_camera(camera, CameraPrior(distortion_sd=0.02), rng(seed)), "camera").model()
+            for seed in range(200)]  # fmt: skip
+    seen = np.array([each.project(camera.unproject(pixel)) for each in made]) - pixel
+    assert seen[:, 1] == pytest.approx(0, abs=1e-6)
+    assert np.std(seen[:, 0]) == pytest.approx(0.02 * 0.3**3 * camera.fx, rel=0.25)
 
 
 @pytest.mark.parametrize(("colour", "organ"), [((0.66, 0.29, 0.19), "tissue_colon"),

@@ -27,17 +27,19 @@ from simtest.runtime.resources import shown
 LEAST_TWINS = 20
 """A bank with fewer highlights measures nothing."""
 
+FIXED = "not possible: simtest twin takes no value of it"
+
 DRAWN = (
-    Assumption("curvature and tilt of the tissue", "a pool of 16 patches; tilts up to 35 deg", "not yet told"),
-    Assumption("light exits", "discs of 0.5 to 1.3 mm radius; lights of one power", "not yet told"),
-    Assumption("camera chain", "one of three presets, its sharpening, noise and coding drawn", "not yet told"),
+    Assumption("curvature and tilt of the tissue", "a pool of 16 patches; tilts up to 35 deg", FIXED),
+    Assumption("light exits", "discs of 0.5 to 1.3 mm radius; lights of one power", FIXED),
+    Assumption("camera chain", "one of three presets, its sharpening, noise and coding drawn", FIXED),
 )
 """What no frame shows and no file states of a twin; the ranges are those of `patches` and `scenes`."""
 
 
 def _drawn(organ: str | None, tissue: Tissue) -> list[Assumption]:
     """Return what is drawn anew for each frame of the bank; the relief and the film as the organ has them."""
-    name, how = ("any tissue", "--organ") if organ is None else (organ, "not yet told")
+    name, how = ("any tissue", "--organ") if organ is None else (organ, FIXED)
     film = "roughness {:.2g} to {:.2g}, level {:.2g} to {:.2g}".format(*tissue.alpha, *tissue.level)
     relief = Assumption("relief of the tissue", f"{name}: {tissue}", how)
     return [relief, Assumption("liquid film", f"{name}: {film}", how), *DRAWN]

@@ -186,9 +186,12 @@ def drawn_camera(camera: Camera, prior: CameraPrior, rng: np.random.Generator) -
     shift = prior.centre_sd_px * rng.standard_normal(2)
     table |= {"fx": camera.fx * scale, "fy": camera.fy * scale}
     table |= {"cx": camera.cx + float(shift[0]), "cy": camera.cy + float(shift[1])}
-    k1 = prior.distortion_sd * float(rng.standard_normal())
-    if camera.distortion is None and k1:
-        table["distortion"] = {"type": "brown_conrady", "k1": k1}
+    error = prior.distortion_sd * float(rng.standard_normal())
+    if error:
+        lens = table.get("distortion", {"type": "brown_conrady"})
+        # To first order k2 of the polynomial moves a point as k1 of the other lenses does.
+        name = "k2" if lens["type"] == "scaramuzza" else "k1"
+        table["distortion"] = {**lens, name: lens.get(name, 0.0) + error}
     return table
 
 

@@ -15,6 +15,7 @@ from simtest.realism.fitting.summaries import NAMES, summarise
 from simtest.realism.frame_statistics import measure
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import Json, make_folder, require_plain, write_json
+from simtest.runtime.provenance import source_hash
 from simtest.runtime.resources import shown
 from simtest.spec.dataset_recipe import Dataset, Splits
 
@@ -166,6 +167,7 @@ def _claim(recipe: Dataset, folder: Path, chains: int) -> None:
     path = folder / "bank.json"
     # A larger bank of the same recipe goes on from a smaller one only where the plan is the same.
     wanted: dict[str, Any] = {"chains": chains, "recipe": recipe.model_dump(mode="json"), "summaries": list(NAMES)}
+    wanted["source"] = source_hash()
     if not path.is_file():
         write_json(path, wanted)
         return
@@ -175,5 +177,6 @@ def _claim(recipe: Dataset, folder: Path, chains: int) -> None:
         raise InputError(f"{shown(path)}: not valid JSON ({error}); remove the folder") from error
     if held != json.loads(json.dumps(wanted)):
         raise InputError(
-            f"{shown(folder)}: holds the bank of another recipe, seed or size; remove it or name another --out"
+            f"{shown(folder)}: holds the bank of another recipe, seed, size or release of simtest; remove it or name "
+            "another --out"
         )

@@ -141,18 +141,20 @@ def learn(bank: Bank, rng: np.random.Generator, draws: int) -> Emulator:
     x, fold = features(bank.shares), rng.permutation(len(radiances))[numbers] % FOLDS
     # One sign a radiance: its pictures share what the form misses of it (wild cluster bootstrap).
     signs = rng.choice([-1.0, 1.0], size=(draws, len(radiances)))[:, numbers]
-    weights, residuals = np.empty((x.shape[1], values.shape[1])), np.full(values.shape, np.nan)
-    errors = np.empty((draws, *weights.shape))
-    for s in range(values.shape[1]):
-        known = np.isfinite(values[:, s])
+    # A summary that hardly any picture tells counts as pure noise.
+    weights, residuals = np.zeros((x.shape[1], values.shape[1])), np.full(values.shape, np.nan)
+    errors = np.zeros((draws, *weights.shape))
+    patterns, pattern = np.unique(np.isfinite(values), axis=1, return_inverse=True)
+    for number, known in enumerate(patterns.T):
         if np.count_nonzero(known) < LEAST_RADIANCES:
-            # Hardly any picture tells it: it counts as pure noise.
-            weights[:, s], errors[:, :, s] = 0.0, 0.0
             continue
-        weights[:, s], residuals[known, s], solver = _ridge(
-            x[known], values[known, s], fold[known], bank.shares.shape[1]
-        )
-        errors[:, :, s] = (signs[:, known] * residuals[known, s]) @ solver.T
+        # Columns that the same pictures tell share their matrices.
+        columns = np.flatnonzero(pattern.ravel() == number)
+        told = np.ix_(known, columns)
+        residuals[told], solvers = _ridge(x[known], values[told], fold[known], bank.shares.shape[1])
+        for s, solver in zip(columns, solvers, strict=True):
+            weights[:, s] = solver @ values[known, s]
+            errors[:, :, s] = (signs[:, known] * residuals[known, s]) @ solver.T
     # The error of the mean at the bank's own pictures, which lie all over the ranges.
     wrong = np.einsum("nf,rfs->rns", x[:: max(1, len(x) // 100)], errors).reshape(-1, values.shape[1])
     return Emulator(centre, scale, weights, _covariance(residuals), wrong.T @ wrong / len(wrong), errors)
@@ -167,26 +169,27 @@ def _standard(summaries: Array) -> tuple[Array, Array]:
     return centre, np.where(scale > 0, scale, 1.0)
 
 
-def _ridge(x: Array, y: Array, fold: IntArray, parameters: int) -> tuple[Array, Array, Array]:
-    """Return the weights, the residuals of unseen folds, and the matrix that makes weights of values, (F, N)."""
+def _ridge(x: Array, y: Array, fold: IntArray, parameters: int) -> tuple[Array, list[Array]]:
+    """Return the residuals of unseen folds, shape (N, C), and of each column the matrix of weights of values, (F, N).
+
+    Each column has the penalty whose residuals are least.
+    """
     penalty = np.ones(x.shape[1])
     penalty[0], penalty[1 + 2 * parameters :] = 0.0, MIXED_PENALTY
-    best: tuple[float, Array, float] = (np.inf, np.empty(0), 0.0)
-    for strength in PENALTIES:
-        residuals = np.empty(len(y))
-        for k in np.unique(fold):
-            out = fold == k
-            residuals[out] = y[out] - x[out] @ (_solver(x[~out], strength * penalty) @ y[~out])
-        loss = float(np.mean(residuals**2))
-        if loss < best[0]:
-            best = (loss, residuals, float(strength))
-    solver = _solver(x, best[2] * penalty)
-    return solver @ y, best[1], solver
+    residuals = np.empty((len(PENALTIES), *y.shape))
+    for k in np.unique(fold):
+        out = fold == k
+        for i, strength in enumerate(PENALTIES):
+            weights = _solved(x[~out], strength * penalty, x[~out].T @ y[~out])
+            residuals[i, out] = y[out] - x[out] @ weights
+    best = np.mean(residuals**2, axis=1).argmin(axis=0)
+    solvers = {i: _solved(x, PENALTIES[i] * penalty, x.T) for i in np.unique(best).tolist()}
+    return np.take_along_axis(residuals, best[None, None], axis=0)[0], [solvers[i] for i in best.tolist()]
 
 
-def _solver(x: Array, penalty: Array) -> Array:
-    """Return (X'X + n diag(penalty))^-1 X'."""
-    return np.asarray(np.linalg.solve(x.T @ x + np.diag(len(x) * penalty + 1e-9), x.T))
+def _solved(x: Array, penalty: Array, right: Array) -> Array:
+    """Return (X'X + n diag(penalty))^-1 times a matrix."""
+    return np.asarray(np.linalg.solve(x.T @ x + np.diag(len(x) * penalty + 1e-9), right))
 
 
 def _covariance(residuals: Array) -> Array:

@@ -16,6 +16,7 @@ from simtest.realism.frame_sets import NamedFrame
 from simtest.realism.frame_statistics import measure
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
+from simtest.spec import load_scene
 from simtest.spec.dataset_recipe import Dataset
 
 LEAST_SCENES = 3
@@ -79,9 +80,14 @@ class FittedRecipe:
             notes.append(f"the frames do not tell: {', '.join(silent)}")
         if self.out_of_reach:
             notes.append(f"no frame of the recipe reaches: {', '.join(self.out_of_reach)}")
-        if len(self.sizes) > 1:
+        family = self.recipe.families[0]
+        camera = load_scene(family.scene, family.set).camera
+        if self.sizes != {(camera.width, camera.height)}:
             sizes = ", ".join(f"{width} x {height}" for width, height in sorted(self.sizes))
-            notes.append(f"frames of several sizes ({sizes}): what is measured in pixels mixes them")
+            notes.append(
+                f"frames of {sizes} px, the recipe's of {camera.width} x {camera.height}: what is measured in pixels "
+                "(halos, noise, spectrum) differs with the size"
+            )
         return notes
 
 

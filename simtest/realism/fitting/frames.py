@@ -10,6 +10,7 @@ from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
+from simtest.runtime.kept_arrays import only_reading
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.rendered_view import expose_picture
@@ -109,11 +110,12 @@ class FrameMaker:
         from simtest.surfaces.factory import forget_meshes
 
         if self._session is not None and anatomy != self._anatomy:
-            # As in `simtest dataset`: an anatomy never comes back, and its memory must not add up.
+            # As in `simtest dataset`: an anatomy never comes back, and neither its memory nor its files must add up.
             self._session = None
             forget_meshes()
             backend.release_memory()
-        if self._session is None:
-            self._session, self._anatomy = Session(scene, self._variant), anatomy
-        self._session.update(scene)
+        with only_reading():
+            if self._session is None:
+                self._session, self._anatomy = Session(scene, self._variant), anatomy
+            self._session.update(scene)
         return self._session

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from simtest.realism.distance import widened
 from simtest.realism.fitting.emulator import Emulator
 from simtest.runtime.arrays import Array, IntArray
 
@@ -128,7 +129,8 @@ def infer(
         if step:
             step(number + 1, repeats)
     centres, spreads = (np.array(part) for part in zip(*found, strict=True))
-    return Fitted(centre, spread, gap, centres, spreads, _interval(centre, centres, len(values)), told)
+    interval = np.clip(widened(centre, centres, len(values)).T, 0.0, 1.0)
+    return Fitted(centre, spread, gap, centres, spreads, interval, told)
 
 
 def _complete(emulator: Emulator, scenes: Array) -> tuple[Array, Array]:
@@ -225,17 +227,3 @@ def _gaussian(covariance: Array, scatter: Array, count: int) -> tuple[float, Arr
     solved = inverse @ scatter
     value = (count * np.linalg.slogdet(covariance)[1] + np.trace(solved)) / 2
     return float(value), np.asarray((count * inverse - solved @ inverse) / 2)
-
-
-def _interval(centre: Array, centres: Array, scenes: int) -> Array:
-    """Return 95 % intervals of centres, shape (P, 2), inside their ranges.
-
-    Few scenes resample too narrowly: deviations from the centre are widened from a normal to Student's distribution.
-    """
-    from scipy.stats import norm, t
-
-    wider = t.ppf(0.975, scenes - 1) / norm.ppf(0.975) * np.sqrt(scenes / (scenes - 1))
-    low, high = np.quantile(centres, [0.025, 0.975], axis=0)
-    middle = np.median(centres, axis=0)
-    ends = np.stack([centre + (low - middle) * wider, centre + (high - middle) * wider], axis=1)
-    return np.asarray(np.clip(ends, 0.0, 1.0))

@@ -31,7 +31,6 @@ def write_fit(found: FittedRecipe, path: Path) -> tuple[Path, Path]:
     """
     report = path.with_suffix(".json")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, lambda part: part.write_text(recipe_toml(found.recipe), encoding="utf-8"))
         write_json(report, report_json(found))
     except OSError as error:

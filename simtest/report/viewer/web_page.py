@@ -24,8 +24,6 @@ def check_page(path: Path) -> None:
     """Raise `InputError` where it is plain, before anything is rendered, that there can be no page."""
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--page {path}: suffix {path.suffix!r}; must be .html")
-    if not path.parent.is_dir():
-        raise InputError(f"--page {path}: no such folder")
 
 
 def write_scene_page(content: Content, path: Path, title: str) -> None:

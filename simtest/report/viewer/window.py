@@ -52,8 +52,6 @@ def check_target(path: Path | None) -> None:
         return
     if path.suffix.lower() != ".png":
         raise InputError(f"--screenshot {path}: suffix {path.suffix!r}; must be .png")
-    if not path.parent.is_dir():
-        raise InputError(f"--screenshot {path}: no such folder")
 
 
 def save_screenshot(content: Content, path: Path) -> None:

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import traceback
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -175,14 +176,14 @@ def _work(pipe: Connection, task: Task, threads: int) -> None:
 def _answer(pipe: Connection, task: Task, argument: Any) -> tuple[str, Any]:
     try:
         return "done", task(argument, lambda: pipe.send(("step", None)))
-    except SimtestError as error:
-        return "error", error
     except Exception as error:
+        answer = error
         # Whoever knows the folder says which one it is.
-        if isinstance(error, OSError) and disk_problem(error):
-            return "error", error
-        told = machine_problem(error) or f"a worker failed ({type(error).__name__}: {error})"
-        return "error", SimtestError(told)
+        if not isinstance(error, SimtestError) and not (isinstance(error, OSError) and disk_problem(error)):
+            answer = SimtestError(machine_problem(error) or f"a worker failed ({type(error).__name__}: {error})")
+        # A traceback does not pass the pipe; its text does.
+        answer.add_note(f"In a worker: {''.join(traceback.format_exception(error))}")
+        return "error", answer
 
 
 def _die_with_parent() -> None:
