@@ -17,6 +17,9 @@ STEEPEST = 1e6
 """Largest tangent of a field angle for which a perspective lens is evaluated."""
 
 CLOSE = 4 * float(np.finfo(float).eps)
+NEAR = 1e-6
+"""Within this share of the value Newton's steps are not watched: rounding stops them from getting nearer."""
+
 REAL_ROOT = 1e-9
 """An imaginary part below this share of a root's size is rounding."""
 
@@ -48,18 +51,22 @@ def invert(curve: Curve, value: Array, top: float, reach: float) -> Array:
     # start: the identity, or the middle of the bracket
     low, high, target = np.zeros(len(open_)), np.full(len(open_), top), wanted[open_]
     x = np.minimum(target, 0.5 * high)
+    # gaps of the last step and of the one before
+    last, earlier = np.full((2, len(open_)), np.inf)
     for _ in range(NEWTON_STEPS):
-        # narrow the bracket, then take Newton's step where it stays inside, else bisect
+        # narrow the bracket, then take Newton's step where it stays inside and does not go to and fro, else bisect
         reached, slope = curve(x)
         gap = reached - target
         low, high = np.where(gap < 0, x, low), np.where(gap > 0, x, high)
         with np.errstate(divide="ignore", invalid="ignore"):
             after = x - gap / slope
-        after = np.where((after >= low) & (after <= high), after, (low + high) / 2)
+        nearer = np.abs(gap) < np.maximum(earlier / 2, NEAR * target)
+        after = np.where((after >= low) & (after <= high) & nearer, after, (low + high) / 2)
         # points leave the iteration as they converge
         done = (np.abs(after - x) <= CLOSE * x) | (np.abs(gap) <= CLOSE * target)
         found[open_[done]] = after[done]
-        open_, target, low, high, x = (part[~done] for part in (open_, target, low, high, after))
+        parts = (open_, target, low, high, after, np.abs(gap), last)
+        open_, target, low, high, x, last, earlier = (part[~done] for part in parts)
         if not len(open_):
             break
     found[open_] = x

@@ -128,7 +128,7 @@ def test_help_and_pages_name_all_that_is_shipped(here, command, kind, page):
 
 BAD_USE = {
     "frobnicate": 'Unknown command "frobnicate". Available commands: ',
-    "render": "SCENE: missing (A scene file, or the name of a shipped scene); simtest render --help describes it",
+    "render": "SCENE: missing (A scene file, a sample's JSON, or a shipped scene); simtest render --help describes it",
     "render plane": "--out: missing (Folder for the results; made if need be); simtest render --help describes it",
     "render plane --out": "--out: needs a value (Folder for the results",
     "score answers.csv": "--on: missing (Run or dataset whose frames were exported",
