@@ -8,8 +8,9 @@ import polars as pl
 
 from simtest.pages.style import estimator_order, number
 from simtest.report.run_folder import Run
+from simtest.runtime.statistics import mean_interval
 from simtest.validation.paired import side_by_side, targets_of
-from simtest.validation.statistics import student_interval
+from simtest.validation.statistics import units
 
 NONE = "–"
 
@@ -27,7 +28,7 @@ class Pair:
     mean_first: float | None  # over the n
     mean_second: float | None
     difference: float | None  # mean of first less second
-    low: float | None  # its 95 % interval (Student's t); None with fewer than two
+    low: float | None  # its 95 % interval, over frames; None with fewer than two
     high: float | None
     first_better: int  # highlights where the first is nearer to the truth
 
@@ -71,7 +72,7 @@ def _pair(label: str, first: str, second: str, wide: pl.DataFrame) -> Pair:
     answered = wide.filter(one.is_not_null() & other.is_not_null())
     a, b = (answered[f"of {name}"].to_numpy().astype(float) for name in (first, second))
     n = len(a)
-    low, high = student_interval(a - b)
+    low, high = mean_interval(a - b, *units(answered))
     return Pair(
         label, first, second, n,
         int((one.is_not_null() & other.is_null()).sum()), int((one.is_null() & other.is_not_null()).sum()),

@@ -24,19 +24,17 @@ from simtest.errors import FAULTS
 from simtest.estimators.descriptions import is_own
 from simtest.runtime.arrays import Array
 from simtest.runtime.entry_points import OWN
+from simtest.runtime.statistics import Interval, median_interval
 from simtest.validation.paired import (
-    FRAME,
     LEAST_FRAMES,
     Distinct,
     distinct_frames,
     is_above_zero,
-    median_interval,
     side_by_side,
     targets_of,
-    units,
 )
 from simtest.validation.situations import Situation, is_co_located, situations_of
-from simtest.validation.statistics import PENALTY_DEG, Interval
+from simtest.validation.statistics import FRAME, PENALTY_DEG, units
 
 BREAK_DEG = 5.0
 """A method breaks where the mean error of its answers is larger, ..."""

@@ -29,7 +29,7 @@ STATISTICS: tuple[Mutant, ...] = (
            "mean_deg=_or_none(np.median, errors)"),
     mutant("median is the mean", "statistics", f"{_FIGURES}:figures", "median_deg=_or_none(np.median, errors)",
            "median_deg=_or_none(np.mean, errors)"),
-    mutant("interval of 90 % called 95 %", "statistics", f"{_FIGURES}:student_interval", "(1 + CONFIDENCE) / 2",
+    mutant("interval of 90 % called 95 %", "statistics", "simtest.runtime.statistics:student_quantile", "(1 + CONFIDENCE) / 2",
            "CONFIDENCE"),
     mutant("95th percentile is the 90th", "statistics", f"{_FIGURES}:figures", "np.percentile(e, 95)",
            "np.percentile(e, 90)"),

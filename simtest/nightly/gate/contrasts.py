@@ -14,7 +14,7 @@ from scipy import stats
 
 from simtest.nightly.gate.quantities import Quantity
 from simtest.runtime.arrays import Array, IntArray, Mask
-from simtest.validation.statistics import CONFIDENCE
+from simtest.runtime.statistics import CONFIDENCE
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ SUMMARY: dict[str, Judged | NotJudged] = {
     "p95_deg": _COUNT,
     "max_deg": _COUNT,
     "mean_penalised_deg": Judged(f"mean_penalised_deg, {_WITH_TESTS}", f"{_ERROR}; {_ROWS}"),
-    "ci95_deg": Judged("published mean_deg, interval", _ROWS),
+    "ci95_deg": Judged("mean_deg", _ROWS),
     "coverage95": Judged(f"coverage95, truth_in_region, {_WITH_TESTS}", f"{_LIMITS.coverage:g}, either way; {_ROWS}"),
 }
 """Figures of a setting and estimator in summary.json."""

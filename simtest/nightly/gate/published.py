@@ -3,14 +3,12 @@
 The code that makes the figures is not asked: a mean that became a median shows here on any night.
 """
 
-import numpy as np
 import polars as pl
-from scipy import stats
 
 from simtest.nightly.gate.figures import digests_of
 from simtest.nightly.gate.quantities import ANSWERED, COVERED, IS_TRUE, RATIO_OFF, is_false
 from simtest.nightly.records import CELL
-from simtest.validation.statistics import CONFIDENCE, PENALTY_DEG
+from simtest.validation.statistics import PENALTY_DEG
 
 PUBLISHED = "published "
 """Begins the names of these comparisons."""
@@ -21,9 +19,7 @@ SAME = 1e-9
 FLOOR = 1e-2
 """Figures below it, such as a deviation of equal errors, are held to as much as this one."""
 
-_TAIL = (1 - CONFIDENCE) / 2
 _SHARES = ("failed", "missed", "unanswered", "coverage95")
-_MEANS = ("mean_deg", "axis_ratio")
 _SHA = r"^[0-9a-f]{64}$"
 
 
@@ -36,7 +32,7 @@ def unlike_rows(figures: pl.DataFrame, rows: pl.DataFrame) -> pl.DataFrame:
     own = figures.filter(pl.col("kind") == "setting", pl.col("value").is_not_null() | (pl.col("quantity") != "n"))
     if own.is_empty() or rows.is_empty():
         return pl.DataFrame()
-    found = own.select(*CELL, "quantity", "unit", "n", "value", "low", "high")
+    found = own.select(*CELL, "quantity", "unit", "n", "value")
     frames = found.filter(pl.col("quantity") == "frames").select(*CELL, frames="value")
     anew = _anew(rows, frames).join(found.select(CELL).unique(), on=CELL, how="semi", nulls_equal=True)
     key = (*CELL, "quantity")
@@ -44,14 +40,9 @@ def unlike_rows(figures: pl.DataFrame, rows: pl.DataFrame) -> pl.DataFrame:
         found, on=key, how="full", coalesce=True, nulls_equal=True, suffix="_2", maintain_order="left_right"
     )
     both = both.filter(~pl.col("quantity").is_in(["frames", "n_instrument"]))
-    differs = [_differs(pl.col(name), pl.col(f"{name}_2")) for name in ("value", "low", "high")]
-    unlike = both.filter(pl.any_horizontal(differs)).with_columns(
-        # The first of the three that differs is shown.
-        baseline=_first_of(differs, ""), tonight=_first_of(differs, "_2"),
-        quantity=pl.concat_str(
-            pl.lit(PUBLISHED), "quantity", pl.when(differs[0]).then(pl.lit("")).otherwise(pl.lit(", interval"))
-        ),
-    )  # fmt: skip
+    unlike = both.filter(_differs(pl.col("value"), pl.col("value_2"))).with_columns(
+        baseline=pl.col("value"), tonight=pl.col("value_2"), quantity=pl.concat_str(pl.lit(PUBLISHED), "quantity")
+    )
     made = [unlike.select(*CELL, "quantity", pl.col("unit").fill_null(""), "n", "baseline", "tonight")]
     made.append(_other_digests(own, rows))
     return pl.concat(made, how="diagonal").with_columns(
@@ -66,11 +57,6 @@ def _differs(was: pl.Expr, now: pl.Expr) -> pl.Expr:
     return apart.fill_null(False) | (was.is_null() != now.is_null())
 
 
-def _first_of(differs: list[pl.Expr], suffix: str) -> pl.Expr:
-    value, low, high = (pl.col(f"{name}{suffix}") for name in ("value", "low", "high"))
-    return pl.when(differs[0]).then(value).when(differs[1]).then(low).otherwise(high)
-
-
 def _other_digests(own: pl.DataFrame, rows: pl.DataFrame) -> pl.DataFrame:
     """Return the cells whose hash is not that of their rows."""
     stated = own.filter(pl.col("digest").str.contains(_SHA)).select(*CELL, "digest").unique(CELL)
@@ -81,7 +67,7 @@ def _other_digests(own: pl.DataFrame, rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def _anew(rows: pl.DataFrame, frames: pl.DataFrame) -> pl.DataFrame:
-    """Compute figures from rows: `CELL`, `quantity`, `value`, `low`, `high`; those without a number are left out."""
+    """Compute figures from rows: `CELL`, `quantity`, `value`; those without a number are left out."""
     true, failed = IS_TRUE, ~pl.col("status").is_in(["ok", "missed"])
     ok, missed = true & (pl.col("status") == "ok"), true & (pl.col("status") == "missed")
     error, distance = pl.col("error_deg").filter(ok), pl.col("mahalanobis2").filter(ok).drop_nulls()
@@ -89,31 +75,28 @@ def _anew(rows: pl.DataFrame, frames: pl.DataFrame) -> pl.DataFrame:
     table = rows.group_by(CELL, maintain_order=True).agg(
         n=true.sum(), n_ok=ok.sum(), failed=(true & failed).sum(), missed=missed.sum(), unanswered=(true & ~ok).sum(),
         false=is_false(rows).sum(), with_rows=pl.col("realisation").n_unique(),
-        mean_deg=error.mean(), mean_deg_sd=error.std(), rms_deg=(error**2).mean().sqrt(), std_deg=error.std(),
+        mean_deg=error.mean(), rms_deg=(error**2).mean().sqrt(), std_deg=error.std(),
         median_deg=error.median(), p95_deg=error.quantile(0.95, "linear"), max_deg=error.max(),
         mean_oracle_deg=pl.col("error_oracle_deg").filter(ok).mean(),
         mean_base_deg=pl.col("error_base_deg").filter(ok).drop_nulls().mean(), regions=distance.len(),
         mean_penalised_deg=(error.sum() + PENALTY_DEG * (true.sum() - ok.sum())) / true.sum(),
-        coverage95=(distance <= COVERED).sum(), ratios=ratio.len(), axis_ratio=ratio.mean(), axis_ratio_sd=ratio.std(),
+        coverage95=(distance <= COVERED).sum(), axis_ratio=ratio.mean(),
         axis_ratio_median=ratio.median(), broken=(ok & ~ANSWERED).any(),
     )  # fmt: skip
     table = table.join(frames, on=CELL, how="left", nulls_equal=True, maintain_order="left")
     table = table.with_columns(
         false=pl.col("false") / pl.max_horizontal(pl.col("frames").fill_null(0), "with_rows"),
-        mean_deg_n=pl.col("n_ok"),
-        axis_ratio_n=pl.col("ratios"),
     )
     made = [table.select(*CELL, quantity=pl.lit(name), value=pl.col(name).cast(pl.Float64)) for name in _PLAIN]
     # An error that is no number makes those figures unknown that hold it.
     made = [_known(one, table) for one in made]
     made += [_share(table, name, "regions" if name == "coverage95" else "n") for name in _SHARES]
-    made += [_mean(table, name) for name in _MEANS]
     return pl.concat(made, how="diagonal").filter(pl.col("value").is_finite())
 
 
 _PLAIN = (
-    "n", "n_ok", "false", "rms_deg", "std_deg", "median_deg", "p95_deg", "max_deg", "mean_oracle_deg", "mean_base_deg",
-    "mean_penalised_deg", "axis_ratio_median",
+    "n", "n_ok", "false", "mean_deg", "rms_deg", "std_deg", "median_deg", "p95_deg", "max_deg", "mean_oracle_deg",
+    "mean_base_deg", "mean_penalised_deg", "axis_ratio", "axis_ratio_median",
 )  # fmt: skip
 
 
@@ -128,24 +111,4 @@ def _known(figures: pl.DataFrame, table: pl.DataFrame) -> pl.DataFrame:
 
 
 def _share(table: pl.DataFrame, name: str, of: str) -> pl.DataFrame:
-    """Compute a share with Clopper and Pearson's interval."""
-    k, n = table[name].to_numpy().astype(float), table[of].to_numpy().astype(float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low = np.where(k > 0, stats.beta.ppf(_TAIL, k, n - k + 1), 0.0)
-        high = np.where(k < n, stats.beta.ppf(1 - _TAIL, k + 1, n - k), 1.0)
-        value = k / n
-    made = table.select(CELL).with_columns(pl.lit(name).alias("quantity"), pl.Series("value", value))
-    return made.with_columns(pl.Series("low", low), pl.Series("high", high))
-
-
-def _mean(table: pl.DataFrame, name: str) -> pl.DataFrame:
-    """Compute a mean with Student's interval; that of angles is not negative."""
-    n = table[f"{name}_n"].to_numpy().astype(float)
-    mean, deviation = (table[column].to_numpy() for column in (name, f"{name}_sd"))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        half = np.where(n > 1, stats.t.ppf(1 - _TAIL, np.maximum(n - 1, 1)) * deviation / np.sqrt(n), np.nan)
-    low = np.maximum(mean - half, 0.0) if name == "mean_deg" else mean - half
-    made = table.select(CELL).with_columns(pl.lit(name).alias("quantity"), pl.Series("value", mean))
-    return made.with_columns(pl.Series("low", low), pl.Series("high", mean + half)).with_columns(
-        pl.col("value", "low", "high").fill_nan(None)
-    )
+    return table.select(*CELL, quantity=pl.lit(name), value=pl.col(name) / pl.col(of))
