@@ -50,10 +50,11 @@ def mean_interval(
     Returns
     -------
     (float or None, float or None)
-        None for a single group. Where each group has a stratum of its own, the spread between these has to do.
+        None where a single group holds values. Where each group has a stratum of its own, the spread between these has
+        to do.
     """
     totals, counts, kinds = summed(values, groups, strata, counts)
-    if len(totals) < 2:
+    if np.count_nonzero(counts) < 2:
         return None, None
     mean = float((totals.sum() + others.sum()) / (counts.sum() + len(others)))
     deviation, skewness = _moments(totals, counts, kinds, others)
@@ -192,7 +193,7 @@ def _design_effect(totals: Array, counts: Array, strata: IntArray) -> tuple[floa
     """
     n, share = float(counts.sum()), float(totals.sum() / counts.sum())
     most = float(counts @ counts) / n
-    if not 0 < share < 1 or n < 2:
+    if not 0 < share < 1 or np.count_nonzero(counts) < 2:
         return most, most
     alone = n * share * (1 - share)
     sizes, hits = np.bincount(strata, counts), np.bincount(strata, totals)

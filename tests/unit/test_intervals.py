@@ -117,6 +117,14 @@ def test_highlights_that_are_all_alike_in_their_frame_count_as_one():
     assert share_interval(np.ones(80), np.repeat(np.arange(10), 8)) == pytest.approx(share_interval(np.ones(10)))
 
 
+def test_a_single_frame_tells_no_spread():
+    assert mean_interval(np.array([3.0, 0.0, 0.0]), counts=np.array([2.0, 0.0, 0.0])) == (None, None)
+    # Twenty highlights of one frame are worth one.
+    low, high = share_interval(np.arange(20) < 10, np.zeros(20, int))
+    assert low < 0.01
+    assert high > 0.99
+
+
 def test_a_median_lies_between_two_of_its_values():
     values = np.arange(100.0)
     low, high = median_interval(values)

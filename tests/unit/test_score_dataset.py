@@ -9,6 +9,7 @@ import pytest
 from simtest.dataset.card import CARD
 from simtest.dataset.export import export_dataset
 from simtest.dataset.manifest import read_manifest
+from simtest.dataset.scoring.dense.from_folder import frames_of
 from simtest.dataset.scoring.frames import scored_frames
 from simtest.dataset.scoring.run import score_table
 from simtest.dataset.shard_writer import write_dataset
@@ -47,6 +48,16 @@ def test_a_dataset_has_a_frame_for_each_sample(made):
     for frame in scored:
         assert frame.swept == json.loads(drawn[frame.realisation])
         assert frame.view.highlights
+
+
+def test_samples_of_one_anatomy_are_one_scene_of_a_dense_score(tmp_path):
+    dataset = load_dataset("tiny", {"samples": FEW, "samples_per_anatomy": 2})
+    write_dataset(dataset, tmp_path / "data", make_engine())
+    export_dataset(tmp_path / "data", tmp_path / "frames", make_engine())
+    scenes = {truth.name: truth.scene for truth in frames_of(tmp_path / "data")}
+    by_index = [scenes[frame.name] for frame in sorted(scored_frames(tmp_path / "data"), key=lambda f: f.realisation)]
+    assert by_index[::2] == by_index[1::2]
+    assert len(set(by_index)) == FEW // 2
 
 
 def test_frames_need_none_of_the_estimators_that_a_dataset_was_made_with(made, tmp_path):
