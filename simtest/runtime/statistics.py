@@ -8,6 +8,7 @@ between them is no chance. `studies/intervals.py` prints how often these interva
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from simtest.runtime.arrays import Array, IntArray
 
@@ -32,9 +33,8 @@ def mean_interval(
 ) -> Interval:  # fmt: skip
     """Compute the 95 % interval of a mean of values, or of a ratio of sums.
 
-    It is Student's, with the jackknife's deviation (`deviation_of_mean`) and the degrees of freedom of `freedom_of`.
-    Errors are skewed, and of ten exponential ones it would hold the mean in 90 % alone. So an end lies where Hall's
-    correction for skewness puts it [J. R. Stat. Soc. B 54, 1992, 221] where that is farther from the mean.
+    It is Student's, with the jackknife's deviation (`deviation_of_mean`) and the degrees of freedom of `freedom_of`,
+    and reaches farther on the side to which the values are skewed (`reach`).
 
     Parameters
     ----------
@@ -58,9 +58,8 @@ def mean_interval(
         return None, None
     mean = float((totals.sum() + others.sum()) / (counts.sum() + len(others)))
     deviation, skewness = _moments(totals, counts, kinds, others)
-    t = student_quantile(freedom_of(counts, kinds))
-    below, above = (max(t, sign * _untransformed(sign * t, skewness)) for sign in (1, -1))
-    return mean - deviation * below, mean + deviation * above
+    below, above = reach(student_quantile(freedom_of(counts, kinds)), skewness)
+    return mean - deviation * float(below), mean + deviation * float(above)
 
 
 def share_interval(
@@ -178,11 +177,20 @@ def student_quantile(freedom: float) -> float:
     return float(stdtrit(freedom, (1 + CONFIDENCE) / 2))
 
 
-def _untransformed(t: float, skewness: float) -> float:
-    """Return the studentised error whose Hall transform is t: T + a T^2 / 3 + a^2 T^3 / 27 + a / 6 of a skewness a."""
-    shifted = t - skewness / 6
-    # The series where the closed form cancels.
-    return shifted if abs(skewness) < _ROUNDING else 3 / skewness * float(np.cbrt(1 + skewness * shifted) - 1)
+def reach(t: npt.ArrayLike, skewness: npt.ArrayLike) -> tuple[Array, Array]:
+    """Return how many standard deviations an interval reaches below and above a mean: Student's t, or more.
+
+    Of ten exponential errors Student's interval holds the mean in 90 % alone. So an end lies where Hall's transform of
+    the studentised error, T + a T^2 / 3 + a^2 T^3 / 27 + a / 6 of a mean with the skewness a, puts it where that is
+    farther from the mean [J. R. Stat. Soc. B 54, 1992, 221].
+    """
+    t, a = np.asarray(t, dtype=float), np.asarray(skewness, dtype=float)
+    # The inverse transform cancels where there is no skewness.
+    is_skewed = np.abs(a) > _ROUNDING
+    a = np.where(is_skewed, a, 1.0)
+    ends = (sign * 3 / a * (np.cbrt(1 + a * (sign * t - a / 6)) - 1) for sign in (1, -1))
+    below, above = (np.where(is_skewed, np.fmax(t, end), t) for end in ends)
+    return below, above
 
 
 def _design_effect(totals: Array, counts: Array, strata: IntArray) -> tuple[float, float]:

@@ -1,11 +1,17 @@
 """Intervals of means, shares and medians whose frames are the independent units."""
 
+import itertools
 import math
 
 import numpy as np
+import polars as pl
 import pytest
 from scipy import stats
 
+from simtest.nightly.gate.figures import setting_figures
+from simtest.report.curves import bar
+from simtest.report.pairs import pairs
+from simtest.report.run_folder import Run
 from simtest.runtime.statistics import (
     deviation_of_mean,
     mean_interval,
@@ -13,7 +19,10 @@ from simtest.runtime.statistics import (
     share_interval,
     student_quantile,
 )
+from simtest.validation.guide import guide_of
 from simtest.validation.paired import is_above_zero
+from simtest.validation.results_table import ResultRow, table
+from simtest.validation.statistics import summarise
 from tests.unit.given_numbers import of_given_numbers
 
 NONE = np.empty(0)
@@ -170,3 +179,48 @@ def test_a_mean_is_above_zero_only_beyond_its_interval():
     assert is_above_zero(values + 1.01 * below, frames, settings, certain)
     assert not is_above_zero(values + 0.99 * below, frames, settings, certain)
     assert not is_above_zero(values[:0], frames[:0], settings[:0], certain[:0])
+
+
+def rows_of(each):
+    """Return results of two estimators in ten frames, whose highlights are all alike, so many in each."""
+    rng, rows = np.random.default_rng(2), []
+    errors = {"cone_axis": rng.gamma(2.0, 0.5, 10), "curved": rng.gamma(2.0, 0.6, 10)}
+    for frame, number, name in itertools.product(range(10), range(each), errors):
+        error = float(errors[name][frame])
+        rows.append(ResultRow(
+            experiment="e", label="a", surface="a", setting="s", realisation=frame, specularity=number, true_id=number,
+            estimator=name, status="ok" if error < 1.5 else "no_peak", target="fine", error_deg=error,
+            mahalanobis2=12 * error, axis_ratio=1 + error / 9, axis_ratio_law=1.0,
+        ))  # fmt: skip
+    return table(rows, {})
+
+
+def of_summary(rows, path):
+    return [found.ci95_deg for found in summarise(rows)["s"].values()]
+
+
+def of_curves(rows, path):
+    return [bar(own, "error_deg") for _, own in rows.filter(pl.col("status") == "ok").group_by("estimator")]
+
+
+def of_pairs(rows, path):
+    return [(pair.low, pair.high) for pair in pairs(Run(path, rows))]
+
+
+def of_guide(rows, path):
+    return [method.interval_deg for advice in guide_of(rows).advice for method in advice.methods.values()]
+
+
+def of_nightly_run(rows, path):
+    found = setting_figures(rows).drop_nulls("low")
+    assert {"mean_deg", "failed", "unanswered", "coverage95", "axis_ratio"} <= set(found["quantity"])
+    return found.select("low", "high").rows()
+
+
+@pytest.mark.parametrize("intervals", [of_summary, of_curves, of_pairs, of_guide, of_nightly_run])
+def test_each_printed_interval_counts_equal_highlights_of_a_frame_once(intervals, tmp_path):
+    # A median lies between two values, of few frames farther apart.
+    allowed = 0.15 if intervals is of_guide else 1e-6
+    once, often = (intervals(rows_of(each), tmp_path) for each in (1, 20))
+    assert len(once) > 0
+    np.testing.assert_allclose(sorted(often), sorted(once), rtol=allowed)
