@@ -95,7 +95,9 @@ def median_interval(values: Array, groups: IntArray | None = None, strata: IntAr
     totals, counts, kinds = summed(below, groups, strata, None)
     if len(totals) < LEAST_GROUPS:
         return None, None
-    half = NORMAL_QUANTILE / 2 * math.sqrt(_design_effect(totals, counts, kinds)[0] / n)
+    effect, _ = _design_effect(totals, counts, kinds)
+    # One more value than there are: so that of six independent ones and more 95 to 97 % hold it.
+    half = NORMAL_QUANTILE / 2 * math.sqrt(effect / (effect + n))
     low, high = np.interp(n * np.array([0.5 - half, 0.5 + half]) - 0.5, np.arange(n), ordered)
     return float(low), float(high)
 
