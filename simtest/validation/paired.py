@@ -13,7 +13,7 @@ import polars as pl
 
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.statistics import LEAST_GROUPS, Interval, mean_interval
-from simtest.validation.statistics import FRAME
+from simtest.validation.statistics import ANATOMY, FRAME
 
 KEYS = (*FRAME, "target", "true_id")
 """A true highlight of a frame. Of an estimator of clouds ``true_id`` numbers the base's highlights: a list apart."""
@@ -57,6 +57,8 @@ def side_by_side(rows: pl.DataFrame, targets: Mapping[str, str]) -> pl.DataFrame
         columns += [pl.col("status").filter(own).first().alias(f"status {name}"),
                     error.filter(own).first().alias(f"of {name}")]  # fmt: skip
     stated = pl.col("estimator").replace_strict(targets, default=None, return_dtype=pl.String).alias("target")
+    if ANATOMY in rows.columns:
+        columns.append(pl.col(ANATOMY).first())
     told = rows.with_columns(stated).drop_nulls("target")
     return told.group_by(KEYS, maintain_order=True).agg(pl.col("label").first(), *columns)
 

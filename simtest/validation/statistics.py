@@ -15,6 +15,9 @@ from simtest.runtime.statistics import CONFIDENCE, Interval, mean_interval
 
 FRAME = ("experiment", "setting", "realisation")
 
+ANATOMY = "anatomy"
+"""Column of scored datasets: samples of one anatomy are not independent."""
+
 PENALTY_DEG = 90.0
 """What a failed or missed row counts in mean_penalised_deg: refusing is no way to a good figure."""
 
@@ -129,7 +132,14 @@ def _or_none(statistic: Callable[[Array], Any], values: Array) -> float | None:
 
 
 def units(rows: pl.DataFrame) -> tuple[IntArray, IntArray]:
-    """Return the number of the frame and of the setting of each row, from 0: groups and strata of an interval."""
-    numbers = rows.select(pl.struct(columns).rank("dense").alias(columns[-1]) - 1 for columns in (FRAME, FRAME[:-1]))
-    frames, settings = (numbers[column].to_numpy().astype(int) for column in (FRAME[-1], FRAME[-2]))
+    """Return the number of the frame, of a dataset the anatomy, and of the setting of each row, from 0.
+
+    They are the groups and the strata of an interval (`simtest.runtime.statistics`).
+    """
+    strata = FRAME[:-1]
+    groups = (*strata, ANATOMY) if ANATOMY in rows.columns else FRAME
+    frames, settings = (
+        (rows.select(pl.struct(columns).rank("dense")).to_series().to_numpy().astype(int) - 1)
+        for columns in (groups, strata)
+    )
     return frames, settings

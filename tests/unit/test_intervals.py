@@ -22,7 +22,7 @@ from simtest.runtime.statistics import (
 from simtest.validation.guide import guide_of
 from simtest.validation.paired import is_above_zero
 from simtest.validation.results_table import ResultRow, table
-from simtest.validation.statistics import summarise
+from simtest.validation.statistics import summarise, units
 from tests.unit.given_numbers import of_given_numbers
 
 NONE = np.empty(0)
@@ -215,6 +215,15 @@ def of_nightly_run(rows, path):
     found = setting_figures(rows).drop_nulls("low")
     assert {"mean_deg", "failed", "unanswered", "coverage95", "axis_ratio"} <= set(found["quantity"])
     return found.select("low", "high").rows()
+
+
+def test_samples_of_one_anatomy_are_one_unit():
+    rows = rows_of(1)
+    frames, settings = units(rows)
+    assert len(set(frames.tolist())) == 10
+    anatomies, strata = units(rows.with_columns(anatomy=pl.format("0.{}", pl.col("realisation") // 5)))
+    np.testing.assert_array_equal(anatomies, frames // 5)
+    np.testing.assert_array_equal(strata, settings)
 
 
 @pytest.mark.parametrize("intervals", [of_summary, of_curves, of_pairs, of_guide, of_nightly_run])

@@ -95,6 +95,7 @@ def test_own_estimates_of_a_dataset_are_scored_as_they_were(made, tmp_path):
             kept = single if name in OF_CANDIDATES else single | True
             assert ours[name].filter(kept).equals(again[name].filter(kept), null_equal=True), name
     assert again["setting"].equals(ours["split"])
+    assert again.select("anatomy", "realisation").unique()["anatomy"].n_unique() == 3
     summary = json.loads((tmp_path / "scored" / "summary.json").read_text())
     assert set(summary["experiments"]["tiny"]["settings"]) == set(ours["split"])
 

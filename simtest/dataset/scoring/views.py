@@ -120,7 +120,8 @@ class ShardViews:
                 key: value if isinstance(value, bool | int | float | str) else str(value)
                 for key, value in drawn.values.items()
             }
-            split, anatomy = maker.plan.split(index), str(maker.plan.anatomy(index))
+            split, of = maker.plan.split(index), maker.plan.anatomy(index)
+            anatomy = f"{of.family}.{of.number}"
             yield Shown(0, index, drawn.scene.sensor.seed, view, session, split, values, anatomy=anatomy)
 
 
