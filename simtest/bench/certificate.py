@@ -17,7 +17,7 @@ from simtest.spec.spec_model import validate
 
 CERTIFICATE = "certificate.json"
 KIND = "simtest-bench certificate"
-FORMAT = 1
+FORMAT = 2
 
 OF_CERTIFICATE = "sha256"
 """Key of the hash of everything else."""

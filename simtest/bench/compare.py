@@ -168,7 +168,7 @@ class _Comparison:
         if _is_number(told) and _is_number(found):
             self._figure(name, key, told, found, self._allowed(key, found, n))
         elif _is_span(told) and _is_span(found):
-            # The bootstrap draws other scenes where their number changed.
+            # A highlight more or less moves the ends farther than the figure.
             width = 0.1 * (found[1] - found[0])
             for end, stated, again in zip(("low", "high"), told, found, strict=True):
                 self._figure(f"{name} {end}", key, stated, again, self._allowed(key, again, n) + width)
