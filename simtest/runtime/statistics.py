@@ -87,19 +87,29 @@ def median_interval(values: Array, groups: IntArray | None = None, strata: IntAr
 
     Parameters as of `mean_interval`. None with fewer than `LEAST_GROUPS` groups.
     """
-    ordered, n = np.sort(values), len(values)
-    if not n:
+    n = len(values)
+    if not n or len(values if groups is None else np.unique(groups)) < LEAST_GROUPS:
         return None, None
-    # Half a value counts as below the median that it is.
-    below = np.where(values == (middle := np.median(values)), 0.5, values < middle)
-    totals, counts, kinds = summed(below, groups, strata, None)
-    if len(totals) < LEAST_GROUPS:
-        return None, None
-    effect, _ = _design_effect(totals, counts, kinds)
-    # One more value than there are: so that of six independent ones and more 95 to 97 % hold it.
-    half = NORMAL_QUANTILE / 2 * math.sqrt(effect / (effect + n))
-    low, high = np.interp(n * np.array([0.5 - half, 0.5 + half]) - 0.5, np.arange(n), ordered)
-    return float(low), float(high)
+    ordered = np.sort(values)
+
+    def half(at: float, kinds: IntArray | None) -> float:
+        # Half a value counts as below one that is equal.
+        below = np.where(values == at, 0.5, values < at)
+        effect, _ = _design_effect(*summed(below, groups, kinds, None))
+        # One more value than there are: so that of six independent ones and more 95 to 97 % hold the median.
+        return NORMAL_QUANTILE / 2 * math.sqrt(effect / (effect + n))
+
+    def quantile(share: float) -> float:
+        return float(np.interp(n * share - 0.5, np.arange(n), ordered))
+
+    middle = float(np.median(values))
+    if strata is None or np.ptp(strata) == 0:
+        reached = half(middle, None)
+        return quantile(0.5 - reached), quantile(0.5 + reached)
+    # Where the median lies between two strata, the share below it does not vary, but that below the ends does.
+    without = half(middle, None)
+    low, high = (max(half(at, strata) for at in (middle, quantile(0.5 + side * without))) for side in (-1, 1))
+    return quantile(0.5 - low), quantile(0.5 + high)
 
 
 def summed(

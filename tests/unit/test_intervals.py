@@ -217,6 +217,18 @@ def of_nightly_run(rows, path):
     return found.select("low", "high").rows()
 
 
+def test_a_median_between_two_strata_has_a_width():
+    """The share below it is a half whatever is drawn, and which value is the next one is not."""
+    rng, held = np.random.default_rng(4), 0
+    strata = np.repeat([0, 1], 8)
+    for _ in range(200):
+        values = np.concatenate([-rng.standard_exponential(8), rng.standard_exponential(8)])
+        low, high = median_interval(values, np.arange(16), strata)
+        held += low <= 0.0 <= high
+        assert low < high
+    assert held >= 180
+
+
 def test_samples_of_one_anatomy_are_one_unit():
     rows = rows_of(1)
     frames, settings = units(rows)
