@@ -27,15 +27,17 @@ from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.learned_dense import LEAST_HIGHLIGHTS, LearnedDense
 from simtest.estimators.shading_maps import shading_maps
 from simtest.estimators.spot_inputs import normal_of
+from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg, tangent_basis, tangent_coordinates
 from simtest.reconstruction.pipeline import run_pipeline
 from simtest.runtime.arrays import Array
+from simtest.runtime.statistics import CONFIDENCE, NORMAL_QUANTILE
 from studies.resampling import drawn_groups, interval_of_mean
 
 STEP = 4
 """Each so many pixels along each axis one is scored."""
 
-CHI2_95, NORMAL_95 = -2 * np.log(0.05), 1.959964
+CHI2_95 = chi_squared.quantile(CONFIDENCE, 2)
 SEED, DRAWS = 2026, 1000
 FAMILIES = ("colon", "stomach", "liver")
 DENSE, SMOOTH, SHADING = "learned_dense", "learned_dense, smooth-trained", "shading"
@@ -194,7 +196,7 @@ def _add_distance(scores: Scores, anatomy: tuple[int, int], share: Array, deviat
         scores.distance[anatomy].append(100 * np.abs(share - 1))
         # The deviation is of the logarithm; here it is a share of the true distance.
         logarithm = np.abs(np.log(share)) * share / deviation
-        scores.distance_inside[anatomy].append((logarithm <= NORMAL_95).astype(float))
+        scores.distance_inside[anatomy].append((logarithm <= NORMAL_QUANTILE).astype(float))
 
 
 def _table(place: str, scores: dict[str, Scores]) -> Iterator[str]:

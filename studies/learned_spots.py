@@ -25,12 +25,14 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.learned_spot import LearnedSpot
 from simtest.estimators.spot_inputs import rays_of
+from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import run_pipeline
 from simtest.runtime.arrays import Array
+from simtest.runtime.statistics import CONFIDENCE, NORMAL_QUANTILE
 from studies.resampling import interval_of_mean
 
-CHI2_95 = -2 * np.log(0.05)
+CHI2_95 = chi_squared.quantile(CONFIDENCE, 2)
 SEED, DRAWS = 2026, 2000
 FAMILIES = ("colon", "stomach", "liver")
 
@@ -105,7 +107,9 @@ def _rows(sample: Sample, estimators: dict[str, object]) -> Iterator[Row]:
             row.tilt_deg = float(angle_deg(base, -rays_of(frame.camera, peak[None])[0]))
             if isinstance(result, Estimate) and result.axis_ratio_deviation and result.target == "base":
                 off = abs((result.axis_ratio or np.nan) - _base_ratio(sample, peak))
-                row.ratio_inside = float(off <= 1.96 * result.axis_ratio_deviation) if np.isfinite(off) else np.nan
+                row.ratio_inside = (
+                    float(off <= NORMAL_QUANTILE * result.axis_ratio_deviation) if np.isfinite(off) else np.nan
+                )
             yield _scored(row, result, base, fine)
     answered = [
         (n, p) for n, p in enumerate(peaks) if isinstance(single[n].estimates.get("learned_spot, base"), Estimate)

@@ -27,11 +27,13 @@ from simtest.dataset.learn.spots import Spots, read_spots
 from simtest.dataset.learn.training import load_training
 from simtest.estimators.learned_spot import LearnedSpot, _Network, log_deviation
 from simtest.estimators.spot_inputs import ROTATION_SCALE, SURFACES, normal_of
+from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.arrays import Array
+from simtest.runtime.statistics import CONFIDENCE
 
 FAMILIES = ("colon", "stomach", "liver")
-CHI2_95 = -2 * np.log(0.05)
+CHI2_95 = chi_squared.quantile(CONFIDENCE, 2)
 BASE = SURFACES.index("base")
 
 

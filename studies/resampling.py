@@ -5,12 +5,14 @@ import numpy as np
 from simtest.runtime.arrays import Array, IntArray
 
 
-def drawn_groups(count: int, draws: int, seed: int) -> IntArray:
+def drawn_groups(count: int, draws: int, seed: int | np.random.Generator) -> IntArray:
     """Return the groups of each draw, with replacement, shape (draws, count)."""
     return np.random.default_rng(seed).integers(count, size=(draws, count))
 
 
-def interval_of_mean(values: Array, groups: Array | IntArray, draws: int, seed: int) -> tuple[float, float]:
+def interval_of_mean(
+    values: Array, groups: Array | IntArray, draws: int, seed: int | np.random.Generator
+) -> tuple[float, float]:
     """Return the 95 % interval of the mean of values by bootstrap over their groups.
 
     Parameters

@@ -27,7 +27,6 @@ import numpy as np
 
 from benchmarks.measuring import print_markdown
 from simtest.advice.twin.bank import Subject, all_spots, make_bank
-from simtest.advice.twin.matching import RESAMPLED
 from simtest.advice.twin.run import SpotTwins, match_spots
 from simtest.advice.twin.scenes import SceneDraws, look_of
 from simtest.advice.twin.scoring import ScoredSpot, score, usable_spots
@@ -161,7 +160,7 @@ def _resampled(frames: Array) -> Iterator[IntArray]:
     """Yield bootstrap samples of rows by their frames: highlights of a frame share its light and distance."""
     rng, numbers = from_integer(0), np.unique(frames)
     rows = [np.flatnonzero(frames == number) for number in numbers]
-    for _ in range(RESAMPLED):
+    for _ in range(400):
         yield np.concatenate([rows[i] for i in rng.integers(len(rows), size=len(rows))])
 
 

@@ -3,7 +3,6 @@
 Frames, not highlights, are the independent units, and the distances are strata.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -11,23 +10,19 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest.geometry import student_t
-from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.statistics import Interval, mean_interval
 from simtest.validation.guide import Advice, MethodFigures, advice_of
-from simtest.validation.paired import FRAME, deviation_of_mean, freedom_of, targets_of, units
+from simtest.validation.paired import targets_of
 from simtest.validation.ranking import Pair, best_of
 from simtest.validation.row_kinds import is_false
 from simtest.validation.situations import Situation
-from simtest.validation.statistics import CONFIDENCE, Interval
+from simtest.validation.statistics import FRAME, units
 
 WIDE = 0.15
 """An interval that reaches farther from its mean than this share of it is called wide."""
 
 LEAST_PART_DEG = 1e-6
 """A part of the budget below this is rounding."""
-
-MOST_FACTOR = 10.0
-"""Of the logarithm of an interval's end over the mean, so that two or three frames give finite numbers."""
 
 STRATUM = "surface.distance_mm"
 
@@ -193,50 +188,17 @@ def mean_error(answered: pl.DataFrame, column: str, frames: int | None = None) -
     values = rows[column].to_numpy()
     if not len(values):
         return MeanError(None, (None, None), 0, 0)
-    strata, numbers = units(rows)
-    counts: Array = np.bincount(numbers).astype(np.float64)
-    totals: Array = np.asarray(np.bincount(numbers, values), dtype=np.float64)
-    own = np.zeros(len(counts), dtype=np.int64)
-    own[numbers] = strata
-    return MeanError(float(np.mean(values)), ratio_interval(totals, counts, own, frames), len(values), len(counts))
-
-
-def ratio_interval(totals: Array, counts: Array, strata: IntArray, frames: int | None = None) -> Interval:
-    """Compute the 95 % interval of the mean of all values: the sum of totals over the sum of counts.
-
-    It holds where the number of values varies from frame to frame (`simtest.validation.paired.deviation_of_mean`), and
-    where a frame with many of them draws the mean to its own. Errors are positive and skewed: the interval is that of
-    the mean's logarithm.
-
-    Parameters
-    ----------
-    totals, counts : ndarray, shape (F,)
-        Sum and number of the values of each frame that has any.
-    strata : ndarray of int, shape (F,)
-        Number of the stratum of each, from 0.
-    frames : int, optional
-        Frames of each stratum, those without values too; default those with some.
-
-    Returns
-    -------
-    (float or None, float or None)
-        None for a single frame, or a mean of 0.
-    """
-    kinds = len(np.unique(strata))
-    if len(totals) < 2 * kinds:
-        # Too few to see the spread within strata: that between them is added.
-        frames = None if frames is None else frames * kinds
-        strata, kinds = np.zeros_like(strata), 1
-    mean = float(totals.sum() / counts.sum())
-    if len(totals) == kinds or not mean:
-        return None, None
-    freedom = freedom_of(counts, strata)
-    empty = np.maximum((frames or 0) - np.bincount(strata), 0)
-    strata = np.concatenate([strata, np.repeat(np.arange(len(empty)), empty)])
-    nothing = np.zeros(len(strata) - len(totals))
-    deviation = deviation_of_mean(np.concatenate([totals, nothing]), np.concatenate([counts, nothing]), strata)
-    factor = math.exp(min(student_t.quantile((1 + CONFIDENCE) / 2, freedom) * deviation / mean, MOST_FACTOR))
-    return mean / factor, mean * factor
+    numbers, strata = units(rows)
+    answering, first = np.unique(numbers, return_index=True)
+    # Frames without an answer hold no values: one more or one fewer of them moves the mean.
+    empty = np.maximum((frames or 0) - np.bincount(strata[first]), 0)
+    nothing = np.repeat(np.arange(len(empty)), empty)
+    none, counts = np.zeros(len(nothing)), np.ones(len(values))
+    low, high = mean_interval(
+        np.concatenate([values, none]), np.concatenate([numbers, len(numbers) + np.arange(len(nothing))]),
+        np.concatenate([strata, nothing]), np.concatenate([counts, none]),
+    )  # fmt: skip
+    return MeanError(float(np.mean(values)), (low if low is None else max(low, 0.0), high), len(values), len(answering))
 
 
 def _root_mean_square(rows: pl.DataFrame, column: str) -> float | None:

@@ -17,8 +17,8 @@ from simtest.pages.palette import SERIES
 from simtest.pages.style import number, symbols
 from simtest.runtime import provenance
 from simtest.runtime.files import make_folder, write_atomically, write_json
+from simtest.runtime.statistics import Interval
 from simtest.validation import laws
-from simtest.validation.statistics import Interval
 
 PAGE, RESULT = "index.html", "advice.json"
 

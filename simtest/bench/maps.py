@@ -1,5 +1,6 @@
 """The dense part: its frames for methods that run elsewhere, and the figures of their maps."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from simtest.bench.draws import experiment_of
@@ -10,6 +11,7 @@ from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.dataset.scoring.dense.map_files import find_maps
 from simtest.dataset.scoring.dense.score import DenseScore, score_maps
 from simtest.dataset.scoring.dense.scorer import ANGLE, NORMAL, depth_source
+from simtest.dataset.scoring.record import read_record
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, make_engine
@@ -73,10 +75,11 @@ def score_dense(
             progress(done, total, f"scoring {what}")
 
     score = score_maps(maps, folder / RUN, folder / SCORES, options, "", tell)
-    return score, dense_figures(score, layout_of(suite, PART)) | {"stated": stated_record(options)}
+    numbers = {use.frame: use.realisation for use in read_record(folder / RUN).uses}
+    return score, dense_figures(score, layout_of(suite, PART), numbers) | {"stated": stated_record(options)}
 
 
-def dense_figures(score: DenseScore, layout: Layout) -> JsonObject:
+def dense_figures(score: DenseScore, layout: Layout, numbers: Mapping[str, int]) -> JsonObject:
     """Return a part's figures of the angles at all scored pixels, in the form of other parts, and those by zone.
 
     They are of normal maps where there are any, else of depth maps after an affine alignment. The score counts 90 deg
@@ -97,27 +100,28 @@ def dense_figures(score: DenseScore, layout: Layout) -> JsonObject:
         "refused": {"no_value": every["n_unanswered"]} if every["n_unanswered"] else {},
         "median_deg": every["median_deg"], "median_interval": every["median_interval"], "mean_deg": every["mean_deg"],
         "p95_deg": every["p95_deg"], "score_deg": every["penalised_deg"],
-        "score_interval": every["penalised_interval"], "scenes": _scene_sums(score, source, layout),
+        "score_interval": every["penalised_interval"], "scenes": _scene_sums(score, source, layout, numbers),
         "uncertainty": nothing.to_json(),
         "results": digest_of(rows), "source": source, "zones": zones, "conventions": told,
     }  # fmt: skip
 
 
-def _scene_sums(score: DenseScore, source: str, layout: Layout) -> JsonObject:
-    """Return by case, for each scene, its number of pixels and the sum of their errors as the score takes them."""
-    held: dict[str, list[list[float]]] = {case: [] for case in layout}
+def _scene_sums(score: DenseScore, source: str, layout: Layout, numbers: Mapping[str, int]) -> JsonObject:
+    """Return by case, for each scene, its number of pixels and the sum of their errors as the score takes them.
+
+    `numbers` are the frames' realisations by name. A frame without a surface has no row, and equal ones have one name.
+    """
+    sums = {case: [[0, 0.0] for _ in range(scenes)] for case, (scenes, _) in layout.items()}
     for row in score.scorer.rows:
         if (row["source"], row["quantity"], row["surface"], row["group"], row["label"]) == (
             source, ANGLE, "fine", "zone", "all",
         ):  # fmt: skip
-            held[row["setting"]].append([row["n"], row["n"] * row["mean_penalised"]])
-    sums: JsonObject = {}
-    for case, (scenes, frames) in layout.items():
-        # A frame without a surface has no row; which one that is, the truth alone decides, so cores agree on it.
-        rows = held[case] + [[0, 0.0]] * (scenes * frames - len(held[case]))
-        parts = [rows[i * frames : (i + 1) * frames] for i in range(scenes)]
-        sums[case] = [[sum(n for n, _ in part), sum(total for _, total in part)] for part in parts]
-    return sums
+            case = row["setting"]
+            scene = sums[case][numbers[row["frame"]] // layout[case][1]]
+            scene[0] += row["n"]
+            scene[1] += row["n"] * row["mean_penalised"]
+    held: JsonObject = dict(sums)
+    return held
 
 
 def stated_record(options: MapOptions | None) -> JsonObject:

@@ -98,19 +98,25 @@ def rank(parts: Sequence[Part], alpha: float = ALPHA) -> Ranking:
     for part in parts:
         means, strata = _residuals(part)
         scores += means / len(parts)
-        for rest in strata:
+        # A case of one scene shows no spread: it is taken to spread as the others do, or as such cases do between them.
+        seen = [rest for rest in strata if rest.shape[1] > 1] or [np.concatenate(strata, axis=1)]
+        share = sum(rest.shape[1] for rest in strata) / sum(rest.shape[1] for rest in seen)
+        for rest in seen:
             free = rest.shape[1] - 1
             if free < 1:
+                # A single scene tells nothing.
+                variances += np.inf
                 continue
             centred = rest / len(parts)
             centred = centred - centred.mean(axis=1, keepdims=True)
-            gram = centred @ centred.T * ((free + 1) / free)
+            gram = centred @ centred.T * ((free + 1) / free) * share
             own = np.diag(gram)
             of_stratum = np.maximum(own[:, None] + own[None, :] - 2 * gram, 0.0)
             variances += of_stratum
             terms += of_stratum**2 / free
     # Without any variance the difference is exact, and its degrees of freedom do not matter.
-    freedom = np.divide(variances**2, terms, out=np.full_like(terms, np.inf), where=terms > 0)
+    known = (terms > 0) & np.isfinite(variances)
+    freedom = np.divide(variances**2, terms, out=np.full_like(terms, np.inf), where=known)
     pairs = max(count * (count - 1) / 2, 1)
     reach = stdtrit(np.minimum(freedom, 1e6), 1 - alpha / (2 * pairs)) * np.sqrt(variances)
     gain = scores[None, :] - scores[:, None]

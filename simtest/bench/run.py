@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from simtest.bench.certificate import FORMAT, KIND, cases_of, environment, suite_record, write_certificate
 from simtest.bench.cores import check_core, core_record
 from simtest.bench.draws import experiment_of
+from simtest.bench.ranking import CAP_DEG
 from simtest.bench.scores import score_part
 from simtest.bench.suite import Suite, layout_of
 from simtest.errors import InputError
@@ -149,5 +150,6 @@ def overall_of(suite: Suite, parts: "dict[str, JsonObject]") -> JsonObject:
     spans = [part["score_interval"] for part in told if part["score_interval"] is not None]
     if len(spans) < len(wanted):
         return {"complete": True, "score_deg": mean, "score_interval": None}
-    half = math.hypot(*((high - low) / 2 for low, high in spans)) / len(spans)
-    return {"complete": True, "score_deg": mean, "score_interval": [max(0.0, mean - half), mean + half]}
+    below, above = (math.hypot(*(span[i] - value for span, value in zip(spans, values, strict=True))) for i in (0, 1))
+    interval = [max(mean - below / len(spans), 0.0), min(mean + above / len(spans), CAP_DEG)]
+    return {"complete": True, "score_deg": mean, "score_interval": interval}

@@ -10,15 +10,10 @@ import polars as pl
 from simtest.bench.ranking import CAP_DEG
 from simtest.bench.suite import Layout, digest_of
 from simtest.bench.uncertainty import UncertaintyScore, score_uncertainty
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import Json, JsonObject
-from simtest.runtime.seeds import from_integer
+from simtest.runtime.statistics import Interval, mean_interval, median_interval
 from simtest.validation.statistics import figures
-
-RESAMPLES = 1000
-"""Of the bootstrap over scenes; its seed is fixed, so that the same rows give the same intervals."""
-
-_SEED = 1
 
 HASHED = (
     "setting", "realisation", "specularity", "true_id", "status", "target", "error_deg", "normal_x", "normal_y",
@@ -29,7 +24,7 @@ HASHED = (
 SUM_DIGITS = 6
 """Decimals of the sums by scene: the score is computed of the rounded ones, so that it follows from a certificate."""
 
-Interval = tuple[float, float]
+Span = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -45,7 +40,7 @@ class PartScore:
     median_deg, mean_deg, p95_deg : float or None
         Of the errors of the answers.
     median_interval : tuple of float or None
-        95 % interval of the median, by bootstrap over scenes.
+        95 % interval of the median, over scenes; the cases are frozen, and their differences no chance.
     score_deg, score_interval
         What cores are ranked by, and its interval: the mean of the errors, each at most `CAP_DEG`, with `CAP_DEG` for
         each highlight that was refused or missed.
@@ -63,11 +58,11 @@ class PartScore:
     false: int
     refused: dict[str, int]
     median_deg: float | None
-    median_interval: Interval | None
+    median_interval: Span | None
     mean_deg: float | None
     p95_deg: float | None
     score_deg: float | None
-    score_interval: Interval | None
+    score_interval: Span | None
     scenes: dict[str, list[tuple[int, float]]]
     uncertainty: UncertaintyScore
     results: str
@@ -91,7 +86,8 @@ def score_part(rows: pl.DataFrame, layout: Layout) -> PartScore:
     errors = answered["error_deg"].to_numpy()
     capped = np.where(true["status"] == "ok", true["error_deg"].fill_null(CAP_DEG).clip(0.0, CAP_DEG), CAP_DEG)
     scenes = scene_sums(true, capped, layout)
-    number, total = (sum(scene[i] for held in scenes.values() for scene in held) for i in (0, 1))
+    numbers, sums = np.array([scene for held in scenes.values() for scene in held]).T
+    cases = np.repeat(np.arange(len(scenes)), [len(held) for held in scenes.values()])
     return PartScore(
         n=told.n,
         answered=told.n_ok,
@@ -99,21 +95,23 @@ def score_part(rows: pl.DataFrame, layout: Layout) -> PartScore:
         false=told.n_false,
         refused=told.n_failed_by_reason,
         median_deg=told.median_deg,
-        median_interval=interval_over_scenes(errors, scenes_of(answered, layout), median=True),
+        median_interval=_span(median_interval(errors, *scenes_of(answered, layout))),
         mean_deg=told.mean_deg,
         p95_deg=told.p95_deg,
-        score_deg=total / number if number else None,
-        score_interval=interval_over_scenes(capped, scenes_of(true, layout)),
+        score_deg=float(sums.sum() / numbers.sum()) if len(capped) else None,
+        score_interval=_span(mean_interval(sums, None, cases, numbers), CAP_DEG) if len(capped) else None,
         scenes=scenes,
-        uncertainty=score_uncertainty(answered, scenes_of(answered, layout)),
+        uncertainty=score_uncertainty(answered, *scenes_of(answered, layout)),
         results=results_hash(rows),
     )
 
 
-def scenes_of(rows: pl.DataFrame, layout: Layout) -> Array:
-    """Return a number for the scene of each row: frames of one scene differ in noise alone."""
-    index: dict[tuple[str, int], int] = {}
-    return np.array([index.setdefault(key, len(index)) for key in _scene_keys(rows, layout)], dtype=int)
+def scenes_of(rows: pl.DataFrame, layout: Layout) -> tuple[IntArray, IntArray]:
+    """Return a number for the scene of each row, whose frames differ in noise alone, and one for its case."""
+    scenes: dict[tuple[str, int], int] = {}
+    cases = {case: number for number, case in enumerate(layout)}
+    numbers = [(scenes.setdefault(key, len(scenes)), cases.get(key[0], 0)) for key in _scene_keys(rows, layout)]
+    return np.array([scene for scene, _ in numbers], dtype=int), np.array([case for _, case in numbers], dtype=int)
 
 
 def scene_sums(rows: pl.DataFrame, values: Array, layout: Layout) -> dict[str, list[tuple[int, float]]]:
@@ -154,22 +152,7 @@ def _plain(value: Any) -> Json:
     return plain
 
 
-def interval_over_scenes(values: Array, scenes: Array, median: bool = False) -> Interval | None:
-    """Compute the 95 % interval of a mean or median by bootstrap over scenes; None with fewer than two of them."""
-    count = len(np.unique(scenes))
-    if count < 2:
-        return None
-    # scenes are numbered in order of appearance
-    index = np.unique(scenes, return_inverse=True)[1]
-    picks = from_integer(_SEED).integers(0, count, size=(RESAMPLES, count))
-    times = np.stack([np.bincount(pick, minlength=count) for pick in picks])
-    if median:
-        order = np.argsort(values, kind="stable")
-        weights = np.cumsum(times[:, index[order]], axis=1)
-        at = (weights >= weights[:, -1:] / 2).argmax(axis=1)
-        drawn = values[order][at]
-    else:
-        sums, rows = np.bincount(index, weights=values), np.bincount(index)
-        drawn = (times @ sums) / (times @ rows)
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    return float(low), float(high)
+def _span(interval: Interval, most: float = 180.0) -> Span | None:
+    """Return an interval of angles up to the largest; None where there is none."""
+    low, high = interval
+    return None if low is None or high is None else (max(low, 0.0), min(high, most))

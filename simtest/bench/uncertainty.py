@@ -8,8 +8,9 @@ import polars as pl
 
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import tangent_coordinates
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject
+from simtest.runtime.statistics import share_interval
 
 LEVEL = 0.95
 """Of the regions whose coverage is tested."""
@@ -23,8 +24,8 @@ LEAST_STATED = 50
 DIRECTIONS = 64
 """Over which the energy score is averaged."""
 
-_Z_TEST, _Z_INTERVAL = 2.3263478740408408, 1.959963984540054
-"""Quantiles of the normal distribution at 1 - ALPHA and at 97.5 %."""
+_Z_TEST = 2.3263478740408408
+"""Quantile of the normal distribution at 1 - ALPHA."""
 
 SCALED, WELL, NARROW = "underconfident", "calibrated", "overconfident"
 UNTESTED = "too few"
@@ -66,7 +67,7 @@ class UncertaintyScore:
         return {**vars(self), "interval": None if self.interval is None else list(self.interval)}
 
 
-def score_uncertainty(answered: pl.DataFrame, scenes: Array) -> UncertaintyScore:
+def score_uncertainty(answered: pl.DataFrame, scenes: IntArray, cases: IntArray | None = None) -> UncertaintyScore:
     """Score the uncertainties of answers.
 
     Parameters
@@ -76,6 +77,8 @@ def score_uncertainty(answered: pl.DataFrame, scenes: Array) -> UncertaintyScore
         distance is singular.
     scenes : ndarray of int, shape (N,)
         Which scene each row is of: rows of one scene are not independent.
+    cases : ndarray of int, shape (N,), optional
+        Which case each row is of: they are frozen, and not drawn.
     """
     distances = answered["mahalanobis2"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
     covariances = answered.select("cov_11", "cov_12", "cov_22").cast(pl.Float64).to_numpy().astype(float)
@@ -88,8 +91,7 @@ def score_uncertainty(answered: pl.DataFrame, scenes: Array) -> UncertaintyScore
     inside = (squared[stated] <= limit).astype(float)
     error = coverage_error(inside, scenes[stated])
     share = float(np.mean(inside))
-    # Wilson's interval for as many independent rows as would have this error.
-    interval = _wilson(share, LEVEL * (1 - LEVEL) / error**2)
+    interval = share_interval(inside, scenes[stated], None if cases is None else cases[stated])
     coordinates, covariances = _misses(answered)
     semi_axis = energy = None
     if len(covariances):
@@ -107,7 +109,7 @@ def finite(value: float | np.floating) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def coverage_error(inside: Array, scenes: Array) -> float:
+def coverage_error(inside: Array, scenes: IntArray) -> float:
     """Return the standard error that a coverage of 95 % has with rows that are grouped in scenes.
 
     The error over scenes is that of a ratio estimator (Cochran 1977, section 2.11): with m_i rows of which a_i lie
@@ -191,11 +193,3 @@ def _misses(answered: pl.DataFrame) -> tuple[Array, Array]:
         misses.append(across * (math.radians(row[3]) / length) if length > 0 else across)
         covariances.append([[c11, c12], [c12, c22]])
     return np.array(misses).reshape(-1, 2), np.array(covariances).reshape(-1, 2, 2)
-
-
-def _wilson(share: float, n: float) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a share of `n` independent rows."""
-    z2 = _Z_INTERVAL**2
-    centre = (share + z2 / (2 * n)) / (1 + z2 / n)
-    half = _Z_INTERVAL * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
-    return max(0.0, centre - half), min(1.0, centre + half)

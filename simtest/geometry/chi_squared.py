@@ -4,9 +4,8 @@ Reconstruction of a picture needs no other distribution, and loading SciPy's tak
 """
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
-
-from simtest.geometry.quantiles import check_quantile, first_not_below
 
 
 def survival(x: float, freedom: int) -> float:
@@ -42,7 +41,24 @@ def quantile(share: float, freedom: int) -> float:
     ValueError
         If `share` is not inside (0, 1), or `freedom` is below 1.
     """
-    check_quantile(share, freedom)
+    if not 0 < share < 1 or freedom < 1:
+        raise ValueError(f"share = {share}, freedom = {freedom}: must be inside (0, 1), and at least 1")
     if freedom == 2:
         return -2 * math.log1p(-share)
-    return first_not_below(lambda x: survival(x, freedom) > 1 - share, float(freedom))
+    return _first_not_below(lambda x: survival(x, freedom) > 1 - share, float(freedom))
+
+
+def _first_not_below(is_below: Callable[[float], bool], high: float) -> float:
+    """Return the least positive number for which `is_below`, true up to it and false from it on, is false.
+
+    `high` is where the search begins. It ends when two neighbouring numbers are left.
+    """
+    low = 0.0
+    while is_below(high):
+        low, high = high, 2 * high
+    while low < (middle := (low + high) / 2) < high:
+        if is_below(middle):
+            low = middle
+        else:
+            high = middle
+    return high

@@ -1,5 +1,6 @@
 """Curves: rows gathered by setting, means with intervals, and the law predicted for them."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -7,15 +8,17 @@ import numpy as np
 import polars as pl
 
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
-from simtest.geometry import student_t
 from simtest.pages.axes import Axis
 from simtest.pages.style import estimator_order
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
+from simtest.runtime.statistics import mean_interval
 from simtest.validation import laws
+from simtest.validation.statistics import units
 
 _BINS = 12
 _PHONG_EXPONENT = 50.0
+_ENDS = {"estimator": pl.String, "group": pl.String, "low": pl.Float64, "high": pl.Float64}
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Curve:
     label: str  # what the symbol stands for
     x: Array  # of each setting, shape (n,)
     y: Array  # mean
-    low: Array  # 95 % t interval of the mean; NaN for a single value
+    low: Array  # 95 % interval of the mean; NaN for a single frame
     high: Array
     law_at: Array  # the law's mean prediction at each point; NaN where there is none
     law_x: Array  # the law as a line, shape (m,); empty where there is none
@@ -99,28 +102,28 @@ def _aggregate(rows: pl.DataFrame, ask: Ask, is_scattered: bool) -> pl.DataFrame
     rank = pl.col(ask.x).rank("dense") - 1
     group = (rank * _BINS // (rank.max() + 1)).cast(pl.String) if is_scattered else pl.col("setting")
     exponent = pl.col("reflectance.exponent") if "reflectance.exponent" in rows.columns else pl.lit(None)
-    values = pl.col(ask.value).filter(pl.col("ok") & pl.col(ask.value).is_not_null())
+    is_answer = pl.col("ok") & pl.col(ask.value).is_not_null()
+    values = pl.col(ask.value).filter(is_answer)
+    rows, keys = rows.with_columns(group=group, exponent=exponent.cast(pl.Float64)), ("estimator", "group")
+    ends = [(*key, *bar(part, ask.value)) for key, part in rows.filter(is_answer).group_by(keys)]
     return (
-        rows.with_columns(group=group, exponent=exponent.cast(pl.Float64))
-        .group_by("estimator", "group", maintain_order=True)
+        rows.group_by(keys, maintain_order=True)
         .agg(
             x=pl.col(ask.x).mean(), kd=pl.col("kd").mean(), kd_other=pl.col("kd_other").mean(),
-            y=values.mean(), std=values.std(), least=values.min(), n=values.len(), rows=pl.len(),
+            y=values.mean(), n=values.len(), rows=pl.len(),
             law=pl.col(ask.law).mean(), isovalue=pl.col("isovalue").median(), exponent=pl.col("exponent").mean(),
         )
+        .join(pl.DataFrame(ends, _ENDS, orient="row"), on=keys, how="left")
         .sort("x", maintain_order=True)
     )  # fmt: skip
 
 
-def _interval(table: pl.DataFrame) -> tuple[Array, Array]:
-    """95 % t interval of the mean; its lower end is not drawn below the least value seen."""
-    n = table["n"].to_numpy().astype(float)
-    factor = np.array([student_t.quantile(0.975, max(count - 1, 1)) for count in table["n"].to_list()])
-    std = table["std"].cast(pl.Float64).to_numpy()
-    y, least = table["y"].cast(pl.Float64).to_numpy(), table["least"].cast(pl.Float64).to_numpy()
-    with np.errstate(invalid="ignore", divide="ignore"):
-        half = np.where(n > 1, factor * std / np.sqrt(n), np.nan)
-    return np.maximum(y - half, least), y + half
+def bar(rows: pl.DataFrame, value: str) -> tuple[float, float]:
+    """Return the 95 % interval of the mean of a column over frames, cut at the least value seen; NaN for one frame."""
+    values = rows[value].to_numpy().astype(float)
+    low, high = mean_interval(values, *units(rows))
+    # An interval that reaches 0 is cut: axes may be logarithmic.
+    return (math.nan, math.nan) if low is None or high is None else (max(low, float(values.min())), high)
 
 
 def gather(rows: pl.DataFrame, ask: Ask, axis: Axis) -> tuple[list[Curve], list[str]]:
@@ -137,10 +140,10 @@ def gather(rows: pl.DataFrame, ask: Ask, axis: Axis) -> tuple[list[Curve], list[
             own = own.filter(pl.col("n") > 0)
             if own.is_empty():
                 continue
-            low, high = _interval(own)
             curves.append(
                 Curve(
-                    name, label, _array(own["x"]), _array(own["y"]), low, high, _array(own["law"]), law_x, law_y,
+                    name, label, _array(own["x"]), _array(own["y"]), _array(own["low"]), _array(own["high"]),
+                    _array(own["law"]), law_x, law_y,
                     tuple("bin of highlights" if is_scattered else str(g) for g in own["group"]),
                     tuple(f"{n} of {m}" for n, m in zip(own["n"], own["rows"], strict=True)), not is_scattered,
                 )

@@ -1,21 +1,31 @@
 """The figures of the glints themselves, whatever the estimators: theory.md 7.1, 7.2, 7.3, 7.5 and 7.7."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import cycle
 
 import numpy as np
 import polars as pl
 
-from simtest.geometry import student_t
 from simtest.pages.axes import Axis, finite, log_range
 from simtest.pages.chart import Bars, Chart, Mark, Panel
 from simtest.pages.palette import NEUTRAL, SERIES
 from simtest.pages.style import Symbol, number, symbols
-from simtest.report.relief_figures import KD, LEVEL, ReliefFigure, larger_kd, sweep_axis, sweep_key, sweep_name, sweeps
+from simtest.report.relief_figures import (
+    KD,
+    LEVEL,
+    ReliefFigure,
+    larger_kd,
+    mean_mark,
+    sweep_axis,
+    sweep_key,
+    sweep_name,
+    sweeps,
+)
 from simtest.report.run_folder import Run
-from simtest.runtime.arrays import Array
+from simtest.runtime.statistics import deviation_of_mean, mean_interval, summed
 from simtest.validation import relief_laws
-from simtest.validation.statistics import mean_interval
+from simtest.validation.statistics import units
 
 LEAST_RADIUS_PX = 2.0
 """Below this radius a visible highlight is measured in too few pixels to judge the law."""
@@ -27,7 +37,7 @@ _COLUMNS = {
     "cloud_error_deg", "cloud_error_law_deg", "cloud_kd_min", "cloud_kd_max", "cloud_cov_11", "cloud_cov_22",
 }  # fmt: skip
 _WHOLE = "Only clouds that are wholly in view count, in frames with a detection or an isolated highlight."
-_MEANS = "Points are means over the clouds of a setting, bars their 95 % interval (Student's t)"
+_MEANS = "Points are means over the clouds of a setting, bars their 95 % interval (over frames)"
 
 
 def glint_figures(run: Run) -> list[ReliefFigure]:
@@ -47,21 +57,6 @@ def glint_figures(run: Run) -> list[ReliefFigure]:
     return [*figures, *_centroids(clouds), *_ratios(clouds), *_radii(spots), *_pools(spots)]
 
 
-def _mean_mark(groups: list[tuple[float, Array]], colour: str, name: str, symbol: Symbol, line: bool) -> Mark:
-    """Describe means of values by x, with their intervals."""
-    groups = sorted(((x, values) for x, values in groups if len(values)), key=lambda group: group[0])
-    x, y = np.array([x for x, _ in groups]), np.array([values.mean() for _, values in groups])
-    ends = np.array([[np.nan if end is None else end for end in mean_interval(v)] for _, v in groups]).reshape(-1, 2)
-    # An interval that reaches 0 is cut at the least value: axes may be logarithmic.
-    low = np.fmax(ends[:, 0], [values.min() for _, values in groups])
-    hover = [
-        f"{name}\nx = {number(at)}, mean {number(mean)} of {len(values)}"
-        for (at, values), mean in zip(groups, y.tolist(), strict=True)
-    ]
-    return Mark(x, y, colour, name, line="solid" if line else "", width=0.9, symbol=symbol,
-                bars=Bars(low, ends[:, 1], 1.2), hover=hover)  # fmt: skip
-
-
 def _log(title: str, marks: list[Mark]) -> Axis:
     values = finite([part for mark in marks for part in (mark.y, *((mark.bars or ())[1:2]))])
     return Axis(title, "log", log_range([values]))
@@ -78,8 +73,8 @@ def _counts(rows: pl.DataFrame, x: str, label: str) -> ReliefFigure:
         ("cloud_glints", "glints", _BLUE, _GLINTS),
         ("cloud_visible", "visible highlights", _ORANGE, _VISIBLE),
     ):
-        groups = [(float(at), part[column].to_numpy().astype(float)) for (at,), part in rows.group_by("at")]
-        marks.append(_mean_mark(groups, colour, name, symbol, line=True))
+        groups = [(float(at), part) for (at,), part in rows.group_by("at")]
+        marks.append(replace(mean_mark(groups, column, colour, name, symbol), line="solid"))
     told = rows.filter(pl.col("cloud_glints_law").is_not_null())
     frames = f"{rows.height} clouds, {rows['cloud_glints'].sum()} glints"
     measured = [f"{number(_ratio(rows, 'cloud_visible', 'cloud_glints'))} visible highlights a glint ({frames})."]
@@ -109,12 +104,9 @@ def _ratio(rows: pl.DataFrame, above: str, below: str) -> float | None:
 
 
 def _ratio_error(rows: pl.DataFrame) -> float | None:
-    """Return the standard error of the glints' number over the law's, clouds independent."""
-    if rows.height < 2:
-        return None
-    found, law = (rows[name].to_numpy().astype(float) for name in ("cloud_glints", "cloud_glints_law"))
-    gap = found - law * found.sum() / law.sum()
-    return float(np.sqrt(np.sum(gap**2)) / law.sum())
+    """Return the standard error of the glints' number over the law's; None for a single frame."""
+    totals, counts, _ = summed(rows["cloud_glints"].to_numpy(), *units(rows), rows["cloud_glints_law"].to_numpy())
+    return deviation_of_mean(totals, counts, np.zeros(len(totals), dtype=int)) if len(totals) > 1 else None
 
 
 # Centroid (7.5) ------------------------------------------------------------------------------------------------------
@@ -128,13 +120,13 @@ def _centroids(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
     labels = symbols(rows["label"].to_list())
     marks, measured, independent = [], [], float(relief_laws.independent_centroid_error(1.0, 1.0))
     for (name, symbol), colour in zip(labels.items(), cycle(SERIES), strict=False):
-        groups, own = [], rows.filter(pl.col("label") == name)
-        for _, part in own.group_by("setting", maintain_order=True):
-            expected = float(part["cloud_error_law_deg"].to_numpy().mean()) / independent
-            groups.append((expected, part["cloud_error_deg"].to_numpy()))
-        marks.append(_mean_mark(groups, colour, name, symbol, line=False))
-        shares = np.concatenate([values / expected for expected, values in groups])
-        low, high = mean_interval(shares)
+        own = rows.filter(pl.col("label") == name).with_columns(
+            expected=pl.col("cloud_error_law_deg").mean().over("setting") / independent
+        )
+        groups = [(float(part["expected"][0]), part) for _, part in own.group_by("setting", maintain_order=True)]
+        marks.append(mean_mark(groups, "cloud_error_deg", colour, name, symbol))
+        shares = (own["cloud_error_deg"] / own["expected"]).to_numpy()
+        low, high = mean_interval(shares, *units(own))
         interval = "" if low is None else f" (95 % interval {number(low)} to {number(high)})"
         measured.append(f"{name}: {number(shares.mean())} s/√N in the mean of {own.height} clouds{interval}.")
     ends = finite([mark.x for mark in marks])
@@ -164,12 +156,11 @@ def _ratios(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
     """Describe the axis ratio of the pooled clouds over the base's curvature, along its principal directions."""
     rows = clouds.filter(pl.col("cloud_glints_law").is_not_null() & pl.col("cloud_cov_11").is_not_null())
     groups = rows.with_columns(at=pl.col(KD).round(2)).group_by("label", "at", maintain_order=True)
-    points: dict[str, list[tuple[float, float, float]]] = {}
+    points: dict[str, list[tuple[float, float, float, float]]] = {}
     measured = []
     for (label, at), part in groups:
-        ratio, error = pooled_ratio(part)
-        half = error * student_t.quantile(0.975, max(part.height - 1, 1))
-        points.setdefault(str(label), []).append((float(at), ratio, half))
+        ratio, error, interval = pooled_ratio(part)
+        points.setdefault(str(label), []).append((float(at), ratio, *interval))
         spread = f" ± {number(error, 2)}" if np.isfinite(error) else ""
         measured.append(
             f"{label}, k d = {at:g}: {number(ratio)}{spread} (law {number(_ratio_law(part))}; "
@@ -179,8 +170,8 @@ def _ratios(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
         return
     shapes, marks = symbols(points), []
     for (name, own), colour in zip(points.items(), cycle(SERIES), strict=False):
-        x, y, half_widths = np.array(sorted(own)).T
-        marks.append(Mark(x, y, colour, name, symbol=shapes[name], bars=Bars(y - half_widths, y + half_widths, 1.2),
+        x, y, low, high = np.array(sorted(own)).T
+        marks.append(Mark(x, y, colour, name, symbol=shapes[name], bars=Bars(low, high, 1.2),
                           hover=f"{name}\nk d = {{x}}: {{y}}"))  # fmt: skip
     ends = finite([mark.x for mark in marks])
     fine = np.linspace(ends.min(), ends.max(), 161)
@@ -193,16 +184,13 @@ def _ratios(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
         "a single cloud are too few (theory, section 7, item 1). On a plane the two directions are any two, and the "
         f"ratio may exceed 1. {_WHOLE}"
     )
-    caption = (
-        "Bars are 95 % intervals (jackknife over clouds, Student's t); dashes are the law of a base that is bent in "
-        "one direction."
-    )
+    caption = "Bars are 95 % intervals (over frames); dashes are the law of a base that is bent in one direction."
     yield ReliefFigure(Chart("relief_axis_ratio", "Clouds: axis ratio against the base's curvature", (panel,), 420),
                        about, tuple(measured), caption)  # fmt: skip
 
 
-def pooled_ratio(rows: pl.DataFrame) -> tuple[float, float]:
-    """Return the axis ratio of pooled clouds and its standard error by the jackknife; NaN for a single cloud.
+def pooled_ratio(rows: pl.DataFrame) -> tuple[float, float, tuple[float, float]]:
+    """Return the axis ratio of pooled clouds, its standard error and 95 % interval; NaN for a single frame.
 
     A row is a cloud. Second moments are weighted by the number of glints; those of a setting count relative to its
     size, so that the settings need not share slope and distance.
@@ -216,12 +204,14 @@ def pooled_ratio(rows: pl.DataFrame) -> tuple[float, float]:
     size = ((pl.col("across") + pl.col("along")) * pl.col("weight")).sum() / pl.col("weight").sum()
     rows = rows.with_columns(weight=pl.col("weight") / size.over("setting"))
     across, along = ((rows["weight"] * rows[name]).to_numpy() for name in ("across", "along"))
-    ratio = float(np.sqrt(across.sum() / along.sum()))
-    if len(across) < 2:
-        return ratio, float("nan")
-    left_out = np.sqrt((across.sum() - across) / (along.sum() - along))
-    n = len(across)
-    return ratio, float(np.sqrt((n - 1) / n * np.sum((left_out - left_out.mean()) ** 2)))
+    # Of the square, a ratio of sums; settings do not matter to it once they are scaled.
+    totals, counts, _ = summed(across, units(rows)[0], None, along)
+    ratio = float(np.sqrt(totals.sum() / counts.sum()))
+    low, high = mean_interval(totals, counts=counts)
+    if low is None or high is None:
+        return ratio, np.nan, (np.nan, np.nan)
+    deviation = deviation_of_mean(totals, counts, np.zeros(len(totals), dtype=int))
+    return ratio, deviation / (2 * ratio), (float(np.sqrt(max(low, 0.0))), float(np.sqrt(high)))
 
 
 def _ratio_law(rows: pl.DataFrame) -> float:
@@ -283,14 +273,12 @@ def _pools(spots: pl.DataFrame) -> Iterator[ReliefFigure]:
         share = [float((rows.filter(pl.col(LEVEL) == level)["pool"] == pool).mean()) for level in levels]  # type: ignore[arg-type]
         shares.append(Mark(levels, share, colour, name, line="solid", width=0.9, symbol=symbol,
                            hover=f"{name}\nlevel {{x}}: {{y}}"))  # fmt: skip
-        groups = [
-            (float(level), own.filter(pl.col(LEVEL) == level)["radius_px"].drop_nulls().to_numpy()) for level in levels
-        ]
-        if any(len(values) for _, values in groups):
-            radii.append(_mean_mark(groups, colour, name, symbol, line=True))
-        alone = own["radius_px"].drop_nulls()
-        size = f", {number(alone.mean())} px radius in the mean ({alone.len()} alone in their spots)"
-        measured.append(f"{name}: {own.height} of {rows.height} isolated highlights{size if alone.len() else ''}.")
+        alone = own.filter(pl.col("radius_px").is_not_null())
+        groups = [(float(level), alone.filter(pl.col(LEVEL) == level)) for level in levels]
+        if alone.height:
+            radii.append(replace(mean_mark(groups, "radius_px", colour, name, symbol), line="solid"))
+        size = f", {number(alone['radius_px'].mean())} px radius in the mean ({alone.height} alone in their spots)"
+        measured.append(f"{name}: {own.height} of {rows.height} isolated highlights{size if alone.height else ''}.")
     axis = Axis("level of the film, standard deviations of the height")
     panels = [Panel(axis, Axis("share of highlights", limits=(-0.05, 1.05)), tuple(shares), 0.5)]
     if radii:
@@ -300,6 +288,6 @@ def _pools(spots: pl.DataFrame) -> Iterator[ReliefFigure]:
         "are smooth and give the large highlights, crests the small ones (theory, section 7, item 7); most small ones "
         "are not isolated and do not count here."
     )
-    caption = "Above: shares. Below: mean radius of those alone in their spot, bars the 95 % interval (Student's t)."
+    caption = "Above: shares. Below: mean radius of those alone in their spot, bars the 95 % interval (over frames)."
     yield ReliefFigure(Chart("relief_pools", "Film: highlights in pools and on crests", tuple(panels), 560), about,
                        tuple(measured), caption)  # fmt: skip

@@ -16,8 +16,8 @@ NOTABLE_SHARE = 0.1
 """A larger share of highlights without an answer is told beside where a method breaks."""
 
 RULES = (
-    "Median error: the angle between the estimated and the true normal, of the answers. Its 95 % interval resamples "
-    f"the frames of each setting; none is given where a setting has fewer than {LEAST_FRAMES} distinct frames.",
+    "Median error: the angle between the estimated and the true normal, of the answers. The units of its 95 % "
+    f"interval are frames within their settings; none is given for fewer than {LEAST_FRAMES} distinct frames.",
     "Answered: of the true highlights that the method had to answer for. Missed ones were not detected; refused ones "
     "were, and the method gave a reason instead of a normal; failed ones were, and its code or process stopped with an "
     "error.",

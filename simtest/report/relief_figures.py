@@ -1,22 +1,21 @@
 """The figures of runs on a relief: errors against the fine surface and against its base, with law 7.4."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
 from simtest.pages.axes import Axis, log_range
-from simtest.pages.chart import NOTHING, Bars, Chart, Line, Mark, Panel
+from simtest.pages.chart import NOTHING, Bars, Chart, Mark, Panel
 from simtest.pages.style import NEUTRAL, Symbol, degrees, estimator_order, number
-from simtest.report.curves import scattered, varies
+from simtest.report.curves import bar, scattered, varies
 from simtest.report.run_folder import Run
 from simtest.report.series import axis_title
 from simtest.runtime.arrays import Array
 from simtest.spec.describe import name_key
 from simtest.validation import relief_laws
-from simtest.validation.statistics import mean_interval
 
 KD = "kd_base"
 """Distance times the base's principal curvature of larger size: what a swept radius is drawn over."""
@@ -136,8 +135,8 @@ def _over(rows: pl.DataFrame, x: str, label: str, colours: Mapping[str, str], si
         "highlight's own point, and of the base below it at the same point."
     )
     caption = (
-        "Points are means over the highlights of a setting, bars their 95 % interval (Student's t, highlights taken as "
-        "independent); dashes are the law of all glints of a cloud wholly in view; isolated ones lie lower."
+        "Points are means over the highlights of a setting, bars their 95 % interval (over frames); "
+        "dashes are the law of all glints of a cloud wholly in view; isolated ones lie lower."
     )
     return ReliefFigure(chart, about, tuple(measured), caption)
 
@@ -162,18 +161,25 @@ def _law(rows: pl.DataFrame) -> list[Mark]:
 
 def _curve(rows: pl.DataFrame, error: str, name: str, colour: str) -> Mark:
     """Describe the means of one estimator against one truth, with their intervals."""
-    groups = sorted((float(at), part[error].to_numpy()) for (at,), part in rows.group_by("at"))
-    x, y = np.array([at for at, _ in groups]), np.array([values.mean() for _, values in groups])
-    ends = np.array([[np.nan if end is None else end for end in mean_interval(v)] for _, v in groups]).reshape(-1, 2)
-    # An interval that reaches 0 is cut at the least value: the axis is logarithmic.
-    low = np.fmax(ends[:, 0], [values.min() for _, values in groups])
+    groups = [(float(at), part) for (at,), part in rows.group_by("at")]
+    mark = mean_mark(groups, error, colour, name, _SYMBOLS[error], f"{name}, against the {_AGAINST[error]}", degrees)
+    return replace(mark, line="solid" if error == "error_base_deg" else "dot")
+
+
+def mean_mark(
+    groups: list[tuple[float, pl.DataFrame]], value: str, colour: str, name: str, symbol: Symbol, about: str = "",
+    told: Callable[[float], str] = number,
+) -> Mark:  # fmt: skip
+    """Describe the means of a column of rows by x, with their intervals over frames."""
+    groups = sorted(((x, rows) for x, rows in groups if rows.height), key=lambda group: group[0])
+    means = [float(rows[value].mean()) for _, rows in groups]  # type: ignore[arg-type]
+    low, high = np.array([bar(rows, value) for _, rows in groups]).reshape(-1, 2).T
     hover = [
-        f"{name}, against the {_AGAINST[error]}\nx = {number(at)}, mean {degrees(mean)}, {len(values)} highlights"
-        for (at, values), mean in zip(groups, y.tolist(), strict=True)
+        f"{about or name}\nx = {number(x)}, mean {told(mean)} of {rows.height}"
+        for (x, rows), mean in zip(groups, means, strict=True)
     ]
-    line: Line = "solid" if error == "error_base_deg" else "dot"
-    return Mark(x, y, colour, name, line=line, width=0.9, symbol=_SYMBOLS[error], bars=Bars(low, ends[:, 1], 1.2),
-                hover=hover)  # fmt: skip
+    return Mark(np.array([x for x, _ in groups]), np.array(means), colour, name, width=0.9, symbol=symbol,
+                bars=Bars(low, high, 1.2), hover=hover)  # fmt: skip
 
 
 def _sentence(rows: pl.DataFrame, name: str) -> str:

@@ -21,8 +21,8 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import Stage, generator
+from simtest.runtime.statistics import mean_interval
 from simtest.validation import laws
-from simtest.validation.statistics import mean_interval
 
 DISTANCE_MM = 10.0
 EXPONENT = 50.0
@@ -201,8 +201,9 @@ class Rung:
 
     @property
     def interval_deg(self) -> tuple[float | None, float | None]:
-        """95 % interval of the mean (Student's t); None for a single error."""
-        return mean_interval(self.errors_deg)
+        """95 % interval of the mean; None for a single error."""
+        low, high = mean_interval(self.errors_deg)
+        return None if low is None else max(low, 0.0), high
 
 
 def error_ladder(scenes: Sequence[ClosedScene] = SCENES, realisations: int = REALISATIONS, seed: int = 0) -> list[Rung]:

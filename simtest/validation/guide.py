@@ -21,19 +21,11 @@ import polars as pl
 from simtest.conventions import MOTION
 from simtest.errors import FAULTS
 from simtest.estimators.descriptions import is_own
-from simtest.validation.paired import (
-    FRAME,
-    LEAST_FRAMES,
-    Distinct,
-    distinct_frames,
-    median_interval,
-    side_by_side,
-    targets_of,
-    units,
-)
+from simtest.runtime.statistics import Interval, median_interval
+from simtest.validation.paired import LEAST_FRAMES, Distinct, distinct_frames, side_by_side, targets_of
 from simtest.validation.ranking import Pair, best_of, compare
 from simtest.validation.situations import Situation, situations_of
-from simtest.validation.statistics import PENALTY_DEG, Interval
+from simtest.validation.statistics import FRAME, PENALTY_DEG, units
 
 BREAK_DEG = 5.0
 """A method breaks where the mean error of its answers is larger, ..."""

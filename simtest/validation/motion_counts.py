@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import polars as pl
 
 from simtest.conventions import MOTION, MOTION_COLUMNS
-from simtest.validation.statistics import share_interval
+from simtest.runtime.statistics import share_interval
+from simtest.validation.statistics import units
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,8 @@ class MotionCounts:
         Highlights of which no curvature explains the further views.
     judged : int
         Highlights that were judged at all.
+    wrong_share : (float, float, float)
+        Share of the judged highlights' signs that are told and wrong, and its 95 % interval over frames.
     """
 
     signs: int
@@ -29,17 +33,12 @@ class MotionCounts:
     wrong: int
     misfits: int
     judged: int
+    wrong_share: tuple[float, float, float]
 
     @property
     def told_share(self) -> float:
         """Share of the signs that were told."""
         return self.told / max(self.signs, 1)
-
-    @property
-    def wrong_share(self) -> tuple[float, float, float]:
-        """Share of the judged highlights' signs that are told and wrong, and its exact 95 % interval."""
-        asked = max(2 * self.judged, 1)
-        return (self.wrong / asked, *share_interval(self.wrong, asked))
 
 
 def motion_rows(results: pl.DataFrame) -> pl.DataFrame:
@@ -51,10 +50,15 @@ def motion_rows(results: pl.DataFrame) -> pl.DataFrame:
 
 def motion_counts(rows: pl.DataFrame) -> MotionCounts:
     """Count the signs of rows of `motion_rows`."""
-    told = wrong = 0
-    for i in (1, 2):
-        sign, gain = pl.col(f"motion_sign_{i}"), pl.col(f"motion_gain_{i}")
-        told += rows.filter(sign != 0).height
-        wrong += rows.filter(sign * gain < 0).height
-    judged = rows["motion_fits"].drop_nulls()
-    return MotionCounts(2 * rows.height, told, wrong, int((judged == 0).sum()), len(judged))
+    signs = [(pl.col(f"motion_sign_{i}").fill_null(0), pl.col(f"motion_gain_{i}").fill_null(0)) for i in (1, 2)]
+    count = rows.with_columns(
+        told=pl.sum_horizontal(sign != 0 for sign, _ in signs),
+        wrong=pl.sum_horizontal(sign * gain < 0 for sign, gain in signs),
+    )
+    told, wrong = int(count["told"].sum()), int(count["wrong"].sum())
+    judged = count.filter(pl.col("motion_fits").is_not_null())
+    asked = np.full(judged.height, 2.0)
+    interval = share_interval(judged["wrong"].to_numpy(), *units(judged), asked) if judged.height else (0.0, 1.0)
+    share = wrong / max(2 * judged.height, 1)
+    misfits = int((judged["motion_fits"] == 0).sum())
+    return MotionCounts(2 * rows.height, told, wrong, misfits, judged.height, (share, *interval))

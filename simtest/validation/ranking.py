@@ -10,8 +10,9 @@ from itertools import combinations
 
 import numpy as np
 
-from simtest.validation.paired import LEAST_FRAMES, Distinct, difference_interval, units
-from simtest.validation.statistics import Interval
+from simtest.runtime.statistics import Interval
+from simtest.validation.paired import LEAST_FRAMES, Distinct, difference_interval
+from simtest.validation.statistics import units
 
 MATTERS_DEG = 0.01
 """A smaller difference between two methods decides nothing, ..."""
@@ -63,7 +64,7 @@ class Pair:
 
 def compare(distinct: Distinct, names: Sequence[str]) -> list[Pair]:
     """Compare each two methods, by their errors side by side."""
-    settings, frames = units(distinct.wide)
+    frames, settings = units(distinct.wide)
     certain = distinct.wide["setting"].is_in(list(distinct.copied)).to_numpy()
     errors = {name: distinct.wide[f"of {name}"].to_numpy().astype(float) for name in names}
     made = []

@@ -8,17 +8,19 @@ import numpy as np
 import polars as pl
 
 from simtest.conventions import ON_INSTRUMENT
-from simtest.geometry import chi_squared, student_t
-from simtest.runtime.arrays import Array
+from simtest.geometry import chi_squared
+from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import Json
+from simtest.runtime.statistics import CONFIDENCE, Interval, mean_interval
 from simtest.validation.row_kinds import counts, row_kind
 
-Interval = tuple[float | None, float | None]
+FRAME = ("experiment", "setting", "realisation")
+
+ANATOMY = "anatomy"
+"""Column of scored datasets: samples of one anatomy are not independent."""
 
 PENALTY_DEG = 90.0
 """What a failed or missed row counts in mean_penalised_deg: refusing is no way to a good figure."""
-
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Figures:
     mean_base_deg : float or None
         Mean error against the base's normal; `mean_deg` itself without a relief.
     ci95_deg : tuple of float or None
-        Confidence interval of the mean (`mean_interval`).
+        Confidence interval of the mean, frames being the independent units.
     coverage95 : float or None
         Share of the answers with an uncertainty whose 95 % region holds the true normal.
     """
@@ -94,6 +96,7 @@ def figures(rows: pl.DataFrame) -> Figures:
     errors = answered["error_deg"].to_numpy()
     penalised = np.concatenate([errors, np.full(count["true"] - len(errors), PENALTY_DEG)])
     distances = answered["mahalanobis2"].drop_nulls().to_numpy()
+    low, high = mean_interval(errors, *units(answered))
     return Figures(
         n=count["true"],
         n_ok=count["ok"],
@@ -112,7 +115,8 @@ def figures(rows: pl.DataFrame) -> Figures:
         p95_deg=_or_none(lambda e: np.percentile(e, 95), errors),
         max_deg=_or_none(np.max, errors),
         mean_penalised_deg=_or_none(np.mean, penalised),
-        ci95_deg=mean_interval(errors),
+        # An angle is not negative, nor is its mean.
+        ci95_deg=(None if low is None else max(low, 0.0), high),
         coverage95=float(np.mean(distances <= chi_squared.quantile(CONFIDENCE, 2))) if len(distances) else None,
         n_instrument=count[ON_INSTRUMENT] if ON_INSTRUMENT in rows.columns else None,
     )
@@ -122,27 +126,15 @@ def _or_none(statistic: Callable[[Array], Any], values: Array) -> float | None:
     return float(statistic(values)) if len(values) else None
 
 
-def mean_interval(values: Array) -> Interval:
-    """Compute Student's 95 % interval of the mean of angles; None with fewer than two values."""
-    low, high = student_interval(values)
-    # An angle is not negative, nor is its mean.
-    return None if low is None else max(low, 0.0), high
+def units(rows: pl.DataFrame) -> tuple[IntArray, IntArray]:
+    """Return the number of the frame, of a dataset the anatomy, and of the setting of each row, from 0.
 
-
-def student_interval(values: Array) -> Interval:
-    """Compute Student's 95 % interval of the mean, such as of paired differences; None with fewer than two values."""
-    if len(values) < 2:
-        return None, None
-    half = student_t.quantile((1 + CONFIDENCE) / 2, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
-    return float(np.mean(values) - half), float(np.mean(values) + half)
-
-
-def share_interval(count: int, n: int) -> tuple[float, float]:
-    """Compute the exact 95 % interval of a share [Clopper and Pearson 1934]."""
-    # Imported here: slow to load, and runs need no shares.
-    from scipy import stats
-
-    tail = (1 - CONFIDENCE) / 2
-    low = float(stats.beta.ppf(tail, count, n - count + 1)) if count else 0.0
-    high = float(stats.beta.isf(tail, count + 1, n - count)) if count < n else 1.0
-    return low, high
+    They are the groups and the strata of an interval (`simtest.runtime.statistics`).
+    """
+    strata = FRAME[:-1]
+    groups = (*strata, ANATOMY) if ANATOMY in rows.columns else FRAME
+    frames, settings = (
+        (rows.select(pl.struct(columns).rank("dense")).to_series().to_numpy().astype(int) - 1)
+        for columns in (groups, strata)
+    )
+    return frames, settings

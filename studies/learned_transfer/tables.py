@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.bench.scores import interval_over_scenes
 from simtest.runtime.arrays import Array
+from simtest.runtime.seeds import from_integer
 from studies.detection.tissue import CLASSES, Counts
 from studies.learned_transfer.answers import OK, Answer
 from studies.learned_transfer.real import Agreement
+from studies.resampling import interval_of_mean
 
 NONE, ALL = "none", "all"
 
@@ -50,8 +51,10 @@ def paired(answers: Sequence[Answer], first: str, second: str) -> Paired:
     errors = np.array([[of[name][key] for name in (first, second)] for key in both])
     scenes, off = np.array([key[1] for key in both]), errors[:, 0] - errors[:, 1]
     medians = np.median(errors, axis=0)
+    several = len(set(scenes.tolist())) > 1
+    interval = interval_of_mean(off, scenes, 1000, from_integer(1)) if several else None
     return Paired(
-        len(both), len(set(scenes.tolist())), float(off.mean()), interval_over_scenes(off, scenes),
+        len(both), len(set(scenes.tolist())), float(off.mean()), interval,
         (float(medians[0]), float(medians[1])),
     )  # fmt: skip
 

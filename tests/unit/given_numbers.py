@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from simtest.geometry import student_t
+from simtest.runtime.statistics import student_quantile
 
 
 def of_given_numbers(values, settings, frames):
@@ -13,4 +13,4 @@ def of_given_numbers(values, settings, frames):
     residuals = values - (np.bincount(settings, values) / np.bincount(settings))[settings]
     sums = np.bincount(frames, residuals)
     deviation = math.sqrt(count / (count - kinds) * float(np.sum(sums**2))) / len(values)
-    return student_t.quantile(0.975, count - kinds) * deviation
+    return student_quantile(count - kinds) * deviation

@@ -14,7 +14,7 @@ from simtest.advice import draws
 from simtest.advice.advise import MAIN, RUN, advise, write_scene
 from simtest.advice.break_points import break_points, spot_size
 from simtest.advice.draws import drawn_values
-from simtest.advice.figures import mean_error, ratio_interval, read_results
+from simtest.advice.figures import mean_error, read_results
 from simtest.advice.organs import ORGANS, Surroundings, wall
 from simtest.advice.page import narrower, sentence, write_advice
 from simtest.advice.plan import (
@@ -358,33 +358,33 @@ def test_the_interval_holds_where_the_number_of_highlights_varies():
     for _ in range(300):
         frames = skewed_frames(rng, 10)
         shown = [(stratum, values) for stratum, values in frames if len(values)]
-        strata = np.array([stratum for stratum, _ in shown])
-        counts = np.array([float(len(values)) for _, values in shown])
-        totals = np.array([values.sum() for _, values in shown])
-        low, high = ratio_interval(totals, counts, strata, 10)
+        counts = [len(values) for _, values in shown]
+        values = np.concatenate([values for _, values in shown])
+        strata, numbers = np.repeat([stratum for stratum, _ in shown], counts), np.repeat(np.arange(len(shown)), counts)
+        rows = results(values.tolist(), numbers.tolist()).with_columns(setting=pl.Series(strata.astype(str)))
+        low, high = mean_error(rows, "error_fine_deg", 10).interval_deg
         missed += not low <= true <= high
         # Negative control: numbers of highlights taken as given.
-        values = np.concatenate([values for _, values in shown])
-        half = of_given_numbers(
-            values, np.repeat(strata, counts.astype(int)), np.repeat(np.arange(len(shown)), counts.astype(int))
-        )
+        half = of_given_numbers(values, strata, numbers)
         naive += abs(values.mean() - true) > half
     assert missed <= 31
     assert naive > 31
 
 
 def test_intervals_of_few_frames():
-    one = np.array([2.0]), np.array([1.0]), np.array([0])
-    assert ratio_interval(*one) == (None, None)
+    def interval(values, distances):
+        rows = results(values, range(len(values))).with_columns(setting=pl.Series(distances))
+        return mean_error(rows, "error_fine_deg", 1).interval_deg
+
+    assert interval([2.0], ["a"]) == (None, None)
     # Two frames at two distances: the spread between them is all that is known.
-    low, high = ratio_interval(np.array([2.0, 3.0]), np.ones(2), np.array([0, 1]), 1)
+    low, high = interval([2.0, 3.0], ["a", "b"])
     assert low < 1
     assert high > 6
     # Equal frames have no spread.
-    assert ratio_interval(np.full(8, 3.0), np.ones(8), np.arange(8) // 4) == pytest.approx((3.0, 3.0))
+    assert interval([3.0] * 8, [*"aaaabbbb"]) == pytest.approx((3.0, 3.0))
     # A frame at a distance of its own widens nothing where others tell the spread.
-    totals, counts = np.array([2.0, 3.0, 2.5, 4.0, 5.0]), np.ones(5)
-    assert ratio_interval(totals, counts, np.array([0, 0, 0, 0, 1]))[1] > 3.3
+    assert interval([2.0, 3.0, 2.5, 4.0, 5.0], [*"aaaab"])[1] > 3.3
 
 
 @pytest.mark.parametrize("depends", [pytest.param(True, marks=pytest.mark.ci), False])

@@ -181,6 +181,22 @@ def test_refused_and_missed_highlights_count_the_cap() -> None:
     assert score.scenes["plane"][26:] == [(0, 0.0)] * (LAYOUT["plane"][0] - 26)
 
 
+def test_differences_between_frozen_cases_are_no_chance() -> None:
+    """Errors near 1 deg in one case and near 9 in the other: other seeds move the score by their noise alone."""
+    rng, rows = np.random.default_rng(3), []
+    for case, level in (("easy", 1.0), ("hard", 9.0)):
+        rows += [
+            ResultRow(setting=case, realisation=i, true_id=0, status="ok", estimator="x", target="fine",
+                      error_deg=level + 0.3 * rng.standard_normal(), specularity=0)
+            for i in range(20)
+        ]  # fmt: skip
+    score = score_part(table(rows, {}), {"easy": (20, 1), "hard": (20, 1)})
+    low, high = score.score_interval
+    # The standard error is 0.3 / sqrt(40); as if the cases were drawn it would be 0.64.
+    assert (high - low) / 2 == pytest.approx(2.02 * 0.3 / np.sqrt(40), rel=0.25)
+    assert score.median_interval is not None
+
+
 def test_an_error_beyond_the_cap_counts_the_cap() -> None:
     rows = _rows(4).with_columns(error_deg=pl.Series([1.0, 9.0, 11.0, 170.0]))
     score = score_part(rows, LAYOUT)

@@ -163,7 +163,7 @@ def test_page_table_and_json(tmp_path):
     for line in score.lines:
         assert line[1:20] in text
     record = json.loads((tmp_path / "out" / "dense.json").read_text())
-    assert record["schema"] == 1
+    assert record["schema"] == 2
     assert record["counts"]["frames_without_map"] == 1
     zone = {cell["label"]: cell for cell in record["sources"]["normal"]["angle_deg"]["fine"] if cell["group"] == "zone"}
     assert set(zone) == {"all", "highlight", "ring_1", "ring_2", "ring_4", "elsewhere"}

@@ -8,7 +8,7 @@ from dense_frames import LENSES, sphere_truth, turned, write_png
 from simtest.dataset.scoring.dense import MapFolder, MapOptions, score_frames
 from simtest.dataset.scoring.dense.axes import ALL, matrix, parse_axes
 from simtest.dataset.scoring.dense.frame_truth import frame_truth
-from simtest.dataset.scoring.dense.tally import Tally
+from simtest.dataset.scoring.dense.tally import frame_figures, joined_figures
 from simtest.dataset.scoring.dense.zones import zones
 from simtest.errors import InputError
 
@@ -23,7 +23,10 @@ def scored(folder, *truths, **options):
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_normals_turned_by_one_degree_score_one_degree_in_every_cell(lens, tmp_path):
-    truths = [sphere_truth(name, LENSES[lens], centre=(x, -2.0, 30.0)) for name, x in (("a", 3.0), ("b", -6.0))]
+    truths = [
+        sphere_truth(name, LENSES[lens], centre=(x, -2.0, 30.0))
+        for name, x in zip("abcde", (3.0, -6.0, 4.0, 5.0, -5.0), strict=True)
+    ]
     for seed, truth in enumerate(truths):
         np.save(tmp_path / f"{truth.name}.npy", turned(truth.normal["fine"], 1.0, seed))
     score = scored(tmp_path, *truths)
@@ -267,43 +270,41 @@ def test_pixels_off_the_view_the_surface_and_on_metal_are_excluded_and_counted()
     assert not (made.zone[25:30, 45:50] == 0).any()
 
 
-def test_tallies_of_parts_add_up_whatever_their_order():
+def joined(frames, scenes):
+    rows = [frame_figures(np.asarray(values), (5.0, 20.0)) for values in frames]
+    return joined_figures(rows, np.asarray(scenes), np.zeros(len(rows), dtype=int))
+
+
+def test_figures_of_frames_are_joined():
     rng = np.random.default_rng(3)
-    frames = {name: rng.gamma(2.0, 5.0, 400) for name in "abcdefgh"}
-    label = [np.arange(400) % 3]
-    whole, first, second = (Tally(3, (5.0, 20.0)) for _ in range(3))
-    for name, values in frames.items():
-        whole.add(name, values, label)
-        (first if name < "d" else second).add(name, values, label)
-    second.merge(first)
-    for cell in range(3):
-        both = whole.figures(cell), second.figures(cell)
-        np.testing.assert_allclose(both[0]["median"], both[1]["median"], rtol=1e-9)
-        np.testing.assert_allclose(both[0]["ci95"]["mean"], both[1]["ci95"]["mean"], rtol=1e-6)
-    values = np.concatenate([own[np.arange(400) % 3 == 1] for own in frames.values()])
-    assert whole.figures(1)["median"] == pytest.approx(np.median(values), rel=0.01)
-    assert whole.figures(1)["p95"] == pytest.approx(np.percentile(values, 95), rel=0.01)
-    assert whole.figures(1)["mean"] == pytest.approx(values.mean())
-    assert whole.figures(1)["below_5"] == pytest.approx((values < 5).mean())
+    frames = [rng.gamma(2.0, 5.0, count) for count in (400, 100, 250, 400, 30, 400)]
+    frames[2][:50] = np.nan
+    found, values = joined(frames, range(6)), np.concatenate(frames)
+    answers = values[np.isfinite(values)]
+    assert (found["frames"], found["n"], found["n_unanswered"]) == (6, 1580, 50)
+    assert found["median"] == np.median([np.nanmedian(own) for own in frames])
+    assert found["p95"] == np.median([np.nanpercentile(own, 95) for own in frames])
+    assert found["mean"] == pytest.approx(answers.mean())
+    assert found["rms"] == pytest.approx(np.sqrt(np.mean(answers**2)))
+    assert found["mean_penalised"] == pytest.approx(np.nan_to_num(values, nan=90.0).mean())
+    assert found["below_5"] == pytest.approx((answers < 5).sum() / 1580)
+    assert all(low < found[name] < high for name, (low, high) in found["ci95"].items())
+    nothing = joined([np.full(4, np.nan)], [0])
+    assert (nothing["mean"], nothing["median"], nothing["share_unanswered"], nothing["ci95"]) == (None, None, 1.0, {})
 
 
 def test_intervals_are_over_scenes_not_pixels():
     rng = np.random.default_rng(4)
-    few, tally, truth = Tally(1, ()), Tally(1, ()), []
-    for number in range(60):
-        centre = 10 + 2 * rng.standard_normal()
-        truth.append(centre)
-        tally.add(f"frame {number}", centre + 0.01 * rng.standard_normal(5000), [np.zeros(5000, dtype=np.int64)])
+    truth = 10 + 2 * rng.standard_normal(60)
+    whole = joined([centre + 0.01 * rng.standard_normal(5000) for centre in truth], range(60))
     # A scene in several frames is one scene.
-    noisy = Tally(1, ())
-    for number, centre in enumerate(truth):
-        for _ in range(4):
-            noisy.add(f"frame {number}", centre + 0.01 * rng.standard_normal(500), [np.zeros(500, dtype=np.int64)])
-    assert noisy.figures(0)["frames"] == 240
-    np.testing.assert_allclose(noisy.figures(0)["ci95"]["mean"], tally.figures(0)["ci95"]["mean"], atol=0.02)
-    few.add("one", np.ones(10), [np.zeros(10, dtype=np.int64)])
-    few.add("one", np.ones(10), [np.zeros(10, dtype=np.int64)])
-    low, high = tally.figures(0)["ci95"]["mean"]
-    # 1.96 standard errors over 60 frames on each side.
-    assert (high - low) / 2 == pytest.approx(1.96 * np.std(truth) / np.sqrt(60), rel=0.35)
-    assert few.figures(0)["ci95"] == {}
+    noisy = joined([c + 0.01 * rng.standard_normal(500) for c in truth for _ in range(4)], np.repeat(range(60), 4))
+    assert noisy["frames"] == 240
+    for name in ("mean", "median"):
+        np.testing.assert_allclose(noisy["ci95"][name], whole["ci95"][name], atol=0.05)
+    low, high = whole["ci95"]["mean"]
+    # Two standard errors over 60 frames on each side, and its median's interval is wider.
+    assert (high - low) / 2 == pytest.approx(2.0 * np.std(truth) / np.sqrt(60), rel=0.1)
+    low, high = whole["ci95"]["median"]
+    assert low < whole["median"] < high
+    assert joined([np.ones(10), np.ones(10)], [0, 0])["ci95"] == {}

@@ -148,18 +148,19 @@ def test_axis_ratios_are_pooled_along_the_principal_directions(run):
 def test_a_pooled_ratio_weighs_glints_and_knows_its_error():
     rng = np.random.default_rng(4)
 
-    def cloud(setting, scale, glints):
+    def cloud(setting, scale, glints, frame=0):
         at = rng.normal(0, scale, (glints, 2)) * [3.0, 1.0]
         return {
-            "setting": setting, "cloud_kd_min": -0.2, "cloud_kd_max": 2.0, "cloud_glints": glints,
+            "experiment": "e", "setting": setting, "realisation": frame,
+            "cloud_kd_min": -0.2, "cloud_kd_max": 2.0, "cloud_glints": glints,
             "cloud_cov_11": float(at[:, 0] @ at[:, 0]) / glints, "cloud_cov_22": float(at[:, 1] @ at[:, 1]) / glints,
         }  # fmt: skip
 
     found = []
     for _ in range(200):
-        rows = [cloud("near", 1.0, n) for n in (5, 40)] + [cloud("far", 10.0, n) for n in (20, 30, 25)]
+        rows = [cloud("near", 1.0, n, n) for n in (5, 40)] + [cloud("far", 10.0, n, n) for n in (20, 30, 25)]
         found.append(pooled_ratio(pl.DataFrame(rows)))
-    ratios, errors = np.array(found).T
+    ratios, errors = np.array([each[:2] for each in found]).T
     assert np.median(ratios) == pytest.approx(1 / 3, rel=0.03)
     # Its spread is that of 120 glints, and the jackknife knows it.
     assert ratios.std() == pytest.approx(1 / 3 / np.sqrt(120), rel=0.25)

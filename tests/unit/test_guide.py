@@ -14,11 +14,12 @@ from simtest.report import write_report
 from simtest.report.guide_text import guide_rows, method_rows, seen_sentence
 from simtest.report.pairs import pairs
 from simtest.report.run_folder import read_run
+from simtest.runtime.statistics import median_interval
 from simtest.spec import load_experiment, load_scene
 from simtest.validation.cases import expand
 from simtest.validation.conditions import conditions, conditions_of
 from simtest.validation.guide import guide_of
-from simtest.validation.paired import LEAST_FRAMES, median_interval
+from simtest.validation.paired import LEAST_FRAMES
 from simtest.validation.run_summary import run_summary
 
 FLAT = {"kd_min": 0.0, "kd_max": 0.0, "eps_over_d": 0.0, "surface": "plane"}
@@ -378,13 +379,12 @@ def test_what_was_missed_and_what_was_refused_is_told():
 @pytest.mark.parametrize(("frames", "highlights"), [pytest.param(12, 3, marks=pytest.mark.ci), (8, 2)])
 def test_the_interval_of_a_median_holds_it_in_95_of_100_samples_of_frames(frames, highlights):
     random, trials = np.random.default_rng(5), 150
-    settings = np.zeros(frames * highlights, int)
     number = np.repeat(np.arange(frames), highlights)
     held = alone = 0
     for _ in range(trials):
         values = random.standard_normal(frames)[number] + 0.3 * random.standard_normal(len(number))
         for counted, units in (("frames", number), ("highlights", np.arange(len(number)))):
-            low, high = median_interval(values, settings, units)
+            low, high = median_interval(values, units)
             held += counted == "frames" and low <= 0 <= high
             alone += counted == "highlights" and low <= 0 <= high
     # Four standard deviations below 95 % in 150 trials.
@@ -395,13 +395,15 @@ def test_the_interval_of_a_median_holds_it_in_95_of_100_samples_of_frames(frames
 
 def test_settings_of_few_frames_have_no_interval():
     few, enough = (np.arange(float(n)) for n in (LEAST_FRAMES - 1, LEAST_FRAMES))
-    assert median_interval(few, np.zeros(len(few), int), np.arange(len(few))) == (None, None)
-    low, high = median_interval(enough, np.zeros(len(enough), int), np.arange(len(enough)))
+    assert median_interval(few) == (None, None)
+    low, high = median_interval(enough)
     assert low < np.median(enough) < high
-    assert median_interval(np.empty(0), np.empty(0, int), np.empty(0, int)) == (None, None)
-    # Spread between settings alone is none.
+    assert median_interval(np.empty(0)) == (None, None)
+    # Spread between settings is no chance.
     both = np.repeat([1.0, 2.0, 3.0], 6)
-    assert median_interval(both, np.repeat([0, 1, 2], 6), np.arange(18)) == (2.0, 2.0)
+    low, high = median_interval(both, np.arange(18), np.repeat([0, 1, 2], 6))
+    without = median_interval(both, np.arange(18))
+    assert without[0] < low <= 2.0 <= high < without[1]
 
 
 def test_methods_say_what_they_are_and_where_they_break():

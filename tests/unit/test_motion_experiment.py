@@ -111,6 +111,7 @@ def test_gains_follow_eulers_formula():
 
 def test_counts_of_rows_that_were_not_judged():
     rows = pl.DataFrame({
+        "experiment": ["e"] * 4, "setting": ["s"] * 4, "realisation": [0, 0, 1, 1],
         "estimator": ["motion"] * 4, "true_id": [0, 1, 2, None], "motion_over_d": [0.1] * 4,
         "motion_sign_1": [1.0, -1.0, None, 1.0], "motion_sign_2": [0.0, 1.0, None, 1.0],
         "motion_gain_1": [1.2, 0.8, None, None], "motion_gain_2": [0.5, 1.5, None, None],

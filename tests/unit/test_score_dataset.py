@@ -9,6 +9,7 @@ import pytest
 from simtest.dataset.card import CARD
 from simtest.dataset.export import export_dataset
 from simtest.dataset.manifest import read_manifest
+from simtest.dataset.scoring.dense.from_folder import frames_of
 from simtest.dataset.scoring.frames import scored_frames
 from simtest.dataset.scoring.run import score_table
 from simtest.dataset.shard_writer import write_dataset
@@ -51,6 +52,16 @@ def test_a_dataset_has_a_frame_for_each_sample(made):
         assert frame.view.highlights
 
 
+def test_samples_of_one_anatomy_are_one_scene_of_a_dense_score(tmp_path):
+    dataset = load_dataset("tiny", {"samples": FEW, "samples_per_anatomy": 2})
+    write_dataset(dataset, tmp_path / "data", make_engine())
+    export_dataset(tmp_path / "data", tmp_path / "frames", make_engine())
+    scenes = {truth.name: truth.scene for truth in frames_of(tmp_path / "data")}
+    by_index = [scenes[frame.name] for frame in sorted(scored_frames(tmp_path / "data"), key=lambda f: f.realisation)]
+    assert by_index[::2] == by_index[1::2]
+    assert len(set(by_index)) == FEW // 2
+
+
 @pytest.mark.ci  # meanwhile: test_own_estimates_of_a_dataset_are_scored_as_they_were
 def test_frames_need_none_of_the_estimators_that_a_dataset_was_made_with(made, tmp_path):
     # As on another machine, where a core or package of the dataset's maker is missing.
@@ -87,6 +98,7 @@ def test_own_estimates_of_a_dataset_are_scored_as_they_were(made, tmp_path):
             kept = single if name in OF_CANDIDATES else single | True
             assert ours[name].filter(kept).equals(again[name].filter(kept), null_equal=True), name
     assert again["setting"].equals(ours["split"])
+    assert again.select("anatomy", "realisation").unique()["anatomy"].n_unique() == 3
     summary = json.loads((tmp_path / "scored" / "summary.json").read_text())
     assert set(summary["experiments"]["tiny"]["settings"]) == set(ours["split"])
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.seeds import from_integer
+from simtest.runtime.statistics import mean_interval
 
 TWINS = 40.0
 """Effective number of twins of a highlight."""
@@ -30,9 +30,6 @@ UNKNOWN = 1.0
 WIDEST = 64.0
 """The kernel's width ends here; beyond it nothing in the bank is like the spot."""
 
-RESAMPLED, BOUNDS = 400, (0.025, 0.975)
-"""Bootstrap samples of the bank's frames for an interval, and the shares that it leaves out."""
-
 UNLIKE = 2.0
 """Unlikeness of twins above which they are called so: outside of what the bank covers."""
 
@@ -44,7 +41,7 @@ class Twins:
     Parameters
     ----------
     rms_deg, interval_deg : float, tuple of float
-        Root mean square error against the fine normal, with its 95 % interval by bootstrap over the bank's frames.
+        Root mean square error against the fine normal, with its 95 % interval over the bank's frames.
     base_rms_deg, base_interval_deg : float, tuple of float
         The same against the base's normal.
     coverage : float or None
@@ -148,16 +145,11 @@ class Matcher:
         return np.asarray(squares.sum(axis=1) + OTHER_ESTIMATOR * (self._estimators != spot.estimator))
 
     def _interval(self, weights: Array, errors: Array) -> tuple[float, float]:
-        """Return the 95 % interval of an RMS error, by bootstrap over the frames: their highlights share a light."""
-        count = int(self._frames.max()) + 1
-        mass = np.bincount(self._frames, weights, count)
-        power = np.bincount(self._frames, weights * np.square(errors), count)
-        # Each sample draws as many frames as there are.
-        drawn = from_integer(0).multinomial(count, np.full(count, 1 / count), size=RESAMPLED)
-        held = drawn @ mass
-        values = np.sqrt(drawn[held > 0] @ power / held[held > 0])
-        low, high = np.quantile(values, BOUNDS)
-        return float(low), float(high)
+        """Return the 95 % interval of an RMS error over the frames: their highlights share a light."""
+        low, high = mean_interval(weights * np.square(errors), self._frames, counts=weights)
+        return (
+            (np.nan, np.nan) if low is None or high is None else (float(np.sqrt(max(low, 0.0))), float(np.sqrt(high)))
+        )
 
 
 def _weights(squared: Array, shares: Array, wanted: float) -> Array:

@@ -12,8 +12,8 @@ from simtest.calibration.lights.mirrors import Mirrors
 from simtest.calibration.lights.search import Found
 from simtest.geometry import Array, chi_squared
 from simtest.geometry.camera import Camera
+from simtest.runtime.statistics import NORMAL_QUANTILE
 
-NORMAL_95 = 1.959964
 """Standard deviations in half of a 95 % interval."""
 
 UNLIKELY = 1e-3
@@ -55,7 +55,7 @@ class MeasuredLight:
     @property
     def half_widths_mm(self) -> Array:
         """Half of the 95 % interval of each coordinate, shape (3,), mm."""
-        return NORMAL_95 * np.sqrt(np.diag(self.covariance_mm2))
+        return NORMAL_QUANTILE * np.sqrt(np.diag(self.covariance_mm2))
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def _doubts(
 def _widest(light: MeasuredLight) -> tuple[float, Array] | None:
     """Return half of the widest 95 % interval, mm, and its axis, where it is wide."""
     values, vectors = np.linalg.eigh(light.covariance_mm2)
-    half = NORMAL_95 * math.sqrt(float(values[-1]))
+    half = NORMAL_QUANTILE * math.sqrt(float(values[-1]))
     axis = vectors[:, -1] * (1.0 if vectors[:, -1][np.abs(vectors[:, -1]).argmax()] > 0 else -1.0)
     return (half, axis) if half > WIDE_MM else None
 

@@ -35,6 +35,8 @@ class ScoredFrame:
         Of its noise.
     case, realisation : int
         Index of the experiment's case and number of the realisation; of a dataset 0 and the sample's index.
+    anatomy : str
+        Name of the dataset's anatomy that it shows; empty in a run.
     """
 
     name: str
@@ -46,6 +48,7 @@ class ScoredFrame:
     seed: int
     case: int
     realisation: int
+    anatomy: str = ""
 
 
 def scored_frames(folder: Path | str) -> Iterator[ScoredFrame]:
@@ -73,5 +76,14 @@ def _frames(record: Record, source: Source) -> Iterator[ScoredFrame]:
                 raise InputError(f"{shown(source.folder)}: {each.setting} was not exported as a whole; export again")
             check_frame(source.folder, name, record.frames[name].sha256, each.image)
             yield ScoredFrame(
-                name, each.view, each.session, each.setting, each.swept, each.image, each.seed, each.case, each.number
+                name,
+                each.view,
+                each.session,
+                each.setting,
+                each.swept,
+                each.image,
+                each.seed,
+                each.case,
+                each.number,
+                each.anatomy,
             )

@@ -36,6 +36,7 @@ from simtest.validation.results_table import table as results_table
 from simtest.validation.run_folder import EXPORT, check_folder, remove_folder
 from simtest.validation.run_summary import run_summary, settings_summary, write_results
 from simtest.validation.runner import Progress, Run, RunRecord
+from simtest.validation.statistics import ANATOMY
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ def _parts(source: Source, record: Record, answers: Answers, out: Path) -> list[
     """Split the frames into tasks, each with the answers to its own frames."""
     cases = list(source.cases)
     shown_cases = gallery_cases(cases) if cases else set()
-    swept = swept_example(cases) if cases else {ON_INSTRUMENT: False}
+    swept: Mapping[str, Value] = swept_example(cases) if cases else {ON_INSTRUMENT: False, ANATOMY: ""}
     by_key: dict[int, dict[int, str]] = {views.key: {} for views in source.views}
     if source.dataset is None:
         for use in record.uses:
@@ -262,4 +263,5 @@ def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[ResultRow]:
     maker = maker_of(views.dataset.model_dump_json(), views.variant)
     dark = each.view.full_scale <= 0
     found = [] if dark else reconstruct(each.image, each.view.calibration, estimators)
-    return maker.rows(each.number, each.session, each.view, found, estimators)
+    rows = maker.rows(each.number, each.session, each.view, found, estimators)
+    return [row.having(swept={**row.swept, ANATOMY: each.anatomy}) for row in rows]

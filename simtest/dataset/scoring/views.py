@@ -38,6 +38,8 @@ class Shown:
         Swept, pooled and drawn values by key path.
     isolated : bool
         Whether isolated highlights alone are detected and counted.
+    anatomy : str
+        Name of the dataset's anatomy that it shows; empty in a run.
     """
 
     case: int
@@ -48,6 +50,7 @@ class Shown:
     setting: str
     swept: Mapping[str, Value]
     isolated: bool = True
+    anatomy: str = ""
 
     @cached_property
     def image(self) -> Image:
@@ -117,7 +120,9 @@ class ShardViews:
                 key: value if isinstance(value, bool | int | float | str) else str(value)
                 for key, value in drawn.values.items()
             }
-            yield Shown(0, index, drawn.scene.sensor.seed, view, session, maker.plan.split(index), values)
+            split, of = maker.plan.split(index), maker.plan.anatomy(index)
+            anatomy = f"{of.family}.{of.number}"
+            yield Shown(0, index, drawn.scene.sensor.seed, view, session, split, values, anatomy=anatomy)
 
 
 def views_of_cases(experiment: Experiment, cases: Sequence[Case], variant: str) -> list[Views]:

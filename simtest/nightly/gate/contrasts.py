@@ -6,15 +6,17 @@ has its measured error rates. A mean of rows is a ratio of sums over units; its 
 about it.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 from scipy import stats
 
+from simtest.nightly.gate.pairing_units import GROUP
 from simtest.nightly.gate.quantities import Quantity
 from simtest.runtime.arrays import Array, IntArray, Mask
-from simtest.validation.statistics import CONFIDENCE
+from simtest.runtime.statistics import CONFIDENCE, reach
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ def tail(estimate: Array, deviation: Array, freedom: Array) -> Array:
     return np.where(usable, stats.t.sf(statistic, np.where(usable, freedom, 1.0)), np.nan)
 
 
-def half_width(deviation: Array, freedom: Array) -> Array:
+def half_width(deviation: Array | float, freedom: Array) -> Array:
     """Return half of the 95 % interval's width; NaN without a degree of freedom."""
     usable = freedom >= 1
     quantile = stats.t.ppf((1 + CONFIDENCE) / 2, np.where(usable, freedom, 1.0))
@@ -81,7 +83,7 @@ def paired(sums: pl.DataFrame, quantity: Quantity) -> Outcomes:
         most = quantity.span * size
         m |= {"units": units + 2, "rows": rows + 2 * size, "x": s["x"] + most, "nn": s["nn"] + 2 * size**2}
         m |= {"dd": s["dd"] + 2 * most**2, "xx": s["xx"] + most**2, "dx": s["dx"] - most**2}
-        m["xn"] = s["xn"] + most * size
+        m |= {"xn": s["xn"] + most * size, "ddn": s["ddn"] + 2 * most**2 * size, "nnn": s["nnn"] + 2 * size**3}
 
     def contrast(share: float, shift: float, sign: float) -> tuple[Array, Array]:
         """Compute mean and standard error of sign d - share x - shift."""
@@ -104,10 +106,10 @@ def paired(sums: pl.DataFrame, quantity: Quantity) -> Outcomes:
         for sign in (1.0, -1.0)
     ]
     centre, deviation = contrast(0.0, 0.0, 1.0)
-    half = half_width(deviation, freedom)
+    below, above = reach(half_width(1.0, freedom), _skewness(_third(m, centre, "d"), deviation))
     return Outcomes(
-        units.astype(np.int64), baseline, baseline + difference, difference, centre - half, centre + half, margin,
-        p[0], p[1], s["largest"] <= margin, deviation, freedom,
+        units.astype(np.int64), baseline, baseline + difference, difference, centre - below * deviation,
+        centre + above * deviation, margin, p[0], p[1], s["largest"] <= margin, deviation, freedom,
     )  # fmt: skip
 
 
@@ -131,12 +133,12 @@ def unpaired(before: pl.DataFrame, after: pl.DataFrame, quantity: Quantity) -> O
         return np.asarray(np.max(found, axis=0))
 
     deviation, freedom = _welch(x, y, 1.0, 1.0)
-    half = half_width(deviation, freedom)
+    below, above = reach(half_width(1.0, freedom), _skewness(y.third - x.third, deviation))
     centre = y.mean - x.mean
     return Outcomes(
-        np.minimum(x.units, y.units).astype(np.int64), x.shown, y.shown, y.shown - x.shown, centre - half,
-        centre + half, margin, test(y, x, x), test(x, y, x), np.zeros(len(margin), dtype=bool), deviation,
-        freedom,
+        np.minimum(x.units, y.units).astype(np.int64), x.shown, y.shown, y.shown - x.shown,
+        centre - below * deviation, centre + above * deviation, margin, test(y, x, x), test(x, y, x),
+        np.zeros(len(margin), dtype=bool), deviation, freedom,
     )  # fmt: skip
 
 
@@ -148,13 +150,15 @@ class _Arm:
     shown: Array
     mean: Array
     variance: Array
+    third: Array  # third central moment of the mean
     freedom: Array
 
     @classmethod
     def of(cls, table: pl.DataFrame, span: float) -> "_Arm":
-        units, rows, x, xx, nn, xn = (
-            table[name].to_numpy().astype(float) for name in ("units", "rows", "x", "xx", "nn", "xn")
-        )
+        m = {
+            name: values.to_numpy().astype(float) for name, values in table.select(pl.exclude(GROUP)).to_dict().items()
+        }
+        units, rows, x, xx, nn, xn = (m[name] for name in ("units", "rows", "x", "xx", "nn", "xn"))
         shown, seen = x / rows, units
         if span:
             # One that harms and one that does not [Agresti and Caffo 2000].
@@ -162,6 +166,8 @@ class _Arm:
             most = span * size
             x, xx, nn, xn = x + most, xx + most**2, nn + 2 * size**2, xn + most * size
             rows, units = rows + 2 * size, units + 2
+            m |= {"units": units, "rows": rows, "nnn": m["nnn"] + 2 * size**3}
+            m |= {"xxx": m["xxx"] + most**3, "xxn": m["xxn"] + most**2 * size, "xnn": m["xnn"] + most * size**2}
         mean = x / rows
         # Of the units' residuals about the mean
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -169,7 +175,23 @@ class _Arm:
             # A constant's squares cancel to rounding.
             squares = np.where(squares > 1e-13 * xx, squares, 0.0)
             variance = squares / (units * (units - 1)) / (rows / units) ** 2
-        return cls(seen, shown, mean, variance, seen - 1)
+        return cls(seen, shown, mean, variance, _third(m, mean, "x"), seen - 1)
+
+
+def _third(m: Mapping[str, Array], mean: Array, of: str) -> Array:
+    """Return the third central moment of a mean of rows, without bias; 0 of fewer than three units."""
+    cubes = (
+        m[of * 3] - 3 * mean * m[f"{of}{of}n"] + 3 * mean**2 * m[f"{of}nn"] - mean**3 * m["nnn"]
+    )  # fmt: skip
+    units = m["units"]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moment = cubes * units**2 / (m["rows"] ** 3 * (units - 1) * (units - 2))
+    return np.where(units > 2, moment, 0.0)
+
+
+def _skewness(third: Array, deviation: Array) -> Array:
+    """Return the skewness of an estimate; 0 where it has no variance."""
+    return np.where(deviation > 0, third / np.where(deviation > 0, deviation, 1.0) ** 3, 0.0)
 
 
 def _welch(first: _Arm, second: _Arm, a: float, b: float) -> tuple[Array, Array]:

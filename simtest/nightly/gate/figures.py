@@ -7,10 +7,11 @@ import numpy as np
 import polars as pl
 
 from simtest.conventions import MOTION_COLUMNS
-from simtest.nightly.gate.quantities import RATIO_OFF
+from simtest.nightly.gate.quantities import COVERED, IS_TRUE, RATIO_OFF
 from simtest.nightly.records import CELL, Cell, Figure, figure_table
+from simtest.runtime.statistics import mean_interval, share_interval
 from simtest.validation.results_table import SCHEMA
-from simtest.validation.statistics import figures, share_interval, student_interval
+from simtest.validation.statistics import figures, units
 
 DIGEST_KEYS = ("realisation", "true_id", "specularity", "seed")
 """Order of the rows within a cell."""
@@ -75,19 +76,22 @@ def _cell_figures(cell: Cell, rows: pl.DataFrame, taken: int, hashed: str) -> It
         if value is not None:
             yield Figure(cell, quantity, unit, value, low, high, n, hashed)
 
-    def share(quantity: str, count: int, n: int) -> Iterator[Figure]:
-        return figure(quantity, "", count / n, n, share_interval(count, n))
+    def share(quantity: str, of: pl.DataFrame, hits: pl.Expr) -> Iterator[Figure]:
+        held = of.select(hits.fill_null(False).alias("hit"))["hit"].to_numpy()
+        count, n = int(held.sum()), len(held)
+        return figure(quantity, "", count / n, n, share_interval(held, *units(of)))
 
     # Counts and shares
     found, frames = figures(rows), max(taken, rows["realisation"].n_unique())
-    n, n_ok, missed, failed = found.n, found.n_ok, found.n_missed, sum(found.n_failed_by_reason.values())
+    n, n_ok = found.n, found.n_ok
     yield from figure("frames", "", frames, frames)
     yield from figure("n", "", n, n)
     yield from figure("n_ok", "", n_ok, n)
     if n:
-        yield from share("failed", failed, n)
-        yield from share("missed", missed, n)
-        yield from share("unanswered", failed + missed, n)
+        true, missed = rows.filter(IS_TRUE), pl.col("status") == "missed"
+        yield from share("failed", true, ~missed & (pl.col("status") != "ok"))
+        yield from share("missed", true, missed)
+        yield from share("unanswered", true, pl.col("status") != "ok")
     yield from figure("false", "a frame", found.n_false / frames, frames)
     # Errors
     yield from figure("mean_deg", "deg", found.mean_deg, n_ok, found.ci95_deg)
@@ -97,19 +101,14 @@ def _cell_figures(cell: Cell, rows: pl.DataFrame, taken: int, hashed: str) -> It
     if found.n_instrument is not None:
         yield from figure("n_instrument", "", found.n_instrument, rows.height)
     if found.coverage95 is not None:
-        stated = _results_with_region(rows)
-        yield from share("coverage95", round(found.coverage95 * stated), stated)
+        with_region = rows.filter(IS_TRUE & (pl.col("status") == "ok") & pl.col("mahalanobis2").is_not_null())
+        yield from share("coverage95", with_region, pl.col("mahalanobis2") <= COVERED)
     # Axis ratios against their law
-    off = rows.select(off=RATIO_OFF)["off"].drop_nulls().to_numpy()
-    if len(off):
-        yield from figure("axis_ratio", "", float(np.mean(off)), len(off), student_interval(off))
+    known = rows.with_columns(off=RATIO_OFF).drop_nulls("off")
+    if known.height:
+        off = known["off"].to_numpy()
+        yield from figure("axis_ratio", "", float(np.mean(off)), len(off), mean_interval(off, *units(known)))
         yield from figure("axis_ratio_median", "", float(np.median(off)), len(off))
-
-
-def _results_with_region(rows: pl.DataFrame) -> int:
-    """Count the results that state an uncertainty, as `figures` does."""
-    answered = rows.filter(pl.col("true_id").is_not_null() & (pl.col("status") == "ok"))
-    return answered["mahalanobis2"].drop_nulls().len()
 
 
 def digest(rows: pl.DataFrame) -> str:

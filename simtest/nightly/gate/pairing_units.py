@@ -1,5 +1,6 @@
 """Sums over resampling units: realisations, each a scene or a pose, whatever number of highlights it shows."""
 
+import operator
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
 
@@ -23,7 +24,8 @@ def paired_sums(values: pl.DataFrame) -> pl.DataFrame:
     -------
     polars.DataFrame
         `GROUP`, `units`, `rows`; sums over units of d (tonight less baseline), x (baseline) and of products of d, x and
-        n (the unit's rows): `d`, `x`, `dd`, `dx`, `dn`, `xx`, `xn`, `nn`; `largest`: the largest abs(d) of a row.
+        n (the unit's rows): `d`, `x`, `dd`, `dx`, `dn`, `xx`, `xn`, `nn`, `ddd`, `ddn`, `dnn`, `nnn`; `largest`: the
+        largest abs(d) of a row.
     """
     d = pl.col("tonight") - pl.col("baseline")
     return _sums(values, (d.alias("d"), pl.col("baseline").alias("x")), d.abs())
@@ -40,10 +42,11 @@ def _sums(values: pl.DataFrame, terms: Sequence[pl.Expr], size: pl.Expr) -> pl.D
         *(term.sum() for term in terms), n=pl.len().cast(pl.Float64), largest=size.max()
     )
     names = [term.meta.output_name() for term in terms]
-    products = [
-        (pl.col(first) * pl.col(second)).sum().alias(first + second)
-        for first, second in combinations_with_replacement((*names, "n"), 2)
+    factors = [
+        *combinations_with_replacement((*names, "n"), 2),
+        *combinations_with_replacement((names[0], "n"), 3),
     ]
+    products = [pl.reduce(operator.mul, [pl.col(name) for name in own]).sum().alias("".join(own)) for own in factors]
     return units.group_by(GROUP, maintain_order=True).agg(
         pl.len().alias("units"), pl.col("n").sum().alias("rows"), pl.col(names).sum(), *products,
         pl.col("largest").max(),

@@ -8,9 +8,10 @@ from scipy import stats
 from simtest.conventions import MOTION, ON_INSTRUMENT
 from simtest.nightly.gate.limits import Limits
 from simtest.nightly.records import CELL
+from simtest.runtime.statistics import CONFIDENCE
 from simtest.validation.results_table import BUDGET_COLUMNS
 from simtest.validation.row_kinds import is_false
-from simtest.validation.statistics import CONFIDENCE, PENALTY_DEG
+from simtest.validation.statistics import PENALTY_DEG
 
 COVERED = float(stats.chi2.ppf(CONFIDENCE, 2))
 """Squared Mahalanobis distance of the border of a 95 % region."""

@@ -57,7 +57,7 @@ class FrameTruth:
     swept : dict
         Values of the swept parameters.
     scene : str
-        Names the scene: frames of one scene differ in noise alone. Empty where each frame has its own.
+        Names the scene, of a dataset the anatomy, which other frames may show too. Empty where each has its own.
     """
 
     name: str
@@ -125,11 +125,11 @@ def _larger(low: Array, high: Array) -> Array:
 
 def truth_of_view(
     name: str, view: "RenderedView", session: "Session", setting: str = "",
-    swept: Mapping[str, object] | None = None, image: Image | None = None,
+    swept: Mapping[str, object] | None = None, image: Image | None = None, scene: str = "",
 ) -> FrameTruth:  # fmt: skip
-    """Return the truth of a rendered view; the session stands at its scene."""
+    """Return the truth of a rendered view; the session stands at its scene, which `scene` names."""
     eps = float(np.linalg.norm(view.scene.rig.true_mm(), axis=1).max())
     truth = frame_truth(
         name, session.truth(), session.camera, eps, view.spots.regions, image, view.calibration, setting, swept
     )
-    return replace(truth, scene=view.scene.model_dump_json())
+    return replace(truth, scene=scene or view.scene.model_dump_json())

@@ -24,6 +24,6 @@ def frames_of(folder: Path, progress: Progress | None = None, total: int = 0) ->
         # One frame may stand for several realisations; it has one map.
         if each.name not in told:
             told.add(each.name)
-            yield truth_of_view(each.name, each.view, each.session, each.setting, each.swept, each.image)
+            yield truth_of_view(each.name, each.view, each.session, each.setting, each.swept, each.image, each.anatomy)
             if progress:
                 progress(len(told), total, each.name)

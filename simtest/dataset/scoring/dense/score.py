@@ -22,7 +22,7 @@ from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.resources import shown
 
 TABLE, SUMMARY, PAGE = "dense.parquet", "dense.json", "index.html"
-SCHEMA = 1
+SCHEMA = 2
 
 MOST_SHOWN, LEAST_SHOWN = 6, 3
 """Frames that the page shows: one of each setting up to the larger number, and the first ones up to the smaller."""
@@ -46,7 +46,7 @@ class DenseScore:
     evidence : Evidence
         What speaks for them.
     scorer : Scorer
-        Tallies and rows.
+        The figures of each frame.
     counts : dict of int
         Frames, frames without any map, scored pixels, and pixels excluded by reason.
     shown : list of Shown

@@ -1,15 +1,15 @@
-"""Scores maps frame by frame: angles and depth errors go into tallies, and each frame leaves its rows."""
+"""Scores maps frame by frame: each frame leaves the figures of its angles and depth errors, a row a cell."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from simtest.dataset.scoring.dense.cells import CELLS, ZONE_CELLS, labels
+from simtest.dataset.scoring.dense.cells import CELLS, Cell, labels
 from simtest.dataset.scoring.dense.conventions import Answer, Conventions, MapOptions
 from simtest.dataset.scoring.dense.depth import ALIGNMENTS, align, answered, depth_factor, normals_of_distance
 from simtest.dataset.scoring.dense.frame_truth import SURFACES, FrameTruth
 from simtest.dataset.scoring.dense.map_files import decode_depth
-from simtest.dataset.scoring.dense.tally import PENALTY, Tally, named
+from simtest.dataset.scoring.dense.tally import PENALTY, frame_figures, joined_figures
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject
@@ -49,11 +49,11 @@ class Scorer:
 
     options: MapOptions
     conventions: Conventions
-    tallies: dict[Key, Tally] = field(default_factory=dict)
     rows: list[JsonObject] = field(default_factory=list)
     alignments: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     sources: tuple[str, ...] = ()
     """Sources that some frame has; a frame without one counts as unanswered there."""
+    _scenes: dict[str, str] = field(default_factory=dict)
     _cells: list[tuple[Key, JsonObject]] = field(default_factory=list)
     _told_rows: int = 0
 
@@ -102,27 +102,15 @@ class Scorer:
 
     def _count(self, key: Key, truth: FrameTruth, values: Array, sorted_in: list[IntArray]) -> None:
         source, quantity, surface = key
-        below = BELOW[quantity]
-        if key not in self.tallies:
-            self.tallies[key] = Tally(len(CELLS), below, PENALTY if quantity == ANGLE else None)
-        sums = self.tallies[key].add(truth.scene or truth.name, values, sorted_in)
+        self._scenes[truth.name] = truth.scene or truth.name
         common = {"frame": truth.name, "setting": truth.setting, **truth.swept, "source": source,
                   "quantity": quantity, "surface": surface}  # fmt: skip
-        for number, cell in enumerate(CELLS):
-            if sums[number, 0] + sums[number, 1] == 0:
-                continue
-            # Exact quantiles of the frame's zones; of the bins its sums.
-            own = np.empty(0)
-            if number < len(ZONE_CELLS):
-                own = values[sorted_in[0 if number == 0 else 1] == number]
-                own = own[np.isfinite(own)]
-            self.rows.append({
-                **common, "group": cell.group, "label": cell.label, "scope": cell.scope,
-                "n": int(sums[number, 0] + sums[number, 1]), "n_unanswered": int(sums[number, 1]),
-                **named(sums[number], below, self.tallies[key].penalty),
-                "median": float(np.median(own)) if own.size else None,
-                "p95": float(np.percentile(own, 95)) if own.size else None,
-            })  # fmt: skip
+        penalty = PENALTY if quantity == ANGLE else None
+        for sorting in sorted_in:
+            for number in np.unique(sorting[sorting >= 0]):
+                cell, own = CELLS[number], values[sorting == number]
+                told = {"group": cell.group, "label": cell.label, "scope": cell.scope}
+                self.rows.append({**common, **told, **frame_figures(own, BELOW[quantity], penalty)})
 
     def alignment_summary(self) -> JsonObject:
         """Return median, least and largest factor and shift of each alignment over the frames.
@@ -150,11 +138,21 @@ class Scorer:
     def cells(self) -> list[tuple[Key, JsonObject]]:
         """Return the figures of every cell that holds a pixel."""
         if len(self.rows) != self._told_rows:
+            held: dict[tuple[Key, Cell], list[JsonObject]] = {}
+            for row in self.rows:
+                key = (row["source"], row["quantity"], row["surface"])
+                held.setdefault((key, Cell(row["group"], row["label"], row["scope"])), []).append(row)
+            order = {cell: number for number, cell in enumerate(CELLS)}
+            keys = list(dict.fromkeys(key for key, _ in held))
             self._cells = [
-                (key, {"group": cell.group, "label": cell.label, "scope": cell.scope, **tally.figures(number)})
-                for key, tally in self.tallies.items()
-                for number, cell in enumerate(CELLS)
-                if tally.frames[number]
+                (key, {**vars(cell), **self._joined(held[key, cell])})
+                for key, cell in sorted(held, key=lambda each: (keys.index(each[0]), order[each[1]]))
             ]
             self._told_rows = len(self.rows)
         return self._cells
+
+    def _joined(self, rows: list[JsonObject]) -> JsonObject:
+        names = [[self._scenes[row["frame"]] for row in rows], [row["setting"] for row in rows]]
+        scenes, settings = (np.unique(each, return_inverse=True)[1] for each in names)
+        figures = [*rows[0]][[*rows[0]].index("scope") + 1 :]
+        return joined_figures([{name: row[name] for name in figures} for row in rows], scenes, settings)

@@ -1,172 +1,85 @@
-"""Figures of very many values, held in little memory: sums and histograms that can be added frame by frame.
+"""Figures of the pixels of one frame, and of many frames together.
 
-The scenes, not the pixels, are the sample: intervals come from a bootstrap over scenes. Each replicate weighs a frame
-with a Poisson number of mean 1, drawn from its scene's name, so that it can be computed frame by frame and in parts
-[Chamandy et al. 2012, Estimating uncertainty for massive data streams, section 3]. Frames of one scene, which differ in
-noise alone, have the same weight.
+The scenes, not the pixels, are the sample (of a dataset the anatomies): frames of one scene differ in noise alone.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from simtest.runtime.arrays import Array, IntArray, Mask
+from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject
-from simtest.runtime.seeds import from_integer, key
+from simtest.runtime.statistics import Interval, mean_interval, median_interval, share_interval
 
-LOWEST, HIGHEST = 1e-6, 1e4
-"""Ends of the histogram; values beyond are counted in the outer bins."""
-
-FINE_STEP, PER_COARSE = 0.005, 10
-"""Width of a bin as a share of its value, and how many bins are one of the bootstrap's."""
-
-REPLICATES = 100
 PENALTY = 90.0
 """An unanswered pixel counts as this angle, deg, in the penalised mean."""
 
-_EDGES = np.exp(np.arange(np.log(LOWEST), np.log(HIGHEST) + PER_COARSE * FINE_STEP, FINE_STEP))
-BINS = PER_COARSE * (len(_EDGES) // PER_COARSE)
-_COARSE = BINS // PER_COARSE
+QUANTILES = {"median": 0.5, "p95": 0.95}
 
 
-class Tally:
-    """Counts, sums and histograms of values in cells, such as those of the zones and of the bins of a quantity.
+def frame_figures(values: Array, below: Sequence[float], penalty: float | None = PENALTY) -> JsonObject:
+    """Return the figures of a frame's pixels of one cell: shares are of all, the unanswered among them.
 
     Parameters
     ----------
-    cells : int
-        Number of cells.
+    values : ndarray, shape (N,)
+        At least one; NaN where there is no answer.
     below : sequence of float
-        Thresholds; the share of the pixels below each is kept.
+        Thresholds; the share of the pixels below each is told.
     penalty : float or None
         What an unanswered pixel counts in `mean_penalised`; None where the values have no such figure.
     """
-
-    def __init__(self, cells: int, below: Sequence[float], penalty: float | None = PENALTY) -> None:
-        self.below, self.penalty = tuple(below), penalty
-        self.frames = np.zeros(cells, dtype=np.int64)
-        self.scenes: list[set[int]] = [set() for _ in range(cells)]
-        # count, unanswered, sum, sum of squares, and the counts below each threshold
-        self.sums = np.zeros((cells, 4 + len(below)))
-        self.counts = np.zeros((cells, BINS), dtype=np.int64)
-        self.totals = np.zeros((cells, BINS))
-        self._weighed = np.zeros((REPLICATES, cells, 4 + len(below)))
-        self._weighed_counts = np.zeros((REPLICATES, cells, _COARSE), dtype=np.float32)
-
-    def add(self, scene: str, values: Array, labels: Sequence[IntArray]) -> Array:
-        """Add the values of a frame; return its own sums, shape (cells, 4 + thresholds).
-
-        Parameters
-        ----------
-        scene : str
-            Name of its scene, which several frames may show.
-        values : ndarray, shape (N,)
-            NaN where there is no answer.
-        labels : sequence of ndarray of int, shape (N,)
-            Cells that each value belongs to, -1 for none: an array for each way of sorting them.
-        """
-        cells = len(self.sums)
-        answered = np.isfinite(values)
-        bins = np.zeros(len(values), dtype=np.int64)
-        bins[answered] = np.clip(np.searchsorted(_EDGES, values[answered], side="right") - 1, 0, BINS - 1)
-        flat_counts, flat_totals = np.zeros(cells * BINS, dtype=np.int64), np.zeros(cells * BINS)
-        sums = np.zeros_like(self.sums)
-        for label in labels:
-            kept = answered & (label >= 0)
-            at, own = label[kept] * BINS + bins[kept], values[kept]
-            flat_counts += np.bincount(at, minlength=cells * BINS)
-            flat_totals += np.bincount(at, own, cells * BINS)
-            sums += self._sums(label, kept, own, cells)
-        counts, totals = flat_counts.reshape(cells, BINS), flat_totals.reshape(cells, BINS)
-        self.counts += counts
-        self.totals += totals
-        self.sums += sums
-        held = sums[:, 0] + sums[:, 1] > 0
-        self.frames += held
-        for cell in np.flatnonzero(held):
-            self.scenes[cell].add(key(scene))
-        # the bootstrap's replicates, where this frame counts as often as its weight says
-        weights = from_integer(key(scene)).poisson(1.0, REPLICATES)
-        coarse = counts[:, :BINS].reshape(cells, _COARSE, PER_COARSE).sum(axis=2)
-        rows, columns = np.nonzero(coarse)
-        self._weighed += weights[:, None, None] * sums
-        self._weighed_counts[:, rows, columns] += weights[:, None].astype(np.float32) * coarse[rows, columns]
-        return sums
-
-    def _sums(self, label: IntArray, kept: Mask, own: Array, cells: int) -> Array:
-        number = label[kept]
-        missing = label[(label >= 0) & ~kept]
-        columns = [
-            np.bincount(number, minlength=cells),
-            np.bincount(missing, minlength=cells),
-            np.bincount(number, own, cells),
-            np.bincount(number, own * own, cells),
-            *(np.bincount(number[own < most], minlength=cells) for most in self.below),
-        ]
-        return np.stack(columns, axis=1).astype(float)
-
-    def merge(self, other: "Tally") -> None:
-        """Add what another tally of other frames and the same cells has counted."""
-        for name in ("frames", "sums", "counts", "totals", "_weighed", "_weighed_counts"):
-            getattr(self, name).__iadd__(getattr(other, name))
-        for own, others in zip(self.scenes, other.scenes, strict=True):
-            own |= others
-
-    def figures(self, cell: int) -> JsonObject:
-        """Return the figures of a cell, with 95 % intervals where two scenes or more hold pixels of it."""
-        sums, frames = self.sums[cell], int(self.frames[cell])
-        means = self.totals[cell] / np.maximum(self.counts[cell], 1)
-        median, p95 = (_quantile(self.counts[cell], means, q) for q in (0.5, 0.95))
-        found: JsonObject = {
-            "frames": frames,
-            "n": int(sums[0] + sums[1]),
-            "n_unanswered": int(sums[1]),
-            **named(sums, self.below, self.penalty),
-            "median": median,
-            "p95": p95,
-        }
-        found["ci95"] = self._intervals(cell) if len(self.scenes[cell]) > 1 else {}
-        return found
-
-    def _intervals(self, cell: int) -> JsonObject:
-        """Return the 95 % interval of each figure over the bootstrap's replicates."""
-        coarse = self.counts[cell].reshape(_COARSE, PER_COARSE).sum(axis=1)
-        means = self.totals[cell].reshape(_COARSE, PER_COARSE).sum(axis=1) / np.maximum(coarse, 1)
-        # A replicate that holds none of the frames tells nothing.
-        holds = self._weighed[:, cell, 0] > 0
-        if holds.sum() < 2:
-            return {}
-        rows = [named(sums, self.below, self.penalty) for sums in self._weighed[holds, cell]]
-        drawn = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-        cumulated = np.cumsum(self._weighed_counts[holds, cell], axis=1, dtype=float)
-        for name, share in (("median", 0.5), ("p95", 0.95)):
-            number = (cumulated < share * cumulated[:, -1:]).sum(axis=1)
-            drawn[name] = means[np.minimum(number, _COARSE - 1)]
-        return {name: np.percentile(values, [2.5, 97.5]).tolist() for name, values in drawn.items()}
-
-
-def named(sums: Array, below: Sequence[float], penalty: float | None = PENALTY) -> JsonObject:
-    """Return the figures that sums hold: shares are of all pixels, the unanswered among them."""
-    answered, unanswered = sums[0], sums[1]
-    everything = answered + unanswered
-    if everything == 0:
-        penalised: JsonObject = {} if penalty is None else {"mean_penalised": None}
-        return {"mean": None, "rms": None, **penalised, "share_unanswered": None} | {
-            f"below_{most:g}": None for most in below
-        }
+    own = values[np.isfinite(values)]
+    n, missing = len(values), len(values) - len(own)
+    quantiles = np.quantile(own, [*QUANTILES.values()]).tolist() if own.size else [None] * len(QUANTILES)
     return {
-        "mean": float(sums[2] / answered) if answered else None,
-        "rms": float(np.sqrt(sums[3] / answered)) if answered else None,
-        **({} if penalty is None else {"mean_penalised": float((sums[2] + penalty * unanswered) / everything)}),
-        "share_unanswered": float(unanswered / everything),
-        **{f"below_{most:g}": float(sums[4 + i] / everything) for i, most in enumerate(below)},
-    }
+        "n": n, "n_unanswered": missing,
+        "mean": float(own.mean()) if own.size else None, "rms": float(np.sqrt(np.mean(own**2))) if own.size else None,
+        **({} if penalty is None else {"mean_penalised": float((own.sum() + penalty * missing) / n)}),
+        "share_unanswered": missing / n,
+        **{f"below_{most:g}": np.count_nonzero(own < most) / n for most in below},
+        **dict(zip(QUANTILES, quantiles, strict=True)),
+    }  # fmt: skip
 
 
-def _quantile(counts: Array | IntArray, means: Array, share: float) -> float | None:
-    """Return a quantile of binned values: the mean of those in the bin that holds it; None without values."""
-    total = counts.sum()
-    if total <= 0:
-        return None
-    cumulated = np.cumsum(counts, dtype=float)
-    return float(means[min(int(np.searchsorted(cumulated, share * total)), len(counts) - 1)])
+def joined_figures(rows: Sequence[JsonObject], scenes: IntArray, settings: IntArray) -> JsonObject:
+    """Return the figures of a cell over its frames, with 95 % intervals where these show two scenes or more.
+
+    Means and shares are of all pixels; median and p95 are the medians over the frames of each frame's.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        `frame_figures` of each frame.
+    scenes, settings : ndarray of int, shape (N,)
+        Number of the scene and of the setting of each frame.
+    """
+    columns = {name: np.array([np.nan if row[name] is None else row[name] for row in rows], float) for name in rows[0]}
+    pixels = columns.pop("n")
+    answers = pixels - columns.pop("n_unanswered")
+    found: JsonObject = {"frames": len(rows), "n": int(pixels.sum()), "n_unanswered": int((pixels - answers).sum())}
+    intervals: JsonObject = {}
+    for name, values in columns.items():
+        known = np.isfinite(values)
+        value, interval = _joined(
+            name, values[known], scenes[known], settings[known], (answers if name in ("mean", "rms") else pixels)[known]
+        )
+        found[name] = value
+        if interval[0] is not None and len(np.unique(scenes)) > 1:
+            intervals[name] = list(interval)
+    return found | {"ci95": intervals}
+
+
+def _joined(
+    name: str, values: Array, scenes: IntArray, settings: IntArray, counts: Array
+) -> tuple[float | None, Interval]:
+    if not len(values):
+        return None, (None, None)
+    if name in QUANTILES:
+        return float(np.median(values)), median_interval(values, scenes, settings)
+    root = np.sqrt if name == "rms" else float
+    totals = counts * (values**2 if name == "rms" else values)
+    interval_of = share_interval if name.startswith(("share", "below")) else mean_interval
+    low, high = interval_of(totals, scenes, settings, counts)
+    ends = (None, None) if low is None or high is None else (float(root(max(low, 0.0))), float(root(high)))
+    return float(root(totals.sum() / counts.sum())), ends
