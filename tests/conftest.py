@@ -19,6 +19,10 @@ settings.load_profile("untimed")
 if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
     os.environ.setdefault("SIMTEST_THREADS", "1")
 
+# Children run the checkout whose tests these are, not the package that happens to be installed.
+ROOT = Path(__file__).resolve().parents[1]
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+
 # Tests change constants and functions that the key of a kept array does not know of.
 os.environ["SIMTEST_CACHE"] = "off"
 
@@ -86,7 +90,7 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
-SHARED = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+SHARED = ROOT.parent / "shared" / "data"
 
 
 @pytest.fixture(scope="session")
