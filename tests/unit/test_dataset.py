@@ -616,6 +616,42 @@ def test_damage_is_found_and_named(copy, damage, named):
     assert named in {fault.file for fault in faults}, faults
 
 
+BY_HASH = "differs from its SHA-256 in the manifest"
+
+
+def test_each_file_is_held_against_its_hash(copy):
+    """One bit of each file, its size kept: whatever else might tell is not asked before."""
+    manifest = read_manifest(copy)
+    for name in {**manifest.shards, **manifest.tables}:
+        data = (copy / name).read_bytes()
+        flip(copy / name, 0.5)
+        assert [(fault.file, fault.what) for fault in verify(copy) if fault.file == name] == [(name, BY_HASH)]
+        (copy / name).write_bytes(data)
+    assert verify(copy) == []
+
+
+def test_a_digit_of_a_samples_values_is_found_by_its_hash_alone(copy):
+    data = (copy / TAR).read_bytes()
+    # The noise that a sample was given: no table has it, and no picture is held against it.
+    start = data.index(b'"noise_sigma":') + len(b'"noise_sigma":')
+    place = next(i for i in range(start, start + 9) if data[i : i + 1] in b"123456789" and data[i : i + 1])
+    changed = data[:place] + (b"1" if data[place : place + 1] != b"1" else b"2") + data[place + 1 :]
+    (copy / TAR).write_bytes(changed)
+    assert [(fault.file, fault.what) for fault in verify(copy)] == [(TAR, BY_HASH)]
+    # Negative control: nothing else tells.
+    honest(copy, TAR)
+    assert not [fault for fault in verify(copy) if fault.file == TAR]
+
+
+def test_a_member_is_held_against_its_samples_hash(copy):
+    with (copy / TAR).open("rb") as file:
+        start, length = next(samples(file)).members["normal.png"]
+    flip_at = (start + length // 2) / ((copy / TAR).stat().st_size - 1)
+    flip(copy / TAR, flip_at)
+    honest(copy, TAR)
+    assert any("normal.png differs from its hash" in fault.what for fault in verify(copy))
+
+
 def test_damage_is_mended(made, copy):
     DAMAGE["flipped byte in the middle"][0](copy)
     DAMAGE["edited estimates"][0](copy)
