@@ -125,7 +125,9 @@ def test_the_correction_is_that_of_dense_gaussian_conditioning(kind):
     rays = small.unproject(pixels)
     normals = random.normal(size=(6, 3)) * 0.3 - rays
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    factors = np.radians(random.uniform(2, 5, (6, 2, 2)) if kind != "round" else np.eye(2) * np.arange(2, 8)[:, None, None])
+    factors = np.radians(
+        random.uniform(2, 5, (6, 2, 2)) if kind != "round" else np.eye(2) * np.arange(2, 8)[:, None, None]
+    )
     covariances = factors @ factors.transpose(0, 2, 1) + np.radians(1) ** 2 * np.eye(2)
     # prior: tau^2 (kappa^2 - Laplacian)^3 with free edges
     second = 2.0 * np.eye(size) - np.eye(size, k=1) - np.eye(size, k=-1)
