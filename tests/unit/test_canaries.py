@@ -7,15 +7,13 @@ import pytest
 from gate_nights import rows
 
 import simtest.nightly.canaries as all_canaries
+from simtest.estimators import bisector
 from simtest.geometry import Camera
 from simtest.nightly.canaries import geometry, measures, run_canaries
 from simtest.nightly.canaries import randomness as noise
 from simtest.nightly.records import FIGURES
 from simtest.spec import Experiment
 from studies.gate.faults import FAULTS, HARMLESS, Mutation, planted
-from studies.mutants.catalogue import MUTANTS
-from studies.mutants.kinds import KINDS, MEASURES, measures_of
-from studies.mutants.mutant import Change
 
 DETECTORS = {
     "sign flip of an axis": ("circle_pose", "normal_off"),
@@ -63,9 +61,7 @@ def test_a_fault_of_the_geometry_kills_its_canary(fault):
 def test_a_planted_fault_kills_its_canary(fault):
     with planted(*FAULTS[fault]), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        all_measures = measures()
-        own = [all_measures[name]() for name in MEASURES[DETECTORS[fault][0]]]
-        assert DETECTORS[fault] in failed(pl.concat(own))
+        assert DETECTORS[fault] in failed(run_canaries())
     # And is gone afterwards.
     with pytest.raises(LookupError):
         Mutation(FAULTS[fault][0].function, FAULTS[fault][0].new + "nowhere", "").code()
@@ -74,29 +70,9 @@ def test_a_planted_fault_kills_its_canary(fault):
 @pytest.mark.render
 @pytest.mark.parametrize("share", ["0.0", "2.0"])
 def test_the_falloffs_shift_is_undone_once(share):
-    change = Change("simtest.estimators.bisector:_normals", "sightline - slope", f"sightline - {share} * slope")
-    with planted(change.mutation()):
+    with planted(Mutation(bisector._normals, "sightline - slope", f"sightline - {share} * slope")):
         assert ("bisector", "plane_off") in failed(measures()["told_light"]())
     assert not failed(measures()["told_light"]())
-
-
-WITHOUT_RENDERING = (
-    "lenses", "view_masks", "camera_files", "rigs", "photon_noise", "stated_noise", "curves", "quantisation",
-    "vignetting", "widths", "branches", "statistics", "law_values", "ellipse", "protocol_noise",
-)  # fmt: skip
-"""Measures of canaries that take some milliseconds each."""
-
-
-@pytest.mark.parametrize(
-    "mutant", [own for own in MUTANTS if set(measures_of(own.kind)) <= set(WITHOUT_RENDERING)], ids=lambda own: own.name
-)
-def test_a_mutant_is_named_without_rendering(mutant):
-    own = {name: measure for name, measure in measures().items() if name in measures_of(mutant.kind)}
-    assert not failed(pl.concat(measure() for measure in own.values()))
-    with planted(*mutant.mutations()), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        dead = failed(pl.concat(measure() for measure in own.values()))
-    assert {name for name, _ in dead} & set(KINDS[mutant.kind])
 
 
 def test_the_noise_of_canaries_is_the_same_each_time():
