@@ -1,4 +1,4 @@
-"""What a rendered frame's files hold, against closed forms: colours of the picture, curvatures and depth of the truth."""
+"""Files of a rendered frame against closed forms: colours of the picture, curvatures and depth of the truth."""
 
 import cv2
 import numpy as np
