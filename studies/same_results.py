@@ -191,6 +191,9 @@ def differences(before: Path, after: Path) -> dict[str, str | None]:
 
 def main(arguments: list[str]) -> int:
     """Print each file that differs, and how many are equal; return 1 where any differs, 2 where there is none."""
+    if len(arguments) != 2:
+        print("python -m studies.same_results BEFORE AFTER: two folders", file=sys.stderr)
+        return 2
     before, after = (Path(argument) for argument in arguments)
     for folder in (before, after):
         if not folder.is_dir():

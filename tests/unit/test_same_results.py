@@ -104,6 +104,7 @@ def test_folders_that_are_mistyped_or_empty_are_not_equal(tmp_path, capsys):
     assert main([str(empty), str(empty)]) == 2
     assert main([str(empty), str(sound)]) == main([str(sound), str(empty)]) == 1
     assert main([str(sound), str(sound)]) == 0
+    assert main([str(sound)]) == 2
 
 
 def test_each_suffix_is_compared_or_has_a_reason(tmp_path, capsys):
