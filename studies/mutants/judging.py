@@ -47,11 +47,11 @@ def pytest_run(tests: Iterable[str], *options: str) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
-def check_sound(tests: Iterable[str]) -> None:
-    """Raise `GuardError` if tests fail without a fault, or if there are none."""
-    code, output = pytest_run(sorted(set(tests)))
+def check_sound(test: str) -> None:
+    """Raise `GuardError` if a test file fails without a fault, or holds no test."""
+    code, output = pytest_run([test])
     if code != PASSED:
-        raise GuardError(f"without a fault the tests must pass:\n{output[-2000:]}")
+        raise GuardError(f"{test}: without a fault the tests must pass:\n{output[-2000:]}")
 
 
 def catcher(row: Row) -> str:
@@ -71,8 +71,10 @@ def judge(rows: Iterable[Row], workers: int) -> Iterator[tuple[Row, str]]:
     rows = list(rows)
     for row in rows:
         row.mutations()
-    check_sound(test for row in rows for test in row.tests)
     with ThreadPoolExecutor(workers) as threads:
+        # Each file once: rows share them.
+        for _ in threads.map(check_sound, sorted({test for row in rows for test in row.tests})):
+            pass
         yield from zip(rows, threads.map(catcher, rows), strict=True)
 
 

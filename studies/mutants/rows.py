@@ -337,8 +337,8 @@ ROWS = (
         "closed=not touched and not cut", "closed=not cut", "regions"),
     row("a saddle 10 % higher still parts two spots", "thresholds", "detection.basins:_merged",
         "keep * summits[1][top_b]", "1.1 * keep * summits[1][top_b]", "spots"),
-    row("specular light without the tissue's least channel", "labels", "detection.light_split:split_light",
-        "least - floor * tissue", "least", "colour_detection spots"),
+    row("specular light with the tissue's part", "labels", "detection.light_split:split_light",
+        "intensity - tissue, least - floor", "intensity, least - floor", "colour_detection"),
     # estimators
     row("covariance x 0.8", "covariance", "estimators.budget:total", "return whole", "return 0.8 * whole",
         "budget prior_parts"),

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.cli.main import main
-from simtest.dataset import fields, read
+from simtest.dataset import fields, png, read
 from simtest.dataset.card import make_card
 from simtest.dataset.index import TABLES, write_shard_tables, write_tables
 from simtest.dataset.manifest import NAME, FileEntry, _digest, new_manifest, read_manifest
@@ -442,6 +442,13 @@ def test_the_card_says_where_surfaces_come_from():
     text = card(mesh.model_copy(update={"families": (family,), "splits": Splits(train=1.0, validation=0.0, test=0.0)}))
     assert "meshes: colon_40mm.ply" in text
     assert "No patient's data" not in text
+
+
+def test_stored_normals_have_the_levels_that_their_description_says():
+    """Levels count from 1 to 16383 over the square, u above v; 0 stands for no surface."""
+    normals = np.array([[[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [np.nan] * 3]], dtype=np.float32)
+    counts = png.decode(fields.BY_NAME["normal"].encode(normals))
+    assert counts.tolist() == [[8192, 16383, 8192, 0], [8192, 8192, 1, 0]]
 
 
 # Damage -------------------------------------------------------------------------------------------------------------

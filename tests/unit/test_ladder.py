@@ -174,3 +174,13 @@ def test_the_figures_of_a_night_hold_every_rung():
     assert figures["value"].null_count() == 0
     assert set(figures["kind"]) == {"ladder"}
     assert list(dict.fromkeys(figures["quantity"])) == NAMES
+
+
+def test_the_first_rung_has_the_noise_that_it_says(monkeypatch):
+    frames = []
+    whole = ladder._whole
+    monkeypatch.setattr(ladder, "_whole", lambda frame, smoothing: frames.append(frame) or whole(frame, smoothing))
+    error_ladder([PLANE], realisations=2)
+    noisy, clean = frames[:2], frames[-1]
+    assert [np.std(frame - clean) for frame in noisy] == pytest.approx([ladder.NOISE] * 2, rel=0.02)
+    assert "sigma 0.05" in RUNGS["as it is"]

@@ -83,11 +83,11 @@ def test_the_first_test_that_fails_catches_a_fault(file, fault, who):
 
 
 def test_tests_that_fail_or_hang_without_a_fault_are_said(file, tmp_path, monkeypatch):
-    judging.check_sound([str(file)])
+    judging.check_sound(str(file))
     bad = tmp_path / "test_bad.py"
     bad.write_text("def test_red():\n    assert False\n", encoding="utf-8")
     with pytest.raises(judging.GuardError, match="without a fault the tests must pass"):
-        judging.check_sound([str(bad)])
+        judging.check_sound(str(bad))
     assert not judging.is_caught(judging.catcher(SimpleNamespace(name=KEY, tests=(str(tmp_path / "gone.py"),))))
     monkeypatch.setattr(judging, "LIMIT_S", 0.01)
     assert judging.catcher(SimpleNamespace(name=KEY, tests=(str(file),))) == judging.HANGS

@@ -12,7 +12,7 @@ from simtest.detection import Detection, Region
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate, load_estimators
 from simtest.geometry import Camera, Patch
-from simtest.geometry.vectors import angle_deg
+from simtest.geometry.vectors import angle_deg, tangent_basis
 from simtest.reconstruction.pipeline import Specularity, reconstruct, run_pipeline
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, from_integer, generator, integer, key, sequence
@@ -21,7 +21,7 @@ from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example
 from simtest.validation.matching import match
-from simtest.validation.metrics import rows
+from simtest.validation.metrics import mahalanobis2, rows
 from simtest.validation.realisation import realise
 from simtest.validation.results_table import SCHEMA, ResultRow, table
 from simtest.validation.runner import run_experiment
@@ -52,6 +52,15 @@ def spots(*centres, sigma=5.0):
 
 def matched_to(found, truths):
     return match(found, [truth.bp_px for truth in truths])
+
+
+def test_the_mahalanobis_distance_counts_deviations():
+    """Two deviations along one axis and one along the other, in the tangent basis of the estimate's normal."""
+    first, second = (axis[0] for axis in tangent_basis(NORTH[None]))
+    truth = NORTH + np.tan(1e-3) * (2 * first + 3 * second)
+    estimate = Estimate(NORTH, NORTH[None], np.zeros(2), covariance=np.diag([1e-6, 9e-6]))
+    assert mahalanobis2(estimate, truth / np.linalg.norm(truth)) == pytest.approx(5.0, rel=1e-4)
+    assert mahalanobis2(Estimate(NORTH, NORTH[None], np.zeros(2)), NORTH) is None
 
 
 # Matching ------------------------------------------------------------------------------------------------------------
