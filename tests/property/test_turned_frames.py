@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, CameraPrior, Priors, exactly
+from simtest.calibration import Calibration, CameraPrior, Normal, Priors, exactly
 from simtest.estimators import lobe_models, photometric, two_views
 from simtest.estimators.process import answers
 from simtest.estimators.protocol import Estimate
@@ -34,13 +34,17 @@ TURNS = {
 }
 
 
+OBLIQUE = rotation(np.radians([0.0, 0.0, 37.0]))
+"""A turn by no quarter: quarters and mirrors leave a covariance whose mixed term has the wrong sign consistent."""
+
+
 def camera(lens):
     return Camera(SIZE, SIZE, 200.0, 200.0, SIZE / 2, SIZE / 2, distortion=LENSES[lens])
 
 
-def picture(lens, light):
-    """Return the noisy picture of a cylinder."""
-    rays = camera(lens).unproject(camera(lens).pixel_centres()).reshape(-1, 3)
+def picture(lens, light, turn):
+    """Return the noisy picture of a cylinder, by a camera that is turned."""
+    rays = camera(lens).unproject(camera(lens).pixel_centres()).reshape(-1, 3) @ turn
     axis, centre, radius = np.array([0.8, 0.5, 0.33]), np.array([3.0, -2.0, 27.0]), 9.0
     axis /= np.linalg.norm(axis)
 
@@ -60,22 +64,24 @@ def picture(lens, light):
     return (values / values.max() + noise).astype(np.float32)
 
 
-def given(light, turn):
+def given(light, turn, distance=exactly(25.0)):
     """Return what is known, in the turned frame."""
     covariance = turn @ np.array([[0.1, 0.05, 0.0], [0.05, 0.4, -0.1], [0.0, -0.1, 0.2]]) @ turn.T
     return Priors(
         lights_mm=(tuple(turn @ light),), lights_covariance_mm2=(tuple(map(tuple, covariance)),),
-        distance_mm=exactly(25.0), lobe_curvature=exactly(240.0), camera=CameraPrior(0.01, 1.0, 0.02),
+        distance_mm=distance, lobe_curvature=exactly(240.0), camera=CameraPrior(0.01, 1.0, 0.02),
     )  # fmt: skip
 
 
 @cache
 def answered(lens, light, turn=None):
-    """Return the estimates of the one highlight, of the picture turned as `TURNS` names it."""
-    frame = picture(lens, LIGHTS[light])
-    matrix, change = TURNS[turn] if turn else (np.eye(3), lambda same: same)
-    calibration = Calibration(camera(lens), priors=given(LIGHTS[light], matrix))
-    (found,) = reconstruct(np.ascontiguousarray(change(frame)), calibration, ESTIMATORS)
+    """Return the estimates of the one highlight, of the picture turned as `TURNS` names it, or taken obliquely."""
+    if turn == "oblique":
+        matrix, frame = OBLIQUE, picture(lens, LIGHTS[light], OBLIQUE)
+    else:
+        matrix, change = TURNS[turn] if turn else (np.eye(3), lambda same: same)
+        frame = np.ascontiguousarray(change(picture(lens, LIGHTS[light], np.eye(3))))
+    (found,) = reconstruct(frame, Calibration(camera(lens), priors=given(LIGHTS[light], matrix)), ESTIMATORS)
     return found.estimates
 
 
@@ -85,10 +91,10 @@ def in_space(normal, covariance):
     return basis.T @ covariance @ basis
 
 
-def assert_turned(covariance, of, other, of_other, turn):
+def assert_turned(covariance, of, other, of_other, turn, share=0.02):
     wanted, found = turn @ in_space(of, covariance) @ turn.T, in_space(of_other, other)
     # Ripples beyond the noise are a small difference of large numbers. A part of 0 is that of what is exact.
-    assert np.abs(found - wanted).max() <= 0.02 * np.abs(wanted).max()
+    assert np.abs(found - wanted).max() <= share * np.abs(wanted).max()
 
 
 @pytest.mark.render
@@ -116,13 +122,44 @@ def test_answers_turn_with_the_picture(lens, light, turn):
 
 
 @pytest.mark.render
-def test_a_covariance_that_is_not_turned_is_noticed():
+@pytest.mark.parametrize(("lens", "light"), itertools.product(LENSES, LIGHTS))
+def test_answers_turn_with_the_camera(lens, light):
+    """Another picture with other noise: normals to some deviations, parts to a tenth."""
+    first, second = answered(lens, light), answered(lens, light, "oblique")
+    for name in ESTIMATORS:
+        before, after = first[name], second[name]
+        if before.covariance is None:
+            continue
+        np.testing.assert_allclose(after.normal, OBLIQUE @ before.normal, atol=0.01)
+        for part in {"noise", "light_offset", "camera"} & set(before.budget):
+            assert_turned(before.budget[part], before.normal, after.budget[part], after.normal, OBLIQUE, 0.1)
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("turn", ["quarter", "oblique"])
+def test_a_covariance_that_is_not_turned_is_noticed(turn):
     """Negative control: the covariances are no circles, and the bases of the two normals differ."""
-    first, second = answered("pinhole", "at the camera"), answered("pinhole", "at the camera", "quarter")
-    for name in ("cone_axis", "photometric", "bisector"):
+    matrix = OBLIQUE if turn == "oblique" else QUARTER
+    first, second = answered("pinhole", "at the camera"), answered("pinhole", "at the camera", turn)
+    for name in ("cone_axis", "photometric", "bisector", "inverse_rendering"):
         before, after = first[name], second[name]
         with pytest.raises(AssertionError):
-            assert_turned(before.covariance, before.normal, before.covariance, after.normal, QUARTER)
+            assert_turned(before.covariance, before.normal, before.covariance, after.normal, matrix, 0.1)
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("name", ["bisector", "inverse_rendering"])
+def test_the_part_of_the_distance_is_how_far_the_normal_moves(name):
+    frame, light = picture("pinhole", LIGHTS["aside"], np.eye(3)), LIGHTS["aside"]
+
+    def estimate(distance):
+        priors = given(light, np.eye(3), distance)
+        return reconstruct(frame, Calibration(camera("pinhole"), priors=priors), [name])[0].estimates[name]
+
+    near, far = (estimate(exactly(25.0 + step)).normal for step in (-1.0, 1.0))
+    move = basis_across(near) @ (far - near) / 2
+    found = estimate(Normal(25.0, 1.0))
+    assert np.trace(found.budget["distance"]) == pytest.approx(move @ move, rel=0.1)
 
 
 # A basis other than that of the normal ------------------------------------------------------------------------------
