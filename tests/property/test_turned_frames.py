@@ -38,6 +38,9 @@ OBLIQUE = rotation(np.radians([0.0, 0.0, 37.0]))
 """A turn by no quarter: quarters and mirrors leave a covariance whose mixed term has the wrong sign consistent."""
 
 
+EXACT = exactly(25.0)
+
+
 def camera(lens):
     return Camera(SIZE, SIZE, 200.0, 200.0, SIZE / 2, SIZE / 2, distortion=LENSES[lens])
 
@@ -64,7 +67,7 @@ def picture(lens, light, turn):
     return (values / values.max() + noise).astype(np.float32)
 
 
-def given(light, turn, distance=exactly(25.0)):
+def given(light, turn, distance=EXACT):
     """Return what is known, in the turned frame."""
     covariance = turn @ np.array([[0.1, 0.05, 0.0], [0.05, 0.4, -0.1], [0.0, -0.1, 0.2]]) @ turn.T
     return Priors(
