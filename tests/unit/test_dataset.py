@@ -451,6 +451,23 @@ def test_stored_normals_have_the_levels_that_their_description_says():
     assert counts.tolist() == [[8192, 16383, 8192, 0], [8192, 8192, 1, 0]]
 
 
+def test_the_tables_say_what_the_samples_hold(made):
+    index, highlights = (pl.read_parquet(made / name) for name in (INDEX, HIGHLIGHTS))
+    assert index["width"].unique().to_list() == [64]
+    assert index["height"].unique().to_list() == [48]
+    for sample in read(made):
+        row = index.row(by_predicate=pl.col("index") == sample["meta"]["index"], named=True)
+        assert sample["image"].shape[:2] == (row["height"], row["width"])
+        assert row["n_highlights"] == len(sample["meta"]["highlights"])
+        own = highlights.filter(pl.col("index") == sample["meta"]["index"])
+        for found, held in zip(own.iter_rows(named=True), sample["meta"]["highlights"], strict=True):
+            for key, names in (
+                ("normal", ("normal_x", "normal_y", "normal_z")), ("position_mm", ("x_mm", "y_mm", "z_mm")),
+                ("bp_px", ("bp_x_px", "bp_y_px")),
+            ):  # fmt: skip
+                assert [found[name] for name in names] == held[key]
+
+
 # Damage -------------------------------------------------------------------------------------------------------------
 
 
