@@ -17,6 +17,7 @@ from simtest.cli.main import main
 from simtest.dataset import fields, png, read
 from simtest.dataset.card import make_card
 from simtest.dataset.index import TABLES, write_shard_tables, write_tables
+from simtest.dataset.maker import _share_of
 from simtest.dataset.manifest import NAME, FileEntry, _digest, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
 from simtest.dataset.reproduce import compare, reproduce_sample
@@ -449,6 +450,16 @@ def test_stored_normals_have_the_levels_that_their_description_says():
     normals = np.array([[[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [np.nan] * 3]], dtype=np.float32)
     counts = png.decode(fields.BY_NAME["normal"].encode(normals))
     assert counts.tolist() == [[8192, 16383, 8192, 0], [8192, 8192, 1, 0]]
+
+
+def test_parts_of_the_radiance_are_shares_of_full_scale():
+    part = np.full((2, 3), 3.0, np.float32)
+    half = _share_of(part, 6.0)
+    assert half.shape == (2, 3, 3)
+    # sRGB of one half is 188 of 255.
+    assert (half == 188).all()
+    assert (_share_of(part, 3.0) == 255).all()
+    assert not _share_of(np.zeros((2, 3), np.float32), 6.0).any()
 
 
 def test_the_tables_say_what_the_samples_hold(made):

@@ -1,6 +1,7 @@
 """Matching, rows, summary figures, seeds, cases, and that a row can be made again alone."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -161,6 +162,21 @@ def test_errors_of_a_row():
     assert row.n_candidates == 2
 
 
+def test_columns_of_a_row_are_what_their_names_say():
+    session, common = context()
+    light = {"rig": {"lights": [{"offset_mm": 2.0, "azimuth_deg": 90.0}]}}
+    session.scene = scene_from_dict({"surface": {"type": "plane"}, **light})
+    result = replace(estimate(leaned(3), look=(81.0, 63.0)), budget={"noise": np.diag([3e-4, 1e-4])})
+    found = [detection(0, 0, 50, 50, (20, 20), {"a": result})]
+    (row,) = rows(session, common, found, [truth_at(21.0, 33.0)], {0: 0}, ["a"])
+    assert (row.bp_true_x_px, row.bp_true_y_px, row.look_x_px, row.look_y_px) == (21.0, 33.0, 81.0, 63.0)
+    assert (row.kd_min, row.kd_max, row.distance_mm, row.peak_snr) == (0.2, 0.5, 10.0, 50.0)
+    # 2 mm over 10 mm.
+    assert row.eps_over_d == pytest.approx(0.2)
+    assert row.axis_ratio_law == pytest.approx(1.2 / 1.5)
+    assert row.budget["budget_noise_deg"] == pytest.approx(np.degrees(0.02))
+
+
 def test_angles_are_exact_near_zero_and_near_180_deg():
     for degrees in (0.0, 1e-9, 1e-4, 30.0, 179.9999999):
         assert float(angle_deg(NORTH, leaned(degrees))) == pytest.approx(degrees, rel=1e-6, abs=1e-15)
@@ -222,6 +238,18 @@ def test_summary_of_a_hand_made_table():
     assert b.mean_penalised_deg == b.mean_deg == pytest.approx(3.0)
     assert b.ci95_deg == pytest.approx((0.0, 3 + 4.302653), abs=1e-5)
     assert b.coverage95 is None
+
+
+def test_median_and_coverage_of_skewed_errors():
+    lines = [(0, 1.0, 1.0), (1, 2.0, 4.5), (2, 9.0, 7.0)]
+    made = [
+        ResultRow(setting="s", estimator="a", true_id=number, status="ok", error_deg=error, mahalanobis2=squared)
+        for number, error, squared in lines
+    ]
+    (found,) = summarise(table(made, {}))["s"].values()
+    assert (found.median_deg, found.mean_deg) == (2.0, 4.0)
+    # 4.5 lies between the quantiles of one degree of freedom and of two, 3.84 and 5.99.
+    assert found.coverage95 == pytest.approx(2 / 3)
 
 
 def test_summary_where_nothing_answered():
