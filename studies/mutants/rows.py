@@ -337,8 +337,8 @@ ROWS = (
         "closed=not touched and not cut", "closed=not cut", "regions"),
     row("a saddle 10 % higher still parts two spots", "thresholds", "detection.basins:_merged",
         "keep * summits[1][top_b]", "1.1 * keep * summits[1][top_b]", "spots"),
-    row("specular light with the tissue's part", "labels", "detection.light_split:split_light",
-        "intensity - tissue, least - floor", "intensity, least - floor", "colour_detection"),
+    row("logarithm of the tissue's factor not undone", "units", "detection.light_split:_tissue_colour",
+        "return np.exp(maps[0]), maps[1]", "return maps[0], maps[1]", "colour_detection"),
     # estimators
     row("covariance x 0.8", "covariance", "estimators.budget:total", "return whole", "return 0.8 * whole",
         "budget prior_parts"),

@@ -58,11 +58,12 @@ def test_the_curvature_is_the_second_difference_of_the_lobes_logarithm(name):
 
 
 @pytest.mark.render
+@pytest.mark.parametrize("kind", ["rough_conductor", "rough_plastic"])
 @pytest.mark.parametrize("alpha", [0.1, 0.3])
-def test_a_rendered_conductor_has_the_lobe_of_its_alpha(alpha):
+def test_rendered_facets_have_the_lobe_of_their_alpha(kind, alpha):
     """Light at the camera, plane across the axis: D G / (4 cos) over the squared distance, facets met straight on."""
     camera = {"width": 64, "height": 64, "fx": 80.0, "fy": 80.0}
-    reflectance = {"type": "rough_conductor", "alpha": ALPHA}
+    reflectance = {"type": kind, "alpha": ALPHA, "diffuse": 0.0}
     session = Session(scene_from_dict({"surface": {"type": "plane"}, "camera": camera, "reflectance": reflectance}))
     # As built, and after an update.
     session.update(scene_from_dict({"surface": {"type": "plane"}, "camera": camera,
