@@ -1,74 +1,118 @@
 """Compare what two versions of the code made of the same commands: `python -m studies.same_results BEFORE AFTER`.
 
 BEFORE and AFTER hold the same folders: runs of `simtest validate`, datasets, renders, reconstructions, the reports of
-`simtest nightly`. Tables must hold equal values, types and order of rows and columns; JSON equal values, provenance and
-times aside; pictures, shards, PLY and CSV files equal bytes. Not compared are pages, what the nightly's code costs, and
-its files that are named by the time or tell of the costs.
+`simtest nightly`. Both must hold the same files, one at least. Tables must have equal values, types and order of rows
+and columns; JSON equal values of equal types; pages and other texts equal characters; arrays equal bytes and types; all
+other files equal bytes. What says where and when the files were made is left out by its place, as the tables below list
+it, and nothing else is.
 """
 
 import json
+import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-BYTES = (".png", ".exr", ".tar", ".ply", ".csv", ".toml")
-NOT_COMPARED = (
-    "run",
-    "provenance",
-    "environment",
-    "origin",
-    "digest",
-    "duration_s",
-    "started",
-    "id",
-    "fingerprint",
-    "command",
-)
-"""Keys of JSON files that say where and when: they differ between versions by design."""
+NOT_COMPARED = {
+    ".lock": "says which process has the folder",
+    ".part": "is what a stopped run left of a file",
+    ".log": "says when what happened",
+}
+"""Suffixes of files that are not compared, and why; a suffix that stands neither here nor in `COMPARE` is an error."""
 
-NOT_COMPARED_PARTS = ("figures", "history", "verdict.json", "run.json")
-"""Folders and files that are not compared."""
+ORIGIN = (
+    "commit", "version", "versions", "python", "processor", "system", "llvm", "fingerprint", "source", "source_hash",
+    "started", "duration_s", "experiments_s", "command",
+)  # fmt: skip
+"""Keys of a record of origin that say where, when and by which code."""
 
-RENAMED = {"light_aside": "light_offset"}
-"""Flags by their old names."""
+LEFT_OUT: dict[str, tuple[str, ...]] = {
+    "*.json": tuple(f"{top}/{key}" for top in ("run", "provenance", "environment", "origin") for key in ORIGIN),
+    # The record of a nightly run; each of its files is compared itself.
+    "run.json": ("id", "files", *ORIGIN),
+    "verdict.json": ("run/id", "costs", *(f"baseline/{key}" for key in ("id", *ORIGIN))),
+    # The card and its like name the version; they are compared themselves.
+    "manifest.json": ("digest", "tables/README.md/sha256", "tables/croissant.json/sha256"),
+}
+"""Paths of keys that are left out of JSON files, by the files' names."""
+
+FOLDERS = {"*.json": ("image",)}
+"""Paths of keys whose value is a path that hangs on the folder: its name is compared."""
+
+ORIGIN_COLUMNS = ("run_id", "started", "commit", "processor", "versions", "duration_s", "source_hash")
+"""Columns of the nightly run's history that say where and when."""
+
+TEXTS: tuple[tuple[str, str], ...] = (
+    (r"simtest \d+\.\d+\.\d+", "the version"),
+    (r"\d{8}T\d{6}Z-\d+-[0-9a-f]{8}", "a nightly run's name"),
+    (r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\+00:00)?)?( UTC)?, commit [^,]*, [\d.]+ \w+( on [^;]*)?", "when, how long"),
+    (r"(?<=<title>)([^<]*), \d{4}-\d\d-\d\d \d\d:\d\d UTC", "the title's time"),
+    (r'<tr><th[^>]*>(id|versions: simtest|' + "|".join(
+        key.replace("_", "_(?:<wbr>)?") for key in ORIGIN) + r')</th><td[^>]*>.*?</td></tr>', "a page's origin"),
+    (r"<!-- made of \{.*?\} -->", "hashes of what the page was made of"),
+    (r'<script type="application/octet-stream" id="trend-data">[^<]*</script>', "the history, compared as tables"),
+    (r' (time|timestamp)="[^"]*"', "when and how long"),
+)  # fmt: skip
+"""What is left out of texts, and what it is."""
+
+PARTS = ((r"^date=.*", "date"), (r"^commit=.*", "commit"), (r"^\d{8}T\d{6}Z-\d+-[0-9a-f]{8}", "run"))
+"""Folders and files that are named by the time or the commit, and what they are called here."""
 
 
-def stripped(value: Any) -> Any:
-    """Return a JSON value without the keys that are not compared, with flags by their new names."""
-    if isinstance(value, dict):
-        kept = {key: stripped(item) for key, item in value.items() if key not in NOT_COMPARED}
-        # A picture's path depends on the folder that it was rendered into.
-        return kept | ({"image": Path(kept["image"]).name} if isinstance(kept.get("image"), str) else {})
-    if isinstance(value, list):
-        return [stripped(item) for item in value]
-    return RENAMED.get(value, value) if isinstance(value, str) else value
+def flat(value: Any, path: str = "") -> dict[str, Any]:
+    """Return the values of a JSON document by their full paths; empty tables and lists are values."""
+    if not isinstance(value, dict | list) or not value:
+        return {path: value}
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    return {key: leaf for name, item in items for key, leaf in flat(item, f"{path}/{name}").items()}
 
 
-def renamed(table: pl.DataFrame) -> pl.DataFrame:
-    """Return a table whose flags have their new names, without the costs of code."""
-    if "kind" in table.columns:
-        table = table.filter(pl.col("kind") != "cost")
-    if "flags" not in table.columns or table.schema["flags"] != pl.String:
-        return table
-    return table.with_columns(pl.col("flags").str.replace_many(list(RENAMED), list(RENAMED.values())))
+def document(text: str, name: str) -> dict[str, str]:
+    """Return what is compared of a JSON document: values as text, so that 1, 1.0 and true differ, by their paths."""
+    left_out = [f"/{path}" for pattern, paths in LEFT_OUT.items() if fnmatch(name, pattern) for path in paths]
+    named = [f"/{path}" for pattern, paths in FOLDERS.items() if fnmatch(name, pattern) for path in paths]
+    kept = {}
+    for path, value in flat(json.loads(text)).items():
+        if not any(path == key or path.startswith(f"{key}/") for key in left_out):
+            own = Path(value).name if path in named and isinstance(value, str) else value
+            kept[path] = without_origin(json.dumps(own))
+    return kept
+
+
+def without_origin(text: str) -> str:
+    """Return a text without what says where and when it was made."""
+    for pattern, what in TEXTS:
+        text = re.sub(pattern, f"({what})", text, flags=re.DOTALL)
+    return text
+
+
+def table(path: Path) -> pl.DataFrame:
+    """Return a table without the costs of code and, in the history, without where and when."""
+    found = pl.read_parquet(path, hive_partitioning=False)
+    if {"kind", "quantity", "value"} <= set(found.columns):
+        found = found.filter(pl.col("kind") != "cost")
+    return found.drop(ORIGIN_COLUMNS) if set(ORIGIN_COLUMNS) <= set(found.columns) else found
 
 
 def table_difference(before: Path, after: Path) -> str | None:
     """Return how two tables differ, or None."""
-    first, second = renamed(pl.read_parquet(before)), renamed(pl.read_parquet(after))
-    if first.schema != second.schema:
+    first, second = table(before), table(after)
+    if list(first.schema.items()) != list(second.schema.items()):
         names = set(first.schema.items()) ^ set(second.schema.items())
         return f"schemas differ: {sorted(str(name) for name in names) or 'in the order of columns'}"
-    if first.equals(second, null_equal=True):
-        return None
     if first.height != second.height:
         return f"{first.height} rows, then {second.height}"
     unequal = [name for name in first.columns if not first[name].equals(second[name], null_equal=True)]
-    return f"unequal values in {', '.join(unequal)}"
+    return f"unequal values in {', '.join(unequal)}" if unequal else None
+
+
+def _equal(first: np.ndarray, second: np.ndarray) -> bool:
+    return first.dtype == second.dtype and first.shape == second.shape and first.tobytes() == second.tobytes()
 
 
 def arrays_difference(before: Path, after: Path) -> str | None:
@@ -80,58 +124,91 @@ def arrays_difference(before: Path, after: Path) -> str | None:
     return f"unequal arrays {', '.join(unequal)}" if unequal else None
 
 
-def _equal(first: np.ndarray, second: np.ndarray) -> bool:
-    if first.dtype.kind in "US" and first.ndim == 0:
-        # Descriptions are JSON texts.
-        try:
-            return bool(stripped(json.loads(str(first))) == stripped(json.loads(str(second))))
-        except ValueError:
-            return str(first) == str(second)
-    return first.dtype == second.dtype and first.shape == second.shape and first.tobytes() == second.tobytes()
-
-
 def json_difference(before: Path, after: Path) -> str | None:
     """Return how two JSON files differ, or None."""
-    first, second = (stripped(json.loads(path.read_text(encoding="utf-8"))) for path in (before, after))
-    if first == second:
+    first, second = (document(path.read_text(encoding="utf-8"), path.name) for path in (before, after))
+    unequal = sorted(key for key in first.keys() | second.keys() if first.get(key) != second.get(key))
+    return f"unequal at {', '.join(unequal[:5])}{' ...' * (len(unequal) > 5)}" if unequal else None
+
+
+def text_difference(before: Path, after: Path) -> str | None:
+    """Return how two texts differ, or None."""
+    first, second = (without_origin(path.read_text(encoding="utf-8")).splitlines() for path in (before, after))
+    unequal = [number + 1 for number, pair in enumerate(zip(first, second, strict=False)) if pair[0] != pair[1]]
+    if not unequal and len(first) == len(second):
         return None
-    if isinstance(first, dict) and isinstance(second, dict):
-        keys = [key for key in first.keys() | second.keys() if first.get(key) != second.get(key)]
-        return f"unequal under {', '.join(sorted(keys))}"
-    return "unequal"
+    return f"unequal from line {unequal[0] if unequal else min(len(first), len(second)) + 1} on"
 
 
-def difference(before: Path, after: Path) -> str | None:
-    """Return how two files of one name differ, or None."""
-    if not after.is_file():
-        return "missing"
-    if before.suffix == ".parquet":
-        return table_difference(before, after)
-    if before.suffix == ".npz":
-        return arrays_difference(before, after)
-    if before.suffix == ".json":
-        return json_difference(before, after)
+def bytes_difference(before: Path, after: Path) -> str | None:
+    """Return that two files' bytes differ, or None."""
     return None if before.read_bytes() == after.read_bytes() else "unequal bytes"
 
 
-def compared(before: Path) -> Iterator[Path]:
-    """Yield the files that are compared, by their paths below the folder."""
-    for path in sorted(before.rglob("*")):
-        if path.suffix in (*BYTES, ".parquet", ".npz", ".json") and not set(path.parts) & set(NOT_COMPARED_PARTS):
-            yield path.relative_to(before)
+COMPARE: dict[str, Callable[[Path, Path], str | None]] = {
+    ".parquet": table_difference,
+    ".npz": arrays_difference,
+    ".json": json_difference,
+    **dict.fromkeys((".html", ".md", ".xml", ".svg"), text_difference),
+    **dict.fromkeys(
+        (".png", ".jpg", ".exr", ".npy", ".tar", ".ply", ".csv", ".toml", ".txt", ".jsonl", ".mat", ".avi"),
+        bytes_difference,
+    ),
+}
+"""How files are compared, by their suffixes."""
 
 
-def main() -> int:
-    """Print each file that differs, and how many are equal; return 1 where any differs."""
-    before, after = (Path(argument) for argument in sys.argv[1:3])
-    found = {name: difference(before / name, after / name) for name in compared(before)}
+def files(folder: Path) -> dict[str, Path]:
+    """Return the files of a folder that are compared, by their paths below it without times and commits."""
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if not path.is_file() or Path(f"_{path.name}").suffix in NOT_COMPARED:
+            continue
+        parts = list(path.relative_to(folder).parts)
+        for pattern, word in PARTS:
+            parts = [re.sub(pattern, word, part) for part in parts]
+        name = "/".join(parts)
+        # Several nightly runs lie in one folder; their order is that of their times.
+        while name in found:
+            name = f"{name} (next)"
+        found[name] = path
+    return found
+
+
+def differences(before: Path, after: Path) -> dict[str, str | None]:
+    """Return how each file of two folders differs, by its name; None where it does not."""
+    first, second = files(before), files(after)
+    found: dict[str, str | None] = {}
+    for name in sorted(first.keys() | second.keys()):
+        if name not in first or name not in second:
+            found[name] = f"there only {'before' if name in first else 'afterwards'}"
+        elif compare := COMPARE.get(first[name].suffix):
+            found[name] = compare(first[name], second[name])
+        else:
+            found[name] = f"a file of the suffix {first[name].suffix!r}, of which studies/same_results.py knows nothing"
+    return found
+
+
+def main(arguments: list[str]) -> int:
+    """Print each file that differs, and how many are equal; return 1 where any differs, 2 where there is none."""
+    if len(arguments) != 2:
+        print("python -m studies.same_results BEFORE AFTER: two folders", file=sys.stderr)
+        return 2
+    before, after = (Path(argument) for argument in arguments)
+    for folder in (before, after):
+        if not folder.is_dir():
+            print(f"{folder}: no such folder", file=sys.stderr)
+            return 2
+    found = differences(before, after)
     for name, how in found.items():
         if how:
             print(f"{name}: {how}")
     unequal = sum(how is not None for how in found.values())
     print(f"{len(found) - unequal} of {len(found)} files equal")
-    return int(unequal > 0)
+    for suffix, why in NOT_COMPARED.items():
+        print(f"not compared: {suffix}, which {why}")
+    return 2 if not found else int(unequal > 0)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

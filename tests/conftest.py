@@ -23,6 +23,9 @@ if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
 if "PYTEST_XDIST_WORKER" not in os.environ:
     _KEPT = tempfile.TemporaryDirectory(prefix="simtest-tests-", ignore_cleanup_errors=True)
     os.environ["SIMTEST_CACHE"] = _KEPT.name
+# Children run the checkout whose tests these are, not the package that happens to be installed.
+ROOT = Path(__file__).resolve().parents[1]
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
 
 
 def _without_waiting(descriptor):
@@ -64,7 +67,7 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: order[item.path])
 
 
-SHARED = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+SHARED = ROOT.parent / "shared" / "data"
 
 
 @pytest.fixture(scope="session")

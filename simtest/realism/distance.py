@@ -12,10 +12,10 @@ from statistics import NormalDist
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.geometry import student_t
 from simtest.realism.frame_statistics import COLUMNS, STATISTICS, Measured, Statistic
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.seeds import from_integer
+from simtest.runtime.statistics import student_quantile
 
 VERDICTS = ("near", "between", "far", "too few scenes")
 
@@ -170,7 +170,7 @@ def widened(values: Array | float, samples: Array, scenes: int) -> Array:
     widened from a normal to Student's distribution.
     """
     share = (1 + LEVEL) / 2
-    wider = student_t.quantile(share, scenes - 1) / NormalDist().inv_cdf(share) * np.sqrt(scenes / (scenes - 1))
+    wider = student_quantile(scenes - 1) / NormalDist().inv_cdf(share) * np.sqrt(scenes / (scenes - 1))
     low, middle, high = np.quantile(samples, [1 - share, 0.5, share], axis=0)
     return np.stack([values + (low - middle) * wider, values + (high - middle) * wider])
 

@@ -1,69 +1,55 @@
-"""Print the table of faults in docs/gallery/gate_measured.md.
+"""Plant faults one at a time, and say which test catches each.
 
-`python -m studies.mutants [--out FILE] [--only NAME...] [--workers N]`
-
-Canaries are asked first, and the gate about those faults alone that they do not name; with --canaries it is not asked.
-What --out holds from an earlier call on the same code and profile is not asked again.
+`python -m studies.mutants --tests [--only ROOM or NAME...] [--workers N]` runs for each row of studies/mutants/rows.py
+the tests that could see it: first on sound code, where they must pass, then with the fault, where one must fail. Who
+caught what is written to studies/mutants/caught.json. Without --tests that table is printed.
 """
 
 import argparse
 import sys
-from pathlib import Path
 
-from studies.mutants.catalogue import BY_NAME, MUTANTS, UNCHANGED
-from studies.mutants.further import FURTHER
-from studies.mutants.judging import Judged, run
-
-ANSWERS = Path("reports/studies/mutants.jsonl")
-"""Answers of earlier calls, where --out names no other file."""
+from studies.mutants.judging import GuardError, is_caught, judge, read_table, write_table
+from studies.mutants.rows import BY_NAME, ROWS, Row
 
 
-def table(found: list[Judged]) -> str:
-    """Return the table of who names each mutant, and a last line that counts them."""
-    lines = [("fault", "kind", "named by", "other alarms"), ("---",) * 4]
-    planted = [each for each in found if each.mutant is not UNCHANGED]
-    for each in planted:
-        by = each.naming or [f"gate: {quantity}" for quantity in (each.worse or ())[:3]]
-        all_others = each.others + [f"gate: {alarm}" for alarm in each.alarms if alarm not in (each.worse or ())]
-        others = ", ".join(all_others[:4]) + (f" and {len(all_others) - 4} more" * (len(all_others) > 4))
-        lines.append((each.mutant.name, each.mutant.kind, ", ".join(by) or each.stopped or "nobody", others))
-    text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    named, seen = sum(each.by_name for each in planted), sum(each.is_seen for each in planted)
-    control = next((each for each in found if each.mutant is UNCHANGED), None)
-    return f"{text}\n\n{named} of {len(planted)} named, {seen} seen; alarms on unchanged code: {_alarms(control)}."
+def chosen(names: list[str]) -> list[Row]:
+    """Return the rows of some sections of the package, or of some names; all without a name."""
+    rooms = {row.room for row in ROWS}
+    if unknown := next((name for name in names if name not in BY_NAME and name not in rooms), None):
+        raise LookupError(f"--only {unknown}: unknown; allowed: {', '.join(sorted(rooms))}, or the name of a fault")
+    return [row for row in ROWS if not names or row.name in names or row.room in names]
 
 
-def _alarms(control: Judged | None) -> str:
-    """Return the alarms that unchanged code raised, by name."""
-    if control is None:
-        return "not asked"
-    canaries = control.naming + control.others
-    told = [
-        f"{len(canaries)} canaries",
-        "the gate not asked" if control.worse is None else f"{len(control.alarms)} of the gate",
-    ]
-    names = canaries + control.alarms + [control.stopped] * bool(control.stopped)
-    return ", ".join(told) + (f" ({', '.join(names)})" if names else "")
+def table(rows: list[Row], caught: dict[str, str]) -> str:
+    """Return who caught each fault, and a last line that counts them."""
+    lines = [("fault", "section", "kind", "caught by"), ("---",) * 4]
+    lines += [(row.name, row.room, row.kind, caught.get(row.name, "not asked")) for row in rows]
+    seen = sum(is_caught(caught.get(row.name)) for row in rows)
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + f"\n\n{seen} of {len(rows)} caught."
 
 
 def main(arguments: list[str]) -> int:
-    """Plant the mutants and print the table; 1 where one is named by nobody, or unchanged code raises an alarm."""
+    """Print the table; return 1 where nobody catches a fault, 2 where the tests or a fault cannot be run."""
     parser = argparse.ArgumentParser(prog="python -m studies.mutants", description=__doc__)
-    parser.add_argument("--out", type=Path, default=ANSWERS, help=f"JSON lines, one an answer; default: {ANSWERS}")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="of mutants, as the table has them")
-    parser.add_argument("--workers", type=int, default=2, help="mutants at once (default 2)")
-    parser.add_argument("--canaries", action="store_true", help="leave out the gate")
-    parser.add_argument("--further", action="store_true", help="the ten faults that no canary was made for")
-    parser.add_argument("--profile", default="quick", help="of the gate's nights, a name or a path (default quick)")
+    parser.add_argument("--tests", action="store_true", help="run the tests, and renew studies/mutants/caught.json")
+    parser.add_argument("--only", nargs="+", default=[], metavar="ROOM", help="sections of the package, or names")
+    parser.add_argument("--workers", type=int, default=2, help="faults at once (default 2)")
     options = parser.parse_args(arguments)
-    names = options.only or [mutant.name for mutant in (FURTHER if options.further else MUTANTS)]
-    if unknown := next((name for name in names if name not in BY_NAME), None):
-        print(f"mutant {unknown!r}: unknown; must be a name of studies/mutants/catalogue.py", file=sys.stderr)
+    caught = read_table()
+    try:
+        rows = chosen(options.only)
+        if options.tests:
+            known = caught
+            for row, who in judge(rows, options.workers):
+                print(f"{row.room}: {row.name}: {who}", file=sys.stderr, flush=True)
+                known = {**known, row.name: who}
+                write_table(ROWS, known)
+            caught = known
+    except (LookupError, GuardError) as error:
+        print(error, file=sys.stderr)
         return 2
-    profile = None if options.canaries else options.profile
-    found = run(names, options.out, options.workers, lambda line: print(line, file=sys.stderr, flush=True), profile)
-    print(table(found))
-    return 0 if all(each.as_wanted for each in found) else 1
+    print(table(rows, caught))
+    return int(not all(is_caught(caught.get(row.name)) for row in rows))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from simtest.bench.draws import experiment_of
+from simtest.bench.draws import experiment_of, pooled
 from simtest.bench.suite import (
     SUITE,
     CaseSpec,
@@ -178,3 +178,16 @@ def test_a_later_key_changes_no_hash(tmp_path: Path, monkeypatch: pytest.MonkeyP
     (tmp_path / "v1" / SUITE).write_text(text.replace("draws = 3", "draws = 3\nlater = 1.0"))
     with pytest.raises(InputError, match=r"case smooth/plane .*; a changed case must be a new version"):
         load_suite("v1", tmp_path / "v1")
+
+
+@pytest.mark.parametrize(
+    ("draw", "mean", "sd"),
+    [({"kind": "normal", "low": 3.0, "high": 0.2}, 3.0, 0.2), ({"low": 2.0, "high": 6.0}, 4.0, 4 / np.sqrt(12)),
+     ({"kind": "log_uniform", "low": 1.0, "high": np.e}, np.e - 1, 0.492)],
+)  # fmt: skip
+def test_drawn_values_have_the_mean_and_deviation_of_their_distribution(draw, mean, sd):
+    case = CaseSpec.model_validate({"part": "p", "name": "c", "draws": 1000, "draw": {"surface.tilt_deg": draw}})
+    values = pooled(0, "e", case)["surface.tilt_deg"]
+    # 1000 values: the mean to 3 %, the deviation to 2 %, of the deviation, one standard error.
+    assert np.mean(values) == pytest.approx(mean, abs=0.13 * sd)
+    assert np.std(values) == pytest.approx(sd, rel=0.1)

@@ -30,6 +30,12 @@ def test_white_noise_is_found_again_after_smoothing(smoothing):
     assert found == pytest.approx(SIGMA, rel=0.06)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_white_noise_is_found_as_it_is(seed):
+    # 76,800 pixels: a standard deviation is good to 0.5 %.
+    assert estimate_noise(white(seed)) == pytest.approx(SIGMA, rel=0.02)
+
+
 def test_correlated_noise_counts_by_what_smoothing_leaves_of_it():
     """Noise averaged over 2 x 2 px and doubled has the same low frequencies as noise of twice the deviation."""
     noise = 2 * cv2.blur(white(1), (2, 2))

@@ -5,7 +5,8 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt
-from simtest.reconstruction.completion import CoarseError, complete, log_distance_gradients
+from simtest.geometry.vectors import tangent_basis
+from simtest.reconstruction.completion import LEAST_SLOPE_SD, CoarseError, complete, log_distance_gradients
 
 CENTRE, RADIUS = np.array([3.0, -2.0, 40.0]), 25.0
 LENSES = {"pinhole": None, "Brown-Conrady": BrownConrady(-0.15, 0.03), "fisheye": KannalaBrandt(0.02, -0.01, 0.0, 0.0)}
@@ -63,8 +64,6 @@ def test_a_normal_fixes_the_gradient_of_log_distance(lens):
 def test_the_covariance_is_that_of_gradients_of_drawn_normals():
     pixels, normals, _ = spots(3, 1)
     covariance = np.radians([[2.0, 0.0], [0.0, 1.0]]) ** 2
-    from simtest.geometry.vectors import tangent_basis
-
     first, second = (basis[0] for basis in tangent_basis(normals))
     random = np.random.default_rng(5)
     turns = random.multivariate_normal([0, 0], covariance, size=4000)
@@ -113,6 +112,47 @@ def test_mirrored_normals_harm():
     # the negative control: normals of another surface
     wrong = complete(coarse, camera(), pixels, normals * [-1, -1, 1], sure, ERROR)
     assert gradient_error(wrong, truth) > gradient_error(coarse, truth)
+
+
+@pytest.mark.parametrize("kind", ["round", "long and oblique"])
+def test_the_correction_is_that_of_dense_gaussian_conditioning(kind):
+    """The field's covariance is a dense matrix here, and each normal a row of it, by differences of the closed form."""
+    size, kappa = 12, 4 / ERROR.length_px
+    small = Camera(size, size, 15.0, 15.0, 6.0, 6.0)
+    random = np.random.default_rng(7)
+    coarse = 40.0 * np.exp(0.05 * random.normal(size=(size, size)).cumsum(0).cumsum(1) / 8)
+    columns, rows = np.array([2, 5, 6, 8, 9, 3]), np.array([3, 8, 2, 6, 9, 6])
+    pixels = np.stack([columns, rows], axis=1) + 0.5
+    rays = small.unproject(pixels)
+    normals = random.normal(size=(6, 3)) * 0.3 - rays
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    factors = np.radians(
+        random.uniform(2, 5, (6, 2, 2)) if kind != "round" else np.eye(2) * np.arange(2, 8)[:, None, None]
+    )
+    covariances = factors @ factors.transpose(0, 2, 1) + np.radians(1) ** 2 * np.eye(2)
+    # prior: tau^2 (kappa^2 - Laplacian)^3 with free edges
+    second = 2.0 * np.eye(size) - np.eye(size, k=1) - np.eye(size, k=-1)
+    second[0, 0] = second[-1, -1] = 1.0
+    operator = kappa**2 * np.eye(size**2) + np.kron(second, np.eye(size)) + np.kron(np.eye(size), second)
+    prior = np.linalg.inv(operator @ operator @ operator) * 8 * np.pi * kappa**4 * ERROR.share**2
+    # observations: grad v = -(n . grad s) / (n . s), two rows a pixel
+    take, value, noise = np.zeros((12, size**2)), np.zeros(12), np.zeros((12, 12))
+    for i, (column, row) in enumerate(zip(columns, rows, strict=True)):
+        place = row * size + column
+        take[2 * i, [place + 1, place - 1]] = take[2 * i + 1, [place + size, place - size]] = 0.5, -0.5
+        slopes = np.array([small.unproject(pixels[i] + h) - small.unproject(pixels[i] - h) for h in np.eye(2) / 2])
+        value[2 * i : 2 * i + 2] = -slopes @ normals[i] / (normals[i] @ rays[i])
+        basis = np.stack(tangent_basis(normals[i : i + 1]))[:, 0]
+        # d/dn of that quotient along the two tangents
+        along = normals[i] @ rays[i]
+        turn = (-(slopes @ basis.T) * along + np.outer(slopes @ normals[i], basis @ rays[i])) / along**2
+        block = slice(2 * i, 2 * i + 2)
+        noise[block, block] = turn @ covariances[i] @ turn.T + LEAST_SLOPE_SD**2 * slopes @ slopes.T
+    gain = prior @ take.T @ np.linalg.inv(take @ prior @ take.T + noise)
+    wanted = gain @ (value - take @ np.log(coarse).ravel())
+    correction = np.log(complete(coarse, small, pixels, normals, covariances, ERROR) / coarse).ravel()
+    assert np.abs(wanted).max() > 0.01
+    assert np.abs(correction - wanted).max() < 1e-4 * np.abs(wanted).max()
 
 
 def test_unknown_pixels_stay_unknown():

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 
 import simtest
 from simtest.cli.main import main
-from simtest.dataset import fields, read
+from simtest.dataset import fields, png, read
 from simtest.dataset.card import make_card
 from simtest.dataset.index import TABLES, write_shard_tables, write_tables
+from simtest.dataset.maker import _share_of
 from simtest.dataset.manifest import NAME, FileEntry, _digest, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
 from simtest.dataset.reproduce import compare, reproduce_sample
@@ -460,6 +461,40 @@ def test_the_card_says_where_surfaces_come_from():
     assert "No patient's data" not in text
 
 
+def test_stored_normals_have_the_levels_that_their_description_says():
+    """Levels count from 1 to 16383 over the square, u above v; 0 stands for no surface."""
+    normals = np.array([[[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [np.nan] * 3]], dtype=np.float32)
+    counts = png.decode(fields.BY_NAME["normal"].encode(normals))
+    assert counts.tolist() == [[8192, 16383, 8192, 0], [8192, 8192, 1, 0]]
+
+
+def test_parts_of_the_radiance_are_shares_of_full_scale():
+    part = np.full((2, 3), 3.0, np.float32)
+    half = _share_of(part, 6.0)
+    assert half.shape == (2, 3, 3)
+    # sRGB of one half is 188 of 255.
+    assert (half == 188).all()
+    assert (_share_of(part, 3.0) == 255).all()
+    assert not _share_of(np.zeros((2, 3), np.float32), 6.0).any()
+
+
+def test_the_tables_say_what_the_samples_hold(made):
+    index, highlights = (pl.read_parquet(made / name) for name in (INDEX, HIGHLIGHTS))
+    assert index["width"].unique().to_list() == [64]
+    assert index["height"].unique().to_list() == [48]
+    for sample in read(made):
+        row = index.row(by_predicate=pl.col("index") == sample["meta"]["index"], named=True)
+        assert sample["image"].shape[:2] == (row["height"], row["width"])
+        assert row["n_highlights"] == len(sample["meta"]["highlights"])
+        own = highlights.filter(pl.col("index") == sample["meta"]["index"])
+        for found, held in zip(own.iter_rows(named=True), sample["meta"]["highlights"], strict=True):
+            for key, names in (
+                ("normal", ("normal_x", "normal_y", "normal_z")), ("position_mm", ("x_mm", "y_mm", "z_mm")),
+                ("bp_px", ("bp_x_px", "bp_y_px")),
+            ):  # fmt: skip
+                assert [found[name] for name in names] == held[key]
+
+
 # Damage -------------------------------------------------------------------------------------------------------------
 
 
@@ -630,6 +665,42 @@ def test_damage_is_found_and_named(copy, damage, named):
     damage(copy)
     faults = verify(copy)
     assert named in {fault.file for fault in faults}, faults
+
+
+BY_HASH = "differs from its SHA-256 in the manifest"
+
+
+def test_each_file_is_held_against_its_hash(copy):
+    """One bit of each file, its size kept: whatever else might tell is not asked before."""
+    manifest = read_manifest(copy)
+    for name in {**manifest.shards, **manifest.tables}:
+        data = (copy / name).read_bytes()
+        flip(copy / name, 0.5)
+        assert [(fault.file, fault.what) for fault in verify(copy) if fault.file == name] == [(name, BY_HASH)]
+        (copy / name).write_bytes(data)
+    assert verify(copy) == []
+
+
+def test_a_digit_of_a_samples_values_is_found_by_its_hash_alone(copy):
+    data = (copy / TAR).read_bytes()
+    # The noise that a sample was given: no table has it, and no picture is held against it.
+    start = data.index(b'"noise_sigma":') + len(b'"noise_sigma":')
+    place = next(i for i in range(start, start + 9) if data[i : i + 1] in b"123456789" and data[i : i + 1])
+    changed = data[:place] + (b"1" if data[place : place + 1] != b"1" else b"2") + data[place + 1 :]
+    (copy / TAR).write_bytes(changed)
+    assert [(fault.file, fault.what) for fault in verify(copy)] == [(TAR, BY_HASH)]
+    # Negative control: nothing else tells.
+    honest(copy, TAR)
+    assert not [fault for fault in verify(copy) if fault.file == TAR]
+
+
+def test_a_member_is_held_against_its_samples_hash(copy):
+    with (copy / TAR).open("rb") as file:
+        start, length = next(samples(file)).members["normal.png"]
+    flip_at = (start + length // 2) / ((copy / TAR).stat().st_size - 1)
+    flip(copy / TAR, flip_at)
+    honest(copy, TAR)
+    assert any("normal.png differs from its hash" in fault.what for fault in verify(copy))
 
 
 def test_damage_is_mended(made, copy):

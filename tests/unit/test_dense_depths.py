@@ -8,10 +8,17 @@ import pytest
 from dense_frames import LENSES, sphere_truth
 
 from simtest.dataset.scoring.dense import MapFolder, MapOptions, open_method, score_frames, write_score
-from simtest.dataset.scoring.dense.depth import align, depth_factor, normals_of_distance
+from simtest.dataset.scoring.dense.depth import align, normals_of_distance
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
+
+
+def depth_of(truth, kind):
+    """Return the true depth along the ray, or its part along the optical axis."""
+    rays = truth.camera.unproject(truth.camera.pixel_centres())
+    points = truth.distance[..., None] * rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    return points[..., 2] if kind == "z" else truth.distance
 
 
 def scored(folder, *truths, **options):
@@ -36,8 +43,7 @@ def test_normals_of_a_plane_are_exact_through_any_lens(lens):
 @pytest.mark.parametrize("kind", ["z", "ray"])
 def test_kind_of_depth_is_found_out(lens, kind, tmp_path):
     truth = sphere_truth(camera=LENSES[lens])
-    depth = truth.distance * depth_factor(truth.camera, kind)
-    np.save(tmp_path / "a.npy", depth)
+    np.save(tmp_path / "a.npy", depth_of(truth, kind))
     score = scored(tmp_path, truth)
     assert score.conventions.depth == kind
     percent = score.cell("depth_none", quantity="depth_percent")
@@ -55,7 +61,7 @@ def test_kind_of_depth_is_found_out(lens, kind, tmp_path):
 @pytest.mark.parametrize("shift", [-4.0, 4.0])
 def test_kind_of_relative_depths_is_found_out(lens, kind, shift, tmp_path):
     truth = sphere_truth(camera=LENSES[lens])
-    np.save(tmp_path / "a.npy", 0.5 * truth.distance * depth_factor(truth.camera, kind) + shift)
+    np.save(tmp_path / "a.npy", 0.5 * depth_of(truth, kind) + shift)
     score = scored(tmp_path, truth)
     assert score.conventions.depth == kind
     assert score.cell("depth_affine")["median"] < 0.2

@@ -202,7 +202,7 @@ def of_curves(rows, path):
 
 
 def of_pairs(rows, path):
-    return [(pair.low, pair.high) for pair in pairs(Run(path, rows))]
+    return [pair.interval_deg for _, pair in pairs(Run(path, rows))]
 
 
 def of_guide(rows, path):

@@ -156,3 +156,13 @@ def test_a_cone_without_a_pose_is_a_rung_without_an_answer(monkeypatch):
     assert {rung for rung, value in found.items() if value is None} == {
         (name, "exact cone") for name in ladder.ESTIMATORS
     }
+
+
+def test_the_first_rung_has_the_noise_that_it_says(monkeypatch):
+    frames = []
+    whole = ladder._whole
+    monkeypatch.setattr(ladder, "_whole", lambda frame, smoothing: frames.append(frame) or whole(frame, smoothing))
+    error_ladder([PLANE], realisations=2)
+    noisy, clean = frames[:2], frames[-1]
+    assert [np.std(frame - clean) for frame in noisy] == pytest.approx([ladder.NOISE] * 2, rel=0.02)
+    assert "sigma 0.05" in RUNGS["as it is"]

@@ -40,6 +40,13 @@ def result(run, name="offset"):
     return next(r for r in law_results(run) if r.name == name)
 
 
+def test_a_departure_above_the_law_is_positive():
+    found = result(run_of(offset("s", 0.65, 0.3), offset("l", 19.0, 20.0)))
+    np.testing.assert_allclose(sorted(found.gap), [-1.0, 0.35])
+    # The worst is told with its sign.
+    assert found.cells["worst"] == "-1°"
+
+
 def test_a_law_is_met_within_the_larger_of_both_tolerances_at_every_setting():
     met = run_of(offset("s", 0.55, 0.3), offset("l", 20.5, 20.0))
     assert (result(met).verdict, result(met).met) == (MET, 2)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from simtest.calibration.lights.bundle import Highlights, solve
 from simtest.calibration.lights.mirrors import Balls, Plates, mirror_points
@@ -133,6 +134,19 @@ def test_covariance_holds_over_draws() -> None:
     assert abs(mean - 1) < 4 * 0.105
     # A covariance of half the size would not pass.
     assert abs(2 * mean - 1) > 4 * 0.105
+
+
+def test_each_highlight_counts_two_and_each_light_takes_three() -> None:
+    """The sum of squares of eight draws lies in the middle 99.8 % of chi-squared of their degrees of freedom."""
+    total, freedom = 0.0, 0
+    for seed in range(8):
+        mirrors = balls(seed=300 + seed)
+        highlights, planted = seen(mirrors, LIGHTS, seed=400 + seed)
+        bundle = solve(CAMERA, mirrors, highlights, planted.astype(np.intp), LIGHTS + 1.0)
+        assert bundle is not None
+        assert bundle.freedom == 2 * int((planted >= 0).sum()) - 3 * len(LIGHTS)
+        total, freedom = total + bundle.chi2, freedom + bundle.freedom
+    assert 0.001 < stats.chi2.cdf(total, freedom) < 0.999
 
 
 def test_wrong_radius_shows_in_no_residual_and_scales_the_lights() -> None:

@@ -1,244 +1,124 @@
-"""The suite of mutants: each applies to today's source, answers are kept, and a handful is named by its canary."""
+"""The guard: each planted fault applies to today's source, and a test is on record that catches it."""
 
-import json
+import re
+from types import SimpleNamespace
 
 import pytest
-from simtest.nightly.canaries import measures
 
+from studies.gate.faults import FAULTS, HARMLESS
 from studies.mutants import judging
-from studies.mutants.__main__ import main, table
-from studies.mutants.catalogue import BY_NAME, MUTANTS, UNCHANGED
-from studies.mutants.child import LADDER
-from studies.mutants.further import FURTHER
-from studies.mutants.kinds import KINDS, MEASURES, QUANTITIES, measures_of, naming
-from studies.mutants.mutant import mutant
+from studies.mutants.__main__ import main
+from studies.mutants.planting import Mutation, function_at
+from studies.mutants.rows import BY_NAME, ROWS, TESTS, row
+
+KEY = "names enter the seed tree by their length"
 
 
-@pytest.mark.parametrize("own", BY_NAME.values(), ids=lambda own: own.name)
-def test_a_mutant_applies_to_the_source(own):
-    for mutation in own.mutations():
-        # Other code, not another spelling of it
-        assert mutation.code() != mutation.function.__code__
-        assert mutation.old != mutation.new
+def test_every_fault_applies_to_the_source_and_its_tests_are_there():
+    wrong = []
+    for own in ROWS:
+        try:
+            # Other code, not another spelling of it
+            assert all(each.code() != each.function.__code__ for each in own.mutations()), own.name
+            assert own.tests, own.name
+        except LookupError as error:
+            wrong.append(f"{own.name}: {error}")
+    assert not wrong
+    assert len(BY_NAME) == len(ROWS) >= 181
+    assert all(each.code() != each.function.__code__ for name in HARMLESS for each in HARMLESS[name])
+    assert all(FAULTS.values())
 
 
-def test_the_list_is_whole():
-    assert len(MUTANTS) >= 60
-    assert len(FURTHER) == 10
-    assert len(BY_NAME) == len(MUTANTS) + len(FURTHER) + 1
-    assert {own.kind for own in BY_NAME.values()} == set(KINDS)
-    assert set(QUANTITIES) <= set(KINDS)
-    assert {name for names in KINDS.values() for name in names} <= set(MEASURES)
-    assert {name for names in MEASURES.values() for name in names} <= {*measures(), LADDER}
+def test_somebody_catches_every_fault():
+    caught, files = judging.read_table(), {path.relative_to(TESTS.parent).as_posix() for path in TESTS.rglob("*.py")}
+    assert set(caught) == set(BY_NAME)
+    for name, who in caught.items():
+        assert judging.is_caught(who), name
+        if who.startswith("tests/"):
+            path, _, test = who.partition("::")
+            assert path in BY_NAME[name].tests, name
+            assert path in files, name
+            function = re.match(r"\w+", test.split("::")[-1])[0]
+            assert re.search(rf"def {function}\(", (TESTS.parent / path).read_text(encoding="utf-8")), who
 
 
 @pytest.mark.parametrize(
     ("where", "old"),
-    [("simtest.geometry.camera:Camera.unproject", "nowhere in it"), ("simtest.geometry.camera:Camera.gone", "return"),
-     ("simtest.gone:here", "return"), ("simtest.geometry.camera:Camera.unproject", "rays")],
+    [("geometry.camera:Camera.unproject", "nowhere in it"), ("geometry.camera:Camera.gone", "return"),
+     ("gone:here", "return"), ("geometry.camera:Camera.unproject", "rays")],
 )  # fmt: skip
-def test_a_mutant_that_does_not_apply_is_an_error(where, old):
+def test_a_fault_that_does_not_apply_is_an_error(where, old):
     with pytest.raises(LookupError):
-        mutant("gone", "lens", where, old, "1").mutations()
+        row("gone", "lens", where, old, "1", "camera").mutations()
 
 
-def test_what_is_kept_on_disk_is_not_spoilt():
-    spoils = {own.name for own in MUTANTS if own.spoils_kept_arrays}
-    assert {"slope of the relief 20 % too low", "stages share one branch of the seed tree"} <= spoils
-    assert "mean is the median" not in spoils
+def test_a_test_file_that_is_gone_or_there_twice_is_an_error(tmp_path, monkeypatch):
+    with pytest.raises(LookupError, match=r"test_gone\.py is there 0 times"):
+        row("fault", "lens", "geometry.camera:Camera.unproject", "rays", "1", "gone").tests  # noqa: B018
+    for folder in ("a", "b"):
+        (tmp_path / "tests" / folder).mkdir(parents=True)
+        (tmp_path / "tests" / folder / "test_two.py").write_text("", encoding="utf-8")
+    monkeypatch.setattr("studies.mutants.rows.TESTS", tmp_path / "tests")
+    with pytest.raises(LookupError, match=r"test_two\.py is there 2 times"):
+        row("fault", "lens", "geometry.camera:Camera.unproject", "rays", "1", "two").tests  # noqa: B018
+    assert row("fault", "lens", "geometry.camera:Camera.unproject", "rays", "1", "b/two").tests == (
+        "tests/b/test_two.py",
+    )
 
 
-def test_only_canaries_of_the_faults_subject_name_it():
-    assert naming("lens", ["photometry", "lens", "lens", "plane"]) == ["lens"]
-    assert naming("lens", ["photometry"]) == []
-    assert measures_of("light sign") == ["rigs", "photometry", "told_light"]
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """Write a test that sees names enter the seed tree by their length alone."""
+    path = tmp_path_factory.mktemp("guard") / "test_own.py"
+    text = "from simtest.runtime.seeds import key\n\n\ndef test_names():\n    assert key('ab') != key('cd')\n"
+    path.write_text(text, encoding="utf-8")
+    return path
 
 
-@pytest.fixture
-def asked(monkeypatch):
-    """Answers without processes: the canaries name statistics and nothing else, the gate calls `n` worse."""
-    names = []
-
-    def answer(name, stage):
-        names.append((name, stage))
-        if stage == "night":
-            return {"name": name, "stage": stage, "worse": [] if name == UNCHANGED.name else [["grid", "n"]]}
-        failed = [["statistics", "mean_off", 1.0]] if name == "mean is the median" else []
-        return {"name": name, "stage": stage, "failed": failed}
-
-    def answers(some, stage, file, profile):
-        return [answer(name, stage) for name in some]
-
-    monkeypatch.setattr(judging, "_asked", answers)
-    return names
-
-
-def test_the_gate_is_asked_about_what_canaries_do_not_name(asked, tmp_path):
-    names = ["mean is the median", "only answers are counted", "k4 of a fisheye lost"]
-    found = judging.run(names, tmp_path / "out" / "answers.jsonl", 2, lambda line: None)
-    assert [each.by_name for each in found] == [False, True, True, False]
-    assert ("mean is the median", "night") not in asked
-    assert asked.index((UNCHANGED.name, "night")) < asked.index(("only answers are counted", "night"))
-    text = table(found)
-    assert "2 of 3 named" in text
-    assert "| only answers are counted | counts | gate: grid n |" in text
-    assert "| k4 of a fisheye lost | lens | nobody |" in text
-
-
-def test_a_later_call_goes_on(asked, tmp_path):
-    file = tmp_path / "answers.jsonl"
-    known = {"name": "median is the mean", "stage": "canaries", "failed": [["statistics", "median_off", 1.0]]}
-    known |= judging.stamp("")
-    # The last line is what a kill left of one.
-    file.write_text(json.dumps(known) + "\n" + '{"name": "mean is', encoding="utf-8")
-    names = ["median is the mean", "mean is the median"]
-    found = judging.run(names, file, 1, lambda line: None, None)
-    assert asked == [(UNCHANGED.name, "canaries"), ("mean is the median", "canaries")]
-    assert [each.by_name for each in found] == [False, True, True]
-    judging.run(names, file, 1, lambda line: None, None)
-    assert len(asked) == 2
-
-
-def test_answers_about_other_code_are_not_told(asked, tmp_path, monkeypatch):
-    file, names = tmp_path / "answers.jsonl", ["mean is the median"]
-    judging.run(names, file, 1, lambda line: None, None)
-    before, folder = len(asked), judging.night_folder(file, "quick")
-    monkeypatch.setattr(judging, "source_hash", lambda: "of other code")
-    judging.code_hash.cache_clear()
-    try:
-        assert judging.read(file) == {}
-        assert judging.night_folder(file, "quick") != folder
-        judging.run(names, file, 1, lambda line: None, None)
-        assert len(asked) == 2 * before
-    finally:
-        judging.code_hash.cache_clear()
-
-
-def test_nights_of_another_profile_are_not_told(asked, tmp_path):
-    file, mine = tmp_path / "answers.jsonl", tmp_path / "mine.toml"
-    mine.write_text("costs = false", encoding="utf-8")
-    night = ("k4 of a fisheye lost", "night")
-    judging.run([night[0]], file, 1, lambda line: None, str(mine))
-    assert night in judging.read(file, str(mine))
-    assert night not in judging.read(file, "quick")
-    # What canaries told holds for every profile.
-    assert (night[0], "canaries") in judging.read(file, "quick")
-    folder = judging.night_folder(file, str(mine))
-    mine.write_text("costs = true", encoding="utf-8")
-    assert night not in judging.read(file, str(mine))
-    assert len({folder, judging.night_folder(file, str(mine)), judging.night_folder(file, "quick")}) == 3
-    judging.run([night[0]], file, 1, lambda line: None, "quick")
-    assert asked.count(night) == 2
-    assert asked.count((night[0], "canaries")) == 1
-
-
-def _answers(monkeypatch, canaries=None, night=None):
-    """Let the canaries, and the night, answer alike about unchanged code; a planted fault is named by its canary."""
-
-    def answer(name, stage):
-        if name != UNCHANGED.name:
-            return {"name": name, "stage": stage, "failed": [["statistics", "mean_off", 1.0]]}
-        return {"name": name, "stage": stage, **((canaries if stage == "canaries" else night) or {})}
-
-    monkeypatch.setattr(judging, "_asked", lambda some, stage, *rest: [answer(name, stage) for name in some])
-
-
-def _called(tmp_path, *more):
-    return main(["--out", str(tmp_path / "answers.jsonl"), "--only", "mean is the median", *more])
-
-
-def test_a_canary_that_fails_on_unchanged_code_is_an_alarm(monkeypatch, tmp_path, capsys):
-    _answers(monkeypatch, canaries={"failed": [["photometry", "residual", 1.0]]})
-    assert _called(tmp_path, "--canaries") == 1
-    assert "alarms on unchanged code: 1 canaries, the gate not asked (photometry)." in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("canaries", [{}, {"stopped": "exit 1: no renderer"}])
-def test_unchanged_code_must_be_quiet(monkeypatch, tmp_path, canaries):
-    _answers(monkeypatch, canaries=canaries)
-    assert _called(tmp_path, "--canaries") == (1 if canaries else 0)
-
-
-@pytest.mark.parametrize("night", [{"worse": []}, {"worse": [["grid", "mean_deg"]]}, {"stopped": "exit 1: killed"}])
-def test_the_gates_alarm_on_unchanged_code_is_one(monkeypatch, tmp_path, capsys, night):
-    _answers(monkeypatch, night=night)
-    # Nobody names this one but the gate, by a quantity of its kind: so the unchanged night is asked for.
-    answer = judging._asked
-
-    def answers(some, stage, *rest):
-        if some == ["only answers are counted"]:
-            worse = [["grid", "n"], ["grid", "mean_deg"]] if stage == "night" else []
-            return [{"name": some[0], "stage": stage, "worse": worse}]
-        return answer(some, stage, *rest)
-
-    monkeypatch.setattr(judging, "_asked", answers)
-    monkeypatch.setattr(judging, "BATCH", 1)
-    quiet = night == {"worse": []}
-    assert _called(tmp_path, "only answers are counted") == (0 if quiet else 1)
-    text = capsys.readouterr().out
-    assert "| only answers are counted | counts | gate: grid n | gate: grid mean_deg |" in text
-    assert quiet or "grid mean_deg)." in text or "exit 1: killed)." in text
-
-
-def test_the_gates_alarm_under_another_name_is_seen():
-    answers = {
-        ("k4 of a fisheye lost", "canaries"): {"failed": []},
-        ("k4 of a fisheye lost", "night"): {"worse": [["grid", "mean_deg"]]},
-    }
-    (found,) = judging.judged(answers, ["k4 of a fisheye lost"])
-    assert found.is_seen
-    assert not found.by_name
-    assert "0 of 1 named, 1 seen" in table([found])
-
-
-def test_an_unknown_mutant_is_refused(capsys):
-    assert main(["--only", "a fault that nobody wrote"]) == 2
-    assert "unknown" in capsys.readouterr().err
-
-
-def test_a_process_that_ends_without_an_answer_is_told(tmp_path):
-    (answer,) = judging._asked(["mean is the median"], "night", tmp_path / "a.jsonl", "a profile that nobody wrote")
-    assert answer["stopped"].startswith("exit 1: ")
-    assert "a profile that nobody wrote" in answer["stopped"]
-
-
-HANDFUL = (
-    "k4 of a fisheye lost",
-    "mean is the median",
-    "one bounce too many",
-    "covariance x 0.8",
-    "instances counted from 0",
+@pytest.mark.parametrize(
+    ("fault", "who"), [(KEY, "::test_names"), ("k4 of a fisheye lost", judging.NOBODY)], ids=["caught", "not caught"]
 )
+def test_the_first_test_that_fails_catches_a_fault(file, fault, who):
+    assert judging.catcher(SimpleNamespace(name=fault, tests=(str(file),))).endswith(who)
 
 
-@pytest.mark.render
-@pytest.mark.slow
-def test_a_handful_is_named(tmp_path):
-    found = judging.run(HANDFUL, tmp_path / "answers.jsonl", 1, lambda line: None, None)
-    control, *planted = found
-    assert not control.is_seen
-    assert all(each.by_name for each in planted)
+def test_tests_that_fail_or_hang_without_a_fault_are_said(file, tmp_path, monkeypatch):
+    judging.check_sound(str(file))
+    bad = tmp_path / "test_bad.py"
+    bad.write_text("def test_red():\n    assert False\n", encoding="utf-8")
+    with pytest.raises(judging.GuardError, match="without a fault the tests must pass"):
+        judging.check_sound(str(bad))
+    assert not judging.is_caught(judging.catcher(SimpleNamespace(name=KEY, tests=(str(tmp_path / "gone.py"),))))
+    monkeypatch.setattr(judging, "LIMIT_S", 0.01)
+    assert judging.catcher(SimpleNamespace(name=KEY, tests=(str(file),))) == judging.HANGS
 
 
-PROFILE = """
-canaries = false
-costs = false
-
-[[experiments]]
-experiment = "overview"
-realisations = 2
-labels = ["plane"]
-"""
+def test_the_table_keeps_what_was_not_asked(tmp_path):
+    path, (first, second, third) = tmp_path / "caught.json", ROWS[:3]
+    judging.write_table(ROWS, {first.name: "a", "a row that is gone": "b", third.name: "c"}, path)
+    assert judging.read_table(path) == {first.name: "a", third.name: "c"}
+    judging.write_table(ROWS, {**judging.read_table(path), second.name: "d"}, path)
+    assert list(judging.read_table(path)) == [first.name, second.name, third.name]
 
 
-@pytest.mark.render
-@pytest.mark.slow
-def test_the_gate_names_what_it_can(tmp_path):
-    profile = tmp_path / "small.toml"
-    profile.write_text(PROFILE, encoding="utf-8")
-    file = tmp_path / "answers.jsonl"
-    answers = judging.ask([UNCHANGED.name], "night", file, 1, lambda line: None, str(profile))
-    assert answers[UNCHANGED.name, "night"]["worse"] == []
-    assert answers[UNCHANGED.name, "night"]["cells"] > 0
-    answers = judging.ask(["error halved"], "night", file, 1, lambda line: None, str(profile))
-    assert "worse" in answers["error halved", "night"]
+def test_the_command_prints_the_table_and_refuses_unknown_names(capsys, monkeypatch):
+    assert main(["--only", "bench"]) == 0
+    output = capsys.readouterr().out
+    assert (
+        output.splitlines()[-1] == f"{sum(own.room == 'bench' for own in ROWS)} of {output.count('| bench |')} caught."
+    )
+    assert main(["--only", "a fault that nobody wrote"]) == 2
+    assert "--only a fault that nobody wrote: unknown; allowed: advice, " in capsys.readouterr().err
+    monkeypatch.setattr("studies.mutants.__main__.read_table", dict)
+    assert main(["--only", KEY]) == 1
+    assert "| not asked |" in capsys.readouterr().out
+
+
+def test_a_planted_change_is_taken_out_again():
+    from simtest.runtime.seeds import key
+    from studies.mutants.planting import planted
+
+    before = key("ab")
+    with planted(Mutation(function_at("simtest.runtime.seeds:key"), "text.encode()", "b''")):
+        assert key("ab") == key("cd") != before
+    assert key("ab") == before

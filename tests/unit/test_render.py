@@ -414,6 +414,17 @@ def test_true_highlights_bisect_and_are_where_the_frame_is_brightest(session, na
         session.update(scene(surface, lights, {"exponent": exponent}))
 
 
+def test_curvatures_of_a_true_highlight_count_distances(session):
+    for surface, gains in (
+        ({"type": "sphere", "radius_mm": 6.0, "tilt_deg": 9.0}, (1 / 6.0, 1 / 6.0)),
+        ({"type": "cylinder", "radius_mm": 20.0, "side": "inside", "tilt_deg": 9.0}, (-1 / 20.0, 0.0)),
+    ):
+        session.update(scene(surface, (AT_CAMERA,)))
+        (highlight,) = session.highlights(session.radiance())
+        expected = np.linalg.norm(highlight.position) * np.array(gains)
+        np.testing.assert_allclose([highlight.kd_min, highlight.kd_max], expected, atol=1e-6)
+
+
 def test_true_highlight_of_a_plane_has_a_closed_form(session):
     """The sightline meets the mirrored light; at the camera it is the foot of the perpendicular."""
     N = leaned(12.0, 30.0)

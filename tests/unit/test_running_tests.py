@@ -1,9 +1,13 @@
 """How the tests themselves are run: long files first, marks of single cases, and nothing waits for the disk."""
 
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
+import simtest
 from tests.conftest import largest_first
 from tests.marked import marked
 
@@ -31,3 +35,16 @@ def test_a_closed_file_cannot_be_flushed_to_the_disk(tmp_path):
     os.close(closed)
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fsync(closed)
+
+
+def test_children_run_the_checkout_whose_tests_these_are(tmp_path):
+    checkout = Path(__file__).resolve().parents[2]
+    assert Path(simtest.__file__).parents[1] == checkout
+    # An installed package of that name lies behind the checkout, whatever is installed here.
+    (tmp_path / "simtest").mkdir()
+    (tmp_path / "simtest" / "__init__.py").write_text("", encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": f"{os.environ['PYTHONPATH']}{os.pathsep}{tmp_path}"}
+    command = [sys.executable, "-c", "import simtest; print(simtest.__file__)"]
+    for own in (None, environment):
+        done = subprocess.run(command, env=own, cwd="/", capture_output=True, text=True, timeout=60, check=True)
+        assert Path(done.stdout.strip()).parents[1] == checkout

@@ -276,6 +276,17 @@ def test_twins_measure_the_error_of_highlights_alike():
     assert matcher.find(like(1.7)).rms_deg > 1.5 * matcher.find(like(0.6)).rms_deg
 
 
+def test_each_frame_counts_once_and_coverage_is_over_those_that_report():
+    """All alike: one highlight of 1 deg in one frame, four of 3 deg in another, of which none reports a region."""
+    features = [1.0] * len(FEATURES)
+    bank = [(0, ScoredSpot(spot(features), "glint", 1.0, 2.0, True))]
+    bank += [(1, ScoredSpot(spot(features), "glint", 3.0, 6.0, None)) for _ in range(4)]
+    twins = Matcher(bank).find(spot(features))
+    assert twins.rms_deg == pytest.approx(math.sqrt((1 + 9) / 2))
+    assert twins.base_rms_deg == pytest.approx(2 * twins.rms_deg)
+    assert twins.coverage == 1.0
+
+
 def test_the_interval_covers():
     """95 % intervals of 60 banks hold the law in 48 to 60: alpha < 1e-4 for a coverage of 93 % or more."""
     held = 0

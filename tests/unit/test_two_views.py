@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Normal, Priors, exactly
 from simtest.errors import Failure, InputError, Reason
@@ -107,17 +108,19 @@ def sphere_estimate(kd, normal):
     return Estimate(normal, normal[None], np.zeros(2), curvature=EstimatedCurvature(directions, 1.0, hypotheses))
 
 
+@pytest.mark.parametrize("turn_deg", [(0, 0, 0), (40, -70, 25)])
 @pytest.mark.parametrize("kd", [0.5, 3.0, -0.4, -1.6, -3.0])
-def test_small_motions_on_spheres_are_predicted_exactly(kd):
-    """The highlight of a sphere lies on the line from the camera to its centre."""
+def test_small_motions_on_spheres_are_predicted_exactly(kd, turn_deg):
+    """The highlight of a sphere lies on the line from the camera to its centre, wherever the camera looks."""
     first = sphere_estimate(kd, np.array([0.0, 0, -1]))
     centre = np.array([0, 0, D + D / kd])
     place = np.array([0.03, -0.02, 0.01])
+    turn = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
     T = np.eye(4)
-    T[:3, 3] = -place
+    T[:3, :3], T[:3, 3] = turn, -turn @ place
     towards = place - centre
     # Within the centre's distance the camera lies between the highlight and the centre.
-    normal = towards / np.linalg.norm(towards) * np.sign(kd * (1 + kd))
+    normal = turn @ (towards / np.linalg.norm(towards)) * np.sign(kd * (1 + kd))
     second = Estimate(normal, normal[None], np.zeros(2))
     ranked = rank_by_motion(first, second, T, Priors(distance_mm=exactly(D)))
     np.testing.assert_allclose(ranked.hypotheses[0], 1 + kd)

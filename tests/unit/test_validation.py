@@ -1,6 +1,7 @@
 """Matching, rows, summary figures, seeds, cases, and that a row can be made again alone."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ from simtest.detection import Detection, Region
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate, load_estimators
 from simtest.geometry import Camera, Patch
-from simtest.geometry.vectors import angle_deg
+from simtest.geometry.vectors import angle_deg, tangent_basis
 from simtest.reconstruction.pipeline import Specularity, reconstruct, run_pipeline
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, from_integer, generator, integer, key, sequence
@@ -21,7 +22,7 @@ from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example
 from simtest.validation.matching import match
-from simtest.validation.metrics import rows
+from simtest.validation.metrics import mahalanobis2, rows
 from simtest.validation.realisation import realise
 from simtest.validation.results_table import SCHEMA, ResultRow, table
 from simtest.validation.runner import run_experiment
@@ -52,6 +53,15 @@ def spots(*centres, sigma=5.0):
 
 def matched_to(found, truths):
     return match(found, [truth.bp_px for truth in truths])
+
+
+def test_the_mahalanobis_distance_counts_deviations():
+    """Two deviations along one axis and one along the other, in the tangent basis of the estimate's normal."""
+    first, second = (axis[0] for axis in tangent_basis(NORTH[None]))
+    truth = NORTH + np.tan(1e-3) * (2 * first + 3 * second)
+    estimate = Estimate(NORTH, NORTH[None], np.zeros(2), covariance=np.diag([1e-6, 9e-6]))
+    assert mahalanobis2(estimate, truth / np.linalg.norm(truth)) == pytest.approx(5.0, rel=1e-4)
+    assert mahalanobis2(Estimate(NORTH, NORTH[None], np.zeros(2)), NORTH) is None
 
 
 # Matching ------------------------------------------------------------------------------------------------------------
@@ -152,6 +162,21 @@ def test_errors_of_a_row():
     assert row.n_candidates == 2
 
 
+def test_columns_of_a_row_are_what_their_names_say():
+    session, common = context()
+    light = {"rig": {"lights": [{"offset_mm": 2.0, "azimuth_deg": 90.0}]}}
+    session.scene = scene_from_dict({"surface": {"type": "plane"}, **light})
+    result = replace(estimate(leaned(3), look=(81.0, 63.0)), budget={"noise": np.diag([3e-4, 1e-4])})
+    found = [detection(0, 0, 50, 50, (20, 20), {"a": result})]
+    (row,) = rows(session, common, found, [truth_at(21.0, 33.0)], {0: 0}, ["a"])
+    assert (row.bp_true_x_px, row.bp_true_y_px, row.look_x_px, row.look_y_px) == (21.0, 33.0, 81.0, 63.0)
+    assert (row.kd_min, row.kd_max, row.distance_mm, row.peak_snr) == (0.2, 0.5, 10.0, 50.0)
+    # 2 mm over 10 mm.
+    assert row.eps_over_d == pytest.approx(0.2)
+    assert row.axis_ratio_law == pytest.approx(1.2 / 1.5)
+    assert row.budget["budget_noise_deg"] == pytest.approx(np.degrees(0.02))
+
+
 def test_angles_are_exact_near_zero_and_near_180_deg():
     for degrees in (0.0, 1e-9, 1e-4, 30.0, 179.9999999):
         assert float(angle_deg(NORTH, leaned(degrees))) == pytest.approx(degrees, rel=1e-6, abs=1e-15)
@@ -216,6 +241,18 @@ def test_summary_of_a_hand_made_table():
     assert b.ci95_deg[0] == 0.0
     assert b.ci95_deg[1] > 3 + 4.302653
     assert b.coverage95 is None
+
+
+def test_median_and_coverage_of_skewed_errors():
+    lines = [(0, 1.0, 1.0), (1, 2.0, 4.5), (2, 9.0, 7.0)]
+    made = [
+        ResultRow(setting="s", estimator="a", true_id=number, status="ok", error_deg=error, mahalanobis2=squared)
+        for number, error, squared in lines
+    ]
+    (found,) = summarise(table(made, {}))["s"].values()
+    assert (found.median_deg, found.mean_deg) == (2.0, 4.0)
+    # 4.5 lies between the quantiles of one degree of freedom and of two, 3.84 and 5.99.
+    assert found.coverage95 == pytest.approx(2 / 3)
 
 
 def test_summary_where_nothing_answered():

@@ -1,0 +1,55 @@
+"""Regions of peaks: their area, box and contrast, and how far above the noise a peak must stand."""
+
+import numpy as np
+import pytest
+
+from simtest.detection.regions import contrast, detect, half_height_component
+
+SIGMA, PLACE = 6.0, (70, 45)
+
+
+def spot(height=1.0, base=0.0, place=PLACE):
+    y, x = np.mgrid[:100, :140]
+    lobe = np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / (2 * SIGMA**2))
+    return (base + height * lobe).astype(np.float32)
+
+
+def test_a_region_holds_the_pixels_above_half_height():
+    found = half_height_component(spot(), PLACE[1], PLACE[0])
+    # exp(-r^2 / 2 s^2) = 1/2; whole pixels
+    assert np.count_nonzero(found.mask) == pytest.approx(np.pi * 2 * np.log(2) * SIGMA**2, rel=0.07)
+    assert found.closed
+    assert found.holds(np.array(PLACE) + 0.5)
+    assert not found.holds(np.array([PLACE[0] + 3 * SIGMA, PLACE[1]]))
+
+
+@pytest.mark.parametrize(("sigmas", "count"), [(9.8, 0), (10.2, 1)])
+def test_ten_sigma_make_a_detection(sigmas, count):
+    found = detect(spot(0.01 * sigmas), 0.01)
+    assert len(found) == count
+    for region in found:
+        assert region.peak == PLACE
+        assert region.contrast == pytest.approx(0.01 * sigmas, rel=0.1)
+
+
+def test_a_box_lies_about_its_peak_wherever_it_is():
+    for place in ((70, 45), (30, 70)):
+        (region,) = detect(spot(place=place), 0.001)
+        x, y, width, height = region.box
+        assert abs(x + (width - 1) / 2 - place[0]) <= 1
+        assert abs(y + (height - 1) / 2 - place[1]) <= 1
+        # Twice the half-height region and more.
+        assert min(width, height) > 2 * 2 * np.sqrt(2 * np.log(2)) * SIGMA
+
+
+def test_contrast_counts_from_the_surroundings():
+    image = spot(0.5, base=0.4)
+    found = half_height_component(image, PLACE[1], PLACE[0])
+    assert contrast(image, found, 0.9) == pytest.approx(0.5, rel=0.1)
+
+
+def test_a_region_that_the_border_cuts_is_open():
+    image = spot(place=(2, 45))
+    assert not half_height_component(image, 45, 2).closed
+    assert not detect(image, 0.001)
+    assert len(detect(image, 0.001, isolated=False)) == 1
