@@ -516,7 +516,8 @@ ROWS = (
         "float(fitted[1]) if", "-float(fitted[1]) if", "dense_depths"),
     # realism
     row("real scenes' spread over n", "statistics", "realism.distance:_column_distance",
-        "(own.sum(axis=0) - own) / (n - 1)", "(own.sum(axis=0) - own) / n", "realism_distance"),
+        "(scenes.sum(axis=0) - scenes) / (len(scenes) - 1)", "(scenes.sum(axis=0) - scenes) / len(scenes)",
+        "realism_distance"),
     row("dark halos have the sign of bright ones", "labels", "realism.frame_statistics:_halos",
         "_quantile(luma[crop][around], 0.5) - _quantile(luma[crop][ring], 0.2)",
         "_quantile(luma[crop][ring], 0.2) - _quantile(luma[crop][around], 0.5)", "realism_statistics"),
