@@ -208,6 +208,7 @@ def test_false_detections_that_failed_are_counted():
         {
             "true_id": [None, None], "status": ["ok", "no_peak"], "error_deg": [None, None],
             "error_oracle_deg": [None, None], "mahalanobis2": [None, None],
+            "experiment": ["e", "e"], "setting": ["s", "s"], "realisation": [0, 1],
         },
         schema_overrides={"true_id": pl.Int64, "error_deg": pl.Float64, "mahalanobis2": pl.Float64},
     )  # fmt: skip

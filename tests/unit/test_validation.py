@@ -168,7 +168,7 @@ def test_columns_of_a_row_are_what_their_names_say():
     session.scene = scene_from_dict({"surface": {"type": "plane"}, **light})
     result = replace(estimate(leaned(3), look=(81.0, 63.0)), budget={"noise": np.diag([3e-4, 1e-4])})
     found = [detection(0, 0, 50, 50, (20, 20), {"a": result})]
-    (row,) = rows(session, common, found, [truth_at(21.0, 33.0)], {0: 0}, ["a"])
+    (row,) = rows(session, common, found, [truth_at(21.0, 33.0)], {0: 0}, {"a": ()})
     assert (row.bp_true_x_px, row.bp_true_y_px, row.look_x_px, row.look_y_px) == (21.0, 33.0, 81.0, 63.0)
     assert (row.kd_min, row.kd_max, row.distance_mm, row.peak_snr) == (0.2, 0.5, 10.0, 50.0)
     # 2 mm over 10 mm.
