@@ -158,7 +158,7 @@ def _slope(rows: pl.DataFrame) -> LawResult | None:
     """Fit the slope of log error over log sigma; None with fewer than three noise levels."""
     noisy = rows.filter(pl.col("noise_sigma") > 0)
     ok = noisy.filter((pl.col("status") == "ok") & (pl.col("error_oracle_deg") > 0))
-    parts = {float(sigma): part for (sigma,), part in ok.group_by("noise_sigma")}  # type: ignore[arg-type]
+    parts = {float(sigma): part for (sigma,), part in ok.group_by("noise_sigma")}
     if len(parts) < 3:
         return None
     sigmas = sorted(parts)
