@@ -47,6 +47,7 @@ class Ask:
     value: str
     law: str
     hold: str | None = None
+    at: str = "setting"  # column of the points' names: settings, or what several settings share
 
 
 def prepared(run: Run) -> pl.DataFrame:
@@ -100,7 +101,7 @@ def slices(rows: pl.DataFrame, x: str, hold: str | None) -> Iterator[tuple[str, 
 
 def _aggregate(rows: pl.DataFrame, ask: Ask, is_scattered: bool) -> pl.DataFrame:
     rank = pl.col(ask.x).rank("dense") - 1
-    group = (rank * _BINS // (rank.max() + 1)).cast(pl.String) if is_scattered else pl.col("setting")
+    group = (rank * _BINS // (rank.max() + 1)).cast(pl.String) if is_scattered else pl.col(ask.at)
     exponent = pl.col("reflectance.exponent") if "reflectance.exponent" in rows.columns else pl.lit(None)
     is_answer = pl.col("ok") & pl.col(ask.value).is_not_null()
     values = pl.col(ask.value).filter(is_answer)

@@ -11,8 +11,10 @@ from simtest.pages.style import degrees, number
 from simtest.report.run_folder import Run
 from simtest.report.series import TOLERANCE_DEG, TOLERANCE_SHARE
 from simtest.runtime.arrays import Array
+from simtest.runtime.statistics import deviation_of_mean, summed
 from simtest.spec.experiment import LawName
 from simtest.validation import laws
+from simtest.validation.statistics import units
 
 MET, DEPARTS, ABSENT = "met", "departs", "not in this run"
 SLOPE = "branch_point_slope"
@@ -107,7 +109,9 @@ class LawResult:
         """Texts of the table's cells."""
         if not self.settings:
             return dict.fromkeys(("range", "worst", "share", "where", "met"), "–")
-        share = np.abs(self.gap) / np.abs(self.predicted)
+        # Where the law is 0, as without noise, no departure is a share of it.
+        gap, size = np.abs(self.gap), np.abs(self.predicted)
+        share = np.divide(gap, size, out=np.zeros_like(gap), where=size > 0)
         worst, most = int(np.abs(self.gap).argmax()), int(share.argmax())
         met = f"{self.met} of {len(self.settings)}"
         return {
@@ -126,6 +130,8 @@ def law_results(run: Run) -> list[LawResult]:
     ratio = run.results["axis_ratio"]
     tilt = pl.Series(np.degrees(laws.branch_point_error(1 - ratio.to_numpy().astype(float))))
     rows = run.results.with_columns(branch_point_deg=tilt, named=pl.col("laws").str.split(","))
+    # A detection of no true highlight has no error: it says nothing of a law.
+    rows = rows.filter(pl.col("true_id").is_not_null())
     results = []
     for name, law in LAWS.items():
         own = rows.filter(pl.col("named").list.contains(name) & (pl.col("estimator") == law.estimator))
@@ -150,25 +156,33 @@ def _result(name: str, law: Law, rows: pl.DataFrame) -> LawResult:
 
 def _slope(rows: pl.DataFrame) -> LawResult | None:
     """Fit the slope of log error over log sigma; None with fewer than three noise levels."""
-    ok = rows.filter((pl.col("status") == "ok") & (pl.col("noise_sigma") > 0) & (pl.col("error_oracle_deg") > 0))
-    means = ok.group_by("noise_sigma").agg(pl.col("error_oracle_deg").mean()).sort("noise_sigma")
-    if means.height < 3:
+    noisy = rows.filter(pl.col("noise_sigma") > 0)
+    ok = noisy.filter((pl.col("status") == "ok") & (pl.col("error_oracle_deg") > 0))
+    parts = {float(sigma): part for (sigma,), part in ok.group_by("noise_sigma")}
+    if len(parts) < 3:
         return None
-    slope = np.polyfit(np.log(means["noise_sigma"].to_numpy()), np.log(means["error_oracle_deg"].to_numpy()), 1)[0]
-    # The errors' spread over the realisations; the noise levels are independent.
-    spread = ok.group_by("noise_sigma").agg(
-        share=pl.col("error_oracle_deg").std() / pl.col("error_oracle_deg").mean() / pl.len().sqrt()
-    )
-    level = np.log(means["noise_sigma"].to_numpy())
-    error = float(spread["share"].to_numpy().mean() / np.sqrt(np.sum((level - level.mean()) ** 2)))
+    sigmas = sorted(parts)
+    means, shares = np.array([_mean_with_share(parts[sigma]) for sigma in sigmas]).T
+    slope = np.polyfit(np.log(sigmas), np.log(means), 1)[0]
+    # The noise levels are independent.
+    level = np.log(sigmas) - np.log(sigmas).mean()
+    error = float(np.sqrt(np.sum((level * shares) ** 2)) / np.sum(level**2))
     law = Law(
         "the same: slope of log error over log σ", f"1/2; here ± {number(error, 2)} by the errors' spread",
         "circle_pose", "", "", False,
     )  # fmt: skip
-    sigmas = f"σ = {means['noise_sigma'][0]:g} to {means['noise_sigma'][-1]:g}"
+    span = f"σ = {sigmas[0]:g} to {sigmas[-1]:g}"
     allowed = np.array([TOLERANCE_SHARE * BRANCH_SLOPE + 2 * error])
     measured, predicted = np.array([slope]), np.array([BRANCH_SLOPE])
-    return LawResult(SLOPE, law, (sigmas,), measured, predicted, rows.height, rows.height - ok.height, allowed)
+    return LawResult(SLOPE, law, (span,), measured, predicted, noisy.height, noisy.height - ok.height, allowed)
+
+
+def _mean_with_share(rows: pl.DataFrame) -> tuple[float, float]:
+    """Return the mean error, and its standard deviation over frames as a share of it; NaN for a single frame."""
+    errors = rows["error_oracle_deg"].to_numpy()
+    totals, counts, strata = summed(errors, *units(rows), None)
+    mean = float(errors.mean())
+    return mean, deviation_of_mean(totals, counts, strata) / mean if len(totals) > 1 else np.nan
 
 
 def is_tested(results: Sequence[LawResult]) -> bool:

@@ -20,6 +20,7 @@ from simtest.report.relief_figures import (
     sweep_axis,
     sweep_key,
     sweep_name,
+    sweep_position,
     sweeps,
 )
 from simtest.report.run_folder import Run
@@ -67,7 +68,7 @@ def _log(title: str, marks: list[Mark]) -> Axis:
 
 def _counts(rows: pl.DataFrame, x: str, label: str) -> ReliefFigure:
     """Describe the numbers of glints and of visible highlights over a swept quantity, with the law."""
-    rows = rows.with_columns(at=pl.col(x).mean().over("setting"))
+    rows = rows.with_columns(at=sweep_position(x))
     marks = []
     for column, name, colour, symbol in (
         ("cloud_glints", "glints", _BLUE, _GLINTS),

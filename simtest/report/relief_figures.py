@@ -86,6 +86,11 @@ def sweeps(run: Run, rows: pl.DataFrame) -> Iterator[tuple[str, str, pl.DataFram
                 yield name, str(label), part.filter(pl.col(name).is_not_null())
 
 
+def sweep_position(x: str) -> pl.Expr:
+    """Return where each row's setting lies on x; rounded, since means of one value over more rows differ in bits."""
+    return pl.col(x).mean().over("setting").round_sig_figs(12)
+
+
 def sweep_axis(x: str) -> Axis:
     """Return the axis of a swept quantity."""
     return Axis(_TITLES.get(x) or axis_title(x))
@@ -115,7 +120,7 @@ def _silent(run: Run, x: str, label: str, rows: pl.DataFrame) -> list[str]:
 
 def _over(rows: pl.DataFrame, x: str, label: str, colours: Mapping[str, str], silent: Sequence[str]) -> ReliefFigure:
     """Describe mean errors over one quantity: colour is the estimator, the symbol is the truth, dashes are the law."""
-    rows = rows.with_columns(at=pl.col(x).mean().over("setting"))
+    rows = rows.with_columns(at=sweep_position(x))
     axis = sweep_axis(x)
     marks, measured = [], []
     for name in estimator_order(rows["estimator"].to_list()):

@@ -148,7 +148,7 @@ class GalleryItem:
 class EstimatorFigures(BaseModel):
     """Figures of one setting and estimator in summary.json, with their headings; errors in deg."""
 
-    n: int | None = Field(None, title="rows")
+    n: int | None = Field(None, title="true highlights")
     n_ok: int | None = Field(None, title="ok")
     n_failed_by_reason: Annotated[dict[str, int], BeforeValidator(lambda v: v or {})] = Field({}, title="failed")
     n_missed: int | None = Field(None, title="missed")

@@ -104,9 +104,10 @@ def _sweep_figures(run: Run, rows: pl.DataFrame, most: int = 8) -> list[LineFigu
         if not kept:
             continue
         part = pl.concat(kept).with_columns(pl.col(name).cast(pl.Float64))
-        part = part.with_columns(setting=pl.lit(f"{name} = ") + pl.col(name).cast(pl.String))
+        # A point may pool several settings: these stay the strata of its interval.
+        part = part.with_columns(point=pl.lit(f"{name} = ") + pl.col(name).cast(pl.String))
         x = Axis(axis_title(name))
-        curves, empty = gather(part, Ask(name, "error_oracle_deg", "error_law_deg"), x)
+        curves, empty = gather(part, Ask(name, "error_oracle_deg", "error_law_deg", at="point"), x)
         if curves:
             slug = "".join(c if c.isalnum() else "_" for c in name)
             meaning = f" ({text})" if (text := describe_key(name)) else ""

@@ -5,13 +5,14 @@ from itertools import pairwise
 import numpy as np
 import polars as pl
 
-from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA
+from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, ON_INSTRUMENT
 from simtest.pages.axes import Axis
 from simtest.pages.chart import Chart, Mark, Panel
 from simtest.pages.palette import NEUTRAL, SERIES
 from simtest.pages.style import Symbol, number
 from simtest.report.relief_figures import ReliefFigure
 from simtest.report.run_folder import Run
+from simtest.validation.row_kinds import row_kind
 
 _NEEDED = {"visible_id", "visible_snr", "frame_visible"}
 _FOUND, _FALSE = Symbol("o", "circle", "●"), Symbol("x", "x", "✕")
@@ -23,10 +24,14 @@ def visible_figures(run: Run) -> list[ReliefFigure]:
     if not {*run.results.columns} >= _NEEDED:
         return []
     rows = run.results.filter(pl.col("frame_visible").is_not_null())
-    detections = rows.filter(pl.col("specularity").is_not_null()).unique([*_FRAME, "specularity"], maintain_order=True)
+    # What shines on an instrument is none of the frame's visible highlights.
+    detections = rows.filter(pl.col("specularity").is_not_null() & (row_kind(rows) != ON_INSTRUMENT))
+    detections = detections.unique([*_FRAME, "specularity"], maintain_order=True)
     if detections.is_empty():
         return []
-    bright = pl.col("visible_id").is_not_null() & (pl.col("visible_snr") >= HIGHLIGHT_CONTRAST_SIGMA)
+    # Without noise, no peak has a finite ratio to it, and the column is null.
+    over_noise = pl.col("visible_snr").fill_null(np.inf) >= HIGHLIGHT_CONTRAST_SIGMA
+    bright = pl.col("visible_id").is_not_null() & over_noise
     found = detections.group_by(_FRAME).agg(
         bright.sum().alias("found"), pl.col("visible_id").is_null().sum().alias("none")
     )

@@ -126,7 +126,9 @@ def guide_of(results: pl.DataFrame, conditions: Mapping[str, Mapping[str, object
     true = results.filter(pl.col("true_id").is_not_null() & (pl.col("estimator") != MOTION))
     shared, found = situations_of(true, conditions or {})
     held = {setting for situation in found for setting in situation.settings}
-    left = [str(name) for name in results["setting"].unique(maintain_order=True) if name not in held]
+    # A setting without a detection has no row at all.
+    names = dict.fromkeys([*results["setting"].unique(maintain_order=True), *(conditions or {})])
+    left = [str(name) for name in names if name not in held]
     # A cloud's number is that of the base's highlight: it counts where its frame has no glint of that number.
     counts = (true.select(key).n_unique() for key in ([*FRAME, "true_id"], [*FRAME]))
     return Guide(shared, tuple(advice for each in found for advice in advice_of(each, true)), tuple(left), *counts)

@@ -7,6 +7,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.report import write_report
 from simtest.report.glint_figures import LEVEL, glint_figures, pooled_ratio
 from simtest.report.relief_figures import KD
@@ -216,7 +217,7 @@ def test_detection_is_scored_on_visible_highlights(tmp_path):
         [
             {
                 "setting": "s", "realisation": frame, "specularity": spot, "visible_id": seen, "visible_snr": snr,
-                "frame_visible": visible, "estimator": name,
+                "frame_visible": visible, "estimator": name, "true_id": None, "status": "ok",
             }
             for frame, spot, seen, snr, visible in rows
             for name in ("cone_axis", "curved")
@@ -227,3 +228,20 @@ def test_detection_is_scored_on_visible_highlights(tmp_path):
     assert figure.measured[0].startswith("40 % of 5 visible highlights are found (40 % where a frame holds 1 to 9;")
     assert figure.measured[0].endswith("1 of 4 detections show nothing visible.")
     assert visible_figures(SimpleNamespace(results=results.drop("visible_snr"))) == []
+
+
+def test_of_visible_highlights_instruments_are_none_and_no_noise_hides_none():
+    schema = {name: pl.Int64() for name in ("specularity", "true_id", "visible_id")} | {"visible_snr": pl.Float64()}
+    # Without noise there is no ratio to it. Two detections lie on an instrument, one of them in a spot that is seen.
+    rows = [(0, 0, None, False), (1, None, None, True), (2, 1, 30.0, True)]
+    results = pl.DataFrame(
+        [
+            {"setting": "s", "realisation": 0, "specularity": i, "true_id": None, "visible_id": seen,
+             "visible_snr": snr, ON_INSTRUMENT: metal, "frame_visible": 1, "estimator": "cone_axis", "status": "ok"}
+            for i, seen, snr, metal in rows
+        ],
+        schema_overrides=schema,
+    )  # fmt: skip
+    (figure,) = visible_figures(SimpleNamespace(results=results))
+    assert figure.measured[0].startswith("100 % of 1 visible highlights are found")
+    assert figure.measured[0].endswith("0 of 1 detections show nothing visible.")

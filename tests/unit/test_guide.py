@@ -260,6 +260,9 @@ def test_false_detections_count_nowhere_and_settings_without_highlights_are_name
     guide = guide_from(rows_of("cone_axis", [1.0]), false)
     assert (guide.left_out, guide.advice[0].n) == (("b",), 1)
     assert guide_of(pl.DataFrame(false)).advice == ()
+    # Where nothing at all was seen there is no row.
+    told = {"a": {}, "dark": {}}
+    assert guide_from(rows_of("cone_axis", [1.0]), conditions=told).left_out == ("dark",)
 
 
 def frames_of(estimator, errors, **more):

@@ -101,6 +101,42 @@ def test_the_branch_point_is_held_against_the_rows_own_ratio_and_a_slope_of_half
         assert slope.measured[0] == pytest.approx(power, abs=1e-6)
 
 
+def test_a_false_detection_says_nothing_of_a_law():
+    found = result(run_of(offset("s", 0.3, 0.3), offset("s", None, None, true_id=None)))
+    assert (found.verdict, found.failed, found.rows) == (MET, 0, 1)
+
+
+def branch(sigma, scatter, highlights=1):
+    """Rows of the branch point at one noise level: an error for each frame, the same at all of its highlights."""
+    made = []
+    for i, factor in enumerate(scatter):
+        delta = 0.5 * (factor * sigma**0.5) ** 2
+        error = float(np.degrees(laws.branch_point_error(delta)))
+        row = {"estimator": "circle_pose", "setting": f"{sigma}", "realisation": i, "laws": "branch_point",
+               "noise_sigma": sigma, "axis_ratio": 1 - delta, "error_oracle_deg": error}  # fmt: skip
+        made += [row | {"true_id": j} for j in range(highlights)]
+    return made
+
+
+def test_a_setting_without_noise_is_no_departure_from_the_slope_nor_hides_a_share():
+    rows = [row for sigma in (0.0, 0.01, 0.02, 0.04) for row in branch(sigma, (0.9, 1.0, 1.1))]
+    slope = result(run_of(*rows), SLOPE)
+    assert (slope.verdict, slope.failed, slope.rows) == (MET, 0, 9)
+    assert "–" not in result(run_of(*rows), "branch_point").cells["share"]
+
+
+def test_the_slopes_error_is_that_of_frames_at_each_level():
+    scatters = {0.01: (0.5, 1.0, 1.5), 0.02: (1.0, 1.0, 1.0), 0.04: (0.9, 1.0, 1.1)}
+    level = np.log(list(scatters)) - np.log(list(scatters)).mean()
+    spread = np.array([np.std(each, ddof=1) / np.sqrt(3) for each in scatters.values()])
+    error = np.sqrt(np.sum((level * spread) ** 2)) / np.sum(level**2)
+    # Highlights of one frame share its error, and say nothing new.
+    for highlights in (1, 20):
+        rows = [row for sigma, scatter in scatters.items() for row in branch(sigma, scatter, highlights)]
+        (allowed,) = result(run_of(*rows), SLOPE).tolerance
+        assert allowed == pytest.approx(0.015 + 2 * error, rel=1e-6)
+
+
 def test_runs_that_name_no_law_have_no_section(tmp_path):
     assert law_results(run_of(offset("s", 0.3, 0.3, laws=None))) == []
     results = law_results(run_of(offset("s", 0.3, 0.3)))

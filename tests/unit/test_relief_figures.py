@@ -80,6 +80,18 @@ def test_means_against_both_truths_stand_beside_the_dashed_law(swept):
     assert np.all(base.bars.high > base.y)
 
 
+def test_settings_at_one_value_are_one_point_whatever_their_numbers_of_rows(tmp_path):
+    rows = []
+    # 0.1 three times adds up to a little more than 0.3.
+    for wave, count in ((1.0, 3), (2.0, 4)):
+        for slope in (0.1, 0.2):
+            swept = {SLOPE: slope, "surface.relief.bands.0.wavelength_mm": wave}
+            rows += made("cone_axis", "plane", f"{slope}, {wave}", slope, count, **swept)
+    mark = marks(relief_figures(run_of(rows, tmp_path), COLOURS)[0])[1]["cone_axis", "●"]
+    np.testing.assert_allclose(mark.x, [0.1, 0.2])
+    assert all(text.endswith(" of 7") for text in mark.hover)
+
+
 def test_what_was_measured_is_told_with_what_gave_no_answer(swept):
     told = " ".join(relief_figures(swept, COLOURS)[0].measured)
     assert "cone_axis: 0.1° against the fine surface, 5.84° against the base, 0.998 of the law" in told

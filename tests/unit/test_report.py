@@ -10,6 +10,7 @@ from html.parser import HTMLParser
 import numpy as np
 import polars as pl
 import pytest
+from scipy.special import stdtrit
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
@@ -391,6 +392,25 @@ def test_other_swept_parameters_get_a_figure(tmp_path):
     assert figure.key == "error_vs_sensor_noise_sigma"
     np.testing.assert_allclose(figure.curves[0].x, [0, 0.02, 0.05])
     assert figure.key in read_page(write_report(path)).ids()
+
+
+def test_a_point_of_several_settings_has_the_interval_of_their_frames(tmp_path):
+    """A grid of noise and something else: a point of the noise pools the settings, whose differences are no chance."""
+    rng = np.random.default_rng(0)
+    base = make_rows("noise")[0] | {"label": "grid", "kd_min": 0.0, "kd_max": 0.0, "status": "ok", "true_id": 0}
+    rows = [
+        base | {"setting": f"noise {noise}, focus {focus}", "realisation": i, "sensor.noise_sigma": noise,
+                "camera.focus": focus, "error_oracle_deg": 5 + 10 * focus + float(rng.normal())}
+        for noise in (0.01, 0.02) for focus in (0.0, 1.0, 2.0) for i in range(5)
+    ]  # fmt: skip
+    run = read_run(make_run(tmp_path, "noise", rows, items=0))
+    figure = next(each for each in line_figures(run) if each.key == "error_vs_sensor_noise_sigma")
+    (curve,) = figure.curves
+    assert curve.names == ("sensor.noise_sigma = 0.01", "sensor.noise_sigma = 0.02")
+    errors = np.reshape([row["error_oracle_deg"] for row in rows], (2, 3, 5))
+    deviation = np.sqrt(errors.var(axis=2, ddof=1).sum(axis=1) / 5) / 3
+    # Student's with 15 frames less 3 settings; 4 degrees of freedom, as of 5 frames, would reach 2.78.
+    np.testing.assert_allclose((curve.high - curve.low) / (2 * deviation), stdtrit(12, 0.975), rtol=0.1)
 
 
 def test_no_ok_row_at_all(tmp_path):
