@@ -79,8 +79,12 @@ def _leaders(rows: list[Ranked]) -> str:
 
 
 def _names(rows: list[Ranked]) -> JsonObject:
-    """Return the ranks of a table, by core and version, best first."""
-    return {_name(row.certificate): row.rank for row in rows}
+    """Return the ranks of a table, by core and version, best first; beside a name that several have stands the file."""
+    names = [_name(row.certificate) for row in rows]
+    return {
+        name if names.count(name) == 1 else f"{name} ({row.certificate.path})": row.rank
+        for name, row in zip(names, rows, strict=True)
+    }
 
 
 def _name(certificate: Certificate) -> str:

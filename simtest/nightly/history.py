@@ -73,7 +73,8 @@ def append(folder: Path, rows: pl.DataFrame, scratch: Path) -> Path:
 
 def trend_rows(rows: pl.DataFrame) -> pl.DataFrame:
     """Return the rows and columns of the history that `read_history` returns."""
-    return rows.filter(pl.col("quantity").is_in(TRENDS)).select(*TREND_COLUMNS)
+    # Figures of no estimator are checks of older versions.
+    return rows.filter(pl.col("quantity").is_in(TRENDS), pl.col("estimator") != "").select(*TREND_COLUMNS)
 
 
 def read_history(folder: Path, newest: int = NEWEST) -> tuple[pl.DataFrame, list[str]]:

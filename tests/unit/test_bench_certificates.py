@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from simtest.bench.certificate import CERTIFICATE, read_certificate
-from simtest.bench.leaderboard import ranked, read_entries, write_leaderboard
+from simtest.bench.leaderboard import Board, ranked, read_entries, write_leaderboard
 from simtest.bench.run import BenchRun, overall_of, run_bench
 from simtest.bench.suite import Suite
 from simtest.errors import InputError
@@ -159,3 +159,21 @@ def test_a_core_without_a_score_has_no_rank(tmp_path: Path) -> None:
     rows = ranked(held, ["smooth"], lambda certificate: certificate.content["value"])
     assert [(row.certificate.path.name, row.rank) for row in rows] == [("b", "1"), ("a", "–")]
     assert [row.rank for row in ranked(held[:1], ["smooth"], lambda _: None)] == ["–"]
+
+
+def test_certificates_of_one_name_each_have_a_rank(tmp_path: Path) -> None:
+    """A command with two options has one name."""
+    from simtest.bench.certificate import Certificate
+
+    held = [
+        Certificate(
+            tmp_path / name,
+            {"core": {"name": core, "version": None}, "value": value,
+             "parts": {"smooth": {"scenes": {"plane": [[1, value], [1, value], [1, value]]}}}},
+        )
+        for name, core, value in (("fast", "my_core", 8.0), ("slow", "my_core", 1.0), ("other", "cone_axis", 4.0))
+    ]  # fmt: skip
+    rows = ranked(held, ["smooth"], lambda certificate: certificate.content["value"])
+    assert Board(rows, {}).to_json()["overall"] == {
+        f"my_core ({tmp_path / 'slow'})": "1", "cone_axis": "2", f"my_core ({tmp_path / 'fast'})": "3"
+    }  # fmt: skip

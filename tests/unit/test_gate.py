@@ -3,7 +3,7 @@
 import numpy as np
 import polars as pl
 import pytest
-from gate_nights import changed, night, raised, rows
+from gate_nights import changed, night, raised, rows, whole
 
 from simtest.nightly.gate.compare import compare
 from simtest.nightly.gate.figures import digest, setting_figures
@@ -98,6 +98,33 @@ def test_an_error_that_is_no_number_is_no_answer():
     verdict = compare(night(broken), night(table))
     assert one(verdict, "unanswered")["tonight"] == pytest.approx(0.6)
     assert np.isfinite(one(verdict, "mean_penalised_deg")["tonight"])
+
+
+def test_answers_whose_errors_are_no_numbers_are_lost_in_one_realisation_too():
+    table = rows(count=1, settings=("a", "b"))
+    verdict = compare(night(changed(table, pl.col("setting") == "a", error_deg=float("nan"))), night(table))
+    row = one(verdict, "single answers")
+    assert (row["setting"], row["baseline"], row["tonight"], row["n"], row["outcome"]) == ("a", 1, 0, 1, "worse")
+    assert verdict.exit_code == 1
+
+
+def test_detections_that_no_longer_count_as_on_an_instrument_are_false_ones():
+    """All other columns are the same bytes."""
+    held = whole(settings=("a",)).with_columns(on_instrument=pl.col("true_id").is_null())
+    lost = held.with_columns(on_instrument=pl.lit(False))
+    verdict = compare(night(lost), night(held))
+    assert (verdict.bit_equal, verdict.exit_code) == (False, 1)
+    moved = verdict.comparisons.filter(quantity="single false")
+    assert moved["baseline"].to_list() == [0, 0]
+    assert moved["tonight"].to_list() == [5, 5]
+    # Where nothing lies on an instrument, the column says nothing.
+    assert digest(lost) == digest(whole(settings=("a",)))
+
+
+def test_counts_are_written_in_full():
+    table = rows(count=1234)
+    verdict = compare(night(table.filter(pl.col("realisation") != 3)), night(table))
+    assert verdict.causes[0].startswith("cone_axis in e, a: the number of true highlights is 1233, was 1234 (worse).")
 
 
 def test_one_realisation_decides_nothing_but_that_nothing_changed():

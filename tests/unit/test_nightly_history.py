@@ -53,6 +53,16 @@ def test_a_night_reads_back_as_it_was_written(folder):
     assert 0 < read.height < written.height
 
 
+def test_checks_of_older_versions_are_no_trend(folder):
+    file = keep(folder, 0)
+    rows = pl.read_parquet(file)
+    check = rows.head(1).with_columns(
+        experiment=pl.lit("costs"), estimator=pl.lit(""), quantity=pl.lit("unanswered"), value=pl.lit(0.0)
+    )
+    pl.concat([rows, check]).write_parquet(file)
+    assert "costs" not in read_history(folder)[0]["experiment"]
+
+
 def test_an_empty_history_has_the_columns(folder, tmp_path):
     for empty in (tmp_path, folder):
         read, notes = read_history(empty)

@@ -210,6 +210,12 @@ def test_a_table_without_answers_is_refused(record, tmp_path):
         read_answers(write(tmp_path / "t.csv", {**GOOD, "status": "missed"}), record, "mine")
 
 
+def test_a_method_that_missed_all_highlights_is_scored_beside_others(record, tmp_path):
+    rows = ({**GOOD, "estimator": "a", "status": ""}, {**GOOD, "estimator": "b", "status": "missed"})
+    answers = read_answers(write(tmp_path / "t.csv", *rows), record, "mine")
+    assert {name: sum(map(len, frames.values())) for name, frames in answers.items()} == {"a": 1, "b": 0}
+
+
 def test_rounded_normals_are_scaled_and_exact_ones_stay(record, tmp_path):
     rounded = write(tmp_path / "r.csv", {**GOOD, "normal_y": "0.5999", "normal_z": "-0.8001"})
     answer = read_answers(rounded, record, "mine")["mine"][FRAME][0]

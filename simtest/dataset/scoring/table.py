@@ -48,7 +48,8 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
     Returns
     -------
     mapping
-        Answers by estimator and frame. Rows whose status is missed are left out, as highlights without a row are.
+        Answers by estimator and frame. Rows whose status is missed are left out, as highlights without a row are; their
+        estimator is there all the same.
 
     Raises
     ------
@@ -69,18 +70,19 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
     made: dict[str, dict[str, list[Answer]]] = {}
     seen: dict[tuple[object, ...], int] = {}
     for row in range(table.rows):
+        frame, estimator = table.texts["frame"][row], table.texts["estimator"][row] or name
+        check_name(estimator, f"{shown(path)}: row {row + 1}: estimator")
+        of_estimator = made.setdefault(estimator, {})
         if table.texts["status"][row] == MISSED:
             continue
-        frame, estimator = table.texts["frame"][row], table.texts["estimator"][row] or name
-        own = made.setdefault(estimator, {}).setdefault(frame, [])
-        check_name(estimator, f"{shown(path)}: row {row + 1}: estimator")
+        own = of_estimator.setdefault(frame, [])
         where = ("specularity", numbers[row]) if numbers[row] is not None else ("pixel", *points[row].tolist())
         if (before := seen.setdefault((estimator, frame, *where), row)) != row:
             raise table.refuse(row, f"frame {frame}: answers the same highlight as row {before + 1}; must be one row")
         stated = (points[row], normals[row], seconds[row], covariances[row])
         result = _estimate(table, row, *stated) if is_answer[row] else _failure(table, row)
         own.append(Answer(result, points[row], numbers[row]))
-    if not made:
+    if not any(made.values()):
         raise InputError(f"{shown(path)}: holds no answer; must have a row for each normal")
     return made
 

@@ -180,4 +180,7 @@ def _budget(row: Mapping[str, object], tonight: NightlyRun, baseline: NightlyRun
 
 
 def _number(value: object) -> str:
-    return "nothing" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+    """Return a number with three digits, a whole one with all."""
+    if isinstance(value, float):
+        return f"{value:.0f}" if value.is_integer() else f"{value:.3g}"
+    return "nothing" if value is None else str(value)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 import polars as pl
 
-from simtest.conventions import MOTION_COLUMNS
+from simtest.conventions import MOTION_COLUMNS, ON_INSTRUMENT
 from simtest.nightly.gate.quantities import COVERED, IS_TRUE, RATIO_OFF
 from simtest.nightly.records import CELL, Cell, Figure, figure_table
 from simtest.runtime.statistics import mean_interval, share_interval
@@ -122,13 +122,14 @@ def digests_of(rows: pl.DataFrame) -> dict[Cell, str]:
 
     SHA-256, hexadecimal, over the cell's rows sorted by `DIGEST_KEYS`: which entries are null, the keys as int64, the
     numbers as float64, little-endian, the names, and the flags of answers. A column that is absent counts as null. What
-    motion told is hashed in the cells that have it.
+    motion told is hashed in the cells that have it, and which detections show an instrument where one does.
     """
     held = rows.sort(*CELL, *DIGEST_KEYS, nulls_last=True)
     parts: list[np.ndarray] = []
     for names, kind, dtype in ((DIGEST_KEYS, pl.Int64, "<i8"), (DIGEST_NUMBERS, pl.Float64, "<f8")):
         parts += _nulls_and_values(held, names, kind, dtype)
     of_motion = _nulls_and_values(held, MOTION_COLUMNS, pl.Float64, "<f8")
+    on_instrument = _nulls_and_values(held, (ON_INSTRUMENT,), pl.Int64, "<i8")[1]
     flags = pl.when(pl.col("status") == "ok").then(_column(held, "flags")).alias("flags")
     texts = held.select(*(_column(held, name).alias(name) for name in DIGEST_NAMES), flags).fill_null("").rows()
     cells = held.with_row_index("row").group_by(CELL, maintain_order=True).agg(first="row").rows()
@@ -136,7 +137,9 @@ def digests_of(rows: pl.DataFrame) -> dict[Cell, str]:
     for *cell, index in cells:
         own = slice(index[0], index[-1] + 1)
         found = hashlib.sha256(f"{len(index)} {DIGEST_KEYS} {DIGEST_NUMBERS} {DIGEST_NAMES}".encode())
-        for part in (*parts, *(() if of_motion[0][own].all() else of_motion)):
+        optional = [*(() if of_motion[0][own].all() else of_motion)]
+        optional += [on_instrument] if on_instrument[own].any() else []
+        for part in (*parts, *optional):
             found.update(part[own].tobytes())
         found.update(repr(texts[own]).encode())
         made[Cell(*cell)] = found.hexdigest()

@@ -86,8 +86,10 @@ def _told(found: pl.DataFrame, quantity: str, unit: str, outcome: pl.Expr | None
 
 def _status(both: pl.DataFrame) -> pl.DataFrame:
     before, after = pl.col("answered"), pl.col("answered_2")
+    # An answer whose error is no number is none, whatever its status.
+    other = pl.col("status").ne_missing(pl.col("status_2")) | (before != after)
     found = both.group_by(CELL, maintain_order=True).agg(
-        n=pl.col("status").ne_missing(pl.col("status_2")).sum(), baseline=before.sum(), tonight=after.sum(),
+        n=other.sum(), baseline=before.sum(), tonight=after.sum(),
         lost=(before & ~after).sum(),
     )  # fmt: skip
     many = (pl.col("lost") > 0) & (pl.col("lost") >= _LOST_HALF * pl.col("baseline"))
