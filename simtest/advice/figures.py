@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from simtest.advice.plan import DISTANCES
 from simtest.runtime.statistics import Interval, mean_interval
 from simtest.validation.guide import Advice, MethodFigures, advice_of
 from simtest.validation.paired import targets_of
@@ -130,15 +131,15 @@ class Found:
         return record
 
 
-def read_results(results: pl.DataFrame, frames: int) -> Found:
-    """Read the results of an advice's experiment, of so many frames."""
+def read_results(results: pl.DataFrame, frames: int, distances: int = DISTANCES) -> Found:
+    """Read the results of an advice's experiment, of so many frames, as many at each of some distances."""
     rows = results if STRATUM in results.columns else results.with_columns(pl.lit(0.0).alias(STRATUM))
     rows = rows.with_columns(pl.format("{} mm", STRATUM).alias("setting"))
     targets = targets_of(rows)
     single = next((name for name, target in targets.items() if target == "fine"), None)
     visible, found, detections, false = _counted(rows.filter(pl.col("estimator") == single))
-    each = frames // max(rows["setting"].n_unique(), 1)
-    methods = [_answers(name, target, rows, each) for name, target in targets.items()]
+    # Not of the distances that have rows: one without a highlight has none.
+    methods = [_answers(name, target, rows, frames // distances) for name, target in targets.items()]
     return Found(frames, visible, found, detections, false, methods, _choices(rows))
 
 

@@ -52,7 +52,8 @@ def advise(
 ) -> None:  # fmt: skip
     """Measure what a scope and its lights can reach before an organ: best method, expected error, break-points.
 
-    Every figure is measured on frames rendered for the purpose; the page prints the command behind each.
+    The errors are measured on frames rendered for the purpose, the break-points follow from laws; the page prints the
+    command behind each measured figure.
 
     Parameters
     ----------

@@ -52,10 +52,10 @@ def _distance_marks(row: int, d: StatisticDistance) -> list[Mark]:
     low, high = map(distance_text, d.interval)
     told += f"\ndistance {distance_text(d.distance)}\n95 % interval {low} to {high}"
     value, *interval = np.clip([d.distance, *d.interval], LEAST_DISTANCE, MOST_DISTANCE)
-    return [
-        Mark(interval, [row, row], colour, line="solid", width=2.5),
-        Mark([value], [row], colour, symbol=VERDICT_SYMBOLS[d.verdict], size=10, hover=[told]),
-    ]
+    point = Mark([value], [row], colour, symbol=VERDICT_SYMBOLS[d.verdict], size=10, hover=[told])
+    if np.isnan(d.interval).any():
+        return [point]
+    return [Mark(interval, [row, row], colour, line="solid", width=2.5), point]
 
 
 def distribution_charts(found: Comparison) -> list[Chart]:

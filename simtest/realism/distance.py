@@ -46,7 +46,7 @@ class StatisticDistance:
         Mean over the statistic's columns; NaN where a side has too few scenes that tell it (two real ones, one
         generated), infinite where all real scenes are alike and the generated ones differ.
     interval : tuple of float
-        95 % interval by bootstrap over the scenes of both sides.
+        95 % interval by bootstrap over the scenes of both sides; NaN without a distance, or with one generated scene.
     n_real, n_generated : int
         Scenes that tell it, all of its columns.
     """
@@ -152,8 +152,11 @@ def _interval(value: float, samples: Array, exchanged: Array, scenes: int) -> tu
     """Return the 95 % interval of a distance; `scenes` are those of the smaller side.
 
     Of two sets of one distribution each estimate is above 0. So 0 is the lower end where sides to which the scenes were
-    dealt anew often differ as much (`exchanged`, see `_column_distance`).
+    dealt anew often differ as much (`exchanged`, see `_column_distance`). NaN with a single scene on a side, whose
+    spread is unknown.
     """
+    if scenes < 2:
+        return np.nan, np.nan
     if np.isfinite(samples).all():
         low, high = widened(value, samples, scenes)
     else:

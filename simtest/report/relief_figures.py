@@ -175,8 +175,9 @@ def mean_mark(
     groups: list[tuple[float, pl.DataFrame]], value: str, colour: str, name: str, symbol: Symbol, about: str = "",
     told: Callable[[float], str] = number,
 ) -> Mark:  # fmt: skip
-    """Describe the means of a column of rows by x, with their intervals over frames."""
-    groups = sorted(((x, rows) for x, rows in groups if rows.height), key=lambda group: group[0])
+    """Describe the means of a column of rows by x, with their intervals over frames; rows without a value are none."""
+    valued = [(x, rows.drop_nulls(value)) for x, rows in groups]
+    groups = sorted(((x, rows) for x, rows in valued if rows.height), key=lambda group: group[0])
     means = [float(rows[value].mean()) for _, rows in groups]  # type: ignore[arg-type]
     low, high = np.array([bar(rows, value) for _, rows in groups]).reshape(-1, 2).T
     hover = [

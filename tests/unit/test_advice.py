@@ -300,7 +300,7 @@ def results(errors, frame_of, status=None):
 
 
 def test_figures_of_known_errors():
-    found = read_results(results([1.0, 3.0, 2.0, 2.0, 4.0, 6.0], [0, 0, 1, 1, 2, 3]), 4)
+    found = read_results(results([1.0, 3.0, 2.0, 2.0, 4.0, 6.0], [0, 0, 1, 1, 2, 3]), 4, 2)
     method = found.method("cone_axis")
     assert method.fine.mean_deg == pytest.approx(3.0)
     assert method.base.mean_deg == pytest.approx(6.0)
@@ -309,6 +309,14 @@ def test_figures_of_known_errors():
     assert (found.visible, found.detections, found.false) == (40, 6, 0)
     assert found.choices[0].best == "cone_axis"
     assert set(found.choices[0].by_distance) == {20.0, 30.0}
+
+
+def test_distances_without_a_highlight_do_not_add_frames_to_the_others():
+    """Of 80 frames 10 are at each distance, also where six of the eight distances have no row."""
+    rows = results([1.0, 3.0, 2.0, 2.0, 4.0, 6.0, 1.5, 1.2], [0, 0, 1, 1, 2, 3, 4, 5])
+    found = read_results(rows, 80).method("cone_axis").fine
+    rows = rows.with_columns(setting=pl.col("surface.distance_mm").cast(pl.String))
+    assert found.interval_deg == pytest.approx(mean_error(rows, "error_fine_deg", 10).interval_deg)
 
 
 def test_refused_and_missed_are_counted_apart():
@@ -426,7 +434,7 @@ def test_strata_are_read_from_the_frames_of_a_run(tmp_path):
     ("high", "said"), [(1.1, None), (1.29, "32 frames"), (2.49, "344 frames"), (200.0, "more frames")]
 )
 def test_a_wide_interval_names_the_frames_that_narrow_it(high, said):
-    found = read_results(results([1.0, 1.2, 0.8, 1.0], [0, 1, 2, 3]), 8)
+    found = read_results(results([1.0, 1.2, 0.8, 1.0], [0, 1, 2, 3]), 8, 2)
     own = replace(found.method("cone_axis").fine, mean_deg=1.0, interval_deg=(0.5, high))
     found = replace(found, methods=[replace(found.method("cone_axis"), fine=own)])
     advised = SimpleNamespace(found=found)
@@ -444,7 +452,7 @@ def test_a_wide_interval_names_the_frames_that_narrow_it(high, said):
 @pytest.mark.parametrize(("base_deg", "said"), [(2.5, True), (6.5, False), (None, False)])
 def test_the_best_for_the_base_is_compared_with_fine_normals(base_deg, said):
     """`cloud` is ranked alone for the base: a method of the fine surface that comes nearer to it is named."""
-    found = read_results(results([1.0, 1.2, 0.8, 1.0], [0, 1, 2, 3]), 8)
+    found = read_results(results([1.0, 1.2, 0.8, 1.0], [0, 1, 2, 3]), 8, 2)
     single = found.method("cone_axis")
     near = replace(single, base=replace(single.fine, mean_deg=base_deg))
     cloud = replace(single, estimator="cloud", target="base", base=replace(single.fine, mean_deg=6.0))

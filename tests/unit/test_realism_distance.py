@@ -60,6 +60,14 @@ def test_few_scenes_carry_no_verdict():
     assert all(np.isfinite(d.distance) for d in distances(scenes(4), scenes(30, seed=1)))
 
 
+@pytest.mark.parametrize("real", [2, 6])
+def test_one_generated_scene_gives_a_distance_without_an_interval(real):
+    for d in distances(scenes(real), scenes(1, seed=1)):
+        assert np.isfinite(d.distance)
+        assert np.isnan(d.interval).all()
+        assert d.verdict == "too few scenes"
+
+
 def test_what_no_frame_tells_is_a_stated_gap():
     real, generated = scenes(6), scenes(6, seed=1)
     for side in generated.values():

@@ -127,6 +127,17 @@ def test_a_relief_without_a_law_is_drawn_without_dashes(tmp_path):
     assert "of the law" not in " ".join(figure.measured)
 
 
+def test_a_method_of_clouds_is_drawn_against_the_base_alone(tmp_path):
+    """A method that reports the base's normal alone has no error against the fine surface."""
+    rows = [row for s in (2.0, 4.0) for row in made("curved", "plane", f"{s}", s, **{SLOPE: s})]
+    clouds = [row for s in (2.0, 4.0) for row in made("cone_axis", "plane", f"{s}", s, **{SLOPE: s})]
+    rows += [row | {"error_fine_deg": None} for row in clouds]
+    figure, *_ = relief_figures(run_of(rows, tmp_path), COLOURS)
+    _, by_name = marks(figure)
+    assert len(by_name["cone_axis", "▲"].x) + len(by_name["cone_axis", "●"].x) == 2
+    assert any(text.startswith("cone_axis: – against the fine surface") for text in figure.measured)
+
+
 def test_the_page_shows_the_figures(swept, tmp_path):
     swept.results.write_parquet(tmp_path / "results.parquet")
     (tmp_path / "summary.json").write_text(json.dumps({"run": {}, "experiments": {}}))
