@@ -50,6 +50,8 @@ class Reader:
         page.on("pageerror", lambda error: self.complaints.append(str(error)))
         page.on("request", lambda request: self.asked.append(request.url))
         page.goto(self.address)
+        # Charts are drawn once they come into view.
+        page.locator(TREND).scroll_into_view_if_needed()
         page.wait_for_selector("#trends .main-svg")
         return page
 
