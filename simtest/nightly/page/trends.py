@@ -16,7 +16,9 @@ from simtest.pages.style import NEUTRAL, Symbol, number
 TITLES = dict(zip(TRENDS, ("mean error (deg)", "unanswered", "in the 95 % region"), strict=True))
 """What the panels show, by quantity."""
 
-_TICKS = 6
+_TICKS = 4
+"""As many dates stand side by side on a phone."""
+
 _DAY_S = 86_400.0
 _POINT, _CROSS = Symbol("o", "circle", "●"), Symbol("X", "x", "✖")
 
