@@ -46,6 +46,7 @@ def run(folder, *experiments):
     ]
 
 
+@pytest.mark.ci
 @pytest.mark.law
 @pytest.mark.render
 def test_results_break_no_rule(tmp_path):
@@ -59,6 +60,7 @@ def test_results_break_no_rule(tmp_path):
     assert set(made[0]["noise_sigma"]) == {0.03}
 
 
+@pytest.mark.ci
 @pytest.mark.law
 @pytest.mark.render
 def test_reversed_signs_of_motion_are_seen_where_nothing_else_changes(tmp_path):

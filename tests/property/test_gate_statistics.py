@@ -155,7 +155,7 @@ def pooled_p(units, factor):
     return np.array([pooled(found[part], ERROR).worse[0] for part in parts])
 
 
-@pytest.mark.parametrize("units", [1, pytest.param(2, marks=pytest.mark.ci), 8])
+@pytest.mark.parametrize("units", [*(pytest.param(n, marks=pytest.mark.ci) for n in (1, 2)), 8])
 def test_cells_together_keep_their_level_under_heavy_tails(units):
     """At 0.05: as many of 300 nights as have a chance below 1e-3 / 3 are too many; a tenfold error must be seen."""
     most = stats.binom.isf(1e-3 / 3, NIGHTS, 0.05)

@@ -122,6 +122,7 @@ def test_causes_name_the_part_of_the_budget_that_moved():
     assert not any(cause.startswith("cone_axis") for cause in verdict.causes)
 
 
+@pytest.mark.ci
 def test_many_findings_are_counted_in_one_line():
     table = rows(settings=tuple("abcdefghijkl"), estimators=tuple("opqrstuvwxyz"))
     verdict = compare(night(changed(table, True, error_law_deg=3.0, peak_snr=9.0)), night(table))

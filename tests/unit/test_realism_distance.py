@@ -43,6 +43,7 @@ def test_distance_is_the_wasserstein_distance_over_the_left_out_scenes():
     assert found["radius"].interval[0] < expected
 
 
+@pytest.mark.ci  # meanwhile: test_realism_intervals
 def test_two_halves_of_one_set_are_told_apart_on_nothing():
     """Negative control over 12 statistics and 10 seeds; a shift by two spreads is told on all."""
     for seed in range(10):
