@@ -157,8 +157,7 @@ def _moments(totals: Array, counts: Array, strata: IntArray, others: Array) -> t
     deviation = math.sqrt(float(np.sum((1 - 1 / size) * off**2)))
     if not deviation:
         return 0.0, 0.0
-    # The third central moment without bias; two groups tell none.
-    third = -float(np.sum(np.where(size > 2, (size - 1) ** 2 / (size * np.maximum(size - 2, 1)), 0.0) * off**3))
+    third = -float(np.sum((1 - 1 / size) ** 3 * off**3))
     return deviation * math.sqrt(len(totals) / np.count_nonzero(size > 1)), third / deviation**3
 
 

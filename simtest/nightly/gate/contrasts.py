@@ -179,14 +179,12 @@ class _Arm:
 
 
 def _third(m: Mapping[str, Array], mean: Array, of: str) -> Array:
-    """Return the third central moment of a mean of rows, without bias; 0 of fewer than three units."""
+    """Return the third central moment of a mean of rows."""
     cubes = (
         m[of * 3] - 3 * mean * m[f"{of}{of}n"] + 3 * mean**2 * m[f"{of}nn"] - mean**3 * m["nnn"]
     )  # fmt: skip
-    units = m["units"]
     with np.errstate(divide="ignore", invalid="ignore"):
-        moment = cubes * units**2 / (m["rows"] ** 3 * (units - 1) * (units - 2))
-    return np.where(units > 2, moment, 0.0)
+        return np.asarray(cubes / m["rows"] ** 3)
 
 
 def _skewness(third: Array, deviation: Array) -> Array:
