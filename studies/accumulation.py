@@ -27,9 +27,9 @@ from simtest.estimators.sightings import Plane, Sighting, fine_map, light_of, sp
 from simtest.geometry import Array
 from simtest.geometry.vectors import angle_deg, deviation_deg, rotation
 from simtest.rendering import Session
+from simtest.runtime.statistics import share_interval
 from simtest.simulation.rendered_view import render_picture
 from simtest.spec import Scene, scene_from_dict
-from studies.hard.table import wilson
 from studies.kept import code_hash
 
 SLOPES = 2.0, 4.0, 6.0
@@ -158,7 +158,7 @@ def held(rows: list[Row], name: str) -> str:
     if not len(d2):
         return "none"
     hits = int(np.count_nonzero(d2 < CHI95))
-    low, high = wilson(hits, len(d2))
+    low, high = share_interval(d2 < CHI95)
     return f"{hits} of {len(d2)} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from simtest.geometry import chi_squared
+from simtest.runtime.statistics import share_interval
 
 CHI2_95 = chi_squared.quantile(0.95, 2)
 """95 % quantile of the chi-squared distribution with two degrees of freedom."""
@@ -40,16 +41,6 @@ class Line:
     merged_covered: float
 
 
-def wilson(hits: int, count: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share [Wilson 1927]."""
-    if count == 0:
-        return math.nan, math.nan
-    z, share = 1.96, hits / count
-    middle = (share + z * z / (2 * count)) / (1 + z * z / count)
-    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count)) / (1 + z * z / count)
-    return middle - half, middle + half
-
-
 def lines(table: pl.DataFrame, rows: Sequence[str], groups: Mapping[str, Sequence[str]] | None = None) -> list[Line]:
     """Return the figures of all rows, in their order, and of groups of rows together, by the groups' names."""
     made = []
@@ -67,7 +58,7 @@ def _line(row: str, estimator: str, own: pl.DataFrame) -> Line:
     answers = single.filter(pl.col("status") == "ok")
     stated = answers.filter(pl.col("states"))
     distance = stated["mahalanobis2"].to_numpy()
-    hits = int(np.count_nonzero(distance <= CHI2_95))
+    inside = distance <= CHI2_95
     errors, semi = stated["error_deg"].to_numpy(), stated["semi_deg"].to_numpy()
     rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
     half = float(np.nanmedian(semi)) if np.isfinite(semi).any() else math.nan
@@ -78,10 +69,12 @@ def _line(row: str, estimator: str, own: pl.DataFrame) -> Line:
     everything = own.filter((pl.col("status") == "ok") & pl.col("states") & pl.col("matched"))
     quiet = np.array([not warned(flags) for flags in everything["flags"]], dtype=bool)
     silent = np.count_nonzero((everything["mahalanobis2"].to_numpy() > SILENT * CHI2_95) & quiet)
-    low, high = wilson(hits, len(distance))
+    covered = 100 * np.count_nonzero(inside) / max(len(inside), 1)
+    # Highlights of a scene share its noise and its relief.
+    low, high = share_interval(inside, stated["scene"].to_numpy()) if len(inside) else (math.nan, math.nan)
     return Line(
         row, estimator, answers.height, stated.height, single.height - answers.height,
-        100 * hits / max(len(distance), 1), 100 * low, 100 * high, half * math.sqrt(2) / rms, half, rms,
+        covered, 100 * low, 100 * high, half * math.sqrt(2) / rms, half, rms,
         float(np.median(errors)) if len(errors) else math.nan, 100 * silent / max(everything.height, 1),
         merged.height, 100 * sound / max(merged.height, 1),
     )  # fmt: skip

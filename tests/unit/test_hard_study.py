@@ -14,7 +14,7 @@ from studies.hard.cases import Case, calibration_of, load, rows_in, save, scene_
 from studies.hard.measure import record, semi_axis_deg
 from studies.hard.rows import GROUPS, ROWS
 from studies.hard.scenes import KINDS, SPLITS, base_scene
-from studies.hard.table import CHI2_95, lines, text, wilson
+from studies.hard.table import CHI2_95, lines, text
 
 
 def a_case(**changes):
@@ -67,6 +67,20 @@ def test_cases_are_read_as_they_were_written(tmp_path):
         assert read.patch.peak_pixel == written.patch.peak_pixel
 
 
+def test_the_interval_of_a_share_counts_scenes():
+    # Two scenes whose highlights are all alike say less than twenty scenes of one each.
+    row = {"row": "JPEG 80", "estimator": "e", "holds": 1, "status": "ok", "states": True, "matched": True}
+    row |= {"error_deg": 1.0, "semi_deg": 1.0, "flags": ""}
+
+    def line(scenes):
+        made = [row | {"scene": number, "mahalanobis2": 1.0 if number % 2 else 100.0} for number in scenes]
+        return lines(pl.DataFrame(made), ["JPEG 80"])[0]
+
+    few, many = line([0] * 10 + [1] * 10), line(range(20))
+    assert few.covered == many.covered == 50.0
+    assert few.high - few.low > 1.5 * (many.high - many.low)
+
+
 def test_the_table_counts_what_is_covered_silent_and_failed():
     case, normal = a_case(), a_case().normal
     made = [record(0, "plane", case, "e", Failure(Reason.NO_CLOSED_ISOPHOTE, ""))]
@@ -86,5 +100,4 @@ def test_the_table_counts_what_is_covered_silent_and_failed():
     assert replace(alone, row="JPEG 80") == together
     assert set(GROUPS["all rows"]) == {row.name for row in ROWS}
     assert not set(GROUPS["light told"]) & set(GROUPS["light untold"])
-    assert wilson(95, 100)[0] < 0.95 < wilson(95, 100)[1]
     assert pytest.approx(5.991, abs=1e-3) == CHI2_95
