@@ -4,14 +4,12 @@ import re
 from datetime import UTC, datetime
 
 import pytest
-from playwright import sync_api as playwright
 from test_nightly_page import rows_of
 
 from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.nightly.gate.compare import compare
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
-from tests.extras.needs import program
 
 TREND = "#trends [data-chart=trend0]"
 DESKTOP, PHONE = {"width": 1200, "height": 900}, {"width": 390, "height": 844}
@@ -24,14 +22,6 @@ def address(tmp_path_factory):
     judged = JudgedRun(run, verdict_of(run), history_of(run, 30))
     page = write_nightly_page(folder / "page", judged)
     return page.as_uri()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as driver:
-        launched = driver.chromium.launch(executable_path=program("chromium"), args=["--no-sandbox"])
-        yield launched
-        launched.close()
 
 
 class Reader:

@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from playwright import sync_api as playwright
 from test_nightly_page import rows_of
 from test_realism_page import frames
 from test_report import make_run
@@ -25,7 +24,6 @@ from simtest.reconstruction.picture import Options
 from simtest.report import write_report
 from simtest.report.view3d import grid_triangles
 from simtest.report.viewer import Content, write_scene_page
-from tests.extras.needs import program
 
 pytestmark = pytest.mark.slow
 
@@ -119,14 +117,6 @@ def picture_page(folder: Path) -> Path:
     with pytest.warns(UserWarning, match="no calibration"):
         _, files = reconstruct_picture(folder / "spots.png", folder / "picture", Options(fov_deg=70.0))
     return next(file for file in files if file.name == "index.html")
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as driver:
-        launched = driver.chromium.launch(executable_path=program("chromium"), args=["--no-sandbox"])
-        yield launched
-        launched.close()
 
 
 @pytest.fixture
