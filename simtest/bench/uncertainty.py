@@ -10,7 +10,7 @@ from simtest.geometry import chi_squared
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject
-from simtest.runtime.statistics import share_interval
+from simtest.runtime.statistics import deviation_of_mean, share_interval, summed
 
 LEVEL = 0.95
 """Of the regions whose coverage is tested."""
@@ -89,9 +89,8 @@ def score_uncertainty(answered: pl.DataFrame, scenes: IntArray, cases: IntArray 
     if n == 0:
         return UncertaintyScore(0, None, None, UNTESTED, None, None, None)
     inside = (squared[stated] <= limit).astype(float)
-    error = coverage_error(inside, scenes[stated])
-    share = float(np.mean(inside))
-    interval = share_interval(inside, scenes[stated], None if cases is None else cases[stated])
+    share, groups = float(np.mean(inside)), (scenes[stated], None if cases is None else cases[stated])
+    error, interval = coverage_error(inside, *groups), share_interval(inside, *groups)
     coordinates, covariances = _misses(answered)
     semi_axis = energy = None
     if len(covariances):
@@ -109,23 +108,19 @@ def finite(value: float | np.floating) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def coverage_error(inside: Array, scenes: IntArray) -> float:
+def coverage_error(inside: Array, scenes: IntArray, cases: IntArray | None = None) -> float:
     """Return the standard error that a coverage of 95 % has with rows that are grouped in scenes.
 
-    The error over scenes is that of a ratio estimator (Cochran 1977, section 2.11): with m_i rows of which a_i lie
-    inside, the variance is that of a_i - p m_i over scenes, over the square of the mean m. By how much it exceeds that
-    of independent rows, at least 1, is the design effect; it enlarges the variance at 95 %. The variance at the
-    observed p would be small where p happens to be large, and mark right uncertainties as underconfident.
+    By how much the variance over the scenes of each case exceeds that of independent rows, at least 1, is the design
+    effect; it enlarges the variance at 95 %. The variance at the observed share would be small where that happens to be
+    large, and mark right uncertainties as underconfident.
     """
-    n = len(inside)
+    n, share = len(inside), float(np.mean(inside))
     independent = math.sqrt(LEVEL * (1 - LEVEL) / n)
-    _, index = np.unique(scenes, return_inverse=True)
-    rows, hits = np.bincount(index), np.bincount(index, weights=inside)
-    share = float(np.mean(inside))
-    if len(rows) < 2 or share in (0.0, 1.0):
+    totals, counts, kinds = summed(inside, scenes, cases, None)
+    if len(counts) < 2 or share in (0.0, 1.0):
         return independent
-    rest = hits - share * rows
-    grouped = len(rows) / (len(rows) - 1) * float(rest @ rest) / n**2
+    grouped = deviation_of_mean(totals, counts, kinds) ** 2
     return independent * math.sqrt(max(1.0, grouped / (share * (1 - share) / n)))
 
 

@@ -108,6 +108,13 @@ def test_rows_of_one_scene_do_not_count_as_independent() -> None:
     assert grouped > 3 * alone
 
 
+def test_a_difference_between_frozen_cases_is_no_chance() -> None:
+    """All of one case inside, none of another: other scenes of these cases would give the same share."""
+    inside, scenes = np.repeat([1.0, 0.0], 200), np.arange(400) // 20
+    assert coverage_error(inside, scenes, scenes // 10) == coverage_error(inside, np.arange(400), np.arange(400) // 200)
+    assert coverage_error(inside, scenes) > 3 * coverage_error(inside, scenes, scenes // 10)
+
+
 def test_few_regions_get_no_verdict() -> None:
     assert _score(0.01, count=40).verdict == "too few"
     unstated = dict.fromkeys(["cov_11", "cov_12", "cov_22", "mahalanobis2"])
