@@ -5,6 +5,7 @@ their shape.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,7 +62,7 @@ class BreakPoint:
 
 def break_points(question: Question) -> list[BreakPoint]:
     """Return the break-points of a question by the laws."""
-    made = (_offset_ignored(question), _distance_unknown(question), _streak(question), _relief(question))
+    made = (_offset_ignored(question), *_distance_unknown(question), _streak(question), _relief(question))
     return [point for point in made if point is not None]
 
 
@@ -79,31 +80,32 @@ def _offset_ignored(question: Question) -> BreakPoint | None:
     )  # fmt: skip
 
 
-def _distance_unknown(question: Question) -> BreakPoint | None:
-    """Find the distance below which a bisector that knows the range alone errs by the bound."""
+def _distance_unknown(question: Question) -> Iterator[BreakPoint]:
+    """Find the distances between which a bisector that knows the range alone errs by less than the bound."""
     offset = float(np.mean(question.scope.offsets_mm))
     if not offset:
-        return None
-    # The told distance is the middle of the range.
+        return
+    # The distance given is the middle of the range.
     middle = question.middle_mm
 
     def law_deg(distance: float) -> float:
         point = np.array([0.0, 0.0, distance])
         return float(np.degrees(laws.bisector_residual(point, np.array([offset, 0.0, 0.0]), middle / distance - 1)))
 
-    # The error falls from the nearest distance to the middle.
-    low, high = NEAREST_MM, middle
-    if law_deg(low) < question.bound_deg:
-        return None
-    for _ in range(_HALVINGS):
-        half = (low + high) / 2
-        low, high = (half, high) if law_deg(half) > question.bound_deg else (low, half)
-    distance = round(low, 3)
-    return BreakPoint(
-        "bisector, told the range of the distance alone", "bisector", "distance", "mm", distance,
-        "eps / 2 * abs(1 / d - 1 / middle)", law_deg(distance),
-        f"eps/d = {offset / distance:.3g}, middle = {middle:g} mm",
-    )  # fmt: skip
+    # The error grows from the middle to either end.
+    for side, end in (("below", NEAREST_MM), ("beyond", question.distances_mm[1])):
+        low, high = middle, end
+        if law_deg(end) < question.bound_deg:
+            continue
+        for _ in range(_HALVINGS):
+            half = (low + high) / 2
+            low, high = (low, half) if law_deg(half) > question.bound_deg else (half, high)
+        distance = round(high, 3)
+        yield BreakPoint(
+            f"bisector, given the range of the distance alone, {side} the middle", "bisector", "distance", "mm",
+            distance, "eps / 2 * abs(1 / d - 1 / middle)", law_deg(distance),
+            f"eps/d = {offset / distance:.3g}, middle = {middle:g} mm",
+        )  # fmt: skip
 
 
 def _streak(question: Question) -> BreakPoint:

@@ -250,6 +250,16 @@ def test_break_points_lie_where_the_laws_put_them():
     assert relief.value == pytest.approx(4.0 / math.sqrt(math.pi / 2), abs=1e-3)
 
 
+def test_a_bisector_that_knows_the_range_errs_beyond_its_middle_too():
+    question = Question(read_scope("colonoscope_2"), "colon", (20.0, 60.0), bound_deg=0.8)
+    near, far = (point for point in break_points(question) if point.method == "bisector")
+    assert near.value < question.middle_mm < far.value < 60.0
+    for point in (near, far):
+        # By hand: the light at 4 mm seen from a wall at the true and at the given distance.
+        turn = math.degrees(math.atan(4.0 / point.value) - math.atan(4.0 / question.middle_mm)) / 2
+        assert abs(turn) == pytest.approx(0.8, abs=0.02)
+
+
 def test_a_light_at_the_camera_has_no_break_points_of_offset():
     quantities = [point.quantity for point in break_points(Question(read_scope("colocated")))]
     assert quantities == ["d k", "slope of the relief"]
