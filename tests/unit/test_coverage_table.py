@@ -27,9 +27,11 @@ ROWS = [
 ]
 
 
+SCHEMA = {name: pl.Float64 for name in ("error_oracle_deg", "error_law_deg", "axis_ratio", "axis_ratio_law")}
+
+
 def test_found_missed_false_and_laws_are_counted():
-    schema = {name: pl.Float64 for name in ("error_oracle_deg", "error_law_deg", "axis_ratio", "axis_ratio_law")}
-    tables = coverage(SimpleNamespace(results=pl.DataFrame(ROWS, schema_overrides=schema)))
+    tables = coverage(SimpleNamespace(results=pl.DataFrame(ROWS, schema_overrides=SCHEMA)))
     (found,) = tables.found.rows(named=True)
     assert (found["true"], found["found"], found["missed"], found["false"]) == (4, 3, 1, 1)
     assert found["coverage"] == 0.75
@@ -38,6 +40,13 @@ def test_found_missed_false_and_laws_are_counted():
     assert (error["measure"], error["n"], error["met"]) == ("error", 2, 1)
     assert error["median_gap"] == pytest.approx(0.55)
     assert (ratio["measure"], ratio["n"], ratio["met"]) == ("axis ratio", 2, 1)
+
+
+def test_detections_are_not_counted_by_clouds():
+    """A cloud estimator that stands first has one answer for several detections."""
+    rows = [row("cloud", 0, "ok", 2.1, 2.0), row("cloud", 1, "missed"), *ROWS]
+    (found,) = coverage(SimpleNamespace(results=pl.DataFrame(rows, schema_overrides=SCHEMA))).found.rows(named=True)
+    assert (found["true"], found["found"], found["missed"], found["false"]) == (4, 3, 1, 1)
 
 
 def test_other_runs_have_none():
