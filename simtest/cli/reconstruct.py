@@ -43,13 +43,6 @@ Poses = Annotated[
         help="Poses of a sequence's frames: views.json, JSON of matrices or a TUM file; tells convex from concave."
     ),
 ]
-Patch = Annotated[
-    str | None,
-    Parameter(
-        help="x,y,radius: a pixel of the first frame, and mm; gives the base's normal over this patch of still tissue, "
-        "and its fine normals, from all frames. Needs --poses."
-    ),
-]
 DepthScale = Annotated[float | None, Parameter(help="mm of one step of an integer depth map.")]
 
 
@@ -66,7 +59,6 @@ def reconstruct(
     depth: Depth = None,
     depth_scale: DepthScale = None,
     poses: Poses = None,
-    patch: Patch = None,
     as_json: AsJson = False,
 ) -> None:
     """Reconstruct the normals at the specularities of a picture, of each picture of a folder, or of a video's frames.
@@ -85,12 +77,10 @@ def reconstruct(
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
     if poses and not sequence:
         raise InputError(f"{image}: --poses is for a folder or a film")
-    if patch and not poses:
-        raise InputError("--patch: needs --poses")
     box = None if roi is None else parse_roi(roi)
     options = known.checked(box, poses)
     if sequence:
-        _sequence(image, out, options, as_json, patch)
+        _sequence(image, out, options, as_json)
         return
     from simtest.api import Extras, reconstruct_picture
 
@@ -109,24 +99,15 @@ def reconstruct(
     print_files(files, as_json)
 
 
-def _sequence(source: Path, out: Path, options: "Options", as_json: bool, patch: str | None) -> None:
+def _sequence(source: Path, out: Path, options: "Options", as_json: bool) -> None:
     """Reconstruct the frames of a folder or a video, and print what came of them."""
-    from dataclasses import asdict, replace
+    from dataclasses import asdict
 
     from simtest.cli.progress import progress_bar
     from simtest.reconstruction.sequence import reconstruct_sequence
 
-    asked = None
-    if patch is not None:
-        from simtest.reconstruction.accumulation import accumulate, parse_patch, write_patch
-
-        asked = parse_patch(patch)
     with progress_bar("writing the tables") as progress:
         made = reconstruct_sequence(source, out, options, progress)
-    shown_patch = None
-    if asked is not None:
-        shown_patch = accumulate(source, options, asked)
-        made = replace(made, files=[*made.files, *write_patch(out, shown_patch)])
     if as_json:
         print_json(asdict(made))
         return
@@ -136,8 +117,6 @@ def _sequence(source: Path, out: Path, options: "Options", as_json: bool, patch:
     print(f"{counted(made.frames, 'frame')}{unread}: {found}, {made.tracks} seen in several frames")
     if made.motion:
         print(made.motion)
-    if shown_patch is not None:
-        print(shown_patch.summary)
     print_files(made.files, as_json)
 
 
