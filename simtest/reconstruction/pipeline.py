@@ -210,7 +210,8 @@ def reconstruct_colour(
         Estimates of highlights that smoothing has made rounder have the flag ``small``; those of highlights too small
         to have a shape ``unresolved``.
     """
-    return run_pipeline(picture, camera, ColourDetector(isolated), estimators, None, smoothing_px)
+    known = complete(_calibration(camera), None)
+    return run_pipeline(picture, known, ColourDetector(isolated), estimators, None, smoothing_px)
 
 
 def default_estimators(calibration: Calibration) -> tuple[str, ...]:
