@@ -40,6 +40,9 @@ from simtest.runtime.resources import shown
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
 MAX_SMOOTHING_PX = 50
 
+SAME_PEAK_PX = 1.5
+"""A user's region and a detected one whose peaks are nearer to each other hold the same highlight."""
+
 SMALL_RADIUS = 3.0
 """A highlight whose radius at half height is below this many smoothing widths is made rounder by more than a tenth: its
 estimates have the flag ``small``."""
@@ -252,27 +255,47 @@ def _run(
     # linear light: a frame computes each step of its correction when it is first asked for
     frame = Frame(image, calibration, smoothing_px)
     # detect
-    detection = run_detector(detector, frame) if box is None else _cut_region(frame, box)
+    detection, beside = run_detector(detector, frame), ()
+    if box is not None:
+        detection, beside = _cut_region(detection, box)
     # estimate
-    made = _estimate(detection, chosen)
+    made = _estimate(detection, chosen, beside)
     return made if target == "fine" else _at_base(made, calibration.priors)
 
 
-def _cut_region(frame: Frame, box: tuple[int, int, int, int]) -> Detection:
-    """Take a user's region of interest for the one specularity; raise `InputError` where it leaves the frame."""
+def _cut_region(detected: Detection, box: tuple[int, int, int, int]) -> tuple[Detection, tuple[Region, ...]]:
+    """Take a user's region of interest for the one specularity, with the frame's other regions.
+
+    Raises `InputError` where it leaves the frame.
+    """
+    frame = detected.frame
     patch = frame.patch(box)
-    # A user's region may overlap detected peaks, so it gets no contrast and no list of neighbours.
-    x, y = box[:2] if isinstance(patch, Failure) else (int(v) for v in patch.peak_px)
-    return Detection((Region(box, (x, y), None),), frame)
+    if isinstance(patch, Failure):
+        return Detection((Region(box, box[:2], None),), frame), detected.regions
+    x, y = (int(v) for v in patch.peak_px)
+    # The region's peak is no neighbour of itself; on a clipped plateau both lie at its centroid.
+    others = tuple(
+        region
+        for region in detected.regions
+        if isinstance(other := frame.patch(region.box, region.peak), Failure)
+        or math.dist(other.peak_px, patch.peak_px) > SAME_PEAK_PX
+    )
+    return Detection((Region(box, (x, y), None),), frame), others
 
 
-def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> Reconstruction:
-    """Run each estimator on all patches of a picture, or on the whole frame."""
+def _estimate(
+    detection: Detection, estimators: Mapping[str, AnyEstimator], beside: Sequence[Region] = ()
+) -> Reconstruction:
+    """Run each estimator on all patches of a picture, or on the whole frame.
+
+    `beside` are further specularities of the frame, which are only neighbours.
+    """
     frame, regions = detection.frame, detection.regions
     # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement, and a dim
     # highlight among brighter ones may be a near miss.
-    peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in regions]
-    cut = [frame.patch(r.box) if r.contrast is None else frame.patch(r.box, r.peak) for r in regions]
+    known = [*regions, *beside]
+    peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in known]
+    cut = [frame.patch(r.box) if r.contrast is None else frame.patch(r.box, r.peak) for r in known]
     # Highlights that touch have no isophotes of their own, so no estimator answers for them.
     for i, highlight in enumerate(detection.highlights):
         if highlight.kind is Kind.CLUSTER:
@@ -280,9 +303,9 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     values = [0.0 if isinstance(patch, Failure) else patch.peak_value for patch in cut]
     patches = [
         patch
-        if isinstance(patch, Failure) or len(cut) == 1
+        if isinstance(patch, Failure)
         else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]), others_value=(*values[:i], *values[i + 1 :]))
-        for i, patch in enumerate(cut)
+        for i, patch in enumerate(cut[: len(regions)])
     ]
     prepare(list(estimators.values()), patches, frame.calibration.camera)
     made = {name: run_in_frame(each, frame, patches, frame.calibration.priors) for name, each in estimators.items()}
