@@ -40,9 +40,6 @@ from simtest.runtime.resources import shown
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
 MAX_SMOOTHING_PX = 50
 
-SAME_PEAK_PX = 1.5
-"""A user's region and a detected one whose peaks are nearer to each other hold the same highlight."""
-
 SMALL_RADIUS = 3.0
 """A highlight whose radius at half height is below this many smoothing widths is made rounder by more than a tenth: its
 estimates have the flag ``small``."""
@@ -180,7 +177,9 @@ def _choose(
     """Choose detector and smoothing, and run the pipeline."""
     name, finder = choose_detector(detector, image, known, roi is not None, isolated)
     smoothing = choose_smoothing(smoothing_px, finder)
-    made = _run(image, known, finder, estimators, roi, smoothing, target)
+    # A region of interest is cut as by peaks; its neighbours are those that would be found without it.
+    _, searching = choose_detector(detector, image, known, False, isolated)
+    made = _run(image, known, searching, estimators, roi, smoothing, target)
     kind = known.response.kind if known.response else "linear"
     return made, Choices(kind, known.saturation_level, name, smoothing, short_names(estimators), known.priors)
 
@@ -257,30 +256,31 @@ def _run(
     # detect
     detection, beside = run_detector(detector, frame), ()
     if box is not None:
-        detection, beside = _cut_region(detection, box)
+        detection, beside = _cut_region(frame, box, detection.regions)
     # estimate
     made = _estimate(detection, chosen, beside)
     return made if target == "fine" else _at_base(made, calibration.priors)
 
 
-def _cut_region(detected: Detection, box: tuple[int, int, int, int]) -> tuple[Detection, tuple[Region, ...]]:
-    """Take a user's region of interest for the one specularity, with the frame's other regions.
+def _cut_region(
+    frame: Frame, box: tuple[int, int, int, int], detected: tuple[Region, ...]
+) -> tuple[Detection, tuple[Region, ...]]:
+    """Take a user's region of interest for the one specularity, and return it with the frame's other regions.
 
     Raises `InputError` where it leaves the frame.
     """
-    frame = detected.frame
     patch = frame.patch(box)
     if isinstance(patch, Failure):
-        return Detection((Region(box, box[:2], None),), frame), detected.regions
+        return Detection((Region(box, box[:2], None),), frame), detected
     x, y = (int(v) for v in patch.peak_px)
-    # The region's peak is no neighbour of itself; on a clipped plateau both lie at its centroid.
-    others = tuple(
-        region
-        for region in detected.regions
-        if isinstance(other := frame.patch(region.box, region.peak), Failure)
-        or math.dist(other.peak_px, patch.peak_px) > SAME_PEAK_PX
+    # Of the detected regions the nearest one inside its isophote is the same highlight.
+    inside = np.argwhere(patch.inside(HIGHLIGHT_ISOVALUE, cut=True))[:, ::-1] + box[:2]
+    own = min(
+        (region for region in detected if (inside == region.peak).all(axis=1).any()),
+        key=lambda region: math.dist(region.peak, (x, y)),
+        default=None,
     )
-    return Detection((Region(box, (x, y), None),), frame), others
+    return Detection((Region(box, (x, y), None),), frame), tuple(each for each in detected if each is not own)
 
 
 def _estimate(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from simtest.advice.twin.scoring import score
-from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, Calibration, exactly
+from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, Calibration, exactly, srgb_encode
 from simtest.dataset.maker import colour_variant
 from simtest.estimators import load_estimators
 from simtest.estimators.near_misses import (
@@ -113,6 +113,19 @@ def test_a_region_of_interest_is_as_uncertain_as_in_the_whole_frame():
     (spot,) = reconstruct(single, camera, ["cone_axis"])
     (alone,) = reconstruct(single, camera, ["cone_axis"], roi=spot.region.box)
     assert spot.patch.others_px == alone.patch.others_px == ()
+
+
+def test_neighbours_in_a_colour_picture_are_those_found_by_colour():
+    lobes = np.clip(crowd()[..., None] - 0.05, 0, None)
+    picture = np.rint(255 * srgb_encode(np.clip(0.2 * np.array([1.0, 0.5, 0.4]) + 0.6 * lobes, 0, 1))).astype(np.uint8)
+    camera = Camera.from_fov(60.0, 320, 240)
+    whole = reconstruct(picture, camera, ["cone_axis"])
+    assert whole.choices.detector == "colour"
+    assert len(whole) == 9
+    for spot in whole:
+        (alone,) = reconstruct(picture, camera, ["cone_axis"], roi=spot.region.box)
+        assert sorted(alone.patch.others_px) == sorted(spot.patch.others_px)
+        assert alone.estimates["cone_axis"].deviation_deg > 0.8 * spot.estimates["cone_axis"].deviation_deg
 
 
 def test_a_patch_that_does_not_know_its_frame_may_be_a_near_miss():
