@@ -35,7 +35,7 @@ Pose = Annotated[
     Path | None, Parameter(help="Pose of the reference mesh: TOML with matrix, or rotation and translation_mm.")
 ]
 Depth = Annotated[
-    str | None, Parameter(help="Depth at which normals.ply and arrows.ply stand: mm, or a depth map; default 1.")
+    str | None, Parameter(help="Depth at which the points of normals.ply stand: mm, or a depth map; default 1.")
 ]
 Poses = Annotated[
     Path | None,
