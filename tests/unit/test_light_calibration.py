@@ -11,7 +11,10 @@ import numpy.typing as npt
 import pytest
 
 import simtest
-from simtest.calibration import Calibration, Response
+from simtest.calibration import Calibration, CameraPrior, Priors, Response
+from simtest.calibration.lights.mirrors import mirror_points
+from simtest.calibration.lights.result import covariance_of_variations
+from simtest.calibration.lights.search import find_lights
 from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.camera import Camera
@@ -19,6 +22,8 @@ from simtest.reconstruction.image_io import read_picture
 from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
 from simtest.reconstruction.light_calibration.observations import (
     View,
+    Views,
+    balls_of,
     circles_of,
     read_balls,
     with_floor,
@@ -30,7 +35,7 @@ from simtest.reconstruction.light_calibration.outline import (
     outline_through,
     refine_outline,
 )
-from simtest.reconstruction.light_calibration.run import Ball, Plate, calibrate_lights
+from simtest.reconstruction.light_calibration.run import Ball, Plate, _variations, calibrate_lights
 from simtest.reconstruction.light_calibration.write import write_calibration
 from simtest.spec.calibration_file import load_calibration
 from studies.light_calibration.pictures import Look, picture_of_ball
@@ -198,6 +203,39 @@ def test_spot_wider_than_on_a_larger_ball_is_left_out() -> None:
     assert [bool(view.usable) for view in without_merged(views)] == [True, True, False]
     # On the larger ball a wide spot may be one.
     assert without_merged([views[2], replace(views[0], outline=views[1].outline)])[1].usable
+
+
+def test_a_radial_distortion_that_is_not_given_is_in_the_intervals() -> None:
+    light, ball = np.array([4.0, 1.0, 0.0]), Ball(RADIUS)
+    lens = CAMERA.with_radial_error(0.1)
+    rng = np.random.default_rng(3)
+    centres = [lens.unproject(rng.uniform([40, 40], [200, 160])) * rng.uniform(20, 40) for _ in range(10)]
+    views = []
+    for i, centre in enumerate(centres):
+        true = outline_of(centre)
+        # What a pinhole makes of the outline and of the highlight where they are in the picture.
+        seen = outline_through(CAMERA, true.pixels(lens))
+        pixel = lens.project(mirror_points(centre[None], np.array([RADIUS]), light[None]))[0]
+        highlight = MeasuredHighlight(pixel, 0.02**2 * np.eye(2))
+        outline = replace(seen, covariance=1e-8 * np.eye(3))
+        views.append(View(f"{i}.png", np.zeros((1, 1)), [highlight], outline=outline))
+    found_by = Views(views)
+    highlights = found_by.highlights()
+    found = find_lights(CAMERA, balls_of(views, CAMERA, RADIUS), highlights, 1)
+    assert found is not None
+    gap = found.bundle.lights[0] - light
+    assert np.linalg.norm(gap) > 0.5
+    exact, given = (
+        covariance_of_variations(
+            _variations(views, Calibration(CAMERA, priors=Priors(camera=CameraPrior(distortion_sd=sd))), ball, found),
+            highlights, found,
+        )
+        for sd in (0.0, 0.1)
+    )  # fmt: skip
+    # One standard deviation of k1: about one of the position along its error, and none without it.
+    along = gap / np.linalg.norm(gap)
+    assert 0.6 < np.linalg.norm(gap) / np.sqrt(along @ given @ along) < 1.7
+    assert np.linalg.norm(gap) > 5 * np.sqrt(along @ exact @ along)
 
 
 def pictures(count: int = 5) -> list[tuple[str, Callable[[], npt.NDArray[np.float32]]]]:

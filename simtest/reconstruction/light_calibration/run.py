@@ -178,11 +178,12 @@ def _variations(
 ) -> Iterator[tuple[Camera, Mirrors]]:
     """Return camera and mirrors with each independent error that all pictures share, of one standard deviation."""
     camera, prior = calibration.camera, calibration.priors.camera
-    for focal, dx, dy in np.diag([prior.focal_sd, prior.centre_sd_px, prior.centre_sd_px]):
-        if focal or dx or dy:
+    for errors in np.diag([prior.focal_sd, prior.centre_sd_px, prior.centre_sd_px, prior.distortion_sd]):
+        if errors.any():
+            focal, dx, dy, radial = errors.tolist()
             other = replace(
                 camera, fx=camera.fx * (1 + focal), fy=camera.fy * (1 + focal), cx=camera.cx + dx, cy=camera.cy + dy
-            )
+            ).with_radial_error(radial)
             yield other, _seen_by(views, camera, other, mirror)
     if isinstance(mirror, Ball):
         changed = [
