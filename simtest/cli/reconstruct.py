@@ -146,14 +146,13 @@ def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
     from statistics import median
 
     from simtest.reconstruction.explanations import kind_name
-    from simtest.reconstruction.ranking import deviation_deg
 
     groups: dict[tuple[str, str], list[SpecularityRecord]] = {}
     for spot in spots:
         groups.setdefault((kind_name(spot.kind), spot.best or "none"), []).append(spot)
     rows = []
     for (kind, best), held in sorted(groups.items(), key=lambda item: -len(item[1])):
-        stated = [d for s in held if s.best_estimate and (d := deviation_deg(s.best_estimate)) is not None]
+        stated = [d for s in held if s.best_estimate and (d := s.best_estimate.deviation_deg) is not None]
         flags = Counter(flag for s in held if s.best_estimate for flag in s.best_estimate.flags)
         named = ", ".join(f"{flag} {count}" for flag, count in flags.most_common(MOST_FLAGS))
         rows.append((kind, best, str(len(held)), f"{median(stated):.2f}" if stated else "", named))
@@ -209,11 +208,10 @@ def _pair(mean: float, spread: float | None) -> str:
 
 def _cells(spot: "SpecularityRecord") -> list[str]:
     from simtest.reconstruction.explanations import kind_name
-    from simtest.reconstruction.ranking import deviation_deg
 
     best, published = spot.best_estimate, spot.normals.get("circle_pose")
     x, y = (math.nan, math.nan) if spot.peak_px is None else spot.peak_px
-    deviation = None if best is None else deviation_deg(best)
+    deviation = None if best is None else best.deviation_deg
     margin = None if published is None else published.choice_margin
     return [
         str(spot.id), f"{x:.1f}", f"{y:.1f}", kind_name(spot.kind), "" if spot.score is None else f"{spot.score:.2f}",

@@ -15,7 +15,6 @@ from simtest.geometry import BrownConrady, Camera
 from simtest.reconstruction.constraints import constraints_arrays
 from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.reconstruction.overlay import draw_overlay
-from simtest.reconstruction.ranking import deviation_deg
 from simtest.reconstruction.result_page import write_picture_page
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.files import make_folder, write_atomically, write_json
@@ -73,7 +72,7 @@ def normals_rows(spots: Iterable[SpecularityRecord]) -> Iterator[tuple[object, .
             look = [v if math.isfinite(v) else None for v in result.look_px.tolist()]
             covariance = (None,) * 3 if result.covariance is None else result.covariance[np.triu_indices(2)].tolist()
             seen = (*look, result.axis_ratio, ";".join(result.flags), best, result.choice_margin, *covariance)
-            stated = (*peak, spot.kind, spot.score, result.target, deviation_deg(result))
+            stated = (*peak, spot.kind, spot.score, result.target, result.deviation_deg)
             for k, normal in enumerate(result.candidates.tolist()):
                 yield (spot.id, name, "ok", k, *normal, *seen, *stated)
 

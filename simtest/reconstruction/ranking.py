@@ -9,18 +9,11 @@ import numpy as np
 from simtest.errors import Failure
 from simtest.estimators.budget import deviations, dominant
 from simtest.estimators.protocol import Estimate, Target
-from simtest.geometry import vectors
 
 WITHOUT_UNCERTAINTY = ("bisector", "curved", "photometric", "cone_axis", "brightest_point")
 """Order of estimates that state no uncertainty, so that nothing else can rank them: that which knows the lights, those
 which follow the lobe to its peak, that which averages isophotes, and the one that needs none. Other packages' follow,
 and `circle_pose` last, which takes a curved surface for a plane."""
-
-
-def deviation_deg(estimate: Estimate) -> float | None:
-    """Return the standard deviation of a normal, deg: the square root of the covariance's trace."""
-    # Computed here: a picture's way does not climb back to the estimators.
-    return None if estimate.covariance is None else vectors.deviation_deg(estimate.covariance)
 
 
 @dataclass(frozen=True)
@@ -61,7 +54,7 @@ def stated_errors(best: Sequence[Estimate]) -> StatedErrors | None:
             parts.setdefault(name, []).append(float(np.degrees(value)))
     # A part that some estimates do not have is 0 there.
     medians = {name: statistics.median(values + [0.0] * (len(stated) - len(values))) for name, values in parts.items()}
-    median = statistics.median([deviation for each in stated if (deviation := deviation_deg(each)) is not None])
+    median = statistics.median([deviation for each in stated if (deviation := each.deviation_deg) is not None])
     ordered = dict(sorted(medians.items(), key=lambda item: -item[1]))
     return StatedErrors(len(stated), len(best) - len(stated), median, ordered)
 
@@ -76,7 +69,7 @@ def best_of(estimates: Mapping[str, Estimate | Failure], target: Target = "fine"
     if not answered:
         return None, "no estimator answered"
     wanted = {name: result for name, result in answered.items() if result.target == target} or answered
-    stated = {name: expected for name, result in wanted.items() if (expected := deviation_deg(result)) is not None}
+    stated = {name: expected for name, result in wanted.items() if (expected := result.deviation_deg) is not None}
     if not stated:
         best = min(wanted, key=_rank)
         return best, "no estimator states an uncertainty; chosen by the estimators' order"
