@@ -254,7 +254,7 @@ def _run(
     # linear light: a frame computes each step of its correction when it is first asked for
     frame = Frame(image, calibration, smoothing_px)
     # detect
-    detection, beside = run_detector(detector, frame), ()
+    detection, beside = run_detector(detector, frame), tuple[Region, ...]()
     if box is not None:
         detection, beside = _cut_region(frame, box, detection.regions)
     # estimate
