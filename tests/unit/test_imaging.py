@@ -1,6 +1,9 @@
 import csv
+import gc
 import json
+import tracemalloc
 import warnings
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,6 +12,7 @@ import trimesh
 from PIL import Image as PillowImage
 from test_colour_detection import HEIGHT, WIDTH, lobe, picture
 
+import simtest
 from simtest.api import Extras, reconstruct_picture
 from simtest.errors import InputError
 from simtest.geometry import Camera
@@ -220,6 +224,61 @@ def test_a_stopped_run_goes_on(folder, tmp_path):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     other = Options(fov_deg=FOV, every=True)
     told(lambda: reconstruct_sequence(folder, tmp_path / "out", other), "holds a run with another every")
+
+
+def test_another_calibration_is_another_run(folder, tmp_path):
+    camera, options = tmp_path / "camera.toml", Options(camera=tmp_path / "camera.toml")
+    simtest.save_calibration(simtest.Calibration(CAMERA), camera)
+    reconstruct_sequence(folder, tmp_path / "out", options)
+    before = (tmp_path / "out" / "timeline.csv").read_bytes()
+    # The same content, written otherwise, and the same folder by another path.
+    camera.write_text(camera.read_text() + "\n# a comment\n")
+    other = tmp_path / "out" / ".." / folder.name
+    reconstruct_sequence(other, tmp_path / "out", options)
+    assert (tmp_path / "out" / "timeline.csv").read_bytes() == before
+    simtest.save_calibration(simtest.Calibration(replace(CAMERA, fx=2 * CAMERA.fx)), camera)
+    (tmp_path / "out" / "frames" / "000002.json").unlink()
+    told(lambda: reconstruct_sequence(folder, tmp_path / "out", options), "holds a run with another calibration")
+
+
+def test_tracks_behind_a_repaired_picture_are_those_of_a_whole_run(folder, tmp_path):
+    # One step lies within the reach of a track, two lie beyond.
+    for i in (1, 2, 3, 4):
+        save(folder / f"frame{i}.png", frame(8.0 * i))
+    good = (folder / "frame2.png").read_bytes()
+    (folder / "frame2.png").write_text("no picture")
+    noted(folder, tmp_path / "out")
+    (folder / "frame2.png").write_bytes(good)
+    run(folder, tmp_path / "out")
+    run(folder, tmp_path / "whole")
+    for path in sorted((tmp_path / "whole" / "frames").iterdir()):
+        made = tmp_path / "out" / "frames" / path.name
+        if path.suffix == ".json":
+            numbers = [[s["track"] for s in json.loads(each.read_text())["specularities"]] for each in (made, path)]
+            assert numbers[0] == numbers[1], path.name
+        else:
+            assert made.read_bytes() == path.read_bytes()
+    assert (tmp_path / "out" / "tracks.json").read_bytes() == (tmp_path / "whole" / "tracks.json").read_bytes()
+
+
+def test_a_film_takes_little_memory(folder, tmp_path):
+    """Of each frame tracks are kept, and no isophotes: a film of ten minutes has 15,000 frames."""
+    made = run(folder, tmp_path / "warm")
+    assert made.specularities == 6
+    held = []
+
+    def measure(done, total, what):
+        gc.collect()
+        held.append(tracemalloc.get_traced_memory()[0])
+
+    for i in range(20, 40):
+        save(folder / f"frame{i}.png", frame(3.0))
+    tracemalloc.start()
+    run(folder, tmp_path / "out", progress=measure)
+    tracemalloc.stop()
+    # Two highlights a frame; with isophotes they take 300 kB.
+    growth = (held[-2] - held[5]) / (len(held) - 7)
+    assert growth < 15_000
 
 
 def test_a_broken_picture_in_a_folder_is_told_and_passed_over(folder, tmp_path):

@@ -35,7 +35,13 @@ from simtest.reconstruction.light_calibration.outline import (
     outline_through,
     refine_outline,
 )
-from simtest.reconstruction.light_calibration.run import Ball, Plate, _variations, calibrate_lights
+from simtest.reconstruction.light_calibration.run import (
+    Ball,
+    Plate,
+    _variations,
+    calibrate_lights,
+    picture_readers,
+)
 from simtest.reconstruction.light_calibration.write import write_calibration
 from simtest.spec.calibration_file import load_calibration
 from studies.light_calibration.pictures import Look, picture_of_ball
@@ -342,6 +348,30 @@ def test_picture_of_another_size_is_named(tmp_path: Path) -> None:
     small = [("small.png", lambda: np.zeros((100, 240), np.float32))]
     with pytest.raises(InputError, match=r"small\.png: 240 x 100 px; must be 240 x 200"):
         calibrate_lights(small, Calibration(CAMERA), Ball(RADIUS))
+
+
+def test_pictures_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
+    for folder, value in (("a", 100), ("b", 120)):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "001.png"), np.full((200, 240), value, np.uint8))
+        cv2.imwrite(str(tmp_path / folder / f"{folder}.png"), np.full((200, 240), value, np.uint8))
+    folders = [tmp_path / "a", tmp_path / "b"]
+    twice = picture_readers([*folders, tmp_path / "a" / "001.png", tmp_path / "b"])
+    assert [name for name, _ in twice] == [str(tmp_path / "a/001.png"), "a.png", str(tmp_path / "b/001.png"), "b.png"]
+    assert [float(read()[0, 0]) * 255 for _, read in twice] == pytest.approx([100, 100, 120, 120])
+    # Outlines and poses go by file names.
+    with pytest.raises(InputError, match=r"--outlines: 001\.png names 2 pictures"):
+        calibrate_lights(twice, Calibration(CAMERA), Ball(RADIUS, circles={"001.png": (1.0, 2.0, 3.0)}))
+    poses = tmp_path / "poses.json"
+    poses.write_text(json.dumps([{"frame": "001.png", "world_from_camera": np.eye(4).tolist()}]))
+    with pytest.raises(InputError, match=r"--poses .*poses\.json: 001\.png names 2 pictures"):
+        calibrate_lights(twice, Calibration(CAMERA), Plate(poses))
+    with pytest.raises(InputError, match=r"pictures: x\.png names 2 pictures"):
+        calibrate_lights([("x.png", twice[0][1])] * 2, Calibration(CAMERA), Ball(RADIUS))
+    # Without names on either side the order counts, and each picture needs a pose.
+    poses.write_text(json.dumps([np.eye(4).tolist()] * 5))
+    with pytest.raises(InputError, match="5 poses of frames without names; must be one for each of the 4"):
+        calibrate_lights(twice, Calibration(CAMERA), Plate(poses))
 
 
 @pytest.mark.parametrize(
