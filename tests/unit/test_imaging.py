@@ -137,6 +137,19 @@ def test_files_that_are_no_pictures(tmp_path):
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.parametrize(("suffix", "words"), [("jpg", "as they are stored"), ("tif", "as the tag turns them")])
+def test_a_picture_with_an_orientation_says_how_it_is_taken(tmp_path, suffix, words):
+    exif, values = PillowImage.Exif(), np.zeros((40, 60), np.uint8)
+    values[:20] = 200
+    for orientation in (1, 3):
+        exif[0x0112] = orientation
+        PillowImage.fromarray(values).save(tmp_path / f"{orientation}.{suffix}", exif=exif)
+    plain = read_picture(tmp_path / f"1.{suffix}")  # warnings are errors here
+    with pytest.warns(UserWarning, match=f"its orientation tag is 3: pixels are taken {words}"):
+        turned = read_picture(tmp_path / f"3.{suffix}")
+    assert np.allclose(turned, plain if suffix == "jpg" else plain[::-1, ::-1], atol=0.02)
+
+
 def test_a_huge_picture_is_refused_before_it_is_decoded(tmp_path):
     PillowImage.new("1", (20000, 20000)).save(tmp_path / "huge.png")
     told(lambda: read_picture(tmp_path / "huge.png"), "huge.png", "400000000 px", "at most 50000000 are allowed")
