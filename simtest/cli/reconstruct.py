@@ -91,7 +91,7 @@ def reconstruct(
         return
     _print_tables(record)
     if record.stated is not None:
-        print(f"stated: {record.stated}")
+        print(f"reported: {record.stated}")
         print(MEANING)
     _print_silent(record.specularities)
     _print_assumed(record.assumed)

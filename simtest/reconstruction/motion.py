@@ -160,7 +160,7 @@ def _record(ranked: RankedHypotheses, frames: tuple[int, ...]) -> MotionRecord:
         status, detail = str(Reason.UNDECIDED), "no curvature explains the other frames: a wrong pose, or it moved"
     elif 0 in signs:
         which = "neither sign is" if signs == (0, 0) else "one sign is not"
-        status, detail = str(Reason.UNDECIDED), f"{which} told"
+        status, detail = str(Reason.UNDECIDED), f"{which} clear"
     first, second = (_BENDS[bend] for bend in ranked.told_bends())
     return MotionRecord(
         status, detail, frames, signs, tuple(ranked.sign_margins.tolist()), tuple(ranked.hypotheses[0].tolist()),

@@ -1,4 +1,4 @@
-"""Which of a highlight's estimates is the best one, and why: the one with the smallest stated error."""
+"""Which of a highlight's estimates is the best one, and why: the one with the smallest reported error."""
 
 import statistics
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ class StatedErrors:
         # Parts below a hundredth of the whole change nothing that is shown.
         told = {name: value for name, value in self.parts_deg.items() if value >= 0.01 * self.median_deg}
         parts = ", ".join(f"{name} {value:.2g}" for name, value in told.items())
-        left = f"; {self.silent} state none" if self.silent else ""
+        left = f"; {self.silent} report none" if self.silent else ""
         return f"median ± {self.median_deg:.2g} deg of {self.count} best normals ({parts}){left}"
 
 
@@ -72,14 +72,14 @@ def best_of(estimates: Mapping[str, Estimate | Failure], target: Target = "fine"
     stated = {name: expected for name, result in wanted.items() if (expected := result.deviation_deg) is not None}
     if not stated:
         best = min(wanted, key=_rank)
-        return best, "no estimator states an uncertainty; chosen by the estimators' order"
+        return best, "no estimator reports an uncertainty; chosen by the estimators' order"
     # The first of equal ones; so the result does not depend on rounding alone.
     best = min(stated, key=lambda name: (stated[name], _rank(name)))
     others = sorted((expected, name) for name, expected in stated.items() if name != best)
     because = f"smallest expected error, {stated[best]:.2g} deg{_mostly(wanted[best])}"
     if others:
         return best, f"{because}; next {others[0][1]} with {others[0][0]:.2g} deg"
-    return best, f"{because}; " + ("the only answer" if len(wanted) == 1 else "the others state no uncertainty")
+    return best, f"{because}; " + ("the only answer" if len(wanted) == 1 else "the others report no uncertainty")
 
 
 def _mostly(estimate: Estimate) -> str:

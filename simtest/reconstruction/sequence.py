@@ -281,7 +281,7 @@ def _told_by_motion(frames: Sequence[TrackedFrame], poses: Poses | None, is_flip
     stated = f"{error.translation:.1%} and {math.degrees(error.rotation):.2g} deg"
     told = (
         f"bends of {len(judged)} highlights: {counts}; {misfits} fit no curvature; "
-        f"error of the poses {'told' if poses.error_told else 'assumed'}: {stated}"
+        f"error of the poses {'given' if poses.error_told else 'assumed'}: {stated}"
     )
     if is_flipped:
         told += (

@@ -47,7 +47,7 @@ def test_the_smallest_expected_error_is_the_best():
 
 def test_what_states_no_uncertainty_comes_last():
     vague = {"brightest_point": stating(), "mine": stating(80.0)}
-    assert best_of(vague) == ("mine", "smallest expected error, 80 deg; the others state no uncertainty")
+    assert best_of(vague) == ("mine", "smallest expected error, 80 deg; the others report no uncertainty")
     silent = {"circle_pose": stating(), "mine": stating(), "cone_axis": stating()}
     assert best_of(silent)[0] == "cone_axis"
     assert best_of({"circle_pose": stating(), "mine": stating()})[0] == "mine"
@@ -72,7 +72,7 @@ def test_the_stated_errors_of_a_picture():
     assert (told.count, told.silent) == (3, 1)
     assert told.median_deg == pytest.approx(2.0)
     assert told.parts_deg == pytest.approx({"noise": 2.0, "light_offset": 0.0})
-    assert str(told) == "median ± 2 deg of 3 best normals (noise 2); 1 state none"
+    assert str(told) == "median ± 2 deg of 3 best normals (noise 2); 1 report none"
     assert stated_errors([stating()]) is None
 
 
