@@ -178,7 +178,7 @@ def _choose(
     name, finder = choose_detector(detector, image, known, roi is not None, isolated)
     smoothing = choose_smoothing(smoothing_px, finder)
     # A region of interest is cut as by peaks; its neighbours are those that would be found without it.
-    _, searching = choose_detector(detector, image, known, False, isolated)
+    searching = finder if roi is None else choose_detector(detector, image, known, False, isolated)[1]
     made = _run(image, known, searching, estimators, roi, smoothing, target)
     kind = known.response.kind if known.response else "linear"
     return made, Choices(kind, known.saturation_level, name, smoothing, short_names(estimators), known.priors)
