@@ -361,7 +361,7 @@ class Extras:
     """camera_from_model of the mesh."""
 
     depth: str | None = None
-    """Depth of the arrows: a number in mm, or a depth map."""
+    """Depth of the points: a number in mm, or a depth map."""
 
     depth_scale_mm: float | None = None
     """mm of one step of an integer depth map."""

@@ -34,7 +34,6 @@ from simtest.estimators import Estimate, near_misses, prior_parts
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import Reconstruction, default_estimators, run_picture
-from simtest.reconstruction.ranking import deviation_deg
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import from_integer
@@ -326,7 +325,7 @@ def _cloud_rows(
 
 
 def _stated(estimate: Estimate) -> float:
-    deviation = deviation_deg(estimate)
+    deviation = estimate.deviation_deg
     return math.nan if deviation is None else deviation
 
 

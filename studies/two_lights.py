@@ -16,7 +16,6 @@ from benchmarks.measuring import print_markdown
 from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.dataset.plan import Plan
 from simtest.reconstruction.pipeline import run_picture
-from simtest.reconstruction.ranking import deviation_deg
 from simtest.spec.dataset_recipe import load_dataset
 from studies.twins import SCOPES, _rendered, told
 
@@ -59,7 +58,7 @@ def _scored(frames: int) -> list[ScoredSpot]:
 
 def _line(name: str, spots: Sequence[ScoredSpot]) -> list[str]:
     errors = np.array([spot.error_deg for spot in spots])
-    stated = np.array([deviation_deg(spot.spot.estimate) for spot in spots], dtype=float)
+    stated = np.array([spot.spot.estimate.deviation_deg for spot in spots], dtype=float)
     rms = [float(np.sqrt(np.mean(np.square(values)))) for values in (errors, stated)]
     held = 100 * float(np.mean([spot.held for spot in spots]))
     return [name, str(len(spots)), *(f"{value:.2f}" for value in rms), f"{held:.0f} %"]

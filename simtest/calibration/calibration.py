@@ -65,7 +65,7 @@ class Calibration:
     camera : Camera
         Geometry.
     response : Response, optional
-        From light to values; None: not stated.
+        From light to values; None: not known, and values count as linear light.
     vignetting : AngularProfile
         Share of the light that the lens transmits, over the angle between sightline and optical axis.
     emission : AngularProfile
@@ -130,15 +130,19 @@ class Calibration:
             return None
         return falloff_map(self.camera, self.vignetting) * falloff_map(self.camera, self.emission, self.emission_axis)
 
+    def clipped(self, values: Image) -> Mask | None:
+        """Return where a channel of a frame as encoded is clipped, shape (H, W); None where no level is known."""
+        if self.saturation_level is None:
+            return None
+        return np.asarray(brightest_channel(values) >= np.float32(self.saturation_level))
+
     def correct(self, values: Image) -> CorrectedFrame:
         """Undo the response, average the channels, divide by the known falloff; smoothing comes after.
 
         The values are those of the frame as encoded, float32, finite, shape (H, W) or (H, W, C).
         """
         # clipped pixels, while the values are as encoded
-        saturated = None
-        if self.saturation_level is not None:
-            saturated = np.asarray(brightest_channel(values) >= np.float32(self.saturation_level))
+        saturated = self.clipped(values)
         # linear light
         if self.response is not None and self.response.kind != "linear":
             values = self.response.decode(values).astype(np.float32)

@@ -57,6 +57,11 @@ class Uniform(_Interval):
 
 
 @dataclass(frozen=True)
+class Assumed(Uniform):
+    """A uniform distribution for what nobody gave; it equals no given one, not even of the same ends."""
+
+
+@dataclass(frozen=True)
 class LogUniform(_Interval):
     """From low > 0 to high, the logarithm uniform: a scale of which only the order of magnitude is known."""
 

@@ -5,9 +5,8 @@ from functools import cached_property
 
 import numpy as np
 
-from simtest.calibration.calibration import Calibration, CorrectedFrame, brightest_channel
+from simtest.calibration.calibration import Calibration, CorrectedFrame
 from simtest.calibration.noise_estimate import COLOURED, estimate_coarse_noise, estimate_noise
-from simtest.calibration.response import Response
 from simtest.errors import Failure
 from simtest.geometry import Camera, Image, Mask, Patch, smooth
 from simtest.runtime.short_repr import short_repr
@@ -58,14 +57,15 @@ class Frame:
 
     @cached_property
     def channels(self) -> Image:
-        """Linear light of each channel, same shape as `encoded` (`Response.decode_picture`); sRGB is the default."""
-        return (self.calibration.response or Response("srgb")).decode_picture(self.encoded)
+        """Linear light of each channel, same shape as `encoded` (`Response.decode_picture`)."""
+        response = self.calibration.response
+        return self.encoded if response is None else response.decode_picture(self.encoded)
 
     @cached_property
     def clipped(self) -> Mask:
-        """Where a channel is clipped, shape (H, W); at 1 where the calibration knows no level."""
-        level = 1.0 if self.calibration.saturation_level is None else self.calibration.saturation_level
-        return np.asarray(brightest_channel(self.encoded) >= np.float32(level))
+        """Where a channel is clipped, shape (H, W); nowhere if the calibration knows no level."""
+        clipped = self.calibration.clipped(self.encoded)
+        return np.zeros(self.encoded.shape[:2], dtype=bool) if clipped is None else clipped
 
     @cached_property
     def corrected(self) -> CorrectedFrame:
@@ -76,7 +76,7 @@ class Frame:
         plain = replace(self.calibration, response=None, saturation_level=None)
         return replace(
             plain.correct(self.light),
-            saturated=self.clipped,
+            saturated=self.calibration.clipped(self.encoded),
             channels=1 if self.encoded.ndim == 2 else self.encoded.shape[2],
         )
 

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from simtest.calibration.distributions import Distribution, Uniform, check_distribution
+from simtest.calibration.distributions import Assumed, Distribution, Uniform, check_distribution
 from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.checks import check_kind, check_number
@@ -27,16 +27,16 @@ ROUNDING = 1e-9
 MOST_COVARIANCE_MM2 = 1e6
 """Of a light, which is within 1000 mm of the camera along each axis."""
 
-UNTOLD_OFFSET_MM = Uniform(0.0, 6.0)
+UNTOLD_OFFSET_MM = Assumed(0.0, 6.0)
 """Distance of a light from the camera across the optical axis, mm, where no rig is told; every azimuth is as likely."""
 
 UNTOLD_DISTANCE_MM = Uniform(5.0, 80.0)
 """Distance of the tissue along the sightline, mm, where none is told: the working range of endoscopes."""
 
-UNTOLD_FALLOFF_POWER = Uniform(0.0, 4.0)
+UNTOLD_FALLOFF_POWER = Assumed(0.0, 4.0)
 """Power k of the falloff cos^k of lens and lights over the angle from the optical axis, where none is told."""
 
-UNTOLD_SLOPE_RAD = Uniform(0.0, math.radians(9.0))
+UNTOLD_SLOPE_RAD = Assumed(0.0, math.radians(9.0))
 """Slope of the relief an axis, rad, where none is told: from smooth organs to the mucosa of the colon, whose recipe was
 fitted to real frames: the slopes of all recipes lie at 1.4 to 9 deg (scenes/datasets/endoscopy.toml)."""
 

@@ -35,19 +35,12 @@ Pose = Annotated[
     Path | None, Parameter(help="Pose of the reference mesh: TOML with matrix, or rotation and translation_mm.")
 ]
 Depth = Annotated[
-    str | None, Parameter(help="Depth at which normals.ply and arrows.ply stand: mm, or a depth map; default 1.")
+    str | None, Parameter(help="Depth at which the points of normals.ply stand: mm, or a depth map; default 1.")
 ]
 Poses = Annotated[
     Path | None,
     Parameter(
         help="Poses of a sequence's frames: views.json, JSON of matrices or a TUM file; tells convex from concave."
-    ),
-]
-Patch = Annotated[
-    str | None,
-    Parameter(
-        help="x,y,radius: a pixel of the first frame, and mm; gives the base's normal over this patch of still tissue, "
-        "and its fine normals, from all frames. Needs --poses."
     ),
 ]
 DepthScale = Annotated[float | None, Parameter(help="mm of one step of an integer depth map.")]
@@ -66,7 +59,6 @@ def reconstruct(
     depth: Depth = None,
     depth_scale: DepthScale = None,
     poses: Poses = None,
-    patch: Patch = None,
     as_json: AsJson = False,
 ) -> None:
     """Reconstruct the normals at the specularities of a picture, of each picture of a folder, or of a video's frames.
@@ -85,12 +77,10 @@ def reconstruct(
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
     if poses and not sequence:
         raise InputError(f"{image}: --poses is for a folder or a film")
-    if patch and not poses:
-        raise InputError("--patch: needs --poses")
     box = None if roi is None else parse_roi(roi)
     options = known.checked(box, poses)
     if sequence:
-        _sequence(image, out, options, as_json, patch)
+        _sequence(image, out, options, as_json)
         return
     from simtest.api import Extras, reconstruct_picture
 
@@ -101,7 +91,7 @@ def reconstruct(
         return
     _print_tables(record)
     if record.stated is not None:
-        print(f"stated: {record.stated}")
+        print(f"reported: {record.stated}")
         print(MEANING)
     _print_silent(record.specularities)
     _print_assumed(record.assumed)
@@ -109,24 +99,15 @@ def reconstruct(
     print_files(files, as_json)
 
 
-def _sequence(source: Path, out: Path, options: "Options", as_json: bool, patch: str | None) -> None:
+def _sequence(source: Path, out: Path, options: "Options", as_json: bool) -> None:
     """Reconstruct the frames of a folder or a video, and print what came of them."""
-    from dataclasses import asdict, replace
+    from dataclasses import asdict
 
     from simtest.cli.progress import progress_bar
     from simtest.reconstruction.sequence import reconstruct_sequence
 
-    asked = None
-    if patch is not None:
-        from simtest.reconstruction.accumulation import accumulate, parse_patch, write_patch
-
-        asked = parse_patch(patch)
     with progress_bar("writing the tables") as progress:
         made = reconstruct_sequence(source, out, options, progress)
-    shown_patch = None
-    if asked is not None:
-        shown_patch = accumulate(source, options, asked)
-        made = replace(made, files=[*made.files, *write_patch(out, shown_patch)])
     if as_json:
         print_json(asdict(made))
         return
@@ -136,8 +117,6 @@ def _sequence(source: Path, out: Path, options: "Options", as_json: bool, patch:
     print(f"{counted(made.frames, 'frame')}{unread}: {found}, {made.tracks} seen in several frames")
     if made.motion:
         print(made.motion)
-    if shown_patch is not None:
-        print(shown_patch.summary)
     print_files(made.files, as_json)
 
 
@@ -167,14 +146,13 @@ def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
     from statistics import median
 
     from simtest.reconstruction.explanations import kind_name
-    from simtest.reconstruction.ranking import deviation_deg
 
     groups: dict[tuple[str, str], list[SpecularityRecord]] = {}
     for spot in spots:
         groups.setdefault((kind_name(spot.kind), spot.best or "none"), []).append(spot)
     rows = []
     for (kind, best), held in sorted(groups.items(), key=lambda item: -len(item[1])):
-        stated = [d for s in held if s.best_estimate and (d := deviation_deg(s.best_estimate)) is not None]
+        stated = [d for s in held if s.best_estimate and (d := s.best_estimate.deviation_deg) is not None]
         flags = Counter(flag for s in held if s.best_estimate for flag in s.best_estimate.flags)
         named = ", ".join(f"{flag} {count}" for flag, count in flags.most_common(MOST_FLAGS))
         rows.append((kind, best, str(len(held)), f"{median(stated):.2f}" if stated else "", named))
@@ -230,11 +208,10 @@ def _pair(mean: float, spread: float | None) -> str:
 
 def _cells(spot: "SpecularityRecord") -> list[str]:
     from simtest.reconstruction.explanations import kind_name
-    from simtest.reconstruction.ranking import deviation_deg
 
     best, published = spot.best_estimate, spot.normals.get("circle_pose")
     x, y = (math.nan, math.nan) if spot.peak_px is None else spot.peak_px
-    deviation = None if best is None else deviation_deg(best)
+    deviation = None if best is None else best.deviation_deg
     margin = None if published is None else published.choice_margin
     return [
         str(spot.id), f"{x:.1f}", f"{y:.1f}", kind_name(spot.kind), "" if spot.score is None else f"{spot.score:.2f}",

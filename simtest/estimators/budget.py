@@ -25,6 +25,9 @@ stated from a single highlight.
 STATED = "stated"
 """Name of the one part of an estimate that states a covariance without a budget, as other packages' may."""
 
+MISPLACED = ("noise", "resolution", "shape", "response", STATED)
+"""Parts that stand for a highlight's brightest point lying elsewhere than where the normal looks."""
+
 CONFIDENCE = 0.95
 
 Budget = Mapping[str, Array]

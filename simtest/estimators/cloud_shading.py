@@ -97,10 +97,7 @@ class DiffuseLight:
         """Return logs of the channels, shape (h, w, C), where they are lit between the spots, and not clipped there."""
         frame, cut = self.frame, (slice(None, None, STRIDE), slice(None, None, STRIDE))
         encoded = frame.encoded if frame.encoded.ndim == 3 else frame.encoded[..., None]
-        # A grey frame whose response nobody told is taken as linear.
-        light = (
-            frame.channels if frame.encoded.ndim == 3 else frame.calibration.correct(frame.encoded).linear[..., None]
-        )
+        light = frame.channels if frame.encoded.ndim == 3 else frame.channels[..., None]
         gain = frame.corrected.gain
         values = light[cut] if gain is None else light[cut] * gain[cut][..., None]
         # The noise is that of the channels' mean.
@@ -109,8 +106,9 @@ class DiffuseLight:
         lit &= ~(cv2.dilate(bright_parts(frame).astype(np.uint8), margin)[cut] > 0)[..., None]
         if frame.seen is not None:
             lit &= frame.seen[cut][..., None]
-        level = 1.0 if frame.calibration.saturation_level is None else frame.calibration.saturation_level
-        return np.log(np.maximum(values, 1e-9), dtype=np.float64), lit, lit & (encoded[cut] < level)
+        level = frame.calibration.saturation_level
+        unclipped = lit if level is None else lit & (encoded[cut] < level)
+        return np.log(np.maximum(values, 1e-9), dtype=np.float64), lit, unclipped
 
     @cached_property
     def _sightlines(self) -> Array:

@@ -96,12 +96,6 @@ def bright_parts(frame: Frame) -> Mask:
     return _above(frame)[1]
 
 
-def specular_light(frame: Frame) -> Image:
-    """Return the light above that of the tissue around in `bright_parts`, 0 elsewhere, shape (H, W), frame units."""
-    above, parts = _above(frame)
-    return np.asarray(np.where(parts if frame.seen is None else parts & frame.seen, above, np.float32(0)))
-
-
 def _above(frame: Frame) -> tuple[Image, Mask]:
     """Return the light less that of the tissue around, and where this is no diffuse light, shape (H, W)."""
     light, noise = _light(frame)

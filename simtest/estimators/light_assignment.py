@@ -76,6 +76,6 @@ def _misfit(seen: Array, offsets: Array) -> float:
 
 def _other_peaks(family: HighlightAxis) -> Array:
     """Return the offsets of the other highlights, the nearest first, tangents in the basis, shape (K, 2)."""
-    others, peak = np.array(family.patch.others_px).reshape(-1, 2), family.patch.peak_px
+    others, peak = family.patch.neighbours_px, family.patch.peak_px
     order = np.argsort(np.linalg.norm(others - peak, axis=1), kind="stable")
     return np.asarray(family.tangents(others[order]) - family.tangents(peak[None]))

@@ -67,9 +67,10 @@ def near_miss_variance(patch: Patch, lights: int) -> float:
     Returns
     -------
     float
-        0 in a frame that does not show more than `CROWD` highlights for each light.
+        0 in a frame that does not show more than `CROWD` highlights for each light; where the patch does not know the
+        frame's others, that of the usual number.
     """
-    count = (len(patch.others_px) + 1) / min(lights, APART)
+    count = USUAL if patch.others_px is None else (len(patch.others_px) + 1) / min(lights, APART)
     if count <= CROWD:
         return 0.0
     scale = (USUAL / min(count, MOST)) ** RARER * (SEVERAL if 1 < lights <= APART else 1.0)
@@ -79,8 +80,8 @@ def near_miss_variance(patch: Patch, lights: int) -> float:
 def _faintness(patch: Patch) -> float:
     """Return ln(I0 / I) of a highlight, 0 for one that is brighter than those around."""
     values = np.array(patch.others_value)
-    if len(values) != len(patch.others_px):
+    if len(values) == 0 or len(values) != len(patch.neighbours_px):
         return UNTOLD_FAINTNESS
-    away = np.sum((np.array(patch.others_px) - patch.peak_px) ** 2, axis=1)
+    away = np.sum((patch.neighbours_px - patch.peak_px) ** 2, axis=1)
     brightest = float(values[np.argsort(away, kind="stable")[:AROUND]].max())
     return max(float(np.log(brightest / patch.peak_value)), 0.0) if brightest > 0 else 0.0

@@ -220,7 +220,7 @@ def _window(patch: Patch, half: int, reach: float, offsets: Array) -> tuple[Arra
     used[inner] = np.isfinite(raw) if patch.seen is None else np.isfinite(raw) & patch.seen[crop]
     used[inner] &= ~_of_others(patch)[crop]
     near = np.sum(offsets**2, axis=0).reshape(side, side) <= reach**2
-    for x, y in np.reshape(patch.others_px, (-1, 2)) - patch.peak_px:
+    for x, y in patch.neighbours_px - patch.peak_px:
         if x * x + y * y < (2 * reach) ** 2:
             # nearer to the neighbour's peak than to this one
             near &= (x * offsets[0] + y * offsets[1] < (x * x + y * y) / 2).reshape(side, side)
@@ -250,7 +250,7 @@ def _spot(i: int, patch: Patch, camera: Camera, windows: SpotWindows, fits: Spot
     variance = np.linalg.inv(np.array([[p[XX], p[XY]], [p[XY], p[YY]]]))
     by_noise = fits.covariance[i] * ((patch.noise_at_peak or 0.0) / patch.peak_value) ** 2
     own = max(radius**2 - GAUSSIAN_RADIUS2 * patch.smoothing_px**2, 0.0)
-    gaps = np.linalg.norm(np.reshape(patch.others_px, (-1, 2)) - patch.peak_px, axis=1)
+    gaps = np.linalg.norm(patch.neighbours_px - patch.peak_px, axis=1)
     near = NEIGHBOUR_PX4 / max(float(gaps.min(initial=np.inf)), LEAST_GAP_PX) ** 4
     by_shape = (PIXEL_PX2 + RADIUS_SHARE * own**2) * np.eye(2) + MOMENTS_SHARE * variance @ variance + near * variance
     by_shape += RESIDUAL_SHARE * fits.covariance[i] * float(fits.residual[i]) ** 2

@@ -1,6 +1,6 @@
 """The camera: pixels to unit sightlines and back, pixel centres at integer + 0.5."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy.typing as npt
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
-from simtest.geometry.distortion import Distortion
+from simtest.geometry.distortion import BrownConrady, Distortion, Scaramuzza
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.short_repr import short_repr
 
@@ -224,6 +224,15 @@ class Camera:
     def K(self) -> Array:
         """Calibration matrix, shape (3, 3), px."""
         return np.array([[self.fx, self.skew, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def with_radial_error(self, error: float) -> "Camera":
+        """Return the camera whose radial distortion k1 is larger by an error; a pinhole is one without distortion."""
+        if not error:
+            return self
+        lens = self.distortion or BrownConrady()
+        # To first order k2 of the polynomial moves a point as k1 of the other lenses does.
+        name = "k2" if isinstance(lens, Scaramuzza) else "k1"
+        return replace(self, distortion=replace(lens, **{name: getattr(lens, name) + error}))
 
     def unproject(self, points_px: npt.ArrayLike) -> Array:
         """Return the unit sightlines, shape (..., 3), of pixels, shape (..., 2), inside the image and outside.

@@ -43,8 +43,8 @@ class Patch:
         Standard deviation of the noise before smoothing, independent from pixel to pixel; None: not known.
     smoothing_px : float
         Standard deviation of the Gaussian that the frame was smoothed with, px.
-    others_px : tuple of tuple of float
-        Peaks of the frame's other specularities, px.
+    others_px : tuple of tuple of float, optional
+        Peaks of the frame's other specularities, px; None: not known, empty: there are none.
     others_value : tuple of float
         Smoothed intensities of those, 0 where one has no patch; empty: not known.
     tracer : IsophoteTracer, optional
@@ -72,7 +72,7 @@ class Patch:
     raw: Image | Array | None = None
     noise: float | Image | None = None
     smoothing_px: float = 0.0
-    others_px: tuple[tuple[float, float], ...] = ()
+    others_px: tuple[tuple[float, float], ...] | None = None
     others_value: tuple[float, ...] = ()
     tracer: IsophoteTracer | None = field(default=None, compare=False, repr=False)
     kept: dict[Hashable, tuple[object, object]] = field(default_factory=dict, init=False, compare=False, repr=False)
@@ -97,6 +97,7 @@ class Patch:
         raw: Image | Array | None = None,
         noise: float | Image | None = None,
         smoothing_px: float = 0.0,
+        others_px: tuple[tuple[float, float], ...] | None = None,
     ) -> "Patch | Failure":
         """Cut a region out of a smoothed frame; masks, raw frame and noise are those of the frame, shape (H, W).
 
@@ -111,6 +112,8 @@ class Patch:
             px and more lies at the plateau's centroid.
         origin_px : tuple of int
             Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
+        others_px : tuple of tuple of float, optional
+            Peaks of the frame's other specularities, px; empty: there are none.
 
         Returns
         -------
@@ -153,7 +156,13 @@ class Patch:
         return cls(
             values, corner, position + PIXEL_CENTRE + corner, value, (int(column), int(row)), saturated, seen,
             None if raw is None else raw[crop], noise[crop] if isinstance(noise, np.ndarray) else noise, smoothing_px,
+            others_px,
         )  # fmt: skip
+
+    @property
+    def neighbours_px(self) -> Array:
+        """The frame's other peaks, shape (N, 2), px; none where they are not known."""
+        return np.reshape(np.array(self.others_px or (), dtype=float), (-1, 2))
 
     def crossings(self, isovalue: float) -> Array | Failure:
         """Return the isophote's points by marching squares [MB, section 2.3, step 1], shape (N, 2), px, in no order.

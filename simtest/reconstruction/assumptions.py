@@ -47,7 +47,7 @@ Extent = Literal["width", "height", "diagonal", "view"]
 LIGHT = "light"
 
 LIGHT_AT_CAMERA = (
-    "The position of the light is not told, so each normal is the reversed line of sight to its highlight, as if the "
+    "The position of the light is not given, so each normal is the reversed line of sight to its highlight, as if the "
     "light were at the camera. A light beside it turns the true normal away by half the angle between light and camera."
 )
 """What a picture's normals are where nobody told the light; in pages and in the terminal."""
@@ -105,7 +105,7 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
         worst = float(np.sqrt(np.linalg.eigvalsh(priors.lights_covariance)[:, -1].max()))
         made.append(
             Assumption(
-                "light positions", f"as stated, normal, ± {worst:.2g} mm along the least certain axis",
+                "light positions", f"as given, normal, ± {worst:.2g} mm along the least certain axis",
                 "[rig] lights_mm and lights_covariance_mm2 in a calibration file", True,
             )
         )  # fmt: skip
@@ -155,7 +155,7 @@ def _of_camera(camera: Camera, prior: CameraPrior) -> list[Assumption]:
             Assumption("principal point", deviation, f"[camera] cx, cy and [uncertainty] centre_sd_px {key}", told)
         )
     if prior.distortion_sd > 0:
-        lens = "none" if camera.distortion is None else "as stated"
+        lens = "none" if camera.distortion is None else "as given"
         deviation = f"{lens}, its k1 normal, ± {prior.distortion_sd:g}"
         made.append(
             Assumption("distortion", deviation, f"[camera.distortion] and [uncertainty] distortion_sd {key}", told)

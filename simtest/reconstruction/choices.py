@@ -84,9 +84,13 @@ def check_encoding(encoding: str | None, calibration: Calibration) -> None:
 
 def complete(calibration: Calibration, encoding: str | None) -> Calibration:
     """Add what every picture has: an encoding, by default sRGB, and a largest value, at which it is clipped."""
-    response = calibration.response or Response("linear" if encoding == "linear" else "srgb")
     level = 1.0 if calibration.saturation_level is None else calibration.saturation_level
-    return replace(calibration, response=response, saturation_level=level)
+    if calibration.response is not None:
+        return replace(calibration, saturation_level=level)
+    response = Response("linear" if encoding == "linear" else "srgb")
+    # The response also sets the steps of light between neighbouring values.
+    noise = replace(calibration.noise, response=response)
+    return replace(calibration, response=response, noise=noise, saturation_level=level)
 
 
 def choose_detector(

@@ -1,102 +1,70 @@
-"""Sparse normals as constraints that a reconstruction of the surface can take: constraints.json and constraints.npz."""
+"""Sparse normals as constraints that a reconstruction of the surface can take: constraints.npz."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from simtest.estimators import Estimate
+from simtest.estimators.budget import MISPLACED
 from simtest.geometry.vectors import tangent_basis
 from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.runtime.arrays import Array
-from simtest.runtime.files import JsonObject
-from simtest.spec import describe_camera
 
-VERSION = 1
-
-ABOUT = (
-    "For constraint i the surface point on the ray depth * sightline[i] through pixel[i] has the unit normal "
-    "normal[i], which faces the camera; target[i] says whether it is that of the fine surface with its relief, or of "
-    "the base without. Camera frame: x right, y down, z forward; pixel centres at integer + 0.5. "
-    "covariance[i] is that of the normal, rad^2, in its tangent basis[i] (two unit vectors); NaN (null) where the "
-    "estimator gives none. "
-    "candidates[i] holds all normals that the data allow."
-)
-
-SHAPES = {"pixel": (2,), "sightline": (3,), "normal": (3,), "basis": (2, 3), "covariance": (2, 2)}
-"""Of what constraints.npz stacks."""
-
-
-@dataclass(frozen=True)
-class Constraint:
-    """The best normal of a specularity (see `ABOUT`), with the candidates of `circle_pose` where it has any."""
-
-    id: int
-    track: int | None
-    pixel: Array | None
-    sightline: Array
-    normal: Array
-    basis: Array
-    covariance: Array | None
-    estimator: str
-    candidates: Array
-    score: float | None
-    flags: tuple[str, ...]
-    target: str
-
-
-def constraints_of(spots: Sequence[SpecularityRecord]) -> list[Constraint]:
-    """Return the best normal of each specularity that has one and a sightline."""
-    return [
-        Constraint(
-            id=spot.id,
-            track=spot.track,
-            pixel=spot.peak_px,
-            sightline=spot.sightline,
-            normal=best.normal,
-            basis=np.concatenate(tangent_basis(best.normal[None])),
-            covariance=best.covariance,
-            estimator=spot.best,
-            candidates=spot.normals.get("circle_pose", best).candidates,
-            score=spot.score,
-            flags=best.flags,
-            target=best.target,
-        )
-        for spot in spots
-        if spot.best is not None and spot.sightline is not None and (best := spot.best_estimate) is not None
-    ]
-
-
-def constraints_json(record: PictureRecord) -> JsonObject:
-    """Return the content of constraints.json."""
-    about = {"version": VERSION, "about": ABOUT, "image": record.image, "camera": describe_camera(record.camera)}
-    return {**about, "constraints": constraints_of(record.specularities)}
+VERSION = 2
 
 
 def constraints_arrays(record: PictureRecord) -> dict[str, npt.NDArray[np.generic]]:
-    """Return the content of constraints.npz: no pickles, a row a constraint, and K (3, 3).
+    """Return the content of constraints.npz: no pickles, a row a specularity with a best normal, and K (3, 3).
 
-    id (N,), pixel (N, 2), sightline and normal (N, 3), basis (N, 2, 3), covariance (N, 2, 2), candidates (N, 2, 3) with
-    NaN where there is no second, estimator and target (N,) as text.
+    The normal and its covariance are those of the surface at the highlight's brightest point, wherever that is; the
+    pixel, at which the best normal looks, is where it is estimated. Of the surface on the sightline through that pixel
+    the normal is the same, with `covariance_at_pixel`. docs/howto/constraints.md lists the arrays.
     """
-    made = constraints_of(record.specularities)
-    stacked = {}
-    for name, shape in SHAPES.items():
-        rows = [getattr(constraint, name) for constraint in made]
-        filled = [np.full(shape, np.nan) if row is None else row for row in rows]
-        stacked[name] = np.array(filled, dtype=float).reshape(-1, *shape)
+    made = [
+        (spot, spot.best, best)
+        for spot in record.specularities
+        if spot.best is not None and spot.sightline is not None and (best := spot.best_estimate) is not None
+        if np.isfinite(record.camera.unproject(best.look_px)).all()
+    ]
+    pixels = np.array([best.look_px for _, _, best in made], dtype=float).reshape(-1, 2)
+    normals = np.array([best.normal for _, _, best in made], dtype=float).reshape(-1, 3)
+    unknown = np.full((2, 2), np.nan)
     candidates = np.full((len(made), 2, 3), np.nan)
-    for pair, constraint in zip(candidates, made, strict=True):
-        pair[: len(constraint.candidates)] = constraint.candidates[:2]
-    ids, estimators, targets = (
-        [getattr(constraint, name) for constraint in made] for name in ("id", "estimator", "target")
-    )
+    for pair, (spot, _, best) in zip(candidates, made, strict=True):
+        listed = spot.normals.get("circle_pose", best).candidates
+        pair[: len(listed)] = listed[:2]
     return {
         "version": np.array(VERSION),
-        "id": np.array(ids, dtype=int),
-        **stacked,
+        "id": np.array([spot.id for spot, _, _ in made], dtype=int),
+        "pixel": pixels,
+        "sightline": record.camera.unproject(pixels),
+        "normal": normals,
+        "basis": np.stack(tangent_basis(normals), axis=1),
+        "covariance": _stacked([unknown if best.covariance is None else best.covariance for _, _, best in made]),
+        "covariance_at_pixel": _stacked([_at_pixel(spot, best) for spot, _, best in made]),
         "candidates": candidates,
-        "estimator": np.array(estimators, dtype=str),
-        "target": np.array(targets, dtype=str),
+        "estimator": np.array([name for _, name, _ in made], dtype=str),
+        "target": np.array([best.target for _, _, best in made], dtype=str),
         "K": record.camera.K,
     }
+
+
+def _at_pixel(spot: SpecularityRecord, best: Estimate) -> Array:
+    """Return the covariance of a normal as that of the surface on the ray through the look pixel; NaN if not known.
+
+    Where the brightest point is misplaced by an angle w, the surface's normal turns by d k w from there to the ray, and
+    the estimate by -w: together (1 + d k) w.
+    """
+    curvatures = (each.curvature for each in spot.normals.values())
+    known = next((each for each in curvatures if each is not None and each.hypotheses is not None), None)
+    if best.budget is None or known is None or known.hypotheses is None:
+        return np.full((2, 2), np.nan)
+    axes = known.directions @ np.concatenate(tangent_basis(best.normal[None])).T
+    M = axes.T @ np.diag(np.abs(known.hypotheses).max(axis=0)) @ axes
+    parts = [M @ part @ M.T if name in MISPLACED else part for name, part in best.budget.items()]
+    return np.asarray(np.sum(parts, axis=0))
+
+
+def _stacked(matrices: Sequence[Array]) -> Array:
+    return np.array(matrices, dtype=float).reshape(-1, 2, 2)

@@ -20,7 +20,7 @@ FLAGS = {
     "cut": "a part of the cloud is out of view",
     "dim": "darker than the clipped highlights of the picture: the normal may only come near the bisector of light and "
     "camera",
-    "light_offset": "a known light is not at the camera, as the estimator takes it to be; no error is stated",
+    "light_offset": "a known light is not at the camera, as the estimator takes it to be; no error is reported",
     "misfit": "the modelled lobe does not explain the pixels of the highlight",
     "missing_isovalues": "some isovalues gave no ellipse, or enclose other highlights too; they were left out",
     "near_degenerate": "the peak fits neither candidate of the circle pose: the two-fold model does not apply",
@@ -60,25 +60,25 @@ PARTS = {
     "noise": "the sensor's noise",
     "resolution": "pixel size, smoothing, blur and coding, as seen in the fit's residuals",
     "shape": "drift of the centre over the isovalues, where the curvature changes inside the highlight",
-    "light_offset": "the light's position beside the camera, unknown or told with a spread",
+    "light_offset": "the light's position beside the camera, unknown or given with a spread",
     "camera": "focal length, principal point and distortion, where they are guesses",
     "distance": "the unknown distance of the surface",
     "response": "unknown response, sharpening and falloff",
     "relief": "slope of the fine relief, where the normal of the smooth base is wanted",
-    "stated": "the estimator states one covariance without parts",
+    "stated": "the estimator reports one covariance without parts",
 }
 """By part of the budget of an uncertainty (docs/concepts/uncertainty.md)."""
 
 UNTOLD_ERROR = {
     "light_offset": "a known light is not at the camera, which this method ignores, so it cannot tell its error",
-    "circle_pose": "circle_pose states an error on surfaces that are known to be planes alone",
+    "circle_pose": "circle_pose reports an error on surfaces that are known to be planes alone",
     "other": "the noise of the picture could not be estimated, fewer than two isophotes are ellipses, or the estimator "
-    "states no error",
+    "reports no error",
 }
 """Why an estimate has no ±."""
 
 TERMS = {
-    "best": "The best normal of a highlight has the smallest stated error. Normals that state none come last.",
+    "best": "The best normal of a highlight has the smallest reported error. Normals without one come last.",
     "tilt": "Tilt is the angle between the normal and the camera's optical axis: 0° faces the camera.",
     "deviation": "± is the root mean square error that is expected of the normal, all parts of its budget together. "
     "The error should stay below 1.7 to 2 times this figure for 95 % of the normals.",
@@ -91,7 +91,7 @@ TERMS = {
 
 
 def why_no_error(name: str, result: Estimate) -> str:
-    """Return why the estimate of the named estimator states no error; an empty text where it states one."""
+    """Return why the estimate of the named estimator reports no error; an empty text where it reports one."""
     if result.covariance is not None:
         return ""
     if "light_offset" in result.flags:

@@ -25,6 +25,12 @@ PATIENCE_MS = 5000
 MOST_BITS = 96
 """Of a pixel, for which the limit of pixels is meant: three channels of 32 bits."""
 
+ORIENTATION = 0x0112
+"""Tag of files that viewers turn or mirror."""
+
+TURNED = {"JPEG": "as they are stored", "MPO": "as they are stored", "TIFF": "as the tag turns them"}
+"""What OpenCV makes of that tag, by formats that have it."""
+
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
 
@@ -86,6 +92,7 @@ def _check_header(path: Path) -> None:
             warnings.simplefilter("ignore")
             with PillowImage.open(path) as header:
                 (width, height), animated = header.size, bool(getattr(header, "is_animated", False))
+                turned = header.getexif().get(ORIENTATION, 1) if header.format in TURNED else 1
                 bits = 0  # Of what Pillow knows none takes more.
     except PillowImage.DecompressionBombError as error:
         # Beyond a limit of its own Pillow tells the size in words alone.
@@ -95,11 +102,18 @@ def _check_header(path: Path) -> None:
     except Exception:
         # OpenCV reads more than Pillow, whose parsers raise whatever they run into, and says what is wrong with others.
         width, height, bits = _tiff_size(path)
-        animated = False
+        animated, turned = False, 1
     check_picture_size(path, width, height)
     # Floats of several channels may need more memory than the pixels alone tell.
     share = bits / MOST_BITS
     check_limit("picture_pixels", width * height * share, f"{path}: {bits} bits a pixel", f"times {MOST_BITS} bits")
+    if turned != 1:
+        how = TURNED.get(str(header.format), "")
+        warnings.warn(
+            f"{shown(path)}: its orientation tag is {turned}: pixels are taken {how}, and the calibration must be of "
+            "such pictures",
+            stacklevel=4,
+        )
     if animated:
         warnings.warn(f"{shown(path)}: holds several pictures; the first is used", stacklevel=4)
 

@@ -32,6 +32,9 @@ MOST_OFFSET = 0.05
 NEEDED = "curved"
 """Estimator of the curvatures whose signs are asked."""
 
+JUDGING = (NEEDED, "cone_axis")
+"""Estimators for a light at the camera, whose normals judge others: the first that answered."""
+
 _FLIPPED = np.diag([1.0, -1.0, -1.0, 1.0])
 """From camera axes x right, y up, z backward, as OpenGL and Blender have them, to ours."""
 
@@ -112,8 +115,8 @@ def fits_flipped_axes(
 
 
 def _normal(estimates: Mapping[str, Estimate | Failure]) -> Estimate | None:
-    """Return the normal of a highlight that judges others, by an estimator for a light at the camera."""
-    for name in (NEEDED, "cone_axis"):
+    """Return the normal of a highlight that judges others."""
+    for name in JUDGING:
         if isinstance(found := estimates.get(name), Estimate):
             return found
     return None
@@ -157,7 +160,7 @@ def _record(ranked: RankedHypotheses, frames: tuple[int, ...]) -> MotionRecord:
         status, detail = str(Reason.UNDECIDED), "no curvature explains the other frames: a wrong pose, or it moved"
     elif 0 in signs:
         which = "neither sign is" if signs == (0, 0) else "one sign is not"
-        status, detail = str(Reason.UNDECIDED), f"{which} told"
+        status, detail = str(Reason.UNDECIDED), f"{which} clear"
     first, second = (_BENDS[bend] for bend in ranked.told_bends())
     return MotionRecord(
         status, detail, frames, signs, tuple(ranked.sign_margins.tolist()), tuple(ranked.hypotheses[0].tolist()),

@@ -1,4 +1,4 @@
-"""What is written of a picture: normals.json, a table, oriented points, arrows, overlay, constraints and the page."""
+"""What is written of a picture: normals.json, a table, oriented points, overlay, constraints and the page."""
 
 import csv
 import json
@@ -12,10 +12,9 @@ import numpy as np
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import BrownConrady, Camera
-from simtest.reconstruction.constraints import constraints_arrays, constraints_json
+from simtest.reconstruction.constraints import constraints_arrays
 from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.reconstruction.overlay import draw_overlay
-from simtest.reconstruction.ranking import deviation_deg
 from simtest.reconstruction.result_page import write_picture_page
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.files import make_folder, write_atomically, write_json
@@ -24,16 +23,13 @@ from simtest.runtime.machine_errors import write_error
 MANY = 10
 """Above this many specularities normals.json is written on one line, since most of it is outlines."""
 
-ARROW_SIDES = 6
-
 COLUMNS = (
     "specularity", "estimator", "status", "candidate", "normal_x", "normal_y", "normal_z", "look_x_px", "look_y_px",
     "axis_ratio", "flags", "best", "choice_margin", "cov_11", "cov_12", "cov_22", "peak_x_px", "peak_y_px", "kind",
     "score", "target", "deviation_deg",
 )  # fmt: skip
 
-FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "arrows.ply", "constraints.json",
-         "constraints.npz", "index.html")  # fmt: skip
+FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "constraints.npz", "index.html")
 
 
 def write_outputs(
@@ -42,24 +38,18 @@ def write_outputs(
     """Write what was reconstructed in a picture, its overlay and its page; return the files.
 
     The folder is made if need be; `InputError` is raised where it cannot be written,
-    `SimtestError` where its disk is full. A specularity's points and arrow
-    stand at its depth, mm, by default at 1.
+    `SimtestError` where its disk is full. A specularity's points stand at its depth, mm, by default at 1.
     """
     spots, camera = record.specularities, record.camera
     depths = [1.0] * len(spots) if depth_mm is None else depth_mm
     arrays = constraints_arrays(record)
-
-    def write_text(name: str, content: str) -> None:
-        write_atomically(out / name, lambda part: part.write_text(content, encoding="ascii"))
-
+    points = normals_ply(spots, camera, depths)
     make_folder(out)
     try:
         write_json(out / "normals.json", record, compact=len(spots) > MANY)
         write_atomically(out / "normals.csv", lambda part: write_csv(part, COLUMNS, normals_rows(spots)))
-        write_text("normals.ply", normals_ply(spots, camera, depths))
+        write_atomically(out / "normals.ply", lambda part: part.write_text(points, encoding="ascii"))
         write_atomically(out / "overlay.png", lambda part: cv2.imwrite(str(part), draw_overlay(picture, spots)))
-        write_text("arrows.ply", arrows_ply(spots, camera, depths))
-        write_json(out / "constraints.json", constraints_json(record))
         write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
         write_atomically(out / "index.html", lambda part: write_picture_page(part, record, picture))
     except OSError as error:
@@ -82,7 +72,7 @@ def normals_rows(spots: Iterable[SpecularityRecord]) -> Iterator[tuple[object, .
             look = [v if math.isfinite(v) else None for v in result.look_px.tolist()]
             covariance = (None,) * 3 if result.covariance is None else result.covariance[np.triu_indices(2)].tolist()
             seen = (*look, result.axis_ratio, ";".join(result.flags), best, result.choice_margin, *covariance)
-            stated = (*peak, spot.kind, spot.score, result.target, deviation_deg(result))
+            stated = (*peak, spot.kind, spot.score, result.target, result.deviation_deg)
             for k, normal in enumerate(result.candidates.tolist()):
                 yield (spot.id, name, "ok", k, *normal, *seen, *stated)
 
@@ -116,51 +106,9 @@ def normals_ply(spots: Sequence[SpecularityRecord], camera: Camera, depths_mm: S
     return "\n".join([*header, *lines]) + "\n"
 
 
-def arrows_ply(spots: Sequence[SpecularityRecord], camera: Camera, depths_mm: Sequence[float]) -> str:
-    """Return the best normals as arrows of triangles, each a tenth of its distance long (PLY, ASCII)."""
-    vertices: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
-    for spot, depth in zip(spots, depths_mm, strict=True):
-        best = spot.best_estimate
-        if best is not None and (start := _surface_point(best, camera, depth)) is not None:
-            _add_arrow(vertices, faces, start, best.normal, 0.1 * float(np.linalg.norm(start)))
-    header = [
-        "ply", "format ascii 1.0", f"element vertex {len(vertices)}",
-        *(f"property float {name}" for name in "xyz"), f"element face {len(faces)}",
-        "property list uchar int vertex_indices", "end_header",
-    ]  # fmt: skip
-    body = [" ".join(f"{v:.7g}" for v in vertex) for vertex in vertices]
-    return "\n".join([*header, *body, *(f"3 {a} {b} {c}" for a, b, c in faces)]) + "\n"
-
-
 def _surface_point(result: Estimate, camera: Camera, depth_mm: float) -> Array | None:
     """Return the point at a depth on the sightline of a normal; None where there is no such sightline or depth."""
     ray, lens = camera.unproject(result.look_px), camera.distortion
     # Depth is along the optical axis of a perspective lens, along the sightline of one that sees sideways.
     point = depth_mm * (ray / ray[2] if lens is None or isinstance(lens, BrownConrady) else ray)
     return np.asarray(point) if np.isfinite(point).all() else None
-
-
-def _add_arrow(
-    vertices: list[list[float]], faces: list[tuple[int, int, int]], start: Array, along: Array, length: float
-) -> None:
-    """Add a shaft and a head: rings of `ARROW_SIDES` points, joined, and a tip."""
-    # two directions across the arrow, the first from the axis that it does not run along
-    side = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [0.0, 1.0, 0.0])
-    side /= np.linalg.norm(side)
-    other = np.cross(along, side)
-    phase = 2 * np.pi * np.arange(ARROW_SIDES) / ARROW_SIDES
-    around = np.cos(phase)[:, None] * side + np.sin(phase)[:, None] * other
-    # The shaft's two rings, the head's, and the tip.
-    first = len(vertices)
-    for at, radius in ((0.0, 0.03), (0.7, 0.03), (0.7, 0.09)):
-        vertices += (start + length * (at * along + radius * around)).tolist()
-    vertices.append((start + length * along).tolist())
-    # Two triangles for each side between neighbouring rings, one from the head to the tip.
-    n = ARROW_SIDES
-    for i in range(n):
-        j = (i + 1) % n
-        for ring in (0, n):
-            a, b, c, d = (first + ring + k for k in (i, j, n + i, n + j))
-            faces += [(a, b, d), (a, d, c)]
-        faces.append((first + 2 * n + i, first + 2 * n + j, first + 3 * n))

@@ -177,7 +177,9 @@ def _choose(
     """Choose detector and smoothing, and run the pipeline."""
     name, finder = choose_detector(detector, image, known, roi is not None, isolated)
     smoothing = choose_smoothing(smoothing_px, finder)
-    made = _run(image, known, finder, estimators, roi, smoothing, target)
+    # A region of interest is cut as by peaks; its neighbours are those that would be found without it.
+    searching = finder if roi is None else choose_detector(detector, image, known, False, isolated)[1]
+    made = _run(image, known, searching, estimators, roi, smoothing, target)
     kind = known.response.kind if known.response else "linear"
     return made, Choices(kind, known.saturation_level, name, smoothing, short_names(estimators), known.priors)
 
@@ -210,7 +212,8 @@ def reconstruct_colour(
         Estimates of highlights that smoothing has made rounder have the flag ``small``; those of highlights too small
         to have a shape ``unresolved``.
     """
-    return run_pipeline(picture, camera, ColourDetector(isolated), estimators, None, smoothing_px)
+    known = complete(_calibration(camera), None)
+    return run_pipeline(picture, known, ColourDetector(isolated), estimators, None, smoothing_px)
 
 
 def default_estimators(calibration: Calibration) -> tuple[str, ...]:
@@ -251,27 +254,48 @@ def _run(
     # linear light: a frame computes each step of its correction when it is first asked for
     frame = Frame(image, calibration, smoothing_px)
     # detect
-    detection = run_detector(detector, frame) if box is None else _cut_region(frame, box)
+    detection, beside = run_detector(detector, frame), tuple[Region, ...]()
+    if box is not None:
+        detection, beside = _cut_region(frame, box, detection.regions)
     # estimate
-    made = _estimate(detection, chosen)
+    made = _estimate(detection, chosen, beside)
     return made if target == "fine" else _at_base(made, calibration.priors)
 
 
-def _cut_region(frame: Frame, box: tuple[int, int, int, int]) -> Detection:
-    """Take a user's region of interest for the one specularity; raise `InputError` where it leaves the frame."""
+def _cut_region(
+    frame: Frame, box: tuple[int, int, int, int], detected: tuple[Region, ...]
+) -> tuple[Detection, tuple[Region, ...]]:
+    """Take a user's region of interest for the one specularity, and return it with the frame's other regions.
+
+    Raises `InputError` where it leaves the frame.
+    """
     patch = frame.patch(box)
-    # A user's region may overlap detected peaks, so it gets no contrast and no list of neighbours.
-    x, y = box[:2] if isinstance(patch, Failure) else (int(v) for v in patch.peak_px)
-    return Detection((Region(box, (x, y), None),), frame)
+    if isinstance(patch, Failure):
+        return Detection((Region(box, box[:2], None),), frame), detected
+    x, y = (int(v) for v in patch.peak_px)
+    # Of the detected regions the nearest one inside its isophote is the same highlight.
+    inside = np.argwhere(patch.inside(HIGHLIGHT_ISOVALUE, cut=True))[:, ::-1] + box[:2]
+    own = min(
+        (region for region in detected if (inside == region.peak).all(axis=1).any()),
+        key=lambda region: math.dist(region.peak, (x, y)),
+        default=None,
+    )
+    return Detection((Region(box, (x, y), None),), frame), tuple(each for each in detected if each is not own)
 
 
-def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> Reconstruction:
-    """Run each estimator on all patches of a picture, or on the whole frame."""
+def _estimate(
+    detection: Detection, estimators: Mapping[str, AnyEstimator], beside: Sequence[Region] = ()
+) -> Reconstruction:
+    """Run each estimator on all patches of a picture, or on the whole frame.
+
+    `beside` are further specularities of the frame, which are only neighbours.
+    """
     frame, regions = detection.frame, detection.regions
     # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement, and a dim
     # highlight among brighter ones may be a near miss.
-    peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in regions]
-    cut = [frame.patch(r.box) if r.contrast is None else frame.patch(r.box, r.peak) for r in regions]
+    known = [*regions, *beside]
+    peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in known]
+    cut = [frame.patch(r.box) if r.contrast is None else frame.patch(r.box, r.peak) for r in known]
     # Highlights that touch have no isophotes of their own, so no estimator answers for them.
     for i, highlight in enumerate(detection.highlights):
         if highlight.kind is Kind.CLUSTER:
@@ -279,9 +303,9 @@ def _estimate(detection: Detection, estimators: Mapping[str, AnyEstimator]) -> R
     values = [0.0 if isinstance(patch, Failure) else patch.peak_value for patch in cut]
     patches = [
         patch
-        if isinstance(patch, Failure) or len(cut) == 1
+        if isinstance(patch, Failure)
         else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]), others_value=(*values[:i], *values[i + 1 :]))
-        for i, patch in enumerate(cut)
+        for i, patch in enumerate(cut[: len(regions)])
     ]
     prepare(list(estimators.values()), patches, frame.calibration.camera)
     made = {name: run_in_frame(each, frame, patches, frame.calibration.priors) for name, each in estimators.items()}

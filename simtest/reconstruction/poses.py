@@ -7,8 +7,9 @@ docs/howto/motion.md describes the formats.
 
 import json
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,22 +68,20 @@ class Poses:
     error: PoseError
     error_told: bool
 
-    def of_frames(self, names: Sequence[str], indices: Sequence[int], by_name: bool) -> list[Array | None]:
+    def of_frames(self, names: Sequence[str], indices: Sequence[int]) -> list[Array | None]:
         """Return the pose of each frame, None for those without one.
 
         Parameters
         ----------
         names, indices : sequence
-            Names of the frames, and their numbers in the sequence.
-        by_name : bool
-            Whether frames are files, so that they can be named.
+            Names of the frames' files, and their numbers in the sequence, which count where the poses have no names.
 
         Raises
         ------
         InputError
             If no frame is named in the file, or there are fewer poses than frames.
         """
-        if by_name and self.names:
+        if self.names:
             table = {name: pose for name, pose in zip(self.names, self.world_from_camera, strict=True)}
             found = [table.get(name) for name in names]
             if all(pose is None for pose in found):
@@ -98,9 +97,47 @@ class Poses:
             )
         return [self.world_from_camera[index] for index in indices]
 
-    def is_for(self, count: int) -> bool:
-        """Return whether the file names its frames, or holds as many poses as there are frames: `count`."""
-        return bool(self.names) or len(self.world_from_camera) == count
+    def of_files(self, names: Sequence[str]) -> list[Array | None]:
+        """Return the pose of each file of a folder (`of_frames`); raise `InputError` where it is not clear which.
+
+        Poses without names must be as many as the files, and a name must be that of one file.
+        """
+        where, count = f"--poses {shown(self.path)}", len(self.world_from_camera)
+        check_names(where, self.names, names)
+        found = self.of_frames(names, range(len(names)))
+        if not self.names and count != len(names):
+            raise InputError(
+                f"{where}: {count} poses of frames without names; must be one for each of the {len(names)} frames"
+            )
+        return found
+
+    def of_film(self, least: int) -> "Poses":
+        """Return the poses in the order of a film's frames; raise `InputError` where it is not known.
+
+        Names must number the frames from 0 or 1 without a gap. There must be one for each of at least `least` frames.
+        """
+        where, count, poses = f"--poses {shown(self.path)}", len(self.world_from_camera), self
+        if self.names:
+            numbers = [int((re.findall(r"\d+", Path(name).stem) or ["-1"])[-1]) for name in self.names]
+            order = np.argsort(numbers)
+            first = numbers[order[0]]
+            if first not in (0, 1) or sorted(numbers) != list(range(first, first + count)):
+                raise InputError(
+                    f"{where}: names {shown(self.names[0], 60)}; of a film the names must number its frames from 0 or "
+                    "1 without a gap; or give the folder of the pictures in its place"
+                )
+            poses = replace(self, world_from_camera=self.world_from_camera[order], names=())
+        if count < least:
+            raise InputError(f"{where}: {count} poses; must be one for each of the film's frames, at least {least}")
+        return poses
+
+
+def check_names(where: str, keys: Iterable[str], files: Sequence[str]) -> None:
+    """Raise `InputError` where a key names several files of a list, which may stand in other folders."""
+    counts = Counter(Path(name).name for name in files)
+    for key in keys:
+        if counts[key] > 1:
+            raise InputError(f"{where}: {shown(key, 60)} names {counts[key]} pictures; must be given other file names")
 
 
 def read_poses(path: Path) -> Poses:

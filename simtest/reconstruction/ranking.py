@@ -1,4 +1,4 @@
-"""Which of a highlight's estimates is the best one, and why: the one with the smallest stated error."""
+"""Which of a highlight's estimates is the best one, and why: the one with the smallest reported error."""
 
 import statistics
 from collections.abc import Mapping, Sequence
@@ -9,18 +9,11 @@ import numpy as np
 from simtest.errors import Failure
 from simtest.estimators.budget import deviations, dominant
 from simtest.estimators.protocol import Estimate, Target
-from simtest.geometry import vectors
 
 WITHOUT_UNCERTAINTY = ("bisector", "curved", "photometric", "cone_axis", "brightest_point")
 """Order of estimates that state no uncertainty, so that nothing else can rank them: that which knows the lights, those
 which follow the lobe to its peak, that which averages isophotes, and the one that needs none. Other packages' follow,
 and `circle_pose` last, which takes a curved surface for a plane."""
-
-
-def deviation_deg(estimate: Estimate) -> float | None:
-    """Return the standard deviation of a normal, deg: the square root of the covariance's trace."""
-    # Computed here: a picture's way does not climb back to the estimators.
-    return None if estimate.covariance is None else vectors.deviation_deg(estimate.covariance)
 
 
 @dataclass(frozen=True)
@@ -46,7 +39,7 @@ class StatedErrors:
         # Parts below a hundredth of the whole change nothing that is shown.
         told = {name: value for name, value in self.parts_deg.items() if value >= 0.01 * self.median_deg}
         parts = ", ".join(f"{name} {value:.2g}" for name, value in told.items())
-        left = f"; {self.silent} state none" if self.silent else ""
+        left = f"; {self.silent} report none" if self.silent else ""
         return f"median ± {self.median_deg:.2g} deg of {self.count} best normals ({parts}){left}"
 
 
@@ -61,7 +54,7 @@ def stated_errors(best: Sequence[Estimate]) -> StatedErrors | None:
             parts.setdefault(name, []).append(float(np.degrees(value)))
     # A part that some estimates do not have is 0 there.
     medians = {name: statistics.median(values + [0.0] * (len(stated) - len(values))) for name, values in parts.items()}
-    median = statistics.median([deviation for each in stated if (deviation := deviation_deg(each)) is not None])
+    median = statistics.median([deviation for each in stated if (deviation := each.deviation_deg) is not None])
     ordered = dict(sorted(medians.items(), key=lambda item: -item[1]))
     return StatedErrors(len(stated), len(best) - len(stated), median, ordered)
 
@@ -76,17 +69,17 @@ def best_of(estimates: Mapping[str, Estimate | Failure], target: Target = "fine"
     if not answered:
         return None, "no estimator answered"
     wanted = {name: result for name, result in answered.items() if result.target == target} or answered
-    stated = {name: expected for name, result in wanted.items() if (expected := deviation_deg(result)) is not None}
+    stated = {name: expected for name, result in wanted.items() if (expected := result.deviation_deg) is not None}
     if not stated:
         best = min(wanted, key=_rank)
-        return best, "no estimator states an uncertainty; chosen by the estimators' order"
+        return best, "no estimator reports an uncertainty; chosen by the estimators' order"
     # The first of equal ones; so the result does not depend on rounding alone.
     best = min(stated, key=lambda name: (stated[name], _rank(name)))
     others = sorted((expected, name) for name, expected in stated.items() if name != best)
     because = f"smallest expected error, {stated[best]:.2g} deg{_mostly(wanted[best])}"
     if others:
         return best, f"{because}; next {others[0][1]} with {others[0][0]:.2g} deg"
-    return best, f"{because}; " + ("the only answer" if len(wanted) == 1 else "the others state no uncertainty")
+    return best, f"{because}; " + ("the only answer" if len(wanted) == 1 else "the others report no uncertainty")
 
 
 def _mostly(estimate: Estimate) -> str:

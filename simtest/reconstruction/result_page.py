@@ -19,7 +19,6 @@ from simtest.pages.style import colours
 from simtest.reconstruction import explanations
 from simtest.reconstruction.assumptions import light_note
 from simtest.reconstruction.description import PictureRecord, Points, SpecularityRecord, members
-from simtest.reconstruction.ranking import deviation_deg
 from simtest.reconstruction.tracking import Track, TrackedFrame
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import JsonObject
@@ -149,7 +148,7 @@ def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord, lines: 
         "look": [v if np.isfinite(v) else None for v in _rounded(result.look_px, 2)],
         "isophotes": [lines.index(points) for _, points in traced],
         "curves": [lines.index(curve) for curve in drawing.curves],
-        "deviation": deviation_deg(result),
+        "deviation": result.deviation_deg,
         "silent": explanations.why_no_error(name, result),
         "across": _across(result),
         "target": result.target,

@@ -1,5 +1,6 @@
 """Reconstruction of a folder of pictures or a video: frame by frame, with tracks; a stopped run goes on."""
 
+import hashlib
 import json
 import math
 import warnings
@@ -12,10 +13,12 @@ import cv2
 
 from simtest.calibration import Calibration
 from simtest.errors import InputError
+from simtest.estimators import Estimate
 from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.description import SpecularityRecord
 from simtest.reconstruction.image_io import SequenceFrame, Source, open_source
 from simtest.reconstruction.motion import (
+    JUDGING,
     LEAST_MOTION,
     MOST_MOTION,
     NEEDED,
@@ -34,6 +37,7 @@ from simtest.reconstruction.tracking import Track, TrackedFrame, Tracker, tracks
 from simtest.runtime.files import JsonObject, make_folder, require_plain, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.machine_errors import write_error
+from simtest.runtime.provenance import environment
 from simtest.runtime.resources import shown
 
 Progress = Callable[[int, int, str], None]
@@ -100,13 +104,11 @@ def _checked_poses(path: Path, source: Source, options: Options) -> tuple[Poses,
         raise InputError(f"--poses {shown(path)}: needs a calibration; give --camera in place of --fov")
     poses, calibration = read_poses(path), load_calibration(options.camera)
     check_priors(calibration.priors, options.camera)
-    if not source.is_video:
-        poses.of_frames([file.name for file in source.files], range(len(source.files)), True)
-        if not poses.is_for(len(source.files)):
-            raise InputError(
-                f"--poses {shown(path)}: {len(poses.world_from_camera)} poses of frames without names; must be one for "
-                f"each of the {len(source.files)} frames"
-            )
+    if source.is_video:
+        # The count of a whole film may be off by one, that of one that is cut by more.
+        poses = poses.of_film(1 if source.is_cut else source.count - 1)
+    else:
+        poses.of_files([file.name for file in source.files])
     names = options.estimators or default_estimators(calibration)
     return poses, replace(options, estimators=names if NEEDED in names else (*names, NEEDED))
 
@@ -121,7 +123,7 @@ def _reconstruct(
     path, settings = source.path, _settings(source.path, options)
     _check_settings(out / SETTINGS, settings)
     run = _Run(out, options, settings)
-    if poses is not None and poses.names and not source.is_video:
+    if poses is not None and poses.names:
         run.strangers = frozenset(file.name for file in source.files) - frozenset(poses.names)
     for frame in source.frames():
         if progress is not None:
@@ -144,7 +146,7 @@ def _reconstruct(
                 "ones are taken in their order",
                 stacklevel=2,
             )
-        run.judge_by_motion(poses, by_name=not source.is_video)
+        run.judge_by_motion(poses)
     tracks = tracks_of(run.frames)
     files = _write(out, run.frames, tracks)
     if progress is not None:
@@ -167,6 +169,7 @@ class _Run:
         self.strangers: frozenset[str] = frozenset()  # files that the poses do not name, such as a contact sheet
         self.is_flipped = False
         self.assumed: Sequence[Assumption] = ()
+        self._is_made = False  # a frame of this run; those behind it that an earlier one did have other tracks
         self._calibration: Calibration | None = None
         self._cautions: list[str] = []
         self._tracker: Tracker | None = None
@@ -176,12 +179,13 @@ class _Run:
         self.taken += 1
         stem = self.folder / f"{frame.index:06d}"
         # done by an earlier run: only the tracks are counted anew
-        done = _read_done(stem.with_suffix(".json"), frame.name)
+        done = None if self._is_made else _read_done(stem.with_suffix(".json"), frame.name)
         if done is not None:
-            self.frames.append(replace(done, specularities=self._tracked(done.specularities, done.size)))
+            self._keep(done, self._tracked(done.specularities, done.size))
             return
         try:
-            self.frames.append(self._reconstruct(frame, stem))
+            self._reconstruct(frame, stem)
+            self._is_made = True
         except InputError as error:
             # The first frame shows a wrong camera or estimator; a file that is no picture is passed over.
             if not self.frames and self._calibration is not None and frame.name not in self.strangers:
@@ -190,7 +194,7 @@ class _Run:
             self.first_error = self.first_error or str(error)
             warnings.warn(f"frame {frame.index}: {error}", stacklevel=3)
 
-    def _reconstruct(self, frame: SequenceFrame, stem: Path) -> TrackedFrame:
+    def _reconstruct(self, frame: SequenceFrame, stem: Path) -> None:
         picture = frame.read()
         size = (picture.shape[1], picture.shape[0])
         # The first picture's size completes a camera that is known by its field of view alone.
@@ -207,20 +211,25 @@ class _Run:
             make_folder(self.folder)
             write_json(self.out / SETTINGS, self.settings)
         write_atomically(stem.with_suffix(".jpg"), lambda part: cv2.imwrite(str(part), overlay))
-        spots = [replace(spot, drawings={}) for spot in spots]
+        plain = [replace(spot, drawings={}) for spot in spots]
         entry = {"frame_index": frame.index, "time_s": frame.time_s, "size": size}
         # Last: a frame whose JSON is there is done.
-        write_json(stem.with_suffix(".json"), replace(record, specularities=spots).to_json() | entry, compact=True)
-        return TrackedFrame(frame.name, frame.index, frame.time_s, size, spots)
+        write_json(stem.with_suffix(".json"), replace(record, specularities=plain).to_json() | entry, compact=True)
+        self._keep(TrackedFrame(frame.name, frame.index, frame.time_s, size, []), plain)
 
-    def judge_by_motion(self, poses: Poses, by_name: bool) -> None:
+    def _keep(self, frame: TrackedFrame, spots: Sequence[SpecularityRecord]) -> None:
+        """Keep of a frame what tracks and motion need: a film has thousands, and their files hold the rest."""
+        needed = () if self.options.poses is None else JUDGING
+        self.frames.append(replace(frame, specularities=[_slim(spot, needed) for spot in spots]))
+
+    def judge_by_motion(self, poses: Poses) -> None:
         """Judge the highlights' curvatures by the poses, and add that to the frames' files."""
         # Imported here: the models of files are slow to load.
         from simtest.spec.calibration_file import load_calibration
 
         assert self.options.camera is not None
         names, indices = [frame.name for frame in self.frames], [frame.index for frame in self.frames]
-        told = poses.of_frames(names, indices, by_name)
+        told = poses.of_frames(names, indices)
         priors = load_calibration(self.options.camera).priors
         self.frames = judge_by_motion(self.frames, told, poses.error, priors)
         self.is_flipped = fits_flipped_axes(self.frames, told, poses.error, priors)
@@ -237,10 +246,23 @@ class _Run:
         return [replace(spot, track=number) for spot, number in zip(spots, numbers, strict=True)]
 
 
+def _slim(spot: SpecularityRecord, needed: Sequence[str]) -> SpecularityRecord:
+    """Return a specularity with the estimates that are needed, and of the best one the normal."""
+    estimates = {name: spot.estimates[name] for name in needed if name in spot.estimates}
+    if spot.best is not None and (best := spot.best_estimate) is not None:
+        estimates.setdefault(spot.best, Estimate(best.normal, best.normal[None], best.look_px))
+    return replace(spot, estimates=estimates, highlight=None)
+
+
+def _read(path: Path) -> TrackedFrame:
+    """Read the file of a frame."""
+    return TrackedFrame.from_json(json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8")))
+
+
 def _read_done(path: Path, name: str) -> TrackedFrame | None:
     """Read what an earlier run wrote of a frame; None where there is nothing, or it cannot be used."""
     try:
-        frame = TrackedFrame.from_json(json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8")))
+        frame = _read(path)
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return frame if frame.name == name else None
@@ -259,7 +281,7 @@ def _told_by_motion(frames: Sequence[TrackedFrame], poses: Poses | None, is_flip
     stated = f"{error.translation:.1%} and {math.degrees(error.rotation):.2g} deg"
     told = (
         f"bends of {len(judged)} highlights: {counts}; {misfits} fit no curvature; "
-        f"error of the poses {'told' if poses.error_told else 'assumed'}: {stated}"
+        f"error of the poses {'given' if poses.error_told else 'assumed'}: {stated}"
     )
     if is_flipped:
         told += (
@@ -280,8 +302,21 @@ def _told_by_motion(frames: Sequence[TrackedFrame], poses: Poses | None, is_flip
 
 def _settings(source: Path, options: Options) -> JsonObject:
     """Return the run's settings, through JSON, so that paths and tuples compare with the text and lists of a file."""
-    told = {key: value for key, value in asdict(options).items() if key != "poses" or value is not None}
-    return dict(json.loads(json.dumps({"source": source, **told}, default=str)))
+    given = {key: value for key, value in asdict(options).items() if key != "poses" or value is not None}
+    if options.camera is not None:
+        # Imported here: the models of files are slow to load.
+        from simtest.spec.calibration_file import load_calibration
+
+        content = json.dumps(asdict(load_calibration(options.camera)), default=str)
+        given["calibration"] = hashlib.sha256(content.encode()).hexdigest()
+    return dict(
+        json.loads(
+            json.dumps(
+                {"source": source, **given, "version": environment()["version"]},
+                default=lambda value: str(value.resolve()) if isinstance(value, Path) else str(value),
+            )
+        )
+    )
 
 
 def _check_settings(path: Path, settings: JsonObject) -> None:
@@ -304,12 +339,14 @@ def _write(out: Path, frames: list[TrackedFrame], tracks: list[Track]) -> list[P
     files = [out / name for name in ("timeline.csv", "tracks.json", "index.html")]
     judged = any(spot.motion is not None for frame in frames for spot in frame.specularities)
     columns = (*TIMELINE, *MOTION_COLUMNS) if judged else TIMELINE
-    table = [
+    table = (
         (frame.index, frame.time_s, spot.track, *row, *(() if spot.motion is None else spot.motion.row()))
         for frame in frames
-        for spot in frame.specularities
-        for row in normals_rows([spot])
-    ]
+        for spot, whole in zip(
+            frame.specularities, _read(out / "frames" / f"{frame.index:06d}.json").specularities, strict=True
+        )
+        for row in normals_rows([whole])
+    )
     try:
         write_atomically(files[0], lambda part: write_csv(part, columns, table))
         write_json(files[1], tracks, compact=True)

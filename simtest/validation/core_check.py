@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -173,7 +173,10 @@ def _ask_patch(core: Core) -> Callable[[CoreCase], Answer]:
     estimator = ProcessEstimator(core)
 
     def ask(case: CoreCase) -> Answer:
-        found = run(estimator, case.frame.patch(case.box), case.frame.camera, case.priors)
+        patch = case.frame.patch(case.box)
+        # Each of these frames shows one highlight.
+        alone = patch if isinstance(patch, Failure) else replace(patch, others_px=())
+        found = run(estimator, alone, case.frame.camera, case.priors)
         return found if isinstance(found, Failure) else [found]
 
     return ask

@@ -121,7 +121,8 @@ def load(path: Path) -> Iterator[Case]:
             numbers = each["patch"]
             for name in ("origin_px", "peak_pixel"):
                 numbers[name] = tuple(int(v) for v in numbers[name])
-            numbers["others_px"] = tuple(tuple(point) for point in numbers["others_px"])
+            if numbers["others_px"] is not None:
+                numbers["others_px"] = tuple(tuple(point) for point in numbers["others_px"])
             # Files of before have none.
             numbers["others_value"] = tuple(numbers.get("others_value", ()))
             told = each["case"]

@@ -25,7 +25,6 @@ from simtest.reconstruction.image_io import read_picture
 from simtest.reconstruction.light_calibration.run import Ball, calibrate_lights, picture_readers
 from simtest.reconstruction.light_calibration.write import write_calibration
 from simtest.reconstruction.pipeline import run_picture
-from simtest.reconstruction.ranking import deviation_deg
 from simtest.rendering import Session
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import Scene, load_scene
@@ -101,7 +100,7 @@ def rated(
 def _rated(each: ScoredSpot, told: str, frame: str) -> Rated:
     estimate = each.spot.estimate
     light = deviations(estimate.budget or {}).get("light_offset", 0.0)
-    return Rated(told, frame, each.error_deg, deviation_deg(estimate) or 0.0, float(np.degrees(light)), bool(each.held))
+    return Rated(told, frame, each.error_deg, estimate.deviation_deg or 0.0, float(np.degrees(light)), bool(each.held))
 
 
 def rows_of_rig(

@@ -67,11 +67,14 @@ ESTIMATE = {
 CONSTRAINTS = {
     "version": ("()", "version of this layout"),
     "id": ("(N,)", "as in normals.json"),
-    "pixel": ("(N, 2)", "peak, px; pixel centres at integer + 0.5"),
+    "pixel": ("(N, 2)", "where the highlight's brightest point is estimated, px; pixel centres at integer + 0.5"),
     "sightline": ("(N, 3)", "unit vector through the pixel, camera frame"),
     "normal": ("(N, 3)", "unit normal, camera frame, facing the camera"),
     "basis": ("(N, 2, 3)", "two unit vectors: the tangent basis that the covariance is in"),
-    "covariance": ("(N, 2, 2)", "rad^2; NaN where the estimator states none"),
+    "covariance": ("(N, 2, 2)", "rad^2, against the surface's normal at that point, wherever it is; NaN where the "
+                                "estimator gives none"),
+    "covariance_at_pixel": ("(N, 2, 2)", "rad^2, against the surface's normal on the sightline through the pixel; NaN "
+                                         "where the lobe's width, and so the curvature, is not known"),
     "candidates": ("(N, 2, 3)", "both normals of circle_pose where it answered, else those of the best estimator; NaN "
                                 "where there is no second"),
     "estimator": ("(N,)", "name of the best estimator"),

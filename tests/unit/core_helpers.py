@@ -22,7 +22,9 @@ def lobe_patch(side=60):
     """Cut a highlight at the image's centre."""
     y, x = np.mgrid[:480, :640] + 0.5
     lobe = np.exp(-((x - 320) ** 2 + (y - 240) ** 2) / 200).astype(np.float32)
-    patch = Patch.cut(lobe, (320 - side // 2, 240 - side // 2, side, side), raw=lobe, noise=0.01, smoothing_px=2.0)
+    patch = Patch.cut(
+        lobe, (320 - side // 2, 240 - side // 2, side, side), raw=lobe, noise=0.01, smoothing_px=2.0, others_px=()
+    )
     assert isinstance(patch, Patch)
     return patch
 

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 import simtest
-from simtest.calibration import CameraPrior, Priors, Uniform, exactly
+from simtest.calibration import NO_PRIORS, CameraPrior, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
+from simtest.estimators.process.requests import priors_message
 from simtest.estimators.protocol import Estimate
 from simtest.reconstruction.assumptions import FOCAL_SD, NEAR_MISSES, assumptions, calibration_of_view
 from simtest.reconstruction.borders import BORDERED
 from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
 from simtest.reconstruction.ranking import best_of, stated_errors
 from simtest.runtime.files import write_json
-from simtest.spec import load_calibration
+from simtest.spec import load_calibration, save_calibration
 
 NORMAL = np.array([0.0, 0.0, -1.0])
 CAMERA_KEYS = "width = 200\nheight = 160\nfx = 200.0\nfy = 200.0\n"
@@ -46,7 +47,7 @@ def test_the_smallest_expected_error_is_the_best():
 
 def test_what_states_no_uncertainty_comes_last():
     vague = {"brightest_point": stating(), "mine": stating(80.0)}
-    assert best_of(vague) == ("mine", "smallest expected error, 80 deg; the others state no uncertainty")
+    assert best_of(vague) == ("mine", "smallest expected error, 80 deg; the others report no uncertainty")
     silent = {"circle_pose": stating(), "mine": stating(), "cone_axis": stating()}
     assert best_of(silent)[0] == "cone_axis"
     assert best_of({"circle_pose": stating(), "mine": stating()})[0] == "mine"
@@ -71,7 +72,7 @@ def test_the_stated_errors_of_a_picture():
     assert (told.count, told.silent) == (3, 1)
     assert told.median_deg == pytest.approx(2.0)
     assert told.parts_deg == pytest.approx({"noise": 2.0, "light_offset": 0.0})
-    assert str(told) == "median ± 2 deg of 3 best normals (noise 2); 1 state none"
+    assert str(told) == "median ± 2 deg of 3 best normals (noise 2); 1 report none"
     assert stated_errors([stating()]) is None
 
 
@@ -165,6 +166,23 @@ def test_a_full_calibration_leaves_nothing_open(tmp_path):
     told = load_calibration(path)
     assert assumptions(told, None, "fine") == [NEAR_MISSES]
     assert assumptions(replace(told, priors=replace(told.priors, plane=True)), None, "fine") == []
+
+
+def test_a_prior_that_a_file_states_is_given_where_it_is_the_default_too(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text(
+        CAMERA_KEYS + "[rig]\nlight_offset_mm = [0, 6]\n[surface]\nrelief_slope_deg = [0, 9]\n"
+        "[uncertainty]\nfalloff_power = [0, 4]\n"
+    )
+    given = load_calibration(path)
+    made = [each for each in assumptions(given, None, "base") if each.given]
+    assert {each.what for each in made} == {"light", "falloff towards the border", "slope of the relief"}
+    # It is one still in a file that is written from it, and for a core in another process.
+    save_calibration(given, tmp_path / "written.toml")
+    assert load_calibration(tmp_path / "written.toml") == given
+    for name in ("light_offset_mm", "falloff_power", "relief_slope"):
+        assert priors_message(given.priors)[name]["told"]
+        assert not priors_message(NO_PRIORS)[name]["told"]
 
 
 def test_what_a_file_states_is_given_and_not_assumed(tmp_path):

@@ -12,6 +12,7 @@ from simtest.detection.peaks import PeakDetector, peaks
 from simtest.errors import Failure, InputError
 from simtest.geometry import Camera, Patch, ViewMask
 from simtest.geometry.angular_profile import AngularProfile
+from simtest.reconstruction.choices import complete
 from simtest.reconstruction.pipeline import reconstruct, reconstruct_colour
 
 CAMERA = Camera(200, 160, 200.0, 200.0, 100.0, 80.0)
@@ -71,7 +72,7 @@ def test_peaks_are_those_of_the_pipeline(name, isolated, smoothing_px):
 @pytest.mark.parametrize("name", ["camera alone", "view mask"])
 def test_colour_is_that_of_the_pipeline(name, isolated):
     calibration = CALIBRATIONS[name]
-    found = ColourDetector(isolated).detect(Frame(tissue(), calibration, 1.0), calibration.camera)
+    found = ColourDetector(isolated).detect(Frame(tissue(), complete(calibration, None), 1.0), calibration.camera)
     made = reconstruct_colour(tissue(), calibration, {}, isolated=isolated)
     assert len(made.specularities) == 2
     same_patches(found, made.specularities)

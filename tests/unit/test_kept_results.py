@@ -1,13 +1,11 @@
 """What studies keep: results of other code are never read."""
 
-import json
-import sys
 from types import SimpleNamespace
 
 import polars as pl
 import pytest
 
-from studies import accumulation, kept
+from studies import kept
 from studies.gate import bank
 
 
@@ -40,18 +38,3 @@ def test_a_bank_of_other_code_is_made_anew(tmp_path, monkeypatch, other_code):
     other_code()
     bank.load_bank(tmp_path)
     assert len(set(made)) == 2
-
-
-def test_films_of_other_code_are_made_anew(tmp_path, monkeypatch, other_code):
-    made = []
-    monkeypatch.setattr(accumulation, "one_film", lambda slope, seed: made.append(seed) or [{"seed": seed}])
-    monkeypatch.setattr(accumulation, "tables", lambda rows: str(len(rows)))
-    monkeypatch.setattr(sys, "argv", ["accumulation", "--scenes", "2", "--rows", str(tmp_path / "rows.json")])
-    accumulation.main()
-    first = len(made)
-    accumulation.main()
-    assert len(made) == first
-    other_code()
-    accumulation.main()
-    assert len(made) == 2 * first
-    assert len(json.loads((tmp_path / "rows.json").read_text())["rows"]) == first

@@ -11,7 +11,10 @@ import numpy.typing as npt
 import pytest
 
 import simtest
-from simtest.calibration import Calibration, Response
+from simtest.calibration import Calibration, CameraPrior, Priors, Response
+from simtest.calibration.lights.mirrors import mirror_points
+from simtest.calibration.lights.result import covariance_of_variations
+from simtest.calibration.lights.search import find_lights
 from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.camera import Camera
@@ -19,6 +22,8 @@ from simtest.reconstruction.image_io import read_picture
 from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
 from simtest.reconstruction.light_calibration.observations import (
     View,
+    Views,
+    balls_of,
     circles_of,
     read_balls,
     with_floor,
@@ -30,7 +35,13 @@ from simtest.reconstruction.light_calibration.outline import (
     outline_through,
     refine_outline,
 )
-from simtest.reconstruction.light_calibration.run import Ball, Plate, calibrate_lights
+from simtest.reconstruction.light_calibration.run import (
+    Ball,
+    Plate,
+    _variations,
+    calibrate_lights,
+    picture_readers,
+)
 from simtest.reconstruction.light_calibration.write import write_calibration
 from simtest.spec.calibration_file import load_calibration
 from studies.light_calibration.pictures import Look, picture_of_ball
@@ -200,6 +211,39 @@ def test_spot_wider_than_on_a_larger_ball_is_left_out() -> None:
     assert without_merged([views[2], replace(views[0], outline=views[1].outline)])[1].usable
 
 
+def test_a_radial_distortion_that_is_not_given_is_in_the_intervals() -> None:
+    light, ball = np.array([4.0, 1.0, 0.0]), Ball(RADIUS)
+    lens = CAMERA.with_radial_error(0.1)
+    rng = np.random.default_rng(3)
+    centres = [lens.unproject(rng.uniform([40, 40], [200, 160])) * rng.uniform(20, 40) for _ in range(10)]
+    views = []
+    for i, centre in enumerate(centres):
+        true = outline_of(centre)
+        # What a pinhole makes of the outline and of the highlight where they are in the picture.
+        seen = outline_through(CAMERA, true.pixels(lens))
+        pixel = lens.project(mirror_points(centre[None], np.array([RADIUS]), light[None]))[0]
+        highlight = MeasuredHighlight(pixel, 0.02**2 * np.eye(2))
+        outline = replace(seen, covariance=1e-8 * np.eye(3))
+        views.append(View(f"{i}.png", np.zeros((1, 1)), [highlight], outline=outline))
+    found_by = Views(views)
+    highlights = found_by.highlights()
+    found = find_lights(CAMERA, balls_of(views, CAMERA, RADIUS), highlights, 1)
+    assert found is not None
+    gap = found.bundle.lights[0] - light
+    assert np.linalg.norm(gap) > 0.5
+    exact, given = (
+        covariance_of_variations(
+            _variations(views, Calibration(CAMERA, priors=Priors(camera=CameraPrior(distortion_sd=sd))), ball, found),
+            highlights, found,
+        )
+        for sd in (0.0, 0.1)
+    )  # fmt: skip
+    # One standard deviation of k1: about one of the position along its error, and none without it.
+    along = gap / np.linalg.norm(gap)
+    assert 0.6 < np.linalg.norm(gap) / np.sqrt(along @ given @ along) < 1.7
+    assert np.linalg.norm(gap) > 5 * np.sqrt(along @ exact @ along)
+
+
 def pictures(count: int = 5) -> list[tuple[str, Callable[[], npt.NDArray[np.float32]]]]:
     rng = np.random.default_rng(12)
     made = []
@@ -304,6 +348,30 @@ def test_picture_of_another_size_is_named(tmp_path: Path) -> None:
     small = [("small.png", lambda: np.zeros((100, 240), np.float32))]
     with pytest.raises(InputError, match=r"small\.png: 240 x 100 px; must be 240 x 200"):
         calibrate_lights(small, Calibration(CAMERA), Ball(RADIUS))
+
+
+def test_pictures_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
+    for folder, value in (("a", 100), ("b", 120)):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "001.png"), np.full((200, 240), value, np.uint8))
+        cv2.imwrite(str(tmp_path / folder / f"{folder}.png"), np.full((200, 240), value, np.uint8))
+    folders = [tmp_path / "a", tmp_path / "b"]
+    twice = picture_readers([*folders, tmp_path / "a" / "001.png", tmp_path / "b"])
+    assert [name for name, _ in twice] == [str(tmp_path / "a/001.png"), "a.png", str(tmp_path / "b/001.png"), "b.png"]
+    assert [float(read()[0, 0]) * 255 for _, read in twice] == pytest.approx([100, 100, 120, 120])
+    # Outlines and poses go by file names.
+    with pytest.raises(InputError, match=r"--outlines: 001\.png names 2 pictures"):
+        calibrate_lights(twice, Calibration(CAMERA), Ball(RADIUS, circles={"001.png": (1.0, 2.0, 3.0)}))
+    poses = tmp_path / "poses.json"
+    poses.write_text(json.dumps([{"frame": "001.png", "world_from_camera": np.eye(4).tolist()}]))
+    with pytest.raises(InputError, match=r"--poses .*poses\.json: 001\.png names 2 pictures"):
+        calibrate_lights(twice, Calibration(CAMERA), Plate(poses))
+    with pytest.raises(InputError, match=r"pictures: x\.png names 2 pictures"):
+        calibrate_lights([("x.png", twice[0][1])] * 2, Calibration(CAMERA), Ball(RADIUS))
+    # Without names on either side the order counts, and each picture needs a pose.
+    poses.write_text(json.dumps([np.eye(4).tolist()] * 5))
+    with pytest.raises(InputError, match="5 poses of frames without names; must be one for each of the 4"):
+        calibrate_lights(twice, Calibration(CAMERA), Plate(poses))
 
 
 @pytest.mark.parametrize(

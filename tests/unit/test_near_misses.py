@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from simtest.advice.twin.scoring import score
-from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, exactly
+from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, Calibration, exactly, srgb_encode
 from simtest.dataset.maker import colour_variant
 from simtest.estimators import load_estimators
 from simtest.estimators.near_misses import (
@@ -22,8 +22,8 @@ from simtest.estimators.near_misses import (
     USUAL,
     near_miss_variance,
 )
-from simtest.geometry import Camera, chi_squared
-from simtest.reconstruction.pipeline import run_picture
+from simtest.geometry import Camera, Patch, chi_squared, smooth
+from simtest.reconstruction.pipeline import reconstruct, run_picture
 from simtest.rendering import Session
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import load_scene
@@ -85,6 +85,55 @@ def test_a_dim_highlight_may_be_farther_off():
     assert near_miss_variance(among(USUAL - 1, 0.0), 1) == pytest.approx(BRIGHT)
     untold = replace(among(USUAL - 1), others_value=())
     assert near_miss_variance(untold, 1) == pytest.approx(BRIGHT + UNTOLD_FAINTNESS * FAINT)
+
+
+def crowd(count=3):
+    """Return a frame of count x count lobes of different brightness, with noise."""
+    y, x = np.mgrid[:240, :320] + 0.5
+    rng = np.random.default_rng(0)
+    frame = rng.normal(0.05, 0.002, (240, 320))
+    for column in np.linspace(50, 270, count):
+        for row in np.linspace(40, 200, count):
+            frame += rng.uniform(0.5, 1.0) * np.exp(-((x - column) ** 2 + (y - row) ** 2) / 128)
+    return frame.astype(np.float32)
+
+
+def test_a_region_of_interest_is_as_uncertain_as_in_the_whole_frame():
+    frame, camera = crowd(), Calibration(Camera.from_fov(60.0, 320, 240), priors=LIGHT_AT_CAMERA)
+    whole = reconstruct(frame, camera, NAMES)
+    assert len(whole) == 9
+    for spot in whole:
+        (alone,) = reconstruct(frame, camera, NAMES, roi=spot.region.box)
+        assert alone.patch.others_px is not None
+        assert sorted(alone.patch.others_px) == sorted(spot.patch.others_px)
+        for name, estimate in spot.estimates.items():
+            assert alone.estimates[name].deviation_deg == pytest.approx(estimate.deviation_deg, rel=1e-6)
+    # Negative control: the only highlight of a frame has no neighbours, with a region or without.
+    single = crowd(1)
+    (spot,) = reconstruct(single, camera, ["cone_axis"])
+    (alone,) = reconstruct(single, camera, ["cone_axis"], roi=spot.region.box)
+    assert spot.patch.others_px == alone.patch.others_px == ()
+
+
+def test_neighbours_in_a_colour_picture_are_those_found_by_colour():
+    lobes = np.clip(crowd()[..., None] - 0.05, 0, None)
+    picture = np.rint(255 * srgb_encode(np.clip(0.2 * np.array([1.0, 0.5, 0.4]) + 0.6 * lobes, 0, 1))).astype(np.uint8)
+    camera = Camera.from_fov(60.0, 320, 240)
+    whole = reconstruct(picture, camera, ["cone_axis"])
+    assert whole.choices.detector == "colour"
+    assert len(whole) == 9
+    for spot in whole:
+        (alone,) = reconstruct(picture, camera, ["cone_axis"], roi=spot.region.box)
+        assert sorted(alone.patch.others_px) == sorted(spot.patch.others_px)
+        assert alone.estimates["cone_axis"].deviation_deg > 0.8 * spot.estimates["cone_axis"].deviation_deg
+
+
+def test_a_patch_that_does_not_know_its_frame_may_be_a_near_miss():
+    unknown = near_miss_variance(replace(PATCH, others_px=None), 1)
+    assert unknown == pytest.approx(BRIGHT + UNTOLD_FAINTNESS * FAINT)
+    assert near_miss_variance(replace(PATCH, others_px=()), 1) == 0
+    frame = smooth(crowd(), 2.0)
+    assert near_miss_variance(Patch.cut(frame, (20, 10, 60, 60)), 1) == pytest.approx(unknown)
 
 
 def test_near_misses_get_rarer_with_the_number_of_highlights_up_to_a_limit():

@@ -163,7 +163,7 @@ def test_what_the_calibration_gives_stands_apart_from_what_is_assumed(tmp_path, 
     write_picture_page(tmp_path / "index.html", record, np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "Given by the calibration, not exactly: distance of the tissue, focal length" in page
-    assert "Assumed, because nothing states it: light</summary>" in page
+    assert "Assumed, because nobody gave it: light</summary>" in page
     _print_assumed(record.assumed)
     _, *lines = capsys.readouterr().out.splitlines()
     assert [line.split(": ")[:2] for line in (lines[0], lines[-1])] == [

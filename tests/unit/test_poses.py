@@ -65,17 +65,43 @@ def test_poses_go_with_frames_by_name_or_by_order(tmp_path):
     path.write_text(json.dumps([{"frame": f"dir/{i}.png", "world_from_camera": T.tolist()}
                                 for i, T in enumerate(TWO)]))  # fmt: skip
     read = read_poses(path)
-    second, missing, first = read.of_frames(["1.png", "x.png", "0.png"], [0, 1, 2], True)
+    second, missing, first = read.of_frames(["1.png", "x.png", "0.png"], [0, 1, 2])
     assert missing is None
     np.testing.assert_allclose([first, second], TWO, atol=1e-15)
-    np.testing.assert_allclose(read.of_frames(["film.avi#0", "film.avi#1"], [0, 1], False), TWO, atol=1e-15)
+    np.testing.assert_allclose(read.of_film(2).of_frames(["film.avi#0", "film.avi#1"], [0, 1]), TWO, atol=1e-15)
     with pytest.raises(InputError, match="must name frames of the folder"):
-        read.of_frames(["a.png"], [0], True)
+        read.of_frames(["a.png"], [0])
     with pytest.raises(InputError, match="2 poses; must be one for each of the 3 frames"):
-        read.of_frames(["a", "b", "c"], [0, 1, 2], False)
-    assert read.is_for(3)
+        read.of_film(2).of_frames(["a", "b", "c"], [0, 1, 2])
+    assert len(read.of_files(["1.png", "x.png", "0.png"])) == 3
     path.write_text(json.dumps([T.tolist() for T in TWO]))
-    assert [read_poses(path).is_for(count) for count in (1, 2, 3)] == [False, True, False]
+    assert len(read_poses(path).of_files(["a", "b"])) == 2
+    for names, words in ((["a"], "2 poses of frames without names; must be one for each of the 1"), ("abc", "2 poses")):
+        with pytest.raises(InputError, match=words):
+            read_poses(path).of_files(names)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_film_takes_poses_by_the_numbers_in_their_names(tmp_path, first):
+    """COLMAP lists pictures by its own numbers, in any order."""
+    path = tmp_path / "poses.json"
+    moved = [pose(), pose(), pose()]
+    for i, T in enumerate(moved):
+        T[0, 3] = i
+
+    def read(*numbers):
+        entries = [{"frame": f"film2_{n + first:04d}.png", "world_from_camera": moved[i].tolist()}
+                   for i, n in enumerate(numbers)]  # fmt: skip
+        path.write_text(json.dumps(entries))
+        return read_poses(path)
+
+    given = read(2, 0, 1).of_film(3)
+    assert [T[0, 3] for T in given.of_frames(["f#0", "f#1", "f#2"], [0, 1, 2])] == [1, 2, 0]
+    # A frame without a pose shifts those behind it, and nobody knows which it is.
+    with pytest.raises(InputError, match="must number its frames from 0 or 1 without"):
+        read(0, 1, 3).of_film(3)
+    with pytest.raises(InputError, match="3 poses; must be one for each of the film's frames, at least 4"):
+        read(0, 1, 2).of_film(4)
 
 
 MALFORMED = {

@@ -29,7 +29,9 @@ def lobe(seed: int, noise: float, blur_px: float = 0.0) -> Patch:
         drawn = cv2.GaussianBlur(drawn, (0, 0), blur_px)
         drawn /= drawn.std()
     raw = (values + noise * drawn).astype(np.float32)
-    patch = Patch.cut(smooth(raw, SMOOTHING_PX), (0, 0, 120, 100), raw=raw, noise=noise, smoothing_px=SMOOTHING_PX)
+    patch = Patch.cut(
+        smooth(raw, SMOOTHING_PX), (0, 0, 120, 100), raw=raw, noise=noise, smoothing_px=SMOOTHING_PX, others_px=()
+    )
     assert isinstance(patch, Patch)
     return patch
 

@@ -20,7 +20,6 @@ from simtest.reconstruction.found import Reconstruction
 from simtest.reconstruction.image_io import is_sequence, read_picture
 from simtest.reconstruction.picture import Options, read_calibration
 from simtest.reconstruction.pipeline import run_picture
-from simtest.reconstruction.ranking import deviation_deg
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.resources import shown
 
@@ -218,4 +217,4 @@ def match_spots(
             "give more with --frames, or a calibration that is nearer to the scope"
         )
     matcher = Matcher(twins)
-    return [SpotTwins(spot, deviation_deg(spot.estimate), matcher.find(spot)) for spot in spots]
+    return [SpotTwins(spot, spot.estimate.deviation_deg, matcher.find(spot)) for spot in spots]

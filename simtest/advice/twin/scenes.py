@@ -120,9 +120,9 @@ class SceneDraws:
             values = {
                 "surface": patch.surface, "rig": self._rig(rng), "reflectance.film": self._film(rng),
                 "sensor": self._sensor(rng), "render.samples_per_pixel": SAMPLES,
-                "camera": {**drawn_camera(self._calibration.camera, priors.camera, rng), "moved": moved},
             }  # fmt: skip
             try:
+                values["camera"] = {**drawn_camera(self._calibration.camera, priors.camera, rng), "moved": moved}
                 return _scene(self._base, values, self._look.organ)
             except InputError:
                 # A drawn lens may fold, or a light lie in the tissue: another draw.
@@ -181,18 +181,12 @@ class SceneDraws:
 
 def drawn_camera(camera: Camera, prior: CameraPrior, rng: np.random.Generator) -> dict[str, Any]:
     """Return the table of a camera about the told one, as far as its prior leaves it open."""
-    table: dict[str, Any] = dict(camera_table(camera))
     scale = max(1 + prior.focal_sd * float(rng.standard_normal()), 0.3)
     shift = prior.centre_sd_px * rng.standard_normal(2)
-    table |= {"fx": camera.fx * scale, "fy": camera.fy * scale}
-    table |= {"cx": camera.cx + float(shift[0]), "cy": camera.cy + float(shift[1])}
     error = prior.distortion_sd * float(rng.standard_normal())
-    if error:
-        lens = table.get("distortion", {"type": "brown_conrady"})
-        # To first order k2 of the polynomial moves a point as k1 of the other lenses does.
-        name = "k2" if lens["type"] == "scaramuzza" else "k1"
-        table["distortion"] = {**lens, name: lens.get(name, 0.0) + error}
-    return table
+    table: dict[str, Any] = dict(camera_table(camera.with_radial_error(error)))
+    table |= {"fx": camera.fx * scale, "fy": camera.fy * scale}
+    return table | {"cx": camera.cx + float(shift[0]), "cy": camera.cy + float(shift[1])}
 
 
 def _profile(profile: AngularProfile) -> dict[str, Any]:

@@ -94,7 +94,7 @@ def patch_request(patch: Patch, camera: Camera, priors: Priors, hello: Hello) ->
         "peak_pixel": list(patch.peak_pixel),
         "smoothing_px": float(patch.smoothing_px),
         "noise": None if isinstance(patch.noise, np.ndarray) or patch.noise is None else float(patch.noise),
-        "others_px": [list(other) for other in patch.others_px],
+        "others_px": None if patch.others_px is None else [list(other) for other in patch.others_px],
         "others_value": [float(value) for value in patch.others_value],
     }
     return _header("patch", camera, priors, about, missing), arrays

@@ -227,11 +227,11 @@ def _outline(intensity: Array, camera: Camera, circle: Circle | None) -> BallOut
     if circle is None:
         searched = find_ball(intensity, camera)
         if searched is None:
-            return "no ball found; tell its outline with --outlines"
+            return "no ball found; give its outline with --outlines"
     else:
         searched = trace_outline(intensity, camera, np.array(circle[:2]), circle[2])
         if searched is None:
-            return "no edge of a ball near the outline that is told"
+            return "no edge of a ball near the outline that is given"
     outline = refine_outline(intensity, camera, searched[0])
     if outline is None:
         return "too little of the ball's outline shows an edge"

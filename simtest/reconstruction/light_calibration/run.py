@@ -1,5 +1,6 @@
 """From pictures of a ball or plate to the positions of the lights."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,7 +32,7 @@ from simtest.reconstruction.light_calibration.observations import (
     unlit_outline_errors,
 )
 from simtest.reconstruction.light_calibration.outline import outline_through
-from simtest.reconstruction.poses import read_poses
+from simtest.reconstruction.poses import check_names, read_poses
 
 LEAST_PICTURES = 2
 
@@ -91,14 +92,19 @@ class Calibrated:
 
 
 def picture_readers(paths: Sequence[Path]) -> list[tuple[str, Callable[[], Image]]]:
-    """Return name and reader of each picture of files and folders; `InputError` where a folder holds none."""
-    found: list[tuple[str, Callable[[], Image]]] = []
+    """Return name and reader of each picture of files and folders; `InputError` where a folder holds none.
+
+    Pictures of the same file name in several folders are named by their paths; one that is given twice counts once.
+    """
+    found: dict[str, tuple[str, Callable[[], Image]]] = {}
     for path in paths:
         if is_sequence(path):
-            found += [(frame.name, frame.read) for frame in open_source(path).frames()]
+            for frame in open_source(path).frames():
+                found.setdefault(str(path / frame.name), (frame.name, frame.read))
         else:
-            found.append((path.name, partial(read_picture, path)))
-    return found
+            found.setdefault(str(path), (path.name, partial(read_picture, path)))
+    counts = Counter(name for name, _ in found.values())
+    return [(name if counts[name] == 1 else path, read) for path, (name, read) in found.items()]
 
 
 def calibrate_lights(
@@ -148,11 +154,13 @@ def calibrate_lights(
 
 
 def _read(pictures: Pictures, calibration: Calibration, mirror: Ball | Plate) -> Views:
-    if isinstance(mirror, Ball):
-        return read_balls(pictures, calibration, mirror.circles or {})
     names = [name for name, _ in pictures]
-    poses = read_poses(mirror.poses).of_frames(names, range(len(names)), True)
-    return read_plates(pictures, calibration, poses)
+    check_names("pictures", {name for name in names if names.count(name) > 1}, names)
+    if isinstance(mirror, Ball):
+        circles = mirror.circles or {}
+        check_names("--outlines", circles, names)
+        return read_balls(pictures, calibration, circles)
+    return read_plates(pictures, calibration, read_poses(mirror.poses).of_files(names))
 
 
 def _mirrors(views: Sequence[View], camera: Camera, mirror: Ball | Plate) -> Mirrors:
@@ -178,11 +186,12 @@ def _variations(
 ) -> Iterator[tuple[Camera, Mirrors]]:
     """Return camera and mirrors with each independent error that all pictures share, of one standard deviation."""
     camera, prior = calibration.camera, calibration.priors.camera
-    for focal, dx, dy in np.diag([prior.focal_sd, prior.centre_sd_px, prior.centre_sd_px]):
-        if focal or dx or dy:
+    for errors in np.diag([prior.focal_sd, prior.centre_sd_px, prior.centre_sd_px, prior.distortion_sd]):
+        if errors.any():
+            focal, dx, dy, radial = errors.tolist()
             other = replace(
                 camera, fx=camera.fx * (1 + focal), fy=camera.fy * (1 + focal), cx=camera.cx + dx, cy=camera.cy + dy
-            )
+            ).with_radial_error(radial)
             yield other, _seen_by(views, camera, other, mirror)
     if isinstance(mirror, Ball):
         changed = [

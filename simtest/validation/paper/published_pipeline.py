@@ -102,7 +102,7 @@ class Pipeline:
         box = (x - self.outer[0], y - self.outer[1], width, height)
         return Patch.cut(
             stages.smoothed, box, origin_px=self.outer[:2], raw=stages.noisy, noise=frame_noise(stages.noisy),
-            smoothing_px=self.setting.smoothing_px,
+            smoothing_px=self.setting.smoothing_px, others_px=(),
         )  # fmt: skip
 
 

@@ -1,0 +1,74 @@
+"""constraints.npz: the region of each normal holds the surface's normal where the entry says that it stands."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Response, exactly
+from simtest.geometry import Camera, chi_squared
+from simtest.reconstruction.constraints import constraints_arrays
+from simtest.reconstruction.picture import Options, reconstruct_values
+
+CAMERA = Camera(160, 120, 400.0, 400.0, 80.0, 60.0)
+AXIS = CAMERA.unproject(np.array([87.0, 64.0]))
+DISTANCE = 20.0
+SPOT_RAD = 0.025
+QUANTILE = chi_squared.quantile(0.95, 2)
+DRAWS = 60
+
+
+def normals_at(rays, dk):
+    """Return the normals of a ball of radius d / dk where rays meet it; its brightest point lies along `AXIS`."""
+    radius = DISTANCE / dk
+    centre = (DISTANCE + radius) * AXIS
+    along = rays @ centre
+    # Beside the ball: where the ray comes nearest to it.
+    reach = along - np.sqrt(np.maximum(along**2 - centre @ centre + radius**2, 0))
+    return (reach[..., None] * rays - centre) / radius
+
+
+@cache
+def stored(dk):
+    """Return the constraints of pictures with 2 % noise of a ball that is lit from the camera."""
+    rays = CAMERA.unproject(CAMERA.pixel_centres())
+    facing = -np.sum(normals_at(rays, dk) * rays, axis=-1)
+    # A Phong lobe of exponent c / 4 over twice the normal's angle, so that the spot is as large at each curvature.
+    curvature = ((1 + dk) * SPOT_RAD) ** -2
+    lobe = np.maximum(2 * np.maximum(facing, 0) ** 2 - 1, 0) ** (curvature / 4)
+    priors = type(LIGHT_AT_CAMERA)(
+        lights_mm=((0.0, 0.0, 0.0),), distance_mm=exactly(DISTANCE), lobe_curvature=exactly(curvature)
+    )
+    calibration = Calibration(CAMERA, Response(), priors=priors)
+    options = Options(fov_deg=60.0, estimators=("curved",), roi=(40, 20, 94, 88))
+    made = []
+    for seed in range(DRAWS):
+        drawn = np.random.default_rng(seed).normal(0, 0.02, lobe.shape)
+        record = reconstruct_values("ball", (0.1 + 0.8 * lobe + drawn).astype(np.float32), calibration, options)
+        made.append(constraints_arrays(record))
+    return made
+
+
+def held(made, truths, key):
+    """Return the share of the regions of covariances that hold true normals."""
+    inside = []
+    for each, truth in zip(made, truths, strict=True):
+        (miss,) = each["basis"] @ (truth - each["normal"][0])
+        inside.append(miss @ np.linalg.solve(each[key][0], miss) <= QUANTILE)
+    return np.mean(inside)
+
+
+@pytest.mark.parametrize("dk", [1.0, 3.0, 6.0])
+def test_the_region_at_the_pixel_holds_the_normal_on_its_sightline(dk):
+    made = stored(dk)
+    at_pixel = [normals_at(each["sightline"], dk)[0] for each in made]
+    assert held(made, at_pixel, "covariance_at_pixel") >= 0.9
+    # The plain covariance is that at the brightest point, and no more.
+    assert held(made, [-AXIS] * DRAWS, "covariance") >= 0.9
+    if dk > 1:
+        assert held(made, at_pixel, "covariance") < 0.6
+    # Neither is much too wide.
+    for key, truths in (("covariance_at_pixel", at_pixel), ("covariance", [-AXIS] * DRAWS)):
+        misses = [np.linalg.norm(truth - each["normal"][0]) for truth, each in zip(truths, made, strict=True)]
+        stated = [np.sqrt(np.trace(each[key][0])) for each in made]
+        assert np.median(stated) < 2 * np.sqrt(np.mean(np.square(misses)))
