@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import shutil
 import tarfile
 from pathlib import Path
@@ -22,6 +23,7 @@ from simtest.dataset.index import TABLES, write_shard_tables, write_tables
 from simtest.dataset.maker import _share_of
 from simtest.dataset.manifest import NAME, FileEntry, _digest, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
+from simtest.dataset.preview import write_preview
 from simtest.dataset.reproduce import compare, reproduce_sample
 from simtest.dataset.sample import sample_key
 from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
@@ -39,6 +41,7 @@ from tests.marked import marked
 from tests.unit.engine_tasks import breaks, dies_once, fails, meets_a_full_disk, square
 
 ROOT = Path(__file__).resolve().parents[2]
+MESH = str(ROOT / "meshes" / "colon_40mm.ply")
 SIX = {"samples": 6, "samples_per_anatomy": 1}
 
 
@@ -132,14 +135,45 @@ def colons(**more):
 
 
 def test_families_may_have_different_seeds_of_one_recipe():
-    def plan(low):
-        families = [colons(), colons(seeds={"low": low, "high": 19})]
+    drawn = {"per_anatomy": {"surface.path": {"choose": ["liver", "colon"]}}}
+
+    def plan(low, **more):
+        families = [colons(**more), colons(seeds={"low": low, "high": 19})]
         data = tiny().model_dump(mode="json", exclude_unset=True)
         return Plan(validate(Dataset, data | {"families": families, "per_sample": {}, "name": "two"}, "two"))
 
     assert {plan(10).anatomy(i).seed // 10 for i in range(12)} == {0, 1}
     with pytest.raises(InputError, match=r"families.1: .* must have seeds that do not overlap"):
         plan(9)
+    # A drawn recipe is held against the others too.
+    with pytest.raises(InputError, match=r"families.1: has surface.path = colon.toml in common with families.0"):
+        plan(9, set={"surface.path": "liver"}, **drawn)
+
+
+def test_drawn_recipes_are_among_the_inputs_and_files_of_one_name_stand_apart(tmp_path):
+    (tmp_path / "liver.toml").write_bytes((ROOT / "meshes" / "liver.toml").read_bytes() + b"# another\n")
+    chosen = ["colon", "liver", str(tmp_path / "liver.toml")]
+    data = tiny().model_dump(mode="json", exclude_unset=True) | {"name": "drawn", "per_sample": {}}
+    families = [colons(seeds={"high": 99}, per_anatomy={"surface.path": {"choose": chosen}})]
+    plan = Plan(validate(Dataset, data | {"families": families}, "drawn"))
+    inputs = new_manifest(plan, "llvm_ad_rgb").origin["inputs"]
+    assert list(inputs) == ["anatomy.toml", "colon.toml", "liver.toml", "liver.toml (2)"]
+    assert len(set(inputs.values())) == 4
+
+
+def test_a_shard_is_planned_for_the_largest_frames():
+    data = tiny().model_dump(mode="json", exclude_unset=True) | {"name": "sizes", "per_sample": {}}
+    data["splits"] = {"train": 1.0, "validation": 0.0, "test": 0.0}
+    small, large = ({"camera.width": 64 * n, "camera.height": 48 * n} for n in (1, 4))
+
+    def each(families, **more):
+        return Plan(validate(Dataset, data | {"families": families, "shard_mb": 2.0} | more, "sizes")).samples_per_shard
+
+    alone = each([{"scene": "plane", "set": large}])
+    assert each([{"scene": "plane", "set": small}]) > 15 * alone
+    assert each([{"scene": "plane", "set": small}, {"scene": "sphere", "set": large}]) == alone
+    drawn = {"camera.width": {"choose": [64, 256]}, "camera.height": {"choose": [48, 192]}}
+    assert each([{"scene": "plane", "set": small}], per_sample=drawn) == alone
 
 
 BAD = {
@@ -161,6 +195,21 @@ BAD = {
         "families",
         [colons(per_sample={"surface.seed": {"low": 0, "high": 9, "integer": True}})],
         "surface.seed is drawn for each sample",
+    ),
+    "a whole anatomy of a sample": (
+        "families",
+        [{"scene": "plane", "per_sample": {"surface": {"choose": [{"type": "anatomy", "path": "colon"}]}}}],
+        "surface is drawn for each sample",
+    ),
+    "seeds of a mesh": (
+        "families",
+        [colons(set={"surface.path": MESH})],
+        "families.0.seeds: the mesh surface.path = colon_40mm.ply is the same for each seed",
+    ),
+    "seeds of drawn meshes": (
+        "families",
+        [colons(per_anatomy={"surface.path": {"choose": ["colon", MESH]}})],
+        "families.0.seeds: the mesh surface.path = colon_40mm.ply is the same for each seed",
     ),
     "both": (
         "families",
@@ -453,8 +502,7 @@ def test_the_card_says_where_surfaces_come_from():
         return make_card(plan, new_manifest(plan, "llvm_ad_rgb"))
 
     assert "No patient's data" in card(tiny())
-    values = {"surface.path": str(ROOT / "meshes" / "colon_40mm.ply"), "samples": 6, "samples_per_anatomy": 1}
-    mesh = load_dataset("smooth", values)
+    mesh = load_dataset("smooth", {"surface.path": MESH, "samples": 6, "samples_per_anatomy": 1})
     family = mesh.families[0].model_copy(update={"seeds": None, "per_anatomy": {}})
     text = card(mesh.model_copy(update={"families": (family,), "splits": Splits(train=1.0, validation=0.0, test=0.0)}))
     assert "meshes: colon_40mm.ply" in text
@@ -855,3 +903,8 @@ def test_a_dataset_of_another_version_is_sound_as_well(copy):
     assert verify(copy) == []
     edit(ESTIMATES, lambda t: t.with_columns(error_deg=pl.col("error_deg") / 2))(copy)
     assert [fault.file for fault in verify(copy)] == [ESTIMATES]
+
+
+def test_a_preview_shows_samples_of_the_whole_dataset(made, tmp_path):
+    page = write_preview(made, tmp_path / "page.html", 4).read_text()
+    assert re.findall(r"<h3>(\d)", page) == list("0235")
