@@ -20,7 +20,7 @@ from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.spec_model import validate
 
 NAME = "manifest.json"
-FORMAT = "simtest dataset, version 1"
+FORMAT = "simtest dataset, version 2"
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,200}")
 
 

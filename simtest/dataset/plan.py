@@ -23,7 +23,7 @@ from simtest.surfaces.recipe import load_recipe
 ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
 """Keys that determine an anatomy."""
 
-BYTES_PER_PIXEL = 4.5
+BYTES_PER_PIXEL = 5.4
 """Size of a sample with its labels, as measured on the shipped datasets (docs/howto/datasets.md)."""
 
 RELIEF_BYTES_PER_PIXEL = 6.0
