@@ -257,7 +257,8 @@ def test_fields_come_back(seed, scale):
             for name, array in (("normal", normal), ("depth", depth), ("curvature", curvature))}  # fmt: skip
     for array in back.values():
         assert np.isnan(array[2, 3]).all()
-    assert np.nanmax(np.abs(back["depth"] - depth)) <= 0.51 * meta["depth_scale_mm"] + 1e-7 * scale
+    # Half a step, and the rounding of float32 where depths are large.
+    assert np.nanmax(np.abs(back["depth"] - depth) - 1.3e-7 * depth) <= 0.51 * meta["depth_scale_mm"]
     assert meta["depth_scale_mm"] < 2.5e-7 * scale
     assert np.nanmax(np.abs(back["curvature"] - curvature)) <= 0.51 * fields.CURVATURE_SCALE
     sine = np.linalg.norm(np.cross(back["normal"], normal), axis=-1)
@@ -289,7 +290,7 @@ def test_stored_depth_gives_the_normals():
 def test_dataset_is_sound_and_says_what_it_holds(made):
     assert verify(made) == []
     names = {path.name for path in made.iterdir()}
-    assert {NAME, "README.md", "croissant.json", *TABLES} <= names
+    assert {NAME, "README.md", *TABLES} <= names
     assert not any(".part" in name for name in names)
     records = list(read(made))
     assert sorted(record["meta"]["index"] for record in records) == list(range(6))
@@ -663,11 +664,6 @@ def new_card(folder):
     honest(folder, "README.md")
 
 
-def new_croissant(folder):
-    (folder / "croissant.json").write_text("{}")
-    honest(folder, "croissant.json")
-
-
 def first(change):
     """Change the members of the first sample."""
     return lambda folder: rewrite(folder, TAR, lambda s: [(s[0][0], change(dict(s[0][1])), s[0][2]), *s[1:]])
@@ -704,8 +700,6 @@ DAMAGE = {
     "row lost from the highlights": (edit(HIGHLIGHTS, lambda t: t.head(3)), HIGHLIGHTS),
     "edited estimates": (edit(ESTIMATES, lambda t: t.with_columns(error_deg=pl.col("error_deg") / 2)), ESTIMATES),
     "edited card": (new_card, "README.md"),
-    "edited Croissant metadata": (new_croissant, "croissant.json"),
-    "missing Croissant metadata": (lambda f: (f / "croissant.json").unlink(), "croissant.json"),
     "normals turned away": (with_image("normal", lambda n: put(n, (0.0, 0.0, 1.0))), TAR),
     "normals of another frame": (with_image("normal", lambda n: n * np.array([-1, 1, 1])), TAR),
     "holes in the depth": (with_image("depth", lambda d: put(d, np.nan)), TAR),
