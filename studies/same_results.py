@@ -36,8 +36,8 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
     # The record of a nightly run; each of its files is compared itself.
     "run.json": ("id", "files", *ORIGIN),
     "verdict.json": ("run/id", "costs", *(f"baseline/{key}" for key in ("id", *ORIGIN))),
-    # The card and its like name the version; they are compared themselves.
-    "manifest.json": ("digest", "tables/README.md/sha256", "tables/croissant.json/sha256"),
+    # The card names the version; it is compared itself.
+    "manifest.json": ("digest", "tables/README.md/sha256"),
 }
 """Paths of keys that are left out of JSON files, by the files' names."""
 

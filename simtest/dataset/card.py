@@ -9,7 +9,7 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.dataset.fields import FIELDS
 from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
 from simtest.dataset.manifest import Manifest
-from simtest.dataset.plan import Plan, spec_files
+from simtest.dataset.plan import Plan
 from simtest.pages.markdown import escaped, paragraphs, yaml_string
 from simtest.runtime.files import write_atomically
 from simtest.spec.dataset_recipe import Distribution
@@ -46,7 +46,7 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
         has_instruments=plan.has_instruments,
         draws=list(_draws(plan)),
         tables=(SAMPLES, HIGHLIGHTS, ESTIMATES),
-        meshes=sorted({path.name for path in spec_files(dataset) if path.suffix != ".toml"}),
+        meshes=sorted({path.name for path in plan.inputs if path.suffix != ".toml"}),
         isovalue=HIGHLIGHT_ISOVALUE,
         versions=manifest.origin["versions"],
         variant=manifest.origin["variant"],

@@ -139,7 +139,7 @@ def export_run(
 
 
 def export_dataset(folder: Path, out: Path, engine: Engine, progress: Progress | None = None) -> Path:
-    """Export the frames of a dataset, rendered again as the sensor gives them; see `export_run`."""
+    """Export the pictures of a dataset, of 8 bits as its samples store them; see `export_run`."""
     source = source_of_dataset(folder)
     with exclusive_folder(folder, "DATASET"):
         return _export(source, {}, out, engine, progress, "--out")
@@ -315,7 +315,7 @@ def write_part(part: ExportPart, on_step: OnStep) -> list[Exported]:
 
 def _write_frame(each: Shown, out: Path) -> Exported:
     """Write a frame, its preview and its camera."""
-    image, sensor, told = each.image, each.view.scene.sensor, each.view.calibration
+    image, sensor, told = each.image, each.sensor, each.view.calibration
     calibration = calibration_toml(told)
     name, camera = frame_name(image, calibration, each.isolated), _camera_name(calibration)
     file, data = _encoded(name, image, sensor)

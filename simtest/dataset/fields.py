@@ -15,8 +15,9 @@ from simtest.dataset.metadata import SampleMeta, has_relief
 from simtest.dataset.png import decode, encode
 from simtest.runtime.arrays import AnyArray
 
-DEPTH_SCALES_MM = tuple(0.005 * 2**k for k in range(12))
-"""A sample's depth is counted in the first of these units with which its farthest point fits 16 bits."""
+DEPTH_LEVELS = 2**22 - 1
+"""Steps from the camera to a sample's farthest point. Normals by differences of neighbouring depths are then right to
+0.002 to 0.004 deg in the median, with 16 bits to 0.1 to 0.2 (docs/howto/datasets.md); float32 ends at 24 bits."""
 
 CURVATURE_SCALE = 1e-4
 """1/mm; 16 bits then reach 3.2767 per mm, a radius of 0.3 mm."""
@@ -60,25 +61,27 @@ class Field:
 
 
 def depth_scale_mm(depth: AnyArray) -> float:
-    """Return the unit, mm, in which a depth map, mm, is counted; raise `ValueError` if it reaches beyond 16 bits."""
-    largest = float(np.nanmax(depth, initial=0.0))
-    for scale in DEPTH_SCALES_MM:
-        if largest <= scale * LEVELS:
-            return scale
-    raise ValueError(f"depth reaches {largest:g} mm; 16 bits hold {DEPTH_SCALES_MM[-1] * LEVELS:g} mm at most")
+    """Return the step, mm, in which a depth map, mm, is counted: by its farthest point, which has the last level."""
+    return float(np.nanmax(depth, initial=0.0)) / DEPTH_LEVELS or 1.0
 
 
 def _encode_depth(depth: AnyArray) -> bytes:
     # Adding one half makes the conversion to integers round; NaN becomes 0, no surface.
-    counts = np.asarray(depth, dtype=np.float32) * np.float32(1 / depth_scale_mm(depth)) + np.float32(0.5)
-    return encode(np.nan_to_num(counts, copy=False, nan=0.0).astype(np.uint16), "up")
+    counts = np.asarray(depth, dtype=float) / depth_scale_mm(depth) + 0.5
+    octets = np.nan_to_num(counts, copy=False, nan=0.0).astype("<u4").view(np.uint8).reshape(*counts.shape, 4)
+    return encode(np.concatenate([octets[..., k] for k in (2, 1, 0)]), "up")
 
 
 def _decode_depth(data: bytes, meta: SampleMeta) -> AnyArray:
-    counts = decode(data)
-    depth = counts.astype(np.float32)
+    # The high octets stand above the middle and the low ones; float32 holds their whole numbers exactly.
+    high, middle, low = np.split(decode(data), 3)
+    depth = high.astype(np.float32)
+    for octets in (middle, low):
+        depth *= 256
+        depth += octets
+    absent = depth == 0
     depth *= meta["depth_scale_mm"]
-    np.copyto(depth, np.nan, where=counts == 0)
+    np.copyto(depth, np.nan, where=absent)
     return depth
 
 
@@ -248,7 +251,8 @@ FIELDS = (
           "8-bit PNG", _encode_picture, _decode_picture),
     Field("depth", "depth.png", "(H, W)", "float32", "mm",
           "distance from the camera centre along the pixel's ray (not z); NaN where there is no surface",
-          "16-bit PNG; count times the sample's depth_scale_mm; 0: no surface", _encode_depth, _decode_depth),
+          "8-bit PNG of 3 H rows: high above middle above low octets; (65536 high + 256 middle + low) times the "
+          "sample's depth_scale_mm; 0: no surface", _encode_depth, _decode_depth),
     Field("normal", "normal.png", "(H, W, 3)", "float32", "1",
           "unit normal of the fine surface, camera frame (x right, y down, z forward); without a relief it faces the "
           "camera: N . ray < 0; NaN off the surface",

@@ -13,25 +13,31 @@ from simtest.dataset.fields import INSTRUMENT, VISIBLE, depth_scale_mm
 from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta, SampleMeta
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample import Sample, sample_key
+from simtest.dataset.sample_calibration import calibration_of_picture, stored_picture
 from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.process.naming import forgive_cores
-from simtest.estimators.protocol import laws_of
 from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
-from simtest.reconstruction.pipeline import Specularity, reconstruct
+from simtest.reconstruction.found import Specularity
 from simtest.rendering import Frame, Session, backend
 from simtest.runtime.arrays import AnyArray, Image, Picture
 from simtest.runtime.kept_arrays import only_reading
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
-from simtest.simulation.rendered_view import RenderedView, has_quick_look, may_show, render_view, shows_isolated
+from simtest.simulation.rendered_view import (
+    RenderedView,
+    brightest_mm,
+    has_quick_look,
+    may_show,
+    render_view,
+    shows_isolated,
+)
 from simtest.simulation.true_highlights import TrueHighlight, region_of
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
-from simtest.validation.matching import match, on_instruments
-from simtest.validation.metrics import MISSED, rows
+from simtest.validation.cloud_rows import of_clouds
+from simtest.validation.realisation import answer, score
 from simtest.validation.results_table import ResultRow
-from simtest.validation.rough_truth import rough_truth
 
 UNPLACED = 100
 """Draws that cannot be rendered, beyond the tries, before a sample is given up."""
@@ -67,10 +73,11 @@ class Maker:
         drawn, attempt, seen, frame = self._choose(index)
         session = self._at(drawn)
         scene, anatomy = drawn.scene, drawn.anatomy
-        # What the frame shows to a camera that knows its calibration and nothing of the truth.
-        picture = seen.frame(scene.sensor.seed)
-        specularities = reconstruct(picture, seen.calibration, self._estimators) if seen.full_scale > 0 else []
-        images = self._images(drawn, seen, frame, picture)
+        # What the stored picture shows to a camera that knows its calibration and nothing of the truth.
+        picture = stored_picture(seen.frame(scene.sensor.seed), scene.sensor)
+        specularities = answer(seen, picture, self._estimators)
+        images = {"image": picture, **self._images(drawn, seen, frame)}
+        scored = self.score(index, session, seen, specularities, self._estimators)
         meta: SampleMeta = {
             "key": sample_key(index),
             "index": index,
@@ -86,12 +93,13 @@ class Maker:
             "camera": describe_camera(scene.camera.model()),
             "world_from_camera": session.surface.model_from_camera.tolist(),
             "lights_mm": scene.rig.true_mm().tolist(),
+            "brightest_mm": brightest_mm(seen.highlights),
             "full_scale": seen.full_scale,
             "scene": scene.model_dump(mode="json"),
             "attempt": attempt,
             "highlights": [_highlight(truth) for truth in seen.highlights],
             "detections": [_detection(specularity) for specularity in specularities],
-            "estimates": self._estimates(index, session, seen, specularities),
+            "estimates": [_estimate(row) for row in scored],
             "depth_scale_mm": depth_scale_mm(images["depth"]),
         }
         if scene.instruments:
@@ -104,7 +112,10 @@ class Maker:
         return Sample(meta, images)
 
     def view(self, index: int) -> tuple[Drawn, RenderedView, Session]:
-        """Render a sample's scene as `make` does; return it with its view, and the session at it."""
+        """Render a sample's scene as `make` does; return it with its view, and the session at it.
+
+        What the view's calibration tells is of the stored picture.
+        """
         drawn, _, seen, _ = self._choose(index)
         return drawn, seen, self._at(drawn)
 
@@ -135,6 +146,8 @@ class Maker:
         session = self._at(drawn)
         frame = session.frame()
         view = render_view(session, drawn.scene, frame.radiance)
+        told = calibration_of_picture(drawn.scene, brightest_mm(view.highlights))
+        view = replace(view, calibration=told)
         least = self.plan.dataset.highlights
         return (drawn, view, frame) if is_last or has_quick_look(drawn.scene) or view.isolated >= least else None
 
@@ -162,43 +175,22 @@ class Maker:
             self._session.update(drawn.scene)
         return self._session
 
-    def _estimates(
-        self, index: int, session: Session, seen: RenderedView, specularities: list[Specularity]
-    ) -> list[EstimateMeta]:
-        """Return the rows of results.parquet; true_id is the highlight's index in the list of all."""
-        estimates = []
-        for row in self.rows(index, session, seen, specularities, self._estimators):
-            columns = row.to_row()
-            if row.status == MISSED:
-                # Shards list a missed highlight's status before its estimator.
-                columns["estimator"] = columns.pop("estimator")
-            estimates.append({key: _plain(value) for key, value in columns.items() if _plain(value) is not None})
-        return estimates
-
-    def rows(
-        self, index: int, session: Session, seen: RenderedView, specularities: Sequence[Specularity],
+    def score(
+        self, index: int, session: Session, seen: RenderedView, answers: Sequence[Specularity],
         estimators: Mapping[str, AnyEstimator],
     ) -> list[ResultRow]:  # fmt: skip
-        """Measure the estimates of a sample, at whose scene the session is; true_id is the index in the list of all."""
+        """Score the answers to a sample, at whose scene the session is; true_id is the index in the list of all."""
         scene = session.scene
-        # Only isolated highlights count as truth, so the rows number these alone.
-        counted = [i for i, truth in enumerate(seen.highlights) if truth.isolated]
-        truths = [seen.highlights[i] for i in counted]
         common = ResultRow(experiment=self.plan.dataset.name, label=scene.surface.label, realisation=index,
                            setting=self.plan.split(index), seed=scene.sensor.seed)  # fmt: skip
-        rough = None
-        if seen.is_rough:
-            found = match(specularities, [spot.peak_px for spot in seen.visible_highlights])
-            rough = rough_truth(session, seen, counted, found)
-        matched = match(specularities, [truth.bp_px for truth in truths])
-        metal = on_instruments(specularities, matched, seen)
-        declared = {name: laws_of(estimator) for name, estimator in estimators.items()}
-        made = rows(session, common, specularities, truths, matched, declared, rough=rough, on_instrument=metal)
-        return [replace(row, true_id=None if row.true_id is None else counted[row.true_id]) for row in made]
+        made, clouds = score(session, seen, answers, estimators, common), of_clouds(estimators)
+        return [
+            row if row.true_id is None or row.estimator in clouds else replace(row, true_id=made.counted[row.true_id])
+            for row in made.rows
+        ]
 
-    def _images(self, drawn: Drawn, seen: RenderedView, frame: Frame, picture: AnyArray) -> dict[str, AnyArray]:
-        radiance, scale = seen.radiance, seen.full_scale or 1.0
-        images = {"image": _encoded(picture, drawn.scene.sensor.encodes), **self._truth(drawn, frame)}
+    def _images(self, drawn: Drawn, seen: RenderedView, frame: Frame) -> dict[str, AnyArray]:
+        radiance, scale, images = seen.radiance, seen.full_scale or 1.0, self._truth(drawn, frame)
         parts = {"specular": radiance.specular, "diffuse": radiance.diffuse, "indirect": radiance.indirect}
         images |= {name: _share_of(part, scale) for name, part in parts.items()}
         images["instance"] = _instances(seen, drawn.scene.camera.model().seen)
@@ -224,12 +216,6 @@ class Maker:
             return truth
         curvature_base = np.stack([seen.k_min_base, seen.k_max_base], axis=-1)
         return {**truth, "normal_base": base, "curvature_base": curvature_base, "pool": seen.pool}
-
-
-def _encoded(picture: AnyArray, encoded: bool) -> AnyArray:
-    """Return the 8-bit picture: what the sensor itself encoded, or else sRGB."""
-    values = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8) if encoded else to_uint8(picture)
-    return _colour(values)
 
 
 def _share_of(part: Image, scale: float) -> AnyArray:
@@ -258,6 +244,11 @@ def _instances(seen: RenderedView, mask: AnyArray | None) -> Picture:
 def _highlight(truth: TrueHighlight) -> HighlightMeta:
     described = truth.to_json() | {"direction_min": truth.direction_min.tolist(), "peak_snr": _plain(truth.peak_snr)}
     return cast(HighlightMeta, described)
+
+
+def _estimate(row: ResultRow) -> EstimateMeta:
+    """Return a row of results as it is kept: columns without a value are left out."""
+    return {key: plain for key, value in row.to_row().items() if (plain := _plain(value)) is not None}
 
 
 def _detection(specularity: Specularity) -> DetectionMeta:

@@ -9,7 +9,7 @@ from typing import Any, TypedDict
 
 from pydantic import JsonValue
 
-from simtest.dataset.plan import Plan, spec_files
+from simtest.dataset.plan import Plan
 from simtest.errors import InputError
 from simtest.estimators.process.naming import core_hashes, short_name
 from simtest.runtime import provenance
@@ -20,7 +20,7 @@ from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.spec_model import validate
 
 NAME = "manifest.json"
-FORMAT = "simtest dataset, version 1"
+FORMAT = "simtest dataset, version 2"
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,200}")
 
 
@@ -93,22 +93,23 @@ def new_manifest(plan: Plan, variant: str) -> Manifest:
         "versions": provenance.versions(),
         "source": provenance.source_hash(),
         "variant": variant,
-        "inputs": {path.name: provenance.file_hash(path) for path in spec_files(plan.dataset)} | _core_files(plan),
+        "inputs": _input_hashes(plan),
     }
     found = provenance.environment()
     environment = {name: found[name] for name in ("commit", "python", "processor", "system")}
     return Manifest(plan.dataset.model_dump(mode="json"), origin, environment)
 
 
-def _core_files(plan: Plan) -> dict[str, str]:
-    """Return the hashes of the files of the estimators that are cores, named without the folders of this machine."""
-    made: dict[str, str] = {}
+def _input_hashes(plan: Plan) -> dict[str, str]:
+    """Return the hashes of scenes, recipes, meshes and files of cores, named without the folders of this machine."""
+    listed = [(path.name, provenance.file_hash(path)) for path in plan.inputs]
     for name, hashes in core_hashes(plan.dataset.estimators).items():
-        for path, digest in hashes.items():
-            label = f"core {short_name(name)}: {Path(path).name}"
-            # Files of one name in several folders are numbered in the command's order.
-            count = sum(each.split(" (")[0] == label for each in made)
-            made[f"{label} ({count + 1})" if count else label] = digest
+        listed += [(f"core {short_name(name)}: {Path(path).name}", digest) for path, digest in hashes.items()]
+    made: dict[str, str] = {}
+    for position, (label, digest) in enumerate(listed):
+        # Files of one name in several folders are numbered in the order of families, or in the command's.
+        count = sum(each == label for each, _ in listed[:position])
+        made[f"{label} ({count + 1})" if count else label] = digest
     return made
 
 

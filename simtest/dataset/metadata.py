@@ -70,6 +70,7 @@ class SampleMeta(TypedDict):
     camera: CameraDescription
     world_from_camera: NotRequired[list[list[float]]]  # 4 x 4, mm; older datasets lack it
     lights_mm: list[list[float]]
+    brightest_mm: float | None  # distance of the brightest highlight, to which known.distance_error is relative
     full_scale: float
     scene: dict[str, JsonValue]
     attempt: int

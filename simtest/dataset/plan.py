@@ -1,8 +1,9 @@
 """Plan of a dataset: anatomies, splits, draws and shards of all samples, known before anything is rendered."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from simtest.surfaces.recipe import load_recipe
 ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
 """Keys that determine an anatomy."""
 
-BYTES_PER_PIXEL = 4.5
+BYTES_PER_PIXEL = 5.4
 """Size of a sample with its labels, as measured on the shipped datasets (docs/howto/datasets.md)."""
 
 RELIEF_BYTES_PER_PIXEL = 6.0
@@ -111,8 +112,10 @@ class Plan:
     def __init__(self, dataset: Dataset) -> None:
         self.dataset = dataset
         self._bases = [self._base(k, family) for k, family in enumerate(dataset.families)]
-        for k, family in enumerate(dataset.families):
-            self._check(k, family)
+        # All that each family may be.
+        tried = [self._check(k, family) for k, family in enumerate(dataset.families)]
+        self._files = [_anatomy_files(own) for own in tried]
+        self._largest_px = max(scene.camera.width * scene.camera.height for own in tried for scene in own)
         self._check_shared()
         self.splits, self.samples_per_anatomy = _made_small(dataset)
         self._blocks = self._lay_out()
@@ -127,6 +130,14 @@ class Plan:
         if empty := [name for name in asked.splits.shares if name not in self.splits]:
             what.append(f"{' and '.join(empty)}: no sample")
         return f"samples = {asked.samples}, few for the splits: {'; '.join(what)}" if what else ""
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The files besides its own that determine its content: base scenes, and recipes and meshes, drawn ones too."""
+        scenes = [find(family.scene, "scenes") for family in self.dataset.families]
+        return tuple(
+            dict.fromkeys(path for pair in zip(scenes, self._files, strict=True) for path in (pair[0], *pair[1]))
+        )
 
     @cached_property
     def has_relief(self) -> bool:
@@ -158,47 +169,58 @@ class Plan:
         base.setdefault("name", f"{self.dataset.name}-{number}"[:80])
         return base
 
-    def _check(self, number: int, family: Family) -> None:
-        """Raise `InputError` if a scene would be malformed at an end of any range, alone or all together."""
+    def _check(self, number: int, family: Family) -> list[Scene]:
+        """Return a family's scene and those at the ends of its ranges, of each alone and of all together.
+
+        Raises `InputError` if one would be malformed, or one anatomy be two or differ between its samples.
+        """
         where = f"families.{number}"
-        # The scene itself, without any drawn value
         drawn = {**family.per_anatomy, **family.per_sample, **self.dataset.per_sample}
         scene = scene_from_dict(self._bases[number], where)
         if family.seeds is not None and not isinstance(scene.surface, AnatomySurface):
             raise InputError(f"{where}.seeds: surface.type = {scene.surface.type} has no seed; leave it out")
+        # One anatomy must not change between its samples.
+        if twice := sorted({*family.per_anatomy} & {*family.per_sample, *self.dataset.per_sample}):
+            raise InputError(f"{where}.per_anatomy: {twice[0]} is drawn for each sample too; must be in one of them")
+        # The scene itself, then the ends of the ranges: each alone, then all lows and all highs at once.
+        alone = [{path: value} for path, one in drawn.items() for value in one.ends]
+        together = [{path: one.ends[end] for path, one in drawn.items()} for end in (0, -1)]
+        tried = []
+        for values in ({}, *alone, *together):
+            tried.append(scene_from_dict(apply_settings(self._bases[number], values, where), where))
+            if isinstance(tried[-1].surface, AnatomySurface):
+                self._check_anatomy(where, family, tried[-1].surface)
+        return tried
+
+    def _check_anatomy(self, where: str, family: Family, surface: AnatomySurface) -> None:
+        """Raise `InputError` if an anatomy is malformed, or might be in two splits."""
         for path in (*family.per_sample, *self.dataset.per_sample):
-            # The key itself, or one below it; surface.path_share places the camera.
-            named = any(f"{path}.".startswith(f"{key}.") for key in ANATOMY_KEYS)
-            if isinstance(scene.surface, AnatomySurface) and named:
+            # The key itself, one below it, or the whole surface; surface.path_share places the camera.
+            if path == "surface" or any(f"{path}.".startswith(f"{key}.") for key in ANATOMY_KEYS):
                 raise InputError(
                     f"{where}: {path} is drawn for each sample, which makes anatomies that may be in two splits; "
                     "must be drawn by seeds or per_anatomy"
                 )
-        # One anatomy must not change between its samples.
-        if twice := sorted({*family.per_anatomy} & {*family.per_sample, *self.dataset.per_sample}):
-            raise InputError(f"{where}.per_anatomy: {twice[0]} is drawn for each sample too; must be in one of them")
-        # Ends of the ranges: each alone, then all lows and all highs at once.
-        alone = [{path: value} for path, one in drawn.items() for value in one.ends]
-        together = [{path: one.ends[end] for path, one in drawn.items()} for end in (0, -1)]
-        for values in (*alone, *together):
-            tried = scene_from_dict(apply_settings(self._bases[number], values, where), where)
-            if isinstance(tried.surface, AnatomySurface) and (file := tried.surface.file()).suffix == ".toml":
-                load_recipe(file, tried.surface.recipe_values)
+        if (file := surface.file()).suffix == ".toml":
+            load_recipe(file, surface.recipe_values)
+        elif family.seeds is not None:
+            raise InputError(
+                f"{where}.seeds: the mesh surface.path = {file.name} is the same for each seed and might be in two "
+                "splits; must have a family of its own, without seeds"
+            )
 
     def _check_shared(self) -> None:
         """Raise `InputError` if two families may share an anatomy, which might then be in two splits."""
         held: list[tuple[int, Path, range | None]] = []
         for number, family in enumerate(self.dataset.families):
-            surface = scene_from_dict(self._bases[number], f"families.{number}").surface
-            if not isinstance(surface, AnatomySurface):
-                continue
-            file, seeds = surface.file(), None
-            if file.suffix == ".toml" and family.seeds is not None:
-                # A recipe makes another anatomy of each seed; a mesh is the same one always.
+            surface, seeds = scene_from_dict(self._bases[number], f"families.{number}").surface, None
+            if family.seeds is not None:
                 seeds = range(family.seeds.low, family.seeds.high + 1)
-            elif file.suffix == ".toml" and surface.seed is not None:
+            elif isinstance(surface, AnatomySurface) and surface.seed is not None:
                 seeds = range(surface.seed, surface.seed + 1)
-            for other, its_file, its_seeds in held:
+            # A recipe makes another anatomy of each seed; a mesh is the same one always.
+            own = [(file.resolve(), seeds if file.suffix == ".toml" else None) for file in self._files[number]]
+            for (file, seeds), (other, its_file, its_seeds) in product(own, held):
                 apart = (
                     seeds is not None
                     and its_seeds is not None
@@ -209,7 +231,7 @@ class Plan:
                         f"families.{number}: has surface.path = {file.name} in common with families.{other}, and an "
                         "anatomy might be in two splits; must have seeds that do not overlap"
                     )
-            held.append((number, file, seeds))
+            held += [(number, *each) for each in own]
 
     # Anatomies and splits ------------------------------------------------------------------------------------------
 
@@ -277,11 +299,10 @@ class Plan:
 
     @cached_property
     def samples_per_shard(self) -> int:
-        """How many samples of the expected size a shard holds; depends on the dataset alone."""
-        camera = scene_from_dict(self._bases[0]).camera
+        """How many samples of the size expected of the largest frames a shard holds; depends on the dataset alone."""
         size = BYTES_PER_PIXEL + (RADIANCE_BYTES_PER_PIXEL if self.dataset.radiance else 0)
         size += RELIEF_BYTES_PER_PIXEL if self.has_relief else 0
-        return max(1, int(self.dataset.shard_mb * 1e6 / (size * camera.width * camera.height)))
+        return max(1, int(self.dataset.shard_mb * 1e6 / (size * self._largest_px)))
 
     @cached_property
     def shards(self) -> tuple[Shard, ...]:
@@ -333,6 +354,11 @@ def _made_small(dataset: Dataset) -> tuple[dict[str, float], int]:
     return {name: share for name, share in shares.items() if name in largest}, max(1, dataset.samples // len(shares))
 
 
+def _anatomy_files(scenes: list[Scene]) -> list[Path]:
+    """Return the recipes and meshes of scenes, each once, in their order."""
+    return list(dict.fromkeys(s.surface.file() for s in scenes if isinstance(s.surface, AnatomySurface)))
+
+
 def _draw(drawn: Mapping[str, Distribution], rng: np.random.Generator) -> dict[str, JsonValue]:
     # By name, so that the order of keys in the file does not matter.
     return {path: drawn[path].draw(rng) for path in sorted(drawn)}
@@ -345,14 +371,3 @@ def _shared(count: int, weights: list[float]) -> list[int]:
     for i in np.argsort(whole - exact, kind="stable")[: count - int(whole.sum())]:
         whole[i] += 1
     return [int(n) for n in whole]
-
-
-def spec_files(dataset: Dataset) -> Iterator[Path]:
-    """Yield the files besides its own that determine a dataset's content: base scenes, recipes and meshes."""
-    for family in dataset.families:
-        path = find(family.scene, "scenes")
-        yield path
-        data = replace_values(Scene, read_toml(path), family.set, str(path))
-        surface = data.get("surface", {})
-        if surface.get("type") == "anatomy":
-            yield find(surface["path"], "meshes")

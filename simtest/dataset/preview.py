@@ -55,7 +55,8 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
     manifest = open_manifest(folder)
     index, highlights = (pl.read_parquet(folder / name) for name in (SAMPLES, HIGHLIGHTS))
     # samples, evenly over the dataset, and the shards that hold them
-    wanted = set(index["index"].gather_every(max(1, index.height // count)).head(count).to_list())
+    places = np.linspace(0, index.height - 1, min(count, index.height)).round().astype(int)
+    wanted = set(index["index"].sort()[places.tolist()].to_list())
     names = index.filter(pl.col("index").is_in(list(wanted)))["shard"].unique().to_list()
     shown = read_samples(folder, shards=sorted(names), indices=wanted)
     environment = Environment(

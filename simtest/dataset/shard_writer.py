@@ -14,7 +14,6 @@ from typing import IO
 import polars as pl
 
 from simtest.dataset.card import CARD, write_card
-from simtest.dataset.croissant import CROISSANT, write_croissant
 from simtest.dataset.index import SAMPLES, TABLES, write_shard_tables, write_tables
 from simtest.dataset.maker import Maker, colour_variant
 from simtest.dataset.manifest import (
@@ -136,9 +135,7 @@ def _complete(plan: Plan, manifest: Manifest, folder: Path, engine: Engine, prog
             progress(total, total + 1, "tables")
         write_tables(plan, folder)
         write_card(plan, manifest, folder)
-        tables = {name: file_entry(folder / name) for name in TABLES}
-        write_croissant(plan, manifest, tables, folder)
-        manifest.tables = tables | {name: file_entry(folder / name) for name in (CARD, CROISSANT)}
+        manifest.tables = {name: file_entry(folder / name) for name in (*TABLES, CARD)}
         manifest.save(folder)
     # rows of single shards, and parts of interrupted runs
     for left in folder.glob(f"*{PART}*"):

@@ -8,7 +8,6 @@ import numpy as np
 import polars as pl
 
 from simtest.dataset.card import CARD, make_card
-from simtest.dataset.croissant import CROISSANT, make_croissant
 from simtest.dataset.fields import BASE_FIELDS, BY_SUFFIX, FIELDS, INSTRUMENT, KEPT_ON_DEMAND, VISIBLE
 from simtest.dataset.index import TABLES, make_tables
 from simtest.dataset.manifest import (
@@ -144,7 +143,7 @@ def repair_files(folder: Path, faults: list[Fault], engine: Engine, progress: Pr
     manifest = read_manifest(folder)
     now = new_manifest(manifest.plan(), str(manifest.origin["variant"]))
     check_same(folder, manifest, now)
-    known = {shard.name for shard in now.plan().shards} | {*TABLES, CARD, CROISSANT}
+    known = {shard.name for shard in now.plan().shards} | {*TABLES, CARD}
     # A folder may hold anything: it stays, and is listed again.
     foreign = [folder / fault.file for fault in faults if fault.file not in known]
     for path in (path for path in foreign if path.is_symlink() or not path.is_dir()):
@@ -301,14 +300,6 @@ def _tables(folder: Path, manifest: Manifest, plan: Plan, damaged: set[str]) -> 
     is_listed = CARD not in damaged and CARD in manifest.tables
     if same_code and is_listed and (folder / CARD).read_text(encoding="utf-8") != make_card(plan, manifest):
         yield Fault(CARD, "differs from the card that the manifest gives")
-    tables = {name: entry for name, entry in manifest.tables.items() if name in TABLES}
-    is_listed = CROISSANT not in damaged and CROISSANT in manifest.tables and len(tables) == len(TABLES)
-    if (
-        same_code
-        and is_listed
-        and (folder / CROISSANT).read_text(encoding="utf-8") != make_croissant(plan, manifest, tables)
-    ):
-        yield Fault(CROISSANT, "differs from the metadata that the manifest gives")
     for name, table in make_tables(plan, folder).items():
         if name in damaged or name not in manifest.tables:
             continue

@@ -103,11 +103,17 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
     highlights, full_scale = _judged(session, radiance, light)
     highlights, clouds = _placed(session, radiance, highlights)
     # What reconstruction is told may include the distance of the brightest highlight.
-    brightest = max((h for h in highlights if h.lit), key=lambda h: h.radiance, default=None)
-    calibration = scene.calibration(None if brightest is None else brightest.distance)
+    calibration = scene.calibration(brightest_mm(highlights))
     cover = session.cover()
     instruments = None if cover is None else cover.numbers
     return RenderedView(scene, radiance, light, highlights, clouds, full_scale, calibration, instruments)
+
+
+def brightest_mm(highlights: Sequence[TrueHighlight]) -> float | None:
+    """Return the distance of the brightest lit highlight, mm; None where none is lit."""
+    return max(((h.radiance, h.distance) for h in highlights if h.lit), key=lambda pair: pair[0], default=(0.0, None))[
+        1
+    ]
 
 
 def render_picture(session: Session, scene: Scene) -> Image:

@@ -1,4 +1,4 @@
-"""One realisation: render, expose, reconstruct, match, measure."""
+"""One realisation: render, expose, reconstruct, match, measure; and the one way to score answers to a view."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -9,7 +9,7 @@ from simtest.estimators import AnyEstimator
 from simtest.estimators.protocol import laws_of
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
-from simtest.runtime.arrays import Image
+from simtest.runtime.arrays import Image, Picture
 from simtest.runtime.kept_arrays import only_reading
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.true_highlights import TrueHighlight
@@ -18,7 +18,7 @@ from simtest.validation.cases import Case
 from simtest.validation.cloud_rows import apart, cloud_rows, of_clouds
 from simtest.validation.matching import match, on_instruments
 from simtest.validation.metrics import MISSED, rows
-from simtest.validation.motion import MOTION, FurtherView, further_views, with_motion
+from simtest.validation.motion import MOTION, FurtherView, MotionResult, further_views, with_motion
 from simtest.validation.results_table import ResultRow, Value
 from simtest.validation.rough_truth import rough_truth
 
@@ -52,6 +52,84 @@ class Realisation:
     specularities: list[Specularity]
     truths: list[TrueHighlight]
     matched: dict[int, int]
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Answers to a view, scored.
+
+    Parameters
+    ----------
+    rows : list of ResultRow
+        Of the results' table; ``true_id`` is an index in `truths`, of a cloud's row one in the view's `clouds`.
+    truths : list of TrueHighlight
+        Those that count.
+    counted : list of int
+        Their indices among the view's highlights.
+    matched : dict
+        Index of the truth by index of the detection.
+    """
+
+    rows: list[ResultRow]
+    truths: list[TrueHighlight]
+    counted: list[int]
+    matched: dict[int, int]
+
+
+def answer(
+    view: RenderedView, frame: Image | Picture, estimators: Mapping[str, AnyEstimator], isolated: bool = True
+) -> list[Specularity]:
+    """Reconstruct a view's frame by what is known of it; without light whatever would be found is noise."""
+    if view.full_scale <= 0:
+        return []
+    return reconstruct(frame, view.calibration, estimators, isolated=isolated, detector="peaks")
+
+
+def score(
+    session: Session, view: RenderedView, answers: Sequence[Specularity], estimators: Mapping[str, AnyEstimator],
+    common: ResultRow, isolated: bool = True, motion: MotionResult | None = None,
+) -> Scored:  # fmt: skip
+    """Score answers to a view, at whose scene the session must be: whatever made them, and wherever they are kept.
+
+    Parameters
+    ----------
+    session, view
+        The rendered scene with its truth.
+    answers : sequence of Specularity
+        Detections with estimates, those of `motion` where it is given.
+    estimators : mapping
+        What was asked, by name.
+    common : ResultRow
+        What all rows share.
+    isolated : bool
+        Whether isolated highlights alone were detected, and count.
+    motion : MotionResult, optional
+        What further views made of the answers.
+    """
+    dark = view.full_scale <= 0
+    # What is of clouds is judged by the base's highlight points, the rest by the true highlights.
+    cloud_names = of_clouds(estimators)
+    singles, of_base, refused = apart(answers, cloud_names)
+    # Without light no highlight counts as isolated, and all count as failures.
+    counted = [i for i, truth in enumerate(view.highlights) if truth.isolated or not isolated or dark]
+    truths = [view.highlights[i] for i in counted]
+    matched = match(singles, [truth.bp_px for truth in truths])
+    rough = None
+    if view.is_rough:
+        # Detection is scored on what can be seen: the relief melts and hides glints.
+        seen = match(singles, [spot.peak_px for spot in view.visible_highlights])
+        rough = rough_truth(session, view, counted, seen)
+    unfound = str(Reason.NO_LIGHT) if dark else MISSED
+    metal = on_instruments(singles, matched, view)
+    declared = {name: laws_of(estimator) for name, estimator in estimators.items() if name not in cloud_names}
+    # Motion is asked for signs; its normals are those of another estimator.
+    declared |= {} if motion is None else {MOTION: ()}
+    made = rows(session, common, singles, truths, matched, declared, unfound, rough, metal)
+    if motion is not None:
+        made = [motion.filled(row, view.scene, truths) if row.estimator == MOTION else row for row in made]
+    if cloud_names:
+        made += cloud_rows(session, view, common, of_base, refused, {} if rough is None else rough.clouds)
+    return Scored(made, truths, counted, matched)
 
 
 class Realiser:
@@ -100,22 +178,9 @@ def realise(
     """
     seed = case.noise_seed(experiment, number)
     frame = view.frame(seed)
-    dark = view.full_scale <= 0
-    # Without light whatever is found is noise; no highlight counts as isolated, and all count as failures.
-    specularities = [] if dark else reconstruct(frame, view.calibration, estimators, isolated=case.isolated)
-    # What is of clouds is judged by the base's highlight points, the rest by the true highlights.
-    cloud_names = of_clouds(estimators)
+    specularities = answer(view, frame, estimators, case.isolated)
     motion = with_motion(experiment, case, number, view, further, specularities) if further else None
     specularities = specularities if motion is None else motion.specularities
-    singles, of_base, refused = apart(specularities, cloud_names)
-    counted = [i for i, truth in enumerate(view.highlights) if truth.isolated or not case.isolated or dark]
-    truths = [view.highlights[i] for i in counted]
-    matched = match(singles, [truth.bp_px for truth in truths])
-    rough = None
-    if view.is_rough:
-        # Detection is scored on what can be seen: the relief melts and hides glints.
-        seen = match(singles, [spot.peak_px for spot in view.visible_highlights])
-        rough = rough_truth(session, view, counted, seen)
     common = ResultRow(
         experiment=experiment.name,
         label=case.label,
@@ -125,14 +190,5 @@ def realise(
         laws=",".join(case.laws) or None,
         swept={**case.swept, **drawn},
     )
-    unfound = str(Reason.NO_LIGHT) if dark else MISSED
-    metal = on_instruments(singles, matched, view)
-    declared = {name: laws_of(estimator) for name, estimator in estimators.items() if name not in cloud_names}
-    # Motion is asked for signs; its normals are those of another estimator.
-    declared |= {} if motion is None else {MOTION: ()}
-    made = rows(session, common, singles, truths, matched, declared, unfound, rough, metal)
-    if motion is not None:
-        made = [motion.filled(row, view.scene, truths) if row.estimator == MOTION else row for row in made]
-    if cloud_names:
-        made += cloud_rows(session, view, common, of_base, refused, {} if rough is None else rough.clouds)
-    return Realisation(number, view, made, frame, specularities, truths, matched)
+    made = score(session, view, specularities, estimators, common, case.isolated, motion)
+    return Realisation(number, view, made.rows, frame, specularities, made.truths, made.matched)

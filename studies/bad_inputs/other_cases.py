@@ -117,7 +117,7 @@ def _mesh_options() -> Iterator[Case]:
 
 def _manifest(digest: str | None = None, **changed: Any) -> str:
     content = {
-        "format": "simtest dataset, version 1",
+        "format": "simtest dataset, version 2",
         "complete": True,
         "dataset": {},
         "origin": {},

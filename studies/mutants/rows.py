@@ -482,7 +482,7 @@ ROWS = (
         "rotation(np.radians(views.rotation_error_deg)", "rotation((views.rotation_error_deg)", "motion_experiment"),
     row("instances counted from 0", "masks", "dataset.maker:_instances", "[component.mask] = i + 1",
         "[component.mask] = i", "dataset"),
-    row("depth counted without rounding", "encodings", "dataset.fields:_encode_depth", " + np.float32(0.5)", "",
+    row("depth counted without rounding", "encodings", "dataset.fields:_encode_depth", "(depth) + 0.5", "(depth)",
         "dataset"),
     row("unit of depth twice as coarse in the metadata", "encodings", "dataset.fields:_decode_depth",
         'depth *= meta["depth_scale_mm"]', 'depth *= 2 * meta["depth_scale_mm"]', "dataset"),

@@ -12,7 +12,7 @@ NEEDS = {
     "checkers": ("test-extras and systemd", ("hadolint", "zizmor", "check-jsonschema", "systemd-analyze")),
     "cores": ("Octave and a C++ compiler", ("octave-cli", "g++")),
     "docs": ("docs", ("sphinx",)),
-    "exchange": ("test-extras", ("datasets", "webdataset", "mlcroissant", "ray", "pycolmap")),
+    "exchange": ("test-extras", ("datasets", "webdataset", "ray", "pycolmap")),
     "git": ("git", ("git",)),
     "learn": ("learn", ("torch", "safetensors", "onnx", "onnxruntime")),
     "video": ("video", ("av",)),

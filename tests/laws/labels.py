@@ -107,8 +107,8 @@ def encodings() -> list[Law]:
     curvature = np.sort(rng.uniform(-3, 3, (24, 20, 2)), axis=-1)
     for image in (normal, depth, curvature):
         image[3, 4] = math.nan
-    scale = 0.005
-    counts = _png("depth", depth)
+    high, middle, low = np.split(_png("depth", depth).astype(float), 3)
+    counts, scale = 65536 * high + 256 * middle + low, float(np.nanmax(depth)) / (2**22 - 1)
     deep = np.where(counts == 0, math.nan, counts * scale)
     u, v = (2 * (half.astype(float) - 1) / 16382 - 1 for half in np.split(_png("normal", normal), 2))
     z = np.abs(u) + np.abs(v) - 1
@@ -123,7 +123,7 @@ def encodings() -> list[Law]:
            for name, image in (("depth", depth), ("normal", normal), ("curvature", curvature))}  # fmt: skip
     made = []
     for name, by_formula, wanted, quantum in (
-        ("depth", deep, depth, 0.5 * scale), ("normal", octahedral, normal, 0.015),
+        ("depth", deep, depth, 0.5 * scale + 300 * 2**-24), ("normal", octahedral, normal, 0.015),
         ("curvature", bent, curvature, 0.5e-4),
     ):  # fmt: skip
         for reader, found in (("formula", by_formula), ("reader", own[name])):

@@ -3,9 +3,13 @@
 import json
 import shutil
 
+import cv2
+import numpy as np
 import polars as pl
 import pytest
 
+import simtest
+from simtest.dataset import calibration_of, read
 from simtest.dataset.card import CARD
 from simtest.dataset.export import export_dataset
 from simtest.dataset.manifest import read_manifest
@@ -47,7 +51,14 @@ def test_a_dataset_has_a_frame_for_each_sample(made):
     assert sorted(frame.realisation for frame in scored) == list(range(FEW))
     assert {frame.name for frame in scored} == {path.stem for path in (frames / "frames").iterdir()}
     drawn = dict(pl.read_parquet(data / "index.parquet").select("index", "drawn").iter_rows())
+    stored = {record["meta"]["index"]: record for record in read(data, fields=["image"])}
+    cameras = dict(pl.read_csv(frames / "frames.csv").select("frame", "camera").iter_rows())
     for frame in scored:
+        # The very picture that the sample stores, with what is told of it.
+        record = stored[frame.realisation]
+        picture = cv2.imread(str(frames / "frames" / f"{frame.name}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(picture[:, :, ::-1], record["image"])
+        assert simtest.load_calibration(frames / cameras[frame.name]) == calibration_of(record["meta"])
         assert frame.swept == json.loads(drawn[frame.realisation])
         assert frame.view.highlights
 

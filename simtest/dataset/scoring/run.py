@@ -18,7 +18,6 @@ from simtest.dataset.scoring.table import Answers, check_name, read_answers
 from simtest.dataset.scoring.views import CaseViews, ShardViews, Shown, Views
 from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
-from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.engines import Engine, OnStep, make_engine
@@ -30,7 +29,7 @@ from simtest.validation import gallery_items
 from simtest.validation.cases import swept_example
 from simtest.validation.execution import forget, gallery_cases
 from simtest.validation.fingerprints import input_hashes
-from simtest.validation.realisation import realise
+from simtest.validation.realisation import answer, realise
 from simtest.validation.results_table import ResultRow, Value
 from simtest.validation.results_table import table as results_table
 from simtest.validation.run_folder import EXPORT, check_folder, remove_folder
@@ -261,7 +260,6 @@ def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[ResultRow]:
         return made.rows
     assert isinstance(views, ShardViews)
     maker = maker_of(views.dataset.model_dump_json(), views.variant)
-    dark = each.view.full_scale <= 0
-    found = [] if dark else reconstruct(each.image, each.view.calibration, estimators)
-    rows = maker.rows(each.number, each.session, each.view, found, estimators)
+    answers = answer(each.view, each.image, estimators)
+    rows = maker.score(each.number, each.session, each.view, answers, estimators)
     return [row.having(swept={**row.swept, ANATOMY: each.anatomy}) for row in rows]

@@ -5,16 +5,21 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
+import numpy as np
+
+from simtest.dataset.sample_calibration import picture_sensor, stored_picture
 from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
-from simtest.reconstruction.pipeline import Specularity, reconstruct
+from simtest.reconstruction.pipeline import Specularity
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
 from simtest.simulation.rendered_view import RenderedView
 from simtest.spec import Experiment
 from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.sensor import Sensor
 from simtest.validation.cases import Case
 from simtest.validation.execution import realiser_of
+from simtest.validation.realisation import answer
 from simtest.validation.results_table import Value
 
 
@@ -40,6 +45,8 @@ class Shown:
         Whether isolated highlights alone are detected and counted.
     anatomy : str
         Name of the dataset's anatomy that it shows; empty in a run.
+    stored : bool
+        Whether the frame is the picture that a dataset stores, not the sensor's frame itself.
     """
 
     case: int
@@ -51,17 +58,25 @@ class Shown:
     swept: Mapping[str, Value]
     isolated: bool = True
     anatomy: str = ""
+    stored: bool = False
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor as whose values the frame is encoded."""
+        sensor = self.view.scene.sensor
+        return picture_sensor(sensor) if self.stored else sensor
 
     @cached_property
     def image(self) -> Image:
         """The frame as the estimators see it: float32, shape (H, W) or (H, W, 3)."""
-        return self.view.frame(self.seed)
+        frame = self.view.frame(self.seed)
+        if not self.stored:
+            return frame
+        return np.asarray(stored_picture(frame, self.view.scene.sensor) / np.float32(255), dtype=np.float32)
 
     def detections(self) -> Sequence[Specularity]:
         """Detect the frame's highlights as a run does, without any estimator; none where no light reaches it."""
-        if self.view.full_scale <= 0:
-            return []
-        return reconstruct(self.image, self.view.calibration, {}, isolated=self.isolated)
+        return answer(self.view, self.image, {}, self.isolated)
 
 
 class Views(Protocol):
@@ -122,7 +137,7 @@ class ShardViews:
             }
             split, of = maker.plan.split(index), maker.plan.anatomy(index)
             anatomy = f"{of.family}.{of.number}"
-            yield Shown(0, index, drawn.scene.sensor.seed, view, session, split, values, anatomy=anatomy)
+            yield Shown(0, index, drawn.scene.sensor.seed, view, session, split, values, anatomy=anatomy, stored=True)
 
 
 def views_of_cases(experiment: Experiment, cases: Sequence[Case], variant: str) -> list[Views]:

@@ -98,9 +98,9 @@ def test_hugging_face_reads_local_shards_offline(made, tmp_path, monkeypatch):
     for row in loaded["train"]:
         record = ours[row["__key__"]]
         assert (np.asarray(row["image.png"]) == record["image"]).all()
-        # 16 bits are kept.
-        counts = np.asarray(row["depth.png"]).astype(float)
-        assert np.nanmax(np.abs(counts * row["json"]["depth_scale_mm"] - record["depth"])) < 1e-4
+        high, middle, low = np.split(np.asarray(row["depth.png"]).astype(float), 3)
+        counts = 65536 * high + 256 * middle + low
+        assert np.nanmax(np.abs(counts * row["json"]["depth_scale_mm"] - record["depth"])) < 1e-5
         assert (np.asarray(row["visible.png"]) == record["visible"]).all()
         assert record["visible"].any()
 
