@@ -170,8 +170,7 @@ def sample_views(
     fps : float, optional
         Frames a second of the sequence, 0.1 to 1000; default 25.
     labels : bool
-        Whether to write the sequence's optical flow (flow_NNNN.npz), covisibility.npy, and tracks.json, the true
-        highlights with their identities.
+        Whether to write the sequence's optical flow (flow_NNNN.npz, flow_sheet.png) and covisibility.npy.
 
     Returns
     -------

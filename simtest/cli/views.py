@@ -25,7 +25,7 @@ def views(
     fps: Annotated[float | None, Parameter(help="Frames a second of the sequence; default 25.")] = None,
     labels: Annotated[
         bool,
-        Parameter(help="Write the sequence's optical flow, co-visibility and highlights with identities.", negative=""),
+        Parameter(help="Write the sequence's optical flow and co-visibility.", negative=""),
     ] = False,
     settings: Settings = None,
     variant: Variant = None,

@@ -131,10 +131,10 @@ class AlbedoKernel:
         cells = turn @ p
         corner = dr.floor(cells)
         share = cells - corner
-        x, y, z = (mi.UInt32(corner[axis] - nodes * dr.floor(corner[axis] * (1 / nodes))) for axis in range(3))
+        # The number of nodes is a power of two.
+        x, y, z = (mi.UInt32(cell) & (nodes - 1) for cell in mi.Vector3i(corner))
         total = mi.Float(0)
         for up, weight in ((0, 1 - share.x), (1, share.x)):
-            # The number of nodes is a power of two.
             slab = (x + up) & (nodes - 1)
             low = self._packet(self._lattices[which] + (slab * nodes + y) * nodes + z, active)
             first, second = dr.lerp(low[0], low[1], share.z), dr.lerp(low[2], low[3], share.z)

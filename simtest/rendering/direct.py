@@ -17,11 +17,8 @@ from simtest.spec.rig import Rig, is_at_camera
 class Reflecting(Protocol):
     """What direct light is reflected by: `Material`, or the metal of instruments."""
 
-    def painted(self, albedo: Any) -> AbstractContextManager[None]:
-        """Let the base have an albedo, mitsuba.Spectrum; None: its own."""
-
-    def albedo_of(self, hit: Hit) -> Any:
-        """Compute the albedo at a hit, once for all its lights; None: the base's own."""
+    def painted(self, hit: Hit) -> AbstractContextManager[None]:
+        """Let the base have its albedo at a hit, computed once for all lights."""
 
     def towards(self, mi: Any, hit: Hit, direction: Any, active: Any) -> tuple[Any, Any]:
         """Compute f cos(theta) of the lobe and of the base towards a direction of the model frame."""
@@ -46,21 +43,17 @@ class Material:
     albedo: AlbedoKernel | None = None
 
     @contextmanager
-    def painted(self, albedo: Any) -> Iterator[None]:
-        """Let the BSDF's base have an albedo, mitsuba.Spectrum; None: its own."""
-        if albedo is None:
+    def painted(self, hit: Hit) -> Iterator[None]:
+        """Let the BSDF's base have the albedo of tissue at a hit; nothing where the albedo is the BSDF's own."""
+        if self.albedo is None:
             yield
             return
-        own = self.bsdf.albedo_at
+        albedo, own = self.albedo.of(hit.base, hit.base.is_valid()), self.bsdf.albedo_at
         self.bsdf.albedo_at = lambda si, active: albedo
         try:
             yield
         finally:
             self.bsdf.albedo_at = own
-
-    def albedo_of(self, hit: Hit) -> Any:
-        """Compute the albedo of tissue at a hit, once for all its lights; None where the albedo is the BSDF's own."""
-        return None if self.albedo is None else self.albedo.of(hit.base, hit.base.is_valid())
 
     def parts(self, mi: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
         """Compute f cos(theta) of the lobe and of the base."""
@@ -117,15 +110,12 @@ class DirectLight:
         """Return what draws points of the sources of finite size for the pixels of a launch; None if all are points."""
         return Drawer(self.mi, lanes, samples) if any(kind.source != "point" for kind in self.kinds) else None
 
-    def radiance(
-        self, scene: Any, material: Reflecting, hit: Hit, draw: Draw | None, albedo: Any = None
-    ) -> tuple[Any, Any]:
+    def radiance(self, scene: Any, material: Reflecting, hit: Hit, draw: Draw | None) -> tuple[Any, Any]:
         """Compute the radiance off the lobe and the base, mitsuba.Spectrum, at surface points, with shadow rays.
 
-        `draw` says which points of sources of finite size are taken; None where all are points. `albedo`,
-        mitsuba.Spectrum, takes the place of that at the hit.
+        `draw` says which points of sources of finite size are taken; None where all are points.
         """
-        with material.painted(material.albedo_of(hit) if albedo is None else albedo):
+        with material.painted(hit):
             return self._of_lights(scene, material, hit, draw)
 
     def _of_lights(self, scene: Any, material: Reflecting, hit: Hit, draw: Draw | None) -> tuple[Any, Any]:

@@ -5,7 +5,7 @@ which of both is nearer, and shadow rays ask both.
 """
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,14 +37,9 @@ class Metal:
     metal: Any
     matt: Any
 
-    @contextmanager
-    def painted(self, albedo: Any) -> Iterator[None]:
-        """Metal has no colour but its own."""
-        yield
-
-    def albedo_of(self, hit: Hit) -> Any:
-        """Return None: there is no pattern."""
-        return
+    def painted(self, hit: Hit) -> AbstractContextManager[None]:
+        """Metal has no pattern."""
+        return nullcontext()
 
     def towards(self, mi: Any, hit: Hit, direction: Any, active: Any) -> tuple[Any, Any]:
         """Compute f cos(theta) of the lobe and of the matt base towards a direction of the model frame."""

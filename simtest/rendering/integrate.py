@@ -36,10 +36,6 @@ LANES = 2**22
 RAYS = 2**24
 """Samples of one launch: some tenths of a second on two cores, so that a frame can be stopped between launches."""
 
-PAINT_EVERY, SAME_PATCH = 3, 0.02
-"""Samples that share an albedo, and how far apart they may lie, as a share of the distance. Every fourth sample of the
-sequence would stand in one column of the pixel."""
-
 SMALLEST_NORMAL = np.finfo(np.float32).tiny
 """Of single precision; what is smaller is subnormal."""
 
@@ -47,9 +43,6 @@ SUMMED = 64
 """Samples of a pixel that are summed in single precision; these sums are added in double precision."""
 
 Sums = npt.NDArray[np.float64]
-
-Painted = tuple[Any, Any]
-"""An albedo, mitsuba.Spectrum, and the point, mitsuba.Point3f, where it was computed."""
 
 
 class Labelling(Protocol):
@@ -110,20 +103,20 @@ class Tracer:
         self.refinement.apply(rays.origin, rays.direction, si)
         return make_hit(self.mi, si, self.relief, bent)
 
-    def _direct(self, rays: Rays, hit: Hit, draw: Draw | None, albedo: Any = None) -> list[Any]:
-        """Compute the channels of direct light off the lobe and off the base; `albedo` as in `DirectLight.radiance`.
+    def _direct(self, rays: Rays, hit: Hit, draw: Draw | None) -> list[Any]:
+        """Compute the channels of direct light off the lobe and off the base.
 
         Where there are instruments those of their metal follow, and each is 0 where the other is in front.
         """
         if self.instruments is None:
-            specular, diffuse = self.light.radiance(self.scene, self.material, hit, draw, albedo)
+            specular, diffuse = self.light.radiance(self.scene, self.material, hit, draw)
             return [*specular, *diffuse]
         import drjit as dr
 
         blockers = self.instruments.before(self.scene)
         ahead, metal = self.instruments.hit(rays)
         in_front = ahead.base.t < hit.base.t
-        tissue = self.light.radiance(blockers, self.material, hit, draw, albedo)
+        tissue = self.light.radiance(blockers, self.material, hit, draw)
 
         def shine(specular: Any, diffuse: Any) -> tuple[Any, Any]:
             return self.light.radiance(blockers, metal, ahead, draw)
@@ -285,46 +278,13 @@ class Tracer:
         number, end = mi.UInt32(start), mi.UInt32(stop)
         dr.make_opaque(number, end)
 
-        def light(rays: Rays, hit: Hit, number: Any, albedo: Any, sums: Any) -> list[Any]:
-            parts = self._direct(rays, hit, None if drawer is None else drawer.at(number), albedo)
-            return [total + part for total, part in zip(sums, parts, strict=True)]
-
         def step(number: Any, *sums: Any) -> tuple[Any, ...]:
             rays, _, hit = self.hit(*self.sightlines.sample(lanes, number))
-            return number + 1, *light(rays, hit, number, None, sums)
+            parts = self._direct(rays, hit, None if drawer is None else drawer.at(number))
+            return number + 1, *(total + part for total, part in zip(sums, parts, strict=True))
 
-        def painted_step(number: Any, held: Painted, *sums: Any) -> tuple[Any, ...]:
-            rays, _, hit = self.hit(*self.sightlines.sample(lanes, number))
-            held = self._paint(hit, number, held)
-            return number + 1, held, *light(rays, hit, number, held[0], sums)
-
-        if self.material.albedo is None:
-            _, *sums = dr.while_loop((number, *zeros), lambda number, *_: number < end, step)
-            return sums
-        held = mi.Spectrum(-1), mi.Point3f(0)
-        _, _, *sums = dr.while_loop((number, held, *zeros), lambda number, *_: number < end, painted_step)
+        _, *sums = dr.while_loop((number, *zeros), lambda number, *_: number < end, step)
         return sums
-
-    def _paint(self, hit: Hit, number: Any, held: Painted) -> Painted:
-        """Return the albedo of tissue for a sample: every `PAINT_EVERY`-th one's, which the samples after it share.
-
-        The samples of a pixel lie in one patch of tissue, and its shading hardly varies. One that lies elsewhere, as at
-        the edge of a fold, takes the albedo of its own point.
-        """
-        import drjit as dr
-
-        mi, position, seen = self.mi, hit.base.p, hit.base.is_valid()
-        near = dr.squared_norm(position - held[1]) < dr.square(SAME_PATCH * hit.base.t)
-        old = number % PAINT_EVERY != 0
-        fresh = seen & ~(old & near & (held[0][0] >= 0))
-
-        kernel = self.material.albedo
-        assert kernel is not None
-
-        def paint(albedo: Any, at: Any) -> Painted:
-            return kernel.at(position, fresh), position
-
-        return dr.if_stmt((mi.Spectrum(held[0]), mi.Point3f(held[1])), fresh, paint, lambda albedo, at: (albedo, at))
 
     def _single(
         self, lanes: Lanes, drawer: Drawer | None, number: int, bounces: Bounces | None, count: int, block: int

@@ -14,6 +14,8 @@ import numpy.typing as npt
 from simtest.geometry import Camera
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Mask
+from simtest.surfaces.deformation import DeformationAt
+from simtest.surfaces.deformed import DeformedSurface
 
 NONE, SEEN, OUT, HIDDEN, INSTRUMENT = range(5)
 """State of a pixel: its ray meets no surface; the other frame sees its point too; the point lies outside the other
@@ -39,6 +41,15 @@ _NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 
 Moved = Callable[[Array], Array]
 """Maps points of the world, shape (N, 3), mm, at one frame's moment to where the same material is at the other's."""
+
+
+def moved_between(session: Session, first_s: float, second_s: float) -> Moved | None:
+    """Return what maps points of the world at one moment to where the same tissue is at another; None: they stay."""
+    if not isinstance(session.surface, DeformedSurface):
+        return None
+    parts = session.scene.deformation
+    first, second = DeformationAt(parts, first_s), DeformationAt(parts, second_s)
+    return lambda points: second.moved(first.at_rest(points))
 
 
 @dataclass(frozen=True)
@@ -76,6 +87,19 @@ class SeenSurface:
         """Return the pixels, shape (N, 2), at which the camera images points of the world, shape (N, 3)."""
         pose = self.world_from_camera
         return self.camera.project((points - pose[:3, 3]) @ pose[:3, :3])
+
+    @property
+    def tissue(self) -> Array:
+        """Return `position` with NaN where an instrument is seen."""
+        return self.position if self.instrument is None else np.where(self.instrument[..., None], np.nan, self.position)
+
+    def shows(self, points_px: Array) -> Mask:
+        """Return which pixel positions, shape (N, 2), lie in view and not on an instrument."""
+        with np.errstate(invalid="ignore"):
+            shown = self.camera.contains(points_px)
+        if self.instrument is not None:
+            shown[shown] = _at(self.instrument, points_px[shown]) == 0
+        return shown
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from simtest.errors import InputError
 from simtest.runtime.files import write_json
-from simtest.simulation.sequence_labels import SequenceLabels
+from simtest.simulation.sequence_labels import FILES, SequenceLabels
 from simtest.simulation.view_files import FRAMES_PER_SECOND, ViewWriter
 from simtest.simulation.viewpoints import Progress, SampledViews, sample_views, viewpoint_key
 from simtest.spec import Scene
@@ -38,13 +38,12 @@ def sample_into(
         raise InputError(f"fps = {fps:g}: must be {FPS[0]:g} to {FPS[1]:g} frames a second")
     rate = (fps or FRAMES_PER_SECOND) if sequence else None
     _remove_old(folder)
-    labeller = SequenceLabels(folder)
+    labeller = SequenceLabels(folder) if labels else None
     with ViewWriter(folder, rate) as writer:
-        sampled = sample_views(
-            scene, count, viewpoints, variant, progress, writer.add, rate, labeller.add if labels else None
-        )
+        label = None if labeller is None else labeller.add
+        sampled = sample_views(scene, count, viewpoints, variant, progress, writer.add, rate, label)
         writer.close()
-    if labels:
+    if labeller is not None:
         labeller.close()
     left_out = _write_poses(folder, scene, sampled)
     write_json(folder / "views.json", sampled.to_json(viewpoint_key(scene)))
@@ -63,7 +62,8 @@ def _write_poses(folder: Path, scene: Scene, sampled: SampledViews) -> list[str]
 
 
 def _remove_old(folder: Path) -> None:
-    """Remove the poses of an earlier call, and its list of views."""
-    colmap = [folder / COLMAP / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
-    for old in (folder / "views.json", folder / TUM, folder / TRANSFORMS, *colmap):
-        old.unlink(missing_ok=True)
+    """Remove the poses of an earlier call, its list of views, and its labels."""
+    colmap = [f"{COLMAP}/{name}.txt" for name in ("cameras", "images", "points3D")]
+    for pattern in ("views.json", TUM, TRANSFORMS, *colmap, *FILES):
+        for old in folder.glob(pattern):
+            old.unlink()

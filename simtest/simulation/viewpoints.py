@@ -14,8 +14,9 @@ from simtest.runtime.arrays import Array
 from simtest.runtime.files import Json
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import AnatomySurface, Scene
+from simtest.surfaces import make_surface
 
-NO_HIGHLIGHT = "no highlight in view"
+NO_HIGHLIGHT, NO_ROOM = "no highlight in view", "no room for the camera, a light or an instrument"
 
 GOLDEN_SHARE = 0.6180339887498949
 """Multiples of it, modulo 1, cover [0, 1) evenly at any number of them."""
@@ -85,8 +86,8 @@ class SampledViews:
     views : list of SampledView
         In the order tried.
     rejected : dict
-        Number of viewpoints left out by reason: `NO_HIGHLIGHT`, or why the highlight of the view that stands out most
-        is not isolated (theory.md section 6).
+        Number of viewpoints left out by reason: `NO_ROOM`, `NO_HIGHLIGHT`, or why the highlight of the view that stands
+        out most is not isolated (theory.md section 6).
     poses_left_out : tuple of str
         Why the poses were not written in a format: it lacks the camera's lens.
     """
@@ -139,33 +140,45 @@ def sample_views(
     Raises
     ------
     InputError
-        If the surface is no anatomy, or it has no such view.
+        If the surface is no anatomy, it has no such view, or no viewpoint has room; of a sequence, if one has none.
     """
     key = viewpoint_key(scene)
     name = key.removeprefix("surface.")
     session: Session | None = None
     kept: list[SampledView] = []
     rejected: Counter[str] = Counter()
+    first_error: InputError | None = None
     for viewpoint in viewpoints:
         # Render.
         time_s = scene.time_s + (0.0 if fps is None else len(kept) / fps)
         surface = scene.surface.model_copy(update={name: viewpoint})
         moved = scene.model_copy(update={"surface": surface, "time_s": time_s if scene.deformation else scene.time_s})
-        session = session or Session(moved, variant)
-        view = render_view(session, moved)
-        # Keep, or count the reason.
-        isolated = sum(highlight.isolated for highlight in view.highlights)
-        if isolated or fps is not None:
-            pose, time = session.surface.model_from_camera, None if fps is None else time_s
-            kept.append(SampledView(viewpoint, isolated, pose, write(view) if write else None, time))
-            if label is not None:
-                label(session, view)
+        if session is None:
+            # Raises where the surface itself is not sound.
+            make_surface(surface)
+        try:
+            session = session or Session(moved, variant)
+            view = render_view(session, moved)
+        except InputError as error:
+            first_error = first_error or InputError(f"{key} = {viewpoint:g}: {error}")
+            if fps is not None:
+                raise first_error from None
+            rejected[NO_ROOM] += 1
         else:
-            rejected[_reason(view)] += 1
+            # Keep, or count the reason.
+            if view.isolated or fps is not None:
+                pose, time = session.surface.model_from_camera, None if fps is None else time_s
+                kept.append(SampledView(viewpoint, view.isolated, pose, write(view) if write else None, time))
+                if label is not None:
+                    label(session, view)
+            else:
+                rejected[_reason(view)] += 1
         if progress:
             progress(len(kept), count, f"{key} = {viewpoint:g}")
         if len(kept) == count:
             break
+    if first_error is not None and not kept and set(rejected) == {NO_ROOM}:
+        raise first_error
     return SampledViews(kept, dict(rejected.most_common()))
 
 

@@ -5,7 +5,6 @@ met with the surface at rest exactly, finds where it meets it.
 """
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -127,16 +126,6 @@ class DeformedSurface(SurfaceModel):
     def at_rest(self) -> SurfaceModel:
         """The surface before its deformation, in its closed form where it has one."""
         return self.rest.at_rest
-
-    def at_moment(self, deformation: DeformationAt) -> "DeformedSurface":
-        """Return the same surface under the deformation of another moment."""
-        other = copy(self)
-        for name in ("vertex_jets", "_vertex_forms", "_mesh"):
-            other.__dict__.pop(name, None)
-        other.deformation = deformation
-        if isinstance(self.relief, DeformedRelief):
-            other.relief = replace(self.relief, deformation=deformation)
-        return other
 
     @cached_property
     def vertex_jets(self) -> MapJets:

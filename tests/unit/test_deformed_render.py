@@ -69,13 +69,15 @@ def test_labels_follow_the_exact_truth_on_relief():
 
 
 @pytest.mark.parametrize(
-    "reflectance", [pytest.param({"type": "phong", "exponent": 200.0}, marks=pytest.mark.ci), TISSUE]
+    ("reflectance", "samples"),
+    [pytest.param({"type": "phong", "exponent": 200.0}, 1, marks=pytest.mark.ci), (TISSUE, 1), (TISSUE, 4)],
 )
-def test_a_rigid_motion_of_tissue_is_the_reverse_motion_of_the_camera(reflectance):
+def test_a_rigid_motion_of_tissue_is_the_reverse_motion_of_the_camera(reflectance, samples):
     """A film, relief and colour that move rigidly with a camera look as before."""
     rigid = {"type": "breathing", "amplitude_mm": 4.0, "period_s": 2.0, "direction": [0, 0, 1], "warp": 0.0}
     # At tilt 0 the camera looks along -z of the model: 4 mm along z is 4 mm back.
     common = {"surface": {"tilt_deg": 0.0, "relief": RELIEF}, "reflectance": reflectance}
+    common["render"] = {"samples_per_pixel": samples}
     still = Session(scene(0.0, deformation=(), **common)).frame()
     moved = Session(scene(1.0, deformation=(rigid,), moved={"translation_mm": [0, 0, -4.0]}, **common)).frame()
     tolerance = 2e-4 * float(still.radiance.total.max())

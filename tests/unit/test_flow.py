@@ -7,6 +7,8 @@ import pytest
 
 from simtest.rendering import Session
 from simtest.simulation.flow import HIDDEN, INSTRUMENT, NONE, OUT, SEEN, Flow, SeenSurface, flow_between
+from simtest.simulation.rendered_view import render_view
+from simtest.simulation.sequence_labels import STRIDE_PX, SequenceLabels
 from simtest.spec import scene_from_dict
 from simtest.spec.views import Moved
 from tests.marked import marked
@@ -127,6 +129,23 @@ def test_instruments_have_no_flow_and_hide():
     assert np.count_nonzero(hidden) > 100
     at = (first.camera.pixel_centres() + np.nan_to_num(flow.flow_px)).astype(int)[hidden]
     assert (second.instrument[at[:, 1], at[:, 0]] > 0).all()
+
+
+def test_what_instruments_cover_is_seen_by_no_frame(tmp_path):
+    """The matrix counts what the flow's states count: the points of the tissue that both frames show."""
+    shaft = {"kind": "shaft", "tip": [0.4, 0.5], "depth_share": 0.5, "diameter_mm": 2, "azimuth_deg": -90.0}
+    scene = scene_of(SURFACES["plane"], instruments=[shaft])
+    labels, session = SequenceLabels(tmp_path), Session(scene)
+    for now in (scene, moved(scene, (3.0, 0.0, 0.0), (0.0, 0.0, 0.0))):
+        session.update(now)
+        labels.add(session, render_view(session, now))
+    labels.close()
+    sparse = np.s_[STRIDE_PX // 2 :: STRIDE_PX, STRIDE_PX // 2 :: STRIDE_PX]
+    flow, shares = np.load(tmp_path / "flow_0000.npz"), np.load(tmp_path / "covisibility.npy")
+    for name, share in (("forward", shares[0, 1]), ("backward", shares[1, 0])):
+        counts = np.bincount(flow[f"{name}_state"][sparse].ravel(), minlength=5)
+        assert min(counts[SEEN], counts[HIDDEN], counts[INSTRUMENT]) > 0
+        assert share == pytest.approx(counts[SEEN] / (counts[SEEN] + counts[OUT] + counts[HIDDEN]))
 
 
 def test_material_that_moves_takes_its_flow_along():

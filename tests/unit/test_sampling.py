@@ -9,8 +9,10 @@ import pytest
 
 from simtest import api
 from simtest.errors import InputError
-from simtest.simulation.viewpoints import NO_HIGHLIGHT, along_path, candidates, sample_views
+from simtest.rendering.placement_checks import check_lights
+from simtest.simulation.viewpoints import NO_HIGHLIGHT, NO_ROOM, along_path, candidates, sample_views
 from simtest.spec import load_scene
+from simtest.surfaces import make_surface
 
 SMALL = {"camera.width": 160, "camera.height": 120, "camera.fx": 80.0, "camera.fy": 80.0}
 
@@ -38,6 +40,32 @@ def test_every_place_is_either_kept_or_counted():
     assert few.tried == 12
     assert viewpoints_of(few)[:3] == viewpoints_of(sampled)
     assert sum(few.rejected.values()) == 12 - len(few.views)
+
+
+@pytest.mark.render
+def test_a_place_without_room_for_the_light_is_counted_and_the_next_is_tried():
+    source = {"position_mm": [11.0, 0.0, 0.0], "source": {"type": "disc", "radius_mm": 1.5}}
+    camera = {"camera.width": 64, "camera.height": 48, "camera.fx": 32.0, "camera.fy": 32.0}
+    scene = load_scene("anatomy", {**camera, "rig.lights": [source]})
+
+    def has_room(viewpoint):
+        surface = make_surface(scene.surface.model_copy(update={"viewpoint": viewpoint}))
+        try:
+            check_lights(scene, surface)
+        except InputError:
+            return False
+        return True
+
+    free = [viewpoint for viewpoint in range(30) if has_room(viewpoint)]
+    without = next(viewpoint for viewpoint in range(30) if viewpoint not in free)
+    sampled = sample_views(scene, 1, [without, without, *free])
+    assert set(viewpoints_of(sampled)) < set(free)
+    assert sampled.rejected[NO_ROOM] == 2
+    # Where there is none anywhere, or a film would have a gap, the line says why.
+    with pytest.raises(InputError, match=r"surface\.viewpoint = \d+: .* touches the colon"):
+        sample_views(scene, 1, [without])
+    with pytest.raises(InputError, match=r"surface\.viewpoint = \d+: .* touches the colon"):
+        sample_views(scene, 1, [without, *free], fps=10.0)
 
 
 @pytest.mark.render

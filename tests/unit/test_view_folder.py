@@ -15,7 +15,7 @@ from simtest.spec import load_scene
 from simtest.surfaces import make_surface
 
 SMALL = {"camera.width": 160, "camera.height": 120, "camera.fx": 80.0, "camera.fy": 80.0}
-LABELS = ("covisibility.npy", "tracks.json", "flow_sheet.png", "flow_0000.npz", "flow_0001.npz")
+LABELS = ("covisibility.npy", "flow_sheet.png", "flow_0000.npz", "flow_0001.npz")
 
 
 @pytest.fixture(scope="module")
@@ -75,15 +75,6 @@ def test_a_rendered_frame_and_a_view_hold_the_same_pose(film, tmp_path):
 @pytest.mark.render
 def test_labels_of_a_film(film):
     folder, _ = film
-    table = json.loads((folder / "tracks.json").read_text())
-    assert len(table["highlights"]) == 3
-    for number, track in enumerate(table["tracks"]):
-        for i, (entry, pixel) in enumerate(zip(track["entries"], track["bp_px"], strict=True)):
-            listed = table["highlights"][track["first_frame"] + i][entry]
-            assert listed["identity"] == number
-            assert listed["bp_px"] == pixel
-            assert listed["light"] == track["light"]
-    assert table["base"] is None
     with np.load(folder / "flow_0000.npz") as flow:
         assert flow["forward"].dtype == flow["backward"].dtype == np.float32
         assert flow["forward"].shape == (120, 160, 2)
