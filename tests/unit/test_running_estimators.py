@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from simtest.calibration import NO_PRIORS, Calibration, Frame, Priors
+from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.detection import Detection, Region
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import BatchEstimator, Estimate, Estimator, FrameEstimator, load_estimators
 from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.circle_pose import circle_pose
+from simtest.estimators.cone_axis import ConeAxis
 from simtest.estimators.dispatch import run, run_each, run_in_frame
 from simtest.geometry import Camera, Patch, smooth
 from simtest.reconstruction.description import describe
@@ -55,6 +57,29 @@ def test_circle_pose_gives_the_same_of_all_at_once(patches):
         assert found.region.statistic(alone.candidates + 0.01) == pytest.approx(
             alone.region.statistic(alone.candidates + 0.01)
         )
+
+
+def test_the_order_of_isovalues_is_irrelevant():
+    """Two touching highlights: the lower isophotes, which hold both, are left out whatever their place in the list."""
+    y, x = np.mgrid[:120, :120] + 0.5
+    left_out = 0
+    for angle in range(12):
+        gap = (14 + angle) * np.array([np.cos(angle), np.sin(angle)])
+        second = np.exp(-((x - 60 - gap[0]) ** 2 + (y - 60 - gap[1]) ** 2) / 120)
+        patch = Patch.cut(np.exp(-((x - 60) ** 2 + (y - 60) ** 2) / 162) + 0.7 * second, (10, 10, 100, 100))
+        first, *others = (
+            ConeAxis(order).estimate(replace(patch), CAMERA)
+            for order in (
+                CONE_AXIS_ISOVALUES,
+                CONE_AXIS_ISOVALUES[::-1],
+                (*CONE_AXIS_ISOVALUES[2:], *CONE_AXIS_ISOVALUES),
+            )
+        )
+        left_out += len(first.isophotes) < len(CONE_AXIS_ISOVALUES)
+        for other in others:
+            np.testing.assert_array_equal(other.normal, first.normal)
+            assert [i.isovalue for i in other.isophotes] == [i.isovalue for i in first.isophotes]
+    assert left_out >= 3
 
 
 # A batch --------------------------------------------------------------------------------------------------------------
