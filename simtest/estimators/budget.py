@@ -25,6 +25,9 @@ stated from a single highlight.
 STATED = "stated"
 """Name of the one part of an estimate that states a covariance without a budget, as other packages' may."""
 
+LARGEST_VARIANCE = math.pi**2
+"""rad^2; no direction is less certain. What states more has other units."""
+
 CONFIDENCE = 0.95
 
 Budget = Mapping[str, Array]
@@ -41,6 +44,12 @@ def total(budget: Budget) -> Array:
     for part in others:
         whole = whole + part
     return whole
+
+
+def bounded(part: Array) -> Array:
+    """Return a part of a budget, scaled down where it says more than that nothing is known of the direction."""
+    size = float(np.abs(part).max())
+    return part if not size > LARGEST_VARIANCE else part * (LARGEST_VARIANCE / size)
 
 
 def dominant(budget: Budget) -> str:

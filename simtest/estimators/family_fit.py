@@ -25,7 +25,7 @@ def fit_isophote_family(patch: Patch, camera: Camera, isovalues: Sequence[float]
 def fit_isophote_families(
     patches: Sequence[Patch], camera: Camera, isovalues: Sequence[float]
 ) -> list[IsophoteFamily | Failure]:
-    """Fit the isophotes of several highlights, all ellipses and poses at once; the order of the isovalues is irrelevant.
+    """Fit the isophotes of several highlights, all ellipses and poses at once, isovalues in any order.
 
     Where fewer than 2 isophotes (1, if only one isovalue is given) are whole, the seen parts of those that are cut are
     fitted too; with fewer than 2 of either kind the result is the first one's Failure.

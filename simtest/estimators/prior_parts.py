@@ -104,7 +104,7 @@ def add_common_parts(
         parts["camera"] = turned
     if priors.falloff_power is not None and family is not None:
         parts["response"] = falloff_part(estimate.normal, family, priors.falloff_power)
-    return estimate.with_parts(**parts) if parts else estimate
+    return estimate.with_parts(**parts)
 
 
 def light_offset_part(normal: Array, priors: Priors) -> Array:
