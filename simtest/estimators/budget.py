@@ -28,6 +28,9 @@ STATED = "stated"
 MISPLACED = ("noise", "resolution", "shape", "response", STATED)
 """Parts that stand for a highlight's brightest point lying elsewhere than where the normal looks."""
 
+LARGEST_VARIANCE = math.pi**2
+"""rad^2; no direction is less certain. What states more has other units."""
+
 CONFIDENCE = 0.95
 
 Budget = Mapping[str, Array]
@@ -44,6 +47,12 @@ def total(budget: Budget) -> Array:
     for part in others:
         whole = whole + part
     return whole
+
+
+def bounded(part: Array) -> Array:
+    """Return a part of a budget, scaled down where it says more than that nothing is known of the direction."""
+    size = float(np.abs(part).max())
+    return part if not size > LARGEST_VARIANCE else part * (LARGEST_VARIANCE / size)
 
 
 def dominant(budget: Budget) -> str:

@@ -25,13 +25,15 @@ def fit_isophote_family(patch: Patch, camera: Camera, isovalues: Sequence[float]
 def fit_isophote_families(
     patches: Sequence[Patch], camera: Camera, isovalues: Sequence[float]
 ) -> list[IsophoteFamily | Failure]:
-    """Fit the isophotes of several highlights, all ellipses and poses at once.
+    """Fit the isophotes of several highlights, all ellipses and poses at once, isovalues in any order.
 
     Where fewer than 2 isophotes (1, if only one isovalue is given) are whole, the seen parts of those that are cut are
     fitted too; with fewer than 2 of either kind the result is the first one's Failure.
     """
     if not patches:
         return []
+    # A family begins with the lowest isophote, from which neighbours are left out, and ends with the innermost.
+    isovalues = sorted(set(isovalues))
     # whole isophotes
     posed = _with_poses(fit_isophotes_of_each(patches, camera, isovalues))
     least = min(MIN_ISOPHOTES, len(isovalues))

@@ -12,12 +12,12 @@ from functools import lru_cache
 import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Priors
-from simtest.estimators.budget import CONFIDENCE, equivalent_variance
+from simtest.estimators.budget import CONFIDENCE, equivalent_variance, line_covariance
 from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.near_misses import near_miss_parts
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Array, Camera, chi_squared
+from simtest.geometry import Array, BrownConrady, Camera, chi_squared
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
 
 AT_CAMERA_MM = 1e-9
@@ -47,6 +47,10 @@ STEP_MM = 1e-3
 
 SHARES = (np.arange(64) + 0.5) / 64
 """At these shares a prior of one number is sampled."""
+
+_DRAWS, _GOLDEN = (np.arange(128) + 0.5) / 128, math.pi * (3 - math.sqrt(5)) * np.arange(128)
+DRAWN = np.sqrt(-2 * np.log(1 - _DRAWS))[:, None] * np.stack([np.cos(_GOLDEN), np.sin(_GOLDEN)], axis=1)
+"""A pair of standard normal numbers is sampled at these, shape (128, 2)."""
 
 
 def add_untold_parts(
@@ -80,28 +84,27 @@ def add_untold_parts(
         return add_common_parts(judged, camera, priors, family)
     if estimate.budget is None:
         return estimate
-    light = light_offset_part(estimate.normal, priors)
-    return estimate.with_parts(light_offset=light, **_common_parts(estimate, camera, priors, family))
+    estimate = estimate.with_parts(light_offset=light_offset_part(estimate.normal, priors))
+    return add_common_parts(estimate, camera, priors, family)
 
 
 def add_common_parts(
     estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None = None
 ) -> Estimate:
-    """Add the parts ``camera`` and ``response``, and the chance of a near miss, to a budget if there is one."""
+    """Add the parts ``camera`` and ``response``, where the priors leave them open, and ``shape`` by near misses.
+
+    An estimate without a budget stays without; so does one whose part ``camera`` cannot be computed.
+    """
     if estimate.budget is None:
         return estimate
-    parts = _common_parts(estimate, camera, priors, family)
-    return estimate.with_parts(**parts) if parts else estimate
-
-
-def _common_parts(estimate: Estimate, camera: Camera, priors: Priors, family: HighlightAxis | None) -> dict[str, Array]:
-    """Return ``camera`` and ``response``, where the priors leave them open, and ``shape`` by near misses."""
     parts = {} if family is None else dict(near_miss_parts(family.patch, priors))
     if not priors.camera.is_exact:
-        parts["camera"] = camera_part(estimate, camera, priors.camera)
+        if (turned := camera_part(estimate, camera, priors.camera)) is None:
+            return estimate.without_uncertainty()
+        parts["camera"] = turned
     if priors.falloff_power is not None and family is not None:
         parts["response"] = falloff_part(estimate.normal, family, priors.falloff_power)
-    return parts
+    return estimate.with_parts(**parts)
 
 
 def light_offset_part(normal: Array, priors: Priors) -> Array:
@@ -150,19 +153,32 @@ def mean_light_part(normal: Array, priors: Priors) -> Array | None:
     return told_light_part(-normal, normal, light, covariance, priors.distance.quantile(SHARES))
 
 
-def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array:
-    """Return the covariance of the normal by the camera's geometry, shape (2, 2), rad^2.
+def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array | None:
+    """Return the covariance of the normal by the camera's geometry, shape (2, 2), rad^2; None where it looks nowhere.
 
     The normal turns with the sightline that it looks along. Another focal length, centre or distortion sees, at the
-    pixel looked at, what this camera sees at a pixel beside it.
+    pixel looked at, what this camera sees at a pixel beside it. Near the angle where a lens folds over, a pixel turns
+    the sightline ever more: there the moves are those at pixels drawn from the prior, without those past the lens's
+    limit, which no camera that saw this highlight has.
     """
-    x, y = estimate.look_px
-    from_centre = np.array([x - camera.cx, y - camera.cy])
-    reach2 = (from_centre[0] / camera.fx) ** 2 + (from_centre[1] / camera.fy) ** 2
-    radial = prior.focal_sd**2 + (prior.distortion_sd * reach2) ** 2
-    in_pixels = radial * np.outer(from_centre, from_centre) + prior.centre_sd_px**2 * np.eye(2)
-    J = basis_across(estimate.normal) @ camera.step_of_pixels(estimate.look_px).T
-    return np.nan_to_num(J @ in_pixels @ J.T)
+    look, sightline = estimate.look_px, camera.unproject(estimate.look_px)
+    across = basis_across(estimate.normal)
+    if not np.isfinite(sightline).all():
+        return None
+    from_centre = look - [camera.cx, camera.cy]
+    reach = np.linalg.solve(camera.K[:2, :2], from_centre)
+    if isinstance(camera.distortion, BrownConrady):
+        reach = sightline[:2] / sightline[2]  # its k1 moves what the lens has not yet bent
+    bulge = camera.K[:2, :2] @ reach * (reach @ reach)
+    in_pixels = prior.focal_sd**2 * np.outer(from_centre, from_centre) + prior.distortion_sd**2 * np.outer(bulge, bulge)
+    in_pixels += prior.centre_sd_px**2 * np.eye(2)
+    if camera.distortion is None:
+        J = across @ camera.step_of_pixels(look).T
+        return np.asarray(J @ in_pixels @ J.T)
+    variances, axes = np.linalg.eigh(in_pixels)
+    drawn = look + DRAWN @ (axes * np.sqrt(np.maximum(variances, 0.0))).T
+    moves = (camera.unproject(drawn) - sightline) @ across.T
+    return line_covariance(moves[np.isfinite(moves).all(axis=1)])
 
 
 def falloff_part(normal: Array, family: HighlightAxis, power: Distribution) -> Array:

@@ -1,6 +1,5 @@
 """Estimator protocols, and the estimate that an estimator returns."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
@@ -9,7 +8,7 @@ import numpy as np
 
 from simtest.calibration import Frame, Priors
 from simtest.errors import Failure
-from simtest.estimators.budget import STATED, Budget, total
+from simtest.estimators.budget import STATED, Budget, bounded, total
 from simtest.estimators.cloud_shape import CloudShape
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.geometry import Array, Camera, Patch
@@ -138,11 +137,14 @@ class Estimate:
         return estimate_html(self)
 
     def with_parts(self, **parts: Array) -> "Estimate":
-        """Return the estimate with more parts in its budget, rad^2; one that is there already is added to."""
+        """Return the estimate with more parts in its budget, rad^2; one that is there already is added to.
+
+        No part says less than that nothing is known of the direction (`simtest.estimators.budget.bounded`).
+        """
         own = dict(self.budget or {})
         for name, part in parts.items():
             own[name] = own[name] + part if name in own else part
-        return replace(self, budget=own, covariance=None)
+        return replace(self, budget={name: bounded(part) for name, part in own.items()}, covariance=None)
 
     def without_uncertainty(self) -> "Estimate":
         """Return the estimate without covariance and budget: it states no uncertainty."""
@@ -201,7 +203,7 @@ class PreparedEstimator(Estimator, Protocol):
 class FrameEstimator(Protocol):
     """Estimates normals from the whole frame, as clouds of highlights, networks and foreign cores do."""
 
-    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
+    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate | Failure] | Failure:
         """Estimate the normals in a frame.
 
         Parameters
@@ -216,7 +218,7 @@ class FrameEstimator(Protocol):
 
         Returns
         -------
-        sequence of Estimate, or Failure
+        sequence of Estimate or Failure, or Failure
             In any order and number, each looking at a pixel of the frame (`Estimate.look_px`), or why there is none.
         """
 
@@ -228,13 +230,6 @@ class CloudEstimator(FrameEstimator, Protocol):
     @property
     def least_spots(self) -> int:
         """Fewest highlights of a cloud."""
-
-
-LARGEST_VARIANCE = math.pi**2
-"""rad^2; no direction is less certain. What states more has other units."""
-
-NEAR_PX = 1.0
-"""An estimate that was made elsewhere looks at a pixel at most so far outside the frame."""
 
 
 @runtime_checkable

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from simtest.conventions import PIXEL_CENTRE
+from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry import pixel_sets
 from simtest.geometry.isophotes import IsophoteTracer
@@ -109,7 +109,7 @@ class Patch:
             Column, row, width, height of the region; inside the frame.
         peak : tuple of int, optional
             Column and row of the peak's pixel; default the brightest of the region. A peak on a clipped plateau of 12
-            px and more lies at the plateau's centroid.
+            px and more of its highlight at half height lies at the plateau's centroid.
         origin_px : tuple of int
             Column and row of the first pixel of `smoothed` in the frame, where it is only a part of it.
         others_px : tuple of tuple of float, optional
@@ -140,7 +140,9 @@ class Patch:
             lowest = float(values.min(where=seen, initial=np.inf))
         # candidate: the given pixel or the brightest; refined by a parabola or, on a clipped plateau, by its centroid
         row, column = divmod(int(values.argmax()), width) if peak is None else (peak[1] - y, peak[0] - x)
-        plateau = None if saturated is None else _plateau(saturated, row, column)
+        unsmoothed = None if raw is None else raw[crop]
+        shown = values if unsmoothed is None else unsmoothed
+        plateau = None if saturated is None else _plateau(shown, saturated, row, column)
         if saturated is None or plateau is None:
             position = _parabolic_peak(values, row, column)
         else:
@@ -155,8 +157,7 @@ class Patch:
             return Failure(Reason.NO_PEAK, f"peak {value:g}, least value {lowest:g}")
         return cls(
             values, corner, position + PIXEL_CENTRE + corner, value, (int(column), int(row)), saturated, seen,
-            None if raw is None else raw[crop], noise[crop] if isinstance(noise, np.ndarray) else noise, smoothing_px,
-            others_px,
+            unsmoothed, noise[crop] if isinstance(noise, np.ndarray) else noise, smoothing_px, others_px,
         )  # fmt: skip
 
     @property
@@ -258,11 +259,15 @@ class Patch:
         return float(np.mean(self.saturated[inside])) if inside.any() else 0.0
 
 
-def _plateau(clipped: Mask, row: int, column: int) -> Mask | None:
-    """Return the connected clipped pixels around a peak's pixel, small holes closed; None where they are few."""
+def _plateau(shown: Image | Array, clipped: Mask, row: int, column: int) -> Mask | None:
+    """Return the connected clipped pixels around a peak's pixel, small holes closed; None where they are few.
+
+    They are those of its own highlight at half height: a channel of pale tissue may be clipped from one to the next.
+    """
     if np.count_nonzero(clipped) < MIN_PLATEAU_PX:
         return None
-    whole = pixel_sets.closed(clipped)
+    high = pixel_sets.connected(shown >= HIGHLIGHT_ISOVALUE * shown[row, column])
+    whole = pixel_sets.closed(clipped & (high == high[row, column]))
     if not whole[row, column]:
         return None
     labels = pixel_sets.connected(whole, diagonally=True)

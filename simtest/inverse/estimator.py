@@ -6,12 +6,14 @@ from typing import ClassVar
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Normal, Priors
+from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.bisector import DISTANCES
 from simtest.estimators.budget import Budget, line_covariance
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
-from simtest.estimators.highlight_fit import fit_small
+from simtest.estimators.highlight_fit import fit_highlight, fit_small
+from simtest.estimators.light_assignment import light_of_highlight
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
 from simtest.estimators.near_misses import near_miss_parts
 from simtest.estimators.photometric import HighlightPixels, highlight_pixels
@@ -43,8 +45,9 @@ class InverseRendering:
     noise this is the maximum-likelihood estimate. Clipped pixels count as "at least this bright". Pixels are those
     before smoothing.
 
-    With lights told the patch is lit from there, at the mean of the prior on the distance; else from the camera, at any
-    distance. The exponent follows from the lobe's curvature.
+    With lights given the patch is lit from there, at the mean of the prior on the distance; else from the camera, at
+    any distance. Of several, the arrangement of the highlights must tell which one is reflected (`light_of_highlight`).
+    The exponent follows from the lobe's curvature.
 
     Parameters
     ----------
@@ -71,7 +74,8 @@ class InverseRendering:
 
         The estimate has one candidate. Its covariance is that of the Gauss-Newton matrix and of the distance's
         uncertainty. Where the lobe is known, the hypotheses of `curvature` are what the picture's second order allows,
-        as in `curved`, the fitted one first. Fails with ``unresolved`` where a highlight is too small for a shape.
+        as in `curved`, the fitted one first. Fails with ``unresolved`` where a highlight is too small for a shape, and
+        with ``not_known`` where several lights are given and it is not clear which one it is of.
 
         Raises
         ------
@@ -83,11 +87,15 @@ class InverseRendering:
         start = cone_axis.estimate(patch, camera)
         if isinstance(start, Failure):
             return start
+        family = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
+        own = 0 if len(priors.lights_mm) < 2 or isinstance(family, Failure) else light_of_highlight(family, priors)
+        if own is None:
+            return Failure(Reason.NOT_KNOWN, f"needs to know which of {len(priors.lights_mm)} lights it reflects")
         pixels = highlight_pixels(patch, camera, cut=any(isophote.cut for isophote in start.isophotes))
         if isinstance(pixels, Failure):
             return pixels
         renderer = PatchRenderer(pixels.rays, self.path_depth, PATHS, self.variant)
-        fitted = _fitted(_start(start, patch, priors, renderer, (self.exponent, self.base)), pixels)
+        fitted = _fitted(_start(start, patch, priors, own, renderer, (self.exponent, self.base)), pixels)
         if fitted is None:
             return Failure(Reason.NOT_CONVERGED, "the fit of a rendered patch did not converge")
         found = fitted.model
@@ -98,7 +106,7 @@ class InverseRendering:
             look_px=camera.project(found.sightline),
             axis_ratio=float(np.abs(gains).min() / np.abs(gains).max()),
             isophotes=start.isophotes,
-            budget=_budget(fitted, priors),
+            budget=_budget(fitted, _of_light(priors, own)),
             flags=start.flags,
             curvature=_curvature(found, priors),
         )
@@ -109,14 +117,14 @@ inverse_rendering = InverseRendering()
 
 
 def _start(
-    start: Estimate, patch: Patch, priors: Priors, renderer: PatchRenderer, opened: tuple[bool, bool]
+    start: Estimate, patch: Patch, priors: Priors, own: int, renderer: PatchRenderer, opened: tuple[bool, bool]
 ) -> RenderedQuadric:
     """Start from the middle isophote: its half-axes give K if n is known, else n as if one curvature were 0.
 
     On the plane across s at unit distance the isophote is w^T Q w = 1, and -2 ln t Q = c M^2 + 2 M.
     """
     s = -start.normal
-    distance, light, lights = _lit(priors)
+    distance, light, lights = _lit(priors, own)
     normal = bisect(distance * s, light)
     basis = basis_across(normal)
     frame = np.concatenate([basis - np.outer(basis @ s, s), s[None]])
@@ -143,11 +151,17 @@ def _fitted(start: RenderedQuadric, pixels: HighlightPixels) -> LobeFit[Rendered
     return min(fits, key=lambda fit: fit.chi2, default=None)
 
 
-def _lit(priors: Priors) -> tuple[float, Array, Array]:
-    """Return distance, the highlight's light and all lights; 1 mm and the camera's position where none is told."""
+def _lit(priors: Priors, own: int) -> tuple[float, Array, Array]:
+    """Return distance, the highlight's light and all lights; 1 mm and the camera's position where none is given."""
     if not priors.lights_mm:
         return 1.0, np.zeros(3), np.zeros((1, 3))
-    return priors.distance.mean, priors.lights.mean(axis=0), priors.lights
+    return priors.distance.mean, priors.lights[own], priors.lights
+
+
+def _of_light(priors: Priors, own: int) -> Priors:
+    """Return the priors with the highlight's light alone."""
+    one = slice(own, own + 1)
+    return replace(priors, lights_mm=priors.lights_mm[one], lights_covariance_mm2=priors.lights_covariance_mm2[one])
 
 
 def _budget(fitted: LobeFit[RenderedQuadric], priors: Priors) -> Budget:

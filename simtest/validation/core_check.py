@@ -191,9 +191,9 @@ def _ask_frame(core: Core) -> Callable[[CoreCase], Answer]:
         whole = case.frame.patch((0, 0, camera.width, camera.height))
         found = run_in_frame(estimator, case.frame, [whole], case.priors)
         first = found.of_patches[0]
-        if isinstance(first, Failure):
-            return first
-        return [*found.elsewhere, *([] if first is None else [first])]
+        if failed := next((each for each in (*found.refused, first) if isinstance(each, Failure)), None):
+            return failed
+        return [*found.elsewhere, *([first] if isinstance(first, Estimate) else [])]
 
     return ask
 

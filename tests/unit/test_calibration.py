@@ -296,6 +296,24 @@ def test_the_peak_of_a_plateau_does_not_lie_in_its_hole():
     assert result.reason is Reason.NO_PEAK
 
 
+def test_two_highlights_on_one_clipped_plateau_keep_their_own_peaks():
+    """Pale tissue clips one channel from one to the next; the light of both falls to nothing between them."""
+    y, x = np.mgrid[:40, :40] + 0.5
+    lobes = [np.exp(-((x - cx) ** 2 + (y - 20.0) ** 2) / 8) for cx in (15.2, 24.8)]
+    frame = (lobes[0] + 0.8 * lobes[1]).astype(np.float32)
+    clipped = np.zeros((40, 40), dtype=bool)
+    clipped[17:24, 12:29] = True
+    first, second = (
+        Patch.cut(smooth(frame, 1.0), (2, 2, 36, 36), peak, saturated=clipped, raw=frame)
+        for peak in ((14, 19), (24, 19))
+    )
+    assert first.peak_px == pytest.approx([15.2, 20.0], abs=0.6)
+    assert second.peak_px == pytest.approx([24.8, 20.0], abs=0.6)
+    # Where it is one highlight, the plateau's centroid is its peak as before.
+    whole = Patch.cut(smooth(frame, 1.0), (2, 2, 36, 36), (14, 19), saturated=clipped, raw=np.maximum(frame, clipped))
+    assert whole.peak_px == pytest.approx([20.5, 20.5])
+
+
 def test_a_few_clipped_pixels_leave_the_parabola():
     frame = np.minimum(spot(height=1.01), 1.0)
     assert 0 < np.count_nonzero(frame >= 1.0) < 12

@@ -41,7 +41,7 @@ IN_ANSWERS = {
     "text": "normal: .*must be numbers",
     "two": r"normal: \[0, -1\]; must be",
     "no_look": "look_px or look_ray: missing",
-    "indefinite": "covariance: must be symmetric",
+    "indefinite": r"covariance \[.*\]: must be symmetric",
     "target": "target 'liver'; must be fine or base",
     "flags": "flags: ",
     "infinite_covariance": "not_finite: covariance",

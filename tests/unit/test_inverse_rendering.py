@@ -7,6 +7,7 @@ import pytest
 
 from simtest.calibration import Calibration, Normal, Priors, exactly
 from simtest.errors import Failure, Reason
+from simtest.estimators.bisector import bisector
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.photometric import photometric
@@ -182,6 +183,26 @@ def test_a_known_light_beside_the_camera(render):
     about = replace(priors, distance_mm=Normal(highlight.distance, 1.0))
     vague = answers(session, frame_of(radiance, 0.02), about, inverse=inverse_rendering)
     assert np.trace(vague["inverse"].covariance) > 100 * np.trace(found.covariance)
+
+
+def test_of_two_given_lights_the_highlight_s_own_is_taken_or_none(render):
+    rig = {"rig": {"lights": [{"offset_mm": 3.0, "azimuth_deg": a} for a in (0.0, 180.0)]}}
+    session, radiance, _ = render(SURFACES["plane"], reflectance={"type": "phong", "exponent": 800.0}, **rig)
+    truths = session.highlights(radiance)
+    lights = tuple(map(tuple, session.scene.rig.true_mm().tolist()))
+    priors = Priors(lights, exactly(truths[0].distance), exactly(4 * 800.0))
+    frame = frame_of(radiance, 0.01)
+    found = reconstruct(
+        frame, Calibration(session.camera, priors=priors), {"inverse": inverse_rendering, "bisector": bisector}
+    )
+    assert len(found) == len(truths) == 2
+    for spot in found:
+        result = spot.estimates["inverse"]
+        assert min(angle_deg(result.normal, truth.normal) for truth in truths) < 0.3
+        assert angle_deg(result.normal, spot.estimates["bisector"].normal) < 0.2
+        # Alone it may be that of either light.
+        alone = inverse_rendering.estimate(replace(spot.patch, others_px=()), session.camera, priors)
+        assert alone == Failure(Reason.NOT_KNOWN, "needs to know which of 2 lights it reflects")
 
 
 def test_the_exponent_is_found_without_noise(render):

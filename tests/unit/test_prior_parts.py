@@ -22,7 +22,7 @@ from simtest.estimators.prior_parts import (
 )
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.registry import load_estimators
-from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry import BrownConrady, Camera, Patch, ViewMask, smooth
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
 
 LIMIT = chi2.ppf(0.95, 2)
@@ -132,6 +132,43 @@ def test_a_guessed_camera_is_covered(prior, pixel):
     true = np.concatenate([seen, np.ones((count, 1))], axis=1)
     true /= np.linalg.norm(true, axis=1)[:, None]
     assert 0.93 <= held(moves_of(sightline, -true) + noise, covariance) <= 0.98
+
+
+FOLDING = Camera(
+    1000, 1000, 400.0, 400.0, 500.0, 500.0, distortion=BrownConrady(k1=-0.3), view_mask=ViewMask(500.0, 500.0, 281.0)
+)
+"""Its lens folds 281.1 px from the centre."""
+
+
+def test_a_camera_is_covered_up_to_the_rim_of_a_lens_that_folds():
+    """200 cameras with a sightline there at each pixel, the last one 0.1 px from where the lens ends."""
+    rng, held_share, without = np.random.default_rng(51), [], []
+    prior = CameraPrior(0.005, 2.0, 0.02)
+    for x in (700.0, 770.0, 778.0, 780.5, 781.0):
+        pixel = np.array([x, 500.0])
+        sightline = FOLDING.unproject(pixel)
+        given = Estimate(-sightline, -sightline[None], pixel, budget={"noise": 1e-4 * np.eye(2)})
+        covariance = add_untold_parts(given, FOLDING, replace(LIGHT_AT_CAMERA, camera=prior)).covariance
+        true = []
+        while len(true) < 200:
+            focal = 400.0 * (1 + prior.focal_sd * rng.standard_normal())
+            centre = 500.0 + prior.centre_sd_px * rng.standard_normal(2)
+            lens = BrownConrady(k1=-0.3 + prior.distortion_sd * rng.standard_normal())
+            seen = lens.undistort((pixel - centre) / focal)
+            true += [seen] if np.isfinite(seen).all() else []
+        moves = moves_of(sightline, -np.array(true)) + 0.01 * rng.standard_normal((200, 2))
+        held_share.append(held(moves, covariance))
+        without.append(held(moves, given.covariance))
+    assert 0.92 <= np.mean(held_share) <= 0.98, held_share
+    assert min(held_share) >= 0.92, held_share
+    # Negative control: without the part.
+    assert max(without[1:]) < 0.8, without
+
+
+def test_no_uncertainty_is_reported_where_the_lens_sees_nothing():
+    sightline = FOLDING.unproject((781.0, 500.0))
+    beyond = Estimate(-sightline, -sightline[None], np.array([782.0, 500.0]), budget={"noise": NOISE})
+    assert add_untold_parts(beyond, FOLDING, Priors(camera=CameraPrior(0.01))).covariance is None
 
 
 # One number -----------------------------------------------------------------------------------------------------------

@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 
 from simtest.calibration import NO_PRIORS, Calibration, Frame, Priors
+from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.detection import Detection, Region
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import BatchEstimator, Estimate, Estimator, FrameEstimator, load_estimators
 from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.circle_pose import circle_pose
+from simtest.estimators.cone_axis import ConeAxis
 from simtest.estimators.dispatch import run, run_each, run_in_frame
+from simtest.estimators.estimate_check import check
+from simtest.estimators.protocol import EstimatedCurvature
 from simtest.geometry import Camera, Patch, smooth
 from simtest.reconstruction.description import describe
 from simtest.reconstruction.pipeline import reconstruct, run_pipeline
@@ -55,6 +59,29 @@ def test_circle_pose_gives_the_same_of_all_at_once(patches):
         assert found.region.statistic(alone.candidates + 0.01) == pytest.approx(
             alone.region.statistic(alone.candidates + 0.01)
         )
+
+
+def test_the_order_of_isovalues_is_irrelevant():
+    """Two touching highlights: the lower isophotes, which hold both, are left out whatever their place in the list."""
+    y, x = np.mgrid[:120, :120] + 0.5
+    left_out = 0
+    for angle in range(12):
+        gap = (20 + angle % 6) * np.array([np.cos(angle), np.sin(angle)])
+        second = np.exp(-((x - 60 - gap[0]) ** 2 + (y - 60 - gap[1]) ** 2) / 120)
+        patch = Patch.cut(np.exp(-((x - 60) ** 2 + (y - 60) ** 2) / 162) + 0.7 * second, (10, 10, 100, 100))
+        first, *others = (
+            ConeAxis(order).estimate(replace(patch), CAMERA)
+            for order in (
+                CONE_AXIS_ISOVALUES,
+                CONE_AXIS_ISOVALUES[::-1],
+                (*CONE_AXIS_ISOVALUES[2:], *CONE_AXIS_ISOVALUES),
+            )
+        )
+        left_out += len(first.isophotes) < len(CONE_AXIS_ISOVALUES)
+        for other in others:
+            np.testing.assert_array_equal(other.normal, first.normal)
+            assert [i.isovalue for i in other.isophotes] == [i.isovalue for i in first.isophotes]
+    assert left_out >= 3
 
 
 # A batch --------------------------------------------------------------------------------------------------------------
@@ -155,8 +182,6 @@ def test_estimates_of_a_frame_go_to_the_patches_that_they_look_into(patches):
     [
         (Peaks(does="raises"), Reason.ESTIMATOR_ERROR, "ZeroDivisionError: somewhere in the frame"),
         (Peaks(does="refuses"), Reason.NOT_CONVERGED, "nowhere"),
-        (Peaks(CENTRES, "is crooked"), Reason.ESTIMATOR_ERROR, "estimate 0: normal or candidate of length 2"),
-        (Peaks(((500.0, 50.0),)), Reason.ESTIMATOR_ERROR, "estimate 0: look_px = [500.0, 50.0]: must lie in the frame"),
     ],
 )
 def test_a_frame_that_fails_is_the_failure_of_every_patch(patches, estimator, reason, said):
@@ -166,6 +191,109 @@ def test_a_frame_that_fails_is_the_failure_of_every_patch(patches, estimator, re
         assert found.of_patches[i].reason == reason
         assert said in found.of_patches[i].detail
     assert found.elsewhere == []
+
+
+def test_one_malformed_estimate_of_a_frame_leaves_the_others(patches):
+    crooked = in_frame(Peaks(CENTRES, "is crooked"), patches)
+    assert crooked.of_patches[0] == Failure(
+        Reason.ESTIMATOR_ERROR, "estimate 0: normal of length 2: must be a unit vector"
+    )
+    assert isinstance(crooked.of_patches[2], Estimate)
+    assert isinstance(crooked.of_patches[3], Estimate)
+    # One that looks far away is at no highlight: those without an estimate say so, or else a warning.
+    astray = in_frame(Peaks(((900.0, 50.0), CENTRES[1])), patches)
+    assert [astray.of_patches[i].reason for i in (0, 3)] == [Reason.ESTIMATOR_ERROR] * 2
+    assert isinstance(astray.of_patches[2], Estimate)
+    with pytest.warns(RuntimeWarning, match=r"Peaks: 1 malformed at no highlight: estimate 0: look_px: .* \(900, 50\)"):
+        in_frame(Peaks(((900.0, 50.0), *CENTRES)), patches)
+    # A rounded pixel beside the frame, where a border cuts a highlight, is none.
+    assert len(in_frame(Peaks(((-0.4, 50.0), *CENTRES)), patches).elsewhere) == 1
+
+
+@dataclass(frozen=True)
+class Regions(Peaks):
+    """Answers region by region, and for what no region holds."""
+
+    results: tuple = ()
+    others: tuple = ()
+
+    def estimate_regions(self, frame, patches):
+        if self.does == "raises":
+            raise ZeroDivisionError("in a region")
+        return list(self.results), list(self.others)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "said"),
+    [
+        (Regions(does="raises"), "ZeroDivisionError: in a region"),
+        (Regions(results=(None,)), "ValueError: 1 results for 4 regions"),
+    ],
+)
+def test_a_region_estimator_that_fails_is_the_failure_of_every_patch(patches, estimator, said):
+    found = in_frame(estimator, patches)
+    assert found.of_patches[1] is patches[1]
+    assert all(said in found.of_patches[i].detail for i in (0, 2, 3))
+
+
+def test_what_a_region_estimator_states_elsewhere_is_checked(patches):
+    normal = np.array([0.0, 0.0, -1.0])
+    good, bad, other = (Estimate(scale * normal, scale * normal[None], np.array([9.0, 9.0])) for scale in (1, 5, 4))
+    with pytest.warns(RuntimeWarning, match="Regions: 1 malformed at no highlight: normal of length 4"):
+        found = in_frame(Regions(results=(good, None, bad, None), others=(good, other)), patches)
+    assert found.of_patches[2].reason == Reason.ESTIMATOR_ERROR
+    assert (found.of_patches[0], found.elsewhere) == (good, [good])
+
+
+# The contract ---------------------------------------------------------------------------------------------------------
+
+UP = np.array([0.0, 0.0, -1.0])
+MALFORMED = {
+    "target": ({"target": "rough"}, "target 'rough'; must be fine or base"),
+    "long": ({"normal": 1.1 * UP}, "normal of length 1.1"),
+    "another first": ({"candidates": np.array([[0.0, 0.6, -0.8]])}, "the first candidate must be"),
+    "no candidate": ({"candidates": np.empty((0, 3))}, "0 candidates; must be 1 to 64"),
+    "asymmetric": ({"covariance": 1e-4 * np.array([[1.0, 0.5], [-0.5, 1.0]])}, "must be symmetric"),
+    "negative": ({"budget": {"noise": np.eye(2), "shape": np.diag([-0.5, 0.5])}}, "budget shape .*no negative"),
+    "degrees": ({"covariance": 25 * np.eye(2)}, "covariance: holds 25; must be at most 9.87 rad"),
+    "singular": ({"covariance": np.diag([1e-4, 0.0])}, "covariance: singular"),
+    "no budget": ({"budget": {}}, "budget: must be 1 to 16 parts"),
+    "ratio": ({"axis_ratio": 7.0}, r"axis_ratio: 7; must be in \(0, 1\]"),
+    "deviation": ({"axis_ratio_deviation": -1.0}, "axis_ratio_deviation: -1; must be above 0"),
+    "far away": ({"look_px": np.array([1e7, -5.0])}, r"look_px: looks at the pixel \(1e\+07, -5\)"),
+    "away": ({"normal": -UP, "candidates": -UP[None]}, "the normal faces away from the camera"),
+    "curvature": ({"curvature": EstimatedCurvature(np.eye(3)[:2], 2.0)}, "curvature axis_ratio: 2"),
+    "flag": ({"flags": ("a,b",)}, r"flags: \('a,b',\); must be a tuple of at most 16 words"),
+    "nowhere": ({"look_px": np.array([np.nan, 1.0])}, "look_px holds NaN"),
+}
+
+
+@pytest.mark.parametrize("fault", MALFORMED)
+def test_a_malformed_estimate_is_refused_alone_in_a_batch_in_a_frame_and_elsewhere(patches, fault):
+    changes, said = MALFORMED[fault]
+    sound = Estimate(UP, UP[None], np.array([50.0, 50.0]))
+    bad = replace(sound, **changes)
+    alone = run(SimpleNamespace(estimate=lambda *_: bad), patches[0], CAMERA)
+    assert re.search(said, alone.detail)
+    batch = SimpleNamespace(estimate=lambda *_: sound, estimate_batch=lambda *_: [bad, sound, sound])
+    assert run_each(batch, patches, CAMERA) == [alone, patches[1], sound, sound]
+    frame = SimpleNamespace(estimate_frame=lambda *_: [bad])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert in_frame(frame, patches).of_patches[0] == replace(alone, detail=f"estimate 0: {alone.detail}")
+        found = in_frame(Regions(results=(bad, None, None, None), others=(bad,)), patches)
+    assert (found.of_patches[0], found.elsewhere, found.refused) == (alone, [], [alone])
+
+
+def test_few_digits_are_made_exact_and_exact_ones_stay():
+    rounded = Estimate(
+        1.0004 * UP, 0.9996 * UP[None], np.array([50.0, 50.0]), covariance=np.array([[1, 0.5], [0.5001, 1]])
+    )
+    made = check(rounded, CAMERA)
+    np.testing.assert_array_equal(made.normal, UP)
+    np.testing.assert_array_equal(made.candidates, UP[None])
+    np.testing.assert_array_equal(made.covariance, made.covariance.T)
+    assert check(made, CAMERA) is made
 
 
 def test_estimators_of_patches_and_of_frames_meet_in_the_specularities():

@@ -42,26 +42,29 @@ WRONG_ROWS = {
     "NaN": ({"normal_x": "NaN"}, "row 1: normal_x = NaN: must be a finite number or empty"),
     "infinite": ({"x_px": "inf"}, "row 1: x_px = inf: must be a finite number or empty"),
     "capitals": ({"status": "OK"}, "row 1: status = OK: must be ok or empty where a normal is given"),
-    "left of the frame": ({"x_px": "-500"}, "row 1: x_px = -500, y_px = 40: must lie in the frame of 96 x 80 px"),
-    "far away": ({"x_px": "1e300"}, "row 1: x_px = 1e.300, y_px = 40: must lie in the frame of 96 x 80 px"),
+    "left of the frame": (
+        {"x_px": "-500"},
+        r"row 1: look_px: looks at the pixel \(-500, 40\); must lie in the frame of 96 x 80 px",
+    ),
+    "far away": ({"x_px": "1e300"}, r"row 1: look_px: looks at the pixel \(1e.300, 40\); must lie in the frame"),
     "elsewhere": (
         {"specularity": "0", "x_px": "95", "y_px": "1"},
         "row 1: x_px = 95, y_px = 1: must lie at detection 0, whose box is 29 x 29 px at .33, 25. .highlights.csv",
     ),
-    "negative ratio": ({"axis_ratio": "-7"}, "row 1: axis_ratio = -7: must be in .0, 1."),
+    "negative ratio": ({"axis_ratio": "-7"}, "row 1: axis_ratio: -7; must be in .0, 1."),
     "no variance": (
         {"cov_11": "0", "cov_12": "0", "cov_22": "0"},
-        "row 1: cov_11, cov_12, cov_22: singular; must have a variance",
+        "row 1: covariance: singular; must have a variance",
     ),
-    "rank 1": ({"cov_11": "1e-4", "cov_12": "1e-4", "cov_22": "1e-4"}, "row 1: cov_11, cov_12, cov_22: singular"),
-    "denormal": ({"cov_11": "1e-320", "cov_12": "0", "cov_22": "1e-320"}, "row 1: cov_11, cov_12, cov_22: singular"),
+    "rank 1": ({"cov_11": "1e-4", "cov_12": "1e-4", "cov_22": "1e-4"}, "row 1: covariance: singular"),
+    "denormal": ({"cov_11": "1e-320", "cov_12": "0", "cov_22": "1e-320"}, "row 1: covariance: singular"),
     "no normal": ({"normal_y": ""}, "row 1: normal_y is empty; must be a number, or status must name why"),
     "no pixel": ({"x_px": ""}, "row 1: x_px or y_px is empty; both must be given, or none and specularity"),
     "unknown frame": ({"frame": "f1"}, "row 1: frame = f1: must be among the 2 names of frames.csv"),
     "no frame": ({"frame": ""}, "row 1: frame = empty: must be among the 2 names of frames.csv"),
-    "long": ({"normal_z": "-0.9"}, "row 1: normal has length 1.08167; must be a unit vector"),
-    "zero": ({"normal_y": "0", "normal_z": "0"}, "row 1: normal has length 0; must be a unit vector"),
-    "away": ({"normal_z": "0.8"}, r"row 1: normal \(0 0.6 0.8\) faces away from the camera; z points forward"),
+    "long": ({"normal_z": "-0.9"}, "row 1: normal of length 1.08167: must be a unit vector"),
+    "zero": ({"normal_y": "0", "normal_z": "0"}, "row 1: normal of length 0: must be a unit vector"),
+    "away": ({"normal_z": "0.8"}, r"row 1: the normal faces away from the camera: \(0 0.6 0.8\); z points forward"),
     "target": ({"target": "rough"}, "row 1: target = rough: must be fine, base or empty"),
     "number": ({"specularity": "7"}, "row 1: specularity = 7: must be a whole number from 0 to 0"),
     "half a number": ({"specularity": "0.5"}, "row 1: specularity = 0.5: must be a whole number"),
@@ -71,27 +74,27 @@ WRONG_ROWS = {
     ),
     "negative variance": (
         {"cov_11": "-1e-4", "cov_12": "0", "cov_22": "1e-4"},
-        "row 1: cov_11 = -0.0001: must be a variance in rad\\^2, 0 to 9.87",
+        r"row 1: covariance \[\[-0.0001, 0\], \[0, 0.0001\]\]: must be symmetric and have no negative",
     ),
     "degrees": (
         {"cov_11": "25", "cov_12": "0", "cov_22": "25"},
-        "row 1: cov_11 = 25: must be a variance in rad\\^2",
+        r"row 1: covariance: holds 25; must be at most 9.87 rad\^2 \(deg\^2 times",
     ),
     "too large a covariance": (
         {"cov_11": "1e-4", "cov_12": "2e-4", "cov_22": "1e-4"},
-        r"row 1: cov_12 = 0.0002: must be at most sqrt\(cov_11 cov_22\) = 0.0001 in size",
+        r"row 1: covariance \[\[0.0001, 0.0002\], .*\]\]: must be symmetric and have no negative eigenvalue",
     ),
     "asymmetric": (
         {"cov_11": "1e-4", "cov_12": "1e-5", "cov_22": "1e-4", "cov_21": "-1e-5"},
-        "row 1: cov_21 = -1e-05: must equal cov_12 = 1e-05; a covariance is symmetric",
+        r"row 1: covariance \[\[0.0001, 1e-05\], \[-1e-05, 0.0001\]\]: must be symmetric",
     ),
     "half a second": (
         {"second_x": "0", "second_y": "", "second_z": "-1"},
-        "row 1: second_x, second_y or second_z is empty; all three must be given, or none",
+        "row 1: second_x, second_y, second_z: some are empty; all three must be given, or none",
     ),
     "second": (
         {"second_x": "0", "second_y": "0", "second_z": "-2"},
-        "row 1: second has length 2; must be a unit vector",
+        "row 1: candidate of length 2: must be a unit vector",
     ),
 }
 
@@ -108,7 +111,7 @@ def test_a_wrong_row_is_named(record, tmp_path, wrong):
 
 def test_the_row_is_the_one_that_is_wrong(record, tmp_path):
     other = {**GOOD, "frame": "f" + "1" * 16, "normal_z": "-0.9"}
-    with pytest.raises(InputError, match="row 2: normal has length"):
+    with pytest.raises(InputError, match="row 2: normal of length"):
         read_answers(write(tmp_path / "t.csv", GOOD, other), record, "mine")
 
 

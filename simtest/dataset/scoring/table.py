@@ -1,7 +1,7 @@
 """Reads a table of normals that were estimated elsewhere, CSV or Parquet; every row is checked before it is scored."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,20 +11,14 @@ from simtest.dataset.scoring.record import Record
 from simtest.dataset.scoring.table_file import COVARIANCE, NORMAL, PIXEL, SECOND, Table, read_table
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.dispatch import is_singular
-from simtest.estimators.protocol import LARGEST_VARIANCE, NEAR_PX, Target
+from simtest.estimators.estimate_check import check
+from simtest.estimators.protocol import Target
 from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.resources import shown
 from simtest.spec.camera_spec import CameraSpec
 from simtest.spec.spec_model import validate
 from simtest.validation.metrics import MISSED
-
-UNIT_TOLERANCE = 1e-3
-"""A normal whose length differs from 1 by more is refused: it is no rounding."""
-
-ROUNDING = 1e-9
-"""A normal whose length differs from 1 by less stays as it is."""
 
 LONGEST_NAME = 80
 """Characters of a method's name."""
@@ -62,11 +56,10 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
     _check_frames(table, record)
     numbers = _specularities(table, record)
     points = _points(table, record, numbers)
-    normals = _normals(table, is_answer)
-    seconds = _seconds(table, is_answer)
-    covariances = _covariances(table, is_answer)
-    _check_ratios(table, is_answer)
-    _check_facing(table, record, is_answer, points, normals)
+    normals = table.stack(NORMAL)
+    seconds = _whole(table, SECOND, np.ones(table.rows, dtype=bool))
+    covariances = _whole(table, COVARIANCE, is_answer)
+    cameras = {name: _camera(record, name) for name in record.cameras}
     made: dict[str, dict[str, list[Answer]]] = {}
     seen: dict[tuple[object, ...], int] = {}
     for row in range(table.rows):
@@ -81,6 +74,8 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
             raise table.refuse(row, f"frame {frame}: answers the same highlight as row {before + 1}; must be one row")
         stated = (points[row], normals[row], seconds[row], covariances[row])
         result = _estimate(table, row, *stated) if is_answer[row] else _failure(table, row)
+        if is_answer[row] and isinstance(result := check(result, cameras[record.frames[frame].camera]), Failure):
+            raise table.refuse(row, result.detail)
         own.append(Answer(result, points[row], numbers[row]))
     if not any(made.values()):
         raise InputError(f"{shown(path)}: holds no answer; must have a row for each normal")
@@ -151,23 +146,8 @@ def _points(table: Table, record: Record, numbers: Sequence[int | None]) -> Arra
                 continue
             raise table.refuse(row, "x_px or y_px is empty; both must be given, or none and specularity")
         points[row] = record.frames[table.texts["frame"][row]].peaks[number]
-    _check_in_frame(table, record, points)
     _check_at_detections(table, record, numbers, points)
     return points
-
-
-def _check_in_frame(table: Table, record: Record, points: Array) -> None:
-    """Raise `InputError` for a pixel outside its frame."""
-    for name, rows in _rows_by([record.frames[frame].camera for frame in table.texts["frame"]]):
-        camera = _camera(record, name)
-        size = np.array([camera.width, camera.height])
-        outside = np.zeros(table.rows, dtype=bool)
-        # A row without a pixel is none outside.
-        outside[rows] = ((points[rows] < -NEAR_PX) | (points[rows] > size + NEAR_PX)).any(axis=1)
-        if (row := table.first(outside)) is not None:
-            x, y = points[row]
-            within = f"the frame of {camera.width} x {camera.height} px"
-            raise table.refuse(row, f"x_px = {x:g}, y_px = {y:g}: must lie in {within}")
 
 
 def _check_at_detections(table: Table, record: Record, numbers: Sequence[int | None], points: Array) -> None:
@@ -182,86 +162,13 @@ def _check_at_detections(table: Table, record: Record, numbers: Sequence[int | N
             raise table.refuse(row, f"x_px = {point[0]:g}, y_px = {point[1]:g}: must lie at {where} (highlights.csv)")
 
 
-def _normals(table: Table, is_answer: Mask) -> Array:
-    """Return the unit normals, shape (rows, 3); raise `InputError` where a length is not 1."""
-    normals = table.stack(NORMAL)
-    return _unit(table, normals, is_answer, "normal")
-
-
-def _seconds(table: Table, is_answer: Mask) -> Array:
-    """Return the second candidates, shape (rows, 3), NaN where there is none."""
-    seconds = table.stack(SECOND)
-    given = np.isfinite(seconds)
-    if (row := table.first(given.any(axis=1) & ~given.all(axis=1))) is not None:
-        raise table.refuse(row, "second_x, second_y or second_z is empty; all three must be given, or none")
-    return _unit(table, seconds, is_answer & given.all(axis=1), "second")
-
-
-def _unit(table: Table, vectors: Array, wanted: Mask, what: str) -> Array:
-    lengths = np.sqrt((vectors**2).sum(axis=1))
-    if (row := table.first(wanted & ~(np.abs(lengths - 1) <= UNIT_TOLERANCE))) is not None:
-        raise table.refuse(row, f"{what} has length {lengths[row]:.6g}; must be a unit vector")
-    # Rounded numbers are scaled; exact ones keep their last bits.
-    rounded = wanted & (np.abs(lengths - 1) > ROUNDING)
-    vectors[rounded] /= lengths[rounded, None]
-    return vectors
-
-
-def _covariances(table: Table, is_answer: Mask) -> Array:
-    """Return cov_11, cov_12 and cov_22, shape (rows, 3), NaN where there is none."""
-    made = table.stack(COVARIANCE)
-    given = np.isfinite(made)
-    if (row := table.first(is_answer & given.any(axis=1) & ~given.all(axis=1))) is not None:
-        raise table.refuse(row, f"{', '.join(COVARIANCE)}: some are empty; all three must be given, or none")
-    first, mixed, second = made.T
-    for name, value in (("cov_11", first), ("cov_22", second)):
-        if (row := table.first(is_answer & ((value < 0) | (value > LARGEST_VARIANCE)))) is not None:
-            unit = " (deg^2 times (pi / 180)^2 is rad^2)" if value[row] > 0 else ""
-            allowed = f"a variance in rad^2, 0 to {LARGEST_VARIANCE:.4g}{unit}"
-            raise table.refuse(row, f"{name} = {value[row]:g}: must be {allowed}")
-    largest = np.sqrt(np.maximum(first * second, 0))
-    if (row := table.first(is_answer & (np.abs(mixed) > largest * (1 + 1e-6) + 1e-15))) is not None:
-        bound = f"at most sqrt(cov_11 cov_22) = {largest[row]:g} in size"
-        raise table.refuse(row, f"cov_12 = {mixed[row]:g}: must be {bound}")
-    singular = [row and is_singular(*stated) for row, stated in zip(is_answer.tolist(), made.tolist(), strict=True)]
-    if (row := table.first(singular)) is not None:
-        raise table.refuse(row, f"{', '.join(COVARIANCE)}: singular; must have a variance in each direction")
-    other = table.numbers["cov_21"]
-    if (row := table.first(is_answer & (np.abs(other - mixed) > 1e-6 * largest + 1e-15))) is not None:
-        raise table.refuse(
-            row, f"cov_21 = {other[row]:g}: must equal cov_12 = {mixed[row]:g}; a covariance is symmetric"
-        )
-    return made
-
-
-def _check_ratios(table: Table, is_answer: Mask) -> None:
-    """Raise `InputError` for an axis ratio that is none."""
-    ratio = table.numbers["axis_ratio"]
-    if (row := table.first(is_answer & ((ratio <= 0) | (ratio > 1)))) is not None:
-        raise table.refuse(row, f"axis_ratio = {ratio[row]:g}: must be in (0, 1]")
-
-
-def _check_facing(table: Table, record: Record, is_answer: Mask, points: Array, normals: Array) -> None:
-    """Raise `InputError` for a normal that faces away from the camera at its pixel."""
-    cameras = [record.frames[frame].camera for frame in table.texts["frame"]]
-    for name, rows in _rows_by(cameras):
-        sightlines = _camera(record, name).unproject(points[rows])
-        towards = np.sum(sightlines * normals[rows], axis=1)
-        away = np.zeros(table.rows, dtype=bool)
-        away[rows] = is_answer[rows] & (towards >= 0)
-        if (row := table.first(away)) is not None:
-            normal = " ".join(f"{value:.4g}" for value in normals[row])
-            raise table.refuse(
-                row, f"normal ({normal}) faces away from the camera; z points forward, so it must be below 0 in front"
-            )
-
-
-def _rows_by(keys: Sequence[str]) -> Iterator[tuple[str, Array]]:
-    """Yield each key with the indices of its rows."""
-    order: dict[str, list[int]] = {}
-    for row, key in enumerate(keys):
-        order.setdefault(key, []).append(row)
-    yield from ((key, np.array(rows)) for key, rows in order.items())
+def _whole(table: Table, columns: Sequence[str], wanted: Mask) -> Array:
+    """Return columns that are given together, shape (rows, 3), NaN where they are not."""
+    values = table.stack(columns)
+    given = np.isfinite(values)
+    if (row := table.first(wanted & given.any(axis=1) & ~given.all(axis=1))) is not None:
+        raise table.refuse(row, f"{', '.join(columns)}: some are empty; all three must be given, or none")
+    return values
 
 
 def _camera(record: Record, name: str) -> Camera:
@@ -276,7 +183,9 @@ def _estimate(table: Table, row: int, point: Array, normal: Array, second: Array
     candidates = np.stack([normal, second]) if np.isfinite(second).all() else normal[None]
     stated = None
     if np.isfinite(covariance).all():
-        stated = np.array([[covariance[0], covariance[1]], [covariance[1], covariance[2]]])
+        first, mixed, last = covariance
+        other = table.numbers["cov_21"][row]
+        stated = np.array([[first, mixed], [other if np.isfinite(other) else mixed, last]])
     target: Target = "base" if table.texts["target"][row] == "base" else "fine"
     return Estimate(
         normal=normal,

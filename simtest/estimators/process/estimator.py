@@ -61,7 +61,9 @@ class ProcessEstimator(_Process):
 class ProcessFrameEstimator(_Process):
     """A core that takes whole frames."""
 
-    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors = NO_PRIORS) -> list[Estimate] | Failure:
+    def estimate_frame(
+        self, frame: Frame, camera: Camera, priors: Priors = NO_PRIORS
+    ) -> list[Estimate | Failure] | Failure:
         """Ask the core (see `simtest.estimators.FrameEstimator`); its breakdown is a Failure ``core_...``."""
         try:
             answer = self._ask(frame_request(frame, camera, priors, self._hello))
