@@ -18,6 +18,9 @@ from simtest.runtime.short_repr import short_repr
 
 MAX_LIGHTS = 32
 
+AT_CAMERA_MM = 1e-9
+"""A light nearer than this is at the camera, or on a sightline."""
+
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 """Rows of a matrix, shape (3, 3)."""
 
@@ -101,8 +104,8 @@ class Priors:
     camera : CameraPrior
         How far the camera's geometry may be off.
     falloff_power : Uniform, Normal or LogUniform, optional
-        k of a falloff cos^k over the angle from the optical axis that is still in the frame; None: there is none, since
-        the falloff of lens and lights is uniform, or told and undone.
+        k of a falloff cos^k over the angle from the axis of lens or light that is still in the frame; None: there is
+        none, since the falloff of lens *and* lights is uniform, or known and undone.
     relief_slope : Uniform, Normal or LogUniform
         Slope of the relief an axis, rad: how far a single highlight may be off the base's normal (theory.md 7.4).
     plane : bool
@@ -146,6 +149,11 @@ class Priors:
     def lights(self) -> Array:
         """Nominal positions of the lights, shape (L, 3), camera frame, mm."""
         return np.array(self.lights_mm, dtype=float).reshape(-1, 3)
+
+    @cached_property
+    def has_light_beside(self) -> bool:
+        """Whether a light is given that is not at the camera."""
+        return bool((np.linalg.norm(self.lights, axis=1) > AT_CAMERA_MM).any())
 
     @cached_property
     def lights_covariance(self) -> Array | None:

@@ -12,16 +12,14 @@ from functools import lru_cache
 import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Priors
-from simtest.estimators.budget import CONFIDENCE, equivalent_variance
+from simtest.calibration.priors import AT_CAMERA_MM
+from simtest.estimators.budget import CONFIDENCE, equivalent_covariance
 from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.near_misses import near_miss_parts
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, chi_squared
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
-
-AT_CAMERA_MM = 1e-9
-"""A light nearer than this to the sightline is on it."""
 
 NEAR_SHARE = 0.05
 """Share of the distances that are nearer than the one at which a told light's offset must be negligible."""
@@ -47,6 +45,16 @@ STEP_MM = 1e-3
 
 SHARES = (np.arange(64) + 0.5) / 64
 """At these shares a prior of one number is sampled."""
+
+TILT = math.radians(10.0)
+"""Standard deviation an axis of the angle between a falloff's axis and the optical axis: light guides beside an oblique
+lens or with lenses of their own shine up to 25 deg aside."""
+
+FAINT = 0.1
+"""Cosine of the angle from its axis down to which a falloff is followed; little light is left there."""
+
+SAMPLES = np.arange(1, 257)[:, None] * 1.1347241384015194 ** -np.arange(1.0, 6.0) % 1
+"""Shares of the five priors of a falloff, shape (N, 5), all alike even: the sequence of the root of x^6 = x + 1."""
 
 
 def add_untold_parts(
@@ -100,7 +108,7 @@ def _common_parts(estimate: Estimate, camera: Camera, priors: Priors, family: Hi
     if not priors.camera.is_exact:
         parts["camera"] = camera_part(estimate, camera, priors.camera)
     if priors.falloff_power is not None and family is not None:
-        parts["response"] = falloff_part(estimate.normal, family, priors.falloff_power)
+        parts["response"] = falloff_part(estimate.normal, family, priors.falloff_power, priors)
     return parts
 
 
@@ -165,16 +173,35 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     return np.nan_to_num(J @ in_pixels @ J.T)
 
 
-def falloff_part(normal: Array, family: HighlightAxis, power: Distribution) -> Array:
+def falloff_part(normal: Array, family: HighlightAxis, power: Distribution, priors: Priors) -> Array:
     """Return the covariance of the normal by a falloff cos^k that is left in the frame, shape (2, 2), rad^2.
 
-    Its slope, k tan(phi) towards the optical axis, moves the peak by the lobe's moments 1/H times the slope (theory.md
-    section 4). The moments are those as seen, so that highlights of few pixels get a little too much.
+    Its slope moves the peak by the lobe's moments 1/H times the slope (theory.md section 4). The moments are those as
+    seen, so that highlights of few pixels get a little too much. The angle is that at the lens or, where lights beside
+    it are given, as likely at one of them, from an axis that is tilted by `TILT`.
     """
-    sightline = family.axis
-    slope = family.basis[:, 2] / max(float(sightline[2]), 1e-3)  # grad log cos(phi) across the sightline
-    shift = basis_across(normal) @ family.basis.T @ (family.seen_moments @ slope)
-    return np.asarray(_unit_variance(power) * np.outer(shift, shift))
+    powers, tilts = _falloffs(power)
+    axes = np.column_stack([TILT * tilts, np.ones(len(tilts))])
+    sightline, steps, place = family.axis, family.basis, family.axis[None]
+    if priors.has_light_beside:
+        # place and steps of the surface as seen from there, over its distance
+        which = (SAMPLES[:, 3] * 2 * len(priors.lights)).astype(int)
+        origins = np.concatenate([np.zeros_like(priors.lights), priors.lights])[which]
+        place = sightline - origins / priors.distance.quantile(SAMPLES[:, 4:])
+        steps = steps - np.outer(steps @ normal / (sightline @ normal), sightline)
+    along = np.sum(place * axes, axis=1)
+    lengths = np.linalg.norm(place, axis=1)
+    reached = np.maximum(along, FAINT * lengths * np.linalg.norm(axes, axis=1))
+    slopes = axes @ steps.T / reached[:, None] - place @ steps.T / lengths[:, None] ** 2
+    shift = basis_across(normal) @ family.basis.T @ family.seen_moments
+    return equivalent_covariance(powers * slopes @ shift.T)
+
+
+@lru_cache(maxsize=16)
+def _falloffs(power: Distribution) -> tuple[Array, Array]:
+    """Return the powers of drawn falloffs, shape (N, 1), and their tilts, normal pairs of deviation 1, shape (N, 2)."""
+    radius, angle = np.sqrt(-2 * np.log1p(-SAMPLES[:, 1])), 2 * np.pi * SAMPLES[:, 2]
+    return power.quantile(SAMPLES[:, :1]), np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 def to_base(estimate: Estimate, priors: Priors) -> Estimate:
@@ -212,12 +239,6 @@ def half_angles(normal: Array, distance: float, lights: Array) -> Array:
     """Return how far each light moves the normal from the reversed sightline, rad, tangent basis, shape (L, 2)."""
     position = -distance * normal
     return np.array([tangent_coordinates(normal, bisect(position, light)) for light in lights])
-
-
-@lru_cache(maxsize=16)
-def _unit_variance(factor: Distribution) -> float:
-    """Return the equivalent variance of an error along one line that is a factor times 1."""
-    return equivalent_variance(factor.quantile(SHARES))
 
 
 @lru_cache(maxsize=16)

@@ -158,7 +158,8 @@ def test_a_field_of_view_may_span_the_round_view():
 def test_a_full_calibration_leaves_nothing_open(tmp_path):
     path = tmp_path / "c.toml"
     path.write_text(
-        CAMERA_KEYS + '[response]\ntype = "srgb"\n[vignetting]\ntype = "cosine"\n[rig]\nlights_mm = [[0, 0, 0]]\n'
+        CAMERA_KEYS + '[response]\ntype = "srgb"\n[vignetting]\ntype = "cosine"\n'
+        '[emission]\ntype = "cosine"\n[rig]\nlights_mm = [[0, 0, 0]]\n'
         "distance_mm = 40.0\n"
     )
     # But for highlights that hold no highlight point; a plane has none of these.
