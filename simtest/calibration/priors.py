@@ -57,6 +57,9 @@ class CameraPrior:
     distortion_sd : float
         Standard deviation of the radial distortion k1, about that of a given lens or none: an error of it moves a point
         at r focal lengths from the principal point by k1 r^3 focal lengths.
+    edge_reach : float
+        r at which the picture is where the lens has it, whatever its k1, such as the edge of a given field of view: an
+        error moves other points by k1 r (r^2 - edge_reach^2).
     guessed : bool
         Whether these are guesses, because nobody stated them. It changes no estimate and does not count in comparisons.
 
@@ -69,6 +72,7 @@ class CameraPrior:
     focal_sd: float = 0.0
     centre_sd_px: float = 0.0
     distortion_sd: float = 0.0
+    edge_reach: float = 0.0
     guessed: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -77,8 +81,9 @@ class CameraPrior:
 
     @property
     def deviations(self) -> dict[str, float]:
-        """The standard deviations by name."""
-        return {name: getattr(self, name) for name in ("focal_sd", "centre_sd_px", "distortion_sd")}
+        """The standard deviations by name, and `edge_reach` where it is not 0."""
+        names = ("focal_sd", "centre_sd_px", "distortion_sd", *(("edge_reach",) if self.edge_reach else ()))
+        return {name: getattr(self, name) for name in names}
 
     @property
     def is_exact(self) -> bool:

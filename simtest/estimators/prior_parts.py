@@ -162,15 +162,24 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     """Return the covariance of the normal by the camera's geometry, shape (2, 2), rad^2.
 
     The normal turns with the sightline that it looks along. Another focal length, centre or distortion sees, at the
-    pixel looked at, what this camera sees at a pixel beside it.
+    pixel looked at, what this camera sees at a pixel beside it. A share s of a lens's scale that is not known divides
+    the pixels of the centre by 1 - s, whose mean square is 1 + 3 s^2 to leading order.
     """
     x, y = estimate.look_px
     from_centre = np.array([x - camera.cx, y - camera.cy])
     reach2 = (from_centre[0] / camera.fx) ** 2 + (from_centre[1] / camera.fy) ** 2
-    radial = prior.focal_sd**2 + (prior.distortion_sd * reach2) ** 2
-    in_pixels = radial * np.outer(from_centre, from_centre) + prior.centre_sd_px**2 * np.eye(2)
+    across = prior.distortion_sd * (reach2 - prior.edge_reach**2)
+    outwards = prior.distortion_sd * (3 * reach2 - prior.edge_reach**2)
+    radial = prior.focal_sd**2 + across**2
+    centre = 3 * (outwards**2 - across**2) * _along(from_centre) + (1 + 3 * across**2) * np.eye(2)
+    in_pixels = radial * np.outer(from_centre, from_centre) + prior.centre_sd_px**2 * centre
     J = basis_across(estimate.normal) @ camera.step_of_pixels(estimate.look_px).T
     return np.nan_to_num(J @ in_pixels @ J.T)
+
+
+def _along(vector: Array) -> Array:
+    """Return the projection onto a vector, shape (2,); zeros where it has no length."""
+    return np.outer(vector, vector) / max(float(vector @ vector), 1e-12)
 
 
 def falloff_part(normal: Array, family: HighlightAxis, power: Distribution, priors: Priors) -> Array:

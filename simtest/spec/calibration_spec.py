@@ -119,6 +119,13 @@ class UncertaintyCalibration(Spec):
     distortion_sd: float = Field(
         0.0, ge=0, le=10, description="standard deviation of the radial distortion k1, about the camera's or none"
     )
+    edge_reach: float = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="distance from the principal point, focal lengths, at which a lens of another k1 images alike, as "
+        "the edge of a given field of view; default 0, the principal point",
+    )
     falloff_power: Interval | None = Field(
         None,
         description="a falloff cos^k over the angle from the optical axis is left in the frame, k anywhere in between; "
@@ -238,7 +245,7 @@ class CalibrationSpec(Spec):
             distance,
             lobe,
             light_offset_mm=_distribution(rig.light_offset_mm) or UNTOLD_OFFSET_MM,
-            camera=CameraPrior(told.focal_sd, told.centre_sd_px, told.distortion_sd),
+            camera=CameraPrior(told.focal_sd, told.centre_sd_px, told.distortion_sd, told.edge_reach),
             falloff_power=_distribution(told.falloff_power) or UNTOLD_FALLOFF_POWER,
             relief_slope=_distribution(slopes, math.radians(1.0)) or UNTOLD_SLOPE_RAD,
             lights_covariance_mm2=rig.lights_covariance_mm2,

@@ -184,9 +184,12 @@ def drawn_camera(camera: Camera, prior: CameraPrior, rng: np.random.Generator) -
     table: dict[str, Any] = dict(camera_table(camera))
     scale = max(1 + prior.focal_sd * float(rng.standard_normal()), 0.3)
     shift = prior.centre_sd_px * rng.standard_normal(2)
+    error = prior.distortion_sd * float(rng.standard_normal())
+    # k1 r (r^2 - edge^2) is another k1 at another focal length.
+    at_axis = max(1 - error * prior.edge_reach**2, 0.3)
+    scale, error = scale * at_axis, error / at_axis
     table |= {"fx": camera.fx * scale, "fy": camera.fy * scale}
     table |= {"cx": camera.cx + float(shift[0]), "cy": camera.cy + float(shift[1])}
-    error = prior.distortion_sd * float(rng.standard_normal())
     if error:
         lens = table.get("distortion", {"type": "brown_conrady"})
         # To first order k2 of the polynomial moves a point as k1 of the other lenses does.
