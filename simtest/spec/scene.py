@@ -171,6 +171,14 @@ class Scene(Spec):
         """The colour of the tissue, where the albedo varies over the surface."""
         return getattr(self.reflectance, "albedo", None)
 
+    @property
+    def is_coloured(self) -> bool:
+        """Whether it takes three channels: the colour of tissue, or a base, light or instrument that is not grey."""
+        colours = [self.reflectance.colour, *(light.colour for light in self.rig.lights)]
+        for instrument in self.shown_instruments.values():
+            colours += [instrument.metal, instrument.colour]
+        return self.albedo is not None or any(len(set(colour)) > 1 for colour in colours)
+
     def calibration(self, distance_mm: float | None = None) -> Calibration:
         """Return what reconstruction knows of the scene's camera, sensor, lights and surface.
 
