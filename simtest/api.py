@@ -306,7 +306,7 @@ def _run_and_report(
 def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, overrides: Mapping[str, Any]) -> "Scene":
     """Return the described scene with values replaced, by key path and by the last name of a key."""
     from simtest.spec import Scene, load_scene
-    from simtest.spec.scene import scene_from_dict
+    from simtest.spec.scene import scene_from_dict, without_presets
     from simtest.spec.short_keys import full_keys
     from simtest.spec.type_change import replace_values
 
@@ -315,7 +315,7 @@ def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, over
             return load_scene(scene, values)
         if not values:
             return scene
-        data = scene.model_dump(mode="json", exclude_unset=True)
+        data = without_presets(scene.model_dump(mode="json", exclude_unset=True), values)
         return scene_from_dict(replace_values(Scene, data, values, "scene"))
 
     described = replaced(values := dict(settings or {}))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, reduce
 
 import numpy as np
@@ -69,21 +69,23 @@ class Calibration:
     vignetting : AngularProfile
         Share of the light that the lens transmits, over the angle between sightline and optical axis.
     emission : AngularProfile
-        Emission of a light at the camera, over the angle between sightline and `emission_axis`.
+        Emission of a light at the camera, over the angle between sightline and `emission_axis`. Where `priors` give
+        a light beside the camera it is not undone, and they must say that a falloff is left in the frame.
     noise : NoiseModel
         Of the known noise; white noise beyond it is estimated from each frame.
     saturation_level : float, optional
         Encoded value at and above which a pixel is clipped; None: not known, and no pixel counts as clipped.
     priors : Priors
-        Of lights, distance, lobe, camera and relief; passed on to the estimators. With a vignetting or emission that is
-        not uniform, none is left in the frame, and the prior on its power is dropped.
+        Of lights, distance, lobe, camera, falloff and relief; passed on to the estimators. Their `falloff_power` is of
+        what is left in the frame beside `vignetting` and `emission`; where both are known it is None.
     emission_axis : tuple of float
         Direction in which the light shines, camera frame, unit; default the optical axis.
 
     Raises
     ------
     InputError
-        If a part is of another type, or the saturation level is no finite number > 0.
+        If a part is of another type, the saturation level is no finite number > 0, or an emission that is not undone
+        comes without a prior on the falloff.
 
     Examples
     --------
@@ -119,16 +121,24 @@ class Calibration:
             raise InputError(f"emission_axis = {self.emission_axis}: must be a unit vector of 3 numbers")
         if self.saturation_level is not None:
             check_number("saturation_level", self.saturation_level, above=0)
-        # A told falloff is undone, so none that nobody told is left.
-        if not (self.vignetting.is_uniform and self.emission.is_uniform) and self.priors.falloff_power is not None:
-            object.__setattr__(self, "priors", replace(self.priors, falloff_power=None))
+        if self.priors.falloff_power is None and not self.is_emission_undone:
+            raise InputError(
+                "emission: cannot be undone for lights_mm beside the camera; must come with priors.falloff_power, "
+                "which says how much of it is in the frame"
+            )
+
+    @property
+    def is_emission_undone(self) -> bool:
+        """Whether no emission is left in the frame: from a light beside the camera it depends on the distance too."""
+        return self.emission.is_uniform or not self.priors.has_light_beside
 
     @cached_property
     def falloff(self) -> Array | None:
-        """Vignetting times emission at each pixel's centre, shape (H, W); None where both are uniform."""
-        if self.vignetting.is_uniform and self.emission.is_uniform:
+        """Vignetting times emission, as far as it is undone, at each pixel's centre, shape (H, W); None: uniform."""
+        emission = self.emission if self.is_emission_undone else AngularProfile()
+        if self.vignetting.is_uniform and emission.is_uniform:
             return None
-        return falloff_map(self.camera, self.vignetting) * falloff_map(self.camera, self.emission, self.emission_axis)
+        return falloff_map(self.camera, self.vignetting) * falloff_map(self.camera, emission, self.emission_axis)
 
     def clipped(self, values: Image) -> Mask | None:
         """Return where a channel of a frame as encoded is clipped, shape (H, W); None where no level is known."""

@@ -18,6 +18,9 @@ from simtest.runtime.short_repr import short_repr
 
 MAX_LIGHTS = 32
 
+AT_CAMERA_MM = 1e-9
+"""A light nearer than this is at the camera, or on a sightline."""
+
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 """Rows of a matrix, shape (3, 3)."""
 
@@ -54,6 +57,9 @@ class CameraPrior:
     distortion_sd : float
         Standard deviation of the radial distortion k1, about that of a given lens or none: an error of it moves a point
         at r focal lengths from the principal point by k1 r^3 focal lengths.
+    edge_reach : float
+        r at which the picture is where the lens has it, whatever its k1, such as the edge of a given field of view: an
+        error moves other points by k1 r (r^2 - edge_reach^2).
     guessed : bool
         Whether these are guesses, because nobody stated them. It changes no estimate and does not count in comparisons.
 
@@ -66,6 +72,7 @@ class CameraPrior:
     focal_sd: float = 0.0
     centre_sd_px: float = 0.0
     distortion_sd: float = 0.0
+    edge_reach: float = 0.0
     guessed: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -74,8 +81,9 @@ class CameraPrior:
 
     @property
     def deviations(self) -> dict[str, float]:
-        """The standard deviations by name."""
-        return {name: getattr(self, name) for name in ("focal_sd", "centre_sd_px", "distortion_sd")}
+        """The standard deviations by name, and `edge_reach` where it is not 0."""
+        names = ("focal_sd", "centre_sd_px", "distortion_sd", *(("edge_reach",) if self.edge_reach else ()))
+        return {name: getattr(self, name) for name in names}
 
     @property
     def is_exact(self) -> bool:
@@ -101,8 +109,8 @@ class Priors:
     camera : CameraPrior
         How far the camera's geometry may be off.
     falloff_power : Uniform, Normal or LogUniform, optional
-        k of a falloff cos^k over the angle from the optical axis that is still in the frame; None: there is none, since
-        the falloff of lens and lights is uniform, or told and undone.
+        k of a falloff cos^k over the angle from the axis of lens or light that is still in the frame; None: there is
+        none, since the falloff of lens *and* lights is uniform, or known and undone.
     relief_slope : Uniform, Normal or LogUniform
         Slope of the relief an axis, rad: how far a single highlight may be off the base's normal (theory.md 7.4).
     plane : bool
@@ -146,6 +154,11 @@ class Priors:
     def lights(self) -> Array:
         """Nominal positions of the lights, shape (L, 3), camera frame, mm."""
         return np.array(self.lights_mm, dtype=float).reshape(-1, 3)
+
+    @cached_property
+    def has_light_beside(self) -> bool:
+        """Whether a light is given that is not at the camera."""
+        return bool((np.linalg.norm(self.lights, axis=1) > AT_CAMERA_MM).any())
 
     @cached_property
     def lights_covariance(self) -> Array | None:

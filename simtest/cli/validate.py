@@ -73,7 +73,7 @@ def validate(
     if Path(experiment).suffix.lower() in MESHES:
         raise InputError(f"{experiment}: is a mesh; use simtest validate mesh --set surface.path={experiment}")
     values = parse_settings(settings or [])
-    own = {"realisations": realisations, "seed": seed, "estimators": estimators, "views": views}
+    own = {"realisations": realisations, "seed": seed, "estimators": estimators, "viewpoints": views}
     values |= {key: value for key, value in own.items() if value is not None}
     described = load_experiment(experiment, values)
     meshes = mesh_verdicts(described)

@@ -12,16 +12,14 @@ from functools import lru_cache
 import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Priors
-from simtest.estimators.budget import CONFIDENCE, equivalent_variance, line_covariance
+from simtest.calibration.priors import AT_CAMERA_MM
+from simtest.estimators.budget import CONFIDENCE, equivalent_covariance, line_covariance
 from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.near_misses import near_miss_parts
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, BrownConrady, Camera, chi_squared
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
-
-AT_CAMERA_MM = 1e-9
-"""A light nearer than this to the sightline is on it."""
 
 NEAR_SHARE = 0.05
 """Share of the distances that are nearer than the one at which a told light's offset must be negligible."""
@@ -47,6 +45,16 @@ STEP_MM = 1e-3
 
 SHARES = (np.arange(64) + 0.5) / 64
 """At these shares a prior of one number is sampled."""
+
+TILT = math.radians(10.0)
+"""Standard deviation an axis of the angle between a falloff's axis and the optical axis: light guides beside an oblique
+lens or with lenses of their own shine up to 25 deg aside."""
+
+FAINT = 0.1
+"""Cosine of the angle from its axis down to which a falloff is followed; little light is left there."""
+
+SAMPLES = np.arange(1, 257)[:, None] * 1.1347241384015194 ** -np.arange(1.0, 6.0) % 1
+"""Shares of the five priors of a falloff, shape (N, 5), all alike even: the sequence of the root of x^6 = x + 1."""
 
 _DRAWS, _GOLDEN = (np.arange(128) + 0.5) / 128, math.pi * (3 - math.sqrt(5)) * np.arange(128)
 DRAWN = np.sqrt(-2 * np.log(1 - _DRAWS))[:, None] * np.stack([np.cos(_GOLDEN), np.sin(_GOLDEN)], axis=1)
@@ -103,7 +111,7 @@ def add_common_parts(
             return estimate.without_uncertainty()
         parts["camera"] = turned
     if priors.falloff_power is not None and family is not None:
-        parts["response"] = falloff_part(estimate.normal, family, priors.falloff_power)
+        parts["response"] = falloff_part(estimate.normal, family, priors.falloff_power, priors)
     return estimate.with_parts(**parts)
 
 
@@ -159,38 +167,67 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     The normal turns with the sightline that it looks along. Another focal length, centre or distortion sees, at the
     pixel looked at, what this camera sees at a pixel beside it. Near the angle where a lens folds over, a pixel turns
     the sightline ever more: there the moves are those at pixels drawn from the prior, without those past the lens's
-    limit, which no camera that saw this highlight has.
+    limit, which no camera that saw this highlight has. A share s of a lens's scale that is not known divides the pixels
+    of the centre by 1 - s, whose mean square is 1 + 3 s^2 to leading order.
     """
     look, sightline = estimate.look_px, camera.unproject(estimate.look_px)
-    across = basis_across(estimate.normal)
+    basis = basis_across(estimate.normal)
     if not np.isfinite(sightline).all():
         return None
     from_centre = look - [camera.cx, camera.cy]
     reach = np.linalg.solve(camera.K[:2, :2], from_centre)
     if isinstance(camera.distortion, BrownConrady):
         reach = sightline[:2] / sightline[2]  # its k1 moves what the lens has not yet bent
-    bulge = camera.K[:2, :2] @ reach * (reach @ reach)
-    in_pixels = prior.focal_sd**2 * np.outer(from_centre, from_centre) + prior.distortion_sd**2 * np.outer(bulge, bulge)
-    in_pixels += prior.centre_sd_px**2 * np.eye(2)
+    reach2 = float(reach @ reach)
+    across = prior.distortion_sd * (reach2 - prior.edge_reach**2)
+    outwards = prior.distortion_sd * (3 * reach2 - prior.edge_reach**2)
+    bulge = camera.K[:2, :2] @ reach
+    in_pixels = prior.focal_sd**2 * np.outer(from_centre, from_centre) + across**2 * np.outer(bulge, bulge)
+    widened = 3 * (outwards**2 - across**2) * _along(from_centre) + (1 + 3 * across**2) * np.eye(2)
+    in_pixels += prior.centre_sd_px**2 * widened
     if camera.distortion is None:
-        J = across @ camera.step_of_pixels(look).T
+        J = basis @ camera.step_of_pixels(look).T
         return np.asarray(J @ in_pixels @ J.T)
     variances, axes = np.linalg.eigh(in_pixels)
     drawn = look + DRAWN @ (axes * np.sqrt(np.maximum(variances, 0.0))).T
-    moves = (camera.unproject(drawn) - sightline) @ across.T
+    moves = (camera.unproject(drawn) - sightline) @ basis.T
     return line_covariance(moves[np.isfinite(moves).all(axis=1)])
 
 
-def falloff_part(normal: Array, family: HighlightAxis, power: Distribution) -> Array:
+def _along(vector: Array) -> Array:
+    """Return the projection onto a vector, shape (2,); zeros where it has no length."""
+    return np.outer(vector, vector) / max(float(vector @ vector), 1e-12)
+
+
+def falloff_part(normal: Array, family: HighlightAxis, power: Distribution, priors: Priors) -> Array:
     """Return the covariance of the normal by a falloff cos^k that is left in the frame, shape (2, 2), rad^2.
 
-    Its slope, k tan(phi) towards the optical axis, moves the peak by the lobe's moments 1/H times the slope (theory.md
-    section 4). The moments are those as seen, so that highlights of few pixels get a little too much.
+    Its slope moves the peak by the lobe's moments 1/H times the slope (theory.md section 4). The moments are those as
+    seen, so that highlights of few pixels get a little too much. The angle is that at the lens or, where lights beside
+    it are given, as likely at one of them, from an axis that is tilted by `TILT`.
     """
-    sightline = family.axis
-    slope = family.basis[:, 2] / max(float(sightline[2]), 1e-3)  # grad log cos(phi) across the sightline
-    shift = basis_across(normal) @ family.basis.T @ (family.seen_moments @ slope)
-    return np.asarray(_unit_variance(power) * np.outer(shift, shift))
+    powers, tilts = _falloffs(power)
+    axes = np.column_stack([TILT * tilts, np.ones(len(tilts))])
+    sightline, steps, place = family.axis, family.basis, family.axis[None]
+    if priors.has_light_beside:
+        # place and steps of the surface as seen from there, over its distance
+        which = (SAMPLES[:, 3] * 2 * len(priors.lights)).astype(int)
+        origins = np.concatenate([np.zeros_like(priors.lights), priors.lights])[which]
+        place = sightline - origins / priors.distance.quantile(SAMPLES[:, 4:])
+        steps = steps - np.outer(steps @ normal / (sightline @ normal), sightline)
+    along = np.sum(place * axes, axis=1)
+    lengths = np.linalg.norm(place, axis=1)
+    reached = np.maximum(along, FAINT * lengths * np.linalg.norm(axes, axis=1))
+    slopes = axes @ steps.T / reached[:, None] - place @ steps.T / lengths[:, None] ** 2
+    shift = basis_across(normal) @ family.basis.T @ family.seen_moments
+    return equivalent_covariance(powers * slopes @ shift.T)
+
+
+@lru_cache(maxsize=16)
+def _falloffs(power: Distribution) -> tuple[Array, Array]:
+    """Return the powers of drawn falloffs, shape (N, 1), and their tilts, normal pairs of deviation 1, shape (N, 2)."""
+    radius, angle = np.sqrt(-2 * np.log1p(-SAMPLES[:, 1])), 2 * np.pi * SAMPLES[:, 2]
+    return power.quantile(SAMPLES[:, :1]), np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 def to_base(estimate: Estimate, priors: Priors) -> Estimate:
@@ -228,12 +265,6 @@ def half_angles(normal: Array, distance: float, lights: Array) -> Array:
     """Return how far each light moves the normal from the reversed sightline, rad, tangent basis, shape (L, 2)."""
     position = -distance * normal
     return np.array([tangent_coordinates(normal, bisect(position, light)) for light in lights])
-
-
-@lru_cache(maxsize=16)
-def _unit_variance(factor: Distribution) -> float:
-    """Return the equivalent variance of an error along one line that is a factor times 1."""
-    return equivalent_variance(factor.quantile(SHARES))
 
 
 @lru_cache(maxsize=16)

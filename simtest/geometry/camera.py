@@ -225,14 +225,20 @@ class Camera:
         """Calibration matrix, shape (3, 3), px."""
         return np.array([[self.fx, self.skew, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    def with_radial_error(self, error: float) -> "Camera":
-        """Return the camera whose radial distortion k1 is larger by an error; a pinhole is one without distortion."""
+    def with_radial_error(self, error: float, edge_reach: float = 0.0) -> "Camera":
+        """Return the camera whose radial distortion k1 is larger by an error; a pinhole is one without distortion.
+
+        Points at `edge_reach` focal lengths from the centre stay: k1 r (r^2 - edge_reach^2) is another k1 at another
+        focal length.
+        """
         if not error:
             return self
+        at_axis = max(1 - error * edge_reach**2, 0.3)
         lens = self.distortion or BrownConrady()
         # To first order k2 of the polynomial moves a point as k1 of the other lenses does.
         name = "k2" if isinstance(lens, Scaramuzza) else "k1"
-        return replace(self, distortion=replace(lens, **{name: getattr(lens, name) + error}))
+        lens = replace(lens, **{name: getattr(lens, name) + error / at_axis})
+        return replace(self, fx=self.fx * at_axis, fy=self.fy * at_axis, distortion=lens)
 
     def unproject(self, points_px: npt.ArrayLike) -> Array:
         """Return the unit sightlines, shape (..., 3), of pixels, shape (..., 2), inside the image and outside.

@@ -95,7 +95,9 @@ class FittedConics:
     def __getitem__(self, index: int) -> FittedConic | Failure:
         # A negative index must find its failure too.
         index = range(len(self))[operator.index(index)]
-        return self.failures.get(index) or FittedConic(self.normalised[index], self.normalised_from_image[index])
+        if (failure := self.failures.get(index)) is not None:
+            return failure
+        return FittedConic(self.normalised[index], self.normalised_from_image[index])
 
 
 class _Failures:

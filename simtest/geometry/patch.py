@@ -123,12 +123,16 @@ class Patch:
         Raises
         ------
         InputError
-            If the box is empty or leaves the frame.
+            If the box is empty or leaves the frame, or the peak leaves the box.
         """
         x, y, width, height = box
         rows, columns = smoothed.shape
         if width < 1 or height < 1 or x < 0 or y < 0 or x + width > columns or y + height > rows:
             raise InputError(f"roi = {x},{y},{width},{height}: must be x,y,w,h inside the {columns} x {rows} frame")
+        if peak is not None and not (x <= peak[0] < x + width and y <= peak[1] < y + height):
+            raise InputError(
+                f"peak = {peak[0]},{peak[1]}: must lie inside its region x,y,w,h = {x},{y},{width},{height}"
+            )
         crop = np.s_[y : y + height, x : x + width]
         values, corner = smoothed[crop], (x + origin_px[0], y + origin_px[1])
         # NaN and infinity show at either end of the range, which costs less than a test of every value.

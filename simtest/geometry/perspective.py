@@ -164,7 +164,11 @@ class BrownConrady:
                 # A longer step could leave the branch.
                 length = np.linalg.norm(step, axis=1)
                 most = 0.2 * (0.1 + np.linalg.norm(x, axis=1))
+                before = np.linalg.norm(x, axis=1)
                 x = x - step * np.where(length > most, most / length, 1.0)[:, None]
+                # One across the fold or pole ends half-way to it.
+                reached = np.linalg.norm(x, axis=1)
+                x *= np.where(reached < self.limit, 1.0, (before + self.limit) / (2 * reached))[:, None]
                 done = length <= CLOSE * scale[active]
                 solution[active[done]] = x[done]
                 active, x = active[~done], x[~done]

@@ -11,7 +11,7 @@ from simtest.calibration import Calibration, CameraPrior, Distribution, Priors
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
 from simtest.errors import InputError
 from simtest.estimators.protocol import Target
-from simtest.geometry import Camera, ViewMask
+from simtest.geometry import Camera, KannalaBrandt, ViewMask
 
 FOCAL_SD = 0.1
 """Standard deviation of a focal length that follows from a stated field of view, as a share of it: makers state it
@@ -22,6 +22,13 @@ CENTRE_SD_SHARE = 0.02
 
 DISTORTION_SD = 0.1
 """Standard deviation of a radial distortion k1, where a lens of which nobody told is taken for a pinhole."""
+
+WIDEST_PINHOLE_DEG = 100.0
+"""Field of view up to which it is; wider ones, and round views, are those of an equidistant lens."""
+
+LENS_SD = 0.17
+"""Standard deviation of k1 about such a lens whose edge is given: of a stereographic one k1 is 1/12, equisolid -1/24,
+orthographic -1/6, a pinhole 1/3. `python -m studies.wide_fov` draws them; of pinholes from 90 deg on few are held."""
 
 
 @dataclass(frozen=True)
@@ -76,14 +83,31 @@ def calibration_of_view(fov_deg: float, width: int, height: int, across: Extent 
 
 def calibration_of_round_view(fov_deg: float, width: int, height: int, view: ViewMask) -> Calibration:
     """Return the same where the angle, deg, spans the round view in the picture; the lens is centred on that view."""
-    return _guessed(fov_deg, width, height, 2 * view.radius, (view.cx, view.cy))
+    return _guessed(fov_deg, width, height, 2 * view.radius, (view.cx, view.cy), view)
 
 
-def _guessed(fov_deg: float, width: int, height: int, extent_px: float, centre: tuple[float, float]) -> Calibration:
-    """Return a pinhole's calibration whose angle spans `extent_px`, with the priors of a guess."""
-    prior = CameraPrior(FOCAL_SD, CENTRE_SD_SHARE * width, DISTORTION_SD, guessed=True)
+def _guessed(
+    fov_deg: float, width: int, height: int, extent_px: float, centre: tuple[float, float], view: ViewMask | None = None
+) -> Calibration:
+    """Return a calibration whose angle spans `extent_px`, with the priors of a guess."""
+    centre_sd = CENTRE_SD_SHARE * width
     focal = Camera.from_fov(fov_deg, width, height).fx * extent_px / width
-    return Calibration(Camera(width, height, focal, focal, *centre), priors=Priors(camera=prior))
+    if view is None and fov_deg <= WIDEST_PINHOLE_DEG:
+        prior = CameraPrior(FOCAL_SD, centre_sd, DISTORTION_SD, guessed=True)
+        return Calibration(Camera(width, height, focal, focal, *centre), priors=Priors(camera=prior))
+    edge = math.radians(fov_deg) / 2
+    focal = extent_px / 2 / edge
+    prior = CameraPrior(FOCAL_SD, centre_sd, LENS_SD, edge, guessed=True)
+    # No lens images what is straight behind it, which the black corners of a picture may need.
+    far = max(math.hypot(x - centre[0], y - centre[1]) for x in (0, width) for y in (0, height))
+    if far >= math.pi * focal and view is None:
+        raise InputError(
+            f"--fov {fov_deg:g}: the corners of the picture would see more than 180 deg off the axis; must be less, or "
+            "--fov-of view"
+        )
+    mask = view if far >= math.pi * focal else None
+    camera = Camera(width, height, focal, focal, *centre, distortion=KannalaBrandt(), view_mask=mask)
+    return Calibration(camera, priors=Priors(camera=prior))
 
 
 def assumptions(calibration: Calibration, encoding: str | None, target: Target) -> list[Assumption]:
@@ -155,8 +179,10 @@ def _of_camera(camera: Camera, prior: CameraPrior) -> list[Assumption]:
             Assumption("principal point", deviation, f"[camera] cx, cy and [uncertainty] centre_sd_px {key}", told)
         )
     if prior.distortion_sd > 0:
-        lens = "none" if camera.distortion is None else "as given"
+        lens = "none" if camera.distortion is None else "as given" if told else "equidistant"
         deviation = f"{lens}, its k1 normal, ± {prior.distortion_sd:g}"
+        if prior.edge_reach:
+            deviation += f", unchanged {prior.edge_reach:.2f} focal lengths from the principal point"
         made.append(
             Assumption("distortion", deviation, f"[camera.distortion] and [uncertainty] distortion_sd {key}", told)
         )

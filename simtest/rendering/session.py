@@ -66,7 +66,7 @@ class Session(SessionTruth):
     """
 
     def __init__(self, scene: Scene, variant: str | None = None, labelled: bool = False) -> None:
-        self._mitsuba = backend.load(backend.requested_variant(variant, coloured=scene.albedo is not None))
+        self._mitsuba = backend.load(backend.requested_variant(variant, coloured=scene.is_coloured))
         self.variant = str(self._mitsuba.variant())
         self.plugin = phong.register(self.mi, self.variant)
         tissue.register(self.mi, self.variant)

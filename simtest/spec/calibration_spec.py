@@ -1,6 +1,7 @@
 """The tables of a calibration file: a camera with its response, vignetting, emission and noise."""
 
 import math
+from dataclasses import replace
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -118,10 +119,18 @@ class UncertaintyCalibration(Spec):
     distortion_sd: float = Field(
         0.0, ge=0, le=10, description="standard deviation of the radial distortion k1, about the camera's or none"
     )
+    edge_reach: float = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="distance from the principal point, focal lengths, at which a lens of another k1 images alike, as "
+        "the edge of a given field of view; default 0, the principal point",
+    )
     falloff_power: Interval | None = Field(
         None,
         description="a falloff cos^k over the angle from the optical axis is left in the frame, k anywhere in between; "
-        "default [0, 4] where neither vignetting nor emission is stated, else none",
+        "default none where vignetting and emission are both given (power = 0 where it is uniform) and an emission "
+        "that is not uniform has no lights_mm beside the camera; else [0, 4]",
     )
 
     @model_validator(mode="after")
@@ -210,7 +219,12 @@ class CalibrationSpec(Spec):
         noise = NoiseModel(sensor.noise_sigma, sensor.full_well, sensor.read_noise, sensor.bits, response or Response())
         falloff = (self.vignetting.model(), self.emission.model())
         level, axis = sensor.saturation_level, self.emission.axis
-        return Calibration(camera, response, *falloff, noise, level, self.priors(), axis)
+        made = Calibration(camera, response, *falloff, noise, level, self.priors(), axis)
+        # None is left in the frame where both of its parts are given and undone.
+        known = {"vignetting", "emission"} <= self.model_fields_set and made.is_emission_undone
+        if known and self.uncertainty.falloff_power is None:
+            made = replace(made, priors=replace(made.priors, falloff_power=None))
+        return made
 
     def priors(self) -> Priors:
         """Return the priors on lights, distance, lobe, camera, falloff and relief."""
@@ -218,8 +232,6 @@ class CalibrationSpec(Spec):
         distance = _distribution(rig.distance_range_mm)
         if rig.distance_mm is not None:
             distance = Normal(rig.distance_mm, rig.distance_sd_mm)
-        # A falloff that neither table states is still in the frame.
-        states_falloff = bool(self.model_fields_set & {"vignetting", "emission"})
         lobe = None if surface.lobe_curvature is None else exactly(surface.lobe_curvature)
         if surface.phong_exponent is not None:
             # Imported here: the reflectances are slower to load than the whole calibration.
@@ -233,8 +245,8 @@ class CalibrationSpec(Spec):
             distance,
             lobe,
             light_offset_mm=_distribution(rig.light_offset_mm) or UNTOLD_OFFSET_MM,
-            camera=CameraPrior(told.focal_sd, told.centre_sd_px, told.distortion_sd),
-            falloff_power=_distribution(told.falloff_power) or (None if states_falloff else UNTOLD_FALLOFF_POWER),
+            camera=CameraPrior(told.focal_sd, told.centre_sd_px, told.distortion_sd, told.edge_reach),
+            falloff_power=_distribution(told.falloff_power) or UNTOLD_FALLOFF_POWER,
             relief_slope=_distribution(slopes, math.radians(1.0)) or UNTOLD_SLOPE_RAD,
             lights_covariance_mm2=rig.lights_covariance_mm2,
         )

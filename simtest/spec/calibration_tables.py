@@ -40,14 +40,12 @@ def calibration_tables(calibration: Calibration) -> Tables:
     tables: Tables = {"camera": dict(camera_table(calibration.camera))}
     if calibration.response is not None:
         tables["response"] = _response(calibration.response)
+    # That no falloff is left in the frame a file says by giving both, even where they are uniform.
     for name in ("vignetting", "emission"):
-        if not (profile := getattr(calibration, name)).is_uniform:
+        if not (profile := getattr(calibration, name)).is_uniform or priors.falloff_power is None:
             tables[name] = _profile(profile)
     if calibration.emission_axis != OPTICAL_AXIS and "emission" in tables:
         tables["emission"]["direction"] = list(calibration.emission_axis)
-    if priors.falloff_power is None and not {"vignetting", "emission"} & set(tables):
-        # None is left in the frame, which a file says by stating that it is uniform.
-        tables["vignetting"] = {"type": "cosine", "power": 0.0}
     # Defaults and what is not known are left out; an empty table says nothing.
     further: Tables = {
         "sensor": {
@@ -56,7 +54,7 @@ def calibration_tables(calibration: Calibration) -> Tables:
         },
         "rig": _rig(priors),
         "surface": _surface(priors),
-        "uncertainty": _uncertainty(priors),
+        "uncertainty": _uncertainty(priors, {"vignetting", "emission"} <= set(tables)),
     }  # fmt: skip
     for name, table in further.items():
         if stated := {key: value for key, value in table.items() if value is not None}:
@@ -98,11 +96,11 @@ def _surface(priors: Priors) -> dict[str, Any]:
     }
 
 
-def _uncertainty(priors: Priors) -> dict[str, Any]:
+def _uncertainty(priors: Priors, gives_falloff: bool) -> dict[str, Any]:
     power = priors.falloff_power
     return {
         **{name: deviation or None for name, deviation in priors.camera.deviations.items()},
-        "falloff_power": None if power in (None, UNTOLD_FALLOFF_POWER) else _interval(power),
+        "falloff_power": _interval(power) if gives_falloff or power != UNTOLD_FALLOFF_POWER else None,
     }
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from simtest.runtime.resources import find
+from simtest.spec.experiment import check_first_parts, still_varied
+from simtest.spec.scene import Scene
 from simtest.spec.spec_model import Name, Share, Spec, load
 
 MAX_SAMPLES = 100_000_000
@@ -53,6 +55,9 @@ class Distribution(Spec):
             return self.choose[int(rng.choice(len(self.choose), p=shares / shares.sum()))]
         assert self.low is not None
         assert self.high is not None
+        if self.integer and self.log:
+            # the whole part of what lies below the next number
+            return min(int(math.exp(rng.uniform(math.log(self.low), math.log(self.high + 1)))), int(self.high))
         if self.integer:
             # high counts, unlike in a continuous range
             return int(rng.integers(int(self.low), int(self.high), endpoint=True))
@@ -190,13 +195,15 @@ def load_dataset(name: str | Path, settings: Mapping[str, Any] | None = None) ->
     # The dataset's own keys; all others are keys of the scenes.
     settings = dict(settings or {})
     own = {key: settings.pop(key) for key in list(settings) if key.split(".")[0] in _DATASET_KEYS}
+    check_first_parts(settings, Scene.model_fields, _DATASET_KEYS)
     dataset = load(Dataset, path, own)
     if not settings:
         return dataset
 
     # A value that is set is no longer drawn.
     def left(drawn: dict[str, Distribution]) -> dict[str, Distribution]:
-        return {key: value for key, value in drawn.items() if key not in settings}
+        kept = still_varied(drawn, settings, "dataset")
+        return {key: value for key, value in drawn.items() if key in kept}
 
     families = tuple(
         family.model_copy(

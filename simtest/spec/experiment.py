@@ -1,6 +1,6 @@
 """Validation experiments: which scenes, which swept parameters, how many realisations, which estimators."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +12,7 @@ from simtest.runtime.short_repr import short_repr
 from simtest.spec.paper import PaperScene
 from simtest.spec.scene import Scene
 from simtest.spec.spec_model import Name, Spec, load
+from simtest.spec.type_change import rivals
 
 LawName = Literal[
     "circle_pose", "branch_point", "axis_ratio", "axis_ratio_seen", "offset", "bisector", "falloff", "look"
@@ -95,7 +96,7 @@ class Experiment(Spec):
 
 
 VIEWPOINT = "surface.viewpoint"
-OWN_KEYS = ("description", "estimators", "realisations", "seed", "title", "views")
+OWN_KEYS = ("description", "estimators", "realisations", "seed", "title", "viewpoints")
 """Settings of the experiment itself; all others are keys of its scenes."""
 
 
@@ -108,8 +109,8 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
         A path, or the name of a shipped experiment.
     settings : mapping, optional
         Values by key path. The experiment's own keys (realisations, seed, estimators) are replaced, realisations in all
-        groups; `views` keeps that many viewpoints, the first ones, of each group that varies them; all other paths are
-        those of the scene and apply to each group, in place of a sweep over them.
+        groups; `viewpoints` keeps that many of them, the first ones, of each group that varies them; all other paths
+        are those of the scene and apply to each group, in place of a sweep over them.
 
     Raises
     ------
@@ -126,15 +127,15 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     # The experiment's own keys; all others are keys of the scenes.
     settings = dict(settings or {})
     own = {key: settings.pop(key) for key in list(settings) if key in OWN_KEYS}
-    views = own.pop("views", None)
+    viewpoints = own.pop("viewpoints", None)
     changes = [f"{key}={value}" for key, value in settings.items()]
-    _check_first_parts(settings)
+    check_first_parts(settings, [*Scene.model_fields, *PaperScene.model_fields], OWN_KEYS)
     experiment = load(Experiment, path, own)
     groups = tuple(_override(group, settings) for group in experiment.groups)
-    if views is not None:
-        groups = tuple(_thinned(group, views) for group in groups)
+    if viewpoints is not None:
+        groups = tuple(_thinned(group, viewpoints) for group in groups)
         if not any(VIEWPOINT in table for group in groups for table in (*group.sweep, *group.pool)):
-            raise InputError(f"--set views: no group of {shown(path)} varies {VIEWPOINT}")
+            raise InputError(f"--set viewpoints: no group of {shown(path)} varies {VIEWPOINT}")
     if "realisations" in own:
         # In all groups, also in those that have a number of their own.
         groups = tuple(group.model_copy(update={"realisations": None}) for group in groups)
@@ -142,31 +143,44 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     description = experiment.description
     if changes:
         description = f"{description} With {', '.join(changes)}.".strip()
-    if views is not None:
-        kept = "the first viewpoint" if views == 1 else f"the first {views} viewpoints"
-        description = f"{description} Cut down by views={views}: at most {kept} of each setting.".strip()
+    if viewpoints is not None:
+        kept = "the first viewpoint" if viewpoints == 1 else f"the first {viewpoints} viewpoints"
+        description = f"{description} Cut down by viewpoints={viewpoints}: at most {kept} of each setting.".strip()
     return experiment.model_copy(update={"groups": groups, "description": description})
 
 
-def _check_first_parts(settings: Mapping[str, Any]) -> None:
-    """Raise `InputError` for a key path that begins with no key of an experiment, nor of its scenes."""
-    scene = dict.fromkeys([*Scene.model_fields, *PaperScene.model_fields])
+def check_first_parts(settings: Mapping[str, Any], scene: Iterable[str], own: Iterable[str]) -> None:
+    """Raise `InputError` for a key path that begins with no key of the scenes; `own` are those of what holds them."""
+    scene, own = dict.fromkeys(scene), sorted(own)
     for path in settings:
         first = path.partition(".")[0]
         if first not in scene:
-            meant = suggestion(first, [*OWN_KEYS, *scene])
-            allowed = f"allowed: {', '.join(OWN_KEYS)}, and of the scenes {', '.join(scene)}"
-            raise InputError(f"--set {shown(path, 60)}: unknown key; {allowed}{meant}")
+            allowed = f"allowed: {', '.join(own)}, and of the scenes {', '.join(scene)}"
+            raise InputError(f"--set {shown(path, 60)}: unknown key; {allowed}{suggestion(first, [*own, *scene])}")
 
 
-def _thinned(group: Group, views: object) -> Group:
+def still_varied(varied: Iterable[str], settings: Mapping[str, Any], what: str) -> set[str]:
+    """Return which of the key paths that an experiment or a dataset varies stay so beside settings.
+
+    A setting fixes its path, all below it and the keys that it excludes. Raises `InputError` for a part of a value that
+    is varied as a whole.
+    """
+    left = dict.fromkeys(varied)
+    for path in settings:
+        if whole := next((key for key in left if path.startswith(f"{key}.")), None):
+            raise InputError(f"--set {path}: the {what} varies {whole} as a whole; set {whole} itself instead")
+    fixed = [each for path in settings for each in (path, *rivals(path))]
+    return {key for key in left if not any(key == path or key.startswith(f"{path}.") for path in fixed)}
+
+
+def _thinned(group: Group, count: object) -> Group:
     """Keep the first viewpoints of a group that varies them."""
-    if isinstance(views, bool) or not isinstance(views, int) or views < 1:
-        raise InputError(f"--set views={shown(str(views), 60)}: must be a whole number from 1 on")
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise InputError(f"--set viewpoints={shown(str(count), 60)}: must be a whole number from 1 on")
 
     def first(tables: tuple[dict[str, tuple[Any, ...]], ...]) -> tuple[dict[str, tuple[Any, ...]], ...]:
         return tuple(
-            {key: values[:views] for key, values in table.items()} if VIEWPOINT in table else table for table in tables
+            {key: values[:count] for key, values in table.items()} if VIEWPOINT in table else table for table in tables
         )
 
     return group.model_copy(update={"sweep": first(group.sweep), "pool": first(group.pool)})
@@ -175,17 +189,10 @@ def _thinned(group: Group, views: object) -> Group:
 def _override(group: Group, settings: Mapping[str, Any]) -> Group:
     """Fix scene values in a group; swept and random values of the same path, or below it, are dropped."""
     varied = [*group.random, *(key for table in (*group.sweep, *group.pool) for key in table)]
-    # A part of a value that is varied as a whole cannot be fixed.
-    for path in settings:
-        for key in varied:
-            if path.startswith(f"{key}."):
-                raise InputError(f"--set {path}: the experiment varies {key} as a whole; set {key} itself instead")
-
-    def kept(key: str) -> bool:
-        return not any(key == path or key.startswith(f"{path}.") for path in settings)
+    kept = still_varied(varied, settings, "experiment")
 
     def without(tables: tuple[dict[str, tuple[Any, ...]], ...]) -> tuple[dict[str, tuple[Any, ...]], ...]:
-        thinned = ({key: values for key, values in table.items() if kept(key)} for table in tables)
+        thinned = ({key: values for key, values in table.items() if key in kept} for table in tables)
         return tuple(table for table in thinned if table)
 
     return group.model_copy(
@@ -193,6 +200,6 @@ def _override(group: Group, settings: Mapping[str, Any]) -> Group:
             "set": {**group.set, **settings},
             "sweep": without(group.sweep),
             "pool": without(group.pool),
-            "random": {key: value for key, value in group.random.items() if kept(key)},
+            "random": {key: value for key, value in group.random.items() if key in kept},
         }
     )

@@ -171,6 +171,14 @@ class Scene(Spec):
         """The colour of the tissue, where the albedo varies over the surface."""
         return getattr(self.reflectance, "albedo", None)
 
+    @property
+    def is_coloured(self) -> bool:
+        """Whether it takes three channels: the colour of tissue, or a base, light or instrument that is not grey."""
+        colours = [self.reflectance.colour, *(light.colour for light in self.rig.lights)]
+        for instrument in self.shown_instruments.values():
+            colours += [instrument.metal, instrument.colour]
+        return self.albedo is not None or any(len(set(colour)) > 1 for colour in colours)
+
     def calibration(self, distance_mm: float | None = None) -> Calibration:
         """Return what reconstruction knows of the scene's camera, sensor, lights and surface.
 
@@ -220,6 +228,36 @@ def scene_from_dict(data: Mapping[str, Any], where: str = "scene") -> Scene:
     return validate(Scene, data, where)
 
 
+PRESETS: tuple[tuple[str, type[Spec]], ...] = (("sensor", Sensor), ("reflectance.albedo", TissueColour))
+"""Tables whose key ``preset`` gives numbers of theirs."""
+
+
+def without_presets(data: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the dump of a scene without the numbers of the presets that settings replace.
+
+    A dump names all numbers, those of a preset too, which would stand over those of another.
+    """
+    left = dict(data)
+    for path, model in PRESETS:
+        *parents, name = path.split(".")
+        table = left.get(parents[0], {}) if parents else left
+        if f"{path}.preset" in settings and isinstance(given := table.get(name), Mapping):
+            plain = validate(model, {"preset": given["preset"]} if given.get("preset") else {}, path)
+            kept = _differing(given, plain.model_dump(mode="json"))
+            left = {**left, parents[0]: {**table, name: kept}} if parents else {**left, name: kept}
+    return left
+
+
+def _differing(table: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a table differs from another, and its type."""
+    both = {key: (value, other.get(key)) for key, value in table.items()}
+    return {
+        key: _differing(value, twin) if isinstance(value, dict) and isinstance(twin, dict) else value
+        for key, (value, twin) in both.items()
+        if key == "type" or value != twin or key not in other
+    }
+
+
 def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> Scene:
     """Read a scene file.
 
@@ -242,7 +280,10 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     5.0
     """
     path = find(name, "scenes")
-    data = replace_values(Scene, _tables(path), settings or {}, str(path))
+    tables = _tables(path)
+    if path.suffix.lower() == ".json":
+        tables = without_presets(tables, settings or {})
+    data = replace_values(Scene, tables, settings or {}, str(path))
     data.setdefault("name", path.stem[:80])
     return scene_from_dict(data, source_name(path, settings))
 

@@ -112,6 +112,11 @@ def _rules(exposure: Any) -> dict[str, Any]:
     return {name: given[name] for name in ("full_scale", "percentile", "average") if name in given}
 
 
+def _optional(model: type[Spec]) -> set[str]:
+    """Return the names of what is None where it is not given."""
+    return {name for name, field in model.model_fields.items() if field.default is None} - {"preset"}
+
+
 class Sensor(Spec):
     """From radiance to a frame, in this order.
 
@@ -119,7 +124,11 @@ class Sensor(Spec):
     saturation, response, sharpening, scaling, captions, quantisation, coding.
     """
 
-    preset: SensorPreset | None = Field(None, description="whose numbers hold where none are given; default none")
+    preset: SensorPreset | None = Field(
+        None,
+        description="whose numbers hold where none are given; false for a stage, "
+        "full_well or bits switches off what it gives; default none",
+    )
     point_spread_px: float = Field(0.0, ge=0, le=50, description="standard deviation of the Gaussian point spread, px")
     vignetting: Profile = Field(
         CosineProfile(), description="share of the light that is left, over the angle from the optical axis"
@@ -152,7 +161,13 @@ class Sensor(Spec):
     @model_validator(mode="before")
     @classmethod
     def _from_preset(cls, data: Any) -> Any:
-        """Fill in the preset's numbers; an unknown preset is refused by its field."""
+        """Fill in the preset's numbers; an unknown preset is refused by its field.
+
+        TOML has no null: false switches off what a preset gives and a sensor need not have.
+        """
+        if isinstance(data, Mapping):
+            off = [name for name, value in data.items() if value is False and name in _optional(cls)]
+            data = {**data, **dict.fromkeys(off)}
         named = data.get("preset") if isinstance(data, Mapping) else None
         preset = PRESETS.get(named) if isinstance(named, str) else None
         if preset is None:

@@ -140,12 +140,14 @@ def source_name(path: Path, settings: Mapping[str, Any] | None) -> str:
 def toml_value(value: Any) -> str:
     """Return a value as TOML: text quoted, tables and lists inline."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {toml_value(item)}" for key, item in value.items()) + "}"
+        # TOML has no null: what is None is left out.
+        given = {key: item for key, item in value.items() if item is not None}
+        return "{" + ", ".join(f"{key} = {toml_value(item)}" for key, item in given.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(toml_value(item) for item in value) + "]"
     if isinstance(value, str):
-        # A JSON string is a TOML basic string.
-        return json.dumps(value)
+        # A JSON string is a TOML basic string, but for surrogates and the one control character that JSON lets stand.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
@@ -153,6 +155,6 @@ def toml_tables(tables: Mapping[str, Mapping[str, Any]]) -> str:
     """Return tables by name as the text of a TOML file, one line per key."""
     parts = []
     for name, table in tables.items():
-        lines = [f"{key} = {toml_value(value)}\n" for key, value in table.items()]
+        lines = [f"{key} = {toml_value(value)}\n" for key, value in table.items() if value is not None]
         parts.append(f"[{name}]\n{''.join(lines)}")
     return "\n".join(parts)

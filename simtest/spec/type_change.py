@@ -1,5 +1,6 @@
 """What becomes of a table when a setting replaces its type, or one key by another that excludes it."""
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -8,8 +9,15 @@ from pydantic import BaseModel
 from simtest.spec.json_schema import nodes_at
 from simtest.spec.toml_files import apply_settings
 
-RIVALS = {"camera.fov_deg": ("fx", "fy"), "camera.fx": ("fov_deg", "fov_of"), "camera.fy": ("fov_deg", "fov_of")}
-"""Keys of the camera that exclude each other."""
+RIVALS = {
+    "camera.fov_deg": ("fx", "fy"), "camera.fx": ("fov_deg", "fov_of"), "camera.fy": ("fov_deg", "fov_of"),
+    "sensor.exposure.full_scale": ("percentile", "average"), "sensor.exposure.percentile": ("full_scale", "average"),
+    "sensor.exposure.average": ("full_scale", "percentile"),
+    "known.distance_mm": ("distance_error",), "known.distance_error": ("distance_mm",),
+    "rig.preset": ("lights",),
+    "rig.lights": ("preset", "count", "radius_mm", "azimuth_deg", "axial_mm", "power", "each"),
+}  # fmt: skip
+"""Keys of a scene, each with those beside it that it excludes, and which it replaces where it is set."""
 
 
 def replace_values(
@@ -18,8 +26,7 @@ def replace_values(
     """Replace values at key paths as `apply_settings` does, and drop what a table's new type does not have.
 
     Setting ``reflectance.type`` to another type leaves no key of the former one behind, unless it is set as well: then
-    it is refused by its name. Keys that both types have stay. In the same way ``camera.fov_deg`` replaces the camera's
-    focal lengths, and they replace it.
+    it is refused by its name. Keys that both types have stay. In the same way a key replaces its `RIVALS`.
 
     Parameters
     ----------
@@ -57,12 +64,18 @@ def replace_values(
 
 
 def _without_rivals(data: Mapping[str, Any], settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return tables without the keys of the camera that a setting's key excludes."""
-    camera = data.get("camera")
-    if not isinstance(camera, Mapping):
-        return data
-    gone = {key for path in settings for key in RIVALS.get(path, ())}
-    return {**data, "camera": {key: value for key, value in camera.items() if key not in gone}} if gone else data
+    """Return tables without the keys that a setting's key excludes."""
+    tables = copy.deepcopy(dict(data))
+    for rival in (rival for path in settings for rival in rivals(path)):
+        *parents, key = rival.split(".")
+        if isinstance(table := _at(tables, parents), dict):
+            table.pop(key, None)
+    return tables
+
+
+def rivals(path: str) -> list[str]:
+    """Return the key paths that a set one excludes."""
+    return [f"{path.rpartition('.')[0]}.{key}" for key in RIVALS.get(path, ())]
 
 
 def _at(data: Any, path: list[str]) -> Any:

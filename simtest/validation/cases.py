@@ -79,6 +79,14 @@ class Case:
         """Whether the case is one of the published protocol, which renders nothing."""
         return is_paper(self.data)
 
+    @property
+    def is_coloured(self) -> bool:
+        """Whether its scenes take three channels, as one at the lower ends of what is drawn does."""
+        if self.is_paper:
+            return False
+        ends = {path: drawn.low for path, drawn in self.random.items()}
+        return scene_from_dict(apply_settings(self.data, ends, self.where), self.where).is_coloured
+
     def paper_setting(self) -> PaperSetting:
         """Return the setting of the published protocol; raise `InputError` where a value does not fit."""
         return paper_from_dict(self.data, self.where)

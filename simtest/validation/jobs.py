@@ -63,9 +63,4 @@ def variant_of(cases: Sequence[Case], variant: str | None = None) -> str:
     The variant depends on the experiment's own scenes alone, never on the other experiments of a run: in a colour
     variant even a grey scene has three channels, each with its own noise, and their mean is less noisy.
     """
-    return backend.requested_variant(variant, coloured=any(map(_is_coloured, cases)))
-
-
-def _is_coloured(case: Case) -> bool:
-    """Return whether a scene has the colour of tissue."""
-    return "albedo" in case.data.get("reflectance", {})
+    return backend.requested_variant(variant, coloured=any(case.is_coloured for case in cases))

@@ -368,7 +368,7 @@ ROWS = (
     row("falloff's shift not undone", "estimators", "estimators.bisector:_normals", "sightlines = sightline - slope",
         "sightlines = sightline - 0.0 * slope", "bisector"),
     row("part by an untold falloff four times too large", "budget", "estimators.prior_parts:falloff_part",
-        "_unit_variance(power) * np.outer(shift, shift)", "4 * _unit_variance(power) * np.outer(shift, shift)",
+        "return equivalent_covariance(", "return 4 * equivalent_covariance(",
         "prior_parts"),
     row("photometric covariance turned the wrong way", "covariance", "estimators.photometric:_turned",
         "turn @ covariance @ turn.T", "turn.T @ covariance @ turn", "turned_frames"),

@@ -218,8 +218,10 @@ def test_the_example_of_the_manual_reads_back(tmp_path):
 
 
 def test_a_guessed_camera_is_written_with_its_deviations_alone(tmp_path):
-    stated = calibration_of_view(70.0, 200, 160)
-    again = written(stated, tmp_path)
-    same(again, stated)
-    assert (stated.priors.camera.guessed, again.priors.camera.guessed) == (True, False)
-    assert set(priors_message(stated.priors)["camera"]) == {"focal_sd", "centre_sd_px", "distortion_sd"}
+    names = {"focal_sd", "centre_sd_px", "distortion_sd"}
+    for fov_deg, more in ((70.0, set()), (140.0, {"edge_reach"})):
+        stated = calibration_of_view(fov_deg, 200, 160)
+        again = written(stated, tmp_path)
+        same(again, stated)
+        assert (stated.priors.camera.guessed, again.priors.camera.guessed) == (True, False)
+        assert set(priors_message(stated.priors)["camera"]) == names | more

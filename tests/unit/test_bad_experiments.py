@@ -127,20 +127,26 @@ def test_settings_of_an_experiment():
 
 
 def test_few_viewpoints_of_an_experiment():
-    few, all_of_them = load_experiment("mesh", {"views": 3}), load_experiment("mesh")
+    few, all_of_them = load_experiment("mesh", {"viewpoints": 3}), load_experiment("mesh")
     assert {case.data["surface"]["viewpoint"] for case in expand(few)} == {0, 1, 2}
     kinds = {case.setting for case in expand(all_of_them)}
     assert {case.setting for case in expand(few)} == kinds
     # 48, 5 x 12 and 3 x 8 frames, or 3 of each.
     assert (len(expand(all_of_them)), len(expand(few))) == (132, 27)
-    assert few.description.endswith("Cut down by views=3: at most the first 3 viewpoints of each setting.")
-    assert len(expand(load_experiment("mesh", {"views": 1000}))) == 132
-    refused(lambda: load_experiment("curvature", {"views": 3}), "--set views: no group of", "varies surface.viewpoint")
+    assert few.description.endswith("Cut down by viewpoints=3: at most the first 3 viewpoints of each setting.")
+    assert len(expand(load_experiment("mesh", {"viewpoints": 1000}))) == 132
+    refused(
+        lambda: load_experiment("curvature", {"viewpoints": 3}),
+        "--set viewpoints: no group of",
+        "varies surface.viewpoint",
+    )
 
 
 @pytest.mark.parametrize("bad", [0, -1, 2.5, True, "x"])
 def test_a_number_of_viewpoints_is_a_whole_one(bad):
-    refused(lambda: load_experiment("mesh", {"views": bad}), f"--set views={bad}: must be a whole number from 1")
+    refused(
+        lambda: load_experiment("mesh", {"viewpoints": bad}), f"--set viewpoints={bad}: must be a whole number from 1"
+    )
 
 
 # Folders of a run ------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import pytest
 
 from simtest.calibration import Calibration, Response
 from simtest.errors import Failure, Reason
-from simtest.geometry import Camera
+from simtest.geometry import Camera, Patch
 from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, reconstruct
 from simtest.spec import load_camera
 from tests.refusals import refused
@@ -110,6 +110,12 @@ FRAMES = {
 def test_frames(name):
     frame, *fragments = FRAMES[name]
     refused(lambda: reconstruct(frame, EYE), *fragments)
+
+
+@pytest.mark.parametrize("peak", [(2, 2), (4, 8), (8, 4), (14, 8), (8, 14), (-1, 8)])
+def test_a_peak_outside_its_region(peak):
+    """An index below 0 took the value of the pixel that is counted from the far end."""
+    refused(lambda: Patch.cut(SPOT, (5, 5, 9, 9), peak), f"peak = {peak[0]},{peak[1]}: must lie inside its region")
 
 
 ARGUMENTS = {

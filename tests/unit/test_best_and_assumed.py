@@ -12,7 +12,16 @@ from simtest.calibration import NO_PRIORS, CameraPrior, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.process.requests import priors_message
 from simtest.estimators.protocol import Estimate
-from simtest.reconstruction.assumptions import FOCAL_SD, NEAR_MISSES, assumptions, calibration_of_view
+from simtest.geometry import KannalaBrandt, ViewMask
+from simtest.reconstruction.assumptions import (
+    CENTRE_SD_SHARE,
+    FOCAL_SD,
+    LENS_SD,
+    NEAR_MISSES,
+    assumptions,
+    calibration_of_round_view,
+    calibration_of_view,
+)
 from simtest.reconstruction.borders import BORDERED
 from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
 from simtest.reconstruction.ranking import best_of, stated_errors
@@ -104,7 +113,15 @@ def test_a_field_of_view_spans_what_it_is_told_to_span(across, corner):
 def test_a_field_of_view_is_told_with_its_extent(tmp_path):
     with pytest.raises(InputError, match="--fov-of depth: must be one of width, height, diagonal"):
         calibration_of_view(70.0, 200, 160, "depth")
-    assert calibration_of_view(175.0, 200, 10, "height").camera.width == 200
+    # A wide field is that of an equidistant lens, which images nothing straight behind it.
+    wide = calibration_of_view(120.0, 200, 160, "height")
+    assert (wide.camera.distortion, wide.camera.fy) == (KannalaBrandt(), pytest.approx(80 / np.radians(60.0)))
+    assert calibration_of_view(100.0, 200, 160).camera.distortion is None
+    with pytest.raises(InputError, match="--fov 175: the corners of the picture would see more than 180 deg off"):
+        calibration_of_view(175.0, 200, 10, "height")
+    # Black corners far outside a round view need no direction.
+    masked = calibration_of_round_view(170.0, 400, 160, ViewMask(200.0, 80.0, 60.0)).camera
+    assert masked.view_mask == ViewMask(200.0, 80.0, 60.0)
     picture = np.zeros((160, 200), np.float32)
     _, (told,) = read_calibration(Options(fov_deg=70.0, fov_of="diagonal"), picture)
     assert "70 deg across the picture's diagonal" in told
@@ -145,12 +162,17 @@ def test_dark_borders_are_named_and_the_note_can_be_obeyed():
 
 
 def test_a_field_of_view_may_span_the_round_view():
-    options = Options(fov_deg=70.0, fov_of="view")
+    options = Options(fov_deg=140.0, fov_of="view")
     calibration, (told,) = read_calibration(options, tissue(ROUND))
-    camera = calibration.camera
+    camera, edge = calibration.camera, np.radians(70.0)
     assert (camera.cx, camera.cy) == pytest.approx((110, 80), abs=0.7)
-    assert camera.fx == pytest.approx(75 / np.tan(np.radians(35.0)), rel=0.02)
-    assert calibration.priors == calibration_of_view(70.0, 200, 160).priors
+    assert (camera.distortion, camera.view_mask) == (KannalaBrandt(), None)
+    assert camera.fx == pytest.approx(75 / edge, rel=0.02)
+    assert calibration.priors.camera == CameraPrior(FOCAL_SD, CENTRE_SD_SHARE * 200, LENS_SD, edge)
+    (lens,) = (each for each in assumptions(calibration, None, "fine") if each.what == "distortion")
+    assert (
+        lens.distribution == "equidistant, its k1 normal, ± 0.17, unchanged 1.22 focal lengths from the principal point"
+    )
     assert "across the picture's round view" in told
     with pytest.raises(InputError, match="--fov-of view: no round view was found"):
         read_calibration(options, tissue(np.ones((160, 200), bool)))
@@ -159,7 +181,8 @@ def test_a_field_of_view_may_span_the_round_view():
 def test_a_full_calibration_leaves_nothing_open(tmp_path):
     path = tmp_path / "c.toml"
     path.write_text(
-        CAMERA_KEYS + '[response]\ntype = "srgb"\n[vignetting]\ntype = "cosine"\n[rig]\nlights_mm = [[0, 0, 0]]\n'
+        CAMERA_KEYS + '[response]\ntype = "srgb"\n[vignetting]\ntype = "cosine"\n'
+        '[emission]\ntype = "cosine"\n[rig]\nlights_mm = [[0, 0, 0]]\n'
         "distance_mm = 40.0\n"
     )
     # But for highlights that hold no highlight point; a plane has none of these.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import simtest
-from simtest.calibration import Calibration, NoiseModel, Response
+from simtest.calibration import Calibration, NoiseModel, Priors, Response, Uniform
 from simtest.calibration.calibration import MIN_FALLOFF
 from simtest.detection import detect, estimate_noise
 from simtest.errors import Failure, InputError, Reason
@@ -68,6 +68,7 @@ def test_a_whole_file_is_read(tmp_path, text):
         AngularProfile(angles=(0.0, np.radians(60.0)), values=(1.0, 0.5)),
         NoiseModel(0.0, 5000.0, 4.0, 10, response),
         0.98,
+        Priors(falloff_power=None),
     )
 
 
@@ -205,6 +206,20 @@ def test_emission_counts_like_vignetting():
     np.testing.assert_array_equal(lens.falloff, light.falloff)
     both = Calibration(CAMERA, vignetting=AngularProfile(1.0), emission=AngularProfile(2.0))
     np.testing.assert_allclose(both.falloff, lens.falloff)
+
+
+def test_a_prior_on_the_falloff_is_left_alone_and_must_hold_what_is_not_undone():
+    """It was dropped as soon as one part was given, and an emission was undone wherever the lights were."""
+    power, profile = Uniform(0.0, 3.0), AngularProfile(2.0)
+    for parts in ({"vignetting": profile}, {"emission": profile}, {"vignetting": profile, "emission": profile}):
+        assert Calibration(CAMERA, **parts, priors=Priors(falloff_power=power)).priors.falloff_power == power
+    beside = Priors(((5.0, 0.0, 0.0),), falloff_power=power)
+    assert Calibration(CAMERA, emission=profile, priors=beside).falloff is None
+    lens = Calibration(CAMERA, vignetting=profile)
+    both = Calibration(CAMERA, vignetting=profile, emission=profile, priors=beside)
+    np.testing.assert_array_equal(both.falloff, lens.falloff)
+    with pytest.raises(InputError, match="emission: cannot be undone for lights_mm beside the camera"):
+        Calibration(CAMERA, emission=profile, priors=dataclasses.replace(beside, falloff_power=None))
 
 
 def test_where_no_light_is_left_the_gain_is_limited_and_marked():

@@ -242,6 +242,30 @@ def test_other_folders_are_left_alone(copy, tmp_path):
 # Fields -------------------------------------------------------------------------------------------------------------
 
 
+def test_whole_numbers_may_be_even_in_the_logarithm():
+    """`log` was ignored beside `integer`: the median of 1 to 1000 was 517."""
+    rng = np.random.default_rng(1)
+    drawn = np.array([Distribution(low=1, high=1000, log=True, integer=True).draw(rng) for _ in range(4000)])
+    assert (drawn.min(), drawn.dtype.kind) == (1, "i")
+    assert drawn.max() <= 1000
+    # P(n) = ln((n + 1) / n) / ln(1001), to four standard deviations
+    for number in (1, 2, 10):
+        share = np.log((number + 1) / number) / np.log(1001)
+        assert np.mean(drawn == number) == pytest.approx(share, abs=4 * np.sqrt(share / 4000))
+    assert Distribution(low=7, high=7, log=True, integer=True).draw(rng) == 7
+
+
+def test_settings_of_a_dataset_fix_what_lies_below_them():
+    """A drawn `sensor.exposure.average` won over the table that was set, and misspelt keys were taken."""
+    dataset = load_dataset("endoscopy", {"sensor.exposure": {"gain": 2.0}})
+    assert all(family.set["sensor.exposure"] == {"gain": 2.0} for family in dataset.families)
+    assert not [key for family in dataset.families for key in family.per_sample if key.startswith("sensor.exposure")]
+    with pytest.raises(InputError, match=r"--set sensr.exposure: unknown key; allowed: .*\(did you mean sensor\?\)"):
+        load_dataset("endoscopy", {"sensr.exposure": {"gain": 2.0}})
+    with pytest.raises(InputError, match=r"the dataset varies reflectance\.colour as a whole"):
+        load_dataset("smooth", {"reflectance.colour.0": 0.5})
+
+
 @given(seed=st.integers(0, 999), scale=st.floats(1.0, 5e3))
 @settings(max_examples=30, deadline=None)
 def test_fields_come_back(seed, scale):

@@ -34,7 +34,7 @@ def described(*instruments, light=LIGHT, **more):
 
 @pytest.fixture(scope="module")
 def session():
-    return Session(described(SHAFT), labelled=True)
+    return Session(described(SHAFT), "llvm_ad_mono", labelled=True)
 
 
 def sightlines():

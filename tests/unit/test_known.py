@@ -112,9 +112,21 @@ def test_a_calibration_file_says_it(tmp_path):
     )
     told = Priors(((4.0, 0.0, 0.0), (-4.0, 0.0, 1.0)), Normal(40.0, 8.0), exactly(200.0))
     assert load_calibration(path).priors == told
-    # A falloff that is stated, even as none, is no prior any more.
-    path.write_text(path.read_text() + '[emission]\ntype = "cosine"\npower = 0.0\n')
-    assert load_calibration(path).priors == replace(told, falloff_power=None)
+    # One part of the falloff leaves the other open; both, even as none, leave no prior.
+    emission, vignetting = (f'[{name}]\ntype = "cosine"\npower = 0.0\n' for name in ("emission", "vignetting"))
+    for stated, prior in (
+        (emission, told),
+        (vignetting, told),
+        (emission + vignetting, replace(told, falloff_power=None)),
+    ):
+        path.write_text(path.read_text().partition("[emission]")[0].partition("[vignetting]")[0] + stated)
+        assert load_calibration(path).priors == prior
+    # An emission is undone for a light at the camera alone.
+    path.write_text(
+        path.read_text().replace('[emission]\ntype = "cosine"\npower = 0.0', '[emission]\ntype = "cosine"\npower = 2.0')
+    )
+    read = load_calibration(path)
+    assert (read.priors, read.falloff) == (told, None)
     path.write_text(path.read_text().replace("distance_mm = 40.0", ""))
     with pytest.raises(InputError, match="distance_sd_mm"):
         load_calibration(path)

@@ -28,6 +28,9 @@ type = "linear"
 [vignetting]
 type = "cosine"
 power = 0.0
+[emission]
+type = "cosine"
+power = 0.0
 [rig]
 lights_mm = [[0.0, 0.0, 0.0]]
 distance_mm = 10.0

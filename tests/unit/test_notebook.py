@@ -177,10 +177,10 @@ def test_a_mistyped_key_of_an_experiment_is_guessed(tmp_path, name, meant):
 
 def test_the_number_of_viewpoints_is_a_key_of_the_experiment(tmp_path):
     """Scenes that are computed have no key of that name."""
-    with pytest.raises(InputError, match=r"--set views: no group of .*paper\.toml varies surface\.viewpoint"):
-        simtest.validate("paper", tmp_path / "run", views=1)
-    with pytest.raises(InputError, match="--set views=0: must be a whole number from 1 on"):
-        simtest.validate("colon", tmp_path / "run", views=0)
+    with pytest.raises(InputError, match=r"--set viewpoints: no group of .*paper\.toml varies surface\.viewpoint"):
+        simtest.validate("paper", tmp_path / "run", viewpoints=1)
+    with pytest.raises(InputError, match="--set viewpoints=0: must be a whole number from 1 on"):
+        simtest.validate("colon", tmp_path / "run", viewpoints=0)
 
 
 @pytest.mark.render

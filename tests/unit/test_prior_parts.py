@@ -8,6 +8,7 @@ from scipy.stats import chi2
 
 from simtest.calibration import LIGHT_AT_CAMERA, CameraPrior, LogUniform, Normal, Priors, Uniform, exactly
 from simtest.errors import InputError
+from simtest.estimators import prior_parts
 from simtest.estimators.budget import equivalent_variance, line_covariance
 from simtest.estimators.family_fit import fit_isophote_family
 from simtest.estimators.prior_parts import (
@@ -243,7 +244,7 @@ def falloff_frame(power, camera, widths=(7.0, 10.0)):
 
 
 @pytest.mark.parametrize("name", ["cone_axis", "brightest_point", "curved"])
-def test_a_falloff_that_nobody_told_is_covered(name):
+def test_a_falloff_that_nobody_told_is_covered(name, monkeypatch):
     camera = Camera.from_fov(80.0, 320, 240)
     powers = (np.arange(20) + 0.5) / 5  # evenly over the prior, 0 to 4
     estimator = load_estimators([name])[name]
@@ -260,10 +261,11 @@ def test_a_falloff_that_nobody_told_is_covered(name):
         Patch.cut(smooth(falloff_frame(0.0, camera), 1.0), (180, 30, 90, 90), noise=1e-4, smoothing_px=1.0),
         camera, (0.5,),
     )  # fmt: skip
-    part = falloff_part(right.normal, family, told.falloff_power)
+    part = falloff_part(right.normal, family, told.falloff_power, told)
     along = np.linalg.eigh(part)[1][:, 1]
-    # The law: k tan(phi) times the lobe's moments.
-    exact = falloff_part(right.normal, family, exactly(4.0)) / equivalent_variance(np.ones(8))
+    # The law about the optical axis: k tan(phi) times the lobe's moments.
+    monkeypatch.setattr(prior_parts, "TILT", 0.0)
+    exact = falloff_part(right.normal, family, exactly(4.0), told) * LIMIT
     largest = float(np.abs(tangent_coordinates(right.normal, estimated(4.0, LIGHT_AT_CAMERA).normal) @ along))
     limit = {"cone_axis": 0.05, "curved": 0.05, "brightest_point": 0.3}[name]
     assert np.sqrt(exact[0, 0] + exact[1, 1]) == pytest.approx(largest, rel=limit)

@@ -3,11 +3,15 @@
 import numpy as np
 import pytest
 
+from simtest.api import _scene
 from simtest.errors import InputError
+from simtest.runtime.files import write_json
 from simtest.simulation.camera_chain import capture
+from simtest.spec import load_scene
 from simtest.spec.scene import scene_from_dict
 from simtest.spec.sensor import Sensor
 from simtest.spec.sensor_presets import PRESETS
+from tests.refusals import refused
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -61,6 +65,40 @@ def test_bad_sensors_are_named_in_one_line(sensor, words):
         scene_from_dict({"surface": {"type": "plane"}, "sensor": sensor})
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("new", PRESETS)
+@pytest.mark.parametrize("kept", [False, True])
+def test_another_preset_replaces_the_numbers_of_the_former(new, kept, tmp_path):
+    """A scene as an object, and one in frame.json, kept the full well, sharpening and coding of the former preset."""
+    own = {"sensor.full_well": 9000.0, "sensor.sharpening.amount": 0.3} if kept else {}
+    expected = load_scene("cylinder", {**own, "sensor.preset": new}).sensor
+    scene = load_scene("cylinder", {**own, "sensor.preset": "colonoscope_hd"})
+    assert _scene(scene, {"sensor.preset": new}, {}).sensor == expected
+    write_json(tmp_path / "frame.json", {"scene": scene.model_dump(mode="json")})
+    assert load_scene(tmp_path / "frame.json", {"sensor.preset": new}).sensor == expected
+
+
+def test_another_tissue_replaces_the_colour_of_the_former(tmp_path):
+    preset = {"reflectance.albedo.preset": "liver_capsule"}
+    expected = load_scene("tissue_colon", preset).reflectance.albedo
+    assert expected.base == (0.2, 0.04, 0.033)
+    write_json(tmp_path / "frame.json", {"scene": load_scene("tissue_colon").model_dump(mode="json")})
+    for made in (_scene(load_scene("tissue_colon"), preset, {}), load_scene(tmp_path / "frame.json", preset)):
+        assert made.reflectance.albedo == expected
+    # Negative control: without a new preset a part of the former one can be set.
+    assert _scene(load_scene("tissue_colon"), {"reflectance.albedo.base.1": 0.5}, {}).albedo.base == (0.66, 0.5, 0.19)
+
+
+def test_what_a_preset_gives_can_be_switched_off():
+    """TOML has no null."""
+    stages = ("mosaic", "colour", "sharpening", "scaling", "overlay", "coding", "full_well", "bits")
+    off = {f"sensor.{name}": False for name in stages} | {"sensor.read_noise": 0.0}
+    sensor = load_scene("plane", {"sensor.preset": "old_sd", **off}).sensor
+    assert [getattr(sensor, name) for name in stages] == [None] * len(stages)
+    assert sensor.response.type == "srgb"
+    refused(lambda: load_scene("plane", {"sensor.coding": True}), "sensor.coding = True: must be a table")
+    refused(lambda: load_scene("plane", {"sensor.read_noise": False}), "sensor.read_noise = False: must be a number")
 
 
 def test_presets_differ_in_what_they_do_to_an_edge():

@@ -176,6 +176,15 @@ def test_a_guessed_camera_is_drawn_about_the_guess():
     assert np.std([each["distortion"]["k1"] for each in made]) == pytest.approx(0.05, rel=0.2)
 
 
+def test_a_lens_whose_edge_is_given_is_drawn_about_that_edge():
+    camera, prior = replace(CAMERA, distortion=KannalaBrandt()), CameraPrior(distortion_sd=0.1, edge_reach=1.0)
+    pixels = np.array([camera.cx, camera.cy]) + np.array([[1.0], [0.5]]) * [camera.fx, 0.0]
+    made = [validate(SceneCamera, drawn_camera(camera, prior, rng(seed)), "camera").model() for seed in range(200)]
+    seen = np.array([each.project(camera.unproject(pixels)) for each in made])[..., 0] - pixels[:, 0]
+    assert seen[:, 0] == pytest.approx(0, abs=1e-6)
+    assert np.std(seen[:, 1]) == pytest.approx(0.1 * 0.5 * 0.75 * camera.fx, rel=0.25)
+
+
 @pytest.mark.parametrize("lens", [None, BrownConrady(0.1), KannalaBrandt(0.02), Scaramuzza(-0.1)])
 def test_a_given_lens_is_drawn_about_what_is_given(lens):
     """The prior moves a point at r focal lengths by k1 r^3 focal lengths, whatever the lens."""

@@ -1,9 +1,15 @@
 """A setting that gives a table another type, and messages that name keys as the user wrote them."""
 
+from functools import reduce
+
 import pytest
 
 from simtest.errors import InputError
-from simtest.spec import load_calibration, load_experiment, load_scene
+from simtest.runtime.resources import find
+from simtest.spec import Scene, load_calibration, load_dataset, load_experiment, load_scene, read_toml
+from simtest.spec.scene import scene_from_dict
+from simtest.spec.toml_files import apply_settings
+from simtest.spec.type_change import replace_values
 from simtest.validation.cases import expand
 from tests.refusals import refused
 
@@ -36,6 +42,39 @@ def test_an_experiment_of_another_type(tmp_path):
     (case,) = expand(load_experiment(path, {"reflectance.type": "rough_conductor"}))
     assert case.data["reflectance"]["type"] == "rough_conductor"
     assert "exponent" not in case.data["reflectance"]
+
+
+@pytest.mark.parametrize(("settings", "key", "rivals"), [
+    ({"sensor.exposure.average": 0.4}, "sensor.exposure.percentile", ["sensor.exposure.average"]),
+    ({"sensor.exposure.percentile": 99.0}, "sensor.exposure.full_scale", ["sensor.exposure.percentile"]),
+    ({"known.distance_mm": 9.0}, "known.distance_error", ["known.distance_mm"]),
+    ({"known.distance_error": 0.1}, "known.distance_mm", ["known.distance_error"]),
+    ({"rig": {"preset": "laparoscope", "radius_mm": 3.0}}, "rig.lights", ["rig.preset", "rig.radius_mm"]),
+])  # fmt: skip
+def test_a_key_that_is_set_replaces_what_it_excludes(settings, key, rivals, tmp_path):
+    """But for the camera's focal length, such a key was refused over a file that has the other."""
+    value = [{"offset_mm": 2.0}] if key == "rig.lights" else 1.5
+    data = apply_settings(read_toml(find("plane", "scenes")), settings, "plane")
+    replaced = replace_values(Scene, data, {key: value}, "plane")
+    scene_from_dict(replaced)
+    for rival in rivals:
+        *parents, name = rival.split(".")
+        assert name not in reduce(dict.__getitem__, parents, replaced)
+    # Both together are refused as ever.
+    both = {key: value, rivals[0]: reduce(dict.__getitem__, rivals[0].split("."), data)}
+    refused(lambda: load_scene("plane", both), "exclude each other")
+
+
+def test_a_preset_of_lights_replaces_a_list_of_them():
+    assert len(load_scene("plane", {"rig.lights": [{}]}).rig.lights) == 1
+    path = find("plane", "scenes")
+    data = apply_settings(read_toml(path), {"rig.lights": [{"offset_mm": 1.0}]}, "plane")
+    assert len(scene_from_dict(replace_values(Scene, data, {"rig.preset": "laparoscope"}, "plane")).rig.lights) == 8
+
+
+def test_what_excludes_a_drawn_value_fixes_it_too():
+    dataset = load_dataset("endoscopy", {"sensor.exposure.percentile": 99.0})
+    assert not [key for family in dataset.families for key in family.per_sample if key.startswith("sensor.exposure")]
 
 
 @pytest.mark.parametrize("value", ["-1.0", "'steep'", "90.0", "{ low = 3.0 }", "[1.0]"])

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from simtest.rendering import Session
 from simtest.runtime.engines import make_engine
 from simtest.spec import load_experiment
 from simtest.validation.case_work import by_variant
@@ -86,6 +87,32 @@ def test_jobs_of_one_variant_follow_each_other(experiments, tmp_path):
     jobs = make_jobs([(experiments[name], tmp_path / name) for name in ("grey", "coloured", "grey_too")], None)
     assert [job.folder.name for job in by_variant(jobs)] == ["grey", "grey_too", "coloured"]
     assert len({job.digest for job in jobs}) == 3
+
+
+@pytest.mark.parametrize(("keys", "coloured"), [
+    ('"reflectance.diffuse" = 0.5', False),
+    ('"reflectance.diffuse" = 0.5, "reflectance.colour" = [0.5, 0.5, 0.5]', False),
+    ('"reflectance.diffuse" = 0.5, "reflectance.colour" = [0.85, 0.45, 0.4]', True),
+    ('"rig.lights" = [{}, { offset_mm = 2.0, colour = [1.0, 0.9, 0.8] }]', True),
+    ('"instruments" = [{ kind = "shaft", tip = [0.5, 0.5] }]', True),
+    ('"instruments" = [{ kind = "shaft", tip = [0.5, 0.5], present = false }]', False),
+])  # fmt: skip
+def test_whatever_is_not_grey_is_rendered_in_colour(keys, coloured, tmp_path):
+    """Bases and lights of a colour were rendered grey without a word."""
+    path = tmp_path / "own.toml"
+    path.write_text(GREY.replace('"sensor.noise_sigma" = 0.02', f'"sensor.noise_sigma" = 0.02, {keys}'.strip(", ")))
+    cases = expand(load_experiment(path))
+    scene, _ = cases[0].scene(load_experiment(path), 0)
+    assert scene.is_coloured == coloured
+    assert variant_of(cases) == ("llvm_ad_rgb" if coloured else "llvm_ad_mono")
+    assert Session(scene).variant == variant_of(cases)
+
+
+def test_a_colour_that_is_drawn_is_rendered_in_colour(tmp_path):
+    path = tmp_path / "own.toml"
+    grey = GREY.replace('"sensor.noise_sigma" = 0.02', '"reflectance.colour" = [0.8, 0.8, 0.8]')
+    path.write_text(grey + '[groups.random]\n"reflectance.colour.1" = { low = 0.2, high = 0.6 }\n')
+    assert variant_of(expand(load_experiment(path))) == "llvm_ad_rgb"
 
 
 def test_the_variant_is_that_of_the_scenes_unless_one_is_named(experiments):

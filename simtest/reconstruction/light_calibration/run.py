@@ -12,7 +12,7 @@ from simtest.calibration import Calibration
 from simtest.calibration.lights.mirrors import Mirrors
 from simtest.calibration.lights.result import LightCalibration, covariance_of_variations, judge
 from simtest.calibration.lights.search import MOST_LIGHTS, Found, find_lights
-from simtest.calibration.priors import UNTOLD_OFFSET_MM, Matrix
+from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, Matrix
 from simtest.errors import InputError
 from simtest.geometry import Array, Image
 from simtest.geometry.camera import Camera
@@ -191,7 +191,7 @@ def _variations(
             focal, dx, dy, radial = errors.tolist()
             other = replace(
                 camera, fx=camera.fx * (1 + focal), fy=camera.fy * (1 + focal), cx=camera.cx + dx, cy=camera.cy + dy
-            ).with_radial_error(radial)
+            ).with_radial_error(radial, prior.edge_reach)
             yield other, _seen_by(views, camera, other, mirror)
     if isinstance(mirror, Ball):
         changed = [
@@ -229,6 +229,9 @@ def with_lights(calibration: Calibration, result: LightCalibration) -> Calibrati
     told = replace(
         calibration.priors, lights_mm=positions, lights_covariance_mm2=matrices, light_offset_mm=UNTOLD_OFFSET_MM
     )
+    if told.falloff_power is None and not calibration.emission.is_uniform:
+        # An emission is undone for a light at the camera alone.
+        told = replace(told, falloff_power=UNTOLD_FALLOFF_POWER)
     return replace(calibration, priors=told)
 
 
