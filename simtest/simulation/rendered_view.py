@@ -68,6 +68,11 @@ class RenderedView:
         return sum(highlight.isolated for highlight in self.highlights)
 
     @cached_property
+    def lobe(self) -> Image:
+        """Mean of the channels of the lobe's direct light before the lens, shape (H, W)."""
+        return _mean(self.radiance.specular)
+
+    @cached_property
     def _specular(self) -> Image:
         """Mean of the channels of the lobe's light behind the lens, shape (H, W)."""
         return _mean(collect(self.radiance.specular, self.scene.sensor, self.calibration.camera))

@@ -8,9 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtest.calibration import NoiseModel
-from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_MIN_GAIN, PIXEL_CENTRE
+from simtest.conventions import (
+    DEFAULT_SMOOTHING_PX,
+    HIGHLIGHT_CONTRAST_SIGMA,
+    HIGHLIGHT_ISOVALUE,
+    HIGHLIGHT_MIN_GAIN,
+    PIXEL_CENTRE,
+)
 from simtest.detection import contrast, half_height_component
-from simtest.detection.regions import Component
+from simtest.detection.regions import Component, component_above
 from simtest.geometry import smooth
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Image, IntArray, Mask
@@ -19,9 +25,6 @@ from simtest.runtime.short_repr import short_repr
 
 Pixel = tuple[int, int]
 """Row and column."""
-
-MAX_CLIMB_PX = 12
-"""Smoothing moves a lopsided highlight's maximum away from its true BP, by no more than this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +70,7 @@ class TrueHighlight(HighlightPoint):
             "bp_px": self.bp_px.tolist(),
             "position_mm": self.position.tolist(),
             "normal": self.normal.tolist(),
+            "direction_min": self.direction_min.tolist(),
             "distance_mm": self.distance,
             "kd_min": self.kd_min,
             "kd_max": self.kd_max,
@@ -76,6 +80,9 @@ class TrueHighlight(HighlightPoint):
             "pool": self.pool,
             "radius_px": self.radius_px if math.isfinite(self.radius_px) else None,
             "cloud": self.cloud,
+            "lit": self.lit,
+            "hidden": self.hidden,
+            "peak_snr": self.peak_snr if math.isfinite(self.peak_snr) else None,
             "isolated": self.isolated,
             "why_not": self.why_not or None,
         }
@@ -176,13 +183,18 @@ def may_be_isolated(point: HighlightPoint) -> bool:
     return point.lit and not point.min_gain <= HIGHLIGHT_MIN_GAIN
 
 
-def region_of(point: HighlightPoint, smoothed: Image, seen: Mask | None = None) -> Component | None:
-    """Return the pixels above half height of the maximum that a highlight point makes.
+def lobe_region(point: HighlightPoint, specular: Image, at_point: float) -> tuple[float, Component | None]:
+    """Return the peak that a highlight point makes in the lobe's light, and the connected pixels above half of it.
 
-    None where a higher maximum lies in it. `smoothed` is the noise-free smoothed light, shape (H, W); `seen` are the
-    pixels inside the camera's view mask, default all.
+    The peak is the brightest pixel uphill from the point, or the light `at_point` (`Session.lobe_at`) where that is
+    more: a highlight smaller than a pixel has none that reaches half of it, and no region. `specular` is the lobe's
+    noise-free light before the lens, shape (H, W).
     """
-    return half_height_component(smoothed, *_peak_pixel(smoothed, point), seen)
+    row, column = _peak_pixel(specular, point)
+    brightest = float(specular[row, column])
+    peak = max(at_point, brightest)
+    level = HIGHLIGHT_ISOVALUE * peak
+    return peak, component_above(specular, row, column, level) if brightest >= level > 0 else None
 
 
 def _owners(points: Sequence[HighlightPoint], peaks: list[Pixel]) -> dict[Pixel, HighlightPoint]:
@@ -233,11 +245,10 @@ def _peak_pixel(smoothed: Image, point: HighlightPoint) -> Pixel:
     """Climb from the true BP to the local maximum."""
     column, row = (int(v) for v in point.bp_px)
     row, column = min(row, smoothed.shape[0] - 1), min(column, smoothed.shape[1] - 1)
-    for _ in range(MAX_CLIMB_PX):
+    while True:
         top, left = max(row - 1, 0), max(column - 1, 0)
         window = smoothed[top : row + 2, left : column + 2]
         step = divmod(int(window.argmax()), window.shape[1])
         if (step[0] + top, step[1] + left) == (row, column):
-            break
+            return row, column
         row, column = step[0] + top, step[1] + left
-    return row, column
