@@ -220,7 +220,8 @@ def _examined(
     if not point.lit:
         return None, "hidden by an instrument" if point.hidden else "in shadow"
     component = half_height_component(smoothed, *peak, seen) if owns_peak else None
-    if component is None:
+    # Uphill may lead far: to another highlight, or to where the base is brightest.
+    if component is None or not component.holds(point.bp_px):
         return None, "part of a brighter one"
     height = contrast(smoothed, component, float(smoothed[peak]), seen)
     if _holds_any(component, others):
