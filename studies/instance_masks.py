@@ -24,7 +24,7 @@ from benchmarks.measuring import print_markdown
 from simtest.dataset.maker import Maker, colour_variant
 from simtest.dataset.plan import Plan
 from simtest.geometry import Camera
-from simtest.rendering import Session
+from simtest.rendering import Session, backend
 from simtest.rendering.rays import Sightlines
 from simtest.runtime.arrays import AnyArray, Array, Image, IntArray, Mask
 from simtest.spec import Scene, scene_from_dict
@@ -137,6 +137,7 @@ def compared(recipe: str, samples: int) -> Iterator[Compared]:
     """Compare all masks of the first samples of a recipe."""
     maker = Maker(Plan(load_dataset(recipe, {"samples": samples})))
     for index in range(samples):
+        backend.release_memory()
         sample = maker.make(index)
         scene, meta = scene_from_dict(sample.meta["scene"]), sample.meta
         session = Session(scene, colour_variant())

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.calibration import NoiseModel
 from simtest.conventions import (
     DEFAULT_SMOOTHING_PX,
     HIGHLIGHT_CONTRAST_SIGMA,
@@ -19,7 +18,7 @@ from simtest.detection import contrast, half_height_component
 from simtest.detection.regions import Component, component_above
 from simtest.geometry import smooth
 from simtest.rendering import HighlightPoint
-from simtest.runtime.arrays import Image, IntArray, Mask
+from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.runtime.files import Json
 from simtest.runtime.short_repr import short_repr
 
@@ -34,8 +33,8 @@ class TrueHighlight(HighlightPoint):
     Parameters
     ----------
     peak_snr : float
-        Peak above its surroundings over the standard deviation of the noise at the peak's level; inf without noise, 0
-        where it has no closed isophote.
+        Peak above its surroundings, up to where the sensor clips, over the standard deviation of the noise there
+        (`noise_at`); inf without noise, 0 where it has no closed isophote.
     why_not : str
         Empty for a true isolated highlight, else the first condition that it fails.
     radius_px : float
@@ -94,30 +93,20 @@ class Examined:
 
     Parameters
     ----------
+    peak : tuple of int
+        Row and column of the maximum that it makes.
     level : float
-        Smoothed light of the maximum that it makes.
+        Smoothed light there.
     height : float or None
         The maximum above its surroundings; None where it has no closed region of its own.
     why_not : str
         Empty for what is isolated if it stands above the noise, else the first condition that it fails.
     """
 
+    peak: Pixel
     level: float
     height: float | None
     why_not: str
-
-
-def judge(
-    points: list[HighlightPoint],
-    light: Image,
-    noise: NoiseModel,
-    full_scale: float,
-    channels: int = 1,
-    seen: Mask | None = None,
-    single: bool = False,
-) -> list[TrueHighlight]:
-    """Judge each highlight point by the noise-free frame (see `examine` and `verdicts`)."""
-    return verdicts(points, examine(points, light, seen, single), noise, full_scale, channels)
 
 
 def examine(
@@ -146,12 +135,12 @@ def examine(
     for point, peak in zip(points, peaks, strict=True):
         others = pixels[[own is not point for own in lit]] if single and owners.get(peak) is point else pixels[:0]
         height, why_not = _examined(point, smoothed, seen, peak, owners.get(peak) is point, others)
-        examined.append(Examined(float(smoothed[peak]), height, why_not))
+        examined.append(Examined(peak, float(smoothed[peak]), height, why_not))
     return examined
 
 
 def verdicts(
-    points: Sequence[HighlightPoint], examined: Sequence[Examined], noise: NoiseModel, full_scale: float, channels: int
+    points: Sequence[HighlightPoint], examined: Sequence[Examined], sigmas: Array, clip: float = math.inf
 ) -> list[TrueHighlight]:
     """Judge highlight points that were examined.
 
@@ -159,19 +148,17 @@ def verdicts(
     ----------
     points, examined : sequence
         Of the same length.
-    noise : NoiseModel
-        Of one channel of `channels`.
-    full_scale : float
-        Radiance at full scale; 0 where there is no light at all.
+    sigmas : ndarray, shape (N,)
+        Noise at each one's peak, radiance; 0 without noise.
+    clip : float
+        Radiance at which the sensor's values end.
     """
-    levels, sigmas = np.array([each.level for each in examined], dtype=np.float32), np.zeros(len(points))
-    if full_scale > 0 and len(points):
-        sigmas = np.asarray(noise.at(levels / full_scale, channels)) * full_scale
     highlights = []
     for point, each, sigma in zip(points, examined, sigmas.tolist(), strict=True):
         # Without a maximum of its own it has no SNR.
-        height, snr = each.height or 0.0, 0.0
+        snr = 0.0
         if each.height is not None:
+            height = min(each.level, clip) - min(each.level - each.height, clip)
             snr = height / sigma if sigma > 0 else np.inf if height > 0 else 0.0
         faint = f"peak below {HIGHLIGHT_CONTRAST_SIGMA:g} sigma" if snr < HIGHLIGHT_CONTRAST_SIGMA else ""
         highlights.append(TrueHighlight(**vars(point), peak_snr=snr, why_not=each.why_not or faint))
@@ -179,7 +166,7 @@ def verdicts(
 
 
 def may_be_isolated(point: HighlightPoint) -> bool:
-    """Return whether `judge` may call a highlight point isolated: by light and shape alone, whatever the frame."""
+    """Return whether a highlight point may be isolated: by light and shape alone, whatever the frame."""
     return point.lit and not point.min_gain <= HIGHLIGHT_MIN_GAIN
 
 

@@ -10,11 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simtest.calibration import NoiseModel
 from simtest.rendering import HighlightPoint, Session
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import Examined, examine, verdicts
-from simtest.spec import scene_from_dict
+from simtest.spec import load_scene, scene_from_dict
 
 NORMAL = np.array([0.0, 0.0, -1.0])
 POINT = HighlightPoint(
@@ -23,26 +22,42 @@ POINT = HighlightPoint(
     radiance=1.0,
 )  # fmt: skip
 
+SMALL = {"camera.width": 160, "camera.height": 120, "camera.fx": 160.0, "camera.fy": 160.0}
 
-def judged(height, noise, level=2.0, full_scale=4.0, channels=1):
-    (found,) = verdicts([POINT], [Examined(level=level, height=height, why_not="")], noise, full_scale, channels)
+
+def judged(height, sigma, level=2.0, **clip):
+    examined = Examined(peak=(5, 5), level=level, height=height, why_not="")
+    (found,) = verdicts([POINT], [examined], np.array([sigma]), **clip)
     return found
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-def test_the_snr_is_the_height_over_the_noise_at_its_level(channels):
-    # Half of full scale: white noise and that of 250 electrons of 500.
-    sigma = 4.0 * np.sqrt((0.01**2 + 0.5 / 500) / channels)
-    assert judged(1.0, NoiseModel(0.01, 500.0), channels=channels).peak_snr == pytest.approx(1 / sigma, rel=1e-6)
-    assert judged(0.0, NoiseModel()).peak_snr == 0
-    assert judged(1.0, NoiseModel()).peak_snr == np.inf
+def test_the_snr_is_the_height_over_the_noise():
+    assert judged(1.0, 0.02).peak_snr == pytest.approx(50, rel=1e-6)
+    assert judged(0.0, 0.0).peak_snr == 0
+    assert judged(1.0, 0.0).peak_snr == np.inf
 
 
 @pytest.mark.parametrize(("sigmas", "isolated"), [(9.9, False), (10.1, True)])
 def test_ten_sigma_make_a_detection(sigmas, isolated):
-    found = judged(4.0 * 0.01 * sigmas, NoiseModel(0.01))
+    found = judged(0.04 * sigmas, 0.04)
     assert (found.why_not == "") is isolated
     assert found.why_not in ("", "peak below 10 sigma")
+
+
+def test_light_counts_up_to_the_clip():
+    assert judged(1.0, 0.02, clip=1.5).peak_snr == pytest.approx(25, rel=1e-6)
+    assert judged(1.0, 0.02, clip=0.5).peak_snr == 0
+    assert judged(1.0, 0.0, clip=0.5).why_not == "peak below 10 sigma"
+
+
+@pytest.mark.render
+def test_a_white_frame_shows_no_highlight():
+    scene = load_scene("plane", {**SMALL, "reflectance.diffuse": 0.5, "sensor.saturation": True,
+                                 "sensor.exposure.gain": 100.0})  # fmt: skip
+    view = render_view(Session(scene), scene)
+    assert (view.frame(0) > 0.9).all()
+    assert [own.why_not for own in view.highlights] == ["peak below 10 sigma"]
+    assert [spot.peak_snr for spot in view.visible_highlights] == pytest.approx([0.0])
 
 
 def sloped(width):

@@ -7,11 +7,16 @@ from scipy import ndimage
 from simtest.dataset.fields import BY_NAME
 from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
+from simtest.rendering import Session
+from simtest.simulation.rendered_view import render_view
+from simtest.spec import scene_from_dict
 from simtest.spec.dataset_recipe import Dataset
 
 pytestmark = pytest.mark.render
 
 ONE = {"samples": 1, "highlights": 0, "splits": {"train": 1.0, "validation": 0.0, "test": 0.0}, "estimators": []}
+
+CAMERA = {"camera": {"width": 120, "height": 90, "fx": 80.0, "fy": 80.0}}
 
 
 def made(scene="plane", **values):
@@ -63,3 +68,19 @@ def test_the_lobe_at_a_point_is_what_a_ray_through_it_sees():
 def test_numbers_beyond_255_are_kept():
     field, numbers = BY_NAME["instance"], np.arange(600, dtype=np.int32).reshape(20, 30)
     assert np.array_equal(field.decode(field.encode(numbers), {}), numbers)
+
+
+def test_labels_do_not_hold_the_renderers_noise():
+    """Bounces at one sample a pixel are noise: labels and full scale are those of direct light, whatever the seed."""
+    tube = {"surface": {"type": "cylinder", "radius_mm": 15.0, "side": "inside", "distance_mm": 12.0}, **CAMERA}
+    tube |= {"reflectance": {"type": "phong", "exponent": 60.0, "diffuse": 0.8}}
+    tube |= {"rig": {"lights": [{"position_mm": [3.0, 0.0, 0.0]}, {"position_mm": [-3.0, 1.0, 0.0]}]}}
+    found = []
+    for seed in range(4):
+        scene = scene_from_dict(tube | {"render": {"path_depth": 6, "samples_per_pixel": 1, "seed": seed}})
+        view = render_view(Session(scene), scene)
+        assert view.radiance.indirect.max() > 0
+        spots = [spot.to_json() for spot in view.visible_highlights]
+        found.append((view.full_scale, spots, [own.to_json() for own in view.highlights], view.spots.regions.tolist()))
+    assert len(found[0][1]) > 0
+    assert found[1:] == found[:1] * 3
