@@ -6,21 +6,23 @@ from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import JsonValue
 
-from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_ISOVALUE
+from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.dataset.fields import INSTRUMENT, VISIBLE, depth_scale_mm
-from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta, SampleMeta
+from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta, InstanceMeta, SampleMeta
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample import Sample, sample_key
 from simtest.dataset.sample_calibration import calibration_of_picture, stored_picture
+from simtest.detection.regions import Component
 from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.process.naming import forgive_cores
-from simtest.geometry import ellipse_of_conic, fit_ellipse, smooth
+from simtest.geometry import ellipse_of_conic, fit_ellipse
 from simtest.reconstruction.found import Specularity
 from simtest.rendering import Frame, Session, backend
-from simtest.runtime.arrays import AnyArray, Image, Picture
+from simtest.runtime.arrays import AnyArray, Image
 from simtest.runtime.kept_arrays import only_reading
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
@@ -32,7 +34,7 @@ from simtest.simulation.rendered_view import (
     render_view,
     shows_isolated,
 )
-from simtest.simulation.true_highlights import TrueHighlight, region_of
+from simtest.simulation.true_highlights import TrueHighlight, lobe_region
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
 from simtest.validation.cloud_rows import of_clouds
@@ -41,8 +43,6 @@ from simtest.validation.results_table import ResultRow
 
 UNPLACED = 100
 """Draws that cannot be rendered, beyond the tries, before a sample is given up."""
-
-MAX_INSTANCES = 255
 
 
 def colour_variant(variant: str | None = None) -> str:
@@ -76,7 +76,15 @@ class Maker:
         # What the stored picture shows to a camera that knows its calibration and nothing of the truth.
         picture = stored_picture(seen.frame(scene.sensor.seed), scene.sensor)
         specularities = answer(seen, picture, self._estimators)
-        images = {"image": picture, **self._images(drawn, seen, frame)}
+        isolated = [i for i, truth in enumerate(seen.highlights) if truth.isolated]
+        lobes = session.lobe_at([seen.highlights[i] for i in isolated]).tolist()
+        regions = {i: lobe_region(seen.highlights[i], seen.lobe, at) for i, at in zip(isolated, lobes, strict=True)}
+        instance = _instances(seen.lobe.shape, regions)
+        images = {"image": picture, **self._images(drawn, seen, frame), "instance": instance}
+        areas = np.bincount(instance.ravel(), minlength=len(seen.highlights) + 1)[1:].tolist()
+        highlights = [_highlight(truth) for truth in seen.highlights]
+        for i, region in regions.items():
+            highlights[i]["region"] = _instance_of(region, areas[i], seen.full_scale)
         scored = self.score(index, session, seen, specularities, self._estimators)
         meta: SampleMeta = {
             "key": sample_key(index),
@@ -97,7 +105,7 @@ class Maker:
             "full_scale": seen.full_scale,
             "scene": scene.model_dump(mode="json"),
             "attempt": attempt,
-            "highlights": [_highlight(truth) for truth in seen.highlights],
+            "highlights": highlights,
             "detections": [_detection(specularity) for specularity in specularities],
             "estimates": [_estimate(row) for row in scored],
             "depth_scale_mm": depth_scale_mm(images["depth"]),
@@ -193,7 +201,6 @@ class Maker:
         radiance, scale, images = seen.radiance, seen.full_scale or 1.0, self._truth(drawn, frame)
         parts = {"specular": radiance.specular, "diffuse": radiance.diffuse, "indirect": radiance.indirect}
         images |= {name: _share_of(part, scale) for name, part in parts.items()}
-        images["instance"] = _instances(seen, drawn.scene.camera.model().seen)
         if self.plan.dataset.visible:
             images[VISIBLE] = seen.spots.regions
         if self.plan.dataset.radiance:
@@ -228,22 +235,30 @@ def _colour(image: AnyArray) -> AnyArray:
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
-def _instances(seen: RenderedView, mask: AnyArray | None) -> Picture:
-    """Return the isolated highlights' regions at half height, each as 1 + its index in the list of all."""
-    light = seen.light if seen.light.ndim == 2 else seen.light.mean(axis=2, dtype=np.float32)
-    smoothed = smooth(light, DEFAULT_SMOOTHING_PX, mask)
-    numbers = np.zeros(light.shape, dtype=np.uint8)
-    for i, truth in enumerate(seen.highlights[:MAX_INSTANCES]):
-        component = region_of(truth, smoothed, mask) if truth.isolated else None
+LobeRegion = tuple[float, Component | None]
+"""A highlight's peak in the lobe's light, and its pixels (`lobe_region`)."""
+
+
+def _instances(shape: tuple[int, ...], regions: Mapping[int, LobeRegion]) -> npt.NDArray[np.int32]:
+    """Return the regions of highlights by index, each as 1 + its index; of overlapping ones the brighter is on top."""
+    numbers = np.zeros(shape, dtype=np.int32)
+    for i, (_, component) in sorted(regions.items(), key=lambda region: region[1][0]):
         if component is not None:
             height, width = component.mask.shape
             numbers[component.y : component.y + height, component.x : component.x + width][component.mask] = i + 1
     return numbers
 
 
+def _instance_of(region: LobeRegion, area: int, full_scale: float) -> InstanceMeta:
+    """Describe the pixels of an isolated highlight in `instance`, or why there are none."""
+    peak, component = region
+    missing = "no pixel reaches half height" if component is None else "its pixels are a brighter one's"
+    shown = peak / (full_scale or 1.0)
+    return {"lobe_peak": shown, "instance_px": area or None, "no_instance": None if area else missing}
+
+
 def _highlight(truth: TrueHighlight) -> HighlightMeta:
-    described = truth.to_json() | {"direction_min": truth.direction_min.tolist(), "peak_snr": _plain(truth.peak_snr)}
-    return cast(HighlightMeta, described)
+    return cast(HighlightMeta, truth.to_json())
 
 
 def _estimate(row: ResultRow) -> EstimateMeta:

@@ -16,6 +16,14 @@ class AnatomyMeta(TypedDict):
     surface: str
 
 
+class InstanceMeta(TypedDict):
+    """Pixels of an isolated highlight in the field instance: how many, or why none."""
+
+    lobe_peak: float  # share of full scale; above 1 it is clipped
+    instance_px: int | None
+    no_instance: str | None
+
+
 class HighlightMeta(TypedDict):
     """A true highlight; camera frame, mm."""
 
@@ -30,6 +38,9 @@ class HighlightMeta(TypedDict):
     why_not: str | None
     direction_min: list[float] | None
     peak_snr: float | None
+    lit: NotRequired[bool]  # older datasets lack them
+    hidden: NotRequired[bool]
+    region: NotRequired[InstanceMeta]  # of isolated ones
     # Of the base; older datasets, all of smooth surfaces, lack them.
     normal_base: NotRequired[list[float]]
     kd_min_base: NotRequired[float]

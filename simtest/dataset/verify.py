@@ -209,7 +209,11 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
     depth, instance = sample.images["depth"], sample.images["instance"]
     if instance.max() > len(highlights):
         yield f"instance names highlight {int(instance.max())} of {len(highlights)}"
+    areas = np.bincount(instance.ravel(), minlength=len(highlights) + 1)[1:].tolist()
     for number, highlight in enumerate(highlights):
+        region = highlight.get("region")
+        if region is not None and (region["instance_px"] or 0) != areas[number]:
+            yield f"highlight {number}: has {areas[number]} pixels; instance_px is {region['instance_px']}"
         normal, position = np.asarray(highlight["normal"]), np.asarray(highlight["position_mm"])
         if abs(float(np.linalg.norm(normal)) - 1) > 1e-6 or normal @ position >= 0:
             yield f"highlight {number}: its normal is no unit vector that faces the camera"

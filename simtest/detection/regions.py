@@ -1,5 +1,6 @@
 """Isolated peaks: local maxima whose isophote at half height closes inside the frame and holds no higher peak."""
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -127,6 +128,16 @@ def half_height_component(image: Image, row: int, column: int, seen: Mask | None
     None where they hold a higher peak. `seen` holds the pixels inside the camera's view mask.
     """
     peak = float(image[row, column])
+    return component_above(image, row, column, HIGHLIGHT_ISOVALUE * peak, seen, most=peak)
+
+
+def component_above(
+    image: Image, row: int, column: int, level: float, seen: Mask | None = None, most: float = math.inf
+) -> Component | None:
+    """Return the connected pixels of at least a level around (row, column), which is one; None where one is > `most`.
+
+    `seen` holds the pixels inside the camera's view mask.
+    """
     rows, columns = image.shape
     # the window grows until the component no longer touches its sides
     half = 8
@@ -134,9 +145,9 @@ def half_height_component(image: Image, row: int, column: int, seen: Mask | None
         y0, y1 = max(row - half, 0), min(row + half + 1, rows)
         x0, x1 = max(column - half, 0), min(column + half + 1, columns)
         window = image[y0:y1, x0:x1]
-        labels = pixel_sets.connected(window >= HIGHLIGHT_ISOVALUE * peak)
+        labels = pixel_sets.connected(window >= level)
         mask = labels == labels[row - y0, column - x0]
-        if float(window[mask].max()) > peak:
+        if float(window[mask].max()) > most:
             return None
         edges = ((mask[0], y0 == 0), (mask[-1], y1 == rows), (mask[:, 0], x0 == 0), (mask[:, -1], x1 == columns))
         touched = [at_border for line, at_border in edges if line.any()]

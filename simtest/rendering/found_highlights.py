@@ -38,13 +38,16 @@ def search(session: "Session", base: bool) -> list[HighlightPoint]:
 
 
 def lit_by(radiance: Radiance, points: Sequence[HighlightPoint]) -> list[HighlightPoint]:
-    """Return highlight points with the radiance of their pixels in a frame, the brightest first."""
+    """Return highlight points with the direct radiance of their pixels in a frame, the brightest first.
+
+    Bounces are left out: their noise would change the order from seed to seed.
+    """
     if not points:
         return []
     height, width = radiance.specular.shape[:2]
     columns, rows = np.array([point.bp_px for point in points]).astype(int).T
     at = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
-    total = radiance.specular[at] + radiance.diffuse[at] + radiance.indirect[at]
-    values = (total if total.ndim == 1 else total.mean(axis=1, dtype=np.float32)).tolist()
+    direct = radiance.specular[at] + radiance.diffuse[at]
+    values = (direct if direct.ndim == 1 else direct.mean(axis=1, dtype=np.float32)).tolist()
     shone = (replace(point, radiance=value) for point, value in zip(points, values, strict=True))
     return highlights.brightest_first(list(shone))

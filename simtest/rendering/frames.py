@@ -216,7 +216,7 @@ class HighlightPoint:
     lit : bool
         Whether the light reaches the point.
     radiance : float
-        Radiance at the nearest pixel.
+        Direct radiance at the nearest pixel.
     normal_base : ndarray, shape (3,)
         Unit normal of the base, without the relief, at the same point; `normal` on a smooth surface.
     kd_min_base, kd_max_base : float

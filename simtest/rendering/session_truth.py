@@ -1,5 +1,7 @@
 """The exact truth of a session's scene: points on rays, maps, and highlight points of every light in view."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -11,7 +13,8 @@ from simtest.rendering.built_scene import BuiltScene
 from simtest.rendering.frames import HighlightPoint, MisfitMaps, Radiance, TruthMaps
 from simtest.rendering.instrument_kernel import InstrumentKernel
 from simtest.rendering.instruments import Cover, shade
-from simtest.rendering.integrate import Tracer
+from simtest.rendering.integrate import Tracer, evaluate
+from simtest.rendering.kernel_arrays import to_kernel
 from simtest.rendering.misfit_grid import MisfitGrid, trace_grid
 from simtest.rendering.misfit_maps import trace_misfits, trace_tiles
 from simtest.rendering.rays import Sightlines
@@ -183,6 +186,24 @@ class SessionTruth:
         hits = self.exact_hits(origins, directions @ pose[:3, :3].T)
         # A blocker stands clearly in front of the point; the point's own triangle does not count.
         return emitted & (hits.distance > distance * (1 - 1e-3))
+
+    def lobe_at(self, points: Sequence[HighlightPoint]) -> Array:
+        """Compute the direct light off the lobe at highlight points, shape (N,), mean of the channels.
+
+        The normal is the exact one: the rendered triangles' misses the peak of a lobe that is narrower than a pixel.
+        """
+        if not points:
+            return np.empty(0)
+        mi, tracer, rotation = self.mi, self._tracer(), self.surface.model_from_camera[:3, :3]
+        pixels, normals = np.array([point.bp_px for point in points]), np.array([point.normal for point in points])
+        rays, _, hit = tracer.hit(*(to_kernel(mi.Float, axis, np.float32) for axis in pixels.T))
+        fine = mi.SurfaceInteraction3f(hit.fine)
+        fine.sh_frame = mi.Frame3f(mi.Normal3f((normals @ rotation.T).T.astype(np.float32)))
+        fine.wi = fine.to_local(-rays.traced.d)
+        drawer = tracer.light.drawer(None)
+        draw = None if drawer is None else drawer.at(0)
+        lobe, _ = tracer.light.radiance(tracer.scene, tracer.material, replace(hit, fine=fine), draw)
+        return np.mean(evaluate([*lobe], len(points)), axis=0, dtype=float)
 
     def highlights(self, radiance: Radiance | None = None) -> list[HighlightPoint]:
         """Find the highlight points of every light in view, the brightest first, with the frame's radiance.

@@ -1,5 +1,6 @@
 """A rendered scene with its true highlights, exposed and ready for the camera's noise."""
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,20 +9,25 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, NoiseModel
+from simtest.calibration import Calibration
+from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Radiance, Session, glints
 from simtest.rendering.light_points import DRAWN, FIXED
 from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
 from simtest.simulation import clouds as glint_clouds
 from simtest.simulation.camera_chain import capture, collect, full_scale_of_average
+from simtest.simulation.chain_noise import noise_at
 from simtest.simulation.coding import check_codec
-from simtest.simulation.true_highlights import Examined, TrueHighlight, examine, may_be_isolated, verdicts
+from simtest.simulation.true_highlights import TrueHighlight, examine, may_be_isolated, verdicts
 from simtest.simulation.visible_highlights import Spots, VisibleHighlight, describe, find_spots
 from simtest.spec import Scene
 
 LEAST_SHARE = 1e-12
 """A percentile of the radiance that is no more than this share of its maximum is darkness, and sets no exposure."""
+
+DRAWS, FEW_DRAWS = 32, 8
+"""Draws of the noise at the peaks of highlights that are isolated if they stand above it, and at all others."""
 
 
 @dataclass(frozen=True)
@@ -68,25 +74,33 @@ class RenderedView:
         return sum(highlight.isolated for highlight in self.highlights)
 
     @cached_property
+    def lobe(self) -> Image:
+        """Mean of the channels of the lobe's direct light before the lens, shape (H, W)."""
+        return _mean(self.radiance.specular)
+
+    @cached_property
     def _specular(self) -> Image:
         """Mean of the channels of the lobe's light behind the lens, shape (H, W)."""
         return _mean(collect(self.radiance.specular, self.scene.sensor, self.calibration.camera))
 
     @cached_property
+    def _judged_light(self) -> Image:
+        """The light behind the lens that labels are judged by (`_direct`), shape (H, W) or (H, W, 3)."""
+        return _direct(self.radiance, self.light, self.scene, self.calibration.camera)
+
+    @cached_property
     def spots(self) -> Spots:
         """The pixels of the spots that can be seen in the noise-free frame, also of those on instruments."""
-        return find_spots(_mean(self.light), self._specular, self.calibration.camera.seen)
+        return find_spots(_mean(self._judged_light), self._specular, self.calibration.camera.seen)
 
     @cached_property
     def visible_highlights(self) -> list[VisibleHighlight]:
         """The spots that can be seen in the noise-free frame, the brightest first (theory.md 7.1b)."""
-        sensor, camera = self.scene.sensor, self.calibration.camera
-        light, specular, spots = _mean(self.light), self._specular, self.spots
-        at = light[spots.rows, spots.columns]
-        scale = self.full_scale
-        noise = sensor.noise_model().at(at / scale, self.radiance.channels) if scale > 0 else np.zeros_like(at)
-        sigma = np.broadcast_to(np.asarray(noise, dtype=float) * scale, at.shape)
-        return describe(spots, light, specular, sigma, self.highlights, camera.seen, self.instruments)
+        light, spots, sensor = self._judged_light, self.spots, self.scene.sensor
+        sigma = noise_at(light, self.full_scale, sensor, spots.rows, spots.columns, FEW_DRAWS)
+        clip = self.full_scale if sensor.clips else math.inf
+        seen = self.calibration.camera.seen
+        return describe(spots, _mean(light), self._specular, sigma, self.highlights, seen, self.instruments, clip)
 
     def frame(self, seed: int) -> Image:
         """Return the sensor's frame with the noise of a seed."""
@@ -128,12 +142,10 @@ def expose_picture(session: Session, scene: Scene, radiance: Radiance) -> Image:
     The session stands at a scene that differs from this one in nothing but its sensor. Highlights are searched only
     where they set the exposure.
     """
-    light = collect(radiance.total, scene.sensor, session.camera)
-    exposure, seen = scene.sensor.exposure, session.camera.seen
-    if exposure.full_scale is exposure.average is exposure.percentile is None:
+    light, seen = collect(radiance.total, scene.sensor, session.camera), session.camera.seen
+    full_scale = _metered(scene, _mean(light), seen)
+    if full_scale is None:
         full_scale = _judged(session, radiance, light)[1]
-    else:
-        full_scale = _full_scale(scene, _mean(light), [], [], seen)
     return capture(light, full_scale, scene.sensor, from_integer(scene.sensor.seed), seen)
 
 
@@ -169,14 +181,37 @@ def shows_isolated(session: Session, scene: Scene, least: int) -> bool:
     return sum(highlight.isolated for highlight in highlights) >= least
 
 
+def _direct(radiance: Radiance, light: Image, scene: Scene, camera: Camera) -> Image:
+    """Return the light behind the lens without bounces, whose noise is the renderer's: labels are judged by it alone.
+
+    `light` is the whole, and is returned where there are no bounces.
+    """
+    if scene.render.path_depth <= 2:
+        return light
+    return collect(radiance.specular + radiance.diffuse, scene.sensor, camera)
+
+
 def _judged(session: Session, radiance: Radiance, light: Image) -> tuple[list[TrueHighlight], float]:
-    """Judge a frame's highlights by its light behind the lens; return them and the full scale."""
-    scene, mean, seen = session.scene, _mean(light), session.camera.seen
+    """Judge a frame's highlights by its direct light behind the lens; return them and the full scale."""
+    scene, camera = session.scene, session.camera
+    direct = _direct(radiance, light, scene, camera)
     points, rough = session.highlights(radiance), session.surface.relief is not None
-    # Noise is independent in each channel; estimators see the channels' mean.
-    examined = examine(points, mean, seen, single=rough)
-    full_scale = _full_scale(scene, mean, points, examined, seen)
-    return verdicts(points, examined, scene.sensor.noise_model(), full_scale, radiance.channels), full_scale
+    examined = examine(points, _mean(direct), camera.seen, single=rough)
+    full_scale = _metered(scene, _mean(light), camera.seen)
+    if full_scale is None:
+        # Which highlights are isolated is judged without noise first.
+        shown = [h.bp_px for h in verdicts(points, examined, np.zeros(len(points))) if h.isolated]
+        at = [_light_at(_mean(direct), bp_px) for bp_px in shown]
+        peak = float(_mean(direct).max()) or float(_mean(light).max())
+        full_scale = max(at, default=peak) / scene.sensor.exposure.gain
+    sigmas = np.zeros(len(points))
+    for draws, own in (
+        (DRAWS, [i for i, each in enumerate(examined) if not each.why_not]),
+        (FEW_DRAWS, [i for i, each in enumerate(examined) if each.why_not and each.height is not None]),
+    ):
+        rows, columns = np.array([examined[i].peak for i in own], dtype=int).reshape(-1, 2).T
+        sigmas[own] = noise_at(direct, full_scale, scene.sensor, rows, columns, draws)
+    return verdicts(points, examined, sigmas, full_scale if scene.sensor.clips else math.inf), full_scale
 
 
 def _placed(
@@ -202,15 +237,15 @@ def _mean(image: Image) -> Image:
     return image if image.ndim == 2 else image.mean(axis=2, dtype=np.float32)
 
 
-def _full_scale(
-    scene: Scene, light: Image, points: list[HighlightPoint], examined: list[Examined], seen: Mask | None
-) -> float:
-    """Return the radiance that becomes 1; 0, with a warning, where there is no light at all."""
+def _metered(scene: Scene, light: Image, seen: Mask | None) -> float | None:
+    """Return the radiance that becomes 1, by the frame's light alone; None where its highlights set it.
+
+    It is 0, with a warning, where there is no light at all.
+    """
     exposure, peak = scene.sensor.exposure, float(light.max())
     if peak <= 0:
         warnings.warn(f"scene {scene.name}: no light reaches the sensor; its frame is dark", stacklevel=4)
         return 0.0
-    # Fixed by the scene, or by the frame, or by its brightest isolated highlight.
     if exposure.full_scale is not None:
         radiance = exposure.full_scale
     elif exposure.average is not None:
@@ -225,9 +260,7 @@ def _full_scale(
             )
             radiance = peak
     else:
-        # Which highlights are isolated is judged without noise first.
-        isolated = [h.bp_px for h in verdicts(points, examined, NoiseModel(), peak, 1) if h.isolated]
-        radiance = max((_light_at(light, bp_px) for bp_px in isolated), default=peak)
+        return None
     return radiance / exposure.gain
 
 

@@ -7,21 +7,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.calibration import NoiseModel
-from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_MIN_GAIN, PIXEL_CENTRE
+from simtest.conventions import (
+    DEFAULT_SMOOTHING_PX,
+    HIGHLIGHT_CONTRAST_SIGMA,
+    HIGHLIGHT_ISOVALUE,
+    HIGHLIGHT_MIN_GAIN,
+    PIXEL_CENTRE,
+)
 from simtest.detection import contrast, half_height_component
-from simtest.detection.regions import Component
+from simtest.detection.regions import Component, component_above
 from simtest.geometry import smooth
 from simtest.rendering import HighlightPoint
-from simtest.runtime.arrays import Image, IntArray, Mask
+from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.runtime.files import Json
 from simtest.runtime.short_repr import short_repr
 
 Pixel = tuple[int, int]
 """Row and column."""
-
-MAX_CLIMB_PX = 12
-"""Smoothing moves a lopsided highlight's maximum away from its true BP, by no more than this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +33,8 @@ class TrueHighlight(HighlightPoint):
     Parameters
     ----------
     peak_snr : float
-        Peak above its surroundings over the standard deviation of the noise at the peak's level; inf without noise, 0
-        where it has no closed isophote.
+        Peak above its surroundings, up to where the sensor clips, over the standard deviation of the noise there
+        (`noise_at`); inf without noise, 0 where it has no closed isophote.
     why_not : str
         Empty for a true isolated highlight, else the first condition that it fails.
     radius_px : float
@@ -67,6 +69,7 @@ class TrueHighlight(HighlightPoint):
             "bp_px": self.bp_px.tolist(),
             "position_mm": self.position.tolist(),
             "normal": self.normal.tolist(),
+            "direction_min": self.direction_min.tolist(),
             "distance_mm": self.distance,
             "kd_min": self.kd_min,
             "kd_max": self.kd_max,
@@ -76,6 +79,9 @@ class TrueHighlight(HighlightPoint):
             "pool": self.pool,
             "radius_px": self.radius_px if math.isfinite(self.radius_px) else None,
             "cloud": self.cloud,
+            "lit": self.lit,
+            "hidden": self.hidden,
+            "peak_snr": self.peak_snr if math.isfinite(self.peak_snr) else None,
             "isolated": self.isolated,
             "why_not": self.why_not or None,
         }
@@ -87,30 +93,20 @@ class Examined:
 
     Parameters
     ----------
+    peak : tuple of int
+        Row and column of the maximum that it makes.
     level : float
-        Smoothed light of the maximum that it makes.
+        Smoothed light there.
     height : float or None
         The maximum above its surroundings; None where it has no closed region of its own.
     why_not : str
         Empty for what is isolated if it stands above the noise, else the first condition that it fails.
     """
 
+    peak: Pixel
     level: float
     height: float | None
     why_not: str
-
-
-def judge(
-    points: list[HighlightPoint],
-    light: Image,
-    noise: NoiseModel,
-    full_scale: float,
-    channels: int = 1,
-    seen: Mask | None = None,
-    single: bool = False,
-) -> list[TrueHighlight]:
-    """Judge each highlight point by the noise-free frame (see `examine` and `verdicts`)."""
-    return verdicts(points, examine(points, light, seen, single), noise, full_scale, channels)
 
 
 def examine(
@@ -139,12 +135,12 @@ def examine(
     for point, peak in zip(points, peaks, strict=True):
         others = pixels[[own is not point for own in lit]] if single and owners.get(peak) is point else pixels[:0]
         height, why_not = _examined(point, smoothed, seen, peak, owners.get(peak) is point, others)
-        examined.append(Examined(float(smoothed[peak]), height, why_not))
+        examined.append(Examined(peak, float(smoothed[peak]), height, why_not))
     return examined
 
 
 def verdicts(
-    points: Sequence[HighlightPoint], examined: Sequence[Examined], noise: NoiseModel, full_scale: float, channels: int
+    points: Sequence[HighlightPoint], examined: Sequence[Examined], sigmas: Array, clip: float = math.inf
 ) -> list[TrueHighlight]:
     """Judge highlight points that were examined.
 
@@ -152,19 +148,17 @@ def verdicts(
     ----------
     points, examined : sequence
         Of the same length.
-    noise : NoiseModel
-        Of one channel of `channels`.
-    full_scale : float
-        Radiance at full scale; 0 where there is no light at all.
+    sigmas : ndarray, shape (N,)
+        Noise at each one's peak, radiance; 0 without noise.
+    clip : float
+        Radiance at which the sensor's values end.
     """
-    levels, sigmas = np.array([each.level for each in examined], dtype=np.float32), np.zeros(len(points))
-    if full_scale > 0 and len(points):
-        sigmas = np.asarray(noise.at(levels / full_scale, channels)) * full_scale
     highlights = []
     for point, each, sigma in zip(points, examined, sigmas.tolist(), strict=True):
         # Without a maximum of its own it has no SNR.
-        height, snr = each.height or 0.0, 0.0
+        snr = 0.0
         if each.height is not None:
+            height = min(each.level, clip) - min(each.level - each.height, clip)
             snr = height / sigma if sigma > 0 else np.inf if height > 0 else 0.0
         faint = f"peak below {HIGHLIGHT_CONTRAST_SIGMA:g} sigma" if snr < HIGHLIGHT_CONTRAST_SIGMA else ""
         highlights.append(TrueHighlight(**vars(point), peak_snr=snr, why_not=each.why_not or faint))
@@ -172,17 +166,22 @@ def verdicts(
 
 
 def may_be_isolated(point: HighlightPoint) -> bool:
-    """Return whether `judge` may call a highlight point isolated: by light and shape alone, whatever the frame."""
+    """Return whether a highlight point may be isolated: by light and shape alone, whatever the frame."""
     return point.lit and not point.min_gain <= HIGHLIGHT_MIN_GAIN
 
 
-def region_of(point: HighlightPoint, smoothed: Image, seen: Mask | None = None) -> Component | None:
-    """Return the pixels above half height of the maximum that a highlight point makes.
+def lobe_region(point: HighlightPoint, specular: Image, at_point: float) -> tuple[float, Component | None]:
+    """Return the peak that a highlight point makes in the lobe's light, and the connected pixels above half of it.
 
-    None where a higher maximum lies in it. `smoothed` is the noise-free smoothed light, shape (H, W); `seen` are the
-    pixels inside the camera's view mask, default all.
+    The peak is the brightest pixel uphill from the point, or the light `at_point` (`Session.lobe_at`) where that is
+    more: a highlight smaller than a pixel has none that reaches half of it, and no region. `specular` is the lobe's
+    noise-free light before the lens, shape (H, W).
     """
-    return half_height_component(smoothed, *_peak_pixel(smoothed, point), seen)
+    row, column = _peak_pixel(specular, point)
+    brightest = float(specular[row, column])
+    peak = max(at_point, brightest)
+    level = HIGHLIGHT_ISOVALUE * peak
+    return peak, component_above(specular, row, column, level) if brightest >= level > 0 else None
 
 
 def _owners(points: Sequence[HighlightPoint], peaks: list[Pixel]) -> dict[Pixel, HighlightPoint]:
@@ -208,7 +207,8 @@ def _examined(
     if not point.lit:
         return None, "hidden by an instrument" if point.hidden else "in shadow"
     component = half_height_component(smoothed, *peak, seen) if owns_peak else None
-    if component is None:
+    # Uphill may lead far: to another highlight, or to where the base is brightest.
+    if component is None or not component.holds(point.bp_px):
         return None, "part of a brighter one"
     height = contrast(smoothed, component, float(smoothed[peak]), seen)
     if _holds_any(component, others):
@@ -233,11 +233,10 @@ def _peak_pixel(smoothed: Image, point: HighlightPoint) -> Pixel:
     """Climb from the true BP to the local maximum."""
     column, row = (int(v) for v in point.bp_px)
     row, column = min(row, smoothed.shape[0] - 1), min(column, smoothed.shape[1] - 1)
-    for _ in range(MAX_CLIMB_PX):
+    while True:
         top, left = max(row - 1, 0), max(column - 1, 0)
         window = smoothed[top : row + 2, left : column + 2]
         step = divmod(int(window.argmax()), window.shape[1])
         if (step[0] + top, step[1] + left) == (row, column):
-            break
+            return row, column
         row, column = step[0] + top, step[1] + left
-    return row, column

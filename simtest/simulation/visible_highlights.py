@@ -34,11 +34,11 @@ class VisibleHighlight:
     peak_px : ndarray, shape (2,)
         Centre of its brightest pixel, px.
     value : float
-        Light behind the lens at the peak, radiance.
+        Direct light behind the lens at the peak, radiance.
     specular : float
         The part of it that comes off the lobe.
     peak_snr : float
-        The specular part over the noise at the peak; inf without noise.
+        The specular part, up to where the sensor clips, over the noise at the peak; inf without noise.
     area_px : int
         Pixels above half of the lobe's peak, without those of brighter neighbours.
     centroid_px : ndarray, shape (2,)
@@ -226,7 +226,7 @@ def _pixels(spots: Spots, number: int) -> tuple[IntArray, IntArray]:
 
 def describe(
     spots: Spots, light: Image, specular: Image, sigma: Array, glints: list[TrueHighlight], seen: Mask | None = None,
-    instruments: npt.NDArray[np.uint8] | None = None,
+    instruments: npt.NDArray[np.uint8] | None = None, clip: float = np.inf,
 ) -> list[VisibleHighlight]:  # fmt: skip
     """Describe the spots of a frame, the brightest first.
 
@@ -242,6 +242,8 @@ def describe(
         All of the frame. A spot's light and cloud are those of its brightest glint, or else of the nearest lit one.
     instruments : ndarray of uint8, shape (H, W), optional
         1 + the index of the instrument that is seen, 0 where none is.
+    clip : float
+        Radiance at which the sensor's values end.
     """
     lit = [number for number, glint in enumerate(glints) if glint.lit]
     at = np.array([glints[number].bp_px for number in lit]).reshape(-1, 2)
@@ -261,13 +263,14 @@ def describe(
             else None
         )
         shape = shape_of(spots, number, specular, seen)
-        value = float(specular[row, column])
+        value, lobe = float(light[row, column]), float(specular[row, column])
+        shown = min(value, clip) - min(value - lobe, clip)
         described.append(
             VisibleHighlight(
                 peak_px=peak,
-                value=float(light[row, column]),
-                specular=value,
-                peak_snr=value / sigma[number] if sigma[number] > 0 else np.inf,
+                value=value,
+                specular=lobe,
+                peak_snr=shown / sigma[number] if sigma[number] > 0 else np.inf,
                 area_px=shape.area_px,
                 centroid_px=shape.centroid_px,
                 axis_ratio=shape.axis_ratio,

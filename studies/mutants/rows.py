@@ -313,7 +313,7 @@ ROWS = (
     row("true highlights need twice the noise", "thresholds", "simulation.true_highlights:verdicts",
         "if snr < HIGHLIGHT_CONTRAST_SIGMA else", "if snr < 2 * HIGHLIGHT_CONTRAST_SIGMA else",
         "highlight_verdicts"),
-    row("gain of the exposure inverted", "exposure", "simulation.rendered_view:_full_scale",
+    row("gain of the exposure inverted", "exposure", "simulation.rendered_view:_metered",
         "return radiance / exposure.gain", "return radiance * exposure.gain", "sensor_scenes"),
     row("shot noise applied twice in dark pixels", "noise width", "simulation.camera_chain:_electrons",
         "levels *= np.float32(1 / full_well)",
@@ -324,7 +324,7 @@ ROWS = (
         "sensor_noise"),
     # detection
     row("regions at half height cut at 0.3", "thresholds", "detection.regions:half_height_component",
-        "window >= HIGHLIGHT_ISOVALUE * peak", "window >= 0.6 * HIGHLIGHT_ISOVALUE * peak",
+        "HIGHLIGHT_ISOVALUE * peak, seen", "0.6 * HIGHLIGHT_ISOVALUE * peak, seen",
         "regions"),
     row("half of the noise suffices for a detection", "thresholds", "detection.regions:detect",
         "HIGHLIGHT_CONTRAST_SIGMA * np.asarray(noise)", "0.5 * HIGHLIGHT_CONTRAST_SIGMA * np.asarray(noise)",

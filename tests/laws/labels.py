@@ -166,12 +166,11 @@ def dataset() -> list[Law]:
     for name, part in (("specular", lobe), ("diffuse", base), ("image", lobe + base)):
         wanted = _srgb(np.minimum(part / meta["full_scale"], 1.0)) * 255
         off[name] = float(np.abs(images[name][..., 0].astype(float) - wanted).max())
-    # The region above half of the smoothed peak
+    # The region above half of the lobe's peak
     total = lobe + base
     (row, column) = np.unravel_index(int(total.argmax()), total.shape)
     region, at_peak = images["instance"], int(images["instance"][row, column])
-    soft = by_hand.blurred(total, 2.0)
-    differ = float(((region == 1) != (soft >= 0.5 * soft.max())).sum())
+    differ = float(((region == 1) != (lobe >= 0.5 * lobe.max())).sum())
     listed = [own["bp_px"] for own in meta["highlights"] if own["isolated"]]
     about = "sRGB of the radiance by hand, in steps of 255; half a step and the smallest rounding"
     deep = float(np.nanmax(np.abs(images["depth"] - depth)))
@@ -183,7 +182,7 @@ def dataset() -> list[Law]:
         law("encoding", "sample_depth_off", "mm", deep, 1e-4, n=total.size, about="along the ray"),
         law("instances", "number_at_peak", "", at_peak, 1, 1, about="1 + the index of the only highlight"),
         law("instances", "others", "", float((region > 1).sum()), 0, n=region.size, about="0 or 1"),
-        law("instances", "pixels_off", "", differ, 2, n=region.size, about="above half, smoothed by 2 px"),
+        law("instances", "pixels_off", "", differ, 2, n=region.size, about="above half of the lobe's peak"),
         law("instances", "listed", "", len(listed), 1, 1, about="isolated highlights of a plane"),
     ]  # fmt: skip
 

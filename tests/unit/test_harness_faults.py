@@ -10,7 +10,6 @@ import pytest
 
 import simtest
 from simtest.api import reconstruct_picture
-from simtest.calibration import NoiseModel
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
 from simtest.estimators.dispatch import run
@@ -21,7 +20,7 @@ from simtest.rendering import HighlightPoint, Session
 from simtest.report import write_report
 from simtest.simulation.frame_files import write_frame
 from simtest.simulation.rendered_view import render_view
-from simtest.simulation.true_highlights import judge
+from simtest.simulation.true_highlights import examine, verdicts
 from simtest.spec import Experiment, load_experiment, parse_settings, scene_from_dict
 from simtest.validation.cases import expand
 from simtest.validation.metrics import mahalanobis2
@@ -124,13 +123,15 @@ def spot(x, lit):
 def test_a_shadowed_highlight_does_not_take_a_lit_one_s_peak():
     y, x = np.mgrid[:60, :80] + 0.5
     radiance = np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 50).astype(np.float32)
-    judged = judge([spot(40.1, lit=False), spot(41.5, lit=True)], radiance, NoiseModel(), 1.0)
+    spots = [spot(40.1, lit=False), spot(41.5, lit=True)]
+    judged = verdicts(spots, examine(spots, radiance), np.zeros(2))
     assert [j.why_not for j in judged] == ["in shadow", ""]
 
 
 def test_the_former_way_to_a_true_highlight_still_works_and_warns():
     radiance = np.ones((60, 80), dtype=np.float32)
-    (truth,) = judge([spot(40.0, lit=True)], radiance, NoiseModel(), 1.0)
+    spots = [spot(40.0, lit=True)]
+    (truth,) = verdicts(spots, examine(spots, radiance), np.zeros(1))
     with pytest.warns(DeprecationWarning, match="use the highlight itself"):
         assert truth.highlight.normal is truth.normal
 

@@ -1,0 +1,63 @@
+"""The noise behind the whole camera chain at highlights' peaks, against frames that are drawn again and again."""
+
+import numpy as np
+import pytest
+
+from simtest.rendering import Session
+from simtest.simulation.chain_noise import noise_at
+from simtest.simulation.rendered_view import render_view
+from simtest.simulation.true_highlights import examine
+from simtest.spec import load_scene
+from simtest.spec.sensor import Sensor
+from simtest.spec.sensor_presets import PRESETS
+
+pytestmark = pytest.mark.render
+
+SCENE = {
+    "camera.width": 120, "camera.height": 90, "camera.fx": 110.0, "camera.fy": 110.0, "surface.radius_mm": 40.0,
+    "reflectance.exponent": 60.0, "reflectance.diffuse": 0.4,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def session():
+    return Session(load_scene("sphere", SCENE), "llvm_ad_rgb")
+
+
+def drawn_sigma(view, row, column, draws=150):
+    """The deviation of the channels' mean over draws of the whole frame, mean of the variances of 3 x 3 pixels."""
+    decode = view.scene.sensor.response.model().decode
+    around = np.s_[row - 1 : row + 2, column - 1 : column + 2]
+    values = np.stack([decode(view.frame(seed))[around] for seed in range(draws)])
+    values = values if values.ndim == 3 else values.mean(axis=3)
+    return np.sqrt(values.var(axis=0, ddof=1).mean()) * view.full_scale
+
+
+SENSORS = {name: {"preset": name} for name in PRESETS} | {
+    "plain": {"full_well": 4000.0, "read_noise": 5.0},
+    "mosaic": {"full_well": 4000.0, "mosaic": {}, "colour": {"white_balance": [1.8, 1.0, 2.2]}},
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("colour", [(1.0, 1.0, 1.0), (0.9, 0.4, 0.3)])
+def test_the_noise_at_a_peak_is_that_of_frames_drawn_again(name, colour, session):
+    sensor = {**SENSORS[name], "exposure": {"percentile": 100.0, "gain": 0.5}}
+    scene = load_scene("sphere", {**SCENE, "reflectance.colour": list(colour), "sensor": sensor})
+    view = render_view(session, scene)
+    light = view.light.mean(axis=2)
+    row, column = np.unravel_index(light.argmax(), light.shape)
+    found = noise_at(view.light, view.full_scale, scene.sensor, np.array([row]), np.array([column]), 64)
+    assert found[0] == pytest.approx(drawn_sigma(view, row, column), rel=0.15)
+    [highlight] = view.highlights
+    [examined] = examine(view.highlights, light)
+    assert highlight.peak_snr == pytest.approx(examined.height / found[0], rel=0.2)
+
+
+def test_without_light_there_is_no_noise():
+    sensor = Sensor(preset="old_sd")
+    assert noise_at(np.zeros((40, 40)), 0.0, sensor, np.array([3]), np.array([3]), 4) == [0.0]
+    assert noise_at(np.ones((40, 40)), 1.0, sensor, np.array([], int), np.array([], int), 4).shape == (0,)
+    # At the border, and in more pictures than one.
+    border = np.zeros(300, dtype=int), np.full(300, 39)
+    assert (noise_at(np.full((40, 40), 0.3, np.float32), 1.0, sensor, *border, 8) > 0).all()
