@@ -13,10 +13,13 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 
+from simtest.errors import SimtestError
 from studies.corners.case import Case
 from studies.corners.checks import CHECKS, run
+from studies.corners.coverage import Answer, answers_of, table
 from studies.corners.scenes import MESH, refusals, rows
 
+NAMES = (*CHECKS, "coverage")
 VERDICTS = ("green", "refused", "not asked", "red")
 
 
@@ -24,7 +27,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(prog="python -m studies.corners", description="Try the corners.")
     parser.add_argument("--scenes", type=int, help="rows of the array, from the first; default all")
-    parser.add_argument("--checks", nargs="+", choices=list(CHECKS), default=list(CHECKS), metavar="NAME")
+    parser.add_argument("--checks", nargs="+", choices=NAMES, default=NAMES, metavar="NAME", help=", ".join(NAMES))
+    parser.add_argument("--draws", type=int, default=4, help="scenes of each row whose answers are pooled; default 4")
     parser.add_argument("--only", type=int, metavar="K", help="row K of the array alone, from 0")
     given = parser.parse_args(arguments)
     array = rows()
@@ -32,7 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for (first, second), reason in refusals().items():
         print(f"  {first[0]} {first[1]}, {second[0]} {second[1]}: {reason}")
     chosen = [given.only] if given.only is not None else list(range(len(array)))[: given.scenes]
-    counts, lines, started = Counter[tuple[str, str]](), [], time.process_time()
+    started = time.process_time()
+    counts, lines, answers = Counter[tuple[str, str]](), list[str](), list[Answer]()
     for number in chosen:
         row = array[number]
         if row["surface"] == "mesh" and not MESH.is_file():
@@ -41,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         case = Case(number, row)
         if given.only is not None:
             print(row)
-        for name in given.checks:
+        for name in [each for each in given.checks if each in CHECKS]:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 verdict, reasons = run(name, case)
@@ -50,9 +55,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 lines += [f"{verdict}: scene {number}, {name}: {reason}" for reason in reasons[:4]]
                 print(lines[-1], f"(and {len(reasons) - 1} more)" if len(reasons) > 1 else "", flush=True)
         case.close()
+        if "coverage" in given.checks:
+            for draw in range(given.draws):
+                try:
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore")
+                        answers += answers_of(case if draw == 0 else Case(number, row, draw))
+                    counts["coverage", "green"] += 1
+                except SimtestError as error:
+                    counts["coverage", "refused"] += 1
+                    lines.append(f"refused: scene {number}, coverage, draw {draw}: {error}")
+                except Exception as error:  # noqa: BLE001 - one scene's failure is one red line
+                    counts["coverage", "red"] += 1
+                    lines.append(f"red: scene {number}, coverage, draw {draw}: {type(error).__name__}: {error}")
     print(f"\n| check | {' | '.join(VERDICTS)} |\n|{'---|' * (1 + len(VERDICTS))}")
     for name in given.checks:
         print(f"| {name} | {' | '.join(str(counts[name, verdict]) for verdict in VERDICTS)} |")
+    if answers:
+        tables, faults = table(answers, array)
+        print("\n" + "\n".join(tables))
+        lines += faults
     red = [line for line in lines if line.startswith("red")]
     if red:
         print("\nreds, each shown again by: python -m studies.corners --only SCENE --checks CHECK")

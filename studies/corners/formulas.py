@@ -90,6 +90,8 @@ def sightlines(camera: Tables, pixels: Array) -> Array:
     step = 1e-6
     for _ in range(25):
         gap = project(camera, rays(m)) - pixels
+        if np.abs(gap).max() < 1e-11 * camera["fx"]:
+            break
         J = np.stack(
             [(project(camera, rays(m + d)) - project(camera, rays(m - d))) / (2 * step) for d in step * np.eye(2)], -1
         )
@@ -234,7 +236,7 @@ def squared_mahalanobis(normal: Array, covariance: Array, truth: Array) -> float
     return float(off @ np.linalg.solve(covariance, off))
 
 
-def wilson(inside: int, count: int) -> tuple[float, float]:
+def wilson(inside: float, count: int) -> tuple[float, float]:
     """Return Wilson's 95 % interval of a share."""
     if count == 0:
         return 0.0, 1.0

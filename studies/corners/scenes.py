@@ -41,6 +41,9 @@ ARRAY_SEED, LEAST_ROWS = 51, 60
 MESH = Path(__file__).absolute().parents[3] / "shared" / "data" / "meshes" / "colon_edingca_00090.ply"
 """A user's mesh, beside the checkout."""
 
+VIGNETTING_POWER, EMISSION_POWER = 2.5, 1.5
+"""Of the cosine; together they lie in the prior on a falloff that is not given, 0 to 4."""
+
 SMOOTH = ("plane", "cylinder", "saddle")
 """Surfaces whose points, normals and curvatures are closed forms."""
 
@@ -81,6 +84,9 @@ def settings(row: Row, draw: int = 0) -> dict[str, Any]:
         # Relief that is smaller than a pixel is averaged over it.
         "render": {"samples_per_pixel": 16 if level["relief"] == "not_resolved" else 1},
     }  # fmt: skip
+    if level["surface"] == "liver":
+        # It may lie beyond the prior on a distance that is not given, 5 to 80 mm.
+        tables["known"] |= {"distance_error": float(rng.normal(0.0, 0.1)), "distance_sd": 0.1}
     if level["instruments"] == "shaft":
         corner = rng.choice([0.1, 0.9], size=2)
         out = float(np.degrees(np.arctan2(corner[1] - 0.5, corner[0] - 0.5)))
@@ -112,21 +118,22 @@ def _surface(level: Row, rng: np.random.Generator) -> dict[str, Any]:
                 "k2_per_mm": float(rng.uniform(-0.02, -0.005)), **tables}  # fmt: skip
     path = str(MESH) if kind == "mesh" else kind
     tables = {"type": "anatomy", "path": path, "viewpoint": int(rng.integers(1000))}
-    return tables | ({"edge_mm": 1.0} if kind == "mesh" else {})
+    return tables
 
 
 def _rig(level: Row, rng: np.random.Generator, far: float) -> dict[str, Any]:
     angle = float(rng.uniform(-180.0, 180.0))
     lights: list[dict[str, Any]] = [{}]
     if level["light"] in ("beside", "beside_not_given", "two"):
-        lights = [{"offset_mm": 2.5 * far, "azimuth_deg": angle}]
+        # Within the prior on a light that is not given, 0 to 6 mm.
+        lights = [{"offset_mm": 2.5 * min(far, 1.6), "azimuth_deg": angle}]
     if level["light"] == "two":
-        lights.append({"offset_mm": 3.5 * far, "azimuth_deg": angle - 150.0 if angle > 0 else angle + 150.0})
+        lights.append({"offset_mm": 3.5 * min(far, 1.6), "azimuth_deg": angle - 150.0 if angle > 0 else angle + 150.0})
     for light in lights:
         if level["light"] == "disc":
             light["source"] = {"type": "disc", "radius_mm": 1.0}
         if level["emission"] != "none":
-            light["profile"] = {"type": "cosine", "power": 3.0}
+            light["profile"] = {"type": "cosine", "power": EMISSION_POWER}
     return {"lights": lights, "emission_known": level["emission"] != "not_known"}
 
 
@@ -170,7 +177,7 @@ def _sensor(level: Row, rng: np.random.Generator) -> dict[str, Any]:
         sensor["bits"] = int(level["bits"])
     if level["vignetting"] != "none":
         sensor |= {
-            "vignetting": {"type": "cosine", "power": 4.0}, "vignetting_known": level["vignetting"] == "known",
+            "vignetting": {"type": "cosine", "power": VIGNETTING_POWER}, "vignetting_known": level["vignetting"] == "known",
         }  # fmt: skip
     return sensor
 
