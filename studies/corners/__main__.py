@@ -1,16 +1,16 @@
 """Try the corners where features meet.
 
-    python -m studies.corners [--scenes N] [--checks NAME ...] [--only K]
+    python -m studies.corners [--scenes N] [--checks NAME ...] [--only K] [--draws N]
 
-Prints the array's size and the pairs that the package refuses, the verdicts of each check, and each red line with the
-command that shows it again. Exit 1 where a check is red.
+Prints the array's size and the pairs that the package refuses, the verdicts of each check, what the regions of the
+estimators hold by feature, and each red line; `--only SCENE --checks NAME` shows it again. Exit 1 where a check is red.
 """
 
 import argparse
 import sys
 import time
 import warnings
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 
 from simtest.errors import SimtestError
@@ -22,6 +22,36 @@ from studies.corners.scenes import MESH, refusals, rows
 NAMES = (*CHECKS, "coverage")
 VERDICTS = ("green", "refused", "not asked", "red")
 
+MOST_LINES = 4
+"""Faults of one check that are printed of one scene."""
+
+
+class Tally:
+    """Verdicts and processor time by check, the lines of what is not green, and the answers."""
+
+    def __init__(self) -> None:
+        self.counts = Counter[tuple[str, str]]()
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.lines: list[str] = []
+        self.answers: list[Answer] = []
+
+    def add(self, check: str, verdict: str, scene: str, reasons: Sequence[str], seconds: float) -> None:
+        """Count a verdict; print what is refused or red."""
+        self.counts[check, verdict] += 1
+        self.seconds[check] += seconds
+        if verdict in ("refused", "red"):
+            self.lines += [f"{verdict}: scene {scene}, {check}: {reason}" for reason in reasons[:MOST_LINES]]
+            more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+            print(f"{verdict}: scene {scene}, {check}: {reasons[0]}{more}", flush=True)
+
+    def table(self, checks: Sequence[str]) -> str:
+        """Return the verdicts of checks as a table."""
+        lines = [f"| check | {' | '.join(VERDICTS)} | s |", f"|{'---|' * (2 + len(VERDICTS))}"]
+        for name in checks:
+            counted = " | ".join(str(self.counts[name, verdict]) for verdict in VERDICTS)
+            lines.append(f"| {name} | {counted} | {self.seconds[name]:.0f} |")
+        return "\n".join(lines)
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
@@ -31,56 +61,50 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--draws", type=int, default=4, help="scenes of each row whose answers are pooled; default 4")
     parser.add_argument("--only", type=int, metavar="K", help="row K of the array alone, from 0")
     given = parser.parse_args(arguments)
-    array = rows()
-    print(f"{len(array)} scenes hold all pairs of {len(array[0])} features; pairs that are refused:")
+    array, tally = rows(), Tally()
+    print(f"{len(array)} scenes hold all pairs of levels of {len(array[0])} features; pairs that are refused:")
     for (first, second), reason in refusals().items():
         print(f"  {first[0]} {first[1]}, {second[0]} {second[1]}: {reason}")
-    chosen = [given.only] if given.only is not None else list(range(len(array)))[: given.scenes]
-    started = time.process_time()
-    counts, lines, answers = Counter[tuple[str, str]](), list[str](), list[Answer]()
-    for number in chosen:
-        row = array[number]
-        if row["surface"] == "mesh" and not MESH.is_file():
-            print(f"scene {number} is left out: there is no {MESH}")
+    for number in range(len(array))[: given.scenes] if given.only is None else [given.only]:
+        if array[number]["surface"] == "mesh" and not MESH.is_file():
+            print(f"scene {number} is left out: no ../shared/data/meshes/{MESH.name} beside the checkout")
             continue
-        case = Case(number, row)
         if given.only is not None:
-            print(row)
-        for name in [each for each in given.checks if each in CHECKS]:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                verdict, reasons = run(name, case)
-            counts[name, verdict] += 1
-            if verdict in ("red", "refused"):
-                lines += [f"{verdict}: scene {number}, {name}: {reason}" for reason in reasons[:4]]
-                print(lines[-1], f"(and {len(reasons) - 1} more)" if len(reasons) > 1 else "", flush=True)
-        case.close()
-        if "coverage" in given.checks:
-            for draw in range(given.draws):
-                try:
-                    with warnings.catch_warnings():
-                        warnings.simplefilter("ignore")
-                        answers += answers_of(case if draw == 0 else Case(number, row, draw))
-                    counts["coverage", "green"] += 1
-                except SimtestError as error:
-                    counts["coverage", "refused"] += 1
-                    lines.append(f"refused: scene {number}, coverage, draw {draw}: {error}")
-                except Exception as error:  # noqa: BLE001 - one scene's failure is one red line
-                    counts["coverage", "red"] += 1
-                    lines.append(f"red: scene {number}, coverage, draw {draw}: {type(error).__name__}: {error}")
-    print(f"\n| check | {' | '.join(VERDICTS)} |\n|{'---|' * (1 + len(VERDICTS))}")
-    for name in given.checks:
-        print(f"| {name} | {' | '.join(str(counts[name, verdict]) for verdict in VERDICTS)} |")
-    if answers:
-        tables, faults = table(answers, array)
+            print(array[number])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            _try(number, array[number], given.checks, given.draws, tally)
+    print(f"\n{tally.table(given.checks)}")
+    if tally.answers:
+        tables, faults = table(tally.answers, array)
         print("\n" + "\n".join(tables))
-        lines += faults
-    red = [line for line in lines if line.startswith("red")]
+        # One scene is no share.
+        tally.lines += faults if given.only is None else []
+    red = [line for line in tally.lines if line.startswith("red")]
     if red:
-        print("\nreds, each shown again by: python -m studies.corners --only SCENE --checks CHECK")
+        print("\nreds; one of a scene is shown again by: python -m studies.corners --only SCENE --checks CHECK")
         print("\n".join(red))
-    print(f"\n{time.process_time() - started:.0f} s of processor time")
+    print(f"\n{sum(tally.seconds.values()):.0f} s of processor time")
     return 1 if red else 0
+
+
+def _try(number: int, row: dict[str, str], checks: Sequence[str], draws: int, tally: Tally) -> None:
+    """Run checks on a row's first scene, and collect the answers of its draws."""
+    case = Case(number, row)
+    for name in [each for each in checks if each in CHECKS]:
+        begun = time.process_time()
+        verdict, reasons = run(name, case)
+        tally.add(name, verdict, str(number), reasons, time.process_time() - begun)
+    case.close()
+    for draw in range(draws) if "coverage" in checks else []:
+        begun, verdict, reasons = time.process_time(), "green", [""]
+        try:
+            tally.answers += answers_of(case if draw == 0 else Case(number, row, draw))
+        except SimtestError as error:
+            verdict, reasons = "refused", [f"draw {draw}: {error}"]
+        except Exception as error:
+            verdict, reasons = "red", [f"draw {draw}: {type(error).__name__}: {error}"]
+        tally.add("coverage", verdict, str(number), reasons, time.process_time() - begun)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import numpy as np
 from simtest.calibration import Calibration
 from simtest.dataset import read
 from simtest.dataset.shard_writer import write_dataset
+from simtest.estimators.protocol import Target
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction import Specularities, reconstruct
 from simtest.rendering import Frame, Session, TruthMaps
@@ -37,6 +38,10 @@ GROWN_PX = 3
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """What turns directions where the picture is turned by 90 deg, x to y."""
+
+
+Faults = list[str]
+"""What a check found wrong, a line each."""
 
 
 class NotAskedError(Exception):
@@ -82,8 +87,8 @@ class View:
         return _mean(self.seen.light)
 
     @cached_property
-    def specular(self) -> Image:
-        """The lobe's part of it, by the checks' formulas: point spread is none, and the falloff of the lens is known."""
+    def specular(self) -> Array:
+        """The lobe's part of it: no scene has a point spread, and the lens's falloff is known."""
         specular = _mean(self.frame.radiance.specular).astype(float)
         return specular * self.falloff
 
@@ -146,7 +151,7 @@ class Case(View):
     @cached_property
     def answers(self) -> Specularities:
         """What is reconstructed, in the whole frame or in a region of interest."""
-        target = "base" if self.row["relief"] == "not_resolved" else "fine"
+        target: Target = "base" if self.row["relief"] == "not_resolved" else "fine"
         whole = reconstruct(self.picture, self.calibration, ESTIMATORS, target=target)
         if self.row["roi"] == "frame" or not whole:
             return whole
@@ -157,14 +162,20 @@ class Case(View):
         box = (left, top, right - left, bottom - top)
         return reconstruct(self.picture, self.calibration, ESTIMATORS, roi=box, target=target)
 
+    def written(self) -> Path:
+        """Write the scene as a file, and return it."""
+        file = self.folder / "corner.toml"
+        file.write_text("\n".join(f"{name} = {_toml(value)}" for name, value in self.tables.items()))
+        return file
+
     @cached_property
     def sample(self) -> dict[str, Any]:
         """The sample of a dataset of this scene alone, as it is read back."""
-        scene, recipe = self.folder / "corner.toml", self.folder / "corners.toml"
-        scene.write_text("\n".join(f"{name} = {_toml(value)}" for name, value in self.tables.items()))
+        recipe = self.folder / "corners.toml"
         recipe.write_text(
             f"samples = 1\nhighlights = 0\nvisible = true\nradiance = true\nestimators = {json.dumps(STORED)}\n"
-            f"splits = {{ train = 1.0, validation = 0.0, test = 0.0 }}\n[[families]]\nscene = {json.dumps(str(scene))}\n"
+            f"splits = {{ train = 1.0, validation = 0.0, test = 0.0 }}\n"
+            f"[[families]]\nscene = {json.dumps(str(self.written()))}\n"
         )
         write_dataset(load_dataset(recipe), self.dataset, make_engine())
         return next(iter(read(self.dataset)))

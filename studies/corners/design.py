@@ -70,8 +70,9 @@ def _grown(factors: Factors, counts: Mapping[Pair, int], start: Pair, rng: np.ra
         worths = {}
         for level in rng.permutation(list(factors[factor])).tolist():
             # Pairs are written in the order of the factors.
-            meets = [
-                tuple(sorted([(factor, level), other], key=lambda each: order.index(each[0])))
+            own = (factor, level)
+            meets: list[Pair] = [
+                (own, other) if order.index(factor) < order.index(other[0]) else (other, own)
                 for other in chosen.items()
             ]
             if all(pair in counts for pair in meets):

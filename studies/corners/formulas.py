@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.arrays import AnyArray, Array, Mask
 
 Tables = Mapping[str, Any]
 
@@ -22,7 +22,7 @@ def unit(v: Array) -> Array:
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def angle_deg(a: Array, b: Array) -> Array:
+def angle_deg(a: AnyArray, b: AnyArray) -> Array:
     """Return angles between unit vectors, shape (..., 3), deg; exact for small ones."""
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
@@ -71,7 +71,7 @@ def bend(camera: Tables, x: Array, y: Array, z: Array) -> tuple[Array, Array]:
 def project(camera: Tables, points: Array) -> Array:
     """Return the pixels, shape (..., 2), of points, shape (..., 3)."""
     x, y = bend(camera, *np.moveaxis(np.asarray(points, dtype=float), -1, 0))
-    return np.stack([camera["fx"] * x + camera.get("skew", 0.0) * y + camera["cx"], camera["fy"] * y + camera["cy"]], -1)
+    return np.stack([camera["fx"] * x + camera["cx"], camera["fy"] * y + camera["cy"]], axis=-1)
 
 
 def sightlines(camera: Tables, pixels: Array) -> Array:
@@ -197,7 +197,7 @@ def bisectors(points: Array, light: Array) -> Array:
 # Labels --------------------------------------------------------------------------------------------------------------
 
 
-def at_half_height(image: Array, start: tuple[int, int], allowed: Mask | None = None) -> Mask:
+def at_half_height(image: AnyArray, start: tuple[int, int], allowed: Mask | None = None) -> Mask:
     """Return the connected pixels around a pixel (row, column) with at least half of its value (four neighbours)."""
     above = image >= image[start] / 2
     if allowed is not None:
@@ -206,7 +206,7 @@ def at_half_height(image: Array, start: tuple[int, int], allowed: Mask | None = 
     return numbers == numbers[start] if numbers[start] else np.zeros(image.shape, dtype=bool)
 
 
-def climbed(image: Array, start: tuple[int, int]) -> tuple[int, int]:
+def climbed(image: AnyArray, start: tuple[int, int]) -> tuple[int, int]:
     """Return the local maximum that steepest ascent over eight neighbours leads to."""
     row, column = start
     while True:

@@ -90,9 +90,10 @@ def settings(row: Row, draw: int = 0) -> dict[str, Any]:
     if level["instruments"] == "shaft":
         corner = rng.choice([0.1, 0.9], size=2)
         out = float(np.degrees(np.arctan2(corner[1] - 0.5, corner[0] - 0.5)))
-        tables["instruments"] = [
-            {"tip": (0.5 + 0.55 * (corner - 0.5)).tolist(), "azimuth_deg": out, "diameter_mm": 2.0 * far}
-        ]
+        # Beside a liver there may be no surface at the tip, of whose distance a share could be taken.
+        depth = {"depth_mm": 30.0} if level["surface"] == "liver" else {"depth_share": 0.8}
+        tip = (0.5 + 0.55 * (corner - 0.5)).tolist()
+        tables["instruments"] = [{"tip": tip, "azimuth_deg": out, "diameter_mm": min(2.0 * far, 5.0), **depth}]
     return tables
 
 
@@ -118,7 +119,7 @@ def _surface(level: Row, rng: np.random.Generator) -> dict[str, Any]:
                 "k2_per_mm": float(rng.uniform(-0.02, -0.005)), **tables}  # fmt: skip
     path = str(MESH) if kind == "mesh" else kind
     tables = {"type": "anatomy", "path": path, "viewpoint": int(rng.integers(1000))}
-    return tables
+    return tables | ({"edge_mm": 3.0} if kind == "mesh" else {})
 
 
 def _rig(level: Row, rng: np.random.Generator, far: float) -> dict[str, Any]:
@@ -176,9 +177,8 @@ def _sensor(level: Row, rng: np.random.Generator) -> dict[str, Any]:
     if level["bits"] != "none":
         sensor["bits"] = int(level["bits"])
     if level["vignetting"] != "none":
-        sensor |= {
-            "vignetting": {"type": "cosine", "power": VIGNETTING_POWER}, "vignetting_known": level["vignetting"] == "known",
-        }  # fmt: skip
+        sensor["vignetting"] = {"type": "cosine", "power": VIGNETTING_POWER}
+        sensor["vignetting_known"] = level["vignetting"] == "known"
     return sensor
 
 

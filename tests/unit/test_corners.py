@@ -1,4 +1,4 @@
-"""The study of corners: its array holds all pairs, its formulas find planted faults, and some of its scenes are right."""
+"""The study of corners: its array holds all pairs, planted faults are found, and some scenes are right."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -67,11 +67,11 @@ def test_a_smooth_scene_is_right(case, check):
 @pytest.mark.render
 def test_a_turned_normal_and_a_moved_highlight_are_red(case, monkeypatch):
     good = case.seen.highlights[0]
-    tilted = formulas.unit(good.normal + [0, 1e-4, 0])
+    tilted = formulas.unit(good.normal + np.array([0, 1e-4, 0]))
     for check, bad in (
         ("law", replace(good, normal=tilted)),
-        ("projection", replace(good, bp_px=good.bp_px + [1e-3, 0])),
-        ("search", replace(good, bp_px=good.bp_px + [3, 0])),
+        ("projection", replace(good, bp_px=good.bp_px + 1e-3)),
+        ("search", replace(good, bp_px=good.bp_px + 3)),
         ("mirror", replace(good, kd_max=good.kd_max + 0.01)),
         ("turn", replace(good, why_not="in shadow")),
     ):
@@ -83,7 +83,8 @@ def test_a_turned_normal_and_a_moved_highlight_are_red(case, monkeypatch):
 @pytest.mark.render
 def test_wrong_depths_and_normals_are_red(case, monkeypatch):
     truth = case.truth
-    for wrong in ({"depth": truth.depth * 1.001}, {"normal_base": truth.normal_base[:, ::-1]}, {"k_min_base": truth.k_min_base + 1e-3}):
+    tilted = formulas.unit(truth.normal_base + np.array([1e-4, 0, 0]))
+    for wrong in ({"depth": truth.depth * 1.001}, {"normal_base": tilted}, {"k_min_base": truth.k_min_base + 1e-3}):
         monkeypatch.setattr(case, "truth", replace(truth, **wrong))
         assert checks.run("surface", case)[0] == "red", list(wrong)
         monkeypatch.undo()
@@ -105,7 +106,8 @@ def test_an_exception_is_one_red_line_and_a_refusal_is_none(case, monkeypatch):
 
 
 def test_lenses_of_the_formulas_go_there_and_back():
-    for lens in (None, {"type": "brown_conrady", "k1": -0.2, "p1": 0.003, "p2": -0.002}, {"type": "kannala_brandt", "k1": -0.04}):
+    bent = {"type": "brown_conrady", "k1": -0.2, "p1": 0.003, "p2": -0.002}
+    for lens in (None, bent, {"type": "kannala_brandt", "k1": -0.04}):
         camera = {"width": 16, "height": 12, "fx": 14.0, "fy": 15.0, "cx": 8.4, "cy": 5.5, "distortion": lens}
         pixels = formulas.pixel_centres(camera)
         assert np.abs(formulas.project(camera, formulas.sightlines(camera, pixels)) - pixels).max() < 1e-9
