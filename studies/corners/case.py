@@ -18,7 +18,7 @@ from simtest.dataset.shard_writer import write_dataset
 from simtest.estimators.protocol import Target
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction import Specularities, reconstruct
-from simtest.rendering import Frame, Session, TruthMaps
+from simtest.rendering import Frame, HighlightPoint, Session, TruthMaps
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.engines import make_engine
 from simtest.simulation.rendered_view import RenderedView, render_view
@@ -35,6 +35,9 @@ STORED = ("brightest_point", "cone_axis", "curved")
 
 GROWN_PX = 3
 """A region of interest is the box of the brightest detection, grown on each side by so much."""
+
+ROOM_PX = 5
+"""How far a highlight that stands alone is from the border, beyond its half height."""
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """What turns directions where the picture is turned by 90 deg, x to y."""
@@ -102,6 +105,25 @@ class View:
     def rays(self) -> Array:
         """Unit sightlines of the pixels' centres, by the checks' formulas."""
         return formulas.sightlines(self.camera, formulas.pixel_centres(self.camera))
+
+    def stands_alone(self, point: HighlightPoint) -> bool:
+        """Return whether a lit highlight is bright and large, and far from the border, from others and from metal.
+
+        Far is beyond the reach of the smoothing by which highlights are judged, 2 px.
+        """
+        height, width = self.specular.shape
+        column, row = (min(int(v), n - 1) for v, n in zip(point.bp_px, (width, height), strict=True))
+        start = formulas.climbed(self.specular, (row, column))
+        rows, columns = np.nonzero(formulas.at_half_height(self.specular, start))
+        radius = float(np.sqrt(len(rows) / np.pi))
+        closed = min(rows.min(), columns.min(), height - 1 - rows.max(), width - 1 - columns.max()) >= ROOM_PX
+        reach = 3 * radius + 2 * ROOM_PX
+        others = [o.bp_px for o in self.seen.highlights if np.linalg.norm(o.bp_px - point.bp_px) > 1e-6]
+        down, right = np.nonzero(self.frame.labels.instrument)
+        others += list(np.stack([right, down], axis=-1) + 0.5)
+        alone = not others or np.linalg.norm(np.array(others) - point.bp_px, axis=1).min() > reach
+        bright = self.specular[start] > max(0.3 * self.specular.max(), 0.5 * self.light[start])
+        return bool(point.lit and closed and alone and bright and radius > 2)
 
 
 class Case(View):

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 from simtest.errors import SimtestError
 from studies.corners.case import Case, Faults, NotAskedError
-from studies.corners.file_checks import calibration, counts, experiment, stored
+from studies.corners.file_checks import calibration, counts, experiment, stored, views
 from studies.corners.geometry_checks import flow, law, projection, search, surface
 from studies.corners.label_checks import depth, isolated, labels, radius, snr
 from studies.corners.symmetry_checks import double, mirror, turn
@@ -13,7 +13,7 @@ CHECKS: dict[str, Callable[[Case], Faults]] = {
     each.__name__: each
     for each in (
         law, projection, surface, search, mirror, turn, double, isolated, labels, depth, radius, snr, flow,
-        calibration, stored, counts, experiment,
+        calibration, stored, counts, experiment, views,
     )
 }  # fmt: skip
 

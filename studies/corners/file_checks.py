@@ -8,12 +8,13 @@ import re
 import numpy as np
 import polars as pl
 
-from simtest.api import reconstruct_picture, validate
+from simtest.api import reconstruct_picture, sample_views, validate
 from simtest.calibration import Calibration
 from simtest.dataset import calibration_of
 from simtest.errors import Failure
 from simtest.reconstruction import reconstruct
 from simtest.reconstruction.picture import Options
+from simtest.simulation.flow import HIDDEN, OUT, SEEN
 from simtest.simulation.frame_files import write_frame
 from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import load_calibration
@@ -212,4 +213,45 @@ def experiment(case: Case) -> Faults:
             faults.append(f"page: {shown[0]!r}, in results.parquet {expected}")
     elif len(rows):
         faults.append("page: does not say of how many rows it is")
+    return faults
+
+
+def views(case: Case) -> Faults:
+    """Check that flow, co-visibility, poses and highlights of a sequence of views are those of one another."""
+    if case.row["surface"] not in ("colon", "mesh"):
+        raise NotAskedError("a sequence follows the path of a lumen")
+    folder, count = case.folder / "views", 3
+    sample_views(case.scene, folder, count, {"surface.view": "wall"}, along=(0.45, 0.48), labels=True)
+    listed = json.loads((folder / "views.json").read_text())["accepted"]
+    shares = np.load(folder / "covisibility.npy")
+    faults = [] if len(listed) == count and shares.shape == (count, count) else [f"{len(listed)} views of {count}"]
+    for first in range(count - 1):
+        with np.load(folder / f"flow_{first:04d}.npz") as arrays:
+            states = {(first, first + 1): arrays["forward_state"], (first + 1, first): arrays["backward_state"]}
+        for (one, other), state in states.items():
+            # Co-visibility is that of points on every 16th pixel.
+            sparse = state[8::16, 8::16]
+            points = np.count_nonzero((sparse == SEEN) | (sparse == OUT) | (sparse == HIDDEN))
+            share = np.count_nonzero(sparse == SEEN) / max(points, 1)
+            if points and not abs(share - shares[one, other]) < 1.5 / points:
+                faults.append(
+                    f"covisibility[{one}, {other}]: {shares[one, other]:.3f}, by the flow's states {share:.3f}"
+                )
+    tracks = json.loads((folder / "tracks.json").read_text())
+    poses = [np.array(view["world_from_camera"]) for view in listed]
+    lights = formulas.lights_mm(case.tables["rig"])
+    for number, (pose, points) in enumerate(zip(poses, tracks["highlights"], strict=True)):
+        for point in points:
+            place = (np.array(point["position_world_mm"]) - pose[:3, 3]) @ pose[:3, :3]
+            normal = np.array(point["normal_world"]) @ pose[:3, :3]
+            off = formulas.angle_deg(normal, formulas.bisectors(place, lights[point["light"]]))
+            gap = np.linalg.norm(formulas.project(case.camera, place) - point["bp_px"])
+            if not off < 1e-4 or not gap < 1e-4:
+                faults.append(
+                    f"view {number}: a highlight {off:.2g} deg off the bisector, {gap:.2g} px beside its bp_px"
+                )
+    lines = [line.split() for line in (folder / "trajectory.txt").read_text().splitlines() if line[:1] != "#"]
+    for pose, line in zip(poses, lines, strict=True):
+        if not np.abs(np.array(line[1:4], dtype=float) - pose[:3, 3]).max() < 1e-5:
+            faults.append("trajectory.txt: another position than views.json")
     return faults

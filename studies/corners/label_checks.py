@@ -9,7 +9,7 @@ import numpy as np
 from simtest.calibration import Response
 from simtest.dataset.maker import colour_variant
 from simtest.rendering import Session
-from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.arrays import Array
 from simtest.spec.scene import scene_from_dict
 from studies.corners import formulas
 from studies.corners.case import Case, Faults, NotAskedError
@@ -21,39 +21,14 @@ DRAWS = 96
 
 def isolated(case: Case) -> Faults:
     """Check that what is isolated is lit and no streak, and that what stands alone is isolated."""
-    faults, specular = [], case.specular
-    size = np.array([case.camera["width"], case.camera["height"]])
-    metal = case.frame.labels.instrument > 0
+    faults = []
     for number, each in enumerate(case.seen.highlights):
-        column, row = np.minimum(each.bp_px.astype(int), size - 1)
         gain = min(abs(1 + each.kd_min), abs(1 + each.kd_max))
         if each.isolated and not (each.lit and gain > 0.25 and each.peak_snr >= 10):
             faults.append(f"highlight {number}: isolated, but lit {each.lit}, gain {gain:.2g}, SNR {each.peak_snr:.3g}")
-        if case.row["relief"] != "none" or not each.lit or gain < 0.35:
-            continue
-        start = formulas.climbed(specular, (int(row), int(column)))
-        region = formulas.at_half_height(specular, start)
-        rows, columns = np.nonzero(region)
-        # Room for the smoothing of detectors on all sides.
-        room = 5
-        closed = rows.min() >= room and columns.min() >= room
-        closed &= rows.max() < size[1] - room and columns.max() < size[0] - room
-        radius = math.sqrt(len(rows) / math.pi)
-        reach = 3 * radius + 8
-        alone = all(
-            np.linalg.norm(o.bp_px - each.bp_px) > reach for o in case.seen.highlights if o is not each
-        ) and not _within(metal, each.bp_px, reach)
-        share = specular[start] / max(float(case.light[start]), 1e-30)
-        bright = specular[start] > 0.3 * specular.max()
-        if closed and alone and bright and share > 0.5 and radius > 2 and not each.isolated:
-            faults.append(f"highlight {number} of {radius:.2g} px radius stands alone, but: {each.why_not}")
+        if case.row["relief"] == "none" and gain > 0.35 and not each.isolated and case.stands_alone(each):
+            faults.append(f"highlight {number} stands alone, but: {each.why_not}")
     return faults
-
-
-def _within(mask: Mask, point: Array, reach: float) -> bool:
-    """Return whether any pixel of a mask lies so near to a point, px."""
-    rows, columns = np.nonzero(mask)
-    return bool((np.hypot(columns + 0.5 - point[0], rows + 0.5 - point[1]) < reach).any())
 
 
 def radius(case: Case) -> Faults:

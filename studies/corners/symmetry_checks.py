@@ -64,7 +64,9 @@ def _same(
             faults.append(f"highlight {number} at {each.bp_px.round(2).tolist()} px is not listed there")
             continue
         left = [o for o in left if o is not near[0]]
-        faults += [f"highlight {number}: {text}" for text in _differences(each, near[0], turning, scale, sampled)]
+        # The smoothing by which they are judged is one of pixels: finer ones part what melts.
+        judged = not sampled and (image is not None or case.stands_alone(each))
+        faults += [f"highlight {number}: {text}" for text in _differences(each, near[0], turning, scale, judged)]
     there = np.array([other.camera["width"], other.camera["height"]])
     for each in left:
         if (each.bp_px > BORDER_PX * scale).all() and (each.bp_px < there - BORDER_PX * scale).all():
@@ -72,10 +74,10 @@ def _same(
     return faults
 
 
-def _differences(one: HighlightPoint, other: HighlightPoint, turning: Array, scale: float, sampled: bool) -> Faults:
+def _differences(one: HighlightPoint, other: HighlightPoint, turning: Array, scale: float, judged: bool) -> Faults:
     """Return how two labels of a highlight differ, of which one is seen turned and in finer pixels.
 
-    Verdicts are compared where the frame has no noise of its own, that of samples.
+    Verdicts are compared where `judged`.
     """
     faults = []
     if not np.linalg.norm(turning @ one.position - other.position) < 1e-5 * one.distance:
@@ -91,7 +93,7 @@ def _differences(one: HighlightPoint, other: HighlightPoint, turning: Array, sca
     for name in ("lit", "hidden", "pool"):
         if getattr(one, name) != getattr(other, name):
             faults.append(f"{name} {getattr(one, name)} and {getattr(other, name)}")
-    if isinstance(one, TrueHighlight) and isinstance(other, TrueHighlight) and not sampled:
+    if isinstance(one, TrueHighlight) and isinstance(other, TrueHighlight) and judged:
         faults += _other_verdicts(one, other, scale)
     return faults
 
