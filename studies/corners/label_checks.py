@@ -1,0 +1,176 @@
+"""Checks of labels against the image: which highlights count, their pixels, size and noise, and the stored maps."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from simtest.calibration import Response
+from simtest.dataset.maker import colour_variant
+from simtest.rendering import Session
+from simtest.runtime.arrays import Array
+from simtest.spec.scene import scene_from_dict
+from studies.corners import formulas
+from studies.corners.case import Case, Faults, NotAskedError
+from studies.corners.scenes import SMOOTH
+
+DRAWS = 96
+"""Pictures by which the noise is measured: its deviation is then known to 7 %."""
+
+
+def isolated(case: Case) -> Faults:
+    """Check that what is isolated is lit and no streak, and that what stands alone is isolated."""
+    faults = []
+    for number, each in enumerate(case.seen.highlights):
+        gain = min(abs(1 + each.kd_min), abs(1 + each.kd_max))
+        if each.isolated and not (each.lit and gain > 0.25 and each.peak_snr >= 10):
+            faults.append(f"highlight {number}: isolated, but lit {each.lit}, gain {gain:.2g}, SNR {each.peak_snr:.3g}")
+        if case.row["relief"] == "none" and gain > 0.35 and not each.isolated and case.stands_alone(each):
+            faults.append(f"highlight {number} stands alone, but: {each.why_not}")
+    return faults
+
+
+def radius(case: Case) -> Faults:
+    """Check the radius of isolated highlights against the rendered lobe at half height."""
+    specular = case.frame.radiance.specular.astype(float)
+    points = [h for h in case.seen.highlights if h.isolated]
+    if case.row["relief"] == "not_resolved":
+        raise NotAskedError("the lobe of a relief below a pixel has no closed form")
+    ratios = []
+    for each in points:
+        column, row = (int(v) for v in each.bp_px)
+        start = formulas.climbed(specular, (min(row, specular.shape[0] - 1), min(column, specular.shape[1] - 1)))
+        region = formulas.at_half_height(specular, start)
+        rows, columns = np.nonzero(region)
+        edge = min(rows.min(), columns.min(), specular.shape[0] - 1 - rows.max(), specular.shape[1] - 1 - columns.max())
+        if edge > 0 and len(rows) > 30:
+            ratios.append(each.radius_px / math.sqrt(len(rows) / math.pi))
+    # Single glints are no circles.
+    least = 1 if case.row["relief"] == "none" else 5
+    if len(ratios) < least:
+        raise NotAskedError(f"fewer than {least} isolated highlights of more than 30 px in the frame's interior")
+    ratio, room = float(np.median(ratios)), 1.12 if case.row["relief"] == "none" else 1.35
+    if 1 / room < ratio < room:
+        return []
+    return [f"radius_px: {ratio:.3g} of the rendered one in the median of {len(ratios)}"]
+
+
+def snr(case: Case) -> Faults:
+    """Check the noise behind `peak_snr` against that of pictures drawn again."""
+    if case.row["sensor"] == "ideal":
+        raise NotAskedError("no noise")
+    spots = [s for s in case.seen.visible_highlights if s.instrument is None][:8]
+    response = Response("srgb") if case.row["sensor"] == "processed" else Response()
+    drawn = []
+    places = [(int(s.peak_px[1]), int(s.peak_px[0])) for s in spots]
+    if not places:
+        raise NotAskedError("no visible highlight")
+    for seed in range(DRAWS):
+        linear = response.decode(case.seen.frame(seed))
+        linear = linear if linear.ndim == 2 else linear.mean(axis=2)
+        drawn.append([linear[place] for place in places])
+    values = np.array(drawn)
+    ratios = []
+    for spot, of_spot in zip(spots, values.T, strict=True):
+        if np.quantile(of_spot, 0.95) < 0.97 and math.isfinite(spot.peak_snr):
+            sigma = spot.specular / spot.peak_snr / case.seen.full_scale
+            ratios.append(float(of_spot.std(ddof=1)) / sigma)
+    if not ratios:
+        raise NotAskedError("all visible highlights are clipped")
+    ratio = float(np.median(ratios))
+    return [] if 0.75 < ratio < 1.33 else [f"peak_snr: the noise is {ratio:.3g} times that behind it"]
+
+
+def labels(case: Case) -> Faults:
+    """Check a sample's `instance` and `visible`: pixels above half of the lobe's peak, unsmoothed, behind the lens."""
+    sample = case.sample
+    meta, faults = sample["meta"], []
+    specular = _lobe_of_sample(case)
+    instance, metal = sample["instance"].astype(int), sample["instrument"] > 0
+    nulls, poor = 0, []
+    for number, each in enumerate(meta["highlights"]):
+        own = instance == number + 1
+        if not each["isolated"]:
+            if own.any():
+                faults.append(f"instance {number + 1}: of a highlight that is not isolated")
+            continue
+        column, row = (min(int(v), n - 1) for v, n in zip(each["bp_px"], specular.shape[::-1], strict=True))
+        region = formulas.at_half_height(specular, formulas.climbed(specular, (row, column)))
+        size, kept = int(region.sum()), int(own.sum())
+        nulls += not kept
+        if kept and size >= 20:
+            overlap = np.count_nonzero(own & region) / np.count_nonzero(own | region)
+            poor += [f"instance {number + 1}: IoU {overlap:.2f} of {kept} with {size} px"] if overlap < 0.9 else []
+        elif kept and abs(kept - size) > 1:
+            poor.append(f"instance {number + 1}: {kept} px where {size} are above half height")
+    if nulls:
+        faults.append(f"instance: {nulls} isolated highlights have no pixel")
+    faults += poor
+    if (instance[metal] > 0).any():
+        faults.append("instance: on an instrument")
+    return faults + _visible(sample, specular)
+
+
+def _visible(sample: Mapping[str, Any], specular: Array) -> Faults:
+    """Check that each visible spot holds its peak and pixels above half of it, and is described as its pixels are."""
+    faults = []
+    regions = sample["visible"]
+    for number, spot in enumerate(sample["meta"]["visible_highlights"]):
+        own = regions == number + 1
+        column, row = (int(v) for v in spot["peak_px"])
+        if spot["area_px"] != np.count_nonzero(own) or not own[row, column]:
+            faults.append(f"visible {number + 1}: area_px {spot['area_px']} for {np.count_nonzero(own)} px")
+            continue
+        around = formulas.at_half_height(specular, (row, column))
+        if np.count_nonzero(own & ~around) > 1 + 0.01 * spot["area_px"]:
+            faults.append(f"visible {number + 1}: {np.count_nonzero(own & ~around)} px are not above half of its peak")
+        rows, columns = np.nonzero(own)
+        weight = specular[rows, columns]
+        centroid = np.array([weight @ (columns + 0.5), weight @ (rows + 0.5)]) / weight.sum()
+        if not np.linalg.norm(centroid - spot["centroid_px"]) < 0.02:
+            stated = np.round(spot["centroid_px"], 2)
+            faults.append(f"visible {number + 1}: centroid_px {stated} for {centroid.round(2)}")
+    return faults
+
+
+def _lobe_of_sample(case: Case) -> Array:
+    """Return the lobe's light behind the lens, rendered again as the sample was: in colour, with its seeds."""
+    session = Session(scene_from_dict(case.sample["meta"]["scene"]), colour_variant(), labelled=True)
+    radiance = session.frame().radiance.specular
+    return np.asarray((radiance if radiance.ndim == 2 else radiance.mean(axis=2)).astype(float) * case.falloff)
+
+
+def depth(case: Case) -> Faults:
+    """Check a sample's depth, normals and masks against the surface, within what their encoding loses."""
+    sample, truth = case.sample, case.truth
+    faults = []
+    step = sample["meta"]["depth_scale_mm"]
+    off = truth.instrument == 0
+    with np.errstate(invalid="ignore"):
+        gap = np.abs(sample["depth"] - truth.depth) - step
+        angle = formulas.angle_deg(formulas.unit(sample["normal_base"].astype(float)), truth.normal_base)
+    smooth = case.row["surface"] in SMOOTH
+    if not np.nanmedian((gap / truth.depth)[off]) < 1e-3 or (smooth and not np.nanmax((gap / truth.depth)[off]) < 5e-3):
+        faults.append(f"depth: {np.nanmedian(gap[off]):.2g} mm off in the median, {np.nanmax(gap[off]):.2g} at most")
+    if not np.nanmedian(angle[off]) < (0.03 if smooth else 0.5):
+        faults.append(f"normal_base: {np.nanmedian(angle[off]):.2g} deg off in the median")
+    if np.count_nonzero((sample["instrument"] > 0) != (truth.instrument > 0)) > 0:
+        faults.append("instrument: not where the truth has it")
+    if smooth:
+        # Normals by differences of the stored depth, on rays of the checks' formulas.
+        points = case.rays * sample["depth"][..., None].astype(float)
+        crossed = formulas.unit(np.cross(points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]))
+        inner, allowed = truth.normal_base[1:-1, 1:-1], _shrunk(off)[1:-1, 1:-1]
+        with np.errstate(invalid="ignore"):
+            off_deg = formulas.angle_deg(crossed * np.sign(np.sum(crossed * inner, -1, keepdims=True)), inner)[allowed]
+        if not np.nanmedian(off_deg) < 0.3:
+            faults.append(f"depth: normals by differences of it are {np.nanmedian(off_deg):.2g} deg off in the median")
+    return faults
+
+
+def _shrunk(mask: Array) -> Array:
+    """Return where a mask holds for a pixel and all around it."""
+    padded = np.pad(mask, 1, constant_values=True)
+    height, width = mask.shape
+    return np.logical_and.reduce([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])

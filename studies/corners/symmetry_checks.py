@@ -1,0 +1,153 @@
+"""Checks by symmetry: a scene that is mirrored, turned or divided into finer pixels has the same labels."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from simtest.rendering import HighlightPoint
+from simtest.runtime.arrays import Array
+from simtest.simulation.true_highlights import TrueHighlight
+from studies.corners import formulas
+from studies.corners.case import TURN, Case, Faults, View
+
+BORDER_PX = 0.5
+"""What lies so near to the frame's border may be in view on one side of a symmetry alone."""
+
+
+def mirror(case: Case) -> Faults:
+    """Check that a mirrored scene has mirrored labels."""
+    other = case.mirrored
+
+    def pixels(p: Array) -> Array:
+        return np.stack([case.camera["width"] - p[..., 0], p[..., 1]], -1)
+
+    return _same(case, other, pixels, np.diag([-1.0, 1.0, 1.0]), lambda image: image[:, ::-1])
+
+
+def turn(case: Case) -> Faults:
+    """Check that a camera turned by 90 deg about its axis sees turned labels and normals."""
+    other = case.turned
+
+    def pixels(p: Array) -> Array:
+        return np.stack([case.camera["height"] - p[..., 1], p[..., 0]], -1)
+
+    return _same(case, other, pixels, TURN, lambda image: np.rot90(image, -1))
+
+
+def double(case: Case) -> Faults:
+    """Check that twice as many pixels along each side show the same highlights."""
+    return _same(case, case.finer, lambda p: 2 * p, np.eye(3), None)
+
+
+def _same(
+    case: Case, other: View, pixels: Callable[[Array], Array], turning: Array, image: Callable[[Array], Array] | None
+) -> Faults:
+    """Compare labels with those of the same scene seen otherwise; `image` turns an image, None where sizes differ."""
+    faults = []
+    size = np.array([case.camera["width"], case.camera["height"]])
+    sampled = case.tables["render"]["samples_per_pixel"] > 1
+    if image is not None:
+        faults += _same_maps(case, other, turning, image, sampled)
+    scale = 1.0 if image is not None else 2.0
+    points: list[HighlightPoint] = list(case.seen.highlights)
+    left: list[HighlightPoint] = list(other.seen.highlights)
+    if image is None and case.row["relief"] != "none":
+        # Finer pixels resolve more of a relief: the base's highlights stay.
+        points, left = list(case.seen.clouds), list(other.seen.clouds)
+    for number, each in enumerate(points):
+        if (each.bp_px < BORDER_PX).any() or (each.bp_px > size - BORDER_PX).any():
+            left = [o for o in left if np.linalg.norm(o.bp_px - pixels(each.bp_px)) > 1e-3 * scale]
+            continue
+        near = [o for o in left if o.light == each.light and np.linalg.norm(o.bp_px - pixels(each.bp_px)) < 1e-3]
+        if not near:
+            faults.append(f"highlight {number} at {each.bp_px.round(2).tolist()} px is not listed there")
+            continue
+        left = [o for o in left if o is not near[0]]
+        # The smoothing by which they are judged is one of pixels: finer ones part what melts.
+        judged = not sampled and (image is not None or case.stands_alone(each))
+        faults += [f"highlight {number}: {text}" for text in _differences(each, near[0], turning, scale, judged)]
+    there = np.array([other.camera["width"], other.camera["height"]])
+    for each in left:
+        if (each.bp_px > BORDER_PX * scale).all() and (each.bp_px < there - BORDER_PX * scale).all():
+            faults.append(f"a highlight at {each.bp_px.round(2).tolist()} px is listed there alone")
+    return faults
+
+
+def _differences(one: HighlightPoint, other: HighlightPoint, turning: Array, scale: float, judged: bool) -> Faults:
+    """Return how two labels of a highlight differ, of which one is seen turned and in finer pixels.
+
+    Verdicts are compared where `judged`.
+    """
+    faults = []
+    if not np.linalg.norm(turning @ one.position - other.position) < 1e-5 * one.distance:
+        faults.append("another position")
+    for name in ("normal", "normal_base"):
+        off = formulas.angle_deg(turning @ getattr(one, name), getattr(other, name))
+        if not off < 1e-4:
+            faults.append(f"{name} {off:.2g} deg off")
+    for name in ("kd_min", "kd_max", "kd_min_base", "kd_max_base"):
+        a, b = getattr(one, name), getattr(other, name)
+        if not abs(a - b) < 1e-4 * (1 + abs(a)):
+            faults.append(f"{name} {a:.6g} and {b:.6g}")
+    for name in ("lit", "hidden", "pool"):
+        if getattr(one, name) != getattr(other, name):
+            faults.append(f"{name} {getattr(one, name)} and {getattr(other, name)}")
+    if isinstance(one, TrueHighlight) and isinstance(other, TrueHighlight) and judged:
+        faults += _other_verdicts(one, other, scale)
+    return faults
+
+
+def _other_verdicts(one: TrueHighlight, other: TrueHighlight, scale: float) -> Faults:
+    """Return how the verdicts on a highlight differ, of which one is of finer pixels."""
+    faults = []
+    if one.why_not != other.why_not:
+        faults.append(f"why_not {one.why_not!r} and {other.why_not!r} there")
+    if one.isolated and other.isolated:
+        if not abs(other.radius_px / one.radius_px / scale - 1) < 1e-3:
+            faults.append(f"radius_px {one.radius_px:.4g} and {other.radius_px:.4g}")
+        if math.isfinite(one.peak_snr) and not abs(other.peak_snr / one.peak_snr - 1) < (0.02 if scale == 1 else 0.15):
+            faults.append(f"peak_snr {one.peak_snr:.4g} and {other.peak_snr:.4g}")
+    return faults
+
+
+def _same_maps(case: Case, other: View, turning: Array, image: Callable[[Array], Array], sampled: bool) -> Faults:
+    """Compare radiance, depth, normals, curvatures and visible spots of a turned or mirrored picture."""
+    faults, here, there = [], case.truth, other.truth
+    for name in ("depth", "k_min", "k_max", "k_min_base", "k_max_base"):
+        a, b = image(getattr(here, name)), getattr(there, name)
+        with np.errstate(invalid="ignore"):
+            wrong = ~((np.abs(a - b) <= 1e-5 * (1 + np.abs(a))) | (np.isnan(a) & np.isnan(b)))
+        # Rays along a silhouette may meet it or not.
+        if np.count_nonzero(wrong) > 1e-3 * wrong.size:
+            faults.append(f"truth.{name}: differs at {np.count_nonzero(wrong)} pixels")
+    for name in ("normal", "normal_base"):
+        a, b = image(getattr(here, name)) @ turning.T, getattr(there, name)
+        with np.errstate(invalid="ignore"):
+            wrong = ~((formulas.angle_deg(a, b) < 1e-4) | (np.isnan(a).any(-1) & np.isnan(b).any(-1)))
+        if np.count_nonzero(wrong) > 1e-3 * wrong.size:
+            faults.append(f"truth.{name}: differs at {np.count_nonzero(wrong)} pixels")
+    for name in ("specular", "diffuse"):
+        a, b = image(getattr(case.frame.radiance, name)), getattr(other.frame.radiance, name)
+        # Samples, and the points of a source of finite size, do not turn with the picture.
+        if sampled:
+            a, b = (_blocks(each) for each in (a, b))
+        limit = 0.1 if sampled else 0.02 if case.row["light"] == "disc" else 1e-3
+        gap = np.quantile(np.abs(a - b), 0.999) / max(float(a.max()), 1e-12)
+        if not gap < limit:
+            faults.append(f"radiance.{name}: {gap:.2g} of its maximum off")
+    if not sampled:
+        spots, others = case.seen.visible_highlights, other.seen.visible_highlights
+        if len(spots) != len(others):
+            faults.append(f"{len(spots)} visible highlights, {len(others)} there")
+            return faults
+        areas, theirs = (np.array(sorted(spot.area_px for spot in each)) for each in (spots, others))
+        if np.abs(areas - theirs).sum() > 1 + 0.01 * areas.sum():
+            faults.append("visible highlights have other areas there")
+    return faults
+
+
+def _blocks(image: Array) -> Array:
+    """Return the means of blocks of 8 x 8 pixels; the frame's sides are multiples of it."""
+    height, width = image.shape
+    return image.reshape(height // 8, 8, width // 8, 8).mean(axis=(1, 3))
