@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from simtest.calibration import Calibration
     from simtest.errors import BackendError, Failure, InputError, Reason, SimtestError
     from simtest.estimators import Estimate
-    from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Mei, Patch, Scaramuzza, ViewMask
+    from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, Scaramuzza, ViewMask
     from simtest.reconstruction import Specularity, reconstruct
     from simtest.spec import (
         Experiment,
@@ -49,7 +49,7 @@ _HOMES = {
     "simtest.calibration": ("Calibration",),
     "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
     "simtest.estimators": ("Estimate",),
-    "simtest.geometry": ("BrownConrady", "Camera", "KannalaBrandt", "Mei", "Patch", "Scaramuzza", "ViewMask"),
+    "simtest.geometry": ("BrownConrady", "Camera", "KannalaBrandt", "Patch", "Scaramuzza", "ViewMask"),
     "simtest.reconstruction": ("Specularity", "reconstruct"),
     "simtest.spec": (
         "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_calibration",
@@ -69,7 +69,6 @@ __all__ = [
     "InputError",
     "KannalaBrandt",
     "LabelledFrame",
-    "Mei",
     "Patch",
     "Reason",
     "RunResults",

@@ -53,7 +53,7 @@ lens or with lenses of their own shine up to 25 deg aside."""
 FAINT = 0.1
 """Cosine of the angle from its axis down to which a falloff is followed; little light is left there."""
 
-SAMPLES = np.arange(1, 257)[:, None] * 1.1347241384015194 ** -np.arange(1.0, 6.0) % 1
+SAMPLES = np.arange(1, 129)[:, None] * 1.1347241384015194 ** -np.arange(1.0, 6.0) % 1
 """Shares of the five priors of a falloff, shape (N, 5), all alike even: the sequence of the root of x^6 = x + 1."""
 
 _DRAWS, _GOLDEN = (np.arange(128) + 0.5) / 128, math.pi * (3 - math.sqrt(5)) * np.arange(128)
@@ -206,28 +206,33 @@ def falloff_part(normal: Array, family: HighlightAxis, power: Distribution, prio
     seen, so that highlights of few pixels get a little too much. The angle is that at the lens or, where lights beside
     it are given, as likely at one of them, from an axis that is tilted by `TILT`.
     """
-    powers, tilts = _falloffs(power)
-    axes = np.column_stack([TILT * tilts, np.ones(len(tilts))])
+    powers, axes = _falloffs(power, TILT)
     sightline, steps, place = family.axis, family.basis, family.axis[None]
     if priors.has_light_beside:
         # place and steps of the surface as seen from there, over its distance
         which = (SAMPLES[:, 3] * 2 * len(priors.lights)).astype(int)
         origins = np.concatenate([np.zeros_like(priors.lights), priors.lights])[which]
-        place = sightline - origins / priors.distance.quantile(SAMPLES[:, 4:])
+        place = sightline - origins / _distances(priors.distance)
         steps = steps - np.outer(steps @ normal / (sightline @ normal), sightline)
-    along = np.sum(place * axes, axis=1)
-    lengths = np.linalg.norm(place, axis=1)
-    reached = np.maximum(along, FAINT * lengths * np.linalg.norm(axes, axis=1))
-    slopes = axes @ steps.T / reached[:, None] - place @ steps.T / lengths[:, None] ** 2
+    squares = np.sum(place * place, axis=1, keepdims=True)
+    reached = np.maximum(np.sum(place * axes, axis=1, keepdims=True), FAINT * np.sqrt(squares))
+    slopes = axes @ steps.T / reached - place @ steps.T / squares
     shift = basis_across(normal) @ family.basis.T @ family.seen_moments
     return equivalent_covariance(powers * slopes @ shift.T)
 
 
 @lru_cache(maxsize=16)
-def _falloffs(power: Distribution) -> tuple[Array, Array]:
-    """Return the powers of drawn falloffs, shape (N, 1), and their tilts, normal pairs of deviation 1, shape (N, 2)."""
-    radius, angle = np.sqrt(-2 * np.log1p(-SAMPLES[:, 1])), 2 * np.pi * SAMPLES[:, 2]
-    return power.quantile(SAMPLES[:, :1]), np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+def _falloffs(power: Distribution, tilt: float) -> tuple[Array, Array]:
+    """Return the powers of drawn falloffs, shape (N, 1), and their unit axes, shape (N, 3)."""
+    radius, angle = tilt * np.sqrt(-2 * np.log1p(-SAMPLES[:, 1])), 2 * np.pi * SAMPLES[:, 2]
+    axes = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones(len(radius))], axis=1)
+    return power.quantile(SAMPLES[:, :1]), axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+@lru_cache(maxsize=16)
+def _distances(distance: Distribution) -> Array:
+    """Return the distances of the surface from the lens in drawn falloffs, mm, shape (N, 1)."""
+    return np.asarray(distance.quantile(SAMPLES[:, 4:]))
 
 
 def to_base(estimate: Estimate, priors: Priors) -> Estimate:

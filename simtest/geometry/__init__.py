@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from simtest.geometry.omnidirectional import Scaramuzza
     from simtest.geometry.patch import Patch
     from simtest.geometry.perspective import BrownConrady
-    from simtest.geometry.unified import Mei
     from simtest.runtime.arrays import Array, Image, Index, Mask
 
 _HOMES = {
@@ -34,7 +33,6 @@ _HOMES = {
     "simtest.geometry.omnidirectional": ("Scaramuzza",),
     "simtest.geometry.patch": ("Patch",),
     "simtest.geometry.perspective": ("BrownConrady",),
-    "simtest.geometry.unified": ("Mei",),
     "simtest.runtime.arrays": ("Array", "Image", "Index", "Mask"),
 }
 
@@ -52,7 +50,6 @@ __all__ = [
     "Index",
     "KannalaBrandt",
     "Mask",
-    "Mei",
     "Patch",
     "Scaramuzza",
     "ViewMask",

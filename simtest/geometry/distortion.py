@@ -15,7 +15,6 @@ from numpy.polynomial import Polynomial
 from simtest.geometry.lens_curves import check_finite, first_root, invert
 from simtest.geometry.omnidirectional import Scaramuzza
 from simtest.geometry.perspective import BrownConrady
-from simtest.geometry.unified import Mei
 from simtest.runtime.arrays import Array
 
 
@@ -89,13 +88,12 @@ class KannalaBrandt:
         return theta * factor(u), factor(u) + 2 * u * factor.deriv()(u)
 
 
-Distortion = BrownConrady | KannalaBrandt | Scaramuzza | Mei
+Distortion = BrownConrady | KannalaBrandt | Scaramuzza
 
 LENSES: dict[str, type[Distortion]] = {
     "brown_conrady": BrownConrady,
     "kannala_brandt": KannalaBrandt,
     "scaramuzza": Scaramuzza,
-    "mei": Mei,
 }
 """Lenses by the names that they have in files."""
 

@@ -9,7 +9,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera, ViewMask
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Mei, Scaramuzza
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.geometry.field_of_view import FovExtent, focal_of_view
 from simtest.runtime.arrays import Array
 from simtest.spec.motion import Motion
@@ -98,25 +98,7 @@ class ScaramuzzaSpec(Spec):
         return Scaramuzza(**self.model_dump(exclude={"type"}))
 
 
-class MeiSpec(Spec):
-    """An omnidirectional lens: the model of OpenCV's omnidir module and of Kalibr's omni.
-
-    The unit direction (x, y, z) is imaged at (x, y) / (z + xi), then distorted as by `BrownConradySpec`.
-    """
-
-    type: Literal["mei"] = "mei"
-    xi: float = Field(0.0, ge=0, le=1e3, description="distance of the projection centre behind the unit sphere's")
-    k1: Coefficient = Field(0.0, description="radial")
-    k2: Coefficient = Field(0.0, description="radial")
-    p1: Coefficient = Field(0.0, description="tangential")
-    p2: Coefficient = Field(0.0, description="tangential")
-
-    def model(self) -> Mei:
-        """Return the lens as the geometry package uses it."""
-        return Mei(**self.model_dump(exclude={"type"}))
-
-
-DistortionSpec = Annotated[BrownConradySpec | KannalaBrandtSpec | ScaramuzzaSpec | MeiSpec, Field(discriminator="type")]
+DistortionSpec = Annotated[BrownConradySpec | KannalaBrandtSpec | ScaramuzzaSpec, Field(discriminator="type")]
 
 
 class ViewMaskSpec(Spec):

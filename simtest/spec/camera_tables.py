@@ -67,7 +67,6 @@ def camera_toml(camera: Camera) -> str:
         "brown_conrady": "Brown-Conrady",
         "kannala_brandt": "Kannala-Brandt",
         "scaramuzza": "Scaramuzza",
-        "mei": "Mei",
     }
     kind = f"{lens[inner['distortion']['type']]} camera" if "distortion" in inner else "Pinhole camera"
     lines = [f"# {kind}; pixel centres at integer + 0.5."]

@@ -175,5 +175,4 @@ def _render(scene: Scene) -> str:
 def _camera(scene: Scene) -> str:
     kind = getattr(scene.camera.distortion, "type", None) if scene.camera.distortion is not None else None
     return {None: "pinhole camera", "none": "pinhole camera", "brown_conrady": "distorted lens",
-            "kannala_brandt": "fisheye", "scaramuzza": "omnidirectional lens",
-            "mei": "omnidirectional lens"}.get(kind, str(kind))  # fmt: skip
+            "kannala_brandt": "fisheye", "scaramuzza": "omnidirectional lens"}.get(kind, str(kind))  # fmt: skip

@@ -244,40 +244,6 @@ def test_kalibr(tmp_path):
     np.testing.assert_allclose(R @ in_first[:3] + [-110.0, 20.0, 3.0], [1, 2, 3], atol=1e-12)
 
 
-def mei(told):
-    """Return the projection of Mei's model: xi fu fv pu pv, then k1 k2 p1 p2."""
-    xi, fu, fv, pu, pv, k1, k2, p1, p2 = told
-
-    def project(x, y, z):
-        length = np.sqrt(x * x + y * y + z * z)
-        u, v = x / (z + xi * length), y / (z + xi * length)
-        r2 = u * u + v * v
-        ratio = 1 + k1 * r2 + k2 * r2**2
-        return (
-            fu * (u * ratio + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)) + pu,
-            fv * (v * ratio + 2 * p2 * u * v + p1 * (r2 + 2 * v * v)) + pv,
-        )
-
-    return project
-
-
-def test_the_omni_models_of_kalibr_and_opencv(tmp_path):
-    told = [1.3, 833.0, 830.3, 373.8, 253.7, -0.12, 0.03, 0.0006, -0.0006]
-    text = (
-        f"cam0:\n  camera_model: omni\n  distortion_model: radtan\n  distortion_coeffs: {told[5:]}\n"
-        f"  intrinsics: {told[:5]}\n  resolution: [752, 480]\n"
-    )
-    camera = load_camera(written(tmp_path, "camchain.yaml", text))
-    agrees(camera, half_a_pixel_on(mei(told)), WIDE)
-    save_camera(camera, tmp_path / "omni.yml")
-    assert "xi:" in (tmp_path / "omni.yml").read_text()
-    agrees(load_camera(tmp_path / "omni.yml"), half_a_pixel_on(mei(told)), WIDE)
-    save_camera(camera, tmp_path / "own.toml")
-    assert load_camera(tmp_path / "own.toml") == camera
-    plain = text.replace("omni", "pinhole").replace("[1.3, ", "[")
-    assert isinstance(load_camera(written(tmp_path, "plain.yaml", plain)).distortion, BrownConrady)
-
-
 # Vicalib ----------------------------------------------------------------------------------------------------------
 
 

@@ -7,7 +7,7 @@ from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 
 from simtest.errors import InputError
-from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Mei, Scaramuzza, ViewMask
+from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Scaramuzza, ViewMask
 from tests.example_counts import examples
 
 WIDTH, HEIGHT = 640, 480
@@ -35,10 +35,6 @@ OMNI = st.builds(
     d=spread(-0.01, 0.01), e=spread(-0.01, 0.01),
 )  # fmt: skip
 
-MEI = st.builds(
-    Mei, xi=spread(0, 2.5), k1=spread(-0.3, 0.3), k2=spread(-0.1, 0.1), p1=spread(-0.01, 0.01), p2=spread(-0.01, 0.01)
-)
-
 
 def test_newtons_steps_do_not_go_to_and_fro():
     """Between 91 and 92 deg they did, and gave directions 66 deg off."""
@@ -49,7 +45,7 @@ def test_newtons_steps_do_not_go_to_and_fro():
 
 
 @settings(max_examples=examples(80), deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
-@given(st.one_of(BROWN, FISHEYE, OMNI, MEI), st.sampled_from([None, MASK]), spread(150, 900))
+@given(st.one_of(BROWN, FISHEYE, OMNI), st.sampled_from([None, MASK]), spread(150, 900))
 def test_pixels_round_trip(lens, mask, focal):
     try:
         camera = Camera(WIDTH, HEIGHT, focal, 0.9 * focal, 331.2, 225.7, 3.0, lens, mask)
@@ -138,29 +134,6 @@ def test_an_omnidirectional_lens_sees_sideways_and_backwards():
     for c, d, e in ((1.0, 2.0, 0.5), (-1.0, 0.0, 0.0), (0.0, 0.0, 0.0)):
         with pytest.raises(InputError, match=r"distortion\.c = .* c - d e must be > 0"):
             Scaramuzza(-0.1, 0.0, 0.0, c, d, e)
-
-
-def test_meis_lens():
-    """Without distortion, r = sin / (cos + xi): xi 1 is stereographic, xi 0 a pinhole."""
-    for xi in (0.0, 0.6, 1.0, 1.8):
-        lens = Mei(xi)
-        angle = np.linspace(0, 0.95 * lens.limit_angle, 40)
-        rays = np.stack([np.sin(angle), np.zeros(40), np.cos(angle)], axis=-1)
-        seen = lens.distort(3 * rays)
-        np.testing.assert_allclose(seen[:, 0], np.sin(angle) / (np.cos(angle) + xi), rtol=1e-12, atol=1e-15)
-        np.testing.assert_allclose(lens.undistort(seen), rays, atol=1e-9)
-    np.testing.assert_allclose(Mei(1.0).distort([1.0, 0.0, 0.0]), [1, 0], atol=1e-15)
-    assert Mei(0.5).limit_angle == pytest.approx(np.arccos(-0.5), abs=1e-5)
-    assert Mei(2.0).limit_angle == pytest.approx(np.arccos(-0.5))
-    assert np.isnan(Mei(2.0).distort([np.sin(2.2), 0.0, np.cos(2.2)])).all()
-    # r is at most 1 / sqrt(xi^2 - 1) with xi > 1.
-    assert np.isnan(Mei(2.0).undistort([0.58, 0.0])).all()
-    # The perspective lens behind the sphere folds over first.
-    bent = Mei(1.0, k1=-0.4)
-    assert bent.distort([np.sin(bent.limit_angle - 1e-4), 0, np.cos(bent.limit_angle - 1e-4)])[0] > 0
-    assert np.isnan(bent.distort([np.sin(bent.limit_angle + 1e-4), 0, np.cos(bent.limit_angle + 1e-4)])).all()
-    with pytest.raises(InputError, match="xi = -1: must be >= 0"):
-        Mei(-1.0)
 
 
 def test_a_fisheye_sees_sideways_and_backwards():

@@ -24,7 +24,6 @@ PUBLIC = {
     "Failure": "simtest.errors",
     "InputError": "simtest.errors",
     "KannalaBrandt": "simtest.geometry.distortion",
-    "Mei": "simtest.geometry.unified",
     "Scaramuzza": "simtest.geometry.omnidirectional",
     "LabelledFrame": "simtest.simulation.labelled_frame",
     "Patch": "simtest.geometry.patch",

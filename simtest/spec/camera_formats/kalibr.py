@@ -62,20 +62,18 @@ def _chain(path: Path) -> dict[str, Mapping[str, Any]]:
 
 def _camera(data: Mapping[str, Any], at: str) -> Table:
     model = data.get("camera_model")
-    if model not in ("pinhole", "omni"):
-        raise InputError(f"{at}: camera_model = {shown(repr(model), 40)}: simtest lacks it; must be pinhole or omni")
-    intrinsics = numbers(data.get("intrinsics"), at, "intrinsics", 4 if model == "pinhole" else 5)
-    xi = intrinsics.pop(0) if model == "omni" else 0.0
-    fx, fy, cx, cy = intrinsics
+    if model != "pinhole":
+        raise InputError(f"{at}: camera_model = {shown(repr(model), 40)}: simtest lacks it; must be pinhole")
+    fx, fy, cx, cy = numbers(data.get("intrinsics"), at, "intrinsics", 4)
     width, height = numbers(data.get("resolution"), at, "resolution", 2)
     table = {
         "width": int(number(width, at, "resolution", whole=True)), "fx": fx, "cx": cx + PIXEL_CENTRE,
         "height": int(number(height, at, "resolution", whole=True)), "fy": fy, "cy": cy + PIXEL_CENTRE,
     }  # fmt: skip
-    return table | _lens(data, xi, at)
+    return table | _lens(data, at)
 
 
-def _lens(data: Mapping[str, Any], xi: float, at: str) -> Table:
+def _lens(data: Mapping[str, Any], at: str) -> Table:
     """Return the key `distortion`, or nothing for a pinhole."""
     name = data.get("distortion_model", "none")
     if name not in LENSES:
@@ -83,11 +81,6 @@ def _lens(data: Mapping[str, Any], xi: float, at: str) -> Table:
             f"{at}: distortion_model = {shown(repr(name), 40)}: simtest lacks it; must be one of {', '.join(LENSES)}"
         )
     told = [] if name == "none" else numbers(data.get("distortion_coeffs"), at, "distortion_coeffs", 4)
-    if xi != 0:
-        if name in ("equidistant", "equi"):
-            raise InputError(f"{at}: distortion_model = {name!r}: must be none or radtan with camera_model 'omni'")
-        lens = dict(zip(("k1", "k2", "p1", "p2"), told or (0.0,) * 4, strict=True))
-        return {"distortion": {"type": "mei", "xi": xi, **lens}}
     if name in ("equidistant", "equi"):
         return {"distortion": {"type": "kannala_brandt", **dict(zip(("k1", "k2", "k3", "k4"), told, strict=True))}}
     if not any(told):

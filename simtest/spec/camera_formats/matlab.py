@@ -13,7 +13,7 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Mei, Scaramuzza
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.runtime.resources import shown
 from simtest.spec.camera_formats.common import Table, check_alike, mask_of_text, mask_text, number
 from simtest.spec.camera_formats.matlab_struct import HOW, read_struct
@@ -135,9 +135,8 @@ def matlab_bytes(camera: Camera) -> bytes:
             "DistortionCenter": np.array([camera.cx, camera.cy]) + PIXEL_CENTRE,
             "StretchMatrix": np.array([[lens.c, lens.d], [lens.e, 1.0]]),
         }
-    elif isinstance(lens, KannalaBrandt | Mei):
-        kind = "Mei" if isinstance(lens, Mei) else "Kannala-Brandt"
-        raise InputError(f"camera.distortion: MATLAB has no {kind} lens; save as TOML instead")
+    elif isinstance(lens, KannalaBrandt):
+        raise InputError("camera.distortion: MATLAB has no Kannala-Brandt lens; save as TOML instead")
     else:
         lens = lens or BrownConrady()
         if lens.k4 or lens.k5 or lens.k6:

@@ -15,7 +15,7 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Mei, Scaramuzza
+from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.runtime.resources import shown
 from simtest.spec.camera_formats.common import Table, parse_json
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
@@ -201,12 +201,8 @@ def _lens(data: Mapping[str, Any], where: str) -> dict[str, str | float] | None:
     name, value = _one_of(data, LENS_NAMES, where)
     fisheye, model = _is_fisheye(data, where), data.get("distortion_model") or ""
     if "xi" in data:
-        if fisheye:
-            raise InputError(f"{where}: xi: given beside a fisheye model; only one of them is allowed")
-        # The omnidir module's mirror; without it the other numbers mean another lens.
-        (xi,) = _numbers(data["xi"] if not isinstance(data["xi"], int | float) else [data["xi"]], where, "xi", (1,))
-        told = [0.0] * 4 if name is None else _numbers(value, where, name, (4,))
-        return {"type": "mei", "xi": xi, **dict(zip(("k1", "k2", "p1", "p2"), told, strict=True))}
+        # Without it the other numbers mean another lens.
+        raise InputError(f"{where}: xi: simtest lacks the lens of OpenCV's omnidir module; calibrate as a fisheye")
     if name is None:
         _check_no_other_lens(data, where)
     # no coefficients
@@ -273,8 +269,6 @@ def opencv_text(camera: Camera, suffix: str) -> str:
     storage.write("image_height", camera.height)
     if isinstance(camera.distortion, KannalaBrandt):
         storage.write("fisheye_model", 1)
-    if isinstance(camera.distortion, Mei):
-        storage.write("xi", np.array([[camera.distortion.xi]]))
     storage.write("camera_matrix", matrix)
     storage.write("distortion_coefficients", np.array([coefficients]))
     if (mask := _shifted_mask(camera)) is not None:
@@ -311,10 +305,6 @@ def _shifted(camera: Camera, whose: str) -> tuple[Any, list[float]]:
     lens = camera.distortion
     if isinstance(lens, Scaramuzza):
         raise InputError(f"camera.distortion: {whose} has no Scaramuzza lens; save as TOML or for MATLAB instead")
-    if isinstance(lens, Mei):
-        if whose == "ROS":
-            raise InputError("camera.distortion: ROS has no Mei lens; save as TOML or for OpenCV instead")
-        return matrix, [float(getattr(lens, name)) for name in ("k1", "k2", "p1", "p2")]
     if isinstance(lens, KannalaBrandt):
         return matrix, [float(getattr(lens, name)) for name in ("k1", "k2", "k3", "k4")]
     values = [float(getattr(lens or BrownConrady(), name)) for name in BROWN_ORDER]
