@@ -9,6 +9,7 @@ import pytest
 from simtest.advice.twin.scoring import score
 from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, Calibration, exactly, srgb_encode
 from simtest.dataset.maker import colour_variant
+from simtest.errors import Failure, Reason
 from simtest.estimators import load_estimators
 from simtest.estimators.near_misses import (
     AROUND,
@@ -113,6 +114,20 @@ def test_a_region_of_interest_is_as_uncertain_as_in_the_whole_frame():
     (spot,) = reconstruct(single, camera, ["cone_axis"])
     (alone,) = reconstruct(single, camera, ["cone_axis"], roi=spot.region.box)
     assert spot.patch.others_px == alone.patch.others_px == ()
+
+
+def test_a_region_of_noise_alone_has_no_answer():
+    known = Calibration(Camera.from_fov(60.0, 160, 120), priors=LIGHT_AT_CAMERA)
+    y, x = np.mgrid[:120, :160] + 0.5
+    dim = np.exp(-((x - 70) ** 2 + (y - 65) ** 2) / 128)
+    for seed in range(20):
+        noise = np.random.default_rng(seed).normal(0.08, 0.004, (120, 160))
+        (spot,) = reconstruct(noise.astype(np.float32), known, NAMES, roi=(40, 40, 60, 60))
+        assert isinstance(spot.patch, Failure)
+        assert {each.reason for each in spot.estimates.values()} == {Reason.NO_PEAK}
+        # Negative control: a highlight that stands no higher than detection asks for.
+        (spot,) = reconstruct((noise + 0.03 * dim).astype(np.float32), known, NAMES, roi=(40, 40, 60, 60))
+        assert not isinstance(spot.patch, Failure)
 
 
 def test_neighbours_in_a_colour_picture_are_those_found_by_colour():
