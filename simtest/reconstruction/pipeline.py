@@ -68,7 +68,7 @@ def reconstruct(
     (or at the calibration's saturation level); specularities are found by colour where it has any. A frame of real
     numbers is linear light of any scale, or values as encoded where the calibration states the response, in which no
     pixel counts as clipped unless the calibration states the level; specularities are found as peaks of the channels'
-    mean. What was told and what was inferred stands in the result's `choices`.
+    mean. What was given and what was inferred stands in the result's `choices`.
 
     Parameters
     ----------
