@@ -131,7 +131,7 @@ class LearnedDense:
         values : ndarray of float32, shape (H, W, 3)
             The frame as encoded, in [0, 1].
         calibration : Calibration
-            Camera, lights, response and falloff.
+            Camera, lights, response and falloff; without a response the values count as linear light.
         highlights_px : ndarray, shape (N, 2), optional
             Peaks of detected highlights. Where they are four or more, the frame is checked against the law of
             reflection. `simtest.reconstruction.learned_maps.learned_maps` detects them.

@@ -1,7 +1,7 @@
 """How a picture is taken where nobody says it: encoding, detector, smoothing; one rule for files and for arrays.
 
 Values of 8 or 16 bits are those of a picture: encoded, and clipped at the largest one. Real values are linear light of
-any scale, unless an encoding is told: then they are those of a picture, in [0, 1].
+any scale, unless an encoding is given: then they are those of a picture, in [0, 1].
 """
 
 from dataclasses import dataclass, replace
@@ -43,11 +43,11 @@ class Choices:
     estimators : tuple of str
         Their names.
     priors : Priors
-        What the estimators were told of lights, distance, lobe, camera and relief.
+        What the estimators are given of lights, distance, lobe, camera and relief.
     inferred : tuple of str
-        Those of `encoding`, `saturation_level`, `detector`, `smoothing_px` and `estimators` that nobody told.
+        Those of `encoding`, `saturation_level`, `detector`, `smoothing_px` and `estimators` that nobody gave.
     assumed : tuple of Assumption
-        What else nobody told, with the distribution that stands for it in the budgets, and how to narrow it.
+        What else nobody gave, with the distribution that stands for it in the budgets, and how to narrow it.
     """
 
     encoding: str
@@ -62,7 +62,7 @@ class Choices:
     __repr__ = short_repr
 
     def __str__(self) -> str:
-        """Return the choices on one line; those that nobody told are marked."""
+        """Return the choices on one line; those that nobody gave are marked."""
         level = "none" if self.saturation_level is None else f"at {self.saturation_level:g}"
         said = {
             "encoding": f"encoding {self.encoding}", "saturation_level": f"clipped {level}",
@@ -118,7 +118,7 @@ def choose_detector(
 
 
 def choose_smoothing(told: float | None, finder: Detector) -> float:
-    """Return the smoothing, px: the told one, or else 1 px by colour or a network, and 2 px by other detectors."""
+    """Return the smoothing, px: the given one, or else 1 px by colour or a network, and 2 px by other detectors."""
     if told is not None:
         return told
     return SMOOTHING_BY_COLOUR_PX if isinstance(finder, ColourDetector | LearnedDetector) else DEFAULT_SMOOTHING_PX

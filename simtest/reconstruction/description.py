@@ -159,8 +159,8 @@ class PictureRecord:
     """A picture and all that was reconstructed in it.
 
     `encoding` is the kind of the response that was undone, `smoothing_px` the width of the Gaussian; `inferred` names
-    those of these and of detector, estimators and saturation level that nobody told, and `assumed` is what else nobody
-    told, and how it was taken.
+    those of these and of detector, estimators and saturation level that nobody gave, and `assumed` is what else nobody
+    gave, and how it was taken.
     """
 
     image: str

@@ -73,7 +73,7 @@ class Specularities(list[Specularity]):
     detection : Detection
         What the detector found, with highlights of other kinds and the view where it judges them.
     choices : Choices
-        Encoding, detector, smoothing, estimators and priors; `choices.inferred` names those that nobody told.
+        Encoding, detector, smoothing, estimators and priors; `choices.inferred` names those that nobody gave.
     """
 
     def __init__(self, made: Reconstruction, choices: Choices) -> None:

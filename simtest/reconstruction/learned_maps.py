@@ -8,6 +8,7 @@ from simtest.detection.view_mask import find_view
 from simtest.errors import Failure
 from simtest.estimators.learned_dense import DenseMaps, LearnedDense, learned_dense
 from simtest.geometry import Array
+from simtest.reconstruction.choices import complete
 from simtest.runtime.arrays import Image, Mask
 
 SMOOTHING_PX = 1.0
@@ -27,14 +28,15 @@ def learned_maps(
     picture : ndarray of float32, shape (H, W, 3)
         Values as encoded, in [0, 1].
     calibration : Calibration
-        Camera, lights, response and falloff.
+        Camera, lights, response and falloff; without a response sRGB.
     network : LearnedDense
         Default: the shipped one.
     detector : str or Detector
         Finds the highlights.
     """
     seen = find_view(picture).seen if calibration.camera.seen is None else calibration.camera.seen
-    return network.maps(picture, calibration, _peaks(picture, calibration, seen, detector), seen)
+    known = complete(calibration, None)
+    return network.maps(picture, known, _peaks(picture, known, seen, detector), seen)
 
 
 def _peaks(picture: Image, calibration: Calibration, seen: Mask | None, detector: str | Detector) -> Array:

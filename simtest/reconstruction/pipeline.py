@@ -21,6 +21,7 @@ from simtest.estimators.process.naming import short_names
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
+from simtest.geometry.gaussian_smoothing import share_of_noise
 from simtest.reconstruction.assumptions import assumptions, calibration_of_view
 from simtest.reconstruction.choices import (
     AUTO,
@@ -39,6 +40,10 @@ from simtest.runtime.resources import shown
 
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
 MAX_SMOOTHING_PX = 50
+
+LEAST_HEIGHT = 6.0
+"""A user's region holds a highlight if its peak is so many standard deviations of the smoothed noise above its median:
+noise alone reaches 6 in one of 10^5 regions. What is detected stands out far more."""
 
 SMALL_RADIUS = 3.0
 """A highlight whose radius at half height is below this many smoothing widths is made rounder by more than a tenth: its
@@ -63,7 +68,7 @@ def reconstruct(
     (or at the calibration's saturation level); specularities are found by colour where it has any. A frame of real
     numbers is linear light of any scale, or values as encoded where the calibration states the response, in which no
     pixel counts as clipped unless the calibration states the level; specularities are found as peaks of the channels'
-    mean. What was told and what was inferred stands in the result's `choices`.
+    mean. What was given and what was inferred stands in the result's `choices`.
 
     Parameters
     ----------
@@ -283,6 +288,17 @@ def _cut_region(
     return Detection((Region(box, (x, y), None),), frame), tuple(each for each in detected if each is not own)
 
 
+def _above_noise(patch: Patch | Failure) -> Patch | Failure:
+    """Return the patch of a user's region, or a Failure where its peak may be noise alone."""
+    if isinstance(patch, Failure):
+        return patch
+    noise = (patch.noise_at_peak or 0.0) * share_of_noise(patch.smoothing_px)
+    height = patch.peak_value - float(np.median(patch.values if patch.seen is None else patch.values[patch.seen]))
+    if height > LEAST_HEIGHT * noise:
+        return patch
+    return Failure(Reason.NO_PEAK, f"the peak is {height:.3g} above the region's median, {noise:.3g} is noise")
+
+
 def _estimate(
     detection: Detection, estimators: Mapping[str, AnyEstimator], beside: Sequence[Region] = ()
 ) -> Reconstruction:
@@ -295,7 +311,7 @@ def _estimate(
     # highlight among brighter ones may be a near miss.
     known = [*regions, *beside]
     peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in known]
-    cut = [frame.patch(r.box) if r.contrast is None else frame.patch(r.box, r.peak) for r in known]
+    cut = [_above_noise(frame.patch(r.box)) if r.contrast is None else frame.patch(r.box, r.peak) for r in known]
     # Highlights that touch have no isophotes of their own, so no estimator answers for them.
     for i, highlight in enumerate(detection.highlights):
         if highlight.kind is Kind.CLUSTER:

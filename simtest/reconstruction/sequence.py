@@ -50,8 +50,8 @@ TIMELINE = ("frame", "time_s", "track", *COLUMNS)
 class SequenceResult:
     """How many frames, specularities and tracks of two frames or more a sequence gave, and the files written.
 
-    `assumed` is what nobody told of its frames; empty where all were done by an earlier run. `motion` says how many
-    highlights' curvatures the poses told, where these are known.
+    `assumed` is what nobody gave of its frames; empty where all were done by an earlier run. `motion` says how many
+    highlights' curvatures the poses tell, where these are known.
     """
 
     frames: int

@@ -9,6 +9,7 @@ import pytest
 from simtest.advice.twin.scoring import score
 from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, Calibration, exactly, srgb_encode
 from simtest.dataset.maker import colour_variant
+from simtest.errors import Failure, Reason
 from simtest.estimators import load_estimators
 from simtest.estimators.near_misses import (
     AROUND,
@@ -23,7 +24,9 @@ from simtest.estimators.near_misses import (
     near_miss_variance,
 )
 from simtest.geometry import Camera, Patch, chi_squared, smooth
+from simtest.reconstruction.found import Reconstruction
 from simtest.reconstruction.pipeline import reconstruct, run_picture
+from simtest.reconstruction.ranking import best_of
 from simtest.rendering import Session
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import load_scene
@@ -115,6 +118,20 @@ def test_a_region_of_interest_is_as_uncertain_as_in_the_whole_frame():
     assert spot.patch.others_px == alone.patch.others_px == ()
 
 
+def test_a_region_of_noise_alone_has_no_answer():
+    known = Calibration(Camera.from_fov(60.0, 160, 120), priors=LIGHT_AT_CAMERA)
+    y, x = np.mgrid[:120, :160] + 0.5
+    dim = np.exp(-((x - 70) ** 2 + (y - 65) ** 2) / 128)
+    for seed in range(20):
+        noise = np.random.default_rng(seed).normal(0.08, 0.004, (120, 160))
+        (spot,) = reconstruct(noise.astype(np.float32), known, NAMES, roi=(40, 40, 60, 60))
+        assert isinstance(spot.patch, Failure)
+        assert {each.reason for each in spot.estimates.values()} == {Reason.NO_PEAK}
+        # Negative control: a highlight that stands no higher than detection asks for.
+        (spot,) = reconstruct((noise + 0.03 * dim).astype(np.float32), known, NAMES, roi=(40, 40, 60, 60))
+        assert not isinstance(spot.patch, Failure)
+
+
 def test_neighbours_in_a_colour_picture_are_those_found_by_colour():
     lobes = np.clip(crowd()[..., None] - 0.05, 0, None)
     picture = np.rint(255 * srgb_encode(np.clip(0.2 * np.array([1.0, 0.5, 0.4]) + 0.6 * lobes, 0, 1))).astype(np.uint8)
@@ -183,6 +200,20 @@ def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monk
     assert count >= 100
     assert near > 0.2
     assert held > 0.88
+    # Regions of interest of the same boxes are as uncertain, and hold as many.
+    whole = run_picture(picture, view.calibration)[0]
+    cut, ratios = [], []
+    for spot in whole.specularities[:60]:
+        (alone,) = run_picture(picture, view.calibration, roi=spot.region.box)[0].specularities
+        pair = [each.estimates[best].deviation_deg for each in (spot, alone) if (best := best_of(each.estimates)[0])]
+        if len(pair) == 2:
+            ratios.append(pair[1] / pair[0])
+            cut.append(alone)
+    assert len(ratios) >= 20
+    assert min(ratios) > 0.8
+    boxes = replace(whole.detection, regions=tuple(each.region for each in cut), highlights=())
+    scored = [spot.held for spot in score(session, view, Reconstruction(cut, boxes)) if spot.held is not None]
+    assert np.mean(scored) > 0.85
     # Negative control: no frame is crowded.
     monkeypatch.setattr("simtest.estimators.near_misses.CROWD", math.inf)
     assert shares()[2] < 0.75

@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 import torch
 
-from simtest.calibration import Calibration, Frame, Priors
+from simtest.calibration import Calibration, Frame, Priors, Response
 from simtest.dataset.learn import dense_network
 from simtest.dataset.learn.dense_export import dense_scales, evaluated
 from simtest.dataset.learn.dense_task import DenseNormals, cells_of, disturbed, known_cells, without_factor
@@ -60,7 +60,7 @@ def plane(seed):
 
 def calibration(focal=130.0, lights=LIGHTS, width=WIDTH, height=HEIGHT, **camera):
     lens = Camera(width, height, focal, focal, width / 2, height / 2, **camera)
-    return Calibration(lens, priors=Priors(lights_mm=lights))
+    return Calibration(lens, Response("srgb"), priors=Priors(lights_mm=lights))
 
 
 def examples(seeds):
