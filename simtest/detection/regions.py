@@ -9,7 +9,7 @@ import numpy.typing as npt
 from simtest.calibration.noise_estimate import median
 from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_ISOVALUE
 from simtest.geometry import pixel_sets
-from simtest.runtime.arrays import Array, Image, Mask
+from simtest.runtime.arrays import Image, Mask
 
 EXPANSION = 2.0
 """Region of interest over the highlight's size at half height; a Gaussian at t = 0.1 is 1.8 times that size."""
@@ -55,12 +55,6 @@ class Component:
     x: int
     y: int
     closed: bool
-
-    def holds(self, point_px: Array) -> bool:
-        """Return whether a point, px, lies in one of the pixels."""
-        column, row = int(point_px[0]) - self.x, int(point_px[1]) - self.y
-        height, width = self.mask.shape
-        return 0 <= row < height and 0 <= column < width and bool(self.mask[row, column])
 
 
 def detect(smoothed: Image, noise: float | Image, isolated: bool = True, seen: Mask | None = None) -> list[Region]:
