@@ -69,13 +69,15 @@ def _checked(result: object, camera: Camera) -> Estimate:
         changed |= {"budget": budget, "covariance": None}
     # unit vectors, the proposed one first
     normal = unit_vector(_numbers(result.normal, "normal", (3,)), "normal")
-    given = _numbers(result.candidates, "candidates", (None, 3))
+    given = [*_numbers(result.candidates, "candidates", (None, 3))]
     if not 1 <= len(given) <= MAX_CANDIDATES:
         raise Refused(f"{len(given)} candidates; must be 1 to {MAX_CANDIDATES}")
     candidates = [unit_vector(each, "candidate") for each in given]
-    if max(map(abs, (candidates[0] - normal).tolist())) > ROUNDED:
+    apart = max(map(abs, (candidates[0] - normal).tolist()))
+    if apart > ROUNDED:
         raise Refused("the first candidate must be the proposed normal")
-    if normal is not result.normal or max(map(abs, (np.array(candidates) - given).ravel().tolist())) > 0:
+    rounded = any(exact is not each for exact, each in zip(candidates, given, strict=True))
+    if normal is not result.normal or rounded or apart > EXACT:
         changed |= {"normal": normal, "candidates": np.array([normal, *candidates[1:]])}
     _check_look(_numbers(result.look_px, "look_px", (2,)), normal, camera)
     # numbers

@@ -294,6 +294,8 @@ def test_few_digits_are_made_exact_and_exact_ones_stay():
     np.testing.assert_array_equal(made.candidates, UP[None])
     np.testing.assert_array_equal(made.covariance, made.covariance.T)
     assert check(made, CAMERA) is made
+    other = np.array([[3e-4, 0.0, -np.sqrt(1 - 9e-8)], [0.0, 0.6, -0.8]])
+    np.testing.assert_array_equal(check(replace(made, candidates=other), CAMERA).candidates, [UP, other[1]])
 
 
 def test_estimators_of_patches_and_of_frames_meet_in_the_specularities():
