@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Priors
-from simtest.estimators.budget import CONFIDENCE, equivalent_variance, line_covariance
+from simtest.estimators.budget import CONFIDENCE, equivalent_covariance, equivalent_variance
 from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.near_misses import near_miss_parts
@@ -49,8 +49,9 @@ SHARES = (np.arange(64) + 0.5) / 64
 """At these shares a prior of one number is sampled."""
 
 _DRAWS, _GOLDEN = (np.arange(128) + 0.5) / 128, math.pi * (3 - math.sqrt(5)) * np.arange(128)
-DRAWN = np.sqrt(-2 * np.log(1 - _DRAWS))[:, None] * np.stack([np.cos(_GOLDEN), np.sin(_GOLDEN)], axis=1)
-"""A pair of standard normal numbers is sampled at these, shape (128, 2)."""
+_SPIRAL = np.sqrt(-2 * np.log(1 - _DRAWS))[:, None] * np.stack([np.cos(_GOLDEN), np.sin(_GOLDEN)], axis=1)
+DRAWN = _SPIRAL @ np.linalg.inv(np.linalg.cholesky(_SPIRAL.T @ _SPIRAL / 128)).T
+"""A pair of standard normal numbers is sampled at these, whose mean square is the unit matrix, shape (128, 2)."""
 
 
 def add_untold_parts(
@@ -161,12 +162,12 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     the sightline ever more: there the moves are those at pixels drawn from the prior, without those past the lens's
     limit, which no camera that saw this highlight has.
     """
-    look, sightline = estimate.look_px, camera.unproject(estimate.look_px)
-    across = basis_across(estimate.normal)
-    if not np.isfinite(sightline).all():
-        return None
+    look, across = estimate.look_px, basis_across(estimate.normal)
     from_centre = look - [camera.cx, camera.cy]
     reach = np.linalg.solve(camera.K[:2, :2], from_centre)
+    sightline = camera.unproject(look)
+    if not np.isfinite(sightline).all():
+        return None
     if isinstance(camera.distortion, BrownConrady):
         reach = sightline[:2] / sightline[2]  # its k1 moves what the lens has not yet bent
     bulge = camera.K[:2, :2] @ reach * (reach @ reach)
@@ -178,7 +179,9 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     variances, axes = np.linalg.eigh(in_pixels)
     drawn = look + DRAWN @ (axes * np.sqrt(np.maximum(variances, 0.0))).T
     moves = (camera.unproject(drawn) - sightline) @ across.T
-    return line_covariance(moves[np.isfinite(moves).all(axis=1)])
+    moves = moves[np.isfinite(moves).all(axis=1)]
+    square, wide = moves.T @ moves / len(moves), equivalent_covariance(moves)
+    return wide if np.trace(wide) > np.trace(square) else np.asarray(square)
 
 
 def falloff_part(normal: Array, family: HighlightAxis, power: Distribution) -> Array:
