@@ -91,7 +91,7 @@ def _checked(result: object, camera: Camera) -> Estimate:
     if result.curvature is not None:
         _check_curvature(result.curvature)
     if not isinstance(result.flags, tuple) or len(result.flags) > MAX_FLAGS or not all(map(_is_flag, result.flags)):
-        allowed = f"a tuple of at most {MAX_FLAGS} words of at most {LONGEST_FLAG} characters"
+        allowed = f"a tuple of at most {MAX_FLAGS} texts of at most {LONGEST_FLAG} printable characters without a comma"
         raise Refused(f"flags: {result.flags!r:.60}; must be {allowed}")
     return replace(result, **changed) if changed else result  # type: ignore[arg-type]
 
@@ -168,8 +168,8 @@ def _check_ratio(value: object, name: str) -> None:
 
 
 def _is_flag(flag: object) -> bool:
-    """Whether a flag is one word, as the results list several."""
-    return isinstance(flag, str) and 0 < len(flag) <= LONGEST_FLAG and flag.isprintable() and not set(flag) & set(" ,")
+    """Whether a flag can stand in the results, which list several between commas."""
+    return isinstance(flag, str) and 0 < len(flag) <= LONGEST_FLAG and flag.isprintable() and "," not in flag
 
 
 def _number(value: object, name: str) -> float:

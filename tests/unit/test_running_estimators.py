@@ -263,7 +263,7 @@ MALFORMED = {
     "far away": ({"look_px": np.array([1e7, -5.0])}, r"look_px: looks at the pixel \(1e\+07, -5\)"),
     "away": ({"normal": -UP, "candidates": -UP[None]}, "the normal faces away from the camera"),
     "curvature": ({"curvature": EstimatedCurvature(np.eye(3)[:2], 2.0)}, "curvature axis_ratio: 2"),
-    "flag": ({"flags": ("a,b",)}, r"flags: \('a,b',\); must be a tuple of at most 16 words"),
+    "flag": ({"flags": ("a,b",)}, r"flags: \('a,b',\); must be a tuple of at most 16 texts"),
     "nowhere": ({"look_px": np.array([np.nan, 1.0])}, "look_px holds NaN"),
 }
 
