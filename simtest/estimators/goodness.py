@@ -1,5 +1,6 @@
 """Goodness of a lobe's fit: whether it explains its pixels, and how far the normal depends on which are fitted."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -24,9 +25,9 @@ FLOOR = 2e-3
 INNER = 0.5
 """Near the peak all smooth lobes agree: pixels above this share of it are fitted for comparison."""
 
-
-CORRELATED_PX = 4
-"""Coding and demosaicing correlate the noise of pixels this far apart along an axis at most."""
+CORRELATED_PX, SUMMED_DEVIATIONS = 4, 2.0
+"""Coding and demosaicing correlate the noise of pixels this far apart along an axis at most. The sum of white noise's
+correlations exceeds 1 by so many of its standard deviations once in 40 highlights."""
 
 
 def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None, noise: float | Array) -> bool:
@@ -63,9 +64,9 @@ def correlation_of_noise(
 ) -> float:
     """Return by how much the noise's correlation between pixels raises a covariance of white residuals; 1: not at all.
 
-    A smooth model takes from correlated noise the sum of its correlations over all distances. It is at least what the
-    smoothed frame's noise, `noise`, says, and is that of the residuals where this is more; `places` are their rows and
-    columns, shape (2, m).
+    A smooth model takes from correlated noise the sum of its correlations over all distances. Both the smoothed frame's
+    noise, `noise`, and the residuals must show more than chance; the larger one counts. `places` are the residuals'
+    rows and columns, shape (2, m).
     """
     raised = float(np.mean(np.square(noise))) / max(fitted.sigma**2, 1e-300)
     if raised < COLOURED**2:
@@ -74,8 +75,9 @@ def correlation_of_noise(
     kept = np.ones(len(observed)) if clipped is None else (~clipped).astype(float)
     residual = kept * (observed - fitted.model.evaluate()[0])
     sums, pairs = (_products(values, rows, columns) for values in (residual, kept))
-    correlations = sums / np.maximum(pairs, 1.0) / fitted.sigma**2
-    return max(raised, float(correlations.sum()))
+    summed = float((sums / np.maximum(pairs, 1.0)).sum()) / fitted.sigma**2
+    chance = SUMMED_DEVIATIONS * math.sqrt((2 * CORRELATED_PX + 1) ** 2 / len(observed))
+    return max(raised, summed) if summed > 1 + chance else 1.0
 
 
 def _products(values: Array, rows: Index, columns: Index) -> Array:
