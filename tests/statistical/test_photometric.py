@@ -91,6 +91,7 @@ def test_regions_cover_the_truth():
     assert np.mean(4 * distances < quantile) < 0.6
 
 
+@pytest.mark.ci
 def test_noise_that_coding_or_demosaicing_has_correlated_widens_the_region(monkeypatch):
     """White noise of 3 % blurred by 1 px; the residuals alone show a third of what it does to the normal."""
     camera = Camera(110, 110, 250.0, 250.0, 55.0, 55.0)
