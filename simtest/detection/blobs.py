@@ -89,9 +89,6 @@ something else besides."""
 FOOT_REACH, FARTHEST_PX = 0.7, 10
 """Clutter is looked for beyond this share of a radius from the isophote at half height, and no farther off."""
 
-EDGE_PX = 3
-"""The picture's edge may cut a highlight within this distance."""
-
 _WIDE = np.ones((7, 7), dtype=np.uint8)
 
 
@@ -346,12 +343,6 @@ def _at_border(spot: Spot, shape: tuple[int, ...], seen: Mask | None) -> bool:
     own = np.zeros(around.shape, dtype=np.uint8)
     own[y - top : y - top + height, x - left : x - left + width] = spot.mask
     return bool((cv2.dilate(own, _WIDE) > 0)[around].any())
-
-
-def _near_edge(outline: Array, shape: tuple[int, ...]) -> bool:
-    """Return whether an isophote is so near to the picture's edge that it may be cut there."""
-    edge = [shape[1] - EDGE_PX, shape[0] - EDGE_PX]
-    return bool((outline < EDGE_PX).any() or (outline > edge).any())
 
 
 def _shape(fits: list[_Fitted]) -> tuple[float | None, float | None, float | None]:

@@ -1,7 +1,12 @@
 """Detector protocol, and detectors by name through the entry-point group ``simtest.detectors``."""
 
-from dataclasses import dataclass
+import contextlib
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
+
+import numpy as np
 
 from simtest.calibration import Frame, Priors
 from simtest.detection.blobs import Highlight
@@ -90,10 +95,28 @@ def run_detector(detector: Detector, frame: Frame) -> Detection:
         raise InputError(f"detector {name}: returned a {type(found).__name__}; must be a Detection")
     if len(found.highlights) not in (0, len(found.regions)):
         raise InputError(f"detector {name}: {len(found.highlights)} highlights for {len(found.regions)} regions")
-    for box in (region.box for region in found.regions):
-        if not (isinstance(box, tuple) and len(box) == 4 and all(isinstance(v, int) for v in box)):
-            raise InputError(f"detector {name}: box {shown(box, 80)}: must be a tuple of four integers x, y, w, h")
-        x, y, w, h = box
-        if min(x, y) < 0 or min(w, h) < 1 or x + w > width or y + h > height:
-            raise InputError(f"detector {name}: box {box} leaves the frame of {width} x {height} px")
-    return found
+    try:
+        return replace(found, regions=tuple(_sound(region, width, height) for region in found.regions))
+    except InputError as error:
+        raise InputError(f"detector {name}: {error}") from None
+
+
+def _sound(region: Region, width: int, height: int) -> Region:
+    """Return a region in plain integers; raise `InputError` where it leaves the frame, or its peak the box."""
+    x, y, w, h = _integers("box", region.box, "x, y, w, h")
+    column, row = _integers("peak", region.peak, "column, row")
+    box, peak = (x, y, w, h), (column, row)
+    if min(x, y) < 0 or min(w, h) < 1 or x + w > width or y + h > height:
+        raise InputError(f"box {box} leaves the frame of {width} x {height} px")
+    if not (x <= column < x + w and y <= row < y + h):
+        raise InputError(f"peak {peak}: must lie in its box {box}")
+    return replace(region, box=box, peak=peak)
+
+
+def _integers(what: str, given: object, names: str) -> tuple[int, ...]:
+    """Return integers of any kind as a tuple of Python's."""
+    count = len(names.split())
+    if isinstance(given, Sequence | np.ndarray) and len(given) == count:
+        with contextlib.suppress(TypeError):
+            return tuple(operator.index(each) for each in given)
+    raise InputError(f"{what} {shown(given, 80)}: must be {count} integers {names}")

@@ -59,7 +59,7 @@ class Component:
 
     def holds(self, point_px: Array) -> bool:
         """Return whether a point, px, lies in one of the pixels."""
-        column, row = int(point_px[0]) - self.x, int(point_px[1]) - self.y
+        column, row = np.floor(point_px).astype(int) - [self.x, self.y]
         height, width = self.mask.shape
         return 0 <= row < height and 0 <= column < width and bool(self.mask[row, column])
 

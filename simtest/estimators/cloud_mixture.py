@@ -225,14 +225,14 @@ def _fit(clouds: list[Cloud], sightlines: Array, window: Window, turns: Turns) -
     """Fit clouds from a start by expectation and maximisation."""
     stray, last, total, count = FIRST_STRAY, -np.inf, sum(cloud.share for cloud in clouds), len(sightlines)
     clouds = [replace(cloud, share=(1 - stray) * cloud.share / total) for cloud in clouds]
-    for _ in range(STEPS):
-        # expectation, by densities of what is seen
+    for step in range(STEPS + 1):
+        # expectation, by densities of what is seen; it comes last too, so that all that is returned is of one fit
         inside = [cloud.densities(window.sightlines) * window.solid[:, None] for cloud in clouds]
         seen = [min(max(float(part.sum()), LEAST_SEEN), 1.0) for part in inside]
         joint = [c.share * c.densities(sightlines) / z for c, z in zip(clouds, seen, strict=True)]
         whole = sum(part.sum(axis=1) for part in joint) + stray / window.total
         value = float(np.log(whole).sum())
-        if value - last < CLOSE * count:
+        if value - last < CLOSE * count or step == STEPS:
             break
         last = value
         # maximisation

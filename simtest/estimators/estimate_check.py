@@ -69,13 +69,15 @@ def _checked(result: object, camera: Camera) -> Estimate:
         changed |= {"budget": budget, "covariance": None}
     # unit vectors, the proposed one first
     normal = unit_vector(_numbers(result.normal, "normal", (3,)), "normal")
-    given = _numbers(result.candidates, "candidates", (None, 3))
+    given = [*_numbers(result.candidates, "candidates", (None, 3))]
     if not 1 <= len(given) <= MAX_CANDIDATES:
         raise Refused(f"{len(given)} candidates; must be 1 to {MAX_CANDIDATES}")
     candidates = [unit_vector(each, "candidate") for each in given]
-    if max(map(abs, (candidates[0] - normal).tolist())) > ROUNDED:
+    apart = max(map(abs, (candidates[0] - normal).tolist()))
+    if apart > ROUNDED:
         raise Refused("the first candidate must be the proposed normal")
-    if normal is not result.normal or max(map(abs, (np.array(candidates) - given).ravel().tolist())) > 0:
+    rounded = any(exact is not each for exact, each in zip(candidates, given, strict=True))
+    if normal is not result.normal or rounded or apart > EXACT:
         changed |= {"normal": normal, "candidates": np.array([normal, *candidates[1:]])}
     _check_look(_numbers(result.look_px, "look_px", (2,)), normal, camera)
     # numbers
@@ -89,7 +91,7 @@ def _checked(result: object, camera: Camera) -> Estimate:
     if result.curvature is not None:
         _check_curvature(result.curvature)
     if not isinstance(result.flags, tuple) or len(result.flags) > MAX_FLAGS or not all(map(_is_flag, result.flags)):
-        allowed = f"a tuple of at most {MAX_FLAGS} words of at most {LONGEST_FLAG} characters"
+        allowed = f"a tuple of at most {MAX_FLAGS} texts of at most {LONGEST_FLAG} printable characters without a comma"
         raise Refused(f"flags: {result.flags!r:.60}; must be {allowed}")
     return replace(result, **changed) if changed else result  # type: ignore[arg-type]
 
@@ -166,8 +168,8 @@ def _check_ratio(value: object, name: str) -> None:
 
 
 def _is_flag(flag: object) -> bool:
-    """Whether a flag is one word, as the results list several."""
-    return isinstance(flag, str) and 0 < len(flag) <= LONGEST_FLAG and flag.isprintable() and not set(flag) & set(" ,")
+    """Whether a flag can stand in the results, which list several between commas."""
+    return isinstance(flag, str) and 0 < len(flag) <= LONGEST_FLAG and flag.isprintable() and "," not in flag
 
 
 def _number(value: object, name: str) -> float:

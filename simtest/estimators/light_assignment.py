@@ -13,8 +13,9 @@ CLEAR = 2.0
 """The next best light must fit this many times worse for the choice to be clear."""
 
 ALONE = 3.0
-"""With two lights, the second nearest of the other highlights must lie this many times farther away than the nearest.
-On rough tissue the nearest lies along the lights' line by chance 16 times in 100, half of them on the wrong side."""
+"""The highlights of one place must lie this many times nearer together than the next one does. On rough tissue glints
+meet the lights' arrangement by chance: of two lights 16 times in 100, half of them wrongly; of three 3 times in 100,
+which are half of all choices that seem clear there."""
 
 
 def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
@@ -23,17 +24,15 @@ def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     The highlights of lights at L_i lie at w_i in the image with M (w_i - w_j) = (L_i - L_j)_perp / (2 d): the bisector
     turns by half the light's angle, the normal turns against the sightline by M. M is the root of the lobe's H up to a
     factor, which is fitted. It is taken as positive: no surface that is concave beyond its centre of curvature. Of the
-    frame's other highlights, which the patch names, the nearest are used, one for each other light.
-
-    Two lights have a single offset, of which only the direction tells anything. There the pair must also stand alone
-    (`ALONE`). Three lights or more have an arrangement, which neighbours meet by chance three times in 100 or less.
+    frame's other highlights, which the patch names, the nearest are used, one for each other light; with them the
+    highlight must stand alone (`ALONE`).
     """
     if len(priors.lights_mm) == 1:
         return 0
     # observed offsets, turned by M into those of the lights up to a factor
     peaks = _other_peaks(family)
     others = peaks[: len(priors.lights_mm) - 1]
-    if len(priors.lights_mm) == 2 and not _stand_alone(peaks):
+    if not _stand_alone(peaks, len(others)):
         return None
     values, vectors = np.linalg.eigh(family.moments)
     if not len(others) or values[0] <= 0:
@@ -48,10 +47,10 @@ def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     return int(first) if clear else None
 
 
-def _stand_alone(peaks: Array) -> bool:
-    """Return whether the first of other peaks, nearest first, shape (K, 2), is far nearer than the second."""
-    gaps = np.linalg.norm(peaks[:2], axis=1)
-    return len(gaps) < 2 or bool(gaps[1] > ALONE * gaps[0])
+def _stand_alone(peaks: Array, count: int) -> bool:
+    """Return whether the first so many of other peaks, nearest first, shape (K, 2), are far nearer than the next."""
+    gaps = np.linalg.norm(peaks[: count + 1], axis=1)
+    return len(gaps) <= count or bool(gaps[count] > ALONE * gaps[count - 1])
 
 
 def _misfit(seen: Array, offsets: Array) -> float:

@@ -10,17 +10,18 @@ from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.circle_pose import circle_pose
-from simtest.estimators.goodness import excess_of_misfit, is_misfit
+from simtest.estimators.goodness import correlation_of_noise, excess_of_misfit, is_misfit
 from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
 from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.isophote_fit import FittedIsophote
-from simtest.estimators.lobe_fit import fit_lobe
+from simtest.estimators.lobe_fit import LobeFit, Model, fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, Law
 from simtest.estimators.small_spot import SmallSpot
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.geometry.vectors import basis_across
+from simtest.runtime.arrays import Index
 
 REGIONS = (0.05, 0.1, 0.2, 0.3, 0.5)
 """The pixels inside the first of these isophotes that closes are fitted. Further out there is little but noise."""
@@ -48,18 +49,25 @@ SAME_RAD = 1e-3
 
 @dataclass(frozen=True)
 class HighlightPixels:
-    """The fitted pixels: sightlines, intensities, noise, and which are clipped."""
+    """The fitted pixels: sightlines, intensities, noise, which are clipped, and rows and columns, shape (2, m)."""
 
     rays: Array
     observed: Array
     clipped: Mask | None
     noise: float | Array | None
+    places: Index
+
+    def correlation(self, fitted: LobeFit[Model]) -> float:
+        """Return by how much the noise's correlation raises the covariance of a fit (`correlation_of_noise`)."""
+        if self.noise is None:
+            return 1.0
+        return correlation_of_noise(fitted, self.observed, self.clipped, self.noise, self.places)
 
     def every(self, step: int) -> "HighlightPixels":
         """Return every so many pixels."""
         clipped = None if self.clipped is None else self.clipped[::step]
         noise = self.noise[::step] if isinstance(self.noise, np.ndarray) else self.noise
-        return HighlightPixels(self.rays[::step], self.observed[::step], clipped, noise)
+        return HighlightPixels(self.rays[::step], self.observed[::step], clipped, noise, self.places[:, ::step])
 
 
 @dataclass(frozen=True)
@@ -67,7 +75,8 @@ class Photometric:
     """A quadric patch with a co-located light, fitted to the pixels from `cone_axis` as start.
 
     N = -s with s the sightline of the BP. The shape d S and the lobe's scale are fitted too; its exponent, all but
-    degenerate with the shape, is held. Under white noise this is the maximum-likelihood estimate. Clipped pixels count
+    degenerate with the shape, is held. Under white noise this is the maximum-likelihood estimate; where coding or
+    demosaicing has correlated the noise, the covariance is that of noise so correlated. Clipped pixels count
     as "at least this bright". Pixels are those before smoothing where the patch has them.
 
     What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
@@ -106,6 +115,8 @@ class Photometric:
         if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
             misfit = True
             excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
+        else:
+            covariance = covariance * pixels.correlation(fitted)
         shape = MISFIT_SHARE * excess * np.eye(2) + family.bend_error()
         budget = {"noise": covariance, "shape": shape + family.drift_error}
         if family.clipping.any():
@@ -221,7 +232,8 @@ def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False, least: flo
     clipped = None if patch.saturated is None else patch.saturated[rows, columns][sound]
     stated = patch.noise
     noise = stated[rows, columns][sound].astype(float) if isinstance(stated, np.ndarray) else stated
-    return HighlightPixels(rays[sound], values[rows, columns][sound].astype(float), clipped, noise)
+    places = np.stack([rows, columns])[:, sound]
+    return HighlightPixels(rays[sound], values[rows, columns][sound].astype(float), clipped, noise, places)
 
 
 def _quadric(family: IsophoteFamily, rays: Array) -> ColocatedQuadric:

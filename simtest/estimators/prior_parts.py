@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Priors
 from simtest.calibration.priors import AT_CAMERA_MM
-from simtest.estimators.budget import CONFIDENCE, equivalent_covariance, line_covariance
+from simtest.estimators.budget import CONFIDENCE, equivalent_covariance
 from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.near_misses import near_miss_parts
@@ -57,8 +57,9 @@ SAMPLES = np.arange(1, 129)[:, None] * 1.1347241384015194 ** -np.arange(1.0, 6.0
 """Shares of the five priors of a falloff, shape (N, 5), all alike even: the sequence of the root of x^6 = x + 1."""
 
 _DRAWS, _GOLDEN = (np.arange(128) + 0.5) / 128, math.pi * (3 - math.sqrt(5)) * np.arange(128)
-DRAWN = np.sqrt(-2 * np.log(1 - _DRAWS))[:, None] * np.stack([np.cos(_GOLDEN), np.sin(_GOLDEN)], axis=1)
-"""A pair of standard normal numbers is sampled at these, shape (128, 2)."""
+_SPIRAL = np.sqrt(-2 * np.log(1 - _DRAWS))[:, None] * np.stack([np.cos(_GOLDEN), np.sin(_GOLDEN)], axis=1)
+DRAWN = _SPIRAL @ np.linalg.inv(np.linalg.cholesky(_SPIRAL.T @ _SPIRAL / 128)).T
+"""A pair of standard normal numbers is sampled at these, whose mean square is the unit matrix, shape (128, 2)."""
 
 
 def add_untold_parts(
@@ -170,12 +171,12 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     limit, which no camera that saw this highlight has. A share s of a lens's scale that is not known divides the pixels
     of the centre by 1 - s, whose mean square is 1 + 3 s^2 to leading order.
     """
-    look, sightline = estimate.look_px, camera.unproject(estimate.look_px)
-    basis = basis_across(estimate.normal)
-    if not np.isfinite(sightline).all():
-        return None
+    look, basis = estimate.look_px, basis_across(estimate.normal)
     from_centre = look - [camera.cx, camera.cy]
     reach = np.linalg.solve(camera.K[:2, :2], from_centre)
+    sightline = camera.unproject(look)
+    if not np.isfinite(sightline).all():
+        return None
     if isinstance(camera.distortion, BrownConrady):
         reach = sightline[:2] / sightline[2]  # its k1 moves what the lens has not yet bent
     reach2 = float(reach @ reach)
@@ -191,7 +192,9 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     variances, axes = np.linalg.eigh(in_pixels)
     drawn = look + DRAWN @ (axes * np.sqrt(np.maximum(variances, 0.0))).T
     moves = (camera.unproject(drawn) - sightline) @ basis.T
-    return line_covariance(moves[np.isfinite(moves).all(axis=1)])
+    moves = moves[np.isfinite(moves).all(axis=1)]
+    square, wide = moves.T @ moves / len(moves), equivalent_covariance(moves)
+    return wide if np.trace(wide) > np.trace(square) else np.asarray(square)
 
 
 def _along(vector: Array) -> Array:

@@ -106,7 +106,7 @@ class InverseRendering:
             look_px=camera.project(found.sightline),
             axis_ratio=float(np.abs(gains).min() / np.abs(gains).max()),
             isophotes=start.isophotes,
-            budget=_budget(fitted, _of_light(priors, own)),
+            budget=_budget(fitted, pixels.correlation(fitted), _of_light(priors, own)),
             flags=start.flags,
             curvature=_curvature(found, priors),
         )
@@ -164,13 +164,13 @@ def _of_light(priors: Priors, own: int) -> Priors:
     return replace(priors, lights_mm=priors.lights_mm[one], lights_covariance_mm2=priors.lights_covariance_mm2[one])
 
 
-def _budget(fitted: LobeFit[RenderedQuadric], priors: Priors) -> Budget:
+def _budget(fitted: LobeFit[RenderedQuadric], correlation: float, priors: Priors) -> Budget:
     """Return the budget of the normal: noise, and distance or, where no light is told, the light's offset."""
     model = fitted.model
     across = basis_across(model.normal)
     steps = [model.moved(np.append(STEP * unit, np.zeros(len(fitted.covariance) - 2))).normal for unit in np.eye(2)]
     J = across @ (np.array(steps) - model.normal).T / STEP
-    noise = J @ fitted.covariance[:2, :2] @ J.T
+    noise = correlation * J @ fitted.covariance[:2, :2] @ J.T
     if not priors.lights_mm:
         return {"noise": noise, "light_offset": light_offset_part(model.normal, priors)}
     told = mean_light_part(model.normal, priors)

@@ -147,6 +147,15 @@ def test_one_cloud_is_one_and_its_extent_is_the_sample_s():
     assert large == pytest.approx(0.12, rel=0.2)
 
 
+def test_a_fit_that_is_ended_early_is_whole(monkeypatch):
+    """The share of a cloud that is in view, and whose the spots are, are those of the clouds that are returned."""
+    monkeypatch.setattr("simtest.estimators.cloud_mixture.STEPS", 1)
+    sightlines, window = directions(np.random.default_rng(5), 60, (0.5, 0.1, 1.0)), window_of(CAMERA)
+    mixture = fit_mixture(sightlines, window)
+    inside = [float((cloud.densities(window.sightlines) * window.solid[:, None]).sum()) for cloud in mixture.clouds]
+    assert [cloud.seen for cloud in mixture.clouds] == pytest.approx(np.clip(inside, 0.05, 1.0), rel=1e-12)
+
+
 def test_two_patches_are_two_clouds():
     rng = np.random.default_rng(3)
     centres = np.array([[-0.4, 0.0, 1.0], [0.4, 0.1, 1.0]])

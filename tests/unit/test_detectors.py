@@ -128,7 +128,11 @@ def fails(frame):
     ("detect", "said"),
     [
         (lambda frame: None, "returned a NoneType; must be a Detection"),
-        (lambda frame: Detection((Region((0.5, 0, 9, 9), (3, 3), 1.0),), frame), "a tuple of four integers"),
+        (lambda frame: Detection((Region((0.5, 0, 9, 9), (3, 3), 1.0),), frame), "must be 4 integers x, y, w, h"),
+        (lambda frame: Detection((Region((0, 0, 9), (3, 3), 1.0),), frame), "must be 4 integers x, y, w, h"),
+        (lambda frame: Detection((Region((0, 0, 9, 9), (3.5, 3), 1.0),), frame), "must be 2 integers column, row"),
+        (lambda frame: Detection((Region((5, 5, 45, 45), (2, 2), 0.1),), frame), r"peak \(2, 2\): must lie in its box"),
+        (lambda frame: Detection((Region((5, 5, 45, 45), (50, 9), 0.1),), frame), r"peak \(50, 9\): must lie in its"),
         (lambda frame: Detection((Region((CAMERA.width - 3, 0, 9, 9), (3, 3), 1.0),), frame), "leaves the frame"),
         (fails, "RuntimeError: no model"),
     ],
@@ -136,6 +140,13 @@ def fails(frame):
 def test_a_detector_that_fails_is_named(detect, said):
     with pytest.raises(InputError, match=rf"detector Finder: .*{said}"):
         found_by(detect)
+
+
+def test_integers_of_numpy_are_taken():
+    box, peak = (tuple(np.array(numbers, dtype=np.int64)) for numbers in ((0, 0, CAMERA.width, CAMERA.height), (9, 8)))
+    (spot,) = found_by(lambda frame: Detection((Region(np.array(box), peak, 1.0),), frame))
+    assert spot.region == Region((0, 0, CAMERA.width, CAMERA.height), (9, 8), 1.0)
+    assert all(type(number) is int for number in (*spot.region.box, *spot.region.peak))
 
 
 def test_a_detector_may_hand_on_other_light_of_a_grey_frame():

@@ -141,6 +141,7 @@ FOLDING = Camera(
 """Its lens folds 281.1 px from the centre."""
 
 
+@pytest.mark.ci
 def test_a_camera_is_covered_up_to_the_rim_of_a_lens_that_folds():
     """200 cameras with a sightline there at each pixel, the last one 0.1 px from where the lens ends."""
     rng, held_share, without = np.random.default_rng(51), [], []

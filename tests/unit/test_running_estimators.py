@@ -263,7 +263,7 @@ MALFORMED = {
     "far away": ({"look_px": np.array([1e7, -5.0])}, r"look_px: looks at the pixel \(1e\+07, -5\)"),
     "away": ({"normal": -UP, "candidates": -UP[None]}, "the normal faces away from the camera"),
     "curvature": ({"curvature": EstimatedCurvature(np.eye(3)[:2], 2.0)}, "curvature axis_ratio: 2"),
-    "flag": ({"flags": ("a,b",)}, r"flags: \('a,b',\); must be a tuple of at most 16 words"),
+    "flag": ({"flags": ("a,b",)}, r"flags: \('a,b',\); must be a tuple of at most 16 texts"),
     "nowhere": ({"look_px": np.array([np.nan, 1.0])}, "look_px holds NaN"),
 }
 
@@ -294,6 +294,8 @@ def test_few_digits_are_made_exact_and_exact_ones_stay():
     np.testing.assert_array_equal(made.candidates, UP[None])
     np.testing.assert_array_equal(made.covariance, made.covariance.T)
     assert check(made, CAMERA) is made
+    other = np.array([[3e-4, 0.0, -np.sqrt(1 - 9e-8)], [0.0, 0.6, -0.8]])
+    np.testing.assert_array_equal(check(replace(made, candidates=other), CAMERA).candidates, [UP, other[1]])
 
 
 def test_estimators_of_patches_and_of_frames_meet_in_the_specularities():

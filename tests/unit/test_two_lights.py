@@ -57,3 +57,22 @@ def test_neighbours_on_rough_tissue_seldom_choose_one_of_two_lights(monkeypatch)
     # Negative control: the same fields choose where nothing stands alone.
     monkeypatch.setattr("simtest.estimators.light_assignment.ALONE", 1.0)
     assert chosen() > 0.11
+
+
+def test_neighbours_on_rough_tissue_hardly_ever_choose_one_of_three_lights(monkeypatch):
+    three = replace(PRIORS, lights_mm=((4.0, 0.0, 0.0), (-2.0, 3.5, 0.0), (-2.0, -3.5, 0.0)))
+    fields = 500 * np.random.default_rng(8).random((600, 30, 2)) - 250
+    fitted = fit_highlight(PATCH, CAMERA, (0.5,))
+
+    def chosen():
+        families = [replace(fitted, patch=among(offsets)) for offsets in fields]
+        return sum(light_of_highlight(family, three) is not None for family in families)
+
+    assert chosen() <= 4
+    # Their arrangement alone, as of a smooth surface: the first light's highlight, with the others 36 px to the left.
+    group = [(-36, 21), (-36, -21)]
+    for others, light in ((group, 0), ([*group, (0, 250)], 0), ([*group, (0, 100)], None)):
+        assert light_of_highlight(replace(fitted, patch=among(others)), three) == light
+    # Negative control.
+    monkeypatch.setattr("simtest.estimators.light_assignment.ALONE", 1.0)
+    assert chosen() >= 9

@@ -167,7 +167,7 @@ def _curvature(given: object) -> EstimatedCurvature | None:
 def _flags(given: object) -> tuple[str, ...]:
     if given is None:
         return ()
-    if not isinstance(given, list):
+    if not isinstance(given, list) or not all(isinstance(flag, str) and " " not in flag for flag in given):
         raise Refused(f"flags: {_told(given)}; must be a list of words")
     return tuple(given)
 
