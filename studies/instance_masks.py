@@ -137,7 +137,6 @@ def compared(recipe: str, samples: int) -> Iterator[Compared]:
     """Compare all masks of the first samples of a recipe."""
     maker = Maker(Plan(load_dataset(recipe, {"samples": samples})))
     for index in range(samples):
-        backend.release_memory()
         sample = maker.make(index)
         scene, meta = scene_from_dict(sample.meta["scene"]), sample.meta
         session = Session(scene, colour_variant())
@@ -150,6 +149,9 @@ def compared(recipe: str, samples: int) -> Iterator[Compared]:
         for number in range(1, len(spots) + 1):
             yield _masks(recipe, "visible", f"{index}/{number - 1}", sample.images["visible"] == number,
                          expected == number)  # fmt: skip
+        # Sessions of many anatomies must not add up.
+        del session
+        backend.release_memory()
 
 
 def _instances(
