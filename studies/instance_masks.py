@@ -150,6 +150,8 @@ def compared(recipe: str, samples: int) -> Iterator[Compared]:
         for number in range(1, len(spots) + 1):
             yield _masks(recipe, "visible", f"{index}/{number - 1}", sample.images["visible"] == number,
                          expected == number)  # fmt: skip
+        # The maker drops it before the next anatomy's.
+        del session
 
 
 def _instances(
