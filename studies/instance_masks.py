@@ -21,13 +21,13 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks.measuring import print_markdown
-from simtest.dataset.maker import Maker, colour_variant
+from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
 from simtest.geometry import Camera
-from simtest.rendering import Session, backend
+from simtest.rendering import Session
 from simtest.rendering.rays import Sightlines
 from simtest.runtime.arrays import AnyArray, Array, Image, IntArray, Mask
-from simtest.spec import Scene, scene_from_dict
+from simtest.spec import Scene
 from simtest.spec.dataset_recipe import load_dataset
 
 RECIPES = ("highlights", "highlights_smooth")
@@ -137,19 +137,21 @@ def compared(recipe: str, samples: int) -> Iterator[Compared]:
     """Compare all masks of the first samples of a recipe."""
     maker = Maker(Plan(load_dataset(recipe, {"samples": samples})))
     for index in range(samples):
-        backend.release_memory()
         sample = maker.make(index)
-        scene, meta = scene_from_dict(sample.meta["scene"]), sample.meta
-        session = Session(scene, colour_variant())
+        # It stands at the sample's scene.
+        session, meta = maker._session, sample.meta
+        assert session is not None
         specular = _mean(session.radiance().specular)
         yield from _instances(recipe, index, session, meta["highlights"], sample.images["instance"], specular)
         spots = meta.get("visible_highlights", [])
         at = np.array([spot["peak_px"] for spot in spots]).reshape(-1, 2)[:, ::-1].astype(int)
-        light = behind_lens(specular, scene)
+        light = behind_lens(specular, session.scene)
         expected = shared_out(light, at) if spots else np.zeros(light.shape, dtype=int)
         for number in range(1, len(spots) + 1):
             yield _masks(recipe, "visible", f"{index}/{number - 1}", sample.images["visible"] == number,
                          expected == number)  # fmt: skip
+        # The maker drops it before the next anatomy's.
+        del session
 
 
 def _instances(

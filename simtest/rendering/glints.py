@@ -4,6 +4,7 @@ They are hundreds a frame, and small. The misfit of the rendered frame, a value 
 exact Newton steps with the closed derivative of the fine normal finish.
 """
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -45,6 +46,12 @@ SAME_PX = 0.02
 """Glints closer than this are the same zero, found twice."""
 
 SAME_SEED_PX = 0.5
+
+HALF_WIDTH = math.sqrt(2 * math.log(2))
+"""Half-width at half height of a Gaussian over its standard deviation."""
+
+RATIOS, BISECTIONS = (1e-3, 30.0), 40
+"""Radii of discs over a lobe's standard deviation: less widens nothing, more is the disc alone."""
 
 
 def is_resolved(session: "Session") -> bool:
@@ -187,17 +194,44 @@ def radii_px(session: "Session", highlights: Sequence[HighlightPoint], half_widt
     """Compute the radii, shape (N,), px, at which highlights fall to half height, from their shape alone (theory 7.3).
 
     The half-angle grows from the BP by the misfit's derivative J: a lobe of half-width `half_width`, rad, at half
-    height covers pi half_width^2 / abs(det J) px^2; the radius is that of the circle of this area.
+    height covers pi half_width^2 / abs(det J) px^2; the radius is that of the circle of this area. Relief that is not
+    resolved widens the lobe by its slopes, and a source by its size (theory 7.6), as if the lobe were Gaussian.
     """
     radii = np.full(len(highlights), np.nan)
-    lights = session.scene.rig.true_mm()
-    for index, light in enumerate(lights):
+    relief, rig = session.scene.surface.relief, session.scene.rig
+    resolved = relief is None or is_resolved(session)
+    if relief is not None and not resolved:
+        half_width = math.hypot(half_width, HALF_WIDTH * math.radians(relief.slope_deg))
+    for index, (light, place) in enumerate(zip(rig.lights, rig.true_mm(), strict=True)):
         own = [i for i, highlight in enumerate(highlights) if highlight.light == index]
         if own:
-            state = exact_misfit(session, np.array([highlights[i].bp_px for i in own]), light)
+            state = exact_misfit(session, np.array([highlights[i].bp_px for i in own]), place, fine=resolved)
+            widths = np.full(len(own), half_width)
+            if light.source is not None:
+                # The disc of the source's area, as the highlight points see it; the half-angle turns half as far.
+                away = np.array([highlights[i].position for i in own]) - place
+                reach = np.linalg.norm(away, axis=1)
+                seen = light.source.area_mm2 / np.pi * np.abs(away @ light.axis) / reach
+                widths = widened(half_width, np.sqrt(seen) / (2 * reach))
             with np.errstate(divide="ignore"):
-                radii[own] = half_width / np.sqrt(np.abs(np.linalg.det(state.jacobian)))
+                radii[own] = widths / np.sqrt(np.abs(np.linalg.det(state.jacobian)))
     return radii
+
+
+def widened(half_width: float, disc: Array) -> Array:
+    """Return the half-widths at half height of a Gaussian lobe of one, convolved with discs of radii of shape (N,)."""
+    from scipy.special import chndtr
+
+    sigma = half_width / HALF_WIDTH
+    # At a distance r from its centre a disc of radius a holds the share P(a^2; 2, r^2) of a normal distribution.
+    ratio = np.clip(disc / sigma, *RATIOS)
+    low, high = np.zeros_like(ratio), ratio + HALF_WIDTH
+    half = chndtr(ratio**2, 2, 0.0) / 2
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        inside = chndtr(ratio**2, 2, middle**2) > half
+        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+    return np.asarray(np.where(disc > RATIOS[1] * sigma, disc, sigma * low))
 
 
 def distinct(points: Array, apart: float) -> Array:

@@ -21,9 +21,9 @@ CELLS = 2**10
 def noise_at(light: Image, full_scale: float, sensor: Sensor, rows: IntArray, columns: IntArray, draws: int) -> Array:
     """Return the standard deviation, radiance, of the mean of the frame's channels at pixels, shape (N,).
 
-    Where a sensor has no stage that mixes pixels or channels the noise model has it in closed form. Else the light
-    around each pixel goes through the chain `draws` times, and the deviation is that over the 3 x 3 pixels around it,
-    linear again. That of clipped light is the one below the clip.
+    Where a sensor has no stage that mixes pixels or channels, or draws no noise, the noise model has it in closed form.
+    Else the light around each pixel goes through the chain `draws` times, and the deviation is that over the 3 x 3
+    pixels around it, linear again. That of clipped light is the one below the clip.
 
     Parameters
     ----------
@@ -42,7 +42,8 @@ def noise_at(light: Image, full_scale: float, sensor: Sensor, rows: IntArray, co
         return np.zeros(len(rows))
     colour = light if light.ndim == 3 else light[..., None]
     level = colour[rows, columns].mean(axis=1, dtype=float) / full_scale
-    if not (sensor.is_processed or sensor.mosaic or sensor.colour):
+    mixes = sensor.is_processed or sensor.mosaic is not None or sensor.colour is not None
+    if not mixes or (sensor.full_well is None and sensor.noise_sigma == 0):
         noise = sensor.noise_model().at(np.minimum(level, 1) if sensor.clips else level, colour.shape[2])
         return np.asarray(noise) * full_scale
     share = np.minimum(1, UNCLIPPED / np.maximum(level, 1e-12)) if sensor.clips else np.ones(len(rows))

@@ -253,15 +253,9 @@ def describe(
         peak = np.array([column, row]) + PIXEL_CENTRE
         owner = 0 if instruments is None else int(instruments[row, column])
         held = () if owner else held
-        nearest = (
-            None
-            if owner
-            else held[0]
-            if held
-            else lit[int(np.linalg.norm(at - peak, axis=1).argmin())]
-            if lit
-            else None
-        )
+        nearest = held[0] if held else None
+        if not (held or owner) and lit:
+            nearest = lit[int(np.linalg.norm(at - peak, axis=1).argmin())]
         shape = shape_of(spots, number, specular, seen)
         value, lobe = float(light[row, column]), float(specular[row, column])
         shown = min(value, clip) - min(value - lobe, clip)

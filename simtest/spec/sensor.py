@@ -205,5 +205,5 @@ class Sensor(Spec):
         return self.saturation or self.encodes or self.mosaic is not None
 
     def noise_model(self) -> NoiseModel:
-        """Return the noise of one channel of the linear frame as a function of its level."""
+        """Return the noise of one channel of the linear frame by its level, before pixels or channels are mixed."""
         return NoiseModel(self.noise_sigma, self.full_well, self.read_noise, self.bits, self.response.model())

@@ -333,7 +333,7 @@ ROWS = (
         "return peak - float(median(around) if around.size else least)", "return peak", "regions"),
     row("region's box placed by the window, not the frame", "labels", "detection.regions:_expanded_box",
         "max(y + int(rows[0]) - grow_y, 0)", "max(int(rows[0]) - grow_y, 0)", "regions"),
-    row("open highlights count as closed", "thresholds", "detection.regions:half_height_component",
+    row("open highlights count as closed", "thresholds", "detection.regions:component_above",
         "closed=not touched and not cut", "closed=not cut", "regions"),
     row("a saddle 10 % higher still parts two spots", "thresholds", "detection.basins:_merged",
         "keep * summits[1][top_b]", "1.1 * keep * summits[1][top_b]", "spots"),

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from simtest.calibration import NoiseModel
 from simtest.detection.regions import detect, half_height_component
 from simtest.estimators import Estimate, load_estimators
 from simtest.rendering import Session
@@ -138,8 +137,8 @@ def thresholds(session: Session) -> list[Law]:
     # True highlights by their peak over the noise.
     session.update(described(PLANE))
     points = session.highlights()
-    levels = [Examined(1.0, 10.5 * SIGMA, ""), Examined(1.0, 9.5 * SIGMA, "")]
-    judged = verdicts([points[0]] * 2, levels, NoiseModel(SIGMA), 1.0, 1)
+    levels = [Examined((0, 0), 1.0, 10.5 * SIGMA, ""), Examined((0, 0), 1.0, 9.5 * SIGMA, "")]
+    judged = verdicts([points[0]] * 2, levels, np.full(2, SIGMA))
     return [
         law("detection", "found", "", len(found), 3, 3, about="spots of 10.3 to 14 standard deviations, of six"),
         law("detection", "lowest", "sigma", lowest, 10.35, 10.0, about="the lowest one that counts stands at 10"),

@@ -61,3 +61,10 @@ def test_without_light_there_is_no_noise():
     # At the border, and in more pictures than one.
     border = np.zeros(300, dtype=int), np.full(300, 39)
     assert (noise_at(np.full((40, 40), 0.3, np.float32), 1.0, sensor, *border, 8) > 0).all()
+
+
+def test_a_chain_that_draws_no_noise_has_that_of_its_steps():
+    sensor = Sensor(bits=8, scaling={"factor": 0.6}, sharpening={"amount": 1.0})
+    light = np.linspace(0.1, 0.9, 1600, dtype=np.float32).reshape(40, 40)
+    found = noise_at(light, 1.0, sensor, np.array([20]), np.array([20]), 8)
+    assert found == pytest.approx(1 / 255 / np.sqrt(12), rel=1e-3)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from simtest.rendering import Session, glints
 from simtest.simulation.rendered_view import render_view
@@ -264,3 +265,36 @@ def test_spots_hold_the_glints_in_them(sessions):
         values = [view.highlights[number].radiance for number in spot.glints]
         assert values == sorted(values, reverse=True)
     assert glints_of(find_spots(np.zeros((9, 9)), np.zeros((9, 9))), view.highlights) == []
+
+
+FRONTAL = {
+    "surface": {"type": "plane", "distance_mm": 20.0}, "camera": {"width": 96, "height": 96, "fx": 160.0, "fy": 160.0},
+}  # fmt: skip
+FILM = {"type": "tissue", "film": {"index": 1.36, "alpha": 0.05, "distribution": "beckmann"}, "diffuse": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("lobe", "within"),
+    [*(({"type": "phong", "exponent": n, "diffuse": 0.0}, 0.05) for n in (100.0, 1000.0, 10000.0)), (FILM, 0.05),
+     # Its long tails are no Gaussian's.
+     ({**FILM, "film": {"index": 1.36, "alpha": 0.03}}, 0.15)],
+)  # fmt: skip
+@pytest.mark.parametrize("source", [{"type": "disc", "radius_mm": 1.5}, {"type": "disc", "radius_mm": 0.5}])
+def test_a_source_of_finite_size_widens_the_radius(lobe, within, source):
+    seen = scene_from_dict({**FRONTAL, "reflectance": lobe, "rig": {"lights": [{"source": source}]}})
+    view = render_view(Session(seen), seen)
+    [highlight], [spot] = view.highlights, view.visible_highlights
+    assert highlight.radius_px == pytest.approx(spot.radius_px, rel=within, abs=0.3)
+
+
+def test_relief_that_is_not_resolved_widens_the_radius():
+    surface = {**FRONTAL["surface"], "relief": {"bands": [{"slope_deg": 4.0, "wavelength_mm": 0.02}], "seed": 0}}
+    more = {"reflectance": FILM, "surface": surface, "render": {"samples_per_pixel": 100}}
+    seen = scene_from_dict({**FRONTAL, **more})
+    view = render_view(Session(seen), seen)
+    [highlight] = view.highlights
+    # Waves leave some noise.
+    lobe = ndimage.gaussian_filter(view.radiance.specular, 2.0)
+    radius = np.sqrt(np.count_nonzero(lobe > 0.5 * lobe.max()) / np.pi)
+    assert radius > 12
+    assert highlight.radius_px == pytest.approx(radius, rel=0.1)

@@ -134,7 +134,7 @@ def test_tensors_are_channels_first(made):
     assert item["image"].dtype == torch.float32
     assert float(item["image"].max()) <= 1
     assert item["normal"].shape == (3, 48, 64)
-    assert item["instance"].dtype == torch.uint8
+    assert item["instance"].dtype == torch.int32
     batch = Samples.collate([item, item])
     assert batch["depth"].shape == (2, 48, 64)
     small = {**item, "depth": item["depth"][1:]}
