@@ -112,7 +112,7 @@ class TracedPatch:
     def __init__(self, mi: Any, patch: Patch) -> None:
         self.mi, self.patch = mi, patch
         self.mesh, self.feet = patch.mesh()
-        self.shape = Shape("mesh", False, {}, self.mesh, "displaced")
+        self.shape = Shape("mesh", False, np.eye(4), self.mesh, "displaced")
         made = make_shape(mi, self.shape, {"type": "diffuse"})
         self.scene = mi.load_dict({"type": "scene", "surface": made}, optimize=False)
 

@@ -27,9 +27,6 @@ from simtest.inverse.rendered_quadric import RenderedQuadric
 STEP = 1e-5
 """Step of the differences of the normal, rad, and as a share of the distance."""
 
-PATHS = 64
-"""Paths a pixel, where there are inter-reflections."""
-
 ROUNDING = 1e-7
 """Relative error of a sum of squares of residuals in single precision."""
 
@@ -39,34 +36,23 @@ class InverseRendering:
     """A rendered quadric patch with a Phong lobe, fitted to the pixels from `cone_axis` as start.
 
     The fit determines the BP's sightline, to which the highlight's condition ties the normal, the shape d S in all
-    three components, the lobe's scale and, if wanted, a Lambertian base and the lobe's exponent. The patch is a
-    paraboloid or, where that leaves a smaller residual, a quadric that is a sphere or cylinder where its curvatures
-    are. The renderer is differentiated by Dr.Jit's forward mode; the fit is Levenberg and Marquardt's. Under white
-    noise this is the maximum-likelihood estimate. Clipped pixels count as "at least this bright". Pixels are those
-    before smoothing.
+    three components, the lobe's scale and, if wanted, a Lambertian base. The patch is a paraboloid or, where that
+    leaves a smaller residual, a quadric that is a sphere or cylinder where its curvatures are. The renderer is
+    differentiated by Dr.Jit's forward mode; the fit is Levenberg and Marquardt's. Under white noise this is the
+    maximum-likelihood estimate. Clipped pixels count as "at least this bright". Pixels are those before smoothing.
 
     With lights given the patch is lit from there, at the mean of the prior on the distance; else from the camera, at
     any distance. Of several, the arrangement of the highlights must tell which one is reflected (`light_of_highlight`).
-    The exponent follows from the lobe's curvature.
+    The exponent is the known one or, where the lobe is not known, the one with which the surface is straight along the
+    highlight's longer axis: a noisy picture determines sqrt(n) (I + d S) alone.
 
     Parameters
     ----------
-    path_depth : int
-        2: direct light; more adds path_depth - 2 inter-reflections of the patch with itself, twice as wide as
-        far, with a lobe of strength 1; they follow scale and base, and are not differentiated by position and shape.
     base : bool
         Whether a Lambertian base is fitted; else there is none.
-    exponent : bool
-        Whether the exponent is fitted. Else it is the known one or, where the lobe is not known, the one with which the
-        surface is straight along the highlight's longer axis: a noisy picture determines sqrt(n) (I + d S) alone.
-    variant : str, optional
-        Mitsuba variant; default by `simtest.rendering.backend.requested_variant`.
     """
 
-    path_depth: int = 2
     base: bool = True
-    exponent: bool = False
-    variant: str | None = None
     laws: ClassVar[tuple[Law, ...]] = ("bisector",)
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
@@ -94,8 +80,7 @@ class InverseRendering:
         pixels = highlight_pixels(patch, camera, cut=any(isophote.cut for isophote in start.isophotes))
         if isinstance(pixels, Failure):
             return pixels
-        renderer = PatchRenderer(pixels.rays, self.path_depth, PATHS, self.variant)
-        fitted = _fitted(_start(start, patch, priors, own, renderer, (self.exponent, self.base)), pixels)
+        fitted = _fitted(_start(start, patch, priors, own, PatchRenderer(pixels.rays), self.base), pixels)
         if fitted is None:
             return Failure(Reason.NOT_CONVERGED, "the fit of a rendered patch did not converge")
         found = fitted.model
@@ -117,7 +102,7 @@ inverse_rendering = InverseRendering()
 
 
 def _start(
-    start: Estimate, patch: Patch, priors: Priors, own: int, renderer: PatchRenderer, opened: tuple[bool, bool]
+    start: Estimate, patch: Patch, priors: Priors, own: int, renderer: PatchRenderer, open_base: bool
 ) -> RenderedQuadric:
     """Start from the middle isophote: its half-axes give K if n is known, else n as if one curvature were 0.
 
@@ -139,7 +124,7 @@ def _start(
     M = vectors @ np.diag(gain_of_stiffness(stiffness, lobe)) @ vectors.T
     stretch = np.sqrt(lobe / 4) * np.array([M[0, 0], M[0, 1], M[1, 1]])
     logs = float(np.log(patch.peak_value)), float(np.log(lobe / 4))
-    return RenderedQuadric(renderer, s, basis[0], distance, light, lights, stretch, *logs, 0.0, *opened)
+    return RenderedQuadric(renderer, s, basis[0], distance, light, lights, stretch, *logs, 0.0, open_base)
 
 
 def _fitted(start: RenderedQuadric, pixels: HighlightPixels) -> LobeFit[RenderedQuadric] | None:

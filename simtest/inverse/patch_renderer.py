@@ -3,8 +3,7 @@
 Mitsuba cannot differentiate its intersections of rays with analytic shapes. Here each ray solves a quadratic equation,
 written in Dr.Jit, and the surface points are passed to Mitsuba's BSDF; everything that depends on the patch's
 parameters is differentiated. Each parameter has its own copy of the pixels, in which it alone varies, so that one pass
-of one kernel computes the intensities and all derivatives; another highlight compiles nothing. Inter-reflections of the
-patch with itself are added as a sampled term that follows scale and base.
+of one kernel computes the intensities and all derivatives; another highlight compiles nothing.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -22,20 +21,8 @@ if TYPE_CHECKING:
 PASSING = 1e-6
 """Where a ray misses the quadric, this share of the squared slope replaces the discriminant."""
 
-SAME_HIT = 1e-3
-"""A blocker stands before a point by at least this share of the distance."""
-
 FLAT = 1e-6
 """Added to tr(K^2), which is 0 on a plane."""
-
-REACH = 1.0
-"""Half side, over the distance, of the patch that lights itself; its border is not differentiated."""
-
-LOG_SCALE = 5
-"""Index of the log scale among the parameters."""
-
-GOLDEN = (0.7548776662466927, 0.5698402909980532)
-"""Steps of the R2 sequence, evenly spread points of the unit square; the same for every pixel and evaluation."""
 
 
 class PatchRenderer:
@@ -45,22 +32,15 @@ class PatchRenderer:
     ----------
     rays : ndarray, shape (m, 3)
         Sightlines, unit, camera frame.
-    path_depth : int
-        2: direct light; more adds path_depth - 2 inter-reflections of the patch with itself.
-    samples : int
-        Paths per pixel, where there are inter-reflections.
-    variant : str, optional
-        Mitsuba variant.
     """
 
-    def __init__(self, rays: Array, path_depth: int = 2, samples: int = 16, variant: str | None = None) -> None:
-        mi = backend.load(variant)
+    def __init__(self, rays: Array) -> None:
+        mi = backend.load(None)
         # The backend must be loaded first: it chooses the library that Dr.Jit compiles with.
         import drjit
 
         plugin = phong.register(mi, str(mi.variant()))
-        self.mi, self.dr, self.count, self.depth = mi, drjit, len(rays), path_depth
-        self.samples = samples
+        self.mi, self.dr, self.count = mi, drjit, len(rays)
         # Gathered: a kernel keeps the length of an array of shape (n, 3), and whether its address is aligned.
         self._rays = [mi.Float(np.ascontiguousarray(part, dtype=np.float32)) for part in rays.T]
         # Lobe and base of unit strength: their factors are differentiated outside of the BSDF.
@@ -71,43 +51,21 @@ class PatchRenderer:
     def radiance(self, patch: "RenderedQuadric", kept: list[bool]) -> tuple[Array, Array]:
         """Compute intensities, shape (m,), and their derivatives by the p parameters that are kept, shape (m, p).
 
-        `kept` holds a bool for each of the eight parameters: s (2), stretch (3), log scale, log n, base.
+        `kept` holds a bool for each of the seven parameters: s (2), stretch (3), log scale, base.
         """
         # lanes: a copy of all pixels for each parameter
         columns, count = int(sum(kept)), self._opaque(self.count, self.mi.UInt32)
         lane = self._lanes(self.count * columns)
         direct = _Surface(self, patch, self._parameters(patch, kept, lane // count)).radiance(self._seen(lane % count))
         image, slopes = (values.reshape(columns, self.count) for values in self._evaluated(direct))
-        intensity, J = image[0], slopes.T
-        if self.depth > 2:
-            intensity, J = self._with_bounces(patch, kept, intensity, J)
         # Mitsuba's virtual calls trace every existing BSDF: this one must not keep the copies alive.
         self._bsdf.exponent = self._opaque(float(np.exp(patch.log_exponent)))
-        return intensity, J
-
-    def _with_bounces(
-        self, patch: "RenderedQuadric", kept: list[bool], intensity: Array, J: Array
-    ) -> tuple[Array, Array]:
-        """Add the light that the patch sends to itself, with its derivatives by log scale and base.
-
-        It is not differentiated by position and shape: where a concave patch focuses light, the derivatives of sampled
-        paths are noise, while the intensities hardly move.
-        """
-        rays = self._seen(self._lanes(self.count * self.samples) // self._opaque(self.samples, self.mi.UInt32))
-        by_base = [False] * (len(kept) - 1) + [kept[-1]]
-        surface = _Surface(self, patch, self._parameters(patch, by_base, self.mi.UInt32(0)))
-        added = self._bounced(surface, rays)
-        value, slope = (v.reshape(self.count, self.samples).mean(axis=1) for v in self._evaluated(added))
-        J = J.copy()
-        J[:, LOG_SCALE] += value
-        if kept[-1]:
-            J[:, -1] += slope
-        return intensity + value, J
+        return image[0], slopes.T
 
     def _parameters(self, patch: "RenderedQuadric", kept: list[bool], which: Any) -> list[Any]:
-        """Return the eight parameters; each kept one has gradient 1 in its own copy of the pixels."""
+        """Return the seven parameters; each kept one has gradient 1 in its own copy of the pixels."""
         mi, dr, made, lane = self.mi, self.dr, [], 0
-        values = [0.0, 0.0, *patch.stretch, patch.log_scale, patch.log_exponent, patch.base]
+        values = [0.0, 0.0, *patch.stretch, patch.log_scale, patch.base]
         for value, is_kept in zip(values, kept, strict=True):
             parameter = dr.zeros(mi.Float, dr.width(which)) + self._opaque(value)
             if is_kept:
@@ -138,33 +96,6 @@ class PatchRenderer:
         self.dr.make_opaque(held)
         return held
 
-    def _bounced(self, surface: "_Surface", rays: Any) -> Any:
-        """Return the radiance along rays from the camera after more than one bounce."""
-        mi, dr = self.mi, self.dr
-        si = surface.first_hit(rays)
-        radiance, weight = mi.Float(0), mi.Float(1)
-        for bounce in range(self.depth - 2):
-            # sample the BSDF, go on to the next point, and add the direct light there
-            first, second = self._numbers(bounce, dr.width(rays))
-            local, density = surface.sample(si, first, second)
-            weight *= dr.select(density > 0, surface.reflected(si, local) / dr.maximum(density, 1e-6), 0)
-            si, reached = surface.next_hit(si, si.to_world(local))
-            radiance += dr.select(reached, weight * surface.direct(si, lit=surface.is_seen(si)), 0)
-            weight = dr.select(reached, weight, 0)
-        return radiance * dr.exp(surface.log_scale)
-
-    def _numbers(self, bounce: int, width: int) -> tuple[Any, Any]:
-        """Return the random numbers of a bounce: different for each path, the same at every evaluation."""
-        mi, lane, samples = self.mi, self._lanes(width), self._opaque(self.samples, self.mi.UInt32)
-        number = mi.Float(lane % samples)
-        # Each pixel shifts the sequence by its own amount.
-        pixel = lane // samples
-        shift = [mi.Float(mi.sample_tea_32(pixel, 3 * bounce + i)[0]) * 2.0**-32 for i in range(3)]
-        u, v = (number * step + offset for step, offset in zip(GOLDEN, shift[:2], strict=True))
-        w = (number + shift[2]) / self._opaque(float(self.samples))
-        floor = self.dr.floor
-        return w - floor(w), mi.Point2f(u - floor(u), v - floor(v))
-
 
 class _Surface:
     """The patch as the kernel sees it: everything that depends on its parameters."""
@@ -172,7 +103,8 @@ class _Surface:
     def __init__(self, renderer: PatchRenderer, patch: "RenderedQuadric", parameters: list[Any]) -> None:
         mi, dr, opaque = renderer.mi, renderer.dr, renderer._opaque
         self.mi, self.dr = mi, dr
-        by_first, by_second, first, both, second, self.log_scale, log_exponent, self.base = parameters
+        by_first, by_second, first, both, second, self.log_scale, self.base = parameters
+        log_exponent = opaque(patch.log_exponent)
         shrink = dr.exp(-log_exponent / 2)
         self.K = (first * shrink - 1, both * shrink, second * shrink - 1)
         self.distance = opaque(patch.distance)
@@ -230,20 +162,6 @@ class _Surface:
         t = 2 * c / (root - b)
         return self.interaction(direction, t * direction, t)
 
-    def next_hit(self, si: Any, direction: Any) -> tuple[Any, Any]:
-        """Return the next surface points on rays from surface points, and whether there are any, facing the ray."""
-        x, y, z = self.local(si.p - self.foot)
-        wx, wy, wz = self.local(direction)
-        bx, by = self.bent(wx, wy)
-        a, b = (wx * bx + wy * by + self.bulge * wz * wz) / 2, wz + x * bx + y * by + self.bulge * z * wz
-        # One root is the starting point, the other the next hit.
-        dr = self.dr
-        found = (a * b < 0) & (dr.abs(a) > 1e-9)
-        t = dr.select(found, -b / dr.select(found, a, 1), 1)
-        hit = self.interaction(direction, si.p + t * direction, t)
-        near = dr.maximum(dr.abs(x + t * wx), dr.abs(y + t * wy)) < REACH * self.distance
-        return hit, found & near & (dr.dot(hit.n, direction) < 0)
-
     def interaction(self, direction: Any, position: Any, reach: Any) -> Any:
         """Return Mitsuba's surface interaction at surface points."""
         mi, dr = self.mi, self.dr
@@ -256,32 +174,12 @@ class _Surface:
         si.wi = si.to_local(-direction)
         return si
 
-    def direct(self, si: Any, lit: Any = True) -> Any:
-        """Return the radiance of surface points lit straight by the lights, per unit of their power."""
+    def direct(self, si: Any) -> Any:
+        """Return the radiance of surface points lit by the lights, per unit of their power."""
         mi, dr, radiance = self.mi, self.dr, self.mi.Float(0)
         for light in self.lights:
             towards = light - si.p
             squared = dr.squared_norm(towards)
-            lobe, base = self.material.parts(mi, si, si.to_local(towards * dr.rsqrt(squared)), mi.Bool(lit))
+            lobe, base = self.material.parts(mi, si, si.to_local(towards * dr.rsqrt(squared)), mi.Bool(True))
             radiance += (channel_mean(lobe) + self.base * channel_mean(base)) / squared * self.distance**2
         return radiance
-
-    def reflected(self, si: Any, local: Any) -> Any:
-        """Return f cos(theta) of lobe and base together."""
-        lobe, base = self.material.parts(self.mi, si, local, self.mi.Bool(True))
-        return channel_mean(lobe) + self.base * channel_mean(base)
-
-    def sample(self, si: Any, first: Any, second: Any) -> tuple[Any, Any]:
-        """Draw directions, local and not differentiated, with their densities."""
-        mi, dr = self.mi, self.dr
-        with dr.suspend_grad():
-            bs, _ = self.material.bsdf.sample(mi.BSDFContext(), si, first, second, mi.Bool(True))
-            return mi.Vector3f(dr.detach(bs.wo)), mi.Float(dr.detach(bs.pdf))
-
-    def is_seen(self, si: Any) -> Any:
-        """Return whether the first light reaches surface points past the patch itself."""
-        dr = self.dr
-        with dr.suspend_grad():
-            reach = dr.norm(si.p)
-            first = self.first_hit(si.p / reach)
-            return dr.detach(first.t) > dr.detach(reach) * (1 - SAME_HIT)

@@ -17,8 +17,8 @@ class RenderedQuadric:
     The BP is P0 = d s; its normal N bisects the directions to the highlight's light and to the camera. Around it the
     surface is z + ((x, y) K (x, y)^T + q z^2) / (2 d) = 0 along N, K = d S. With q = 0 it is a paraboloid; with
     q = tr(K^3) / tr(K^2) it is a sphere or cylinder where the curvatures are those of one. Parameters: rotation of s
-    along `turning` (2), the three of sqrt(n) (I + K) in the basis e, f, log of the scale, then log n and the base where
-    they are open. To second order a highlight's shape depends on sqrt(n) (I + K) alone, and hardly on n besides.
+    along `turning` (2), the three of sqrt(n) (I + K) in the basis e, f, log of the scale, then the base where it is
+    open. To second order a highlight's shape depends on sqrt(n) (I + K) alone, and hardly on n besides.
 
     Parameters
     ----------
@@ -38,8 +38,8 @@ class RenderedQuadric:
         sqrt(n) (1 + K11), sqrt(n) K12, sqrt(n) (1 + K22).
     log_scale, log_exponent, base : float
         Of the lobe c cos^n(beta); the base's albedo over c.
-    open_exponent, open_base : bool
-        Whether n and the base are fitted.
+    open_base : bool
+        Whether the base is fitted.
     roundness : float
         Share of q: 0 a paraboloid, 1 a sphere or cylinder.
     """
@@ -54,7 +54,6 @@ class RenderedQuadric:
     log_scale: float
     log_exponent: float
     base: float
-    open_exponent: bool
     open_base: bool
     roundness: float = 0.0
 
@@ -89,16 +88,11 @@ class RenderedQuadric:
         s /= np.linalg.norm(s)
         normal = bisect(self.distance * s, self.light)
         first = self.first - (self.first @ normal) * normal
-        rest = list(step[6:])
-        exponent = self.log_exponent + (float(rest.pop(0)) if self.open_exponent else 0.0)
         return replace(
             self, sightline=s, first=first / np.linalg.norm(first), stretch=self.stretch + step[2:5],
-            log_scale=self.log_scale + float(step[5]), log_exponent=exponent,
-            base=self.base + (float(rest.pop(0)) if self.open_base else 0.0),
+            log_scale=self.log_scale + float(step[5]), base=self.base + (float(step[6]) if self.open_base else 0.0),
         )  # fmt: skip
 
     def evaluate(self) -> tuple[Array, Array]:
         """Return the pixels' intensities, shape (m,), and their derivatives, shape (m, p)."""
-        kept = [True] * 6 + [self.open_exponent, self.open_base]
-        intensity, J = self.renderer.radiance(self, kept)
-        return intensity, J
+        return self.renderer.radiance(self, [True] * 6 + [self.open_base])

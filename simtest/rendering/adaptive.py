@@ -130,7 +130,7 @@ class Adaptive:
         """Return whether an analytic shape looks so small that centres may miss it."""
         if self.shape.kind not in ("sphere", "cylinder"):
             return False
-        pose, matrix = self.tracer.sightlines.pose, self.shape.parameters["to_model"]
+        pose, matrix = self.tracer.sightlines.pose, self.shape.to_model
         radius = float(np.linalg.norm(matrix[:3, 0]))
         offset = np.linalg.inv(matrix)[:3] @ pose[:, 3]
         rounded = offset[: 3 if self.shape.kind == "sphere" else 2]

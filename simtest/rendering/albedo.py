@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.rendering.mitsuba_values import channels
-from simtest.surfaces.segment_table import PRIMES
+from simtest.surfaces.segment_table import ENDLESS, PRIMES
 
 if TYPE_CHECKING:
     from simtest.rendering.rest_map import RestMap
@@ -20,8 +20,9 @@ HEADER = 64
 PACKET = 4
 """Numbers that one gather reads."""
 
-TURN, PER_MM, MASK, ROWS = 32, 50, 51, 52
-"""Where the header holds both lattices' turns, cells over mm, what of a hash is the slot, and the first row."""
+TURN, PER_MM, MASK, ROWS, HALF = 32, 50, 51, 52, 53
+"""Where the header holds both lattices' turns, cells over mm, what of a hash is the slot, the first row, and half-sizes
+beyond which vessels are mirrored."""
 
 
 class AlbedoKernel:
@@ -49,6 +50,7 @@ class AlbedoKernel:
         lattices = (pattern.mottling, pattern.capillaries)
         self._nodes = len(pattern.mottling.values)
         table = pattern.vessels
+        self._is_mirrored = bool((table.half_mm < ENDLESS).any())
         first = np.zeros(-(-len(table.first) // PACKET) * PACKET, dtype=np.float32)
         first.view(np.uint32)[: len(table.first)] = table.first
         parts = [_header(pattern), *(_packets(lattice) for lattice in lattices), first, table.rows.ravel()]
@@ -102,6 +104,11 @@ class AlbedoKernel:
         import drjit as dr
 
         mi = self.mi
+        if self._is_mirrored:
+            half = mi.Vector3f(*(self._number(HALF + axis) for axis in range(3)))
+            number = dr.round(p / (2 * half))
+            odd = number - 2 * dr.floor(number / 2)
+            p = (p - 2 * number * half) * (1 - 2 * odd)
         cell = mi.Vector3i(dr.floor(p * self._number(PER_MM)))
         parts = [mi.UInt32(cell[axis]) * prime for axis, prime in enumerate(PRIMES)]
         slot = (parts[0] ^ parts[1] ^ parts[2]) & self._whole(mi.UInt32(MASK))
@@ -151,6 +158,7 @@ def _header(pattern: "TissuePattern") -> npt.NDArray[np.float32]:
     for i, lattice in enumerate((pattern.mottling, pattern.capillaries)):
         header[TURN + 9 * i : TURN + 9 * (i + 1)] = lattice.lattice_from_model.ravel()
     header[PER_MM] = 1 / pattern.vessels.cell_mm
+    header[HALF : HALF + 3] = pattern.vessels.half_mm
     header.view(np.uint32)[MASK] = pattern.vessels.mask
     return header
 

@@ -56,10 +56,9 @@ class BuiltScene:
     def write(self, mi: Any, shape: Shape, reflectance: Reflectance) -> None:
         """Write pose and material of the surface."""
         # Shape.
-        if "to_model" in shape.parameters:
-            matrix = shape.parameters["to_model"]
-            self._set("surface.to_world", mi.AffineTransform4f(matrix.tolist()))
-        if shape.mesh is not None and not _same(shape.mesh, self.mesh):
+        if shape.mesh is None:
+            self._set("surface.to_world", mi.AffineTransform4f(shape.to_model.tolist()))
+        elif not _same(shape.mesh, self.mesh):
             self._deform(shape.mesh)
         # Material: the whole and its base alone.
         for name, value in parameter_updates(mi, reflectance).items():

@@ -174,7 +174,7 @@ class TruthMaps:
 
 @dataclass(frozen=True)
 class MisfitMaps:
-    """Normal minus bisector across the sightline (`highlights.misfit`) of the rendered shape, a map for each light.
+    """Normal minus bisector across the sightline (see `exact_misfit`) of the rendered shape, a map for each light.
 
     The maps reach beyond the frame, so that a zero next to its border lies between pixels too.
 

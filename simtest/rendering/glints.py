@@ -1,7 +1,8 @@
-"""Glints: all zeros of the misfit between the fine normal and the bisector on a surface with relief (theory.md 7.1).
+"""Glints: zeros of the misfit between the fine normal and the bisector on a surface with relief (theory.md 7.1).
 
 They are hundreds a frame, and small. The misfit of the rendered frame, a value a pixel, shows where a zero is near;
-exact Newton steps with the closed derivative of the fine normal finish.
+exact Newton steps with the closed derivative of the fine normal finish. The search is not exhaustive: it misses some of
+the smallest (docs/reference/limits.md says how many).
 """
 
 import math
@@ -19,17 +20,17 @@ from simtest.runtime.arrays import Array, Image, IntArray, Mask
 if TYPE_CHECKING:
     from simtest.rendering.session import Session
 
-NEAR_PX = 1.5
-"""A pixel whose own Newton step is shorter than this is a seed."""
+NEAR_PX = 2.0
+"""A cell of the seeds' grid whose own Newton step is shorter than so many cells is a seed."""
 
-GRID_WAVE = 6.0
+GRID_WAVE = 12.0
 """Steps of the seeds' grid per wave of the finest band; pixels that are wider are divided."""
 
 TILE_PX, VARIES = 4, 0.5
 """Pixels along the side of the tiles that are divided: those in which no component of the misfit is farther from 0 than
 this share of its range over the tile and the pixels round it."""
 
-MAX_DIVISION = 4
+MAX_DIVISION = 8
 LEAST_WAVE_PX = 1.5
 """Pixels are divided by at most this. Relief whose waves are shorter than this many px is not resolved there, and acts
 as roughness."""
@@ -60,7 +61,7 @@ def is_resolved(session: "Session") -> bool:
 
 
 def find(session: "Session", radiance: Radiance) -> list[HighlightPoint]:
-    """Find the glints of all lights in view, the brightest first, with the frame's radiance.
+    """Search for the glints of all lights in view; return them with the frame's radiance, the brightest first.
 
     Those of parts of the frame that do not resolve the relief are left out.
     """
@@ -73,7 +74,7 @@ def find(session: "Session", radiance: Radiance) -> list[HighlightPoint]:
 
 
 def search(session: "Session", index: int) -> Array:
-    """Find the glints of the light of an index; return their pixels, shape (N, 2)."""
+    """Search for the glints of the light of an index; return their pixels, shape (N, 2)."""
     # Seeds: pixels whose own Newton step is short.
     seeds, light = _seeds(session, index), session.scene.rig.true_mm()[index]
     # Refine on the exact surface; seeds of one zero meet.

@@ -34,7 +34,7 @@ class Refinement:
 
         self.mi, self.shape = mi, shape
         if shape.mesh is None:
-            local_from_model = np.linalg.inv(shape.parameters["to_model"])
+            local_from_model = np.linalg.inv(shape.to_model)
             # Opaque, so that a moved or larger shape compiles no new kernel.
             self._turn = mi.Matrix3d(local_from_model[:3, :3].tolist())
             self._shift = mi.Vector3d(local_from_model[:3, 3].tolist())

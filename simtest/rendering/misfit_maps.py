@@ -91,7 +91,7 @@ def _misfits_at(tracer: Tracer, x: Any, y: Any, sources: list[Any], base: bool) 
 
 
 def _misfit(mi: Any, sightline: Any, distance: Any, normal: Any, light: Any) -> tuple[Any, Any]:
-    """Compute normal minus bisector across sightlines, camera frame, as `highlights.misfit` does."""
+    """Compute normal minus bisector across sightlines, camera frame, as `exact_misfit` does."""
     import drjit as dr
 
     bisector = dr.normalize(dr.normalize(light - sightline * distance) - sightline)

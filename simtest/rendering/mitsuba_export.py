@@ -167,9 +167,9 @@ def _cut_to_view(shape: Shape, surface: SurfaceModel, camera: Camera) -> Shape:
     if (directions[:, 2] >= 0).any():
         return shape
     seen = pose[:2, 3] - pose[2, 3] / directions[:, 2:] * directions[:, :2]
-    whole = shape.parameters["to_model"]
+    whole = shape.to_model
     reach = min(VIEW_MARGIN * float(np.abs(seen).max()), whole[0, 0])
-    return replace(shape, parameters={"to_model": np.diag([reach, reach, 1.0, 1.0])})
+    return replace(shape, to_model=np.diag([reach, reach, 1.0, 1.0]))
 
 
 def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> MitsubaDict:
@@ -267,7 +267,7 @@ def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str
     _set_transform(root, "sensor", surface.model_from_camera @ MITSUBA_FROM_CAMERA)
     # A mesh is stored in the model frame already.
     if not shape.mesh:
-        _set_transform(root, "surface", shape.parameters["to_model"])
+        _set_transform(root, "surface", shape.to_model)
     for i, (light, position) in enumerate(zip(scene.rig.lights, scene.rig.true_mm(), strict=True)):
         if light.source is not None:
             _set_transform(root, f"light_{i}", _disc_pose(light, position, surface))

@@ -13,7 +13,7 @@ def make_shape(mi: Any, shape: Shape, bsdf: MitsubaDict) -> Any:
     if shape.mesh is not None:
         return _make_mesh(mi, shape.mesh, bsdf)
     plugin = {"plane": "rectangle", "sphere": "sphere", "cylinder": "cylinder"}[shape.kind]
-    transform = mi.ScalarTransform4f(shape.parameters["to_model"].tolist())
+    transform = mi.ScalarTransform4f(shape.to_model.tolist())
     return {"type": plugin, "to_world": transform, "flip_normals": shape.flip, "bsdf": bsdf}
 
 

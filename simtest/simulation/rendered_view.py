@@ -12,7 +12,6 @@ import numpy.typing as npt
 from simtest.calibration import Calibration
 from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Radiance, Session, glints
-from simtest.rendering.light_points import DRAWN, FIXED
 from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
 from simtest.simulation import clouds as glint_clouds
@@ -28,6 +27,10 @@ LEAST_SHARE = 1e-12
 
 DRAWS, FEW_DRAWS = 32, 8
 """Draws of the noise at the peaks of highlights that are isolated if they stand above it, and at all others."""
+
+DEAR_SAMPLES = 16
+"""With so many samples a pixel or fewer, a frame with a source of finite size costs no more than its quick look. A part
+of what a dataset's seed means: another number keeps other draws."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,7 @@ def has_quick_look(scene: Scene) -> bool:
     """
     effort = scene.render
     wide = any(light.source is not None for light in scene.rig.lights)
-    return effort.path_depth > 2 or not wide or effort.samples_per_pixel * DRAWN > FIXED
+    return effort.path_depth > 2 or not wide or effort.samples_per_pixel > DEAR_SAMPLES
 
 
 def may_show(session: Session, scene: Scene, least: int) -> bool:

@@ -69,7 +69,7 @@ class Plane(_Analytic):
     def shape(self) -> Shape:
         """Return Mitsuba's rectangle, scaled beyond the view."""
         reach = PLANE_REACH * self.distance
-        return Shape("plane", False, {"to_model": np.diag([reach, reach, 1.0, 1.0])}, None, "plane")
+        return Shape("plane", False, np.diag([reach, reach, 1.0, 1.0]), None, "plane")
 
     def clearance(self, points: Array) -> Array:
         """Return z (see `SurfaceModel.clearance`)."""
@@ -122,7 +122,7 @@ class Sphere(_Round):
         """Return Mitsuba's sphere."""
         to_model = np.diag([self.radius, self.radius, self.radius, 1.0])
         to_model[:3, 3] = self.centre
-        return Shape("sphere", self.inside, {"to_model": to_model}, None, f"sphere {self.inside}")
+        return Shape("sphere", self.inside, to_model, None, f"sphere {self.inside}")
 
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Intersect rays with the sphere; S = (I - N N^T)/R (see `SurfaceModel.points`)."""
@@ -147,7 +147,7 @@ class Cylinder(_Round):
         to_model[:3, 1] = [0, 0, -self.radius]
         to_model[:3, 2] = [0, 2 * half, 0]
         to_model[:3, 3] = self.centre - [0, half, 0]
-        return Shape("cylinder", self.inside, {"to_model": to_model}, None, f"cylinder {self.inside}")
+        return Shape("cylinder", self.inside, to_model, None, f"cylinder {self.inside}")
 
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Intersect rays with the cylinder; S = (I - N N^T - y y^T)/R (see `SurfaceModel.points`)."""
@@ -177,7 +177,7 @@ class Quadric(_Analytic):
         normals = np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         mesh = TriangleMesh(vertices, grid_faces(QUADRIC_CELLS, QUADRIC_CELLS), normals)
-        return Shape("mesh", False, {}, mesh, f"quadric {k1!r} {k2!r} {reach!r}")
+        return Shape("mesh", False, np.eye(4), mesh, f"quadric {k1!r} {k2!r} {reach!r}")
 
     def clearance(self, points: Array) -> Array:
         """Return F/|grad F| of F = z + (k1 x^2 + k2 y^2)/2 (see `SurfaceModel.clearance`)."""

@@ -56,7 +56,7 @@ class MeshedSurface(SurfaceModel):
 
     def shape(self) -> Shape:
         """Return the mesh; winding and normals on the camera's side."""
-        return Shape("mesh", False, {}, self._build.mesh, self._build.key)
+        return Shape("mesh", False, np.eye(4), self._build.mesh, self._build.key)
 
     def vertex_shape_operators(self) -> Array:
         """Return S at the mesh's vertices (see `SurfaceModel.vertex_shape_operators`)."""

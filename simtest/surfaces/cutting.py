@@ -53,7 +53,8 @@ def off_between(ends: Array, normals: Array, share: float, limit_deg: float) -> 
     """
     between = (1 - share) * ends[:, 0] + share * ends[:, 1]
     between /= np.linalg.norm(between, axis=1, keepdims=True)
-    return np.asarray(np.linalg.norm(np.cross(between, normals), axis=1) > math.radians(limit_deg))
+    # By the chord, which grows with the angle up to 180 deg; a sine would fall again beyond 90.
+    return np.asarray(np.linalg.norm(between - normals, axis=1) > 2 * math.sin(math.radians(limit_deg) / 2))
 
 
 def halve(faces: IntArray, index: IntArray, chosen: IntArray, first_vertex: int, edge_count: int) -> IntArray:

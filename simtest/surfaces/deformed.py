@@ -146,7 +146,7 @@ class DeformedSurface(SurfaceModel):
 
     def shape(self) -> Shape:
         """Return the mesh with its vertices moved; shapes of all moments have one key."""
-        return Shape("mesh", False, {}, self._mesh, f"deformed {self.rest.shape().key}")
+        return Shape("mesh", False, np.eye(4), self._mesh, f"deformed {self.rest.shape().key}")
 
     def clearance(self, points: Array) -> Array:
         """Return the clearance of the points at rest (see `SurfaceModel.clearance`); the sign is exact."""

@@ -85,7 +85,7 @@ class GradedMesh(SurfaceModel):
         """Return the mesh, with the exact normals at its vertices."""
         form = self._form
         size = "" if isinstance(form, Plane) else f" {form.radius!r} {form.inside}"
-        return Shape("mesh", False, {}, self._mesh, f"graded {type(form).__name__} {form.distance!r}{size}")
+        return Shape("mesh", False, np.eye(4), self._mesh, f"graded {type(form).__name__} {form.distance!r}{size}")
 
     def vertex_shape_operators(self) -> Array:
         """Return S of the closed form at the vertices (see `SurfaceModel.vertex_shape_operators`)."""

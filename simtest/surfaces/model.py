@@ -109,18 +109,18 @@ class Shape:
         Mitsuba's analytic shape, or a mesh.
     flip : bool
         Whether the analytic shape is seen from inside.
-    parameters : dict
-        For an analytic shape: ``to_model``, a (4, 4) matrix from the unit shape to the model frame.
+    to_model : ndarray, shape (4, 4)
+        From an analytic unit shape to the model frame; a mesh is in that frame.
     mesh : TriangleMesh, optional
         For kind "mesh".
     key : str
-        Identity of what the renderer builds; two shapes with equal keys differ in `parameters` alone, and in vertices
+        Identity of what the renderer builds; two shapes with equal keys differ in `to_model` alone, and in vertices
         and normals where the surface deforms.
     """
 
     kind: str
     flip: bool
-    parameters: dict[str, Array]
+    to_model: Array
     mesh: TriangleMesh | None
     key: str
 

@@ -15,7 +15,7 @@ from functools import cached_property, lru_cache, reduce
 import numpy as np
 
 from simtest.geometry.vectors import tangent_basis
-from simtest.runtime.arrays import AnyArray, Array, Mask
+from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.kept_arrays import kept
 from simtest.spec.relief import Relief, ReliefBand
 from simtest.surfaces.model import SurfacePoints
@@ -174,12 +174,6 @@ class ReliefField:
         outer = jets.gradient[:, :, None] * jets.gradient[:, None, :]
         hessian = share[:, None, None] * jets.hessian + bend[:, None, None] * outer
         return HeightJets(height, share[:, None] * jets.gradient, hessian)
-
-    def pool(self, points: Array) -> Mask:
-        """Return which points, shape (N, 3), model frame, mm, lie in a pool of the film, shape (N,)."""
-        if self.level is None:
-            return np.zeros(len(points), dtype=bool)
-        return np.asarray(self.tissue_jets(points).height < self.level)
 
     def apply(self, points: SurfacePoints) -> SurfacePoints:
         """Turn the normals and curvatures of base points, model frame, to those of the fine surface.

@@ -5,7 +5,7 @@ adds nothing, so no slot has to be checked for whose it is. Renderer and NumPy r
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +34,9 @@ CELL_PER_WIDTH = 3.0
 STEPS = 4
 """Points of a segment whose distance to a cell is taken."""
 
+ENDLESS = 1e9
+"""mm: farther than any point of a surface."""
+
 SLACK = 0.5
 """How far a surface may leave the tangent plane of a vessel within its reach, over that reach."""
 
@@ -51,16 +54,25 @@ class SegmentTable:
     rows : ndarray of float32, shape (R, 8)
         Segments of the lists: start (3), half-width that is seen, end minus start (3), peak of the chord, mm; the last
         is negative for a vein.
+    half_mm : ndarray, shape (3,)
+        Along each axis of the model, how far from its origin the segments reach; beyond, they are mirrored over and
+        over. `ENDLESS` where they are not.
     """
 
     cell_mm: float
     first: npt.NDArray[np.uint32]
     rows: npt.NDArray[np.float32]
+    half_mm: Array = field(default_factory=lambda: np.full(3, ENDLESS))
 
     @property
     def mask(self) -> int:
         """What of a hash is the slot."""
         return len(self.first) - 2
+
+    def mirrored(self, points: Array) -> Array:
+        """Return the points among the segments that stand for points, shape (N, 3), mm."""
+        number = np.round(points / (2 * self.half_mm))
+        return np.asarray((points - 2 * number * self.half_mm) * np.where(number % 2, -1.0, 1.0))
 
     def slots(self, points: Array) -> IntArray:
         """Return the slots of points, shape (N, 3), mm."""
@@ -71,6 +83,7 @@ class SegmentTable:
 
         Of several segments the longest chord counts: neighbours along a vessel overlap.
         """
+        points = self.mirrored(points)
         slot = self.slots(points)
         first, last = self.first[slot], self.first[slot + 1]
         found = np.zeros((len(points), 2))
@@ -109,8 +122,11 @@ def seen_profile(radius: Array, blur_mm: float) -> tuple[Array, Array]:
     return width, 8 * radius**2 / (3 * width)
 
 
-def make_table(segments: "Segments", blur_mm: float) -> SegmentTable:
-    """Sort segments into the cells in which they are seen, through a depth that blurs by a standard deviation, mm."""
+def make_table(segments: "Segments", blur_mm: float, half_mm: Array) -> SegmentTable:
+    """Sort segments into the cells in which they are seen, through a depth that blurs by a standard deviation, mm.
+
+    For `half_mm` see `SegmentTable`.
+    """
     width, peak = seen_profile(segments.radius, blur_mm)
     if not len(width):
         return NO_VESSELS
@@ -121,7 +137,8 @@ def make_table(segments: "Segments", blur_mm: float) -> SegmentTable:
     first = np.zeros(slots + 1, dtype=np.uint32)
     first[1:] = np.cumsum(np.bincount(slot, minlength=slots))
     rows = np.column_stack([segments.start, width, segments.end - segments.start, np.where(segments.vein, -peak, peak)])
-    return SegmentTable(cell_mm, first, rows.astype(np.float32)[owner[np.argsort(slot, kind="stable")]])
+    sorted_rows = rows.astype(np.float32)[owner[np.argsort(slot, kind="stable")]]
+    return SegmentTable(cell_mm, first, sorted_rows, half_mm)
 
 
 def _cells(segments: "Segments", width: Array, cell_mm: float) -> tuple[IntArray, IntArray]:

@@ -12,9 +12,10 @@ from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.surfaces.analytic import QUADRIC_REACH, Cylinder, Plane, Quadric, Sphere
 from simtest.surfaces.mesh_geometry import area_vectors
 from simtest.surfaces.model import SurfaceModel, TriangleMesh
+from simtest.surfaces.segment_table import ENDLESS
 
 WINDOW = 1.5
-"""Half-size of the part of an analytic surface that is sampled, over the anchor's distance."""
+"""Half-size of the part of a plane or cylinder that is sampled, over the anchor's distance."""
 
 CANDIDATES = 3.0
 """Points drawn before thinning, per square of the least distance."""
@@ -38,15 +39,18 @@ class Patch:
         mm^2.
     draw : Callable
         See `Draw`.
+    half_mm : tuple of float
+        Half-size along each axis, beyond which the pattern is mirrored; `ENDLESS` where the patch is the whole surface.
     """
 
     key: str
     area: float
     draw: Draw = field(compare=False, repr=False)
+    half_mm: tuple[float, float, float] = (ENDLESS, ENDLESS, ENDLESS)
 
 
 def surface_patch(surface: SurfaceModel) -> Patch:
-    """Return what to sample of a surface: a window around the anchor of an analytic one, a mesh as a whole."""
+    """Return what to sample of a surface: a window around the anchor of one without end, all of another."""
     if isinstance(surface, Plane):
         return _plane(WINDOW * surface.distance)
     if isinstance(surface, Sphere):
@@ -66,39 +70,34 @@ def _plane(half: float) -> Patch:
         points[:, :2] = rng.uniform(-half, half, (count, 2))
         return points, np.tile([0.0, 0.0, 1.0], (count, 1))
 
-    return Patch(f"plane {half!r}", 4 * half**2, draw)
+    return Patch(f"plane {half!r}", 4 * half**2, draw, (half, half, ENDLESS))
 
 
 def _sphere(surface: Sphere) -> Patch:
-    radius = surface.radius
-    # Archimedes: the height above the far side is uniform over the area. From inside, all around is in view.
-    lowest = -1.0 if surface.inside else math.cos(min(WINDOW * surface.distance / radius, math.pi))
-    side = -1.0 if surface.inside else 1.0
+    radius, side = surface.radius, -1.0 if surface.inside else 1.0
 
     def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
-        z, angle = rng.uniform(lowest, 1.0, count), rng.uniform(-np.pi, np.pi, count)
+        # Archimedes: the height above the far side is uniform over the area.
+        z, angle = rng.uniform(-1.0, 1.0, count), rng.uniform(-np.pi, np.pi, count)
         across = np.sqrt(1 - z**2)
         # The anchor is at +z of the centre seen from outside, and at -z from inside.
         out = np.stack([across * np.cos(angle), across * np.sin(angle), side * z], axis=1)
         return surface.centre + radius * out, side * out
 
-    key = f"sphere {radius!r} {lowest!r} {surface.inside}"
-    return Patch(key, 2 * math.pi * radius**2 * (1 - lowest), draw)
+    return Patch(f"sphere {radius!r} {surface.inside}", 4 * math.pi * radius**2, draw)
 
 
 def _cylinder(surface: Cylinder) -> Patch:
     radius, side = surface.radius, -1.0 if surface.inside else 1.0
-    # From inside, all around is in view, and far along the axis.
     half = WINDOW * max(surface.distance, 2 * radius if surface.inside else 0.0)
-    widest = math.pi if surface.inside else min(half / radius, math.pi)
 
     def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
-        angle, along = rng.uniform(-widest, widest, count), rng.uniform(-half, half, count)
+        angle, along = rng.uniform(-np.pi, np.pi, count), rng.uniform(-half, half, count)
         out = np.stack([np.sin(angle), np.zeros(count), side * np.cos(angle)], axis=1)
         return surface.centre + radius * out + along[:, None] * [0.0, 1.0, 0.0], side * out
 
     key = f"cylinder {radius!r} {half!r} {surface.inside}"
-    return Patch(key, 4 * half * widest * radius, draw)
+    return Patch(key, 4 * math.pi * half * radius, draw, (ENDLESS, half, ENDLESS))
 
 
 def _quadric(surface: Quadric) -> Patch:

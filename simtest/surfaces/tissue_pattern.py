@@ -153,7 +153,8 @@ def _unpacked(arrays: Mapping[str, AnyArray]) -> TissuePattern:
     mottling, capillaries = (
         Lattice(arrays[f"{name}_lattice_from_model"], arrays[f"{name}_values"]) for name in _LATTICES
     )
-    vessels = SegmentTable(float(arrays["vessels_cell_mm"]), arrays["vessels_first"], arrays["vessels_rows"])
+    cell, *table = (arrays[f"vessels_{part}"] for part in ("cell_mm", "first", "rows", "half_mm"))
+    vessels = SegmentTable(float(cell), *table)
     plain: dict[str, Any] = {name: arrays[name] for name in _PLAIN}
     return TissuePattern(mottling=mottling, capillaries=capillaries, vessels=vessels, **plain)
 
@@ -162,7 +163,7 @@ def _grown(patch: Patch, spec: TissueColour) -> TissuePattern:
     """Make the pattern of a patch."""
     grow = np.random.SeedSequence(spec.seed).spawn(3)[2]
     forest = grow_vessels(patch, spec.vessels, int(grow.generate_state(1)[0]))
-    return _pattern(spec, make_table(segments(forest), BLUR_PER_DEPTH * spec.vessels.depth_mm))
+    return _pattern(spec, make_table(segments(forest), BLUR_PER_DEPTH * spec.vessels.depth_mm, np.array(patch.half_mm)))
 
 
 def _pattern(spec: TissueColour, table: SegmentTable) -> TissuePattern:

@@ -46,11 +46,14 @@ def _load(made: Path) -> tuple[Array, IntArray]:
 def _triangles(path: str) -> tuple[Array, IntArray]:
     """Read a file in this process; raise `InputError` where its content is no mesh."""
     import pyvista
-    from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
+    from vtkmodules.vtkCommonCore import vtkLogger
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
-    vtkObject.GlobalWarningDisplayOff()
-    data = pyvista.read(path)
+    # VTK fills what is missing with zeros, or leaves it as it finds it, and goes on.
+    with pyvista.VtkErrorCatcher(send_to_logging=False) as caught:
+        data = pyvista.read(path)
+    if any(event.kind == "ERROR" or "Error reading" in event.alert for event in caught.events):
+        raise InputError("holds fewer points or cells than it announces: it is cut short or damaged")
     if isinstance(data, pyvista.UnstructuredGrid):
         check_indices(np.asarray(data.cell_connectivity), data.n_points)
         data = data.extract_surface(algorithm="dataset_surface")

@@ -167,7 +167,7 @@ def wired(monkeypatch):
         pose = self.model_from_camera
         normals = np.tile(-pose[:3, 2], (len(vertices), 1))
         mesh = TriangleMesh(vertices @ pose[:3, :3].T + pose[:3, 3], faces, normals)
-        return Shape("mesh", False, {}, mesh, "wired")
+        return Shape("mesh", False, np.eye(4), mesh, "wired")
 
     monkeypatch.setattr(Quadric, "shape", shape)
     return {"type": "quadric", "k1_per_mm": 0.0, "k2_per_mm": 0.0}, {"camera": {"skew": 0.0}}

@@ -31,7 +31,7 @@ class Bent(SurfaceModel):
         self.model_from_camera = np.eye(4)
 
     def shape(self):
-        return Shape("mesh", False, {}, self._mesh, self._key)
+        return Shape("mesh", False, np.eye(4), self._mesh, self._key)
 
     def clearance(self, points):
         return 8 - np.hypot(np.hypot(points[:, 0], points[:, 1]) - 40, points[:, 2])

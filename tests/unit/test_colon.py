@@ -7,6 +7,7 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.surfaces.colon import Colon, build
+from simtest.surfaces.cutting import off_between
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, Polyp, load_recipe
@@ -312,3 +313,10 @@ def test_recipes_load_and_refuse_what_is_malformed(tmp_path):
         assert "recipe.toml" in str(error.value)
     with pytest.raises(InputError, match="no such file"):
         load_recipe(tmp_path / "none.toml")
+
+
+def test_interpolated_normals_are_judged_by_their_angle():
+    ends = np.array([[[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]] * 5)
+    angle = np.radians([0.1, 0.3, 90.0, 179.9, 180.0])
+    middle = np.stack([np.sin(angle), np.zeros(5), np.cos(angle)], axis=1)
+    np.testing.assert_array_equal(off_between(ends, middle, 0.5, 0.2), [False, True, True, True, True])

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from simtest.rendering import Session, glints
 from simtest.simulation.rendered_view import render_view
@@ -61,6 +62,24 @@ def test_search_finds_what_an_exhaustive_one_finds(sessions, surface):
     found = glints.search(session, 0)
     missing = [zero for zero in boxed_zeros(session) if np.linalg.norm(found - zero, axis=1).min() > 0.3]
     assert missing == []
+
+
+RIDGED = {"bands": [{"kind": "ridged", "slope_deg": 6.0, "wavelength_mm": 1.0}], "seed": 6}
+PITS = {"bands": [{"kind": "ridged", "slope_deg": 5.5, "wavelength_mm": 2.0},
+                  {"kind": "pits", "slope_deg": 4.0, "wavelength_mm": 0.7}], "seed": 4}  # fmt: skip
+
+
+@pytest.mark.parametrize("relief", [RIDGED, pytest.param(PITS, marks=pytest.mark.ci)])
+def test_creases_hide_no_glint_that_a_grid_twice_as_fine_finds(relief, monkeypatch):
+    """The normal turns fastest at ridges and at the rims of pits; the glints there are the smallest."""
+    session = Session(scene("inside", relief))
+    found = glints.search(session, 0)
+    for name in ("GRID_WAVE", "MAX_DIVISION"):
+        monkeypatch.setattr(glints, name, 2 * getattr(glints, name))
+    finer = glints.search(session, 0)
+    assert len(finer) > 100
+    assert cKDTree(found).query(finer)[0].max() < 0.05
+    assert cKDTree(finer).query(found)[0].max() < 0.05
 
 
 FINE = {"bands": [{"slope_deg": 5.0, "wavelength_mm": 0.4}], "seed": 3}

@@ -64,17 +64,16 @@ def answers(session, frame, priors=LOBE, **estimators):
     return found.estimates
 
 
-def model_at(highlight, rays, n=N, light=(0.0, 0, 0), depth=2, samples=1, base=0.0, opened=(True, True)):
+def model_at(highlight, rays, light=(0.0, 0, 0), base=0.0):
     """The patch at a true highlight."""
     s = highlight.position / highlight.distance
     first = highlight.direction_min
     if first is None:
         first = tangent_basis(highlight.normal[None])[0][0]
-    stretch = np.sqrt(n) * np.array([1 + highlight.kd_min, 0, 1 + highlight.kd_max])
+    stretch = np.sqrt(N) * np.array([1 + highlight.kd_min, 0, 1 + highlight.kd_max])
     light = np.array(light)
-    renderer = PatchRenderer(rays, depth, samples)
     return RenderedQuadric(
-        renderer, s, first, highlight.distance, light, light[None], stretch, 0.0, float(np.log(n)), base, *opened
+        PatchRenderer(rays), s, first, highlight.distance, light, light[None], stretch, 0.0, np.log(N), base, True
     )
 
 
@@ -111,27 +110,11 @@ def test_derivatives_are_those_of_the_intensities(render):
     _, rays = pixels_near(session, highlight)
     model = model_at(highlight, rays, light=session.scene.rig.true_mm()[0], base=0.2)
     _, J = model.evaluate()
-    for column, size in enumerate((2e-3, 2e-3, 2e-2, 2e-2, 2e-2, 1e-2, 1e-2, 1e-2)):
-        step = np.zeros(8)
+    for column, size in enumerate((2e-3, 2e-3, 2e-2, 2e-2, 2e-2, 1e-2, 1e-2)):
+        step = np.zeros(7)
         step[column] = size
         numeric = (model.moved(step).evaluate()[0] - model.moved(-step).evaluate()[0]) / (2 * size)
         assert np.abs(J[:, column] - numeric).max() < 0.01 * np.abs(numeric).max() + 1e-5
-
-
-def test_inter_reflections_are_the_renderers(render):
-    """A bowl with a bright base, within the sampling error, which the scatter of the pixels' ratios tells."""
-    bowl = {"type": "quadric", "k1_per_mm": -0.06, "k2_per_mm": -0.05}
-    more = {"reflectance": {"type": "phong", "exponent": N, "diffuse": 0.8}}
-    session, direct, highlight = render(bowl, **more)
-    places, rays = pixels_near(session, highlight, reach=60, step=4)
-    _, full, _ = render(bowl, render={"path_depth": 3, "samples_per_pixel": 24}, **more)
-    expected = (full.total - direct.total)[places[:, 1], places[:, 0]]
-    models = [model_at(highlight, rays, depth=depth, samples=64, base=0.8) for depth in (2, 3)]
-    made = (models[1].evaluate()[0] - models[0].evaluate()[0]) / D**2
-    gap, error = (made - expected).mean(), np.std(made - expected) / np.sqrt(len(made))
-    assert error < 0.03 * expected.mean()
-    assert abs(gap) < 4 * error
-    assert expected.mean() > 0.002 * direct.total.max()
 
 
 @pytest.mark.parametrize("name", marked(SURFACES, ci=["cylinder", "saddle"]))
@@ -203,15 +186,6 @@ def test_of_two_given_lights_the_highlight_s_own_is_taken_or_none(render):
         # Alone it may be that of either light.
         alone = inverse_rendering.estimate(replace(spot.patch, others_px=()), session.camera, priors)
         assert alone == Failure(Reason.NOT_KNOWN, "needs to know which of 2 lights it reflects")
-
-
-def test_the_exponent_is_found_without_noise(render):
-    session, radiance, highlight = render(SURFACES["saddle"])
-    opened = InverseRendering(base=False, exponent=True)
-    found = answers(session, frame_of(radiance, 0.0), Priors(), inverse=opened)["inverse"]
-    assert angle_deg(found.normal, highlight.normal) < 1e-3
-    gains = np.sort(np.abs(1 + np.array([highlight.kd_min, highlight.kd_max])))
-    assert found.axis_ratio == pytest.approx(gains[0] / gains[1], rel=5e-3)
 
 
 def test_another_highlight_compiles_nothing(render):

@@ -10,11 +10,13 @@ import trimesh
 
 from simtest.cli.manners import MANNERS
 from simtest.cli.validate import validate
+from simtest.errors import InputError
 from simtest.spec import Experiment, Group
 from simtest.surfaces.fineness import concentration
 from simtest.surfaces.mesh_check import check_mesh
 from simtest.surfaces.mesh_file import read_mesh
 from simtest.surfaces.ply_polygons import read_mixed_polygons
+from simtest.surfaces.vtk_file import _triangles
 from simtest.validation.mesh_verdicts import MeshVerdict, mesh_verdicts
 from tests.refusals import refused
 
@@ -103,6 +105,39 @@ def test_cut_stl_files_are_told(tmp_path):
     for good in (whole, text.encode(), b"solid by a binary writer".ljust(80) + whole[80:]):
         path.write_bytes(good)
         assert len(read_mesh(path)[1]) == 320
+
+
+@pytest.mark.parametrize("version", [42, 51])
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize("kind", ["PolyData", "UnstructuredGrid"])
+def test_cut_vtk_files_are_refused(tmp_path, kind, text, version):
+    """VTK itself fills what is missing, and goes on."""
+    import pyvista
+    from vtkmodules.vtkIOLegacy import vtkDataSetWriter
+
+    data = pyvista.wrap(ball())
+    path, writer = tmp_path / "ball.vtk", vtkDataSetWriter()
+    writer.SetInputData(data if kind == "PolyData" else data.cast_to_unstructured_grid())
+    writer.SetFileName(str(path))
+    writer.SetFileVersion(version)
+    writer.SetFileTypeToASCII() if text else writer.SetFileTypeToBinary()
+    writer.Write()
+    whole = path.read_bytes()
+    assert len(_triangles(str(path))[1]) == 320
+    # A file of text that ends before its cells has no faces, which is refused as well.
+    for share in (0.8, 0.85, 0.9, 0.95, 0.99):
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(InputError, match="it is cut short or damaged"):
+            _triangles(str(path))
+
+
+def test_a_cut_vtk_file_is_named(tmp_path):
+    import pyvista
+
+    path = tmp_path / "ball.vtk"
+    pyvista.wrap(ball()).save(path)
+    path.write_bytes(path.read_bytes()[:-3000])
+    refused(lambda: read_mesh(path), "ball.vtk: holds fewer points or cells than it announces: it is cut short")
 
 
 # The verdict in an experiment ------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ import pytest
 
 from simtest.dataset.maker import Maker, colour_variant
 from simtest.dataset.plan import Plan
-from simtest.rendering import Session, found_highlights, glints, highlights
-from simtest.simulation.rendered_view import has_quick_look, render_view, shows_isolated
+from simtest.rendering import Session, found_highlights, glints, highlights, light_points
+from simtest.simulation.rendered_view import DEAR_SAMPLES, has_quick_look, render_view, shows_isolated
 from simtest.spec import scene_from_dict
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.spec_model import validate
@@ -186,6 +186,11 @@ def test_a_quick_look_is_taken_where_it_costs_less_than_the_frame(samples, depth
     drawn = scene(ROUGH, lights=[{**LIGHTS[0], **light}], samples=samples)
     effort = drawn.render.model_copy(update={"path_depth": depth})
     assert has_quick_look(drawn.model_copy(update={"render": effort})) is quick
+
+
+def test_the_quick_look_of_a_wide_source_takes_as_many_points_as_that_many_samples():
+    """A control: datasets keep their draws where the renderer's numbers change, and this says that they have."""
+    assert light_points.FIXED == light_points.DRAWN * DEAR_SAMPLES
 
 
 @pytest.mark.parametrize("tries", [pytest.param(8, marks=pytest.mark.ci), 2])

@@ -8,7 +8,7 @@ from simtest.spec import scene_from_dict
 from simtest.spec.tissue_colour import PRESETS, TissueColour
 from simtest.surfaces import make_surface
 from simtest.surfaces.haemoglobin import blood_absorption, reach
-from simtest.surfaces.segment_table import make_table, seen_profile
+from simtest.surfaces.segment_table import ENDLESS, make_table, seen_profile
 from simtest.surfaces.surface_samples import spread_points, surface_patch
 from simtest.surfaces.tissue_pattern import BLUR_PER_DEPTH, _make, make_pattern
 from simtest.surfaces.vessels import Segments, grow_vessels, segments
@@ -177,7 +177,7 @@ def test_smaller_vessels_are_fainter_and_red_is_darkened_least():
     normal, half = np.tile([0.0, 0.0, 1.0], (4, 1)), np.array([2.5, 0.0, 0.0])
     for vein in (False, True):
         lines = Segments(start, start + 2 * half, normal, radius, np.full(4, vein))
-        table = make_table(lines, BLUR_PER_DEPTH * DEPTH_MM)
+        table = make_table(lines, BLUR_PER_DEPTH * DEPTH_MM, np.full(3, ENDLESS))
         chord = table.chords(start + half)[:, int(vein)]
         assert (table.chords(start + half)[:, int(not vein)] == 0).all()
         left = 1 - pattern.share * (1 - np.exp(-chord[:, None] * pattern.absorption[int(vein)]))
@@ -322,6 +322,33 @@ def test_there_is_no_seam_around_a_tube():
     assert 0.6 * others < crossings(np.pi) < 1.6 * others
 
 
+@pytest.mark.parametrize(("name", "axes"), [("plane", [0, 1]), ("inside a cylinder", [1])])
+def test_vessels_do_not_end_where_a_tilted_camera_still_sees_the_surface(name, axes):
+    surface = surface_of(name)
+    patch = surface_patch(surface)
+    vessels = make_pattern(surface, TissueColour()).vessels
+    near = patch.draw(np.random.default_rng(4), 20_000)[0]
+    half, far = np.array(patch.half_mm), near.copy()
+    # Over the second border, where the pattern stands as it is: an even number of mirrors.
+    far[:, axes] += 4 * half[axes]
+    np.testing.assert_allclose(vessels.chords(far), vessels.chords(near), atol=1e-9)
+    covered = (vessels.chords(near) > 0).any(axis=1).mean()
+    assert 0.1 < covered < 0.9
+    # Across the border itself there is no jump.
+    border = near.copy()
+    border[:, axes[0]] = half[axes[0]]
+    step = 1e-6 * np.eye(3)[axes[0]]
+    np.testing.assert_allclose(vessels.chords(border - step), vessels.chords(border + step), atol=1e-4)
+
+
+def test_a_ball_has_vessels_all_around():
+    surface = surface_of("sphere")
+    vessels = make_pattern(surface, TissueColour()).vessels
+    points, _ = surface_patch(surface).draw(np.random.default_rng(4), 20_000)
+    behind = (points - surface.centre)[:, 2] < -0.5 * surface.radius
+    assert (vessels.chords(points[behind]) > 0).any(axis=1).mean() > 0.1
+
+
 # Kernel ----------------------------------------------------------------------------------------------------------
 
 
@@ -341,6 +368,8 @@ def test_the_kernel_is_the_reference(name, variant):
     session = Session(scene(name), variant)
     mi = session.mi
     points, _ = surface_patch(session.surface).draw(np.random.default_rng(2), 3000)
+    # Beyond the borders, too.
+    points[::2] *= {"plane": 3.0}.get(name, 1.0)
     rounded = points.astype(np.float32)
     found = np.array(session._albedo.at(mi.Point3f(rounded.T), mi.Bool(True))).T
     expected = make_pattern(session.surface, TissueColour()).albedo(rounded.astype(float))
