@@ -252,6 +252,9 @@ def views(case: Case) -> Faults:
                 )
     lines = [line.split() for line in (folder / "trajectory.txt").read_text().splitlines() if line[:1] != "#"]
     for pose, line in zip(poses, lines, strict=True):
-        if not np.abs(np.array(line[1:4], dtype=float) - pose[:3, 3]).max() < 1e-5:
-            faults.append("trajectory.txt: another position than views.json")
+        # Time, position in m, quaternion with its real part last.
+        values = np.array(line, dtype=float)
+        place, turn = 1000 * values[1:4], formulas.rotation_of_quaternion(values[4:])
+        if not max(np.abs(place - pose[:3, 3]).max(), np.abs(turn - pose[:3, :3]).max()) < 1e-5:
+            faults.append("trajectory.txt: another pose than views.json")
     return faults
