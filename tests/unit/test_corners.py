@@ -13,7 +13,7 @@ from studies.corners.coverage import Answer, share_by_scene, table
 from studies.corners.design import covering_array
 from studies.corners.scenes import FACTORS, SMOOTH, refusals, rows
 
-QUICK = ("law", "projection", "surface", "search", "mirror", "turn", "calibration", "flow")
+QUICK = ("law", "projection", "surface", "search", "mirror", "turn", "answers", "calibration", "flow")
 
 
 def test_every_pair_that_is_not_refused_is_in_a_row_and_no_other():
