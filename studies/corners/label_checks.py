@@ -15,6 +15,9 @@ from studies.corners import formulas
 from studies.corners.case import Case, Faults, NotAskedError
 from studies.corners.scenes import SMOOTH
 
+LEAST_RADIUS_PX = 0.8
+"""Of a highlight that holds a pixel's centre wherever it lies."""
+
 CLEAR = 0.85
 """Share of full scale below which a peak is not clipped, nor its noise."""
 
@@ -115,7 +118,8 @@ def labels(case: Case) -> Faults:
         column, row = (min(int(v), n - 1) for v, n in zip(each["bp_px"], specular.shape[::-1], strict=True))
         region = formulas.at_half_height(specular, formulas.climbed(specular, (row, column)))
         size, kept = int(region.sum()), int(own.sum())
-        nulls += not kept
+        # Below, half height may lie between the pixels' centres.
+        nulls += not kept and (each["radius_px"] or math.inf) > LEAST_RADIUS_PX
         if kept and size >= 20:
             overlap = np.count_nonzero(own & region) / np.count_nonzero(own | region)
             poor += [f"instance {number + 1}: IoU {overlap:.2f} of {kept} with {size} px"] if overlap < 0.9 else []
