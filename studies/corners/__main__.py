@@ -3,7 +3,7 @@
     python -m studies.corners [--scenes N] [--checks NAME ...] [--only K] [--draws N]
 
 Prints the array's size and the pairs that the package refuses, the verdicts of each check, what the regions of the
-estimators hold by feature, and each red line; `--only SCENE --checks NAME` shows it again. Exit 1 where a check is red.
+estimators hold by feature, and each red line with the command that shows it again. Exit 1 where a check is red.
 """
 
 import argparse
@@ -41,7 +41,8 @@ class Tally:
         self.counts[check, verdict] += 1
         self.seconds[check] += seconds
         if verdict in ("refused", "red"):
-            self.lines += [f"{verdict}: scene {scene}, {check}: {reason}" for reason in reasons[:MOST_LINES]]
+            again = f" [python -m studies.corners --only {scene} --checks {check}]"
+            self.lines += [f"{verdict}: scene {scene}, {check}: {reason}{again}" for reason in reasons[:MOST_LINES]]
             more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
             print(f"{verdict}: scene {scene}, {check}: {reasons[0]}{more}", flush=True)
 
@@ -84,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         tally.lines += faults if given.only is None else []
     red = [line for line in tally.lines if line.startswith("red")]
     if red:
-        print("\nreds; one of a scene is shown again by: python -m studies.corners --only SCENE --checks CHECK")
+        print("\nreds, with the command that shows them again")
         print("\n".join(red))
     print(f"\n{sum(tally.seconds.values()):.0f} s of processor time")
     return 1 if red else 0
