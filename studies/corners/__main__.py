@@ -3,7 +3,7 @@
     python -m studies.corners [--scenes N] [--checks NAME ...] [--only K] [--draws N]
 
 Prints the array's size and the pairs that the package refuses, the verdicts of each check, what the regions of the
-estimators hold by feature, and each red line; `--only SCENE --checks NAME` shows it again. Exit 1 where a check is red.
+estimators hold by feature, and each red line with the command that shows it again. Exit 1 where a check is red.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from simtest.errors import SimtestError
 from studies.corners.case import Case
 from studies.corners.checks import CHECKS, run
 from studies.corners.coverage import Answer, answers_of, table
+from studies.corners.design import whole_from
 from studies.corners.scenes import MESH, refusals, rows
 
 NAMES = (*CHECKS, "coverage")
@@ -40,7 +41,8 @@ class Tally:
         self.counts[check, verdict] += 1
         self.seconds[check] += seconds
         if verdict in ("refused", "red"):
-            self.lines += [f"{verdict}: scene {scene}, {check}: {reason}" for reason in reasons[:MOST_LINES]]
+            again = f" [python -m studies.corners --only {scene} --checks {check}]"
+            self.lines += [f"{verdict}: scene {scene}, {check}: {reason}{again}" for reason in reasons[:MOST_LINES]]
             more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
             print(f"{verdict}: scene {scene}, {check}: {reasons[0]}{more}", flush=True)
 
@@ -62,7 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", type=int, metavar="K", help="row K of the array alone, from 0")
     given = parser.parse_args(arguments)
     array, tally = rows(), Tally()
-    print(f"{len(array)} scenes hold all pairs of levels of {len(array[0])} features; pairs that are refused:")
+    print(f"{len(array)} scenes; the first {whole_from(array)} hold all pairs of levels of {len(array[0])} features")
+    print("pairs that are refused:")
     for (first, second), reason in refusals().items():
         print(f"  {first[0]} {first[1]}, {second[0]} {second[1]}: {reason}")
     for number in range(len(array))[: given.scenes] if given.only is None else [given.only]:
@@ -82,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         tally.lines += faults if given.only is None else []
     red = [line for line in tally.lines if line.startswith("red")]
     if red:
-        print("\nreds; one of a scene is shown again by: python -m studies.corners --only SCENE --checks CHECK")
+        print("\nreds, with the command that shows them again")
         print("\n".join(red))
     print(f"\n{sum(tally.seconds.values()):.0f} s of processor time")
     return 1 if red else 0

@@ -70,6 +70,7 @@ def surface(case: Case) -> Faults:
             gap = np.nanmax(np.abs(getattr(truth, name) - expected[..., k])[known])
             if not gap < 1e-6:
                 faults.append(f"truth.{name}: up to {gap:.2g} per mm off")
+        faults += _highlights_on_surface(case)
     else:
         curvature = truth.k_min_base + truth.k_max_base
         # A mesh's facets are flat, its normals and curvatures interpolated: means over facets are compared.
@@ -82,6 +83,25 @@ def surface(case: Case) -> Faults:
         faults.append("normal: not that of the base on a surface without relief")
     if case.row["relief"] == "resolved":
         faults += _relief_slopes(case)
+    return faults
+
+
+def _highlights_on_surface(case: Case) -> Faults:
+    """Compare each highlight's place, base normal and curvatures with the closed form on its own sightline."""
+    points = [*case.seen.highlights, *case.seen.clouds]
+    if not points:
+        return []
+    rays = formulas.sightlines(case.camera, np.array([each.bp_px for each in points]))
+    depth, normal = formulas.cast(case.tables, rays)
+    curvatures = formulas.curvatures(case.tables, rays * depth[:, None])
+    faults = []
+    for number, each in enumerate(points):
+        if not abs(each.distance / depth[number] - 1) < 1e-7:
+            faults.append(f"highlight {number}: at {each.distance:.6g} mm, the surface at {depth[number]:.6g} mm")
+        off = formulas.angle_deg(each.normal_base, normal[number])
+        kd = np.array([each.kd_min_base, each.kd_max_base])
+        if not off < 1e-5 or not np.abs(kd - depth[number] * curvatures[number]).max() < 1e-6:
+            faults.append(f"highlight {number}: base normal {off:.2g} deg off, kd {kd.round(5).tolist()}")
     return faults
 
 

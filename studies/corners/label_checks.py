@@ -15,17 +15,31 @@ from studies.corners import formulas
 from studies.corners.case import Case, Faults, NotAskedError
 from studies.corners.scenes import SMOOTH
 
+LEAST_RADIUS_PX = 0.8
+"""Of a highlight that holds a pixel's centre wherever it lies."""
+
+CLEAR = 0.85
+"""Share of full scale below which a peak is not clipped, nor its noise."""
+
 DRAWS = 96
 """Pictures by which the noise is measured: its deviation is then known to 7 %."""
 
 
 def isolated(case: Case) -> Faults:
     """Check that what is isolated is lit and no streak, and that what stands alone is isolated."""
-    faults = []
+    faults, metal = [], case.frame.labels.instrument > 0
     for number, each in enumerate(case.seen.highlights):
         gain = min(abs(1 + each.kd_min), abs(1 + each.kd_max))
         if each.isolated and not (each.lit and gain > 0.25 and each.peak_snr >= 10):
             faults.append(f"highlight {number}: isolated, but lit {each.lit}, gain {gain:.2g}, SNR {each.peak_snr:.3g}")
+        row, column = (min(int(v), n - 1) for v, n in zip(each.bp_px[::-1], metal.shape, strict=True))
+        around = metal[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        if (around.all() and not each.hidden) or (each.hidden and not around.any()):
+            faults.append(
+                f"highlight {number}: hidden {each.hidden}, the pixels around show metal {bool(around.all())}"
+            )
+        if each.hidden and each.lit:
+            faults.append(f"highlight {number}: hidden and lit")
         if case.row["relief"] == "none" and gain > 0.35 and not each.isolated and case.stands_alone(each):
             faults.append(f"highlight {number} stands alone, but: {each.why_not}")
     return faults
@@ -50,7 +64,10 @@ def radius(case: Case) -> Faults:
     least = 1 if case.row["relief"] == "none" else 5
     if len(ratios) < least:
         raise NotAskedError(f"fewer than {least} isolated highlights of more than 30 px in the frame's interior")
-    ratio, room = float(np.median(ratios)), 1.12 if case.row["relief"] == "none" else 1.35
+    ratio, room = (
+        float(np.median(ratios)),
+        1.12 if case.row["relief"] == "none" and case.row["surface"] in SMOOTH else 1.35,
+    )
     if 1 / room < ratio < room:
         return []
     return [f"radius_px: {ratio:.3g} of the rendered one in the median of {len(ratios)}"]
@@ -60,12 +77,14 @@ def snr(case: Case) -> Faults:
     """Check the noise behind `peak_snr` against that of pictures drawn again."""
     if case.row["sensor"] == "ideal":
         raise NotAskedError("no noise")
-    spots = [s for s in case.seen.visible_highlights if s.instrument is None][:8]
+    # A clipped peak has less noise than light.
+    most = CLEAR * case.seen.full_scale
+    spots = [s for s in case.seen.visible_highlights if s.instrument is None and s.value < most][:8]
     response = Response("srgb") if case.row["sensor"] == "processed" else Response()
     drawn = []
     places = [(int(s.peak_px[1]), int(s.peak_px[0])) for s in spots]
     if not places:
-        raise NotAskedError("no visible highlight")
+        raise NotAskedError("no visible highlight that is not clipped")
     for seed in range(DRAWS):
         linear = response.decode(case.seen.frame(seed))
         linear = linear if linear.ndim == 2 else linear.mean(axis=2)
@@ -73,6 +92,7 @@ def snr(case: Case) -> Faults:
     values = np.array(drawn)
     ratios = []
     for spot, of_spot in zip(spots, values.T, strict=True):
+        # Demosaicing and sharpening may still lift it.
         if np.quantile(of_spot, 0.95) < 0.97 and math.isfinite(spot.peak_snr):
             sigma = spot.specular / spot.peak_snr / case.seen.full_scale
             ratios.append(float(of_spot.std(ddof=1)) / sigma)
@@ -98,7 +118,8 @@ def labels(case: Case) -> Faults:
         column, row = (min(int(v), n - 1) for v, n in zip(each["bp_px"], specular.shape[::-1], strict=True))
         region = formulas.at_half_height(specular, formulas.climbed(specular, (row, column)))
         size, kept = int(region.sum()), int(own.sum())
-        nulls += not kept
+        # Below, half height may lie between the pixels' centres.
+        nulls += not kept and (each["radius_px"] or math.inf) > LEAST_RADIUS_PX
         if kept and size >= 20:
             overlap = np.count_nonzero(own & region) / np.count_nonzero(own | region)
             poor += [f"instance {number + 1}: IoU {overlap:.2f} of {kept} with {size} px"] if overlap < 0.9 else []

@@ -2,14 +2,19 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
+from simtest.errors import Failure
+from simtest.estimators import Estimate
+from simtest.geometry import BrownConrady, Camera
+from simtest.reconstruction import reconstruct
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array
 from simtest.simulation.true_highlights import TrueHighlight
 from studies.corners import formulas
-from studies.corners.case import TURN, Case, Faults, View
+from studies.corners.case import ESTIMATORS, TURN, Case, Faults, View
 
 BORDER_PX = 0.5
 """What lies so near to the frame's border may be in view on one side of a symmetry alone."""
@@ -151,3 +156,58 @@ def _blocks(image: Array) -> Array:
     """Return the means of blocks of 8 x 8 pixels; the frame's sides are multiples of it."""
     height, width = image.shape
     return image.reshape(height // 8, 8, width // 8, 8).mean(axis=(1, 3))
+
+
+def answers(case: Case) -> Faults:
+    """Check that the answers from a mirrored picture, and from one turned by 90 deg, are mirrored and turned."""
+    known, size = case.calibration, (case.camera["width"], case.camera["height"])
+    found = reconstruct(case.picture, known, ESTIMATORS)
+    faults = []
+    mirroring = np.diag([-1.0, 1.0, 1.0])
+    for name, turning, picture, pixel in (
+        ("mirrored", mirroring, case.picture[:, ::-1], lambda p: np.array([size[0] - p[0], p[1]])),
+        ("turned", TURN, np.rot90(case.picture, -1), lambda p: np.array([size[1] - p[1], p[0]])),
+    ):
+        lights = tuple(tuple((turning @ light).tolist()) for light in known.priors.lights_mm)
+        given = replace(known, camera=_seen(known.camera, turning), priors=replace(known.priors, lights_mm=lights))
+        others = reconstruct(np.ascontiguousarray(picture), given, ESTIMATORS)
+        if len(others) != len(found):
+            faults.append(f"{name}: {len(others)} specularities, {len(found)} as it is")
+        peaks = [(o, o.patch.peak_px) for o in others if not isinstance(o.patch, Failure)]
+        for spot in found:
+            if isinstance(spot.patch, Failure):
+                continue
+            near = [o for o, peak in peaks if np.linalg.norm(peak - pixel(spot.patch.peak_px)) < 0.3]
+            if not near:
+                faults.append(f"{name}: none at the peak {spot.patch.peak_px.round(2).tolist()} px")
+                continue
+            for estimator, one in spot.estimates.items():
+                if text := _other_answer(one, near[0].estimates[estimator], turning):
+                    faults.append(f"{name}: {estimator} at {spot.patch.peak_px.round(1).tolist()} px: {text}")
+    return faults
+
+
+def _other_answer(one: Estimate | Failure, other: Estimate | Failure, turning: Array) -> str:
+    """Return how an answer differs from that of the same picture seen turned; empty where it does not."""
+    if isinstance(one, Failure) or isinstance(other, Failure):
+        status = [str(each.reason) if isinstance(each, Failure) else "ok" for each in (one, other)]
+        return "" if status[0] == status[1] else f"{status[0]} and {status[1]}"
+    off = float(formulas.angle_deg(turning @ one.normal, other.normal))
+    reported = [
+        0.0 if each.covariance is None else math.sqrt(float(np.trace(each.covariance))) for each in (one, other)
+    ]
+    if off > 0.01 + 0.05 * math.degrees(reported[0]):
+        return f"{off:.2g} deg off, reported {math.degrees(reported[0]):.2g}"
+    if reported[0] and not 0.95 < reported[1] / reported[0] < 1.05:
+        return f"reported {math.degrees(reported[0]):.3g} and {math.degrees(reported[1]):.3g} deg"
+    return "" if one.flags == other.flags else f"flags {one.flags} and {other.flags}"
+
+
+def _seen(camera: Camera, turning: Array) -> Camera:
+    """Return the camera of a picture that is mirrored or turned by 90 deg."""
+    lens = camera.distortion
+    if turning[0, 0] < 0:
+        lens = replace(lens, p2=-lens.p2) if isinstance(lens, BrownConrady) else lens
+        return replace(camera, cx=camera.width - camera.cx, distortion=lens)
+    lens = replace(lens, p1=lens.p2, p2=-lens.p1) if isinstance(lens, BrownConrady) else lens
+    return Camera(camera.height, camera.width, camera.fy, camera.fx, camera.height - camera.cy, camera.cx, 0.0, lens)

@@ -10,10 +10,10 @@ from studies.corners import __main__ as command
 from studies.corners import checks, formulas
 from studies.corners.case import Case
 from studies.corners.coverage import Answer, share_by_scene, table
-from studies.corners.design import covering_array
+from studies.corners.design import covering_array, whole_from
 from studies.corners.scenes import FACTORS, SMOOTH, refusals, rows
 
-QUICK = ("law", "projection", "surface", "search", "mirror", "turn", "calibration", "flow")
+QUICK = ("law", "projection", "surface", "search", "mirror", "turn", "answers", "calibration", "flow")
 
 
 def test_every_pair_that_is_not_refused_is_in_a_row_and_no_other():
@@ -25,6 +25,12 @@ def test_every_pair_that_is_not_refused_is_in_a_row_and_no_other():
                 held = sum(row[first] == a and row[second] == b for row in array)
                 assert (held == 0) == (((first, a), (second, b)) in refused), (first, a, second, b)
     assert all(list(row) == list(FACTORS) and all(row[name] in FACTORS[name] for name in FACTORS) for row in array)
+
+
+def test_the_rows_that_hold_all_pairs_are_counted():
+    held = [{"a": "x", "b": "1"}, {"a": "y", "b": "1"}, {"a": "x", "b": "1"}]
+    assert whole_from(held) == 2
+    assert 30 <= whole_from(rows()) <= len(rows())
 
 
 def test_refused_pairs_have_the_line_of_the_refusal():
