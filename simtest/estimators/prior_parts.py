@@ -53,8 +53,14 @@ lens or with lenses of their own shine up to 25 deg aside."""
 FAINT = 0.1
 """Cosine of the angle from its axis down to which a falloff is followed; little light is left there."""
 
-SAMPLES = np.arange(1, 129)[:, None] * 1.1347241384015194 ** -np.arange(1.0, 6.0) % 1
-"""Shares of the five priors of a falloff, shape (N, 5), all alike even: the sequence of the root of x^6 = x + 1."""
+_LATTICE = (np.arange(64)[:, None] * [1, 41, 49, 37, 53] % 64 + 0.5) / 64
+_TURNS = np.repeat(np.arange(4.0), 2)[:, None] + np.tile([0.5, -0.5], 4)[:, None] * _LATTICE[:, 2]
+SAMPLES = np.tile(_LATTICE, (8, 1))
+SAMPLES[:, 2] = _TURNS.ravel() / 4
+"""Shares of the five priors of a falloff, shape (N, 5): a lattice that takes each 64th of each prior once.
+
+The tilt's directions are mirrored and turned by quarters, so that the part turns with the picture.
+"""
 
 _DRAWS, _GOLDEN = (np.arange(128) + 0.5) / 128, math.pi * (3 - math.sqrt(5)) * np.arange(128)
 _SPIRAL = np.sqrt(-2 * np.log(1 - _DRAWS))[:, None] * np.stack([np.cos(_GOLDEN), np.sin(_GOLDEN)], axis=1)

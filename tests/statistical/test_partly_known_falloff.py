@@ -50,7 +50,7 @@ def held(name, calibration, normal, light):
         y, x = np.unravel_index(int(intensity.argmax()), intensity.shape)
         box = (max(x - 30, 0), max(y - 30, 0), 61, 61)
         box = (*box[:2], min(box[2], CAMERA.width - box[0]), min(box[3], CAMERA.height - box[1]))
-        patch = Patch.cut(intensity, box, noise=NOISE / 3, smoothing_px=1.0)
+        patch = Patch.cut(intensity, box, noise=NOISE / 3, smoothing_px=1.0, others_px=())
         found = estimator.estimate(patch, CAMERA, calibration.priors)
         off = tangent_coordinates(found.normal, normal)
         known = found.covariance - found.budget["response"]

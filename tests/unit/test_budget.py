@@ -53,7 +53,7 @@ class Stated:
         ({"budget": {"noise": np.eye(3)}}, "budget noise: must be an array of shape (2, 2)"),
         ({"budget": {"noise": np.full((2, 2), np.nan)}}, "holds NaN or infinity"),
         ({"budget": {"noise": SMALL}, "covariance": LARGE}, "must be the sum of the budget's parts"),
-        ({"target": "bottom"}, "target 'bottom': must be fine or base"),
+        ({"target": "bottom"}, "target 'bottom'; must be fine or base"),
     ],
 )
 def test_malformed_budgets_are_failures(given, said):

@@ -37,7 +37,10 @@ def stored(dk):
     curvature = ((1 + dk) * SPOT_RAD) ** -2
     lobe = np.maximum(2 * np.maximum(facing, 0) ** 2 - 1, 0) ** (curvature / 4)
     priors = type(LIGHT_AT_CAMERA)(
-        lights_mm=((0.0, 0.0, 0.0),), distance_mm=exactly(DISTANCE), lobe_curvature=exactly(curvature)
+        lights_mm=((0.0, 0.0, 0.0),),
+        distance_mm=exactly(DISTANCE),
+        lobe_curvature=exactly(curvature),
+        falloff_power=None,
     )
     calibration = Calibration(CAMERA, Response(), priors=priors)
     options = Options(fov_deg=60.0, estimators=("curved",), roi=(40, 20, 94, 88))

@@ -468,7 +468,7 @@ def test_highlights_of_a_frame_that_the_detector_refuses_are_missed(monkeypatch)
         def detect(self, frame, camera, priors):
             return Detection((), frame, refusal=Failure(Reason.NO_ESTIMATE, "unlike the training"))
 
-    def refused(frame, calibration, estimators, isolated):
+    def refused(frame, calibration, estimators, isolated, detector):
         made = run_pipeline(frame, calibration, Refusing(), estimators, None, 2.0)
         assert made.detection.refusal is not None
         return made.specularities
