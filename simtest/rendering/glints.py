@@ -1,8 +1,8 @@
 """Glints: zeros of the misfit between the fine normal and the bisector on a surface with relief (theory.md 7.1).
 
 They are hundreds a frame, and small. The misfit of the rendered frame, a value a pixel, shows where a zero is near;
-exact Newton steps with the closed derivative of the fine normal finish. The search is not exhaustive: it misses some of
-the smallest (docs/reference/limits.md says how many).
+exact Newton steps with the closed derivative of the fine normal finish. The search is not exhaustive
+(docs/reference/limits.md says how many it misses).
 """
 
 import math
@@ -20,13 +20,13 @@ from simtest.runtime.arrays import Array, Image, IntArray, Mask
 if TYPE_CHECKING:
     from simtest.rendering.session import Session
 
-NEAR_PX = 2.0
+NEAR_PX = 1.5
 """A cell of the seeds' grid whose own Newton step is shorter than so many cells is a seed."""
 
 GRID_WAVE = 12.0
 """Steps of the seeds' grid per wave of the finest band; pixels that are wider are divided."""
 
-TILE_PX, VARIES = 4, 0.5
+TILE_PX, VARIES = 4, 0.3
 """Pixels along the side of the tiles that are divided: those in which no component of the misfit is farther from 0 than
 this share of its range over the tile and the pixels round it."""
 
