@@ -94,12 +94,12 @@ def shared_out(image: Image, peaks: IntArray) -> IntArray:
     half = image[tuple(peaks.T)] / 2
     queue = [(-float(image[r, c]), number, int(r), int(c), number + 1) for number, (r, c) in enumerate(peaks)]
     heapq.heapify(queue)
-    order = len(queue)
+    order, done = len(queue), np.zeros(image.shape, dtype=bool)
     while queue:
         _, _, row, column, number = heapq.heappop(queue)
-        if owner[row, column] not in (0, number):
+        if done[row, column] or owner[row, column] not in (0, number):
             continue
-        owner[row, column] = number
+        done[row, column], owner[row, column] = True, number
         for r, c in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
             inside = 0 <= r < image.shape[0] and 0 <= c < image.shape[1]
             if inside and not owner[r, c] and image[r, c] >= half.min():
