@@ -5,7 +5,7 @@
 Samples of the recipe `highlights` (wet tissue) and of `highlights_smooth` are made as datasets make them, and their
 scenes are rendered again. `instance`: from the maximum uphill from a highlight's point, in the lobe's float radiance,
 the pixels of at least half of the peak are grown by scipy.ndimage; the peak is that maximum, or, where it is more, the
-brightest ray of a render of the 3 x 3 pixels around the point, each divided into 40 x 40. `visible`: all pixels above
+brightest of 100 x 100 rays through a pixel's area around the point. `visible`: all pixels above
 half of a peak behind the lens, shared out among the peaks from the brightest pixel on by a queue. A mask agrees if the
 IoU is at least 0.9 from 20 pixels on, or the numbers of pixels differ by at most 1 below. The table also says how many
 isolated highlights have no pixel: "clipped" where the lobe's peak is above full scale, else "dim".
@@ -33,8 +33,8 @@ from simtest.spec.dataset_recipe import load_dataset
 RECIPES = ("highlights", "highlights_smooth")
 SAMPLES = (200, 100)
 
-DIVISION, AROUND_PX = 40, 1
-"""Rays along a pixel's side, and pixels on each side of the one that holds the point."""
+DIVISION = 100
+"""Rays along a pixel's side."""
 
 LEAST_IOU, LARGE_PX, OFF_PX = 0.9, 20, 1
 
@@ -94,12 +94,12 @@ def shared_out(image: Image, peaks: IntArray) -> IntArray:
     half = image[tuple(peaks.T)] / 2
     queue = [(-float(image[r, c]), number, int(r), int(c), number + 1) for number, (r, c) in enumerate(peaks)]
     heapq.heapify(queue)
-    order = len(queue)
+    order, done = len(queue), np.zeros(image.shape, dtype=bool)
     while queue:
         _, _, row, column, number = heapq.heappop(queue)
-        if owner[row, column] not in (0, number):
+        if done[row, column] or owner[row, column] not in (0, number):
             continue
-        owner[row, column] = number
+        done[row, column], owner[row, column] = True, number
         for r, c in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
             inside = 0 <= r < image.shape[0] and 0 <= c < image.shape[1]
             if inside and not owner[r, c] and image[r, c] >= half.min():
@@ -112,9 +112,8 @@ def shared_out(image: Image, peaks: IntArray) -> IntArray:
 
 
 def peak_of(session: Session, point_px: Array) -> float:
-    """Render the pixels around a point with many rays each, and return the lobe's brightest."""
-    camera, corner = session.camera, np.floor(point_px) - AROUND_PX
-    size = (2 * AROUND_PX + 1) * DIVISION
+    """Render a pixel's area around a point with many rays, and return the lobe's brightest."""
+    camera, corner, size = session.camera, point_px - 0.5, DIVISION
     x, y = (camera.cx - corner[0]) * DIVISION, (camera.cy - corner[1]) * DIVISION
     close = Camera(fx=camera.fx * DIVISION, fy=camera.fy * DIVISION, cx=x, cy=y, width=size, height=size)
     sightlines = Sightlines(session.mi, close, session.surface.model_from_camera)
@@ -125,12 +124,13 @@ def peak_of(session: Session, point_px: Array) -> float:
 
 
 def behind_lens(specular: Image, scene: Scene) -> Image:
-    """Return light behind the lens: the point spread, then vignetting by a power of the cosine."""
+    """Return light behind the lens, in view: the point spread, then vignetting by a power of the cosine."""
     sensor, camera = scene.sensor, scene.camera.model()
     if sensor.point_spread_px:
         specular = ndimage.gaussian_filter(specular, sensor.point_spread_px, mode="mirror", truncate=6.0)
     cosine = camera.unproject(camera.pixel_centres().reshape(-1, 2))[:, 2].reshape(specular.shape)
-    return np.asarray(specular * cosine**sensor.vignetting.power)
+    shown = True if camera.seen is None else camera.seen
+    return np.where(shown, specular * cosine**sensor.vignetting.power, 0.0)
 
 
 def compared(recipe: str, samples: int) -> Iterator[Compared]:
