@@ -196,7 +196,8 @@ def _other_answer(one: Estimate | Failure, other: Estimate | Failure, turning: A
     reported = [
         0.0 if each.covariance is None else math.sqrt(float(np.trace(each.covariance))) for each in (one, other)
     ]
-    if off > 0.01 + 0.05 * math.degrees(reported[0]):
+    # A pose without a deviation is near its branch point, where rounding is the root of itself.
+    if off > (0.01 if reported[0] else 0.1) + 0.05 * math.degrees(reported[0]):
         return f"{off:.2g} deg off, reported {math.degrees(reported[0]):.2g}"
     if reported[0] and not 0.95 < reported[1] / reported[0] < 1.05:
         return f"reported {math.degrees(reported[0]):.3g} and {math.degrees(reported[1]):.3g} deg"
