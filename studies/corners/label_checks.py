@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from simtest.calibration import Response
 from simtest.dataset.maker import colour_variant
-from simtest.rendering import Session
+from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.arrays import Array, Mask
 from simtest.spec.scene import scene_from_dict
 from studies.corners import formulas
@@ -44,11 +44,22 @@ def isolated(case: Case) -> Faults:
             )
         if each.isolated and (cut := _cut(case.specular, metal, (row, column))) > MOST_CUT:
             faults.append(f"highlight {number}: isolated, but {cut:.0%} of its region's border is an instrument's")
+        if each.isolated and (held := _others_in_region(case, each)):
+            faults.append(f"highlight {number}: isolated, but its region at half height holds {held} other highlights")
         if each.hidden and each.lit:
             faults.append(f"highlight {number}: hidden and lit")
         if case.row["relief"] == "none" and gain > 0.35 and not each.isolated and case.stands_alone(each):
             faults.append(f"highlight {number} stands alone, but: {each.why_not}")
     return faults
+
+
+def _others_in_region(case: Case, point: HighlightPoint) -> int:
+    """Return how many other lit highlights lie at half height or above in a highlight's region."""
+    height, width = case.specular.shape
+    start = formulas.climbed(case.specular, (min(int(point.bp_px[1]), height - 1), min(int(point.bp_px[0]), width - 1)))
+    region = formulas.at_half_height(case.specular, start)
+    others = [o.bp_px for o in case.seen.highlights if o.lit and np.linalg.norm(o.bp_px - point.bp_px) > 1e-6]
+    return sum(bool(region[min(int(y), height - 1), min(int(x), width - 1)]) for x, y in others)
 
 
 def _cut(specular: Array, metal: Mask, start: tuple[int, int]) -> float:

@@ -137,8 +137,8 @@ def _same_maps(case: Case, other: View, turning: Array, image: Callable[[Array],
         # Samples, and the points of a source of finite size, do not turn with the picture.
         if sampled:
             a, b = (_blocks(each) for each in (a, b))
-        limit = 0.1 if sampled else 0.02 if case.row["light"] == "disc" else 1e-3
-        gap = np.quantile(np.abs(a - b), 0.999) / max(float(a.max()), 1e-12)
+        share, limit = (0.95, 0.1) if sampled else (0.999, 0.02 if case.row["light"] == "disc" else 1e-3)
+        gap = np.quantile(np.abs(a - b), share) / max(float(a.max()), 1e-12)
         if not gap < limit:
             faults.append(f"radiance.{name}: {gap:.2g} of its maximum off")
     if not sampled:
