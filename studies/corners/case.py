@@ -119,10 +119,11 @@ class View:
         closed = min(rows.min(), columns.min(), height - 1 - rows.max(), width - 1 - columns.max()) >= ROOM_PX
         reach = 3 * radius + 2 * ROOM_PX
         others = [o.bp_px for o in self.seen.highlights if np.linalg.norm(o.bp_px - point.bp_px) > 1e-6]
-        down, right = np.nonzero(self.frame.labels.instrument)
+        metal = self.frame.labels.instrument > 0
+        down, right = np.nonzero(metal)
         others += list(np.stack([right, down], axis=-1) + 0.5)
         alone = not others or np.linalg.norm(np.array(others) - point.bp_px, axis=1).min() > reach
-        bright = self.specular[start] > max(0.3 * self.specular.max(), 0.5 * self.light[start])
+        bright = self.specular[start] > max(0.3 * self.specular[~metal].max(), 0.5 * self.light[start])
         return bool(point.lit and closed and alone and bright and radius > 2)
 
 

@@ -9,6 +9,9 @@ from studies.corners import formulas
 from studies.corners.case import Case, Faults, NotAskedError
 from studies.corners.scenes import SMOOTH
 
+AT_SILHOUETTE = 3
+"""Pixels at which rounding may decide whether there is a surface."""
+
 
 def law(case: Case) -> Faults:
     """Check that at each highlight, and at each of the base, the normal bisects the directions to light and camera."""
@@ -55,9 +58,10 @@ def surface(case: Case) -> Faults:
     if case.row["surface"] in SMOOTH:
         depth, normal = formulas.cast(case.tables, case.rays)
         known = np.isfinite(depth) & off_metal
-        if (np.isfinite(truth.depth)[off_metal] != np.isfinite(depth)[off_metal]).any():
-            wrong = (np.isfinite(truth.depth) != np.isfinite(depth)) & off_metal
-            faults.append(f"depth: there is a surface or none, wrongly, at {np.count_nonzero(wrong)} pixels")
+        # Rays along a silhouette may meet it or not.
+        wrong = np.count_nonzero((np.isfinite(truth.depth) != np.isfinite(depth)) & off_metal)
+        if wrong > AT_SILHOUETTE:
+            faults.append(f"depth: there is a surface or none, wrongly, at {wrong} pixels")
         for name, found, limit in (("truth", truth, 1e-6), ("labels", labels, 2e-3)):
             gap = np.nanmax(np.abs(found.depth - depth)[known] / depth[known])
             angle = np.nanmax(formulas.angle_deg(found.normal_base, normal)[known])

@@ -5,15 +5,19 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from simtest.calibration import Response
 from simtest.dataset.maker import colour_variant
-from simtest.rendering import Session
-from simtest.runtime.arrays import Array
+from simtest.rendering import HighlightPoint, Session
+from simtest.runtime.arrays import Array, Mask
 from simtest.spec.scene import scene_from_dict
 from studies.corners import formulas
 from studies.corners.case import Case, Faults, NotAskedError
 from studies.corners.scenes import SMOOTH
+
+MOST_CUT = 0.1
+"""Share of an isolated highlight's border that an instrument may make."""
 
 LEAST_RADIUS_PX = 0.8
 """Of a highlight that holds a pixel's centre wherever it lies."""
@@ -38,6 +42,10 @@ def isolated(case: Case) -> Faults:
             faults.append(
                 f"highlight {number}: hidden {each.hidden}, the pixels around show metal {bool(around.all())}"
             )
+        if each.isolated and (cut := _cut(case.specular, metal, (row, column))) > MOST_CUT:
+            faults.append(f"highlight {number}: isolated, but {cut:.0%} of its region's border is an instrument's")
+        if each.isolated and (held := _others_in_region(case, each)):
+            faults.append(f"highlight {number}: isolated, but its region at half height holds {held} other highlights")
         if each.hidden and each.lit:
             faults.append(f"highlight {number}: hidden and lit")
         if case.row["relief"] == "none" and gain > 0.35 and not each.isolated and case.stands_alone(each):
@@ -45,10 +53,27 @@ def isolated(case: Case) -> Faults:
     return faults
 
 
+def _others_in_region(case: Case, point: HighlightPoint) -> int:
+    """Return how many other lit highlights lie at half height or above in a highlight's region."""
+    height, width = case.specular.shape
+    start = formulas.climbed(case.specular, (min(int(point.bp_px[1]), height - 1), min(int(point.bp_px[0]), width - 1)))
+    region = formulas.at_half_height(case.specular, start)
+    others = [o.bp_px for o in case.seen.highlights if o.lit and np.linalg.norm(o.bp_px - point.bp_px) > 1e-6]
+    return sum(bool(region[min(int(y), height - 1), min(int(x), width - 1)]) for x, y in others)
+
+
+def _cut(specular: Array, metal: Mask, start: tuple[int, int]) -> float:
+    """Return the share of the pixels around a highlight's region at half height that show metal."""
+    region = formulas.at_half_height(np.where(metal, 0, specular), formulas.climbed(specular, start), ~metal)
+    around = ndimage.binary_dilation(region) & ~region
+    return int(np.count_nonzero(around & metal)) / max(int(np.count_nonzero(around)), 1)
+
+
 def radius(case: Case) -> Faults:
     """Check the radius of isolated highlights against the rendered lobe at half height."""
     specular = case.frame.radiance.specular.astype(float)
-    points = [h for h in case.seen.highlights if h.isolated]
+    smooth = case.row["relief"] == "none"
+    points = [h for h in case.seen.highlights if h.isolated and (not smooth or case.stands_alone(h))]
     if case.row["relief"] == "not_resolved":
         raise NotAskedError("the lobe of a relief below a pixel has no closed form")
     ratios = []
@@ -60,14 +85,11 @@ def radius(case: Case) -> Faults:
         edge = min(rows.min(), columns.min(), specular.shape[0] - 1 - rows.max(), specular.shape[1] - 1 - columns.max())
         if edge > 0 and len(rows) > 30:
             ratios.append(each.radius_px / math.sqrt(len(rows) / math.pi))
-    # Single glints are no circles.
-    least = 1 if case.row["relief"] == "none" else 5
+    # Single glints are no circles, and few highlights of tissue are.
+    least = 1 if case.row["surface"] in SMOOTH and smooth else 3 if smooth else 5
     if len(ratios) < least:
         raise NotAskedError(f"fewer than {least} isolated highlights of more than 30 px in the frame's interior")
-    ratio, room = (
-        float(np.median(ratios)),
-        1.12 if case.row["relief"] == "none" and case.row["surface"] in SMOOTH else 1.35,
-    )
+    ratio, room = float(np.median(ratios)), 1.12 if smooth and case.row["surface"] in SMOOTH else 1.35
     if 1 / room < ratio < room:
         return []
     return [f"radius_px: {ratio:.3g} of the rendered one in the median of {len(ratios)}"]
