@@ -115,7 +115,11 @@ class Plan:
         # All that each family may be.
         tried = [self._check(k, family) for k, family in enumerate(dataset.families)]
         self._files = [_anatomy_files(own) for own in tried]
-        self._largest_px = max(scene.camera.width * scene.camera.height for own in tried for scene in own)
+        scenes = [scene for own in tried for scene in own]
+        self._largest_px = max(scene.camera.width * scene.camera.height for scene in scenes)
+        # Samples hold the truth of the base as well, or a map of the instruments.
+        self.has_relief = any(scene.surface.relief is not None for scene in scenes)
+        self.has_instruments = any(scene.instruments for scene in scenes)
         self._check_shared()
         self.splits, self.samples_per_anatomy = _made_small(dataset)
         self._blocks = self._lay_out()
@@ -138,22 +142,6 @@ class Plan:
         return tuple(
             dict.fromkeys(path for pair in zip(scenes, self._files, strict=True) for path in (pair[0], *pair[1]))
         )
-
-    @cached_property
-    def has_relief(self) -> bool:
-        """Whether some surfaces have a relief, so that samples hold the truth of the base as well."""
-        scenes = (scene_from_dict(base, f"families.{k}") for k, base in enumerate(self._bases))
-        drawn = (key for family in self.dataset.families for key in (*family.per_anatomy, *family.per_sample))
-        # A whole relief may be drawn, one of a list.
-        is_drawn = any(key.startswith("surface.relief") for key in (*drawn, *self.dataset.per_sample))
-        return is_drawn or any(scene.surface.relief is not None for scene in scenes)
-
-    @cached_property
-    def has_instruments(self) -> bool:
-        """Whether some scenes list instruments, so that their samples hold a map of them."""
-        drawn = (key for family in self.dataset.families for key in (*family.per_anatomy, *family.per_sample))
-        is_drawn = any(key.split(".")[0] == "instruments" for key in (*drawn, *self.dataset.per_sample))
-        return is_drawn or any(base.get("instruments") for base in self._bases)
 
     @cached_property
     def fields_left_out(self) -> tuple[str, ...]:

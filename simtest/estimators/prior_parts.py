@@ -11,14 +11,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from simtest.calibration import CameraPrior, Distribution, Priors
+from simtest.calibration import CameraPrior, Distribution, Normal, Priors
 from simtest.calibration.priors import AT_CAMERA_MM
-from simtest.estimators.budget import CONFIDENCE, equivalent_covariance
+from simtest.estimators.budget import CONFIDENCE, equivalent_covariance, line_covariance
 from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.near_misses import near_miss_parts
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Array, BrownConrady, Camera, chi_squared
+from simtest.geometry import Array, Camera, chi_squared
+from simtest.geometry.distortion import undistort_with_errors
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
 
 NEAR_SHARE = 0.05
@@ -62,10 +63,8 @@ SAMPLES[:, 2] = _TURNS.ravel() / 4
 The tilt's directions are mirrored and turned by quarters, so that the part turns with the picture.
 """
 
-_DRAWS, _GOLDEN = (np.arange(128) + 0.5) / 128, math.pi * (3 - math.sqrt(5)) * np.arange(128)
-_SPIRAL = np.sqrt(-2 * np.log(1 - _DRAWS))[:, None] * np.stack([np.cos(_GOLDEN), np.sin(_GOLDEN)], axis=1)
-DRAWN = _SPIRAL @ np.linalg.inv(np.linalg.cholesky(_SPIRAL.T @ _SPIRAL / 128)).T
-"""A pair of standard normal numbers is sampled at these, whose mean square is the unit matrix, shape (128, 2)."""
+CAMERA_SAMPLES = np.arange(1, 257)[:, None] * 1.1673039782614187 ** -np.arange(1.0, 5.0) % 1
+"""Shares of the four priors of a camera, (M, 4), all alike even: the sequence of the root of x^5 = x + 1."""
 
 
 def add_untold_parts(
@@ -171,41 +170,39 @@ def mean_light_part(normal: Array, priors: Priors) -> Array | None:
 def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array | None:
     """Return the covariance of the normal by the camera's geometry, shape (2, 2), rad^2; None where it looks nowhere.
 
-    The normal turns with the sightline that it looks along. Another focal length, centre or distortion sees, at the
-    pixel looked at, what this camera sees at a pixel beside it. Near the angle where a lens folds over, a pixel turns
-    the sightline ever more: there the moves are those at pixels drawn from the prior, without those past the lens's
-    limit, which no camera that saw this highlight has. A share s of a lens's scale that is not known divides the pixels
-    of the centre by 1 - s, whose mean square is 1 + 3 s^2 to leading order.
+    The normal turns with the sightline that it looks along. At the pixel looked at, cameras drawn from the prior have
+    other ones; those that see nothing there, past their lens's limit, never saw this highlight. Of a pinhole the mean
+    square is computed, where a share s of its scale that is not known divides the pixels of the centre by 1 - s: that
+    of 1 / (1 - s) is 1 + 3 s^2 to leading order.
     """
-    look, basis = estimate.look_px, basis_across(estimate.normal)
-    from_centre = look - [camera.cx, camera.cy]
-    reach = np.linalg.solve(camera.K[:2, :2], from_centre)
-    sightline = camera.unproject(look)
+    look, sightline = estimate.look_px, camera.unproject(estimate.look_px)
+    basis, focal = basis_across(estimate.normal), camera.K[:2, :2]
     if not np.isfinite(sightline).all():
         return None
-    if isinstance(camera.distortion, BrownConrady):
-        reach = sightline[:2] / sightline[2]  # its k1 moves what the lens has not yet bent
-    reach2 = float(reach @ reach)
+    from_centre = look - [camera.cx, camera.cy]
+    if camera.distortion is not None:
+        scales, shifts, errors = _cameras(prior)
+        points = np.asarray(np.linalg.solve(focal, ((from_centre - shifts) / scales).T).T, dtype=float)
+        seen = undistort_with_errors(camera.distortion, points, errors, prior.edge_reach, sightline)
+        moves = ((seen - sightline) @ basis.T)[np.isfinite(seen).all(axis=1)]
+        return line_covariance(moves) if len(moves) else None
+    reach2 = float(np.sum(np.linalg.solve(focal, from_centre) ** 2))
     across = prior.distortion_sd * (reach2 - prior.edge_reach**2)
     outwards = prior.distortion_sd * (3 * reach2 - prior.edge_reach**2)
-    bulge = camera.K[:2, :2] @ reach
-    in_pixels = prior.focal_sd**2 * np.outer(from_centre, from_centre) + across**2 * np.outer(bulge, bulge)
-    widened = 3 * (outwards**2 - across**2) * _along(from_centre) + (1 + 3 * across**2) * np.eye(2)
-    in_pixels += prior.centre_sd_px**2 * widened
-    if camera.distortion is None:
-        J = basis @ camera.step_of_pixels(look).T
-        return np.asarray(J @ in_pixels @ J.T)
-    variances, axes = np.linalg.eigh(in_pixels)
-    drawn = look + DRAWN @ (axes * np.sqrt(np.maximum(variances, 0.0))).T
-    moves = (camera.unproject(drawn) - sightline) @ basis.T
-    moves = moves[np.isfinite(moves).all(axis=1)]
-    square, wide = moves.T @ moves / len(moves), equivalent_covariance(moves)
-    return wide if np.trace(wide) > np.trace(square) else np.asarray(square)
+    along = np.outer(from_centre, from_centre)
+    widened = 3 * (outwards**2 - across**2) * along / max(np.trace(along), 1e-12) + (1 + 3 * across**2) * np.eye(2)
+    J = basis @ camera.step_of_pixels(look).T
+    return np.asarray(J @ ((prior.focal_sd**2 + across**2) * along + prior.centre_sd_px**2 * widened) @ J.T)
 
 
-def _along(vector: Array) -> Array:
-    """Return the projection onto a vector, shape (2,); zeros where it has no length."""
-    return np.outer(vector, vector) / max(float(vector @ vector), 1e-12)
+@lru_cache(maxsize=16)
+def _cameras(prior: CameraPrior) -> tuple[Array, Array, Array]:
+    """Return drawn ratios of focal lengths, (M, 1), shifts of the centre, px, (M, 2), and radial errors, (M,)."""
+    drawn = Normal(0.0, 1.0).quantile(CAMERA_SAMPLES)
+    # Their mean square is made the unit matrix, so that the part turns with the picture.
+    drawn = drawn @ np.linalg.inv(np.linalg.cholesky(drawn.T @ drawn / len(drawn))).T
+    scales = np.maximum(1 + prior.focal_sd * drawn[:, :1], 0.3)
+    return scales, prior.centre_sd_px * drawn[:, 1:3], prior.distortion_sd * drawn[:, 3]
 
 
 def falloff_part(normal: Array, family: HighlightAxis, power: Distribution, priors: Priors) -> Array:

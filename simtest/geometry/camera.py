@@ -9,7 +9,7 @@ import numpy.typing as npt
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
-from simtest.geometry.distortion import BrownConrady, Distortion, Scaramuzza
+from simtest.geometry.distortion import BrownConrady, Distortion, with_radial_error
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.short_repr import short_repr
 
@@ -233,12 +233,9 @@ class Camera:
         """
         if not error:
             return self
-        at_axis = max(1 - error * edge_reach**2, 0.3)
-        lens = self.distortion or BrownConrady()
-        # To first order k2 of the polynomial moves a point as k1 of the other lenses does.
-        name = "k2" if isinstance(lens, Scaramuzza) else "k1"
-        lens = replace(lens, **{name: getattr(lens, name) + error / at_axis})
-        return replace(self, fx=self.fx * at_axis, fy=self.fy * at_axis, distortion=lens)
+        lens, at_axis = with_radial_error(self.distortion or BrownConrady(), error, edge_reach)
+        fx, fy, skew = (at_axis * each for each in (self.fx, self.fy, self.skew))
+        return replace(self, fx=fx, fy=fy, skew=skew, distortion=lens)
 
     def unproject(self, points_px: npt.ArrayLike) -> Array:
         """Return the unit sightlines, shape (..., 3), of pixels, shape (..., 2), inside the image and outside.

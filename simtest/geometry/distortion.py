@@ -5,7 +5,7 @@ first monotone branch only, from the optical axis outwards: beyond it the lens w
 two directions.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -66,7 +66,7 @@ class KannalaBrandt:
         theta = np.arctan2(across, P[..., 2])
         theta = np.where((theta < self.limit_angle) & (np.abs(P).max(axis=-1) > 0), theta, np.nan)
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = self._radial(theta)[0] / across
+            share = self.radial(theta)[0] / across
         # On the axis the share is 0/0; the coordinates are 0 there whatever it is.
         share = np.where((across == 0) & (theta == 0), 0.0, share)
         return np.asarray(P[..., :2] * share[..., None])
@@ -76,17 +76,21 @@ class KannalaBrandt:
         target = np.asarray(m, dtype=float)
         radius = np.hypot(target[..., 0], target[..., 1])
         top = self.limit_angle
-        theta = invert(self._radial, radius, top, float(self._radial(np.array(top))[0]))
+        theta = invert(self.radial, radius, top, float(self.radial(np.array(top))[0]))
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.where(radius > 0, np.sin(theta) / radius, theta)
         return np.concatenate([target * share[..., None], np.cos(theta)[..., None]], axis=-1)
 
-    def _radial(self, theta: Array) -> tuple[Array, Array]:
+    def radial(self, theta: Array) -> tuple[Array, Array]:
         """Return abs(m) at field angles, and its slope."""
         u = theta * theta
         factor = Polynomial([1.0, self.k1, self.k2, self.k3, self.k4])
         return theta * factor(u), factor(u) + 2 * u * factor.deriv()(u)
 
+
+ERROR_STEPS, SOLVED = 8, 1e-3
+"""Newton's steps to a sightline by a lens with a radial error, and the share of the radius to which it is found at
+least: at a fold they halve the gap."""
 
 Distortion = BrownConrady | KannalaBrandt | Scaramuzza
 
@@ -96,6 +100,49 @@ LENSES: dict[str, type[Distortion]] = {
     "scaramuzza": Scaramuzza,
 }
 """Lenses by the names that they have in files."""
+
+
+def with_radial_error(lens: Distortion, error: float, edge_reach: float) -> tuple[Distortion, float]:
+    """Return a lens whose k1 is larger by an error, and its focal length over the former's."""
+    at_axis = float(_at_axis(np.array(error), edge_reach))
+    # To first order k2 of the polynomial moves a point as k1 of the other lenses does.
+    name = "k2" if isinstance(lens, Scaramuzza) else "k1"
+    return replace(lens, **{name: getattr(lens, name) + error / at_axis}), at_axis
+
+
+def undistort_with_errors(lens: Distortion, m: Array, errors: Array, edge_reach: float, near: Array) -> Array:
+    """Return the unit directions, shape (N, 3), of image coordinates, shape (N, 2), by lenses `with_radial_error`.
+
+    One error, shape (N,), each; NaN where its lens sees none. Tangential terms are those of the direction `near`.
+    """
+    at_axis = _at_axis(errors, edge_reach)
+    points, shares = m / at_axis[:, None], errors / at_axis
+    if isinstance(lens, Scaramuzza):
+        return lens.undistort(points, shares)
+    across = float(np.hypot(near[0], near[1]))
+    reach = across / near[2] if isinstance(lens, BrownConrady) else np.arctan2(across, near[2])
+    # An error moves a fold, but not so far as to where the lens may rise again.
+    top = 1.5 * lens.limit if isinstance(lens, BrownConrady) else min(1.5 * lens.limit_angle, np.pi)
+    tangential = lens.distort(near) - lens.radial(np.array(reach))[0] * near[:2] / max(across, 1e-12)
+    points = points - tangential
+    radius, further = np.hypot(*points.T), replace(lens, k1=lens.k1 + 1)
+    # Newton's steps from below, where the curves bend least; k1 is a factor of the second part.
+    found = np.minimum(np.full(len(m), reach / 2), radius)
+    with np.errstate(all="ignore"):
+        for _ in range(ERROR_STEPS):
+            (value, slope), (more, steeper) = lens.radial(found), further.radial(found)
+            gap, slope = value + shares * (more - value) - radius, slope + shares * (steeper - slope)
+            found = found - gap / slope
+        solved = (np.abs(gap) <= SOLVED * radius) & (slope > 0) & (found >= 0) & (found < top)
+        ends = (found, np.ones(len(m))) if isinstance(lens, BrownConrady) else (np.sin(found), np.cos(found))
+        shares = np.where(radius > 0, ends[0] / radius, 1.0)
+        rays = np.concatenate([points * shares[:, None], ends[1][:, None]], axis=1)
+        return np.where(solved[:, None], rays / np.linalg.norm(rays, axis=1, keepdims=True), np.nan)
+
+
+def _at_axis(errors: Array, edge_reach: float) -> Array:
+    """Return the focal lengths of lenses with radial errors over that of the lens without one."""
+    return np.maximum(1 - errors * edge_reach**2, 0.3)
 
 
 def lens_name(lens: Distortion) -> str:

@@ -80,14 +80,17 @@ class Scaramuzza:
         x, y = P[..., 0] * share, P[..., 1] * share
         return np.stack([self.c * x + self.d * y, self.e * x + y], axis=-1)
 
-    def undistort(self, m: npt.ArrayLike) -> Array:
-        """Return unit directions as `BrownConrady.undistort` does: exactly, by the polynomial itself."""
+    def undistort(self, m: npt.ArrayLike, errors: Array | float = 0.0) -> Array:
+        """Return unit directions as `BrownConrady.undistort` does: exactly, by the polynomial itself.
+
+        `errors` are added to k2, one for all or one for each.
+        """
         u, v = np.moveaxis(np.asarray(m, dtype=float), -1, 0)
         determinant = self.c - self.d * self.e
         x, y = (u - self.d * v) / determinant, (self.c * v - self.e * u) / determinant
         r = np.hypot(x, y)
         r = np.where(r < self.limit, r, np.nan)
-        rays = np.stack([x, y, self._polynomial(r)], axis=-1)
+        rays = np.stack([x, y, self._polynomial(r) + errors * r * r], axis=-1)
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     @cached_property

@@ -68,7 +68,7 @@ class BrownConrady:
     @cached_property
     def _reach(self) -> float:
         """Supremum of the radial part on its first branch: inf where the branch ends at a pole."""
-        return np.inf if self._turn_and_pole[1] <= self.limit else float(self._radial(np.array(self.limit))[0])
+        return np.inf if self._turn_and_pole[1] <= self.limit else float(self.radial(np.array(self.limit))[0])
 
     @property
     def limit_angle(self) -> float:
@@ -105,7 +105,7 @@ class BrownConrady:
         if tangential:
             # Tangential terms may carry a point a little beyond what the radial part alone reaches.
             reach = np.minimum(radius, 0.99 * self._reach)
-        inner = invert(self._radial, reach, self.limit, self._reach)
+        inner = invert(self.radial, reach, self.limit, self._reach)
         with np.errstate(invalid="ignore", divide="ignore"):
             xy = np.where(radius[..., None] > 0, target * (inner / radius)[..., None], target)
         # refine: the tangential terms too
@@ -115,7 +115,7 @@ class BrownConrady:
         rays[np.isnan(xy).any(axis=-1)] = np.nan
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
-    def _radial(self, r: Array) -> tuple[Array, Array]:
+    def radial(self, r: Array) -> tuple[Array, Array]:
         """Return the radial part r R(r^2) and its slope."""
         u = r * r
         above, below = self._radial_polynomials

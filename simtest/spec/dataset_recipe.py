@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from simtest.runtime.resources import find
-from simtest.spec.experiment import check_first_parts, still_varied
+from simtest.spec.experiment import check_first_parts, replaced, still_varied
 from simtest.spec.scene import Scene
 from simtest.spec.spec_model import Name, Share, Spec, load
 
@@ -208,7 +208,7 @@ def load_dataset(name: str | Path, settings: Mapping[str, Any] | None = None) ->
     families = tuple(
         family.model_copy(
             update={
-                "set": {**family.set, **settings},
+                "set": replaced(family.set, settings),
                 "per_anatomy": left(family.per_anatomy),
                 "per_sample": left(family.per_sample),
             }

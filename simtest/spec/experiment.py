@@ -169,8 +169,18 @@ def still_varied(varied: Iterable[str], settings: Mapping[str, Any], what: str) 
     for path in settings:
         if whole := next((key for key in left if path.startswith(f"{key}.")), None):
             raise InputError(f"--set {path}: the {what} varies {whole} as a whole; set {whole} itself instead")
-    fixed = [each for path in settings for each in (path, *rivals(path))]
-    return {key for key in left if not any(key == path or key.startswith(f"{path}.") for path in fixed)}
+    return {key for key in left if not _is_replaced(key, settings)}
+
+
+def replaced(values: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by key path, with settings in place of those that they fix."""
+    return {**{key: value for key, value in values.items() if not _is_replaced(key, settings)}, **settings}
+
+
+def _is_replaced(key: str, settings: Mapping[str, Any]) -> bool:
+    """Return whether a key path is one that settings fix: theirs, one below it, or one that it excludes."""
+    fixed = (each for path in settings for each in (path, *rivals(path)))
+    return any(f"{key}.".startswith(f"{path}.") for path in fixed)
 
 
 def _thinned(group: Group, count: object) -> Group:
@@ -197,7 +207,7 @@ def _override(group: Group, settings: Mapping[str, Any]) -> Group:
 
     return group.model_copy(
         update={
-            "set": {**group.set, **settings},
+            "set": replaced(group.set, settings),
             "sweep": without(group.sweep),
             "pool": without(group.pool),
             "random": {key: value for key, value in group.random.items() if key in kept},

@@ -81,11 +81,17 @@ class Case:
 
     @property
     def is_coloured(self) -> bool:
-        """Whether its scenes take three channels, as one at the lower ends of what is drawn does."""
+        """Whether its scenes take three channels, as one at the lower or upper ends of what is drawn does."""
         if self.is_paper:
             return False
-        ends = {path: drawn.low for path, drawn in self.random.items()}
-        return scene_from_dict(apply_settings(self.data, ends, self.where), self.where).is_coloured
+        scenes = (scene_from_dict(apply_settings(self.data, values, self.where), self.where) for values in self.ends)
+        return any(scene.is_coloured for scene in scenes)
+
+    @property
+    def ends(self) -> tuple[dict[str, float], dict[str, float]]:
+        """The lower and the upper ends of what is drawn, by key path; an upper end itself is never drawn."""
+        lows = {path: float(d.low) for path, d in self.random.items()}
+        return lows, {path: max(math.nextafter(d.high, -math.inf), d.low) for path, d in self.random.items()}
 
     def paper_setting(self) -> PaperSetting:
         """Return the setting of the published protocol; raise `InputError` where a value does not fit."""
@@ -213,9 +219,7 @@ def _check(case: Case, experiment: Experiment, recipes: set[str]) -> None:
             raise InputError(f"{case.where}: random: the published protocol draws its light itself; use sweep or pool")
         return
     first, _ = case.scene(experiment, case.numbers()[0])
-    lows = {path: float(d.low) for path, d in case.random.items()}
-    # The upper end itself is never drawn.
-    highs = {path: max(math.nextafter(d.high, -math.inf), d.low) for path, d in case.random.items()}
+    lows, highs = case.ends
     # Each range alone and, where there are several, all together.
     ends = [{path: value} for tried in (lows, highs) for path, value in tried.items()]
     for values in ends if len(lows) < 2 else (*ends, lows, highs):

@@ -170,6 +170,14 @@ def test_card_and_preview_tell_both_truths(made, tmp_path):
     assert page.read_text().count("<figcaption>normal of the base, without the relief") == 2
 
 
+def test_a_relief_of_a_whole_surface_that_is_drawn_counts():
+    """Card and index left out the fields of the base, and shards were planned too long."""
+    smooth = {"type": "plane", "distance_mm": 20.0}
+    for others, counts in (([], False), ([smooth | {"relief": RELIEF["surface.relief"]}], True)):
+        family = {"scene": "plane", "per_sample": {"surface": {"choose": [smooth, *others]}}}
+        assert Plan(recipe(families=[family])).has_relief == counts
+
+
 def test_ranges_that_make_too_high_a_relief_are_refused():
     wide = ROUGH | {"per_sample": {"surface.relief.bands.0.wavelength_mm": {"low": 1.0, "high": 15.0}}}
     with pytest.raises(InputError, match=r"families\.0.*must stay below 0\.3 mm"):

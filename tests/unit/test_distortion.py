@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from simtest.errors import InputError
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Scaramuzza, ViewMask
+from simtest.geometry.distortion import undistort_with_errors, with_radial_error
 from tests.example_counts import examples
 
 WIDTH, HEIGHT = 640, 480
@@ -34,6 +35,44 @@ OMNI = st.builds(
     Scaramuzza, k2=spread(-0.8, 0.3), k3=spread(-0.3, 0.4), k4=spread(-0.6, 0.1), c=spread(0.98, 1.02),
     d=spread(-0.01, 0.01), e=spread(-0.01, 0.01),
 )  # fmt: skip
+
+
+def test_an_error_of_k1_leaves_the_edge_where_it_is():
+    """A skew made it move along x."""
+    lens, reach = KannalaBrandt(), 0.8
+    camera = Camera(640, 480, 300.0, 280.0, 320.0, 240.0, skew=40.0, distortion=lens)
+    at_edge = np.array([[np.sin(reach) * np.cos(a), np.sin(reach) * np.sin(a), np.cos(reach)] for a in (0.3, 2.0, 4.5)])
+    moved = camera.with_radial_error(0.05, reach)
+    np.testing.assert_allclose(moved.project(at_edge), camera.project(at_edge), atol=1e-9)
+    # Negative control: other points move.
+    assert np.abs(moved.project([0.3, 0.0, 1.0]) - camera.project([0.3, 0.0, 1.0])).max() > 1
+
+
+@pytest.mark.parametrize(
+    ("lens", "most"),
+    [
+        (BrownConrady(-0.2, 0.03, k3=0.01, k4=0.05), 1e-12),
+        (BrownConrady(-0.2, 0.03, 0.001, -0.002), 1e-3),
+        (KannalaBrandt(-0.05, 0.01), 1e-12),
+        (Scaramuzza(-0.4, 0.02, 0.03, 1.01, 0.01, -0.01), 1e-12),
+    ],
+)
+def test_many_errors_are_undone_as_each_alone_is(lens, most):
+    rng, near = np.random.default_rng(1), np.array([0.488, 0.390, 0.781])
+    errors, m = 0.03 * rng.standard_normal(40), lens.distort(near) + 0.03 * rng.standard_normal((40, 2))
+    rays = undistort_with_errors(lens, m, errors, 0.7, near)
+    for ray, point, error in zip(rays, m, errors.tolist(), strict=True):
+        other, at_axis = with_radial_error(lens, error, 0.7)
+        np.testing.assert_allclose(ray, other.undistort(point / at_axis), rtol=0, atol=most)
+
+
+def test_past_its_fold_a_lens_with_an_error_sees_nothing():
+    near = np.array([np.sin(1.0), 0.0, np.cos(1.0)])
+    m = np.tile(KannalaBrandt().distort(near), (3, 1))
+    seen = undistort_with_errors(KannalaBrandt(), m, np.array([0.0, -0.14, -0.16]), 0.0, near)
+    # theta - 0.16 theta^3 is 0.962 at most
+    np.testing.assert_array_equal(np.isfinite(seen).all(axis=1), [True, True, False])
+    np.testing.assert_allclose(seen[0], near, atol=1e-12)
 
 
 def test_newtons_steps_do_not_go_to_and_fro():

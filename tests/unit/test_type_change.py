@@ -72,6 +72,17 @@ def test_a_preset_of_lights_replaces_a_list_of_them():
     assert len(scene_from_dict(replace_values(Scene, data, {"rig.preset": "laparoscope"}, "plane")).rig.lights) == 8
 
 
+def test_a_setting_replaces_what_it_excludes_of_a_group_too():
+    """These keys were replaced in the scene's file alone: with a group's or family's they were refused."""
+    cases = expand(load_experiment("compare", {"known.distance_mm": 20.0}))
+    assert not [case for case in cases if "known.distance_error" in case.data["known"]]
+    # What lies below such a key goes as well.
+    cases = expand(load_experiment("known_light", {"rig.preset": "laparoscope"}))
+    assert {len(scene_from_dict(case.data).rig.lights) for case in cases} == {8}
+    families = load_dataset("learning", {"camera.fov_deg": 90.0}).families
+    assert all("camera.fx" not in family.set and "camera.width" in family.set for family in families)
+
+
 def test_what_excludes_a_drawn_value_fixes_it_too():
     dataset = load_dataset("endoscopy", {"sensor.exposure.percentile": 99.0})
     assert not [key for family in dataset.families for key in family.per_sample if key.startswith("sensor.exposure")]

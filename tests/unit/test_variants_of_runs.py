@@ -108,10 +108,12 @@ def test_whatever_is_not_grey_is_rendered_in_colour(keys, coloured, tmp_path):
     assert Session(scene).variant == variant_of(cases)
 
 
-def test_a_colour_that_is_drawn_is_rendered_in_colour(tmp_path):
+@pytest.mark.parametrize("drawn", ["low = 0.2, high = 0.6", "low = 0.8, high = 0.9"])
+def test_a_colour_that_is_drawn_is_rendered_in_colour(drawn, tmp_path):
+    """One that is grey at the lower end was rendered grey."""
     path = tmp_path / "own.toml"
     grey = GREY.replace('"sensor.noise_sigma" = 0.02', '"reflectance.colour" = [0.8, 0.8, 0.8]')
-    path.write_text(grey + '[groups.random]\n"reflectance.colour.1" = { low = 0.2, high = 0.6 }\n')
+    path.write_text(grey + '[groups.random]\n"reflectance.colour.1" = {' + drawn + "}\n")
     assert variant_of(expand(load_experiment(path))) == "llvm_ad_rgb"
 
 
