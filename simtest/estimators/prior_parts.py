@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Normal, Priors
 from simtest.calibration.priors import AT_CAMERA_MM
-from simtest.estimators.budget import CONFIDENCE, equivalent_covariance, line_covariance
+from simtest.estimators.budget import CONFIDENCE, equivalent_covariance
 from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.near_misses import near_miss_parts
@@ -63,8 +63,9 @@ SAMPLES[:, 2] = _TURNS.ravel() / 4
 The tilt's directions are mirrored and turned by quarters, so that the part turns with the picture.
 """
 
-CAMERA_SAMPLES = np.arange(1, 257)[:, None] * 1.1673039782614187 ** -np.arange(1.0, 5.0) % 1
-"""Shares of the four priors of a camera, (M, 4), all alike even: the sequence of the root of x^5 = x + 1."""
+CAMERA_SAMPLES = np.tile((np.arange(128)[:, None] * [1, 79, 97, 73] % 128 + 0.5) / 128, (2, 1))
+CAMERA_SAMPLES[128:, 2] = 1 - CAMERA_SAMPLES[128:, 2]
+"""Shares of the four priors of a camera, shape (M, 4): a lattice, and the same mirrored at the centre's sightline."""
 
 
 def add_untold_parts(
@@ -182,10 +183,16 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
     from_centre = look - [camera.cx, camera.cy]
     if camera.distortion is not None:
         scales, shifts, errors = _cameras(prior)
+        # The centre's shifts are along and across the way from there, so that the part turns with the picture.
+        along = from_centre / math.hypot(*from_centre) if from_centre.any() else np.array([1.0, 0.0])
+        shifts = shifts @ np.array([along, [-along[1], along[0]]])
         points = np.asarray(np.linalg.solve(focal, ((from_centre - shifts) / scales).T).T, dtype=float)
         seen = undistort_with_errors(camera.distortion, points, errors, prior.edge_reach, sightline)
         moves = ((seen - sightline) @ basis.T)[np.isfinite(seen).all(axis=1)]
-        return line_covariance(moves) if len(moves) else None
+        if not len(moves):
+            return None
+        square, wide = moves.T @ moves / len(moves), equivalent_covariance(moves)
+        return wide if np.trace(wide) > np.trace(square) else np.asarray(square)
     reach2 = float(np.sum(np.linalg.solve(focal, from_centre) ** 2))
     across = prior.distortion_sd * (reach2 - prior.edge_reach**2)
     outwards = prior.distortion_sd * (3 * reach2 - prior.edge_reach**2)
@@ -199,8 +206,7 @@ def camera_part(estimate: Estimate, camera: Camera, prior: CameraPrior) -> Array
 def _cameras(prior: CameraPrior) -> tuple[Array, Array, Array]:
     """Return drawn ratios of focal lengths, (M, 1), shifts of the centre, px, (M, 2), and radial errors, (M,)."""
     drawn = Normal(0.0, 1.0).quantile(CAMERA_SAMPLES)
-    # Their mean square is made the unit matrix, so that the part turns with the picture.
-    drawn = drawn @ np.linalg.inv(np.linalg.cholesky(drawn.T @ drawn / len(drawn))).T
+    drawn /= np.sqrt(np.mean(drawn**2, axis=0))
     scales = np.maximum(1 + prior.focal_sd * drawn[:, :1], 0.3)
     return scales, prior.centre_sd_px * drawn[:, 1:3], prior.distortion_sd * drawn[:, 3]
 
