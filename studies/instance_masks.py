@@ -5,10 +5,10 @@
 Samples of the recipe `highlights` (wet tissue) and of `highlights_smooth` are made as datasets make them, and their
 scenes are rendered again. `instance`: from the maximum uphill from a highlight's point, in the lobe's float radiance,
 the pixels of at least half of the peak are grown by scipy.ndimage; the peak is that maximum, or, where it is more, the
-brightest of 100 x 100 rays through a pixel's area around the point. `visible`: all pixels above
-half of a peak behind the lens, shared out among the peaks from the brightest pixel on by a queue. A mask agrees if the
-IoU is at least 0.9 from 20 pixels on, or the numbers of pixels differ by at most 1 below. The table also says how many
-isolated highlights have no pixel: "clipped" where the lobe's peak is above full scale, else "dim".
+brightest of 100 x 100 rays through a pixel's area around the point. `visible`: all pixels above half of a peak behind
+the lens, shared out among the peaks from the brightest pixel on by a queue. A mask agrees if the IoU is at least 0.9
+from 20 pixels on, or the numbers of pixels differ by at most 1 below. The table also says how many isolated highlights
+have no pixel: "clipped" where the lobe's peak is above full scale, else "dim".
 """
 
 import argparse

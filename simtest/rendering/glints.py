@@ -7,6 +7,7 @@ exact Newton steps with the closed derivative of the fine normal finish. The sea
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -51,7 +52,7 @@ SAME_SEED_PX = 0.5
 HALF_WIDTH = math.sqrt(2 * math.log(2))
 """Half-width at half height of a Gaussian over its standard deviation."""
 
-RATIOS, BISECTIONS = (1e-3, 30.0), 40
+RATIOS, BISECTIONS = np.geomspace(1e-3, 30.0, 200), 40
 """Radii of discs over a lobe's standard deviation: less widens nothing, more is the disc alone."""
 
 
@@ -221,18 +222,23 @@ def radii_px(session: "Session", highlights: Sequence[HighlightPoint], half_widt
 
 def widened(half_width: float, disc: Array) -> Array:
     """Return the half-widths at half height of a Gaussian lobe of one, convolved with discs of radii of shape (N,)."""
+    sigma = half_width / HALF_WIDTH
+    return np.asarray(np.where(disc > RATIOS[-1] * sigma, disc, sigma * np.interp(disc / sigma, RATIOS, _widths())))
+
+
+@cache
+def _widths() -> Array:
+    """Return the half-widths of a lobe of deviation 1, convolved with discs of radii `RATIOS`."""
     from scipy.special import chndtr
 
-    sigma = half_width / HALF_WIDTH
     # At a distance r from its centre a disc of radius a holds the share P(a^2; 2, r^2) of a normal distribution.
-    ratio = np.clip(disc / sigma, *RATIOS)
-    low, high = np.zeros_like(ratio), ratio + HALF_WIDTH
-    half = chndtr(ratio**2, 2, 0.0) / 2
+    low, high = np.zeros_like(RATIOS), RATIOS + HALF_WIDTH
+    half = chndtr(RATIOS**2, 2, 0.0) / 2
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        inside = chndtr(ratio**2, 2, middle**2) > half
+        inside = chndtr(RATIOS**2, 2, middle**2) > half
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
-    return np.asarray(np.where(disc > RATIOS[1] * sigma, disc, sigma * low))
+    return low
 
 
 def distinct(points: Array, apart: float) -> Array:

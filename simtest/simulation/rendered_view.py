@@ -25,7 +25,7 @@ from simtest.spec import Scene
 LEAST_SHARE = 1e-12
 """A percentile of the radiance that is no more than this share of its maximum is darkness, and sets no exposure."""
 
-DRAWS, FEW_DRAWS = 32, 8
+DRAWS, FEW_DRAWS = 32, 4
 """Draws of the noise at the peaks of highlights that are isolated if they stand above it, and at all others."""
 
 DEAR_SAMPLES = 16
