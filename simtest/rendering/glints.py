@@ -187,10 +187,11 @@ def radii_px(session: "Session", highlights: Sequence[HighlightPoint], half_widt
     """Compute the radii, shape (N,), px, at which highlights fall to half height, from their shape alone (theory 7.3).
 
     The half-angle grows from the BP by the misfit's derivative J: a lobe of half-width `half_width`, rad, at half
-    height covers pi half_width^2 / abs(det J) px^2; the radius is that of the circle of this area.
+    height covers pi half_width^2 / abs(det J) px^2; the radius is that of the circle of this area. NaN where no part of
+    the frame resolves the relief, whose shape is not that of the highlights then.
     """
     radii = np.full(len(highlights), np.nan)
-    lights = session.scene.rig.true_mm()
+    lights = [] if session.is_unresolved else session.scene.rig.true_mm()
     for index, light in enumerate(lights):
         own = [i for i, highlight in enumerate(highlights) if highlight.light == index]
         if own:
