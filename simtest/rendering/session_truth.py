@@ -191,9 +191,10 @@ class SessionTruth:
         """Compute the direct light off the lobe at highlight points, shape (N,), mean of the channels.
 
         The normal is the exact one: the rendered triangles' misses the peak of a lobe that is narrower than a pixel. It
-        is 0 where no part of the frame resolves the relief: then the pixels' mean over it alone is a highlight.
+        is 0 where a highlight is the pixels' mean alone: over a relief that no part of the frame resolves, or over the
+        camera's motion.
         """
-        if not points or self.is_unresolved:
+        if not points or self.is_unresolved or self.scene.camera.moving is not None:
             return np.zeros(len(points))
         mi, tracer, rotation = self.mi, self._tracer(), self.surface.model_from_camera[:3, :3]
         pixels, normals = np.array([point.bp_px for point in points]), np.array([point.normal for point in points])

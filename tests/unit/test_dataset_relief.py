@@ -172,13 +172,19 @@ def test_card_and_preview_tell_both_truths(made, tmp_path):
     assert page.read_text().count("<figcaption>normal of the base, without the relief") == 2
 
 
-@pytest.mark.parametrize("slope_deg", [1.0, 3.0])
-def test_a_highlight_of_a_relief_that_no_pixel_resolves_is_its_pixels(slope_deg):
-    """Its peak was that of the base without relief: no pixel reached half of it, and the radius was 0.03 to 0.1 px."""
+UNRESOLVED = [
+    {"surface.relief": {"bands": [{"slope_deg": slope_deg, "wavelength_mm": 0.02}]}, "render.samples_per_pixel": 64}
+    for slope_deg in (1.0, 3.0)
+]
+MOVED = [{"camera.motion": {"velocity_mm_s": [speed, 0.0, 0.0]}} for speed in (100.0, 300.0)]
+
+
+@pytest.mark.parametrize("values", [*UNRESOLVED, *MOVED])
+def test_a_highlight_that_is_a_mean_is_the_pixels_above_half_of_it(values):
+    """Its peak was that without relief, or of the middle of the exposure: too few pixels or none reached half of it."""
     camera = {"camera.width": 96, "camera.height": 72, "camera.fx": 96.0, "camera.fy": 96.0}
-    relief = {"bands": [{"slope_deg": slope_deg, "wavelength_mm": 0.02}]}
-    values = {"surface.relief": relief, "reflectance.exponent": 200.0, "render.samples_per_pixel": 64}
-    maker = Maker(Plan(recipe(samples=1, families=[{"scene": "sphere", "set": camera | values}])))
+    family = {"scene": "sphere", "set": camera | {"reflectance.exponent": 200.0} | values}
+    maker = Maker(Plan(recipe(samples=1, families=[family])))
     made, (_, view, _) = maker.make(0), maker.view(0)
     (highlight,) = made.meta["highlights"]
     assert highlight["isolated"]
@@ -188,7 +194,8 @@ def test_a_highlight_of_a_relief_that_no_pixel_resolves_is_its_pixels(slope_deg)
     assert numbers[row, column] > 0
     np.testing.assert_array_equal(made.images["instance"] == 1, expected)
     assert highlight["region"]["instance_px"] == np.count_nonzero(expected) > 5
-    assert highlight["radius_px"] is None
+    # Of a relief that is roughness it was 0.03 to 0.1 px.
+    assert (highlight["radius_px"] is None) == ("surface.relief" in values)
 
 
 def test_a_relief_of_a_whole_surface_that_is_drawn_counts():
