@@ -4,7 +4,7 @@ They are hundreds a frame, and small. The misfit of the rendered frame, a value 
 exact Newton steps with the closed derivative of the fine normal finish.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -191,7 +191,7 @@ def radii_px(session: "Session", highlights: Sequence[HighlightPoint], half_widt
     the frame resolves the relief, whose shape is not that of the highlights then.
     """
     radii = np.full(len(highlights), np.nan)
-    lights = [] if session.is_unresolved else session.scene.rig.true_mm()
+    lights: Iterable[Array] = () if session.is_unresolved else session.scene.rig.true_mm()
     for index, light in enumerate(lights):
         own = [i for i, highlight in enumerate(highlights) if highlight.light == index]
         if own:
