@@ -200,8 +200,7 @@ def radii_px(session: "Session", highlights: Sequence[HighlightPoint], half_widt
     resolved widens the lobe by its slopes, and a source by its size (theory 7.6), as if the lobe were Gaussian.
     """
     radii = np.full(len(highlights), np.nan)
-    relief, rig = session.scene.surface.relief, session.scene.rig
-    resolved = relief is None or is_resolved(session)
+    relief, rig, resolved = session.scene.surface.relief, session.scene.rig, not session.is_unresolved
     if relief is not None and not resolved:
         half_width = math.hypot(half_width, HALF_WIDTH * math.radians(relief.slope_deg))
     for index, (light, place) in enumerate(zip(rig.lights, rig.true_mm(), strict=True)):

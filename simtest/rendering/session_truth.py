@@ -190,10 +190,12 @@ class SessionTruth:
     def lobe_at(self, points: Sequence[HighlightPoint]) -> Array:
         """Compute the direct light off the lobe at highlight points, shape (N,), mean of the channels.
 
-        The normal is the exact one: the rendered triangles' misses the peak of a lobe that is narrower than a pixel.
+        The normal is the exact one: the rendered triangles' misses the peak of a lobe that is narrower than a pixel. It
+        is 0 where a highlight is the pixels' mean alone: over a relief that no part of the frame resolves, or over the
+        camera's motion.
         """
-        if not points:
-            return np.empty(0)
+        if not points or self.is_unresolved or self.scene.camera.moving is not None:
+            return np.zeros(len(points))
         mi, tracer, rotation = self.mi, self._tracer(), self.surface.model_from_camera[:3, :3]
         pixels, normals = np.array([point.bp_px for point in points]), np.array([point.normal for point in points])
         rays, _, hit = tracer.hit(*(to_kernel(mi.Float, axis, np.float32) for axis in pixels.T))
@@ -212,8 +214,12 @@ class SessionTruth:
         acts as roughness, and the highlight points are the base's. Without a `radiance` theirs is 0, and they stand in
         no order.
         """
-        unresolved = self.surface.relief is not None and not glints.is_resolved(self._whole)
-        return self._found(unresolved, radiance)
+        return self._found(self.is_unresolved, radiance)
+
+    @property
+    def is_unresolved(self) -> bool:
+        """Whether the surface has a relief that no part of the frame resolves, so that it acts as roughness."""
+        return self.surface.relief is not None and not glints.is_resolved(self._whole)
 
     def base_highlights(self, radiance: Radiance | None = None) -> list[HighlightPoint]:
         """Find the highlight points of the base, without the relief: the centres of the clouds of glints."""

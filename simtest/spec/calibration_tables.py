@@ -46,6 +46,7 @@ def calibration_tables(calibration: Calibration) -> Tables:
             tables[name] = _profile(profile)
     if calibration.emission_axis != OPTICAL_AXIS and "emission" in tables:
         tables["emission"]["direction"] = list(calibration.emission_axis)
+    is_known = {"vignetting", "emission"} <= set(tables)
     # Defaults and what is not known are left out; an empty table says nothing.
     further: Tables = {
         "sensor": {
@@ -54,7 +55,7 @@ def calibration_tables(calibration: Calibration) -> Tables:
         },
         "rig": _rig(priors),
         "surface": _surface(priors),
-        "uncertainty": _uncertainty(priors, {"vignetting", "emission"} <= set(tables)),
+        "uncertainty": _uncertainty(priors, is_known and calibration.is_emission_undone),
     }  # fmt: skip
     for name, table in further.items():
         if stated := {key: value for key, value in table.items() if value is not None}:
@@ -96,11 +97,11 @@ def _surface(priors: Priors) -> dict[str, Any]:
     }
 
 
-def _uncertainty(priors: Priors, gives_falloff: bool) -> dict[str, Any]:
+def _uncertainty(priors: Priors, states_falloff: bool) -> dict[str, Any]:
     power = priors.falloff_power
     return {
         **{name: deviation or None for name, deviation in priors.camera.deviations.items()},
-        "falloff_power": _interval(power) if gives_falloff or power != UNTOLD_FALLOFF_POWER else None,
+        "falloff_power": _interval(power) if states_falloff or power != UNTOLD_FALLOFF_POWER else None,
     }
 
 
@@ -158,9 +159,10 @@ def _alike(one: object, other: object) -> bool:
         pairs = zip(one.angles, other.angles, strict=False)
         close = all(math.isclose(a, b, rel_tol=CLOSE) for a, b in pairs)
         return close and (one.power, one.values) == (other.power, other.values)
-    # A default that a file has to write counts as given when it is read.
-    same = type(one) is type(other) or (isinstance(one, Uniform) and isinstance(other, Uniform))
-    if isinstance(one, Uniform | Normal) and isinstance(other, Uniform | Normal) and same:
+    # Also what nobody gave, which is given once a file states it.
+    if (isinstance(one, Uniform) and isinstance(other, Uniform)) or (
+        isinstance(one, Normal) and isinstance(other, Normal)
+    ):
         return all(math.isclose(a, b, rel_tol=CLOSE) for a, b in zip(_numbers(one), _numbers(other), strict=True))
     # Of a frame without steps between its values the response makes no difference to the noise.
     if isinstance(one, NoiseModel) and isinstance(other, NoiseModel):

@@ -15,7 +15,7 @@ from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.simulation.camera_chain import capture, collect
-from simtest.spec import load_calibration, load_camera
+from simtest.spec import load_calibration, load_camera, save_calibration
 from simtest.spec.sensor import Sensor
 
 CAMERA = Camera(160, 120, 90.0, 90.0, 80.0, 60.0)
@@ -220,6 +220,19 @@ def test_a_prior_on_the_falloff_is_left_alone_and_must_hold_what_is_not_undone()
     np.testing.assert_array_equal(both.falloff, lens.falloff)
     with pytest.raises(InputError, match="emission: cannot be undone for lights_mm beside the camera"):
         Calibration(CAMERA, emission=profile, priors=dataclasses.replace(beside, falloff_power=None))
+
+
+@pytest.mark.parametrize("lights_mm", [(), ((5.0, 0.0, 0.0),)])
+def test_a_known_falloff_beside_one_that_nobody_gave_is_written(lights_mm, tmp_path):
+    """No file could state it, as `simtest calibrate light` makes it of a calibration that has both."""
+    profile = AngularProfile(2.0)
+    known = Calibration(CAMERA, vignetting=profile, emission=profile, priors=Priors(lights_mm))
+    save_calibration(known, tmp_path / "written.toml")
+    read = load_calibration(tmp_path / "written.toml")
+    power = read.priors.falloff_power
+    assert (power.low, power.high) == (0.0, 4.0)
+    # Where both are undone the file has to state it.
+    assert (read == known) == bool(lights_mm)
 
 
 def test_where_no_light_is_left_the_gain_is_limited_and_marked():

@@ -5,10 +5,12 @@ import hashlib
 import numpy as np
 import polars as pl
 import pytest
+from scipy.ndimage import label
 
 from simtest.dataset import fields, read
 from simtest.dataset.card import make_card
 from simtest.dataset.index import HIGHLIGHTS
+from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import read_manifest
 from simtest.dataset.plan import Plan
 from simtest.dataset.preview import write_preview
@@ -168,6 +170,34 @@ def test_card_and_preview_tell_both_truths(made, tmp_path):
     assert "have no relief" in smooth
     page = write_preview(made, tmp_path / "preview.html")
     assert page.read_text().count("<figcaption>normal of the base, without the relief") == 2
+
+
+UNRESOLVED = [
+    {"surface.relief": {"bands": [{"slope_deg": slope_deg, "wavelength_mm": 0.02}]}, "render.samples_per_pixel": 64}
+    for slope_deg in (1.0, 3.0)
+]
+MOVED = [{"camera.motion": {"velocity_mm_s": [speed, 0.0, 0.0]}} for speed in (100.0, 300.0)]
+
+
+@pytest.mark.parametrize("values", [*UNRESOLVED, *MOVED])
+def test_a_highlight_that_is_a_mean_is_the_pixels_above_half_of_it(values):
+    """Its peak was that without relief, or of the middle of the exposure: too few pixels or none reached half of it."""
+    camera = {"camera.width": 96, "camera.height": 72, "camera.fx": 96.0, "camera.fy": 96.0}
+    family = {"scene": "sphere", "set": camera | {"reflectance.exponent": 200.0} | values}
+    maker = Maker(Plan(recipe(samples=1, families=[family])))
+    made, (_, view, _) = maker.make(0), maker.view(0)
+    (highlight,) = made.meta["highlights"]
+    assert highlight["isolated"]
+    numbers, _ = label(view.lobe >= view.lobe.max() / 2)
+    column, row = (int(v) for v in highlight["bp_px"])
+    expected = numbers == numbers[row, column]
+    assert numbers[row, column] > 0
+    np.testing.assert_array_equal(made.images["instance"] == 1, expected)
+    assert highlight["region"]["instance_px"] == np.count_nonzero(expected) > 5
+    if "surface.relief" in values:
+        # It was 0.03 to 0.1 px.
+        area = highlight["region"]["instance_px"]
+        assert highlight["radius_px"] == pytest.approx(np.sqrt(area / np.pi), rel=0.25)
 
 
 def test_a_relief_of_a_whole_surface_that_is_drawn_counts():
