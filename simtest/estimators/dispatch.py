@@ -11,7 +11,7 @@ from typing import TypeGuard
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
-from simtest.errors import Failure, Reason
+from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.estimate_check import check
 from simtest.estimators.protocol import (
     AnyEstimator,
@@ -118,6 +118,9 @@ def run_in_frame(
         else:
             made = _of_frame(estimator.estimate_frame(frame, camera, priors), patches, camera)
     except Exception as error:
+        # A package that a network lacks is the user's to install, and no fault of a highlight.
+        if isinstance(error, InputError) and isinstance(estimator, RegionEstimator):
+            raise
         made = _of_frame(_estimator_error(error), patches, camera)
     if made.refused and made.refused[0] not in made.of_patches:
         what = f"{type(estimator).__qualname__}: {len(made.refused)} malformed at no highlight"
