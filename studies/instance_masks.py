@@ -14,7 +14,7 @@ have no pixel: "clipped" where the lobe's peak is above full scale, else "dim".
 import argparse
 import heapq
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,6 @@ from scipy import ndimage
 from benchmarks.measuring import print_markdown
 from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
-from simtest.geometry import Camera
 from simtest.rendering import Session
 from simtest.rendering.rays import Sightlines
 from simtest.runtime.arrays import AnyArray, Array, Image, IntArray, Mask
@@ -115,7 +114,9 @@ def peak_of(session: Session, point_px: Array) -> float:
     """Render a pixel's area around a point with many rays, and return the lobe's brightest."""
     camera, corner, size = session.camera, point_px - 0.5, DIVISION
     x, y = (camera.cx - corner[0]) * DIVISION, (camera.cy - corner[1]) * DIVISION
-    close = Camera(fx=camera.fx * DIVISION, fy=camera.fy * DIVISION, cx=x, cy=y, width=size, height=size)
+    close = replace(
+        camera, fx=camera.fx * DIVISION, fy=camera.fy * DIVISION, cx=x, cy=y, width=size, height=size, view_mask=None
+    )
     sightlines = Sightlines(session.mi, close, session.surface.model_from_camera)
     parts, _ = session._tracer(sightlines).centres(None, True, None)
     # Of an instrument in front, too.

@@ -87,12 +87,12 @@ class View:
     @cached_property
     def light(self) -> Image:
         """Noise-free light behind the lens, mean of the channels."""
-        return _mean(self.seen.light)
+        return mean(self.seen.light)
 
     @cached_property
     def specular(self) -> Array:
         """The lobe's part of it: no scene has a point spread, and the lens's falloff is known."""
-        specular = _mean(self.frame.radiance.specular).astype(float)
+        specular = mean(self.frame.radiance.specular).astype(float)
         return specular * self.falloff
 
     @cached_property
@@ -287,5 +287,5 @@ def _wrapped(angle_deg: float) -> float:
     return (angle_deg + 180) % 360 - 180
 
 
-def _mean(image: Image) -> Image:
+def mean(image: Image) -> Image:
     return image if image.ndim == 2 else image.mean(axis=2)

@@ -229,7 +229,7 @@ def experiment(case: Case) -> Faults:
 
 
 def views(case: Case) -> Faults:
-    """Check that flow, co-visibility, poses and highlights of a sequence of views are those of one another."""
+    """Check that flow and co-visibility, and the poses, of a sequence of views are those of one another."""
     if case.row["surface"] not in ("colon", "mesh"):
         raise NotAskedError("a sequence follows the path of a lumen")
     folder, count = case.folder / "views", 3
@@ -249,19 +249,7 @@ def views(case: Case) -> Faults:
                 faults.append(
                     f"covisibility[{one}, {other}]: {shares[one, other]:.3f}, by the flow's states {share:.3f}"
                 )
-    tracks = json.loads((folder / "tracks.json").read_text())
     poses = [np.array(view["world_from_camera"]) for view in listed]
-    lights = formulas.lights_mm(case.tables["rig"])
-    for number, (pose, points) in enumerate(zip(poses, tracks["highlights"], strict=True)):
-        for point in points:
-            place = (np.array(point["position_world_mm"]) - pose[:3, 3]) @ pose[:3, :3]
-            normal = np.array(point["normal_world"]) @ pose[:3, :3]
-            off = formulas.angle_deg(normal, formulas.bisectors(place, lights[point["light"]]))
-            gap = np.linalg.norm(formulas.project(case.camera, place) - point["bp_px"])
-            if not off < 1e-4 or not gap < 1e-4:
-                faults.append(
-                    f"view {number}: a highlight {off:.2g} deg off the bisector, {gap:.2g} px beside its bp_px"
-                )
     lines = [line.split() for line in (folder / "trajectory.txt").read_text().splitlines() if line[:1] != "#"]
     for pose, line in zip(poses, lines, strict=True):
         # Time, position in m, quaternion with its real part last.

@@ -203,9 +203,11 @@ def bisectors(points: Array, light: Array) -> Array:
 # Labels --------------------------------------------------------------------------------------------------------------
 
 
-def at_half_height(image: AnyArray, start: tuple[int, int], allowed: Mask | None = None) -> Mask:
-    """Return the connected pixels around a pixel (row, column) with at least half of its value (four neighbours)."""
-    above = image >= image[start] / 2
+def at_half_height(
+    image: AnyArray, start: tuple[int, int], allowed: Mask | None = None, level: float | None = None
+) -> Mask:
+    """Return the pixels of at least half of a pixel's value, or of a level, that are connected with it by sides."""
+    above = image >= (image[start] / 2 if level is None else level)
     if allowed is not None:
         above &= allowed
     numbers, _ = ndimage.label(above)

@@ -1,7 +1,7 @@
 """Checks of labels against the image: which highlights count, their pixels, size and noise, and the stored maps."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,17 +10,15 @@ from scipy import ndimage
 from simtest.calibration import Response
 from simtest.dataset.maker import colour_variant
 from simtest.rendering import HighlightPoint, Session
-from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.spec.scene import scene_from_dict
 from studies.corners import formulas
-from studies.corners.case import Case, Faults, NotAskedError
+from studies.corners.case import Case, Faults, NotAskedError, mean
 from studies.corners.scenes import SMOOTH
+from studies.instance_masks import peak_of
 
 MOST_CUT = 0.1
 """Share of an isolated highlight's border that an instrument may make."""
-
-LEAST_RADIUS_PX = 0.8
-"""Of a highlight that holds a pixel's centre wherever it lies."""
 
 CLEAR = 0.85
 """Share of full scale below which a peak is not clipped, nor its noise."""
@@ -71,7 +69,7 @@ def _cut(specular: Array, metal: Mask, start: tuple[int, int]) -> float:
 
 def radius(case: Case) -> Faults:
     """Check the radius of isolated highlights against the rendered lobe at half height."""
-    specular = case.frame.radiance.specular.astype(float)
+    specular = mean(case.frame.radiance.specular).astype(float)
     smooth = case.row["relief"] == "none"
     points = [h for h in case.seen.highlights if h.isolated and (not smooth or case.stands_alone(h))]
     if case.row["relief"] == "not_resolved":
@@ -125,34 +123,52 @@ def snr(case: Case) -> Faults:
 
 
 def labels(case: Case) -> Faults:
-    """Check a sample's `instance` and `visible`: pixels above half of the lobe's peak, unsmoothed, behind the lens."""
+    """Check a sample's `instance` and `visible`: pixels above half of the lobe's peak, nothing smoothed.
+
+    Of `instance` before the lens, whose peak may lie between pixels; of `visible` behind it.
+    """
     sample = case.sample
     meta, faults = sample["meta"], []
-    specular = _lobe_of_sample(case)
+    session = Session(scene_from_dict(meta["scene"]), colour_variant(), labelled=True)
+    specular = mean(session.frame().radiance.specular).astype(float)
     instance, metal = sample["instance"].astype(int), sample["instrument"] > 0
-    nulls, poor = 0, []
+    expected = _instances(session, meta["highlights"], specular)
     for number, each in enumerate(meta["highlights"]):
-        own = instance == number + 1
-        if not each["isolated"]:
-            if own.any():
-                faults.append(f"instance {number + 1}: of a highlight that is not isolated")
-            continue
-        column, row = (min(int(v), n - 1) for v, n in zip(each["bp_px"], specular.shape[::-1], strict=True))
-        region = formulas.at_half_height(specular, formulas.climbed(specular, (row, column)))
+        own, region = instance == number + 1, expected == number + 1
         size, kept = int(region.sum()), int(own.sum())
-        # Below, half height may lie between the pixels' centres.
-        nulls += not kept and (each["radius_px"] or math.inf) > LEAST_RADIUS_PX
-        if kept and size >= 20:
+        if not each["isolated"]:
+            faults += [f"instance {number + 1}: of a highlight that is not isolated"] if kept else []
+        elif (each["region"]["instance_px"] or 0) != kept or bool(kept) == bool(each["region"]["no_instance"]):
+            faults.append(f"instance {number + 1}: {kept} px, described as {each['region']}")
+        elif size >= 20:
             overlap = np.count_nonzero(own & region) / np.count_nonzero(own | region)
-            poor += [f"instance {number + 1}: IoU {overlap:.2f} of {kept} with {size} px"] if overlap < 0.9 else []
-        elif kept and abs(kept - size) > 1:
-            poor.append(f"instance {number + 1}: {kept} px where {size} are above half height")
-    if nulls:
-        faults.append(f"instance: {nulls} isolated highlights have no pixel")
-    faults += poor
+            faults += [f"instance {number + 1}: IoU {overlap:.2f} of {kept} with {size} px"] if overlap < 0.9 else []
+        elif abs(kept - size) > 1:
+            faults.append(f"instance {number + 1}: {kept} px where {size} are above half height")
     if (instance[metal] > 0).any():
         faults.append("instance: on an instrument")
-    return faults + _visible(sample, specular)
+    return faults + _visible(sample, specular * case.falloff)
+
+
+def _instances(session: Session, highlights: Sequence[Mapping[str, Any]], specular: Array) -> IntArray:
+    """Return the number, from 1, of the isolated highlight at half of whose peak or above each pixel lies, 0 for none.
+
+    Uphill from its point leads to a pixel; the peak is what that shows, or the brightest of many rays through a
+    pixel's area around the point, and what two claim is the brighter one's. The mean over a relief that is smaller
+    than a pixel has no peak between pixels.
+    """
+    found = []
+    for number, each in enumerate(highlights, 1):
+        if each["isolated"]:
+            column, row = (min(int(v), n - 1) for v, n in zip(each["bp_px"], specular.shape[::-1], strict=True))
+            start = formulas.climbed(specular, (row, column))
+            between = 0.0 if session.scene.render.samples_per_pixel > 1 else peak_of(session, np.array(each["bp_px"]))
+            found.append((max(between, float(specular[start])), number, start))
+    numbers = np.zeros(specular.shape, dtype=np.int64)
+    for peak, number, start in sorted(found):
+        if specular[start] >= peak / 2 > 0:
+            numbers[formulas.at_half_height(specular, start, level=peak / 2)] = number
+    return numbers
 
 
 def _visible(sample: Mapping[str, Any], specular: Array) -> Faults:
@@ -175,13 +191,6 @@ def _visible(sample: Mapping[str, Any], specular: Array) -> Faults:
             stated = np.round(spot["centroid_px"], 2)
             faults.append(f"visible {number + 1}: centroid_px {stated} for {centroid.round(2)}")
     return faults
-
-
-def _lobe_of_sample(case: Case) -> Array:
-    """Return the lobe's light behind the lens, rendered again as the sample was: in colour, with its seeds."""
-    session = Session(scene_from_dict(case.sample["meta"]["scene"]), colour_variant(), labelled=True)
-    radiance = session.frame().radiance.specular
-    return np.asarray((radiance if radiance.ndim == 2 else radiance.mean(axis=2)).astype(float) * case.falloff)
 
 
 def depth(case: Case) -> Faults:

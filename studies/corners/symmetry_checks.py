@@ -14,7 +14,7 @@ from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array
 from simtest.simulation.true_highlights import TrueHighlight
 from studies.corners import formulas
-from studies.corners.case import ESTIMATORS, TURN, Case, Faults, View
+from studies.corners.case import ESTIMATORS, TURN, Case, Faults, View, mean
 
 BORDER_PX = 0.5
 """What lies so near to the frame's border may be in view on one side of a symmetry alone."""
@@ -134,7 +134,7 @@ def _same_maps(case: Case, other: View, turning: Array, image: Callable[[Array],
         if np.count_nonzero(wrong) > 1e-3 * wrong.size:
             faults.append(f"truth.{name}: differs at {np.count_nonzero(wrong)} pixels")
     for name in ("specular", "diffuse"):
-        a, b = image(getattr(case.frame.radiance, name)), getattr(other.frame.radiance, name)
+        a, b = image(mean(getattr(case.frame.radiance, name))), mean(getattr(other.frame.radiance, name))
         # Samples, and the points of a source of finite size, do not turn with the picture.
         if sampled:
             a, b = (_blocks(each) for each in (a, b))
