@@ -135,7 +135,8 @@ class AnatomySurface(_Rough):
 
     @model_validator(mode="after")
     def _one_fineness(self) -> "AnatomySurface":
-        if self.edge_mm is not None and "subdivisions" in self.model_fields_set:
+        # Its default stands in a scene's dump, too.
+        if self.edge_mm is not None and self.subdivisions != 1:
             raise ValueError(
                 f"subdivisions = {self.subdivisions} and edge_mm = {self.edge_mm}: only one of them may be given"
             )

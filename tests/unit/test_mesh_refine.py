@@ -120,6 +120,11 @@ def test_a_scene_may_ask_for_an_edge_length(tmp_path, monkeypatch):
         AnatomySurface(path="x.ply", edge_mm="fine")
 
 
+def test_a_surface_of_an_edge_length_is_read_back_from_its_dump():
+    surface = AnatomySurface(path="x.ply", edge_mm=3.0)
+    assert AnatomySurface.model_validate(surface.model_dump(mode="json")) == surface
+
+
 def test_smoothing_is_left_out_with_a_warning_where_it_cannot_be(tmp_path, monkeypatch):
     path = tmp_path / "ball.ply"
     trimesh.creation.icosphere(3, radius=15.0).export(path)
