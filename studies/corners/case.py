@@ -288,4 +288,5 @@ def _wrapped(angle_deg: float) -> float:
 
 
 def mean(image: Image) -> Image:
+    """Return the mean of an image's channels, shape (H, W)."""
     return image if image.ndim == 2 else image.mean(axis=2)
