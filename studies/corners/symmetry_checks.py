@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import BrownConrady, Camera
@@ -112,9 +113,16 @@ def _other_verdicts(one: TrueHighlight, other: TrueHighlight, scale: float) -> F
         if not abs(other.radius_px / one.radius_px / scale - 1) < 1e-3:
             faults.append(f"radius_px {one.radius_px:.4g} and {other.radius_px:.4g}")
         # The noise behind a chain of stages is that of few draws, known to 13 %.
-        if math.isfinite(one.peak_snr) and not abs(math.log(other.peak_snr / one.peak_snr)) < 0.4:
+        expected = _left(other.radius_px) / _left(one.radius_px)
+        if math.isfinite(one.peak_snr) and not abs(math.log(other.peak_snr / one.peak_snr / expected)) < 0.4:
             faults.append(f"peak_snr {one.peak_snr:.4g} and {other.peak_snr:.4g}")
     return faults
+
+
+def _left(radius_px: float) -> float:
+    """Return what the smoothing by which highlights are judged leaves of a Gaussian's height, by its half width."""
+    variance = radius_px**2 / (2 * math.log(2))
+    return variance / (variance + DEFAULT_SMOOTHING_PX**2)
 
 
 def _same_maps(case: Case, other: View, turning: Array, image: Callable[[Array], Array], sampled: bool) -> Faults:
