@@ -142,7 +142,8 @@ def _same_maps(case: Case, other: View, turning: Array, image: Callable[[Array],
         if np.count_nonzero(wrong) > 1e-3 * wrong.size:
             faults.append(f"truth.{name}: differs at {np.count_nonzero(wrong)} pixels")
     for name in ("specular", "diffuse"):
-        a, b = image(mean(getattr(case.frame.radiance, name))), mean(getattr(other.frame.radiance, name))
+        a, b = (mean(getattr(each.frame.radiance, name)).astype(float) for each in (case, other))
+        a = image(a)
         # Samples, and the points of a source of finite size, do not turn with the picture.
         if sampled:
             a, b = (_blocks(each) for each in (a, b))
