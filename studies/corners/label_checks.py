@@ -42,7 +42,9 @@ def isolated(case: Case) -> Faults:
             )
         if each.isolated and (cut := _cut(case.specular, metal, (row, column))) > MOST_CUT:
             faults.append(f"highlight {number}: isolated, but {cut:.0%} of its region's border is an instrument's")
-        if each.isolated and (held := _others_in_region(case, each)):
+        # On a smooth surface the brightest of several that melt stands for them (docs/reference/limits.md).
+        rough = case.row["relief"] != "none"
+        if rough and each.isolated and (held := _others_in_region(case, each)):
             faults.append(f"highlight {number}: isolated, but its region at half height holds {held} other highlights")
         if each.hidden and each.lit:
             faults.append(f"highlight {number}: hidden and lit")
