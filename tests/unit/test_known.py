@@ -33,7 +33,7 @@ def lobe(sigma=0.0, widths=(14.0, 9.0), seed=0, smoothing=2.0):
     frame = np.exp(-((x - 103.3) ** 2) / 2 / widths[0] ** 2 - (y - 76.8) ** 2 / 2 / widths[1] ** 2)
     frame = frame + sigma * np.random.default_rng(seed).standard_normal(frame.shape)
     smoothed = smooth(frame.astype(np.float32), smoothing).astype(float)
-    patch = Patch.cut(smoothed, (30, 20, 150, 120), noise=sigma or None, smoothing_px=smoothing)
+    patch = Patch.cut(smoothed, (30, 20, 150, 120), noise=sigma or None, smoothing_px=smoothing, others_px=())
     assert isinstance(patch, Patch)
     return patch
 
