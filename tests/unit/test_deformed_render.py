@@ -70,7 +70,11 @@ def test_labels_follow_the_exact_truth_on_relief():
 
 @pytest.mark.parametrize(
     ("reflectance", "samples"),
-    [pytest.param({"type": "phong", "exponent": 200.0}, 1, marks=pytest.mark.ci), (TISSUE, 1), (TISSUE, 4)],
+    [
+        pytest.param({"type": "phong", "exponent": 200.0}, 1, marks=pytest.mark.ci),
+        pytest.param(TISSUE, 1, marks=pytest.mark.ci),
+        (TISSUE, 4),
+    ],
 )
 def test_a_rigid_motion_of_tissue_is_the_reverse_motion_of_the_camera(reflectance, samples):
     """A film, relief and colour that move rigidly with a camera look as before."""

@@ -274,6 +274,7 @@ def test_tracks_behind_a_repaired_picture_are_those_of_a_whole_run(folder, tmp_p
     assert (tmp_path / "out" / "tracks.json").read_bytes() == (tmp_path / "whole" / "tracks.json").read_bytes()
 
 
+@pytest.mark.ci
 def test_a_film_takes_little_memory(folder, tmp_path):
     """Of each frame tracks are kept, and no isophotes: a film of ten minutes has 15,000 frames."""
     made = run(folder, tmp_path / "warm")
