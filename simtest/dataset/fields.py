@@ -282,7 +282,7 @@ FIELDS = (
           "pixels whose direct light off the lobe (specular, before it is clipped) is at least half of its peak. Where "
           "no pixel reaches that, as where it is smaller than one, there are none, and its entry in highlights says "
           "so (region)",
-          "16-bit PNG; 8-bit in older datasets", _encode_numbers, _decode_numbers),
+          "16-bit PNG", _encode_numbers, _decode_numbers),
     Field(VISIBLE, "visible.png", "(H, W)", "int32", "1",
           "0, or 1 + the index in the list visible_highlights of the visible highlight whose pixel this is: above half "
           "of its lobe's peak in the noise-free frame; only in datasets that keep it",

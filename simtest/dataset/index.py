@@ -155,14 +155,12 @@ class HighlightRow:
         """Yield the rows of a sample."""
         for number, found in enumerate(meta["highlights"]):
             (bp_x, bp_y), (x, y, z), normal = found["bp_px"], found["position_mm"], found["normal"]
-            # Datasets from before there was a relief hold one truth.
-            base = found.get("normal_base", normal)
-            kd_base = found.get("kd_min_base", found["kd_min"]), found.get("kd_max_base", found["kd_max"])
+            base = found["normal_base"]
             yield cls(
                 meta["index"], meta["split"], number, found["light"], found["isolated"], found["why_not"],
                 bp_x, bp_y, x, y, z, normal[0], normal[1], normal[2],
                 found["distance_mm"], found["kd_min"], found["kd_max"], found["peak_snr"],
-                base[0], base[1], base[2], *kd_base, found.get("pool", False),
+                base[0], base[1], base[2], found["kd_min_base"], found["kd_max_base"], found["pool"],
             )  # fmt: skip
 
 

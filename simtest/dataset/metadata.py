@@ -38,14 +38,14 @@ class HighlightMeta(TypedDict):
     why_not: str | None
     direction_min: list[float] | None
     peak_snr: float | None
-    lit: NotRequired[bool]  # older datasets lack them
-    hidden: NotRequired[bool]
+    lit: bool
+    hidden: bool
     region: NotRequired[InstanceMeta]  # of isolated ones
-    # Of the base; older datasets, all of smooth surfaces, lack them.
-    normal_base: NotRequired[list[float]]
-    kd_min_base: NotRequired[float]
-    kd_max_base: NotRequired[float]
-    pool: NotRequired[bool]
+    # Of the base
+    normal_base: list[float]
+    kd_min_base: float
+    kd_max_base: float
+    pool: bool
 
 
 class EllipseMeta(TypedDict):
@@ -79,7 +79,7 @@ class SampleMeta(TypedDict):
     anatomy: AnatomyMeta
     drawn: dict[str, JsonValue]
     camera: CameraDescription
-    world_from_camera: NotRequired[list[list[float]]]  # 4 x 4, mm; older datasets lack it
+    world_from_camera: list[list[float]]  # 4 x 4, mm
     lights_mm: list[list[float]]
     brightest_mm: float | None  # distance of the brightest highlight, to which known.distance_error is relative
     full_scale: float

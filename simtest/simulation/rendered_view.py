@@ -128,9 +128,8 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
 
 def brightest_mm(highlights: Sequence[TrueHighlight]) -> float | None:
     """Return the distance of the brightest lit highlight, mm; None where none is lit."""
-    return max(((h.radiance, h.distance) for h in highlights if h.lit), key=lambda pair: pair[0], default=(0.0, None))[
-        1
-    ]
+    lit = [highlight for highlight in highlights if highlight.lit]
+    return max(lit, key=lambda highlight: highlight.radiance).distance if lit else None
 
 
 def render_picture(session: Session, scene: Scene) -> Image:
