@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Polynomial
 
-from simtest.geometry.lens_curves import check_finite, first_root, invert
+from simtest.geometry.lens_curves import check_finite, first_root, invert, polynomial
 from simtest.geometry.omnidirectional import Scaramuzza
 from simtest.geometry.perspective import BrownConrady
 from simtest.runtime.arrays import Array
@@ -84,13 +84,18 @@ class KannalaBrandt:
     def radial(self, theta: Array) -> tuple[Array, Array]:
         """Return abs(m) at field angles, and its slope."""
         u = theta * theta
-        factor = Polynomial([1.0, self.k1, self.k2, self.k3, self.k4])
-        return theta * factor(u), factor(u) + 2 * u * factor.deriv()(u)
+        factor, slope = polynomial((1.0, self.k1, self.k2, self.k3, self.k4), u)
+        return theta * factor, factor + 2 * u * slope
+
+    def radial_by_k1(self, theta: Array) -> tuple[Array, Array]:
+        """Return what k1 adds to abs(m) per unit, and its slope."""
+        u = theta * theta
+        return theta * u, 3 * u
 
 
-ERROR_STEPS, SOLVED = 8, 1e-3
-"""Newton's steps to a sightline by a lens with a radial error, and the share of the radius to which it is found at
-least: at a fold they halve the gap."""
+ERROR_STEPS, SOLVED, ROUNDING = 8, 1e-3, 1e-12
+"""Newton's steps to a sightline by a lens with a radial error, the share of the radius to which it is found at least (at a
+fold they halve the gap), and that at which they end."""
 
 Distortion = BrownConrady | KannalaBrandt | Scaramuzza
 
@@ -125,14 +130,16 @@ def undistort_with_errors(lens: Distortion, m: Array, errors: Array, edge_reach:
     top = 1.5 * lens.limit if isinstance(lens, BrownConrady) else min(1.5 * lens.limit_angle, np.pi)
     tangential = lens.distort(near) - lens.radial(np.array(reach))[0] * near[:2] / max(across, 1e-12)
     points = points - tangential
-    radius, further = np.hypot(*points.T), replace(lens, k1=lens.k1 + 1)
-    # Newton's steps from below, where the curves bend least; k1 is a factor of the second part.
+    radius = np.hypot(*points.T)
+    # Newton's steps from below, where the curves bend least
     found = np.minimum(np.full(len(m), reach / 2), radius)
     with np.errstate(all="ignore"):
         for _ in range(ERROR_STEPS):
-            (value, slope), (more, steeper) = lens.radial(found), further.radial(found)
-            gap, slope = value + shares * (more - value) - radius, slope + shares * (steeper - slope)
+            (value, slope), (more, steeper) = lens.radial(found), lens.radial_by_k1(found)
+            gap, slope = value + shares * more - radius, slope + shares * steeper
             found = found - gap / slope
+            if (np.abs(gap) <= ROUNDING * radius).all():
+                break
         solved = (np.abs(gap) <= SOLVED * radius) & (slope > 0) & (found >= 0) & (found < top)
         ends = (found, np.ones(len(m))) if isinstance(lens, BrownConrady) else (np.sin(found), np.cos(found))
         shares = np.where(radius > 0, ends[0] / radius, 1.0)

@@ -30,6 +30,14 @@ def check_finite(model: Any) -> None:
         check_number(f"distortion.{name}", value)
 
 
+def polynomial(coefficients: tuple[float, ...], u: Array) -> tuple[Array, Array]:
+    """Return a polynomial's values, lowest coefficient first, and its slopes, by Horner's scheme."""
+    value, slope = np.zeros_like(u), np.zeros_like(u)
+    for coefficient in reversed(coefficients):
+        value, slope = coefficient + value * u, value + slope * u
+    return value, slope
+
+
 def first_root(polynomial: Polynomial) -> float:
     """Return the smallest positive real root of a polynomial that is 1 at 0; inf where there is none."""
     # The reversed polynomial, whose first coefficient is that 1, has the inverse roots: tiny last coefficients then

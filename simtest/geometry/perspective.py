@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Polynomial
 
-from simtest.geometry.lens_curves import CLOSE, NEWTON_STEPS, STEEPEST, check_finite, first_root, invert
+from simtest.geometry.lens_curves import CLOSE, NEWTON_STEPS, STEEPEST, check_finite, first_root, invert, polynomial
 from simtest.runtime.arrays import Array, Mask
 
 
@@ -60,7 +60,8 @@ class BrownConrady:
     def _turn_and_pole(self) -> tuple[float, float]:
         """Radii at which the slope of the radial part, and its denominator, vanish first; inf where they do not."""
         u = Polynomial([0.0, 1.0])
-        above, below = self._radial_polynomials
+        above = Polynomial([1.0, self.k1, self.k2, self.k3])
+        below = Polynomial([1.0, self.k4, self.k5, self.k6])
         # Numerator of the slope of sqrt(u) above/below.
         slope = (above + 2 * u * above.deriv()) * below - 2 * u * above * below.deriv()
         return float(np.sqrt(first_root(slope))), float(np.sqrt(first_root(below)))
@@ -74,10 +75,6 @@ class BrownConrady:
     def limit_angle(self) -> float:
         """Field angle at which the radial part folds over, rad; almost pi/2 where it does not."""
         return float(np.arctan(self.limit))
-
-    @cached_property
-    def _radial_polynomials(self) -> tuple[Polynomial, Polynomial]:
-        return Polynomial([1.0, self.k1, self.k2, self.k3]), Polynomial([1.0, self.k4, self.k5, self.k6])
 
     def distort(self, rays: npt.ArrayLike) -> Array:
         """Return the normalised image coordinates, shape (..., 2), of directions, shape (..., 3), of any length.
@@ -118,17 +115,29 @@ class BrownConrady:
     def radial(self, r: Array) -> tuple[Array, Array]:
         """Return the radial part r R(r^2) and its slope."""
         u = r * r
-        above, below = self._radial_polynomials
-        ratio = above(u) / below(u)
-        return r * ratio, ratio + 2 * u * (above.deriv()(u) - ratio * below.deriv()(u)) / below(u)
+        ratio, slope = self._ratio(u)
+        return r * ratio, ratio + 2 * u * slope
+
+    def radial_by_k1(self, r: Array) -> tuple[Array, Array]:
+        """Return what k1 adds to the radial part per unit, and its slope."""
+        u = r * r
+        below, falling = polynomial((1.0, self.k4, self.k5, self.k6), u)
+        return r * u / below, u * (3 - 2 * u * falling / below) / below
+
+    def _ratio(self, u: Array) -> tuple[Array, Array]:
+        """Return R(u) and its slope."""
+        above, rising = polynomial((1.0, self.k1, self.k2, self.k3), u)
+        if not (self.k4 or self.k5 or self.k6):
+            return above, rising
+        below, falling = polynomial((1.0, self.k4, self.k5, self.k6), u)
+        ratio = above / below
+        return ratio, (rising - ratio * falling) / below
 
     def _forward(self, xy: Array) -> tuple[Array, Array]:
         """Return m and the three entries of its symmetric Jacobian: xx, xy, yy, shape (..., 3)."""
         x, y = xy[..., 0], xy[..., 1]
         u = x * x + y * y
-        above, below = self._radial_polynomials
-        R = above(u) / below(u)
-        slope = (above.deriv()(u) - R * below.deriv()(u)) / below(u)
+        R, slope = self._ratio(u)
         p1, p2 = self.p1, self.p2
         m = np.stack([x * R + 2 * p1 * x * y + p2 * (u + 2 * x * x), y * R + p1 * (u + 2 * y * y) + 2 * p2 * x * y], -1)
         jacobian = np.stack(
