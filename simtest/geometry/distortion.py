@@ -94,8 +94,8 @@ class KannalaBrandt:
 
 
 ERROR_STEPS, SOLVED, ROUNDING = 8, 1e-3, 1e-12
-"""Newton's steps to a sightline by a lens with a radial error, the share of the radius to which it is found at least (at a
-fold they halve the gap), and that at which they end."""
+"""Newton's steps to a sightline by a lens with a radial error, and the shares of the radius to which it is found: at
+least (at a fold they halve the gap), and so near that the steps end."""
 
 Distortion = BrownConrady | KannalaBrandt | Scaramuzza
 
