@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from simtest.calibration.calibration import mean_channel
 from simtest.runtime.arrays import Array, Image, IntArray
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.camera_chain import capture
@@ -58,8 +59,7 @@ def noise_at(light: Image, full_scale: float, sensor: Sensor, rows: IntArray, co
         cells = colour[inside[0][:, :, None], inside[1][:, None, :]] * share[own, None, None, None]
         picture = np.tile(cells.reshape(-1, CELL, cells.shape[3]), (1, draws, 1)).astype(np.float32)
         frame = capture(picture if light.ndim == 3 else picture[..., 0], full_scale, plain, rng)
-        linear = sensor.response.model().decode(frame)
-        linear = linear if linear.ndim == 2 else linear.mean(axis=2)
+        linear = mean_channel(sensor.response.model().decode_picture(frame))
         variance = linear.reshape(len(cells), CELL, draws, CELL).var(axis=2, ddof=1)
         # Cells begin left of and above the frame where the pixel is near its border.
         number, (row, column) = np.arange(len(cells)), (rows[own] - down, columns[own] - right)
