@@ -60,7 +60,7 @@ def noise_at(light: Image, full_scale: float, sensor: Sensor, rows: IntArray, co
         picture = np.tile(cells.reshape(-1, CELL, cells.shape[3]), (1, draws, 1)).astype(np.float32)
         frame = capture(picture if light.ndim == 3 else picture[..., 0], full_scale, plain, rng)
         linear = mean_channel(sensor.response.model().decode_picture(frame))
-        variance = linear.reshape(len(cells), CELL, draws, CELL).var(axis=2, ddof=1)
+        variance = linear.reshape(len(cells), CELL, draws, CELL).var(axis=2, ddof=1, dtype=float)
         # Cells begin left of and above the frame where the pixel is near its border.
         number, (row, column) = np.arange(len(cells)), (rows[own] - down, columns[own] - right)
         around = [variance[number, row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]
