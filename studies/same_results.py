@@ -1,13 +1,20 @@
-"""Compare what two versions of the code made of the same commands: `python -m studies.same_results BEFORE AFTER`.
+"""Compare what two versions of the code made of the same commands.
+
+    python -m studies.same_results BEFORE AFTER [--tolerance T] [--words]
 
 BEFORE and AFTER hold the same folders: runs of `simtest validate`, datasets, renders, reconstructions, the reports of
 `simtest nightly`. Both must hold the same files, one at least. Tables must have equal values, types and order of rows
 and columns; JSON equal values of equal types; pages and other texts equal characters; arrays equal bytes and types; all
 other files equal bytes. What says where and when the files were made is left out by its place, as the tables below list
-it, and nothing else is.
+it, and nothing else is. With a tolerance, floats in tables, JSON and arrays may differ by so much, and the largest
+difference is printed; counts, texts and truth values may not. With --words, pages are compared by the words that a
+reader sees.
 """
 
+import argparse
+import html
 import json
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -72,6 +79,23 @@ def flat(value: Any, path: str = "") -> dict[str, Any]:
     return {key: leaf for name, item in items for key, leaf in flat(item, f"{path}/{name}").items()}
 
 
+class Rules:
+    """How far results may differ, and how far they did."""
+
+    def __init__(self, tolerance: float = 0.0, words: bool = False) -> None:
+        self.tolerance, self.words, self.largest = tolerance, words, 0.0
+
+    def close(self, first: Any, second: Any) -> bool:
+        """Return whether floats, alone or in arrays of one shape, are equal within the tolerance."""
+        gap = np.abs(np.asarray(first, dtype=float) - np.asarray(second, dtype=float))
+        # NaN and infinity have no distance from themselves.
+        gap = np.where(np.equal(first, second) | (np.isnan(first) & np.isnan(second)), 0.0, gap)
+        if not bool((gap <= self.tolerance).all()):
+            return False
+        self.largest = max(self.largest, float(gap.max(initial=0.0)))
+        return True
+
+
 def document(text: str, name: str) -> dict[str, str]:
     """Return what is compared of a JSON document: values as text, so that 1, 1.0 and true differ, by their paths."""
     left_out = [f"/{path}" for pattern, paths in LEFT_OUT.items() if fnmatch(name, pattern) for path in paths]
@@ -99,7 +123,15 @@ def table(path: Path) -> pl.DataFrame:
     return found.drop(ORIGIN_COLUMNS) if set(ORIGIN_COLUMNS) <= set(found.columns) else found
 
 
-def table_difference(before: Path, after: Path) -> str | None:
+def _same_columns(first: pl.Series, second: pl.Series, rules: Rules) -> bool:
+    if first.equals(second, null_equal=True):
+        return True
+    if rules.tolerance == 0 or not first.dtype.is_float() or not first.is_null().equals(second.is_null()):
+        return False
+    return rules.close(first.drop_nulls().to_numpy(), second.drop_nulls().to_numpy())
+
+
+def table_difference(before: Path, after: Path, rules: Rules) -> str | None:
     """Return how two tables differ, or None."""
     first, second = table(before), table(after)
     if list(first.schema.items()) != list(second.schema.items()):
@@ -107,45 +139,68 @@ def table_difference(before: Path, after: Path) -> str | None:
         return f"schemas differ: {sorted(str(name) for name in names) or 'in the order of columns'}"
     if first.height != second.height:
         return f"{first.height} rows, then {second.height}"
-    unequal = [name for name in first.columns if not first[name].equals(second[name], null_equal=True)]
+    unequal = [name for name in first.columns if not _same_columns(first[name], second[name], rules)]
     return f"unequal values in {', '.join(unequal)}" if unequal else None
 
 
-def _equal(first: np.ndarray, second: np.ndarray) -> bool:
-    return first.dtype == second.dtype and first.shape == second.shape and first.tobytes() == second.tobytes()
+def _equal(first: np.ndarray, second: np.ndarray, rules: Rules) -> bool:
+    if first.dtype != second.dtype or first.shape != second.shape:
+        return False
+    if rules.tolerance > 0 and first.dtype.kind == "f":
+        return rules.close(first, second)
+    return first.tobytes() == second.tobytes()
 
 
-def arrays_difference(before: Path, after: Path) -> str | None:
+def arrays_difference(before: Path, after: Path, rules: Rules) -> str | None:
     """Return how two NPZ files differ, or None."""
     with np.load(before) as first, np.load(after) as second:
         if set(first.files) != set(second.files):
             return f"arrays differ: {sorted(set(first.files) ^ set(second.files))}"
-        unequal = [name for name in first.files if not _equal(first[name], second[name])]
+        unequal = [name for name in first.files if not _equal(first[name], second[name], rules)]
     return f"unequal arrays {', '.join(unequal)}" if unequal else None
 
 
-def json_difference(before: Path, after: Path) -> str | None:
+def _same_values(first: str | None, second: str | None, rules: Rules) -> bool:
+    if first == second or rules.tolerance == 0 or first is None or second is None:
+        return first == second
+    values = json.loads(first), json.loads(second)
+    return all(isinstance(value, float) and math.isfinite(value) for value in values) and rules.close(*values)
+
+
+def json_difference(before: Path, after: Path, rules: Rules) -> str | None:
     """Return how two JSON files differ, or None."""
     first, second = (document(path.read_text(encoding="utf-8"), path.name) for path in (before, after))
-    unequal = sorted(key for key in first.keys() | second.keys() if first.get(key) != second.get(key))
+    unequal = sorted(key for key in first.keys() | second.keys()
+                     if not _same_values(first.get(key), second.get(key), rules))  # fmt: skip
     return f"unequal at {', '.join(unequal[:5])}{' ...' * (len(unequal) > 5)}" if unequal else None
 
 
-def text_difference(before: Path, after: Path) -> str | None:
+def words(page: str) -> list[str]:
+    """Return the words of a page that a reader sees, a line each."""
+    shown = re.sub(r"<!--.*?-->|<(script|style|svg)\b.*?</\1>|<[^>]*>", " ", page, flags=re.DOTALL)
+    return html.unescape(shown).split()
+
+
+def text_difference(before: Path, after: Path, rules: Rules) -> str | None:
     """Return how two texts differ, or None."""
-    first, second = (without_origin(path.read_text(encoding="utf-8")).splitlines() for path in (before, after))
+    texts = [without_origin(path.read_text(encoding="utf-8")) for path in (before, after)]
+    first, second = (words(text) if rules.words and before.suffix == ".html" else text.splitlines() for text in texts)
     unequal = [number + 1 for number, pair in enumerate(zip(first, second, strict=False)) if pair[0] != pair[1]]
     if not unequal and len(first) == len(second):
         return None
+    if rules.words and before.suffix == ".html":
+        start = unequal[0] - 1 if unequal else min(len(first), len(second))
+        said = [" ".join(each[start : start + 8]) for each in (first, second)]
+        return f"{len(unequal)} words differ, first '{said[0]}', then '{said[1]}'"
     return f"unequal from line {unequal[0] if unequal else min(len(first), len(second)) + 1} on"
 
 
-def bytes_difference(before: Path, after: Path) -> str | None:
+def bytes_difference(before: Path, after: Path, rules: Rules) -> str | None:
     """Return that two files' bytes differ, or None."""
     return None if before.read_bytes() == after.read_bytes() else "unequal bytes"
 
 
-COMPARE: dict[str, Callable[[Path, Path], str | None]] = {
+COMPARE: dict[str, Callable[[Path, Path, Rules], str | None]] = {
     ".parquet": table_difference,
     ".npz": arrays_difference,
     ".json": json_difference,
@@ -175,15 +230,16 @@ def files(folder: Path) -> dict[str, Path]:
     return found
 
 
-def differences(before: Path, after: Path) -> dict[str, str | None]:
+def differences(before: Path, after: Path, rules: Rules | None = None) -> dict[str, str | None]:
     """Return how each file of two folders differs, by its name; None where it does not."""
+    rules = rules or Rules()
     first, second = files(before), files(after)
     found: dict[str, str | None] = {}
     for name in sorted(first.keys() | second.keys()):
         if name not in first or name not in second:
             found[name] = f"there only {'before' if name in first else 'afterwards'}"
         elif compare := COMPARE.get(first[name].suffix):
-            found[name] = compare(first[name], second[name])
+            found[name] = compare(first[name], second[name], rules)
         else:
             found[name] = f"a file of the suffix {first[name].suffix!r}, of which studies/same_results.py knows nothing"
     return found
@@ -191,20 +247,25 @@ def differences(before: Path, after: Path) -> dict[str, str | None]:
 
 def main(arguments: list[str]) -> int:
     """Print each file that differs, and how many are equal; return 1 where any differs, 2 where there is none."""
-    if len(arguments) != 2:
-        print("python -m studies.same_results BEFORE AFTER: two folders", file=sys.stderr)
-        return 2
-    before, after = (Path(argument) for argument in arguments)
+    parser = argparse.ArgumentParser(description="Compare what two versions of the code made of the same commands.")
+    parser.add_argument("before", type=Path, metavar="BEFORE")
+    parser.add_argument("after", type=Path, metavar="AFTER")
+    parser.add_argument("--tolerance", type=float, default=0.0, help="largest difference of two floats; default 0")
+    parser.add_argument("--words", action="store_true", help="of pages, the words that a reader sees alone")
+    given = parser.parse_args(arguments)
+    before, after, rules = given.before, given.after, Rules(given.tolerance, given.words)
     for folder in (before, after):
         if not folder.is_dir():
             print(f"{folder}: no such folder", file=sys.stderr)
             return 2
-    found = differences(before, after)
+    found = differences(before, after, rules)
     for name, how in found.items():
         if how:
             print(f"{name}: {how}")
     unequal = sum(how is not None for how in found.values())
     print(f"{len(found) - unequal} of {len(found)} files equal")
+    if rules.tolerance > 0:
+        print(f"largest difference of equal files' floats: {rules.largest:.3g}")
     for suffix, why in NOT_COMPARED.items():
         print(f"not compared: {suffix}, which {why}")
     return 2 if not found else int(unequal > 0)

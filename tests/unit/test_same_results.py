@@ -104,7 +104,42 @@ def test_folders_that_are_mistyped_or_empty_are_not_equal(tmp_path, capsys):
     assert main([str(empty), str(empty)]) == 2
     assert main([str(empty), str(sound)]) == main([str(sound), str(empty)]) == 1
     assert main([str(sound), str(sound)]) == 0
-    assert main([str(sound)]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        main([str(sound)])
+
+
+def shifted(shift):
+    """Return what moves a float of each kind of file."""
+
+    def change(folder):
+        np.savez(folder / "truth.npz", depth=np.arange(6.0) + shift)
+        TABLE.with_columns(pl.col("error_deg") + shift).write_parquet(folder / "results.parquet")
+        changed(lambda v: v["run"].update(duration_s=9.0) or v["experiments"]["e"].update(mean=0.25 + shift))(folder)
+        return folder
+
+    return change
+
+
+def test_a_tolerance_holds_for_floats_and_for_nothing_else(tmp_path, capsys):
+    before, after = (shifted(shift)(write(tmp_path / str(shift))) for shift in (0.0, 3e-7))
+    names = {"truth.npz", "results.parquet", "summary.json"}
+    assert {name for name, how in differences(before, after).items() if how} == names
+    assert main([str(before), str(after), "--tolerance", "1e-6"]) == 0
+    assert "largest difference of equal files' floats: 3e-07" in capsys.readouterr().out
+    assert main([str(before), str(after), "--tolerance", "1e-7"]) == 1
+    for change in ({"n": 2}, {"isolated": False}, {"mean": 1}, {"mean": None}):
+        changed(lambda v, change=change: v["experiments"]["e"].update(change))(after)
+        assert main([str(before), str(after), "--tolerance", "9"]) == 1, change
+
+
+def test_the_words_of_a_page_are_compared_without_its_markup(tmp_path):
+    before, after = write(tmp_path / "before"), write(tmp_path / "after")
+    page = PAGE.replace("<p>Median", "<script>draw()</script><p class='x'>\nMedian")
+    (after / "index.html").write_text(page, encoding="utf-8")
+    assert main([str(before), str(after)]) == 1
+    assert main([str(before), str(after), "--words"]) == 0
+    (after / "index.html").write_text(page.replace("0.25", "0.26"), encoding="utf-8")
+    assert main([str(before), str(after), "--words"]) == 1
 
 
 def test_each_suffix_is_compared_or_has_a_reason(tmp_path, capsys):
