@@ -6,7 +6,7 @@ BEFORE and AFTER hold the same folders: runs of `simtest validate`, datasets, re
 `simtest nightly`. Both must hold the same files, one at least. Tables must have equal values, types and order of rows
 and columns; JSON equal values of equal types; pages and other texts equal characters; arrays equal bytes and types; all
 other files equal bytes. What says where and when the files were made is left out by its place, as the tables below list
-it, and nothing else is. With a tolerance, floats in tables, JSON and arrays may differ by so much, and the largest
+it, and nothing else is. With a tolerance, floats in tables, JSON, NPY and NPZ may differ by so much, and the largest
 difference is printed; counts, texts and truth values may not. With --words, pages are compared by the words that a
 reader sees.
 """
@@ -87,8 +87,9 @@ class Rules:
 
     def close(self, first: Any, second: Any) -> bool:
         """Return whether floats, alone or in arrays of one shape, are equal within the tolerance."""
-        gap = np.abs(np.asarray(first, dtype=float) - np.asarray(second, dtype=float))
         # NaN and infinity have no distance from themselves.
+        with np.errstate(invalid="ignore"):
+            gap = np.abs(np.asarray(first, dtype=float) - np.asarray(second, dtype=float))
         gap = np.where(np.equal(first, second) | (np.isnan(first) & np.isnan(second)), 0.0, gap)
         if not bool((gap <= self.tolerance).all()):
             return False
@@ -167,6 +168,11 @@ def _same_values(first: str | None, second: str | None, rules: Rules) -> bool:
     return all(isinstance(value, float) and math.isfinite(value) for value in values) and rules.close(*values)
 
 
+def array_difference(before: Path, after: Path, rules: Rules) -> str | None:
+    """Return that two NPY files differ, or None."""
+    return None if _equal(np.load(before), np.load(after), rules) else "unequal arrays"
+
+
 def json_difference(before: Path, after: Path, rules: Rules) -> str | None:
     """Return how two JSON files differ, or None."""
     first, second = (document(path.read_text(encoding="utf-8"), path.name) for path in (before, after))
@@ -184,11 +190,12 @@ def words(page: str) -> list[str]:
 def text_difference(before: Path, after: Path, rules: Rules) -> str | None:
     """Return how two texts differ, or None."""
     texts = [without_origin(path.read_text(encoding="utf-8")) for path in (before, after)]
-    first, second = (words(text) if rules.words and before.suffix == ".html" else text.splitlines() for text in texts)
+    by_words = rules.words and before.suffix == ".html"
+    first, second = (words(text) if by_words else text.splitlines() for text in texts)
     unequal = [number + 1 for number, pair in enumerate(zip(first, second, strict=False)) if pair[0] != pair[1]]
     if not unequal and len(first) == len(second):
         return None
-    if rules.words and before.suffix == ".html":
+    if by_words:
         start = unequal[0] - 1 if unequal else min(len(first), len(second))
         said = [" ".join(each[start : start + 8]) for each in (first, second)]
         return f"{len(unequal)} words differ, first '{said[0]}', then '{said[1]}'"
@@ -203,10 +210,11 @@ def bytes_difference(before: Path, after: Path, rules: Rules) -> str | None:
 COMPARE: dict[str, Callable[[Path, Path, Rules], str | None]] = {
     ".parquet": table_difference,
     ".npz": arrays_difference,
+    ".npy": array_difference,
     ".json": json_difference,
     **dict.fromkeys((".html", ".md", ".xml", ".svg"), text_difference),
     **dict.fromkeys(
-        (".png", ".jpg", ".exr", ".npy", ".tar", ".ply", ".csv", ".toml", ".txt", ".jsonl", ".mat", ".avi"),
+        (".png", ".jpg", ".exr", ".tar", ".ply", ".csv", ".toml", ".txt", ".jsonl", ".mat", ".avi"),
         bytes_difference,
     ),
 }

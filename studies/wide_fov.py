@@ -19,7 +19,7 @@ from simtest.geometry import Array, ViewMask, chi_squared
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.reconstruction.assumptions import CENTRE_SD_SHARE, FOCAL_SD, calibration_of_round_view
 
-FIELDS_DEG = (90.0, 120.0, 140.0, 160.0, 170.0)
+FIELDS_DEG = (60.0, 90.0, 120.0, 140.0, 160.0, 170.0)
 SHARES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
 WIDTH, HEIGHT, RADIUS_PX = 640, 480, 240.0
 
@@ -72,7 +72,7 @@ def held(kind: str, fov_deg: float, share: float, draws: int) -> tuple[float, fl
 def main() -> None:
     """Print a table a field of view: shares held by kind and radius, and the width."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=1000)
+    parser.add_argument("--draws", type=int, default=20000)
     draws = parser.parse_args().draws
     for fov_deg in FIELDS_DEG:
         print(f"\n--fov {fov_deg:g} --fov-of view: % held in the 95 % region, by the share of the view's radius")

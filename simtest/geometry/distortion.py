@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Polynomial
 
-from simtest.geometry.lens_curves import check_finite, first_root, invert, polynomial
+from simtest.geometry.lens_curves import check_finite, first_root, horner, invert
 from simtest.geometry.omnidirectional import Scaramuzza
 from simtest.geometry.perspective import BrownConrady
 from simtest.runtime.arrays import Array
@@ -84,7 +84,7 @@ class KannalaBrandt:
     def radial(self, theta: Array) -> tuple[Array, Array]:
         """Return abs(m) at field angles, and its slope."""
         u = theta * theta
-        factor, slope = polynomial((1.0, self.k1, self.k2, self.k3, self.k4), u)
+        factor, slope = horner((1.0, self.k1, self.k2, self.k3, self.k4), u)
         return theta * factor, factor + 2 * u * slope
 
     def radial_by_k1(self, theta: Array) -> tuple[Array, Array]:

@@ -30,7 +30,7 @@ def check_finite(model: Any) -> None:
         check_number(f"distortion.{name}", value)
 
 
-def polynomial(coefficients: tuple[float, ...], u: Array) -> tuple[Array, Array]:
+def horner(coefficients: tuple[float, ...], u: Array) -> tuple[Array, Array]:
     """Return a polynomial's values, lowest coefficient first, and its slopes, by Horner's scheme."""
     value, slope = np.zeros_like(u), np.zeros_like(u)
     for coefficient in reversed(coefficients):

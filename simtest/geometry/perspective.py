@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Polynomial
 
-from simtest.geometry.lens_curves import CLOSE, NEWTON_STEPS, STEEPEST, check_finite, first_root, invert, polynomial
+from simtest.geometry.lens_curves import CLOSE, NEWTON_STEPS, STEEPEST, check_finite, first_root, horner, invert
 from simtest.runtime.arrays import Array, Mask
 
 
@@ -121,15 +121,15 @@ class BrownConrady:
     def radial_by_k1(self, r: Array) -> tuple[Array, Array]:
         """Return what k1 adds to the radial part per unit, and its slope."""
         u = r * r
-        below, falling = polynomial((1.0, self.k4, self.k5, self.k6), u)
+        below, falling = horner((1.0, self.k4, self.k5, self.k6), u)
         return r * u / below, u * (3 - 2 * u * falling / below) / below
 
     def _ratio(self, u: Array) -> tuple[Array, Array]:
         """Return R(u) and its slope."""
-        above, rising = polynomial((1.0, self.k1, self.k2, self.k3), u)
+        above, rising = horner((1.0, self.k1, self.k2, self.k3), u)
         if not (self.k4 or self.k5 or self.k6):
             return above, rising
-        below, falling = polynomial((1.0, self.k4, self.k5, self.k6), u)
+        below, falling = horner((1.0, self.k4, self.k5, self.k6), u)
         ratio = above / below
         return ratio, (rising - ratio * falling) / below
 

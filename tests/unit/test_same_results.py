@@ -108,28 +108,25 @@ def test_folders_that_are_mistyped_or_empty_are_not_equal(tmp_path, capsys):
         main([str(sound)])
 
 
-def shifted(shift):
-    """Return what moves a float of each kind of file."""
-
-    def change(folder):
-        np.savez(folder / "truth.npz", depth=np.arange(6.0) + shift)
-        TABLE.with_columns(pl.col("error_deg") + shift).write_parquet(folder / "results.parquet")
-        changed(lambda v: v["run"].update(duration_s=9.0) or v["experiments"]["e"].update(mean=0.25 + shift))(folder)
-        return folder
-
-    return change
+def shifted(folder, shift, **others):
+    """Return a folder whose floats are moved in each kind of file, and in whose JSON other values are set."""
+    np.save(folder / "normal.npy", np.append(np.arange(6.0), np.inf) + shift)
+    np.savez(folder / "truth.npz", depth=np.append(np.arange(6.0), np.nan) + shift)
+    TABLE.with_columns(pl.col("error_deg") + shift).write_parquet(folder / "results.parquet")
+    changed(lambda v: v["experiments"]["e"].update({"mean": 0.25 + shift, **others}))(folder)
+    return folder
 
 
 def test_a_tolerance_holds_for_floats_and_for_nothing_else(tmp_path, capsys):
-    before, after = (shifted(shift)(write(tmp_path / str(shift))) for shift in (0.0, 3e-7))
-    names = {"truth.npz", "results.parquet", "summary.json"}
+    before, after = (shifted(write(tmp_path / str(shift)), shift) for shift in (0.0, 3e-7))
+    names = {"normal.npy", "truth.npz", "results.parquet", "summary.json"}
     assert {name for name, how in differences(before, after).items() if how} == names
     assert main([str(before), str(after), "--tolerance", "1e-6"]) == 0
     assert "largest difference of equal files' floats: 3e-07" in capsys.readouterr().out
     assert main([str(before), str(after), "--tolerance", "1e-7"]) == 1
-    for change in ({"n": 2}, {"isolated": False}, {"mean": 1}, {"mean": None}):
-        changed(lambda v, change=change: v["experiments"]["e"].update(change))(after)
-        assert main([str(before), str(after), "--tolerance", "9"]) == 1, change
+    for others in ({}, {"n": 2}, {"isolated": False}, {"mean": 1}, {"mean": None}):
+        shifted(after, 3e-7, **others)
+        assert main([str(before), str(after), "--tolerance", "9"]) == int(bool(others)), others
 
 
 def test_the_words_of_a_page_are_compared_without_its_markup(tmp_path):
