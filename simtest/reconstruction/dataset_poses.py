@@ -42,8 +42,11 @@ def dataset_poses(path: Path, text: str, where: str) -> list[Array] | None:
 
 def _c3vd(text: str, where: str) -> list[Array]:
     matrices = np.array(_numbers(text, 16, ",", where)).reshape(-1, 4, 4)
-    in_column = bool((matrices[:, 3, :3] == 0).all() and (matrices[:, :3, 3] != 0).any())
-    return list(matrices if in_column else matrices.transpose(0, 2, 1))
+    transposed = matrices.transpose(0, 2, 1)
+    in_row, in_column = matrices[:, 3, :3].any(), matrices[:, :3, 3].any()
+    if not (in_row or in_column or np.array_equal(matrices, transposed)):
+        raise InputError(f"{where}: no pose has a translation, which tells rows from columns; must hold one that has")
+    return list(transposed if in_row else matrices)
 
 
 def _simcol3d(path: Path, text: str, where: str) -> list[Array]:

@@ -196,6 +196,12 @@ def test_the_poses_of_c3vd_have_their_translation_in_the_last_row_or_column(tmp_
     np.testing.assert_allclose(read_poses(path).world_from_camera, TWO, atol=1e-12)
 
 
+def test_poses_of_c3vd_that_are_all_the_same_either_way_need_no_translation(tmp_path):
+    path = tmp_path / "pose.txt"
+    path.write_text("1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n")
+    np.testing.assert_array_equal(read_poses(path).world_from_camera[0], np.eye(4))
+
+
 def test_the_left_handed_poses_of_simcol3d_carry_points_where_the_engine_does(tmp_path):
     # 30 deg about the engine's y axis, which points up: in its left-handed frame z turns towards x.
     half = np.radians(15.0)
@@ -216,6 +222,7 @@ DATASETS = {
         None,
         "pose 0: off a rotation and a translation",
     ),
+    "no translation": ("pose.txt", "0,-1,0,0,1,0,0,0,0,0,1,0,0,0,0,1", None, "no pose has a translation, .* must hold one"),
     "alone": ("SavedPosition_S1.txt", "1 2 3\n", None, "needs SavedRotationQuaternion_S1.txt beside it"),
     "fewer": ("SavedPosition_S1.txt", "1 2 3\n1 2 3\n", "0 0 0 1\n", "2 positions, but .* has 1 rotations"),
     "no unit": ("SavedPosition_S1.txt", "1 2 3\n", "0 0 0 2\n", "pose 0: quaternion of length 2; must be 1"),
