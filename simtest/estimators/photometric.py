@@ -95,7 +95,8 @@ class Photometric:
         and ``misfit`` where the residuals hold more structure than the frame's noise and the stated error is larger by
         half or more for it: the covariance then includes how far the normal moves when only the pixels around the peak
         are fitted. It also includes the drift of the isophotes' axis where that is more than noise. A highlight too
-        small for isophotes gets the normal of its centre, flagged ``unresolved``.
+        small for isophotes gets the normal of its centre, flagged ``unresolved``. Where the patch does not know its
+        noise no uncertainty is stated, as by the estimators of isophotes.
         """
         family = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
         if isinstance(family, Failure):
@@ -127,7 +128,7 @@ class Photometric:
             look_px=camera.project(s),
             axis_ratio=_axis_ratio(fitted.model),
             isophotes=family.isophotes,
-            budget=budget,
+            budget=None if pixels.noise is None else budget,
             flags=family.flags,
         )
         estimate = add_untold_parts(estimate, camera, priors, family)
@@ -182,13 +183,14 @@ class PhotometricPlane:
         if len(fits) > 1 and best.sigma > 0:
             margin = float(np.sqrt(COARSE * (fits[1].chi2 - fits[0].chi2)) / best.sigma)
         normals = np.stack([fitted.model.normal for fitted in (best, *fits[1:])])
+        covariance = _turned(best.covariance[:2, :2], normals[0], basis_across(normals[0]))
         return Estimate(
             normal=normals[0],
             candidates=normals,
             look_px=camera.project(best.model.foot),
             isophotes=start.isophotes,
             choice_margin=margin,
-            budget={"noise": _turned(best.covariance[:2, :2], normals[0], basis_across(normals[0]))},
+            budget=None if pixels.noise is None else {"noise": covariance},
         )
 
     def _start(self, patch: Patch, camera: Camera) -> Estimate | Failure:

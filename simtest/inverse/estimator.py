@@ -15,7 +15,6 @@ from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
 from simtest.estimators.highlight_fit import fit_highlight, fit_small
 from simtest.estimators.light_assignment import light_of_highlight
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
-from simtest.estimators.near_misses import near_miss_parts
 from simtest.estimators.photometric import HighlightPixels, highlight_pixels
 from simtest.estimators.prior_parts import add_common_parts, light_offset_part, mean_light_part
 from simtest.estimators.protocol import Estimate, EstimatedCurvature, Law
@@ -70,11 +69,10 @@ class InverseRendering:
         """
         if (spot := fit_small([patch], camera)[0]) is not None:
             return spot.no_shape
-        start = cone_axis.estimate(patch, camera)
-        if isinstance(start, Failure):
+        start, family = cone_axis.estimate(patch, camera), fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
+        if isinstance(start, Failure) or isinstance(family, Failure):
             return start
-        family = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
-        own = 0 if len(priors.lights_mm) < 2 or isinstance(family, Failure) else light_of_highlight(family, priors)
+        own = 0 if len(priors.lights_mm) < 2 else light_of_highlight(family, priors)
         if own is None:
             return Failure(Reason.NOT_KNOWN, f"needs to know which of {len(priors.lights_mm)} lights it reflects")
         pixels = highlight_pixels(patch, camera, cut=any(isophote.cut for isophote in start.isophotes))
@@ -85,17 +83,18 @@ class InverseRendering:
             return Failure(Reason.NOT_CONVERGED, "the fit of a rendered patch did not converge")
         found = fitted.model
         gains = 1 + np.linalg.eigvalsh(found.shape)
+        budget = _budget(fitted, pixels.correlation(fitted), _of_light(priors, own))
         estimate = Estimate(
             normal=found.normal,
             candidates=found.normal[None],
             look_px=camera.project(found.sightline),
             axis_ratio=float(np.abs(gains).min() / np.abs(gains).max()),
             isophotes=start.isophotes,
-            budget=_budget(fitted, pixels.correlation(fitted), _of_light(priors, own)),
+            budget=None if pixels.noise is None else budget,
             flags=start.flags,
             curvature=_curvature(found, priors),
         )
-        return add_common_parts(estimate.with_parts(**near_miss_parts(patch, priors)), camera, priors)
+        return add_common_parts(estimate, camera, priors, family)
 
 
 inverse_rendering = InverseRendering()

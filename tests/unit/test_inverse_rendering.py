@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, Normal, Priors, exactly
+from simtest.calibration import Calibration, Normal, Priors, Uniform, exactly
 from simtest.errors import Failure, Reason
 from simtest.estimators.bisector import bisector
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.photometric import photometric
+from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg, tangent_basis
 from simtest.inverse import InverseRendering, inverse_rendering
 from simtest.inverse.patch_renderer import PatchRenderer
@@ -157,7 +158,7 @@ def test_a_known_light_beside_the_camera(render):
     more = {"rig": {"lights": [{"offset_mm": 1.0, "azimuth_deg": 45.0}]}}
     session, radiance, highlight = render(SURFACES["cylinder"], **more)
     lights = tuple(map(tuple, session.scene.rig.true_mm().tolist()))
-    priors = Priors(lights, exactly(highlight.distance), exactly(4 * N))
+    priors = Priors(lights, exactly(highlight.distance), exactly(4 * N), falloff_power=None)
     found = answers(session, frame_of(radiance, 0.02), priors, inverse=inverse_rendering)["inverse"]
     assert angle_deg(found.normal, highlight.normal) < 0.02
     assert curvature_errors(found, highlight).gain_error < 0.01
@@ -211,3 +212,16 @@ def test_what_has_no_start_is_refused_with_its_reason(render):
     for estimate in (specularity.estimates["inverse"] for specularity in found):
         assert isinstance(estimate, Failure)
         assert estimate.reason != Reason.ESTIMATOR_ERROR
+
+
+def test_a_falloff_left_in_the_frame_is_in_the_budget_and_an_unknown_noise_leaves_none():
+    camera = Camera(300, 300, 150.0, 150.0, 150.0, 150.0)
+    y, x = np.mgrid[:300, :300] + 0.5
+    lobe = np.exp(-((x - 230) ** 2 + (y - 150) ** 2) / (2 * 14.0**2)).astype(np.float32)
+    priors = Priors(((0.0, 0.0, 0.0),), exactly(10.0), falloff_power=Uniform(0.0, 4.0))
+    methods = {"inverse": inverse_rendering, "curved": curved}
+    (found,) = reconstruct(lobe, Calibration(camera, priors=priors), methods, isolated=False)
+    own, other = (found.estimates[name].budget["response"] for name in methods)
+    np.testing.assert_allclose(own, other, rtol=0.05, atol=1e-9)
+    unknown = replace(found.patch, noise=None, others_px=None)
+    assert inverse_rendering.estimate(unknown, camera, priors).budget is None
