@@ -2,13 +2,17 @@
 
 import math
 
+import cv2
 import numpy as np
 
-from simtest.calibration.noise_estimate import median
 from simtest.geometry import Array, Mask, Patch
 
 NEARLY_CLIPPED = 0.93
 """Pixels above this share of the clipped ones' intensity count as clipped: coding blurs the plateau."""
+
+AROUND_PX = 17
+"""Side of the square around a pixel whose clipped ones are meant: where a falloff was divided away, those elsewhere are
+brighter or darker."""
 
 PLATEAU_SHARE, BENT_SHARE, BENT_RESIDUAL, MOST_BENT = 0.02, 0.8, 0.05, 1.5
 """Variance of the axis over that of a point anywhere on the plateau: where the isophotes below are ellipses, and what
@@ -22,7 +26,10 @@ def clipped_pixels(patch: Patch) -> Mask | None:
     if patch.saturated is None or not patch.saturated.any():
         return None
     raw = patch.values if patch.raw is None else patch.raw
-    return np.asarray(patch.saturated | (raw >= NEARLY_CLIPPED * median(raw[patch.saturated])))
+    inside = patch.saturated.astype(np.float32)
+    share, sums = (cv2.blur(each, (AROUND_PX, AROUND_PX)) for each in (inside, inside * raw.astype(np.float32)))
+    nearly = (share > 0.5 / AROUND_PX**2) & (raw * share >= NEARLY_CLIPPED * sums)
+    return np.asarray(patch.saturated | nearly)
 
 
 def plateau_area_px(patch: Patch, isovalue: float) -> int:

@@ -11,8 +11,8 @@ from simtest.errors import Failure
 from simtest.estimators import load_estimators
 from simtest.estimators.budget import PARTS, STATED, deviations, dominant, equivalent_covariance, total
 from simtest.estimators.dispatch import run
-from simtest.estimators.protocol import Estimate
 from simtest.estimators.photometric import photometric_plane
+from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch, smooth
 
 NORMAL = np.array([0.0, 0.0, -1.0])

@@ -19,6 +19,7 @@ from simtest.estimators.highlight_fit import fit_highlights
 from simtest.estimators.photometric import photometric
 from simtest.estimators.small_spot import fit_small_spots, is_small, radius_before_smoothing_px
 from simtest.geometry import Camera, Patch
+from simtest.geometry.angular_profile import AngularProfile
 from simtest.geometry.vectors import angle_deg
 
 CAMERA = Camera.from_fov(60.0, 96, 80)
@@ -149,6 +150,20 @@ def test_a_clipped_peak_widens_the_budget():
     # the plateau is as long as the highlight, along the same direction
     values = np.linalg.eigvalsh(families[1].axis_budget["resolution"])
     assert np.sqrt(values[1] / values[0]) == pytest.approx(5 / 4, rel=0.1)
+
+
+@pytest.mark.parametrize("power", [0.0, 4.0])
+def test_what_is_clipped_is_told_where_the_falloff_was_divided_away(power):
+    """A highlight near the border is far from clipped, and after the division as bright as one that is."""
+    camera = Camera(200, 100, 100.0, 100.0, 50.0, 50.0)
+    x, y = np.meshgrid(np.arange(200) + 0.5, np.arange(100) + 0.5)
+    falloff = np.hypot(1, np.hypot(x - 50, y - 50) / 100) ** -power
+    light = sum(h * np.exp(-((x - u) ** 2 + (y - 50) ** 2) / (2 * s**2)) for u, h, s in ((50, 3, 5), (170, 0.97, 5)))
+    frame = np.minimum(light * falloff, 1).astype(np.float32)
+    calibration = Calibration(camera, vignetting=AngularProfile(power), saturation_level=1.0)
+    for peak, clipped in ((50, frame >= 1), (170, np.zeros(frame.shape, dtype=bool))):
+        patch = Frame(frame, calibration, 1.0).patch((0, 0, 200, 100), (peak, 50))
+        assert plateau_area_px(patch, 0.5) == pytest.approx(np.count_nonzero(clipped), rel=0.1)
 
 
 def test_what_is_fitted_is_kept_with_the_patch():
