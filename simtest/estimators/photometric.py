@@ -63,6 +63,17 @@ class HighlightPixels:
             return 1.0
         return correlation_of_noise(fitted, self.observed, self.clipped, self.noise, self.places)
 
+    def covariance(self, fitted: LobeFit[Model]) -> Array:
+        """Return the covariance of a fit's parameters, whose pixels differ in noise as told; its size is measured."""
+        size = fitted.sigma**2 * float(np.mean(np.square(self.noise))) if isinstance(self.noise, np.ndarray) else 0.0
+        if not size > 0:
+            return fitted.covariance
+        intensity, J = fitted.model.evaluate()
+        if self.clipped is not None:
+            J[self.clipped & (intensity > self.observed)] = 0.0
+        by_pixel = fitted.covariance @ J.T * self.noise
+        return np.asarray(by_pixel @ by_pixel.T / size)
+
     def every(self, step: int) -> "HighlightPixels":
         """Return every so many pixels."""
         clipped = None if self.clipped is None else self.clipped[::step]
@@ -110,7 +121,7 @@ class Photometric:
         if fitted is None:
             return Failure(Reason.NOT_CONVERGED, "the fit of a quadric did not converge")
         e, f, s = fitted.model.frame
-        covariance = _turned(fitted.covariance[:2, :2], fitted.model.normal, np.stack([e, f]))
+        covariance = _turned(pixels.covariance(fitted)[:2, :2], fitted.model.normal, np.stack([e, f]))
         # beyond noise: a misfit, or a drift of the isophotes' axis
         excess, misfit = family.drift_excess, False
         if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
@@ -183,7 +194,7 @@ class PhotometricPlane:
         if len(fits) > 1 and best.sigma > 0:
             margin = float(np.sqrt(COARSE * (fits[1].chi2 - fits[0].chi2)) / best.sigma)
         normals = np.stack([fitted.model.normal for fitted in (best, *fits[1:])])
-        covariance = _turned(best.covariance[:2, :2], normals[0], basis_across(normals[0]))
+        covariance = _turned(pixels.covariance(best)[:2, :2], normals[0], basis_across(normals[0]))
         return Estimate(
             normal=normals[0],
             candidates=normals,

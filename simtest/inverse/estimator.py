@@ -83,7 +83,8 @@ class InverseRendering:
             return Failure(Reason.NOT_CONVERGED, "the fit of a rendered patch did not converge")
         found = fitted.model
         gains = 1 + np.linalg.eigvalsh(found.shape)
-        budget = _budget(fitted, pixels.correlation(fitted), _of_light(priors, own))
+        covariance = pixels.correlation(fitted) * pixels.covariance(fitted)
+        budget = _budget(found, covariance, _of_light(priors, own))
         estimate = Estimate(
             normal=found.normal,
             candidates=found.normal[None],
@@ -148,13 +149,12 @@ def _of_light(priors: Priors, own: int) -> Priors:
     return replace(priors, lights_mm=priors.lights_mm[one], lights_covariance_mm2=priors.lights_covariance_mm2[one])
 
 
-def _budget(fitted: LobeFit[RenderedQuadric], correlation: float, priors: Priors) -> Budget:
+def _budget(model: RenderedQuadric, covariance: Array, priors: Priors) -> Budget:
     """Return the budget of the normal: noise, and distance or, where no light is told, the light's offset."""
-    model = fitted.model
     across = basis_across(model.normal)
-    steps = [model.moved(np.append(STEP * unit, np.zeros(len(fitted.covariance) - 2))).normal for unit in np.eye(2)]
+    steps = [model.moved(np.append(STEP * unit, np.zeros(len(covariance) - 2))).normal for unit in np.eye(2)]
     J = across @ (np.array(steps) - model.normal).T / STEP
-    noise = correlation * J @ fitted.covariance[:2, :2] @ J.T
+    noise = J @ covariance[:2, :2] @ J.T
     if not priors.lights_mm:
         return {"noise": noise, "light_offset": light_offset_part(model.normal, priors)}
     told = mean_light_part(model.normal, priors)

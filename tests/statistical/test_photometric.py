@@ -115,6 +115,27 @@ def test_noise_that_coding_or_demosaicing_has_correlated_widens_the_region(monke
     assert np.mean(alone) < 0.75
 
 
+@pytest.mark.ci
+def test_noise_that_grows_with_the_light_is_covered(monkeypatch):
+    """100 electrons at the peak: the flanks, which place the lobe, are noisier than the pixels of the mean residual."""
+    camera = Camera(110, 110, 250.0, 250.0, 55.0, 55.0)
+    axis = np.array([0.002, 0.003, 1.0]) / np.linalg.norm([0.002, 0.003, 1.0])
+    lobe = np.clip(2 * (camera.unproject(camera.pixel_centres()) @ axis) ** 2 - 1, 0, None) ** 60
+    known = Calibration(camera, noise=NoiseModel(full_well=100.0), priors=replace(LIGHT_AT_CAMERA, falloff_power=None))
+    inside, white = [], []
+    for seed in range(300):
+        noise = np.sqrt(lobe / 100) * np.random.default_rng(seed).standard_normal(lobe.shape)
+        patch = replace(Frame((lobe + noise).astype(np.float32), known, 2.0).patch((0, 0, 110, 110)), others_px=())
+        inside.append(mahalanobis2(photometric.estimate(patch, camera, known.priors), -axis) < chi2.ppf(0.95, 2))
+        with monkeypatch.context() as taken_for_white:
+            taken_for_white.setattr(HighlightPixels, "covariance", lambda _, fitted: fitted.covariance)
+            alike = photometric.estimate(patch, camera, known.priors)
+        white.append(mahalanobis2(alike, -axis) < chi2.ppf(0.95, 2))
+    assert 0.92 <= np.mean(inside) <= 0.98, np.mean(inside)
+    # Negative control.
+    assert np.mean(white) < 0.91, np.mean(white)
+
+
 SURFACES = {
     "plane": {"type": "plane", "tilt_deg": 10.0},
     "cylinder": {"type": "cylinder", "radius_mm": 10.0, "tilt_deg": 10.0, "spin_deg": 30.0},
