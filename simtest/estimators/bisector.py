@@ -102,14 +102,14 @@ class Bisector:
 bisector = Bisector()
 
 
-def _is_narrow(distance: Distribution) -> TypeGuard[Normal]:
+def is_narrow(distance: Distribution) -> TypeGuard[Normal]:
     """Whether a distance is known so well that the normal moves with it along a line."""
     return isinstance(distance, Normal) and distance.sd <= NARROW * distance.mean
 
 
 def _middle(distance: Distribution) -> float:
     """Return the distance, mm, that the normal is taken at: the median, also the mean of a small normal error."""
-    return distance.mean if _is_narrow(distance) else float(distance.quantile(np.array([0.5]))[0])
+    return distance.mean if is_narrow(distance) else float(distance.quantile(np.array([0.5]))[0])
 
 
 def _normal(family: HighlightAxis, light: Array, distance: Distribution) -> tuple[Array, Array]:
@@ -156,7 +156,7 @@ def _light_part(family: HighlightAxis, lights: Sequence[Array], distance: Distri
 
     It is the mean square over the lights and the distances, since the angle between two lights goes with 1/d.
     """
-    distances = np.array([_middle(distance)]) if _is_narrow(distance) else distance.quantile(DISTANCES)
+    distances = np.array([_middle(distance)]) if is_narrow(distance) else distance.quantile(DISTANCES)
     first, *single = (_normals(family, light, distances)[0] for light in lights)
     moved = np.concatenate([normals - first for normals in single]) @ basis_across(normal).T
     return np.asarray(moved.T @ moved / len(moved))
@@ -170,7 +170,7 @@ def _with_light_error(
     # The mean of lights whose errors are alike, as a wrong scale makes them, is as uncertain as one of them.
     covariance = priors.lights_covariance.mean(axis=0) if own is None else priors.lights_covariance[own]
     distances = np.array([_middle(priors.distance)])
-    if not _is_narrow(priors.distance):
+    if not is_narrow(priors.distance):
         distances = priors.distance.quantile(DISTANCES)
     normal, sightline = found
     part = told_light_part(sightline, normal, light, covariance, distances)
@@ -179,7 +179,7 @@ def _with_light_error(
 
 def _distance_part(family: HighlightAxis, light: Array, distance: Distribution, across: Array) -> Array:
     """Return the covariance of the normal by the distance, shape (2, 2), rad^2, in the basis `across`."""
-    if _is_narrow(distance):
+    if is_narrow(distance):
         near_and_far = distance.mean * np.array([1.0, 1 + STEP])
         normals = _normals(family, light, near_and_far)[0]
         by_distance = across @ (normals[1] - normals[0]) / (STEP * distance.mean) * distance.sd

@@ -5,10 +5,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from simtest.calibration import NO_PRIORS, Normal, Priors
+from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.bisector import DISTANCES
+from simtest.estimators.bisector import DISTANCES, is_narrow
 from simtest.estimators.budget import Budget, line_covariance
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
@@ -160,11 +160,10 @@ def _budget(model: RenderedQuadric, covariance: Array, priors: Priors) -> Budget
     told = mean_light_part(model.normal, priors)
     known = {"noise": noise} if told is None else {"noise": noise, "light_offset": told}
     distances = priors.distance.quantile(DISTANCES)
-    if isinstance(priors.distance, Normal):
-        # The derivative, which the ends of a wide normal distribution would bend.
+    if is_narrow(priors.distance):
         distances = model.distance * np.array([1.0, 1 + STEP])
     moves = bisect(distances[:, None] * model.sightline, model.light) @ across.T
-    if not isinstance(priors.distance, Normal):
+    if not is_narrow(priors.distance):
         return {**known, "distance": line_covariance(moves)}
     by_distance = (moves[1] - moves[0]) / (STEP * model.distance) * priors.distance.sd
     return {**known, "distance": np.outer(by_distance, by_distance)}
