@@ -89,17 +89,19 @@ class FirstPicture:
             columns.append(np.zeros(2) if moved is None else basis @ (moved.normal - at.normal))
         return np.stack(columns, axis=1) / (STEP * self.distance)
 
-    def sources(self, covariance: Array, distance_sd: float, gain_sd: float) -> Array:
+    def sources(self, covariance: Array, distance_sd: float, gain_sd: float, lobe_sd: float = 0.0) -> Array:
         """Return the covariance of `SOURCES`, shape (6, 6).
 
         Noise that changes the gains by `gain_sd` turns the axes of the highlight's second moments by
-        sqrt(2) gain_sd r / (1 - r^2), with r the axis ratio: those of a round highlight are not known.
+        sqrt(2) gain_sd r / (1 - r^2), with r the axis ratio: those of a round highlight are not known. A lobe that is
+        not known exactly changes both gains alike, by `lobe_sd`.
         """
         low, high = np.sort(np.abs(self.gains))
         ratio = float(low / high)
         turn = min(MOST_TURN, np.sqrt(2) * gain_sd * ratio / max(1 - ratio**2, 1e-9))
         made = np.diag([0.0, 0.0, distance_sd, gain_sd, gain_sd, turn]) ** 2
         made[:2, :2] = covariance
+        made[3:5, 3:5] += lobe_sd**2
         return made
 
     def _predict(self, position: Array, change: Array) -> Prediction | None:

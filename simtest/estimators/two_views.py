@@ -6,7 +6,7 @@ sizes of 1 + d k (theory.md section 3, item 3), the motion their signs.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,7 +23,7 @@ GAIN_SD = 0.03
 """Default relative standard deviation of the first picture's abs(1 + d k)."""
 
 LEAST_SD = 1e-4
-"""Standard deviation of a normal that states none, rad, and least allowance for the patch's third order."""
+"""Least allowance for the patch's third order, rad."""
 
 CHANGE_SD = 0.3
 """Standard deviation of the relative change of the curvatures over one working distance along the surface."""
@@ -100,6 +100,8 @@ class RankedHypotheses:
         Twice the negative log-likelihood, up to a constant: `distance2` and the log of the covariance's determinant.
     freedom : int
         Degrees of freedom of `distance2`: 2 for each further picture.
+    gain_sd : float
+        Relative standard deviation of the sizes of the hypotheses.
     """
 
     hypotheses: Array
@@ -107,6 +109,7 @@ class RankedHypotheses:
     predicted: Array
     deviance: Array
     freedom: int = 2
+    gain_sd: float = GAIN_SD
 
     @property
     def margin(self) -> float:
@@ -134,7 +137,7 @@ class RankedHypotheses:
         other = np.sign(self.hypotheses) != np.sign(self.hypotheses[0])
         return np.array([self._preferred[of].min(initial=np.inf) for of in other.T])
 
-    def told_bends(self, gain_sd: float = GAIN_SD) -> tuple[int, int]:
+    def told_bends(self) -> tuple[int, int]:
         """Sign of the curvature k along each direction, 0 where it is not told.
 
         An abs(1 + d k) below 1 is that of a concave surface, whatever its sign; where it is 1 within the noise, the
@@ -144,7 +147,7 @@ class RankedHypotheses:
         for i, sign in enumerate(self.told_signs):
             gains = self.hypotheses[:, i]
             gains = gains[np.sign(gains) == sign] if sign else gains
-            bends = np.sign(gains - 1) * (np.abs(gains - 1) > 2 * gain_sd * np.abs(gains))
+            bends = np.sign(gains - 1) * (np.abs(gains - 1) > 2 * self.gain_sd * np.abs(gains))
             told.append(int(bends[0]) if (bends == bends[0]).all() else 0)
         return told[0], told[1]
 
@@ -213,8 +216,8 @@ def rank_by_motions(
     first : Estimate
         See `rank_by_motion`, as for `priors` and `gain_sd`.
     views : sequence of MovedView
-        Those without an estimate, and those too far off for the patch, are passed over. Where none is left a Failure
-        ``no_estimate`` or ``undecided``.
+        Those without an estimate that states its uncertainty, and those too far off for the patch, are passed over.
+        Where none is left a Failure ``no_estimate`` or ``undecided``.
 
     Raises
     ------
@@ -223,11 +226,14 @@ def rank_by_motions(
     """
     if first.curvature is None or first.curvature.hypotheses is None or priors.distance_mm is None:
         return Failure(Reason.NOT_KNOWN, "needs curvature hypotheses of the first picture, and its distance")
+    if first.covariance is None:
+        return Failure(Reason.NOT_KNOWN, "needs the uncertainty of the first picture's normal, which states none")
+    views = [replace(view, estimates=[e for e in view.estimates if e.covariance is not None]) for view in views]
     used = [(view, rigid(view.view_from_first, "view_from_first")) for view in views if view.estimates]
     if not used:
-        return Failure(Reason.NO_ESTIMATE, "no further picture shows the highlight")
-    covariance = np.zeros((2, 2)) if first.covariance is None else first.covariance
-    covariance = covariance + LEAST_SD**2 * np.eye(2) if first.covariance is None else covariance
+        return Failure(Reason.NO_ESTIMATE, "no further picture shows the highlight, with an uncertainty")
+    # The sizes of all gains go with 1 / sqrt(c) of the lobe.
+    lobe_sd = priors.lobe_curvature.sd / priors.lobe_curvature.mean / 2 if priors.lobe_curvature else 0.0
     distance_sd = priors.distance_mm.sd / priors.distance_mm.mean
     hypotheses = first.curvature.hypotheses
     pictures = [FirstPicture(first, priors.distance_mm.mean, gains) for gains in hypotheses]
@@ -239,14 +245,15 @@ def rank_by_motions(
         return Failure(Reason.UNDECIDED, "the camera moved farther than the curvatures at one point predict")
     judged = []
     for i, picture in enumerate(pictures):
-        sources = picture.sources(covariance, distance_sd, gain_sd)
+        sources = picture.sources(first.covariance, distance_sd, gain_sd, lobe_sd)
         judged.append(_judge([of_view[i] for of_view in near], sources))
     distance2, deviance = (np.array([each[i] for each in judged]) for i in range(2))
     predicted = np.array([each[2] for each in judged])
     order = np.argsort(distance2, kind="stable")
     return RankedHypotheses(
-        hypotheses[order], distance2[order], predicted[order], deviance[order], freedom=2 * len(near)
-    )
+        hypotheses[order], distance2[order], predicted[order], deviance[order], 2 * len(near),
+        float(np.hypot(gain_sd, lobe_sd)),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -300,8 +307,7 @@ def _moved_by_pose(picture: FirstPicture, prediction: Prediction, error: PoseErr
 
 def _turned(estimate: Estimate, R: Array, predicted: Array) -> Array:
     """Return a further normal's covariance in the predicted one's tangent basis, first camera's frame."""
-    if estimate.covariance is None:
-        return np.zeros((2, 2))
+    assert estimate.covariance is not None
     turn = basis_across(predicted) @ (basis_across(estimate.normal) @ R).T
     return np.asarray(turn @ estimate.covariance @ turn.T)
 

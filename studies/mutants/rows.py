@@ -281,7 +281,7 @@ ROWS = (
         "inverse.rendered_quadric:RenderedQuadric.shape", "np.exp(-self.log_exponent / 2)",
         "np.exp(-self.log_exponent)", "inverse_rendering"),
     row("noise of a rendered patch not turned into its normal's basis", "covariance", "inverse.estimator:_budget",
-        "J @ fitted.covariance[:2, :2] @ J.T", "fitted.covariance[:2, :2]", "turned_frames"),
+        "J @ covariance[:2, :2] @ J.T", "covariance[:2, :2]", "turned_frames"),
     row("part by the distance a quarter", "budget", "inverse.estimator:_budget", "* priors.distance.sd",
         "* priors.distance.sd / 2", "turned_frames"),
     row("hypotheses of a rendered patch: falloff's sign", "estimators", "inverse.estimator:_curvature",

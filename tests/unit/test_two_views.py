@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Normal, Priors, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.cone_axis import cone_axis
-from simtest.estimators.curved import curved
+from simtest.estimators.curved import curved, sign_hypotheses
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.estimators.two_views import rank_by_motion
 from simtest.reconstruction.pipeline import reconstruct
@@ -100,12 +100,16 @@ def test_without_motion_nothing_is_told(view):
 # Exact geometry ------------------------------------------------------------------------------------------------------
 
 
+def exact(normal, **given):
+    return Estimate(normal, normal[None], np.zeros(2), covariance=1e-8 * np.eye(2), **given)
+
+
 def sphere_estimate(kd, normal):
     m = 1 + kd
     other = -2 / LOBE - m
     hypotheses = np.array([[a, b] for a in (m, other) for b in (m, other)])
     directions = np.array([[1.0, 0, 0], [0, 1.0, 0]])
-    return Estimate(normal, normal[None], np.zeros(2), curvature=EstimatedCurvature(directions, 1.0, hypotheses))
+    return exact(normal, curvature=EstimatedCurvature(directions, 1.0, hypotheses))
 
 
 @pytest.mark.parametrize("turn_deg", [(0, 0, 0), (40, -70, 25)])
@@ -121,7 +125,7 @@ def test_small_motions_on_spheres_are_predicted_exactly(kd, turn_deg):
     towards = place - centre
     # Within the centre's distance the camera lies between the highlight and the centre.
     normal = turn @ (towards / np.linalg.norm(towards)) * np.sign(kd * (1 + kd))
-    second = Estimate(normal, normal[None], np.zeros(2))
+    second = exact(normal)
     ranked = rank_by_motion(first, second, T, Priors(distance_mm=exactly(D)))
     np.testing.assert_allclose(ranked.hypotheses[0], 1 + kd)
     np.testing.assert_allclose(ranked.predicted[0], normal, atol=3e-6)
@@ -133,7 +137,7 @@ def test_a_motion_along_one_principal_direction_tells_that_sign_only():
     T = np.eye(4)
     T[0, 3] = -0.5
     normal = np.array([0.5, 0, -30.0]) / np.hypot(0.5, 30.0)
-    ranked = rank_by_motion(first, Estimate(normal, normal[None], np.zeros(2)), T, Priors(distance_mm=exactly(D)))
+    ranked = rank_by_motion(first, exact(normal), T, Priors(distance_mm=exactly(D)))
     assert (ranked.hypotheses[:2, 0] == 1.5).all()
     assert sorted(np.sign(ranked.hypotheses[:2, 1])) == [-1, 1]
     assert ranked.distance2[2] - ranked.distance2[1] > 9
@@ -150,3 +154,25 @@ def test_what_is_missing_or_malformed_is_said():
     for motion in (np.eye(3), np.diag([1.0, 1, 2, 1]), np.diag([1.0, 1, -1, 1]), np.full((4, 4), np.nan)):
         with pytest.raises(InputError, match="second_from_first"):
             rank_by_motion(full, bare, motion, Priors(distance_mm=exactly(D)))
+
+
+def test_without_an_uncertainty_nothing_is_told():
+    normal = np.array([0.0, 0, -1])
+    first, T, priors = sphere_estimate(0.5, normal), np.eye(4), Priors(distance_mm=exactly(D))
+    silent = [each.without_uncertainty() for each in (first, exact(normal))]
+    assert rank_by_motion(silent[0], exact(normal), T, priors).reason == Reason.NOT_KNOWN
+    assert rank_by_motion(first, silent[1], T, priors).reason == Reason.NO_ESTIMATE
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_a_plane_is_not_told_to_bend_by_a_lobe_that_may_be_narrower(spread):
+    """With the lobe taken for 1.4 times as curved as it is, a plane's gain is 0.845."""
+    hypotheses = sign_hypotheses(np.full(2, LOBE + 2), 1.4 * LOBE)
+    normal, T = np.array([0.0, 0, -1]), np.eye(4)
+    first = exact(normal, curvature=EstimatedCurvature(np.eye(3)[:2], 1.0, hypotheses))
+    T[:2, 3] = -0.3, 0.2
+    told = Normal(1.4 * LOBE, spread * 1.4 * LOBE)
+    ranked = rank_by_motion(first, exact(normal), T, Priors(distance_mm=exactly(D), lobe_curvature=told))
+    # A lobe that is given as exact is taken at its word.
+    assert ranked.fits == (spread > 0)
+    assert ranked.told_bends() == ((0, 0) if spread else (-1, -1))
