@@ -9,6 +9,7 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
+from simtest.estimators.budget import Budget
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.goodness import correlation_of_noise, excess_of_misfit, is_misfit
 from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
@@ -65,8 +66,8 @@ class HighlightPixels:
 
     def covariance(self, fitted: LobeFit[Model]) -> Array:
         """Return the covariance of a fit's parameters, whose pixels differ in noise as told; its size is measured."""
-        size = fitted.sigma**2 * float(np.mean(np.square(self.noise))) if isinstance(self.noise, np.ndarray) else 0.0
-        if not size > 0:
+        size = fitted.sigma**2 * float(np.mean(np.square(0.0 if self.noise is None else self.noise)))
+        if not isinstance(self.noise, np.ndarray) or not size > 0:
             return fitted.covariance
         intensity, J = fitted.model.evaluate()
         if self.clipped is not None:
@@ -122,17 +123,13 @@ class Photometric:
             return Failure(Reason.NOT_CONVERGED, "the fit of a quadric did not converge")
         e, f, s = fitted.model.frame
         covariance = _turned(pixels.covariance(fitted)[:2, :2], fitted.model.normal, np.stack([e, f]))
-        # beyond noise: a misfit, or a drift of the isophotes' axis
-        excess, misfit = family.drift_excess, False
+        excess, misfit = 0.0, False
         if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
             misfit = True
-            excess = max(excess_of_misfit(fitted, pixels.observed, pixels.clipped), excess)
+            excess = excess_of_misfit(fitted, pixels.observed, pixels.clipped)
         else:
             covariance = covariance * pixels.correlation(fitted)
-        shape = MISFIT_SHARE * excess * np.eye(2) + family.bend_error()
-        budget = {"noise": covariance, "shape": shape + family.drift_error}
-        if family.clipping.any():
-            budget["resolution"] = family.clipping
+        budget = {"noise": covariance, **beyond_noise(family, excess)}
         estimate = Estimate(
             normal=fitted.model.normal,
             candidates=fitted.model.normal[None],
@@ -144,7 +141,8 @@ class Photometric:
         )
         estimate = add_untold_parts(estimate, camera, priors, family)
         # A bend of the isophotes and the residuals of the fit show the same structure.
-        return _with_misfit_told(estimate, float(np.trace(shape))) if misfit else estimate
+        added = float(np.trace(budget["shape"] - family.drift_error))
+        return _with_misfit_told(estimate, added) if misfit else estimate
 
 
 @dataclass(frozen=True)
@@ -225,6 +223,16 @@ def _with_misfit_told(estimate: Estimate, added: float) -> Estimate:
     if added < (MISFIT_FACTOR**2 - 1) * without:
         return estimate
     return replace(estimate, flags=(*estimate.flags, "misfit"))
+
+
+def beyond_noise(family: IsophoteFamily, excess: float = 0.0) -> Budget:
+    """Return the parts of a fitted lobe's budget that its noise does not show.
+
+    They are those of a misfit's squared shift, `excess`, rad^2, or of the axis's drift, and of bends and clipping.
+    """
+    shape = MISFIT_SHARE * max(excess, family.drift_excess) * np.eye(2) + family.bend_error()
+    clipping = {"resolution": family.clipping} if family.clipping.any() else {}
+    return {"shape": shape + family.drift_error, **clipping}
 
 
 def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False, least: float = 0.0) -> HighlightPixels | Failure:

@@ -13,9 +13,10 @@ from simtest.estimators.budget import Budget, line_covariance
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
 from simtest.estimators.highlight_fit import fit_highlight, fit_small
+from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.light_assignment import light_of_highlight
 from simtest.estimators.lobe_fit import LobeFit, fit_lobe
-from simtest.estimators.photometric import HighlightPixels, highlight_pixels
+from simtest.estimators.photometric import HighlightPixels, beyond_noise, highlight_pixels
 from simtest.estimators.prior_parts import add_common_parts, light_offset_part, mean_light_part
 from simtest.estimators.protocol import Estimate, EstimatedCurvature, Law
 from simtest.geometry import Array, Camera, Patch
@@ -57,10 +58,11 @@ class InverseRendering:
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Estimate normal and curvature (see `simtest.estimators.Estimator`).
 
-        The estimate has one candidate. Its covariance is that of the Gauss-Newton matrix and of the distance's
-        uncertainty. Where the lobe is known, the hypotheses of `curvature` are what the picture's second order allows,
-        as in `curved`, the fitted one first. Fails with ``unresolved`` where a highlight is too small for a shape, and
-        with ``not_known`` where several lights are given and it is not clear which one it is of.
+        The estimate has one candidate. Its covariance is that of the Gauss-Newton matrix, of the distance's uncertainty
+        and, as by `photometric`, of the isophotes' drift, bends and clipping. Where the lobe is known, the hypotheses
+        of `curvature` are what the picture's second order allows, as in `curved`, the fitted one first. Fails with
+        ``unresolved`` where a highlight is too small for a shape, and with ``not_known`` where several lights are given
+        and it is not clear which one it is of.
 
         Raises
         ------
@@ -70,7 +72,7 @@ class InverseRendering:
         if (spot := fit_small([patch], camera)[0]) is not None:
             return spot.no_shape
         start, family = cone_axis.estimate(patch, camera), fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
-        if isinstance(start, Failure) or isinstance(family, Failure):
+        if isinstance(start, Failure) or not isinstance(family, IsophoteFamily):
             return start
         own = 0 if len(priors.lights_mm) < 2 else light_of_highlight(family, priors)
         if own is None:
@@ -84,7 +86,7 @@ class InverseRendering:
         found = fitted.model
         gains = 1 + np.linalg.eigvalsh(found.shape)
         covariance = pixels.correlation(fitted) * pixels.covariance(fitted)
-        budget = _budget(found, covariance, _of_light(priors, own))
+        budget = {**_budget(found, covariance, _of_light(priors, own)), **beyond_noise(family)}
         estimate = Estimate(
             normal=found.normal,
             candidates=found.normal[None],
