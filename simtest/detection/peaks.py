@@ -28,7 +28,7 @@ class PeakDetector:
         """Find the peaks of a frame (see `simtest.detection.Detector`)."""
         regions = detect(frame.smoothed, frame.noise, self.isolated, frame.seen)
         if self.isolated:
-            flat = flat_pixels(frame.encoded)
+            flat = flat_pixels(frame.encoded, frame.seen)
             regions = [region for region in regions if _is_highlight(region, frame, flat)]
         return Detection(tuple(regions), frame)
 

@@ -356,5 +356,5 @@ def _estimate_from_json(entry: JsonObject) -> Estimate | Failure:
         curvature = EstimatedCurvature(np.array(shape["directions"], dtype=float), shape["axis_ratio"], gains)
     return Estimate(
         normal, candidates, look_px, entry["axis_ratio"], (), margin, flags=flags, budget=budget,
-        target=entry["target"], curvature=curvature,
+        target=entry["target"], curvature=curvature, axis_ratio_deviation=entry.get("axis_ratio_deviation"),
     )  # fmt: skip

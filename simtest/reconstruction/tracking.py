@@ -105,14 +105,20 @@ class Tracker:
         self.reach = REACH_SHARE * max(size)
         self._tracks: list[_Moving] = []
         self._count = 0
+        self._next = 0
 
-    def update(self, positions_px: Sequence[npt.ArrayLike]) -> list[int]:
-        """Return the track of each specularity of the next frame, by their positions, px."""
+    def update(self, positions_px: Sequence[npt.ArrayLike], index: int) -> list[int]:
+        """Return the track of each specularity of the next frame that was read, by their positions, px."""
         # Imported here: slow to load, and single pictures have no tracks.
         from scipy.optimize import linear_sum_assignment
 
         points = np.asarray(positions_px, dtype=float).reshape(-1, 2)
         numbers = [-1] * len(points)
+        # In a frame that could not be read nothing was seen.
+        for track in self._tracks:
+            track.unseen += index - self._next
+        self._tracks = [track for track in self._tracks if track.unseen <= LOST_FRAMES]
+        self._next = index + 1
         # continue tracks
         if len(points) and self._tracks:
             expected = np.array([track.expected for track in self._tracks])
