@@ -127,7 +127,8 @@ class Tracker:
             for i, j in zip(*linear_sum_assignment(np.minimum(gaps, self.reach)), strict=True):
                 if gaps[i, j] < self.reach:
                     track = self._tracks[j]
-                    track.step, track.position, track.unseen = points[i] - track.position, points[i], -1
+                    track.step = (points[i] - track.position) / (track.unseen + 1)
+                    track.position, track.unseen = points[i], -1
                     numbers[i] = track.number
         # end those that were lost
         for track in self._tracks:

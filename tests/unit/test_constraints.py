@@ -83,6 +83,14 @@ def test_an_answer_without_a_patch_is_a_constraint_too():
     np.testing.assert_array_equal(made["covariance"][0], alone.covariance)
 
 
+def test_the_outline_of_the_view_is_that_of_its_largest_part():
+    y, x = np.mgrid[:120, :160]
+    seen = (x < 110) | ((x - 140) ** 2 + (y - 60) ** 2 < 15**2)
+    record = PictureRecord("", CAMERA, "linear", "peaks", View(seen), [], [], ())
+    outline = np.array(record.to_json()["view"]["outline"])
+    assert (outline.min(axis=0).tolist(), outline.max(axis=0).tolist()) == ([0.5, 0.5], [109.5, 119.5])
+
+
 @pytest.mark.parametrize("dk", [1.0, 3.0, 6.0])
 def test_the_region_at_the_pixel_holds_the_normal_on_its_sightline(dk):
     made = stored(dk)

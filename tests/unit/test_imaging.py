@@ -361,6 +361,15 @@ def test_frames_that_could_not_be_read_count_as_unseen(unread, number):
     assert tracker.update([(103, 100)], 8 + unread) == [number]
 
 
+def test_a_step_over_frames_without_the_highlight_is_that_of_one_frame():
+    tracker = Tracker((640, 480))
+    assert tracker.update([(100, 100)], 0) == [0]
+    assert [tracker.update([], index) for index in (1, 2)] == [[], []]
+    assert tracker.update([(118, 100)], 4) == [0]
+    # It goes on at 4.5 px a frame; the other one begins where a step of 18 px would have led.
+    assert tracker.update([(122.5, 100), (128, 100)], 5) == [0, 1]
+
+
 # References -------------------------------------------------------------------------------------------------------
 
 
