@@ -204,7 +204,7 @@ def classify(
     traced = [_traced(spot, smoothed, (clipped, white), seen) for spot in spots]
     # ellipses of all isophotes at once
     fits = _fit(traced)
-    return [_classified(one, fitted, linear, mask, light) for one, fitted in zip(traced, fits, strict=True)]
+    return [_classified(one, fitted, linear, mask, light, seen) for one, fitted in zip(traced, fits, strict=True)]
 
 
 def _traced(spot: Spot, smoothed: Image, full: tuple[Mask, Mask], seen: Mask | None) -> _Traced:
@@ -248,13 +248,15 @@ def _fit(traced: list[_Traced]) -> list[list[_Fitted]]:
     return fits
 
 
-def _classified(one: _Traced, fits: list[_Fitted], linear: Image, mask: Mask, light: SplitLight) -> Highlight | None:
+def _classified(
+    one: _Traced, fits: list[_Fitted], linear: Image, mask: Mask, light: SplitLight, seen: Mask | None
+) -> Highlight | None:
     """Return the highlight of a spot with its kind and score; None where it is pale tissue."""
     spot, area = one.spot, one.spot.area_px
     # measurements
     outline, box = _outline(one, light.specular.shape)
     axis_ratio, residual, wander = _shape(fits)
-    tint, clutter, surround = _around(spot, box, linear, mask, light)
+    tint, clutter, surround = _around(spot, box, linear, mask, light, seen)
     kind = _kind(one, axis_ratio, residual, wander, tint, clutter)
     long = area >= MIN_SHAPE_PX and axis_ratio is not None and axis_ratio < ROUND
     if long or kind not in (*SINGLE, Kind.UNCLEAR):
@@ -356,7 +358,9 @@ def _shape(fits: list[_Fitted]) -> tuple[float | None, float | None, float | Non
     return float(np.sqrt(low / high)), float(np.mean(residuals)), float(wander)
 
 
-def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) -> tuple[float, float, float]:
+def _around(
+    spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight, seen: Mask | None
+) -> tuple[float, float, float]:
     """Return tint and clutter of a highlight (see `Highlight`), and the light of its surroundings over its own.
 
     The channels are ranked by the tissue around it.
@@ -364,15 +368,16 @@ def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) 
     x, y, width, height = box
     crop = np.s_[y : y + height, x : x + width]
     values, specular = linear[crop], light.specular[crop]
-    # surroundings: away from all highlights
+    # surroundings: away from all highlights, inside the view
+    visible = np.ones(specular.shape, dtype=bool) if seen is None else seen[crop]
     bright = mask[crop] | (specular > HIGHLIGHT_ISOVALUE * spot.value)
-    around = cv2.dilate(bright.astype(np.uint8), _WIDE) == 0
+    around = visible & (cv2.dilate(bright.astype(np.uint8), _WIDE) == 0)
     if np.count_nonzero(around) < MIN_AREA_PX:
         return 1.0, 0.0, 0.0
     # The foot of a wide highlight reaches farther, and is no clutter.
     far, reach = around, min(int(FOOT_REACH * np.sqrt(spot.area_px / np.pi)), FARTHEST_PX)
     if reach > _WIDE.shape[0] // 2:
-        far = cv2.dilate(bright.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) == 0
+        far = visible & (cv2.dilate(bright.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) == 0)
         far = far if np.count_nonzero(far) >= MIN_AREA_PX else around
     clutter = _ranked(specular[far], CLUTTER_SHARE) / spot.value
     surroundings = values[around]
@@ -381,7 +386,7 @@ def _around(spot: Spot, box: Box, linear: Image, mask: Mask, light: SplitLight) 
     brighter = _ranked(mean_channel(surroundings[None])[0], PALE_SHARE)
     surround = brighter / max(float(own.mean()), 1e-6)
     # gain of each channel, on the rim: channels near full scale have lost it
-    shown = (specular >= 0.3 * spot.value) & (brightest_channel(values) < UNCLIPPED)
+    shown = visible & (specular >= 0.3 * spot.value) & (brightest_channel(values) < UNCLIPPED)
     if np.count_nonzero(shown) < MIN_AREA_PX:
         return 1.0, clutter, surround
     gain = values[shown].mean(axis=0) - tissue

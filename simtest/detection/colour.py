@@ -11,7 +11,7 @@ from simtest.detection.detector import Detection
 from simtest.detection.judging import ColourDetection, detection_of, judge_spots, plateaus, tissue_spots
 from simtest.detection.light_split import SplitLight, fill, split_light
 from simtest.detection.spots import Spot, find_spots
-from simtest.detection.view_mask import View, find_view
+from simtest.detection.view_mask import view_of
 from simtest.errors import InputError
 from simtest.geometry import Camera, Image, Mask, smooth
 
@@ -179,7 +179,7 @@ class ColourDetector:
         """Find the highlights of a frame; raise `InputError` where it has not three channels."""
         if frame.encoded.ndim != 3 or frame.encoded.shape[2] != 3:
             raise InputError(f"frame has shape {frame.encoded.shape}: detection by colour takes (H, W, 3)")
-        view = find_view(frame.encoded) if frame.seen is None else View(frame.seen)
+        view = view_of(frame)
         found = detect_colour(frame.channels, frame.clipped, view.seen)
         return detection_of(found, frame, view, self.isolated)
 

@@ -16,7 +16,7 @@ from simtest.detection.highlight_inputs import frame_statistics, highlight_input
 from simtest.detection.judging import ColourDetection, detection_of, judge_spots, plateaus, tissue_spots
 from simtest.detection.light_split import SplitLight, split_light
 from simtest.detection.spots import SADDLE, SADDLE_NOISE, rise_of_clipped, spots_of
-from simtest.detection.view_mask import View, find_view
+from simtest.detection.view_mask import view_of
 from simtest.errors import Failure, Reason
 from simtest.geometry import Camera, Image, Mask, smooth
 from simtest.runtime.onnx_model import OnnxModel
@@ -83,7 +83,7 @@ class LearnedDetector:
         if frame.encoded.ndim != 3 or frame.encoded.shape[2] != 3:
             told = f"outside the network's training: a frame of shape {frame.encoded.shape} without three channels"
             return Detection((), frame, refusal=Failure(Reason.NO_ESTIMATE, told))
-        view = find_view(frame.encoded) if frame.seen is None else View(frame.seen)
+        view = view_of(frame)
         found = self.find(frame.channels, frame.clipped, view.seen)
         if isinstance(found, Failure):
             return Detection((), replace(frame, seen=view.seen), view=view, refusal=found)

@@ -6,6 +6,7 @@ from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.detection.detector import Detection
 from simtest.detection.regions import Region, detect
 from simtest.detection.shape import flat_pixels, peak_shape
+from simtest.detection.view_mask import view_of
 from simtest.errors import Failure
 from simtest.geometry import Camera, Mask
 from simtest.geometry.gaussian_smoothing import share_of_noise
@@ -28,9 +29,9 @@ class PeakDetector:
         """Find the peaks of a frame (see `simtest.detection.Detector`)."""
         regions = detect(frame.smoothed, frame.noise, self.isolated, frame.seen)
         if self.isolated:
-            flat = flat_pixels(frame.encoded)
+            flat = flat_pixels(frame.encoded, frame.seen)
             regions = [region for region in regions if _is_highlight(region, frame, flat)]
-        return Detection(tuple(regions), frame)
+        return Detection(tuple(regions), frame, view=view_of(frame, search=False))
 
 
 peaks = PeakDetector()

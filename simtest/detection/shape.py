@@ -13,15 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from simtest.conventions import (
-    DEFAULT_SMOOTHING_PX,
-    HIGHLIGHT_ELLIPSE_RESIDUAL,
-    HIGHLIGHT_ISOVALUE,
-    HIGHLIGHT_WIDTH_EXCESS,
-)
+from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL, HIGHLIGHT_ISOVALUE, HIGHLIGHT_WIDTH_EXCESS
 from simtest.detection.regions import Region
 from simtest.errors import Failure
 from simtest.geometry import FittedConic, Mask, Patch, fit_ellipse, smooth
+from simtest.geometry.gaussian_smoothing import share_of_noise
 
 RESIDUAL_ISOVALUE = 0.7
 """The isophote that is compared with an ellipse: lower ones reach farther out, where curvature changes, and higher
@@ -76,14 +72,15 @@ class PeakShape:
         return not (bent or flat)
 
 
-def flat_pixels(frame: npt.NDArray[np.floating]) -> Mask | None:
+def flat_pixels(frame: npt.NDArray[np.floating], seen: Mask | None = None) -> Mask | None:
     """Find the clipped pixels of a frame, shape (H, W) or (H, W, C), without a calibration.
 
-    They are those where a channel has the frame's largest value; None where these are so few that they may be an
-    accident.
+    They are those of the view, `seen`, default all, where a channel has the largest value there; None where these are
+    so few that they may be an accident.
     """
-    largest = frame >= frame.max()
+    largest = frame >= (frame if seen is None else frame[seen]).max(initial=-np.inf)
     mask = np.asarray(largest if largest.ndim == 2 else largest.any(axis=2))
+    mask = mask if seen is None else mask & seen
     return mask if np.count_nonzero(mask) >= MIN_FLAT_PX else None
 
 
@@ -132,17 +129,20 @@ def _at_own_scale(patch: Patch) -> tuple[Patch, float]:
     """Smooth a peak by a share of its width, which leaves a Gaussian one; also return the remaining share of noise."""
     width = math.sqrt(float(np.count_nonzero(patch.inside(HIGHLIGHT_ISOVALUE))) / math.pi)
     more = SCALE * width
-    if more <= DEFAULT_SMOOTHING_PX / 2:
+    if more <= patch.smoothing_px / 2:
         return patch, 1.0
     # the peak of the smoothed patch, near the old one
-    values = smooth(patch.values, more)
+    values, width_px = smooth(patch.values, more, patch.seen), math.hypot(patch.smoothing_px, more)
     rows, columns = np.nonzero(patch.inside(TOP_ISOVALUE))
     highest = int(np.argmax(values[rows, columns]))
     height, wide = values.shape
-    found = Patch.cut(values, (0, 0, wide, height), (int(columns[highest]), int(rows[highest])), patch.origin_px)
+    found = Patch.cut(
+        values, (0, 0, wide, height), (int(columns[highest]), int(rows[highest])), patch.origin_px,
+        seen=patch.seen, smoothing_px=width_px,
+    )  # fmt: skip
     if isinstance(found, Failure):
         return patch, 1.0
-    return found, DEFAULT_SMOOTHING_PX / math.hypot(DEFAULT_SMOOTHING_PX, more)
+    return found, share_of_noise(width_px) / share_of_noise(patch.smoothing_px)
 
 
 def _slope(level: float) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration.calibration import brightest_channel
+from simtest.calibration.frame import Frame
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, ViewMask
 from simtest.runtime.short_repr import short_repr
@@ -58,6 +59,14 @@ class View:
 
 
 WHOLE = View(None)
+
+
+def view_of(frame: Frame, search: bool = True) -> View:
+    """Return the view that a frame states, or else the one that its picture shows; without `search` the whole."""
+    if frame.seen is None:
+        return find_view(frame.encoded) if search else WHOLE
+    stated = frame.camera.view_mask
+    return View(frame.seen, stated if stated is not None and stated.corner is None else None)
 
 
 def find_view(picture: npt.NDArray[np.floating]) -> View:

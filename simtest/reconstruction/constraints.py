@@ -15,7 +15,7 @@ VERSION = 2
 
 
 def constraints_arrays(record: PictureRecord) -> dict[str, npt.NDArray[np.generic]]:
-    """Return the content of constraints.npz: no pickles, a row a specularity with a best normal, and K (3, 3).
+    """Return the content of constraints.npz: no pickles, K (3, 3), and a row a best normal that looks along a ray.
 
     The normal and its covariance are those of the surface at the highlight's brightest point, wherever that is; the
     pixel, at which the best normal looks, is where it is estimated. Of the surface on the sightline through that pixel
@@ -24,7 +24,7 @@ def constraints_arrays(record: PictureRecord) -> dict[str, npt.NDArray[np.generi
     made = [
         (spot, spot.best, best)
         for spot in record.specularities
-        if spot.best is not None and spot.sightline is not None and (best := spot.best_estimate) is not None
+        if spot.best is not None and (best := spot.best_estimate) is not None
         if np.isfinite(record.camera.unproject(best.look_px)).all()
     ]
     pixels = np.array([best.look_px for _, _, best in made], dtype=float).reshape(-1, 2)

@@ -254,7 +254,7 @@ def _view_json(view: View) -> JsonObject | None:
     if view.seen is None:
         return None
     contours, _ = cv2.findContours(view.seen.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    polygon = cv2.approxPolyDP(max(contours, key=len), 1.0, True)[:, 0] if contours else np.empty((0, 2))
+    polygon = cv2.approxPolyDP(max(contours, key=cv2.contourArea), 1.0, True)[:, 0] if contours else np.empty((0, 2))
     return {"circle": view.circle, "outline": polygon + PIXEL_CENTRE}
 
 
@@ -356,5 +356,5 @@ def _estimate_from_json(entry: JsonObject) -> Estimate | Failure:
         curvature = EstimatedCurvature(np.array(shape["directions"], dtype=float), shape["axis_ratio"], gains)
     return Estimate(
         normal, candidates, look_px, entry["axis_ratio"], (), margin, flags=flags, budget=budget,
-        target=entry["target"], curvature=curvature,
+        target=entry["target"], curvature=curvature, axis_ratio_deviation=entry.get("axis_ratio_deviation"),
     )  # fmt: skip

@@ -261,22 +261,24 @@ def _run(
     # detect
     detection, beside = run_detector(detector, frame), tuple[Region, ...]()
     if box is not None:
-        detection, beside = _cut_region(frame, box, detection.regions)
+        detection, beside = _cut_region(frame, box, detection)
     # estimate
     made = _estimate(detection, chosen, beside)
     return made if target == "fine" else _at_base(made, calibration.priors)
 
 
-def _cut_region(
-    frame: Frame, box: tuple[int, int, int, int], detected: tuple[Region, ...]
-) -> tuple[Detection, tuple[Region, ...]]:
+def _cut_region(frame: Frame, box: tuple[int, int, int, int], found: Detection) -> tuple[Detection, tuple[Region, ...]]:
     """Take a user's region of interest for the one specularity, and return it with the frame's other regions.
 
     Raises `InputError` where it leaves the frame.
     """
+    detected = found.regions
+    # The frame's own light, in the view that the detector found.
+    if found.view.seen is not None and found.view.seen is not frame.seen:
+        frame = replace(frame, seen=found.view.seen)
     patch = frame.patch(box)
     if isinstance(patch, Failure):
-        return Detection((Region(box, box[:2], None),), frame), detected
+        return Detection((Region(box, box[:2], None),), frame, view=found.view), detected
     x, y = (int(v) for v in patch.peak_px)
     # Of the detected regions the nearest one inside its isophote is the same highlight.
     inside = np.argwhere(patch.inside(HIGHLIGHT_ISOVALUE, cut=True))[:, ::-1] + box[:2]
@@ -285,7 +287,8 @@ def _cut_region(
         key=lambda region: math.dist(region.peak, (x, y)),
         default=None,
     )
-    return Detection((Region(box, (x, y), None),), frame), tuple(each for each in detected if each is not own)
+    own_detection = Detection((Region(box, (x, y), None),), frame, view=found.view)
+    return own_detection, tuple(each for each in detected if each is not own)
 
 
 def _above_noise(patch: Patch | Failure) -> Patch | Failure:
@@ -397,7 +400,7 @@ def _flagged(
     flags = (*flags, "dim") if dim else flags
     if touched:
         isovalues = [i.isovalue for i in result.isophotes if 0 < i.isovalue < 1]
-        used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE))
+        used = patch.inside(min(isovalues, default=HIGHLIGHT_ISOVALUE), cut=True)
         flags = (*(name for name, mask in touched.items() if (mask & used).any()), *flags)
     # Answers made elsewhere may state them already.
     new = [flag for flag in flags if flag not in result.flags]

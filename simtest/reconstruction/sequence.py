@@ -181,7 +181,7 @@ class _Run:
         # done by an earlier run: only the tracks are counted anew
         done = None if self._is_made else _read_done(stem.with_suffix(".json"), frame.name)
         if done is not None:
-            self._keep(done, self._tracked(done.specularities, done.size))
+            self._keep(done, self._tracked(done.specularities, done.size, frame.index))
             return
         try:
             self._reconstruct(frame, stem)
@@ -204,7 +204,7 @@ class _Run:
                 warnings.warn(caution, stacklevel=5)
         record = reconstruct_values(frame.name, picture, self._calibration, self.options, self._cautions)
         self.assumed = record.assumed
-        spots = self._tracked(record.specularities, size)
+        spots = self._tracked(record.specularities, size, frame.index)
         overlay = draw_overlay(picture, spots)
         # Not before a frame is there: a run that reads nothing leaves nothing.
         if not self.folder.is_dir() or not (self.out / SETTINGS).is_file():
@@ -240,9 +240,9 @@ class _Run:
                 entry["motion"] = spot.motion
             write_json(path, data, compact=True)
 
-    def _tracked(self, spots: list[SpecularityRecord], size: tuple[int, int]) -> list[SpecularityRecord]:
+    def _tracked(self, spots: list[SpecularityRecord], size: tuple[int, int], index: int) -> list[SpecularityRecord]:
         self._tracker = self._tracker or Tracker(size)
-        numbers = self._tracker.update([spot.position_px for spot in spots])
+        numbers = self._tracker.update([spot.position_px for spot in spots], index)
         return [replace(spot, track=number) for spot, number in zip(spots, numbers, strict=True)]
 
 

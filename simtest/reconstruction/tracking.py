@@ -105,14 +105,20 @@ class Tracker:
         self.reach = REACH_SHARE * max(size)
         self._tracks: list[_Moving] = []
         self._count = 0
+        self._next = 0
 
-    def update(self, positions_px: Sequence[npt.ArrayLike]) -> list[int]:
-        """Return the track of each specularity of the next frame, by their positions, px."""
+    def update(self, positions_px: Sequence[npt.ArrayLike], index: int) -> list[int]:
+        """Return the track of each specularity of the next frame that was read, by their positions, px."""
         # Imported here: slow to load, and single pictures have no tracks.
         from scipy.optimize import linear_sum_assignment
 
         points = np.asarray(positions_px, dtype=float).reshape(-1, 2)
         numbers = [-1] * len(points)
+        # In a frame that could not be read nothing was seen.
+        for track in self._tracks:
+            track.unseen += index - self._next
+        self._tracks = [track for track in self._tracks if track.unseen <= LOST_FRAMES]
+        self._next = index + 1
         # continue tracks
         if len(points) and self._tracks:
             expected = np.array([track.expected for track in self._tracks])
@@ -121,7 +127,8 @@ class Tracker:
             for i, j in zip(*linear_sum_assignment(np.minimum(gaps, self.reach)), strict=True):
                 if gaps[i, j] < self.reach:
                     track = self._tracks[j]
-                    track.step, track.position, track.unseen = points[i] - track.position, points[i], -1
+                    track.step = (points[i] - track.position) / (track.unseen + 1)
+                    track.position, track.unseen = points[i], -1
                     numbers[i] = track.number
         # end those that were lost
         for track in self._tracks:

@@ -8,12 +8,14 @@ import pytest
 import simtest
 from simtest.calibration import Calibration, NoiseModel, Priors, Response, Uniform
 from simtest.calibration.calibration import MIN_FALLOFF
-from simtest.detection import detect, estimate_noise
+from simtest.detection import Region, detect, estimate_noise
+from simtest.detection.detector import Detection
 from simtest.errors import Failure, InputError, Reason
+from simtest.estimators import Estimate
 from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
 from simtest.geometry.angular_profile import AngularProfile
-from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction.pipeline import reconstruct, run_pipeline
 from simtest.simulation.camera_chain import capture, collect
 from simtest.spec import load_calibration, load_camera, save_calibration
 from simtest.spec.sensor import Sensor
@@ -363,6 +365,27 @@ def test_saturation_is_flagged_where_it_is_known():
     frame[:3, :3] = 5.0
     (found,) = reconstruct(frame, Calibration(CAMERA, saturation_level=2.0), roi=(30, 10, 100, 100))
     assert found.estimates["cone_axis"].flags == ()
+
+
+def test_a_highlight_that_a_border_cuts_is_flagged_for_its_own_pixels_alone():
+    frame = spot(80.0, 60.0)
+    frame[50:70, 110:120] = 5.0  # clipped, in the region and no part of the highlight
+
+    known = Calibration(CAMERA, saturation_level=2.0)
+    region = Region((80, 10, 60, 100), (80, 60), 1.0)
+
+    class Found:
+        def detect(self, frame, camera, priors):
+            return Detection((region,), frame)
+
+    class Facing:
+        def estimate(self, patch, camera, priors):
+            return Estimate(-camera.unproject(patch.peak_px), -camera.unproject(patch.peak_px)[None], patch.peak_px)
+
+    made = run_pipeline(frame, known, Found(), {"facing": Facing()}, None, 1.0)
+    (found,) = made.specularities
+    assert isinstance(found.patch.isophote(0.5), Failure)
+    assert found.estimates["facing"].flags == ()
 
 
 def test_one_clipped_channel_is_enough():

@@ -2,16 +2,16 @@ import cv2
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, srgb_encode
+from simtest.calibration import Calibration, srgb_decode, srgb_encode
 from simtest.detection import colour as colour_detection
-from simtest.detection.blobs import Kind
-from simtest.detection.light_split import fill, split_light
+from simtest.detection.blobs import Kind, _around
+from simtest.detection.light_split import SplitLight, fill, split_light
 from simtest.detection.spots import Spot
 from simtest.detection.view_mask import find_view
 from simtest.errors import InputError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
-from simtest.reconstruction import detect_in_picture, reconstruct_colour
+from simtest.reconstruction import detect_in_picture, reconstruct, reconstruct_colour
 from studies.detection.scores import Scores, score
 from studies.detection.truth import SpecularTruth, specular_truth
 
@@ -203,6 +203,40 @@ def test_a_round_border_is_found(cx, cy, radius):
     np.testing.assert_allclose([view.circle.cx, view.circle.cy, view.circle.radius], [cx, cy, radius], atol=1.5)
     assert not (view.seen & ~inside).any()
     assert np.count_nonzero(view.seen) > 0.9 * np.count_nonzero(inside)
+
+
+def round_frame(specular=0.0):
+    x, y = places()
+    inside = (x - 160) ** 2 + (y - 120) ** 2 <= 110**2
+    frame = picture(specular + np.zeros((HEIGHT, WIDTH)))
+    frame[~inside] = 0.02
+    return frame
+
+
+def test_a_region_of_interest_keeps_the_view_that_is_found():
+    frame, camera = round_frame(lobe(160, 120, 6.0, peak=0.5)), Camera.from_fov(60.0, WIDTH, HEIGHT)
+    with_region, whole = (
+        reconstruct(np.rint(255 * frame).astype(np.uint8), camera, {}, roi=roi) for roi in ((130, 90, 60, 60), None)
+    )
+    assert whole.detection.view.circle is not None
+    assert with_region.detection.view.circle == whole.detection.view.circle
+    np.testing.assert_array_equal(with_region.detection.frame.seen, whole.detection.view.seen)
+    np.testing.assert_array_equal(with_region[0].patch.seen, whole.detection.view.seen[90:150, 130:190])
+
+
+def test_the_dark_outside_the_view_is_no_tissue_around_a_highlight():
+    """The tint and the brightness of the surroundings are those of the tissue that is seen."""
+    specular = lobe(160, 24, 5.0, peak=0.5)
+    (x, y), frame = places(), round_frame(specular)
+    seen = (x - 160) ** 2 + (y - 120) ** 2 <= 104**2
+    told = []
+    for outside in (0.0, 1.0):
+        linear = srgb_decode(frame)
+        linear[~seen] = outside
+        spot = Spot(np.array([[160, 24]]), 0.5, (155, 19), specular[19:30, 155:166] > 0.25, False, False)
+        light = SplitLight(np.where(seen, specular, 0).astype(np.float32), linear.mean(axis=2), 0.004)
+        told.append(_around(spot, (140, 4, 41, 41), linear, specular > 0.05, light, seen))
+    assert told[0] == told[1]
 
 
 def test_cut_corners_are_found():

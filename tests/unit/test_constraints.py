@@ -1,13 +1,17 @@
 """constraints.npz: the region of each normal holds the surface's normal where the entry says that it stands."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Response, exactly
+from simtest.detection.view_mask import View
+from simtest.estimators import Estimate
 from simtest.geometry import Camera, chi_squared
 from simtest.reconstruction.constraints import constraints_arrays
+from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.reconstruction.picture import Options, reconstruct_values
 
 CAMERA = Camera(160, 120, 400.0, 400.0, 80.0, 60.0)
@@ -59,6 +63,32 @@ def held(made, truths, key):
         (miss,) = each["basis"] @ (truth - each["normal"][0])
         inside.append(miss @ np.linalg.solve(each[key][0], miss) <= QUANTILE)
     return np.mean(inside)
+
+
+def test_an_answer_without_a_patch_is_a_constraint_too():
+    """What a frame's estimator finds by itself, such as a cloud: the other files hold it."""
+    normal, look = np.array([0.0, 0.0, -1.0]), np.array([30.0, 20.0])
+    alone = Estimate(normal, normal[None], look, covariance=np.diag([1e-4, 4e-4]), target="base")
+    beyond = replace(alone, look_px=np.array([np.nan, np.nan]))
+    camera, whole = CAMERA, View(None)
+    spots = [
+        SpecularityRecord(i, (30, 20, 1, 1), None, None, None, None, "own", {"own": each})
+        for i, each in ((4, alone), (5, beyond))
+    ]
+    made = constraints_arrays(PictureRecord("", camera, "linear", "peaks", whole, [], spots, ()))
+    # An answer that looks along no ray has no sightline to stand on.
+    assert (made["id"].tolist(), made["target"].tolist()) == ([4], ["base"])
+    np.testing.assert_array_equal(made["pixel"], [look])
+    np.testing.assert_allclose(made["sightline"], [CAMERA.unproject(look)])
+    np.testing.assert_array_equal(made["covariance"][0], alone.covariance)
+
+
+def test_the_outline_of_the_view_is_that_of_its_largest_part():
+    y, x = np.mgrid[:120, :160]
+    seen = (x < 110) | ((x - 140) ** 2 + (y - 60) ** 2 < 15**2)
+    record = PictureRecord("", CAMERA, "linear", "peaks", View(seen), [], [], ())
+    outline = np.array(record.to_json()["view"]["outline"])
+    assert (outline.min(axis=0).tolist(), outline.max(axis=0).tolist()) == ([0.5, 0.5], [109.5, 119.5])
 
 
 @pytest.mark.parametrize("dk", [1.0, 3.0, 6.0])

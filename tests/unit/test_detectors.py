@@ -101,6 +101,18 @@ def test_detectors_are_found_by_name_or_given():
             load_detector(given)
 
 
+@pytest.mark.parametrize("corner", [None, 30.0])
+@pytest.mark.parametrize("detector", [peaks, colour])
+def test_the_view_that_the_camera_states_is_told(detector, corner):
+    mask = ViewMask(CAMERA.width / 2, CAMERA.height / 2, 45.0, corner)
+    camera = replace(CAMERA, view_mask=mask)
+    light = lobes()
+    frame = Frame(np.repeat(light[:, :, None] / light.max(), 3, axis=2), Calibration(camera), 1.0)
+    view = detector.detect(frame, camera).view
+    np.testing.assert_array_equal(view.seen, camera.seen)
+    assert view.circle == (mask if corner is None else None)
+
+
 def test_a_region_that_was_given_has_no_contrast_and_still_a_shape():
     frame = Frame(lobes(), Calibration(CAMERA), 2.0)
     detected = peaks.detect(frame, CAMERA).regions[0]

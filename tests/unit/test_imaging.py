@@ -346,12 +346,28 @@ def test_what_is_no_sequence(tmp_path):
 
 def test_tracks_cross_gaps_and_do_not_jump():
     tracker = Tracker((640, 480))
-    assert tracker.update([(100, 100), (300, 200)]) == [0, 1]
-    assert tracker.update([(305, 203), (104, 100)]) == [1, 0]
-    assert tracker.update([(108, 100)]) == [0]
-    assert tracker.update([(111, 101), (310, 206)]) == [0, 1]
-    assert tracker.update([(500, 400)]) == [2]
-    assert tracker.update([]) == []
+    assert tracker.update([(100, 100), (300, 200)], 0) == [0, 1]
+    assert tracker.update([(305, 203), (104, 100)], 1) == [1, 0]
+    assert tracker.update([(108, 100)], 2) == [0]
+    assert tracker.update([(111, 101), (310, 206)], 3) == [0, 1]
+    assert tracker.update([(500, 400)], 4) == [2]
+    assert tracker.update([], 5) == []
+
+
+@pytest.mark.parametrize(("unread", "number"), [(0, 0), (3, 0), (4, 1), (40, 1)])
+def test_frames_that_could_not_be_read_count_as_unseen(unread, number):
+    tracker = Tracker((640, 480))
+    assert tracker.update([(100, 100)], 7) == [0]
+    assert tracker.update([(103, 100)], 8 + unread) == [number]
+
+
+def test_a_step_over_frames_without_the_highlight_is_that_of_one_frame():
+    tracker = Tracker((640, 480))
+    assert tracker.update([(100, 100)], 0) == [0]
+    assert [tracker.update([], index) for index in (1, 2)] == [[], []]
+    assert tracker.update([(118, 100)], 4) == [0]
+    # It goes on at 4.5 px a frame; the other one begins where a step of 18 px would have led.
+    assert tracker.update([(122.5, 100), (128, 100)], 5) == [0, 1]
 
 
 # References -------------------------------------------------------------------------------------------------------

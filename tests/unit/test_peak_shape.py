@@ -9,6 +9,7 @@ from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL, HIGHLIGHT_WIDTH_EXCE
 from simtest.detection import detect, flat_pixels, peak_shape
 from simtest.errors import Failure
 from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry.gaussian_smoothing import share_of_noise
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import reconstruct
 from tests.marked import marked
@@ -39,7 +40,8 @@ def ridge(x, y):
 def shape_of(frame, noise=0.0):
     smoothed = smooth(frame, 2.0)
     (region,) = detect(smoothed, noise, isolated=False)
-    shape = peak_shape(Patch.cut(smoothed, region.box, region.peak), region, noise / 7.1, flat_pixels(frame))
+    patch = Patch.cut(smoothed, region.box, region.peak, smoothing_px=2.0)
+    shape = peak_shape(patch, region, noise / 7.1, flat_pixels(frame))
     assert not isinstance(shape, Failure)
     return shape
 
@@ -91,6 +93,45 @@ def test_noise_is_allowed_for(sigma):
     assert found >= 39
     # The fit takes part of it up: the contour of a spot smoothed at its own scale has few independent points.
     assert 0.3 < np.mean(residuals) / np.mean(predicted) < 1.0
+
+
+@pytest.mark.parametrize("smoothing_px", [0.0, 1.0, 4.0])
+def test_the_noise_that_is_left_follows_the_frame_s_own_smoothing(smoothing_px):
+    """White noise that both Gaussians leave, whatever the first one's width; each at its own share of it."""
+    smoothed = smooth(frame_of(gaussian), smoothing_px)
+    (region,) = detect(smoothed, 0.0, isolated=False)
+    patch = Patch.cut(smoothed, region.box, region.peak, smoothing_px=smoothing_px)
+    shape = peak_shape(patch, region, share_of_noise(smoothing_px), None)
+    width = np.sqrt(np.count_nonzero(patch.inside(0.5)) / np.pi)
+    left = share_of_noise(np.hypot(smoothing_px, 0.2 * width))
+    height = region.contrast - (patch.peak_value - smooth(patch.values, 0.2 * width).max())
+    level = 1 - 0.3 * (height + patch.peak_value - region.contrast) / height
+    assert shape.residual_noise == pytest.approx(left / height / (-2 * level * np.log(level)), rel=1e-3)
+
+
+def test_a_shape_is_measured_inside_the_view_alone():
+    """What shines or is dark outside enters neither the smoothed peak nor its isophotes."""
+    frame = frame_of(gaussian)
+    seen = np.arange(SIZE)[:, None] + np.zeros((1, SIZE)) < 96
+    shapes = []
+    for outside in (0.0, 5.0):
+        smoothed = smooth(np.where(seen, frame, np.float32(outside)), 2.0, seen)
+        smoothed[~seen] = outside
+        (region,) = [each for each in detect(smooth(frame, 2.0, seen), 0.0, False, seen)]
+        patch = Patch.cut(smoothed, region.box, region.peak, seen=seen, smoothing_px=2.0)
+        shapes.append(peak_shape(patch, region, 0.0))
+    assert not isinstance(shapes[0], Failure)
+    assert shapes[0] == shapes[1]
+
+
+def test_only_what_is_seen_counts_as_clipped():
+    frame = np.minimum(frame_of(gaussian), 0.7).astype(np.float32)
+    frame[2:8, 2:8] = 1.0
+    seen = np.ones(frame.shape, dtype=bool)
+    seen[:10] = False
+    assert np.array_equal(flat_pixels(frame, seen), (frame == np.float32(0.7)) & seen)
+    assert flat_pixels(frame, ~seen)[2:8, 2:8].all()
+    assert flat_pixels(frame, np.zeros_like(seen)) is None
 
 
 @pytest.mark.parametrize("false", [near_miss, ridge])
