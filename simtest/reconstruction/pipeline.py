@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration, Frame, Priors
+from simtest.calibration.frame import Box
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
 from simtest.detection.blobs import Kind
@@ -35,7 +36,7 @@ from simtest.reconstruction.choices import (
 )
 from simtest.reconstruction.found import Reconstruction, Specularities, Specularity
 from simtest.reconstruction.picture_values import check_frame, check_roi, check_size, image_size
-from simtest.runtime.arrays import Image, Mask
+from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.resources import shown
 
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
@@ -263,11 +264,11 @@ def _run(
     if box is not None:
         detection, beside = _cut_region(frame, box, detection)
     # estimate
-    made = _estimate(detection, chosen, beside)
+    made = _estimate(detection, chosen, beside, box)
     return made if target == "fine" else _at_base(made, calibration.priors)
 
 
-def _cut_region(frame: Frame, box: tuple[int, int, int, int], found: Detection) -> tuple[Detection, tuple[Region, ...]]:
+def _cut_region(frame: Frame, box: Box, found: Detection) -> tuple[Detection, tuple[Region, ...]]:
     """Take a user's region of interest for the one specularity, and return it with the frame's other regions.
 
     Raises `InputError` where it leaves the frame.
@@ -303,11 +304,12 @@ def _above_noise(patch: Patch | Failure) -> Patch | Failure:
 
 
 def _estimate(
-    detection: Detection, estimators: Mapping[str, AnyEstimator], beside: Sequence[Region] = ()
+    detection: Detection, estimators: Mapping[str, AnyEstimator], beside: Sequence[Region], box: Box | None
 ) -> Reconstruction:
     """Run each estimator on all patches of a picture, or on the whole frame.
 
-    `beside` are further specularities of the frame, which are only neighbours.
+    `beside` are further specularities of the frame, which are only neighbours; answers outside `box`, the region that a
+    user named, are not asked for.
     """
     frame, regions = detection.frame, detection.regions
     # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement, and a dim
@@ -342,7 +344,12 @@ def _estimate(
             if result is not None
         }
         result.specularities.append(Specularity(region, patch, estimates))
-    undetected = [_undetected(name, estimate, frame) for name, each in made.items() for estimate in each.elsewhere]
+    undetected = [
+        _undetected(name, estimate, frame)
+        for name, each in made.items()
+        for estimate in each.elsewhere
+        if box is None or _is_inside(estimate.look_px, box)
+    ]
     # Clouds stand last.
     result.specularities.extend(sorted(undetected, key=_is_of_cloud))
     return result
@@ -365,6 +372,10 @@ def _at_base(made: Reconstruction, priors: Priors) -> Reconstruction:
 
 def _is_of_cloud(specularity: Specularity) -> bool:
     return any(isinstance(e, Estimate) and e.cloud is not None for e in specularity.estimates.values())
+
+
+def _is_inside(point_px: Array, box: Box) -> bool:
+    return bool((np.array(box[:2]) <= point_px).all() and (point_px < np.add(box[:2], box[2:])).all())
 
 
 def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:

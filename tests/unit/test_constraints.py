@@ -1,5 +1,6 @@
 """constraints.npz: the region of each normal holds the surface's normal where the entry says that it stands."""
 
+import json
 from dataclasses import replace
 from functools import cache
 
@@ -13,6 +14,7 @@ from simtest.geometry import Camera, chi_squared
 from simtest.reconstruction.constraints import constraints_arrays
 from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.reconstruction.picture import Options, reconstruct_values
+from simtest.runtime.files import write_json
 
 CAMERA = Camera(160, 120, 400.0, 400.0, 80.0, 60.0)
 AXIS = CAMERA.unproject(np.array([87.0, 64.0]))
@@ -81,6 +83,15 @@ def test_an_answer_without_a_patch_is_a_constraint_too():
     np.testing.assert_array_equal(made["pixel"], [look])
     np.testing.assert_allclose(made["sightline"], [CAMERA.unproject(look)])
     np.testing.assert_array_equal(made["covariance"][0], alone.covariance)
+
+
+def test_an_estimate_is_read_back_with_the_spread_of_its_axis_ratio(tmp_path):
+    normal = np.array([0.0, 0.0, -1.0])
+    given = Estimate(normal, normal[None], np.array([30.0, 20.0]), axis_ratio=0.5, axis_ratio_deviation=0.1)
+    spot = SpecularityRecord(0, (30, 20, 1, 1), None, None, None, None, "own", {"own": given})
+    write_json(tmp_path / "spot.json", spot)
+    read = SpecularityRecord.from_json(json.loads((tmp_path / "spot.json").read_text()))
+    assert read.normals["own"].axis_ratio_deviation == 0.1
 
 
 def test_the_outline_of_the_view_is_that_of_its_largest_part():

@@ -312,6 +312,14 @@ def test_estimators_of_patches_and_of_frames_meet_in_the_specularities():
     assert isinstance(alone.estimates["frame"], Estimate)
 
 
+def test_a_region_of_interest_keeps_what_a_frame_estimator_sees_in_it():
+    x, y = (int(value) for value in CENTRES[0])
+    beside = (CENTRES[0][0] + 18.0, CENTRES[0][1])
+    found = reconstruct(picture(), CAMERA, {"frame": Peaks((*CENTRES, beside))}, roi=(x - 20, y - 20, 40, 40))
+    looks = [spot.estimates["frame"].look_px.tolist() for spot in found]
+    assert looks == [list(CENTRES[0]), list(beside)]
+
+
 def test_without_specularities_a_frame_estimator_is_asked_all_the_same():
     class Blind:
         def detect(self, frame, camera, priors):
