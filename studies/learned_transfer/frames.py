@@ -25,7 +25,6 @@ from simtest.runtime.files import make_folder, write_atomically
 from simtest.runtime.seeds import key as hashed
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.rendered_view import RenderedView
-from studies.detection.tissue_frames import TissueFrame
 from studies.hard.cases import scene_of
 from studies.hard.measure import Frames
 from studies.hard.rows import PICTURE, Row, lit_from, moving, plain, vessels, wide, with_relief
@@ -137,14 +136,6 @@ class HardFrame:
     def frame(self) -> Frame:
         """Return the picture as estimators see it."""
         return Frame(self.encoded, self.calibration, SMOOTHING_PX)
-
-    def as_tissue(self) -> TissueFrame:
-        """Return what `studies.detection.tissue` scores."""
-        regions = self.regions.astype(np.int32)
-        name = f"{self.kind} {self.scene}"
-        return TissueFrame(
-            name, self.picture, self.peaks, self.radii, self.clearness, self.whole, np.zeros(len(self.peaks)), regions
-        )
 
 
 def hard_frames(scenes: Sequence[int], rows: Sequence[Row], folder: Path) -> Iterator[HardFrame]:

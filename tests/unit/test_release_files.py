@@ -94,7 +94,7 @@ def test_a_wheel_that_holds_more_than_the_package_or_is_too_large_is_refused(tmp
 def test_an_installation_must_have_all_entry_points_and_data():
     told = loaded("release_check").told()
     assert {"cone_axis", "circle_pose"} <= set(told["simtest.estimators"])
-    assert {"peaks", "colour", "learned_detector"} == set(told["simtest.detectors"])
+    assert {"peaks", "colour"} == set(told["simtest.detectors"])
     assert {"cylinder", "published"} <= set(told["scenes"])
     assert {"overview", "laws"} <= set(told["experiments"])
     assert {"colon", "liver"} == set(told["meshes"])

@@ -17,7 +17,7 @@ DOCUMENTED = {
     "simtest.gate.limits": ("Limits",),
     "simtest.gate.records": ("COMPARISONS", "FIGURES", "Verdict"),
     "simtest.imaging.depth": ("depth_points", "read_depth"),
-    "simtest.learn": ("Crops", "read_crops"),
+    "simtest.learn": (),
     "simtest.report.nightly": ("write_nightly_page",),
 }
 

@@ -7,19 +7,15 @@ task of `tasks` alone. The task of `spot_task` learns from the highlights that `
 network for `simtest.estimators.learned_spot`. The task of `dense_task` learns from the frames that `dense_frames`
 reads; `dense_export` writes its network for `simtest.estimators.learned_dense`. Both fit their uncertainty with
 `calibration` and write through `onnx_export`.
-
-`crops` and `network` are those of docs/gallery/learning.md: smooth colons, without uncertainty.
 """
 
 from typing import TYPE_CHECKING
 
-from simtest.dataset.learn.crops import Crops, read_crops
 from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.dataset.learn.samples import Samples
 
-__all__ = ["Crops", "Samples", "read_crops"]
+__all__ = ["Samples"]
 
-# Crops need no PyTorch.
 __getattr__, _ = lazy_names(__name__, {"simtest.dataset.learn.samples": ("Samples",)})

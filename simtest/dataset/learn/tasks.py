@@ -47,7 +47,6 @@ class Task(Protocol):
 
 TASKS = {
     "dense_normals": "simtest.dataset.learn.dense_task:DenseNormals",
-    "highlight_instances": "simtest.dataset.learn.detector_task:HighlightInstances",
     "spot_normals": "simtest.dataset.learn.spot_task:SpotNormals",
 }
 """Class of each task by name."""
