@@ -4,8 +4,8 @@
         [--hard] [--real] [--overlays FOLDER] [--sheet FILE]
 
 SMOOTH and TISSUE are the files model.onnx of one task, trained on `highlights_smooth` and on `highlights`
-(`simtest train`). The folder of `--kept` holds the frames of the corpus `hard`, rendered at the first run, and the
-answers on them: a run that was ended goes on where it stopped. Without `--hard` and `--real`
+(`python -m studies.networks`). The folder of `--kept` holds the frames of the corpus `hard`, rendered at the first run,
+and the answers on them: a run that was ended goes on where it stopped. Without `--hard` and `--real`
 both parts are run. Tasks without files are left out. `--overlays` writes a PNG of each real frame and method, `--sheet`
 one contact sheet of all.
 """

@@ -52,7 +52,6 @@ def test_the_list_names_what_commands_take(here):
         for name in listed[kind]:
             if name != "published":  # a scene of validate alone
                 load(name)
-    assert list(listed["trainings"]) == ["dense_normals", "spot_normals"]
     assert list(listed["estimators"]) == ESTIMATORS.names()
     for name in listed["sensors"]:
         load_scene("plane", {"sensor.preset": name})
@@ -71,8 +70,8 @@ def test_one_kind_is_listed_alone(here):
     assert code == 0
     assert [line.split()[0] for line in lines] == ["full", "quick"]
     assert here("list", "profile")[2] == [
-        'simtest: Invalid value "profile" for KIND. Choose from: "scenes", "experiments", "datasets", "trainings", '
-        '"profiles", "estimators", "detectors", "sensors", "rigs". Did you mean "profiles"?'
+        'simtest: Invalid value "profile" for KIND. Choose from: "scenes", "experiments", "datasets", "profiles", '
+        '"estimators", "detectors", "sensors", "rigs". Did you mean "profiles"?'
     ]
 
 
@@ -245,12 +244,18 @@ def test_reports_are_json_on_request():
                "doctor", "list", "render", "views", "view", "export", "reconstruct", "realism", "fit", "validate",
                "nightly", "nightly accept", "dataset", "dataset verify", "dataset sample", "dataset preview",
                "dataset export", "mesh check", "mesh colon", "mesh liver", "bench run", "bench table",
-               "bench cases", "bench frames", "camera show", "camera convert", "train"}  # fmt: skip
+               "bench cases", "bench frames", "camera show", "camera convert"}  # fmt: skip
     without = {"schema", "completion", "mesh"}  # a schema is JSON, a script is none, mesh alone does nothing
     for name in reports:
         found, *_ = commands.APP.parse_commands(name.split())[1][-1:]
         assert any("--json" in argument.names for argument in found.assemble_argument_collection()), name
     assert {name.split()[0] for name in reports} | without == set(commands.COMMANDS)
+
+
+def test_a_command_that_is_gone_says_what_takes_its_place(here):
+    assert not set(commands.GONE) & set(commands.COMMANDS)
+    for name, instead in commands.GONE.items():
+        assert here(name, "--out", "x") == (2, "", [f"simtest: {name}: is gone; {instead}"])
 
 
 # How much is said ------------------------------------------------------------------------------------------------
