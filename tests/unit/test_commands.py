@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
+import simtest
 from simtest.cli import commands, manners, printing, progress
 from simtest.cli.listing import HEADINGS, names_of
 from simtest.cli.options import gather_settings
@@ -250,6 +251,11 @@ def test_reports_are_json_on_request():
         found, *_ = commands.APP.parse_commands(name.split())[1][-1:]
         assert any("--json" in argument.names for argument in found.assemble_argument_collection()), name
     assert {name.split()[0] for name in reports} | without == set(commands.COMMANDS)
+
+
+def test_the_package_runs_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "simtest", "--version"], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, simtest.__version__, "")
 
 
 def test_a_command_that_is_gone_says_what_takes_its_place(here):

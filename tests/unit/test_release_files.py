@@ -157,13 +157,3 @@ def test_version_changelog_and_citation_agree():
     assert next(heading for heading in headings if heading != "Unreleased") == version
     assert "Unreleased" not in headings[1:]
     assert f"\nversion: {version}\n" in (CI.parent / "CITATION.cff").read_text(encoding="utf-8")
-
-
-def test_every_deprecated_name_is_listed_with_the_release_in_which_it_goes():
-    from simtest._renamed import GONE, MODULES
-
-    page = (CI.parent / "docs" / "reference" / "stable.md").read_text(encoding="utf-8")
-    rows = [line for line in page.splitlines() if line.endswith(f"| {GONE} |")]
-    listed = set(re.findall(r"`(simtest[\w.]*)`", " ".join(row.split("|")[1] for row in rows)))
-    # Modules below a listed one follow it.
-    assert {old for old in MODULES if not any(old == n or old.startswith(f"{n}.") for n in listed)} == set()
