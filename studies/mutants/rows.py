@@ -385,8 +385,6 @@ ROWS = (
         "equivalent_variance(moves @ vectors[:, 1]) * along", "equivalent_variance(moves @ vectors[:, 1]) / 4 * along",
         "prior_parts"),
     # reconstruction
-    row("a normal's covariance counts four times", "covariance", "reconstruction.completion:complete",
-        "np.linalg.inv(spread) for", "np.linalg.inv(4 * spread) for", "completion"),
     row("quaternion's scalar taken first", "transposes", "reconstruction.poses:_from_tum", "np.roll(values[4:], 1)",
         "values[4:]", "poses"),
     row("unit of poses divided by", "units", "reconstruction.poses:read_poses", "made[:, :3, 3] *= _unit_mm",
