@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry import Image, Mask
-from simtest.geometry.gaussian_smoothing import share_of_noise
+from simtest.geometry.patch import share_of_noise
 
 _KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 """Difference of two Laplacians: blind to any quadratic image (Immerkaer 1996); its norm is 6."""

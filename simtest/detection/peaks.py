@@ -8,7 +8,7 @@ from simtest.detection.regions import Region, detect
 from simtest.detection.shape import flat_pixels, peak_shape
 from simtest.errors import Failure
 from simtest.geometry import Camera, Mask
-from simtest.geometry.gaussian_smoothing import share_of_noise
+from simtest.geometry.patch import share_of_noise
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.estimators.two_views import PoseError
-from simtest.geometry.quaternions import rotation_of
+from simtest.geometry.vectors import rotation_of
 from simtest.reconstruction.dataset_poses import dataset_poses
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import require_plain

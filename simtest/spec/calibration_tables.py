@@ -6,10 +6,10 @@ from dataclasses import fields
 from typing import Any
 
 from simtest.calibration import Calibration, Distribution, NoiseModel, Normal, Priors, Response, Uniform
+from simtest.calibration.angular_profile import AngularProfile
 from simtest.calibration.calibration import OPTICAL_AXIS
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
 from simtest.errors import InputError
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.spec.camera_tables import camera_table
 from simtest.spec.toml_files import toml_tables
 

@@ -8,9 +8,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.errors import InputError
-from simtest.geometry.camera import Camera, ViewMask
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
-from simtest.geometry.field_of_view import FovExtent, focal_of_view
+from simtest.geometry.camera import Camera, FovExtent, ViewMask, focal_of_view
+from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.runtime.arrays import Array
 from simtest.spec.motion import Motion
 from simtest.spec.spec_model import Spec, validate

@@ -4,9 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import lens_name
-from simtest.geometry.field_of_view import FOV_EXTENTS, field_of_view
+from simtest.geometry.camera import FOV_EXTENTS, Camera, field_of_view
+from simtest.geometry.lenses import lens_name
 from simtest.spec.camera_tables import describe_camera
 
 PLACES = {

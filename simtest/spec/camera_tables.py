@@ -4,7 +4,7 @@ from dataclasses import asdict
 from typing import NotRequired, TypedDict
 
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import lens_name
+from simtest.geometry.lenses import lens_name
 from simtest.spec.toml_files import toml_tables, toml_value
 
 

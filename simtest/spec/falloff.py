@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from simtest.geometry.angular_profile import AngularProfile
+from simtest.calibration.angular_profile import AngularProfile
 from simtest.spec.spec_model import Spec
 
 

@@ -7,9 +7,9 @@ from typing import Any
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
+from simtest.calibration.angular_profile import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import find, shown
 from simtest.runtime.short_repr import short_repr

@@ -12,7 +12,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.quaternions import quaternion_of
+from simtest.geometry.vectors import quaternion_of
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.spec.camera_formats.writing import file_contents, write_files

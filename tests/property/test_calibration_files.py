@@ -22,11 +22,11 @@ from simtest.calibration import (
     Uniform,
     exactly,
 )  # fmt: skip
+from simtest.calibration.angular_profile import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
 from simtest.estimators.process.requests import priors_message
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, ViewMask
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction.assumptions import calibration_of_view
 from simtest.simulation.frame_files import picture_calibration
 from simtest.spec import load_scene, scene_from_dict

@@ -16,15 +16,15 @@ ROOT = Path(__file__).resolve().parents[2]
 
 PUBLIC = {
     "BackendError": "simtest.errors",
-    "BrownConrady": "simtest.geometry.perspective",
+    "BrownConrady": "simtest.geometry.lenses",
     "Calibration": "simtest.calibration.calibration",
     "Camera": "simtest.geometry.camera",
     "Estimate": "simtest.estimators.protocol",
     "Experiment": "simtest.spec.experiment",
     "Failure": "simtest.errors",
     "InputError": "simtest.errors",
-    "KannalaBrandt": "simtest.geometry.distortion",
-    "Scaramuzza": "simtest.geometry.omnidirectional",
+    "KannalaBrandt": "simtest.geometry.lenses",
+    "Scaramuzza": "simtest.geometry.lenses",
     "LabelledFrame": "simtest.simulation.labelled_frame",
     "Patch": "simtest.geometry.patch",
     "Reason": "simtest.errors",

@@ -7,7 +7,7 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.geometry.distortion import KannalaBrandt
+from simtest.geometry.lenses import KannalaBrandt
 from simtest.geometry.vectors import rotation
 from simtest.reconstruction.poses import read_poses
 from simtest.spec.trajectories import Trajectory, stack, tum_text, write_trajectory

@@ -21,11 +21,11 @@ from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot, usable_spots
 from simtest.advice.twin.tissue import NAMES, WIDER, tissue_of
 from simtest.advice.twin.writing import COLUMNS, write_twins
 from simtest.calibration import Calibration, CameraPrior, Normal, Priors, Response, Uniform
+from simtest.calibration.angular_profile import AngularProfile
 from simtest.errors import InputError, SimtestError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
-from simtest.geometry.angular_profile import AngularProfile
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
+from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import run_picture

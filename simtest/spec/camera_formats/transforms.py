@@ -14,7 +14,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt
+from simtest.geometry.lenses import BrownConrady, KannalaBrandt
 from simtest.runtime.arrays import Array
 from simtest.runtime.resources import shown, suggestion
 from simtest.spec.camera_formats.common import Poses, Table, check_alike, mask_table, number, read_json, rigid

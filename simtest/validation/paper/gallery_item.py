@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from simtest.errors import Failure
-from simtest.geometry.isocurves import brightest_point
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 from simtest.spec import Experiment
@@ -20,6 +19,7 @@ from simtest.validation.gallery_items import (
     PublishedDetails,
     write_item,
 )
+from simtest.validation.paper.isocurves import brightest_point
 from simtest.validation.paper.published_pipeline import Stages
 from simtest.validation.paper.rows import SURFACE, pipeline_with
 from simtest.validation.paper.slanted_view import Box, plane_from_image, texture, window_centre

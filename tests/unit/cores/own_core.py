@@ -15,7 +15,7 @@ from simtest.calibration.priors import CameraPrior
 from simtest.errors import Failure
 from simtest.estimators import load_estimators
 from simtest.geometry import Camera, Patch, ViewMask
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt
+from simtest.geometry.lenses import BrownConrady, KannalaBrandt
 
 FILES = "--files" in sys.argv
 LENSES = {"brown_conrady": BrownConrady, "kannala_brandt": KannalaBrandt}
