@@ -11,8 +11,7 @@ from simtest.rendering.mesh_edges import MOST_LIGHTS, MeshEdges
 from simtest.rendering.rays import in_tiles
 from simtest.rendering.shape_labels import CHANNELS, ShapeLabels
 from simtest.runtime.arrays import Image, Mask
-from simtest.spec.falloff import CosineProfile
-from simtest.spec.rig import LightSpec, is_at_camera
+from simtest.spec.lights import CosineProfile, LightSpec, is_at_camera
 from simtest.spec.scene import Scene
 from simtest.surfaces import Shape
 

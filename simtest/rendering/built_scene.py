@@ -19,8 +19,8 @@ from simtest.rendering.mesh_edges import MeshEdges
 from simtest.rendering.shape_labels import ShapeLabels
 from simtest.rendering.shapes import flat, make_shape
 from simtest.runtime.arrays import Array
+from simtest.spec.lights import LightSpec, Rig
 from simtest.spec.reflectance import Reflectance
-from simtest.spec.rig import LightSpec, Rig
 from simtest.surfaces import Shape, TriangleMesh
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from simtest.rendering.indirect import Bounces
 from simtest.rendering.integrate import Progress, Tracer
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.motion import Motion
+from simtest.spec.camera import Motion
 from simtest.spec.scene import Effort
 
 TracerAt = Callable[[Array], Tracer]

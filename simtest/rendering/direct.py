@@ -11,7 +11,7 @@ from simtest.rendering.hits import Hit
 from simtest.rendering.light_points import DRAWN, Draw, Drawer, point
 from simtest.rendering.lobes import channel_mean
 from simtest.rendering.rays import Lanes
-from simtest.spec.rig import Rig, is_at_camera
+from simtest.spec.lights import Rig, is_at_camera
 
 
 class Reflecting(Protocol):

@@ -13,8 +13,7 @@ import numpy as np
 from simtest.rendering import light_points, lobes
 from simtest.rendering.mitsuba_values import MitsubaDict, spectrum
 from simtest.runtime.arrays import Array
-from simtest.spec.falloff import CosineProfile, TableProfile
-from simtest.spec.rig import LightSpec
+from simtest.spec.lights import CosineProfile, LightSpec, TableProfile
 
 PLUGIN = "simtest_light"
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from simtest.rendering import glints, highlights
 from simtest.rendering.frames import HighlightPoint, Radiance
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 
 if TYPE_CHECKING:
     from simtest.rendering.session import Session

@@ -15,7 +15,7 @@ from simtest.rendering.hits import Hit
 from simtest.rendering.mitsuba_values import channels, spectrum
 from simtest.rendering.tissue import facet_density, visible_over_cosine
 from simtest.runtime.arrays import Array
-from simtest.spec.instrument import Instrument
+from simtest.spec.surfaces import Instrument
 from simtest.surfaces.instrument import RoundCones
 
 PER_PART = 12

@@ -11,8 +11,8 @@ from simtest.rendering.frames import HighlightPoint, Labels, TruthMaps
 from simtest.rendering.instrument_kernel import InstrumentKernel
 from simtest.rendering.placement_checks import check_instruments
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
-from simtest.spec.instrument import DEFAULT_DEPTH_SHARE, Instrument
-from simtest.spec.rig import is_at_camera
+from simtest.spec.lights import is_at_camera
+from simtest.spec.surfaces import DEFAULT_DEPTH_SHARE, Instrument
 from simtest.surfaces.instrument import round_cones
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 from simtest.rendering.mitsuba_values import MitsubaDict
 from simtest.rendering.rays import Lanes
 from simtest.runtime.arrays import Array
-from simtest.spec.light_source import CrescentSource, DiscSource, RingSource, Source
+from simtest.spec.lights import CrescentSource, DiscSource, RingSource, Source
 
 DRAWN = 4
 """Points of each source at each of a pixel's samples."""

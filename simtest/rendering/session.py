@@ -31,9 +31,9 @@ from simtest.rendering.rest_map import rest_map
 from simtest.rendering.session_truth import SessionTruth
 from simtest.rendering.shape_labels import ShapeLabels, as_labels
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.motion import Motion
+from simtest.spec.camera import Motion
+from simtest.spec.reflectance import Translucency
 from simtest.spec.scene import Scene
-from simtest.spec.translucency import Translucency
 from simtest.surfaces import SurfaceModel, make_surface
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from simtest.rendering.rays import Sightlines
 from simtest.rendering.relief_kernel import ReliefKernel
 from simtest.rendering.shape_labels import as_hits
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
-from simtest.spec.rig import is_at_camera
+from simtest.spec.lights import is_at_camera
 from simtest.spec.scene import Scene
 from simtest.surfaces import RayHits, Shape, SurfaceModel, SurfacePoints
 

@@ -13,20 +13,15 @@ from simtest.errors import InputError
 from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import find, shown
 from simtest.runtime.short_repr import short_repr
+from simtest.spec.camera import SceneCamera, Views
 from simtest.spec.camera_formats.common import read_json
-from simtest.spec.camera_spec import SceneCamera
-from simtest.spec.deformation import MOST_DEFORMATIONS, Deformation
-from simtest.spec.instrument import Instrument
-from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueReflectance
-from simtest.spec.rig import Rig
+from simtest.spec.keys import replace_values
+from simtest.spec.lights import Rig
+from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueColour, TissueReflectance, Translucency
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import Millimetres, Spec, validate
-from simtest.spec.surface import Surface
-from simtest.spec.tissue_colour import TissueColour
+from simtest.spec.surfaces import MOST_DEFORMATIONS, Deformation, Instrument, Surface
 from simtest.spec.toml_files import read_toml, source_name
-from simtest.spec.translucency import Translucency
-from simtest.spec.type_change import replace_values
-from simtest.spec.views import Views
 
 MOST_INSTRUMENTS = 8
 """More than a patient has ports for."""

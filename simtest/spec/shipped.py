@@ -45,7 +45,7 @@ def _sentence(text: str) -> str:
 
 def rig_presets() -> dict[str, str]:
     """Return the names of ``rig.preset``, with their lights."""
-    from simtest.spec.rig import PRESETS
+    from simtest.spec.lights import PRESETS
 
     return {name: _lights(ring.count, ring.radius_mm) for name, ring in PRESETS.items()}
 
@@ -57,7 +57,7 @@ def _lights(count: int, radius_mm: float) -> str:
 
 def sensor_presets() -> dict[str, str]:
     """Return the names of ``sensor.preset``, with what their frames went through."""
-    from simtest.spec.sensor_presets import PRESETS
+    from simtest.spec.sensor import PRESETS
 
     return {name: _chain(keys) for name, keys in PRESETS.items()}
 

@@ -7,7 +7,7 @@ first principal direction.
 import numpy as np
 
 from simtest.runtime.arrays import Array, IntArray
-from simtest.spec.surface import CylinderSurface, PlaneSurface, QuadricSurface, SphereSurface
+from simtest.spec.surfaces import CylinderSurface, PlaneSurface, QuadricSurface, SphereSurface
 from simtest.surfaces.model import (
     RayHits,
     Shape,

@@ -15,7 +15,7 @@ from scipy import ndimage, sparse
 from simtest.errors import InputError
 from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import Array, IntArray, Mask
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.model import SurfaceModel, TriangleMesh
 from simtest.surfaces.poses import CLEARANCE_SHARE, MIN_CLEARANCE_MM, MeshProbe
 

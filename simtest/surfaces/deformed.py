@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from simtest.runtime.arrays import Array
-from simtest.spec.deformation import Deformation
+from simtest.spec.surfaces import Deformation
 from simtest.surfaces.deformation import DeformationAt, MapJets
 from simtest.surfaces.model import (
     RayHits,

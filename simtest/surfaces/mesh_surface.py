@@ -12,7 +12,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.resources import find
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
 from simtest.surfaces.fineness import DEFAULT_EXPONENT, needed_edge, phong_concentration
 from simtest.surfaces.mesh_file import MESH_SUFFIXES, other_unit, read_mesh

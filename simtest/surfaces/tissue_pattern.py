@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.kept_arrays import kept
-from simtest.spec.tissue_colour import TissueColour
+from simtest.spec.reflectance import TissueColour
 from simtest.surfaces.haemoglobin import TISSUE_SATURATION, blood_absorption, reach
 from simtest.surfaces.model import SurfaceModel
 from simtest.surfaces.segment_table import NO_VESSELS, SegmentTable, make_table

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from simtest.runtime.arrays import Array, IntArray, Mask
-from simtest.spec.tissue_colour import Vessels
+from simtest.spec.reflectance import Vessels
 from simtest.surfaces.surface_samples import Patch, spread_points, thinned
 
 NODES_PER_SPACING = 2.5

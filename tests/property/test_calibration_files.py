@@ -30,7 +30,7 @@ from simtest.geometry import BrownConrady, Camera, KannalaBrandt, ViewMask
 from simtest.reconstruction.assumptions import calibration_of_view
 from simtest.simulation.frame_files import picture_calibration
 from simtest.spec import load_scene, scene_from_dict
-from simtest.spec.calibration_tables import degrees_of
+from simtest.spec.calibration_spec import degrees_of
 
 SCENES = sorted(
     p.stem for p in (Path(__file__).resolve().parents[2] / "scenes").glob("*.toml") if p.stem != "published"

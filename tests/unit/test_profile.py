@@ -5,7 +5,7 @@ import pytest
 
 from simtest.calibration.angular_profile import AngularProfile
 from simtest.errors import InputError
-from simtest.spec.falloff import CosineProfile, TableProfile
+from simtest.spec.lights import CosineProfile, TableProfile
 from simtest.spec.spec_model import validate
 
 

@@ -31,8 +31,8 @@ from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.kept_arrays import kept
 from simtest.spec import load_scene
-from simtest.spec.camera_spec import SceneCamera
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.camera import SceneCamera
+from simtest.spec.recipes import load_dataset
 from simtest.spec.spec_model import validate
 from simtest.surfaces.factory import make_surface
 

@@ -18,7 +18,7 @@ from simtest.dataset.reader import read_samples
 from simtest.dataset.sample import Sample
 from simtest.geometry.vectors import tangent_basis, tangent_coordinates
 from simtest.runtime.arrays import AnyArray, Array, Image, IntArray
-from simtest.spec.camera_spec import SceneCamera
+from simtest.spec.camera import SceneCamera
 from simtest.spec.sensor import Sensor
 
 SIDE = 32

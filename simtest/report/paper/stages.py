@@ -12,7 +12,7 @@ from simtest.pages.style import NEUTRAL, TRUTH, Symbol, degrees, labelled
 from simtest.report.paper.parameters import PARAMETERS
 from simtest.report.run_folder import GalleryItem, KeptEstimate, Run
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 
 _ISOPHOTE, _PLANE = "#00C2D1", "#444444"
 _DOT, _CROSS = Symbol("o", "circle", "●"), Symbol("X", "x", "✖")

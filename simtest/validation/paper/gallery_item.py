@@ -9,7 +9,7 @@ from simtest.errors import Failure
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 from simtest.spec import Experiment
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import Case
 from simtest.validation.gallery_items import (
     MAP_SIDE,
@@ -80,7 +80,7 @@ def reproduce_command(setting: PaperSetting, estimators: tuple[str, ...], seed: 
     """Return the command that makes a realisation alone and prints its estimates."""
     values = ", ".join(f"{key}={value!r}" for key, value in setting.model_dump(exclude_defaults=True).items())
     code = (
-        "from simtest.runtime.seeds import from_integer; from simtest.spec.paper import PaperSetting; "
+        "from simtest.runtime.seeds import from_integer; from simtest.spec.recipes import PaperSetting; "
         "from simtest.validation.paper.rows import pipeline_with; "
         f"print(pipeline_with(PaperSetting({values}), {estimators!r}).realise([from_integer({seed})]))"
     )

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.runtime.arrays import Array
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.paper.isocurves import brightest_point
 
 Box = tuple[int, int, int, int]

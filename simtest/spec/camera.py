@@ -1,20 +1,116 @@
-"""The camera of a scene, and camera files."""
+"""The camera of a scene, where it stands and how it moves; camera files."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera, FovExtent, ViewMask, focal_of_view
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
+from simtest.geometry.vectors import rotation
 from simtest.runtime.arrays import Array
-from simtest.spec.motion import Motion
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
-from simtest.spec.views import Moved
+
+Speed = Annotated[float, Field(ge=-1e4, le=1e4)]
+AngularSpeed = Annotated[float, Field(ge=-3600, le=3600)]
+
+
+class Motion(Spec):
+    """Camera and rig move evenly during the exposure; the frame is the mean of the radiance over it.
+
+    All truth (labels, highlights, poses) is that of the middle of the exposure. Camera frame of that moment: x right,
+    y down, z forward.
+    """
+
+    velocity_mm_s: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="of the camera's centre, mm/s")
+    angular_velocity_deg_s: tuple[AngularSpeed, AngularSpeed, AngularSpeed] = Field(
+        (0.0, 0.0, 0.0), description="the camera turns about this axis through its centre, right-handed, deg/s"
+    )
+    exposure_s: float = Field(1 / 60, gt=0, le=10, description="how long the shutter is open, s; 1/60 is a video field")
+    steps: int = Field(
+        16,
+        ge=2,
+        le=1024,
+        description="moments at which the radiance is taken; they share the pixel's samples, at least one each. The "
+        "picture should move by little more than a pixel from one to the next",
+    )
+
+    @property
+    def moves(self) -> bool:
+        """Whether any velocity differs from 0."""
+        return any((*self.velocity_mm_s, *self.angular_velocity_deg_s))
+
+    @property
+    def times_s(self) -> Array:
+        """The moments, shape (steps,), s from the middle of the exposure: the middles of equal parts of it."""
+        return np.asarray(((np.arange(self.steps) + 0.5) / self.steps - 0.5) * self.exposure_s)
+
+    def poses(self) -> Array:
+        """Return the camera's poses, shape (steps, 4, 4), at `times_s`: middle_from_moment, mm.
+
+        The centre moves along a straight line, and the camera turns about a fixed axis.
+        """
+        poses = np.tile(np.eye(4), (self.steps, 1, 1))
+        poses[:, :3, 3] = self.times_s[:, None] * np.array(self.velocity_mm_s)
+        turn = np.radians(self.angular_velocity_deg_s)
+        poses[:, :3, :3] = [rotation(time * turn) for time in self.times_s]
+        return poses
+
+
+Length = Annotated[float, Field(ge=-1e3, le=1e3)]
+Angle = Annotated[float, Field(ge=-360, le=360)]
+
+
+class Moved(Spec):
+    """Camera and rig stand elsewhere than where the surface's own keys put them; in the camera frame of that place."""
+
+    translation_mm: tuple[Length, Length, Length] = Field((0.0, 0.0, 0.0), description="of the camera's centre, mm")
+    rotation_deg: tuple[Angle, Angle, Angle] = Field(
+        (0.0, 0.0, 0.0), description="the camera is turned about this axis through its centre, right-handed, deg"
+    )
+
+    def pose(self) -> Array:
+        """Return unmoved_from_moved, shape (4, 4), mm."""
+        pose = np.eye(4)
+        pose[:3, :3] = rotation(np.radians(self.rotation_deg))
+        pose[:3, 3] = self.translation_mm
+        return pose
+
+
+class Views(Spec):
+    """Further views of the same surface, from a camera moved with its lights: for an experiment on motion.
+
+    The first view is that of the scene. Each further one is moved by `length_mm` across the optical axis.
+    """
+
+    count: int = Field(2, ge=2, le=16, description="number of views, the scene's own included")
+    length_mm: float = Field(1.0, ge=0, le=100, description="of the motion from the first view to each other one, mm")
+    direction_deg: Angle = Field(0.0, description="image direction of the first motion, deg from x to y")
+    turn_deg: Angle = Field(90.0, description="by how much the direction of each next motion is turned on, deg")
+    translation_error: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="standard deviation of the told translation along each axis, share of length_mm",
+    )
+    rotation_error_deg: float = Field(
+        0.0, ge=0, le=45, description="standard deviation of the told rotation about each axis, deg"
+    )
+    errors_told: bool = Field(True, description="whether the method is told these standard deviations, rather than 0")
+
+    def moved(self) -> list[Moved]:
+        """Return where the camera of each further view stands, from the first one."""
+        angles = np.radians(self.direction_deg + self.turn_deg * np.arange(self.count - 1))
+        return [
+            Moved(translation_mm=(float(self.length_mm * np.cos(a)), float(self.length_mm * np.sin(a)), 0.0))
+            for a in angles
+        ]
+
 
 SHORTEST, LONGEST = 0.004, 1000.0
 """Focal lengths over the longer side of the image, for fields of view of 179 and 0.06 deg."""
