@@ -31,12 +31,11 @@ def show(file: Path, /, *, view_radius: ViewRadius = None, as_json: AsJson = Fal
     """
     from simtest.cli.printing import print_json
     from simtest.spec.camera import load_camera
-    from simtest.spec.camera_formats import recognise
-    from simtest.spec.camera_formats.files import NAMES
+    from simtest.spec.camera_formats.files import FORMATS, recognise
     from simtest.spec.camera_tables import camera_summary
 
     shown = camera_summary(load_camera(file, view_radius))
-    shown = {"file": str(file), "format": NAMES[recognise(file)], **shown}
+    shown = {"file": str(file), "format": FORMATS[recognise(file)].title, **shown}
     if as_json:
         print_json(shown)
     else:

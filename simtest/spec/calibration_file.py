@@ -68,7 +68,7 @@ def load_calibration(
 
 def _with_photometry(data: Mapping[str, Any], photometric: Path, path: Path) -> dict[str, Any]:
     """Return the tables of a calibration file with those of a photometric calibration."""
-    from simtest.spec.camera_formats.photometric import read_photometric
+    from simtest.spec.camera_formats.omnidirectional import read_photometric
 
     made = dict(data)
     for name, table in read_photometric(photometric).items():

@@ -427,6 +427,6 @@ def save_camera(
     True
     """
     # Imported on demand, as in `load_camera`.
-    from simtest.spec.camera_formats.writing import write_camera
+    from simtest.spec.camera_formats.files import write_camera
 
     write_camera(camera, path, format, poses)

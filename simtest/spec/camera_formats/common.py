@@ -22,6 +22,9 @@ Table = dict[str, Any]
 Poses = Sequence[tuple[str, Array]]
 """Names of frames, and their world_from_camera, shape (4, 4): OpenCV axes, in the file's unit of length."""
 
+Files = dict[Path, bytes]
+"""What is written into each file."""
+
 LARGEST = 1e9
 """Largest number of a transform, in the file's unit of length."""
 

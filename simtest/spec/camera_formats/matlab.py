@@ -15,7 +15,7 @@ from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.runtime.resources import shown
-from simtest.spec.camera_formats.common import Table, check_alike, mask_of_text, mask_text, number
+from simtest.spec.camera_formats.common import Files, Poses, Table, check_alike, mask_of_text, mask_text, number
 from simtest.spec.camera_formats.matlab_struct import HOW, read_struct
 from simtest.spec.camera_formats.omnidirectional import scaramuzza_table
 
@@ -23,13 +23,8 @@ PARAMETERS = ((1, 1), (1, 3), (2, 2), (2, 3))
 """Rows and columns of fx, cx, fy, cy in K, as MATLAB counts."""
 
 
-def read_cameras(path: Path) -> dict[str, Table]:
-    """Return the file's one camera, whose id is empty; see `read_matlab`."""
-    return {"": read_matlab(path)}
-
-
-def read_matlab(path: Path) -> Table:
-    """Read a calibration of MATLAB as the table of a `CameraSpec`.
+def read_matlab(path: Path) -> dict[str, Table]:
+    """Read a calibration of MATLAB: its one camera, whose id is empty.
 
     The .mat file holds one struct, under any name, with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
     RadialDistortion and TangentialDistortion; or, of a fisheye, with MappingCoefficients, StretchMatrix,
@@ -43,7 +38,7 @@ def read_matlab(path: Path) -> Table:
     where, fields = shown(path), read_struct(path)
     mask = mask_of_text(fields["ViewMask"], where) if "ViewMask" in fields else None
     if "MappingCoefficients" in fields:
-        return _fisheye(fields, where) | {"view_mask": mask}
+        return {"": _fisheye(fields, where) | {"view_mask": mask}}
     matrix = _matrix(fields, "K", where) if "K" in fields else _matrix(fields, "IntrinsicMatrix", where).T
     _check_repeated(fields, matrix, where)
     # upper triangular
@@ -54,12 +49,13 @@ def read_matlab(path: Path) -> Table:
     radial = _array(fields, "RadialDistortion", (2, 3), where).tolist()
     tangential = _array(fields, "TangentialDistortion", 2, where).tolist()
     lens = dict(zip(("k1", "k2", "k3", "p1", "p2"), [*radial, 0.0][:3] + tangential, strict=True))
-    return {
+    table = {
         "width": width, "height": height, "fx": float(matrix[0, 0]), "fy": float(matrix[1, 1]),
         "cx": float(matrix[0, 2]) - PIXEL_CENTRE, "cy": float(matrix[1, 2]) - PIXEL_CENTRE,
         "skew": float(matrix[0, 1]),
         "distortion": {"type": "brown_conrady", **lens} if any(lens.values()) else None, "view_mask": mask,
     }  # fmt: skip
+    return {"": table}
 
 
 def _check_repeated(fields: Mapping[str, Any], matrix: Any, where: str) -> None:
@@ -115,7 +111,7 @@ def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...], 
 # Writing ---------------------------------------------------------------------------------------------------------
 
 
-def matlab_bytes(camera: Camera) -> bytes:
+def matlab_file(camera: Camera, path: Path, _: Poses | None) -> Files:
     """Return a camera as a .mat file of version 5 that holds the struct `camera`.
 
     Its fields are the arguments of MATLAB's cameraParameters, or of fisheyeIntrinsics. Raises `InputError` if MATLAB
@@ -150,4 +146,4 @@ def matlab_bytes(camera: Camera) -> bytes:
         fields["ViewMask"] = mask_text(camera.view_mask)
     buffer = io.BytesIO()
     savemat(buffer, {"camera": fields})
-    return buffer.getvalue()
+    return {path: buffer.getvalue()}

@@ -1,14 +1,23 @@
-"""Scaramuzza's omnidirectional cameras: OCamCalib's calib_results.txt, and the parameters of C3VD.
+"""Files of endoscopes' calibrations: OCamCalib, C3VD, Vicalib, EndoMapper's photometric XML.
 
-In both files the centre of the first pixel is (0, 0), in simtest (0.5, 0.5): the centre gains half a pixel. They differ
-in everything else. C3VD names x before y and has a0 > 0: the polynomial is along the viewing direction. OCamCalib names
-row before column and has a0 < 0: its z axis points backwards.
+In all the centre of the first pixel is (0, 0), in simtest (0.5, 0.5): the centre gains half a pixel (Calibu's detector,
+in Vicalib, fits circles at whole pixel numbers). OCamCalib and C3VD hold Scaramuzza's model and differ in everything
+else. C3VD names x before y and has a0 > 0: the polynomial is along the viewing direction. OCamCalib names row before
+column and has a0 < 0: its z axis points backwards. Vicalib's XML (Calibu) holds EndoMapper's geometrical calibrations.
+
+In EndoMapper's photometric calibration (EM_Dataset-PhotometricCalibration) a pixel holds
+(gain V sigma e^(-mu (1 - cos a)) / d^2 times the surface's reflectance)^(1 / gamma) (Batlle, Montiel and Tardos 2022):
+a is the angle at the light between its principal direction D and the surface, d its distance, and V = cos^k of the
+angle from the optical axis. Gain and sigma scale all pixels alike and are not read. Positions are metres in the camera
+frame.
 """
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -16,15 +25,41 @@ from numpy.polynomial import Polynomial
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.runtime.resources import shown, suggestion
-from simtest.spec.camera_formats.common import Table, number, numbers, read_json
+from simtest.spec.camera_formats.common import Table, number, numbers, read_json, read_xml
 from simtest.spec.toml_files import read_text
 
 C3VD_KEYS = ("width", "height", "cx", "cy", "a0", "a2", "a3", "a4", "c", "d", "e")
+
 LONGEST = 1e6
 """Of a focal length, px."""
 
 MOST_APART = 5.0
 """px by which OCamCalib's two polynomials may differ; the inverse one is a fit to the other."""
+
+FOCAL = ("fx", "fy", "cx", "cy")
+
+VICALIB_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "calibu_fu_fv_u0_v0": ("", ()),
+    "calibu_fu_fv_u0_v0_k1_k2": ("brown_conrady", ("k1", "k2")),
+    "calibu_fu_fv_u0_v0_k1_k2_k3": ("brown_conrady", ("k1", "k2", "k3")),
+    "calibu_fu_fv_u0_v0_rational6": ("brown_conrady", ("k1", "k2", "k3", "k4", "k5", "k6")),
+    "calibu_fu_fv_u0_v0_kb4": ("kannala_brandt", ("k1", "k2", "k3", "k4")),
+    "ocamcalib_cx_cy_a0_a2_a3_a4_e_f_g": ("scaramuzza", ()),
+}
+"""The lens of each camera type, and its parameters after the focal lengths and the principal point."""
+
+AXES = {"right": (1.0, 0.0, 0.0), "down": (0.0, 1.0, 0.0), "forward": (0.0, 0.0, 1.0)}
+
+Tables = dict[str, dict[str, Any]]
+
+MM = 1000.0
+
+STEP_DEG = 0.5
+"""Of the table of the light's spread: with mu = 10, linear interpolation is off by 1e-4."""
+
+FARTHEST_MM = 1000.0
+
+MOST_SPREAD = 1000.0
 
 
 def scaramuzza_table(
@@ -64,9 +99,6 @@ def scaramuzza_table(
         "width": int(size[0]), "height": int(size[1]), "fx": a0, "fy": a0, "cx": centre[0], "cy": centre[1],
         "distortion": {"type": "scaramuzza", **lens},
     }  # fmt: skip
-
-
-# C3VD -------------------------------------------------------------------------------------------------------------
 
 
 def read_c3vd(path: Path) -> dict[str, Table]:
@@ -113,9 +145,6 @@ def _lines(text: str, where: str) -> Mapping[str, Any]:
             raise InputError(f"{where}: line {count}: {shown(found[1], 40)} is given twice")
         data[found[1]] = found[2].strip()
     return data
-
-
-# OCamCalib --------------------------------------------------------------------------------------------------------
 
 
 def read_ocamcalib(path: Path) -> dict[str, Table]:
@@ -180,3 +209,140 @@ def _check_inverse(direct: list[float], back: list[float], most: float, where: s
             f"{where}: the two polynomials differ by {apart:.3g} px; must be each other's inverse within "
             f"{MOST_APART:g} px"
         )
+
+
+def read_vicalib(path: Path) -> dict[str, Table]:
+    """Read the cameras of a rig, by their index; raise `InputError` where the file is malformed."""
+    where, root = shown(path), read_xml(path)
+    cameras: dict[str, Table] = {}
+    for i, element in enumerate(root.iter("camera_model")):
+        name = element.get("index") or str(i)
+        if name in cameras:
+            raise InputError(f"{where}: camera index {shown(name, 40)} is given twice")
+        cameras[name] = _vicalib_camera(element, f"{where}: camera {shown(name, 40)}")
+    return cameras
+
+
+def _vicalib_camera(element: ElementTree.Element, at: str) -> Table:
+    kind = element.get("type") or ""
+    if kind not in VICALIB_MODELS:
+        raise InputError(
+            f"{at}: type = {shown(repr(kind), 60)}: simtest lacks it; must be one of {', '.join(VICALIB_MODELS)}"
+            f"{suggestion(kind, VICALIB_MODELS)}"
+        )
+    for axis, wanted in AXES.items():
+        found = element.find(axis)
+        if found is not None and values(found, at, axis, 3) != list(wanted):
+            raise InputError(
+                f"{at}: {axis} = {shown(' '.join((found.text or '').split()), 40)}: must be {list(wanted)}"
+            )
+    width, height = (int(number(text_of(element, key, at), at, key, whole=True)) for key in ("width", "height"))
+    params = element.find("params")
+    if params is None:
+        raise InputError(f"{at}: params: missing; must be a list of numbers")
+    lens, names = VICALIB_MODELS[kind]
+    if lens == "scaramuzza":
+        cx, cy, *mapping, e, f, g = values(params, at, "params", 9)
+        return scaramuzza_table((width, height), (cx + PIXEL_CENTRE, cy + PIXEL_CENTRE), mapping, (e, f, g), at)
+    told = dict(zip((*FOCAL, *names), values(params, at, "params", 4 + len(names)), strict=True))
+    table: Table = {"width": width, "height": height, "fx": told["fx"], "fy": told["fy"]}
+    table |= {key: told[key] + PIXEL_CENTRE for key in ("cx", "cy")}
+    if lens:
+        table["distortion"] = {"type": lens, **{key: told[key] for key in names}}
+    return table
+
+
+def text_of(element: ElementTree.Element, key: str, at: str) -> str:
+    """Return the text of a child; raise `InputError` where there is none."""
+    found = element.find(key)
+    if found is None or not (found.text or "").strip():
+        raise InputError(f"{at}: {key}: missing")
+    return (found.text or "").strip()
+
+
+def values(element: ElementTree.Element, at: str, name: str, count: int) -> list[float]:
+    """Return the numbers of a text such as ``[ 1; 2; 3 ]``."""
+    words = re.split(r"[;,\s]+", (element.text or "").strip().strip("[]").strip())
+    return numbers([word for word in words if word], at, name, count)
+
+
+def read_photometric(path: Path) -> Tables:
+    """Read a photometric calibration as tables of a calibration file: response, vignetting, emission, rig.
+
+    Several lights must spread their light alike.
+
+    Raises
+    ------
+    InputError
+        If the file is malformed, or holds a model of another kind.
+    """
+    where, root = shown(path), read_xml(path)
+    tables: Tables = {}
+    cameras = root.findall("camera")
+    if len(cameras) > 1:
+        raise InputError(f"{where}: holds {len(cameras)} cameras; must be one")
+    model = cameras[0].find("camera_model") if cameras else None
+    if model is not None:
+        tables |= _lens_and_response(model, f"{where}: camera")
+    lights = [_light(element, f"{where}: light {i}") for i, element in enumerate(root.findall("light/light_model"))]
+    if lights:
+        tables |= _rig(lights, where)
+    if not tables:
+        raise InputError(f"{where}: holds neither a camera_model nor a light_model; must hold one of them")
+    return tables
+
+
+def _lens_and_response(model: ElementTree.Element, at: str) -> Tables:
+    if model.get("type") != "gamma":
+        raise InputError(f"{at}: type = {shown(repr(model.get('type')), 40)}: simtest lacks it; must be 'gamma'")
+    gamma = _number(model, "gamma", at)
+    if not 0.1 <= gamma <= 10:
+        raise InputError(f"{at}: gamma = {gamma:g}: must be 0.1 to 10")
+    tables: Tables = {"response": {"type": "gamma", "gamma": gamma}}
+    power = _number(model, "vignetting", at) if model.find("vignetting") is not None else 0.0
+    if not 0 <= power <= 1000:
+        raise InputError(f"{at}: vignetting = {power:g}: must be 0 to 1000")
+    tables["vignetting"] = {"type": "cosine", "power": power}
+    return tables
+
+
+def _light(model: ElementTree.Element, at: str) -> dict[str, Any]:
+    """Return the spread, position, mm, and direction of a light."""
+    if model.get("type") != "sls":
+        raise InputError(f"{at}: type = {shown(repr(model.get('type')), 40)}: simtest lacks it; must be 'sls'")
+    mu = _number(model, "mu", at)
+    if not 0 <= mu <= MOST_SPREAD:
+        raise InputError(f"{at}: mu = {mu:g}: must be 0 to {MOST_SPREAD:g}")
+    _number(model, "sigma", at)
+    told = {}
+    for key in ("P", "D"):
+        element = model.find(key)
+        if element is None:
+            raise InputError(f"{at}: {key}: missing; must be [ x; y; z ]")
+        told[key] = np.array(values(element, at, key, 3))
+    position, length = told["P"] * MM, float(np.linalg.norm(told["D"]))
+    if not np.abs(position).max() <= FARTHEST_MM:
+        raise InputError(f"{at}: P = {told['P'].tolist()}: must be metres, within 1 m of the camera")
+    if not abs(length - 1) <= 0.01:
+        raise InputError(f"{at}: D has length {length:.3g}; must be a unit vector")
+    return {"mu": mu, "position": position.round(9).tolist(), "direction": (told["D"] / length).tolist()}
+
+
+def _rig(lights: list[dict[str, Any]], where: str) -> Tables:
+    """Return where the lights are and how they emit."""
+    first = lights[0]
+    for light in lights[1:]:
+        if light["mu"] != first["mu"] or not np.allclose(light["direction"], first["direction"], atol=1e-3):
+            raise InputError(f"{where}: lights of different mu or D; must spread their light alike")
+    angles = np.arange(0.0, 180 + STEP_DEG, STEP_DEG)
+    emission = {
+        "type": "table", "angle_deg": angles.tolist(),
+        "value": [math.exp(-first["mu"] * (1 - math.cos(math.radians(angle)))) for angle in angles],
+        "direction": first["direction"],
+    }  # fmt: skip
+    return {"emission": emission, "rig": {"lights_mm": [light["position"] for light in lights]}}
+
+
+def _number(model: ElementTree.Element, key: str, at: str) -> float:
+    """Return a number, in brackets or not."""
+    return number(text_of(model, key, at).strip("[] "), at, key)

@@ -1,9 +1,11 @@
-"""Camera files of OpenCV (FileStorage: YAML, XML, JSON) and ROS (camera_info), read and written.
+"""Camera files of OpenCV (FileStorage: YAML, XML, JSON) and ROS (camera_info), read and written; Kalibr's chains, read.
 
-For both the centre of the first pixel is (0, 0), for simtest (0.5, 0.5): the principal point gains half a pixel on
-import and loses it on export.
+For all the centre of the first pixel is (0, 0), for simtest (0.5, 0.5): the principal point gains half a pixel on
+import and loses it on export. A chain of Kalibr (camchain.yaml) is of several cameras, and says where each is beside
+the one before; its lengths are metres.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,15 +18,20 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
+from simtest.runtime.arrays import Array
 from simtest.runtime.resources import shown
-from simtest.spec.camera_formats.common import Table, parse_json
+from simtest.spec.camera_formats.common import Files, Poses, Table, inverse, number, numbers, parse_json, rigid
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
 from simtest.spec.toml_files import read_text
 
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsic_matrix", "mtx", "K", "k")
+
 LENS_NAMES = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "dist", "D", "d")
+
 WIDTH_NAMES = ("image_width", "image_Width", "imageWidth", "width")
+
 HEIGHT_NAMES = ("image_height", "image_Height", "imageHeight", "height")
+
 SIZE_NAMES = ("image_size", "imageSize", "image_resolution")
 
 MODELS = {
@@ -37,17 +44,19 @@ NUMBER_TYPES = ("d", "f", "i")
 """Of a FileStorage matrix: double, float, integers of 32 bits."""
 
 BROWN_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
 UNKNOWN_TERMS = ("s1", "s2", "s3", "s4", "tauX", "tauY")
 """Coefficients 9 to 14 of OpenCV: thin prism and tilted sensor, which simtest lacks."""
 
+KALIBR_CAMERA = re.compile(r"cam\d+")
 
-def read_cameras(path: Path) -> dict[str, Table]:
-    """Return the file's one camera, whose id is empty; see `read_opencv`."""
-    return {"": read_opencv(path)}
+LENSES = ("none", "radtan", "equidistant", "equi")
+
+MM = 1000.0
 
 
-def read_opencv(path: Path) -> Table:
-    """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json) as the table of a `CameraSpec`.
+def read_opencv(path: Path) -> dict[str, Table]:
+    """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json): its one camera, whose id is empty.
 
     Raises
     ------
@@ -73,7 +82,7 @@ def read_opencv(path: Path) -> Table:
     if "view_mask" in data:
         cx, cy, radius = _numbers(data["view_mask"], where, "view_mask", (3,))
         table["view_mask"] = {"cx": cx + PIXEL_CENTRE, "cy": cy + PIXEL_CENTRE, "radius": radius}
-    return table
+    return {"": table}
 
 
 def _parse(path: Path) -> Mapping[str, Any]:
@@ -218,11 +227,11 @@ def _lens(data: Mapping[str, Any], where: str) -> dict[str, str | float] | None:
     counts = {"plumb_bob": (4, 5), "radtan": (4, 5), "rational_polynomial": (8, 12, 14)}.get(model, (4, 5, 8, 12, 14))
     values = _numbers(value, where, name, counts)
     # Terms that simtest lacks must vanish.
-    for term, number in zip(UNKNOWN_TERMS, values[8:], strict=False):
-        if number != 0:
+    for term, amount in zip(UNKNOWN_TERMS, values[8:], strict=False):
+        if amount != 0:
             kind = "tilted sensor" if term.startswith("tau") else "thin prism"
             raise InputError(
-                f"{where}: {name}: {term} = {number:g} ({kind}): must be 0; simtest does not know that term"
+                f"{where}: {name}: {term} = {amount:g} ({kind}): must be 0; simtest does not know that term"
             )
     if not any(values):
         # All coefficients 0: a pinhole.
@@ -252,17 +261,16 @@ def _is_fisheye(data: Mapping[str, Any], where: str) -> bool:
     return fisheye
 
 
-# Writing ---------------------------------------------------------------------------------------------------------
-
-
-def opencv_text(camera: Camera, suffix: str) -> str:
-    """Return a camera as the text of an OpenCV FileStorage; the file's suffix selects YAML, XML or JSON.
+def opencv_file(camera: Camera, path: Path, _: Poses | None) -> Files:
+    """Return a camera as an OpenCV FileStorage; the file's suffix selects YAML, XML or JSON.
 
     Raises `InputError` if the camera has a skew, which OpenCV ignores.
     """
     matrix, coefficients = _shifted(camera, "OpenCV")
     kinds = {".xml": cv2.FILE_STORAGE_FORMAT_XML, ".json": cv2.FILE_STORAGE_FORMAT_JSON}
-    flags = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | kinds.get(suffix, cv2.FILE_STORAGE_FORMAT_YAML)
+    flags = (
+        cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | kinds.get(path.suffix.lower(), cv2.FILE_STORAGE_FORMAT_YAML)
+    )
     storage = cv2.FileStorage()
     storage.open("", flags)
     storage.write("image_width", camera.width)
@@ -273,11 +281,11 @@ def opencv_text(camera: Camera, suffix: str) -> str:
     storage.write("distortion_coefficients", np.array([coefficients]))
     if (mask := _shifted_mask(camera)) is not None:
         storage.write("view_mask", np.array([mask]))
-    return str(storage.releaseAndGetString())
+    return {path: str(storage.releaseAndGetString()).encode()}
 
 
-def ros_text(camera: Camera) -> str:
-    """Return a camera as the text of a ROS camera_info file (YAML); see `opencv_text`."""
+def ros_file(camera: Camera, path: Path, _: Poses | None) -> Files:
+    """Return a camera as a ROS camera_info file (YAML); see `opencv_file`."""
     matrix, coefficients = _shifted(camera, "ROS")
     model = "plumb_bob" if len(coefficients) == 5 else "rational_polynomial"
     model = "equidistant" if isinstance(camera.distortion, KannalaBrandt) else model
@@ -294,7 +302,7 @@ def ros_text(camera: Camera) -> str:
     ]  # fmt: skip
     if (mask := _shifted_mask(camera)) is not None:
         lines.append(f"view_mask: [{', '.join(repr(v) for v in mask)}]")
-    return "\n".join(lines) + "\n"
+    return {path: ("\n".join(lines) + "\n").encode()}
 
 
 def _shifted(camera: Camera, whose: str) -> tuple[Any, list[float]]:
@@ -320,3 +328,71 @@ def _shifted_mask(camera: Camera) -> list[float] | None:
         corner = f"camera.view_mask.corner = {mask.corner:g}"
         raise InputError(f"{corner}: OpenCV and ROS know round views alone; must be left out, or saved as TOML")
     return [float(mask.cx) - PIXEL_CENTRE, float(mask.cy) - PIXEL_CENTRE, float(mask.radius)]
+
+
+def read_kalibr(path: Path) -> dict[str, Table]:
+    """Read the cameras of a chain by name (cam0, cam1, ...); raise `InputError` where it is malformed."""
+    return {name: _kalibr_camera(data, f"{shown(path)}: {name}") for name, data in _chain(path).items()}
+
+
+def kalibr_poses(path: Path) -> Poses:
+    """Return where the cameras of a chain are: cam0_from_camera, shape (4, 4), lengths mm, named by camera."""
+    made: list[tuple[str, Array]] = []
+    first_from_camera = np.eye(4)
+    for i, (name, data) in enumerate(_chain(path).items()):
+        at = f"{shown(path)}: {name}"
+        if i and "T_cn_cnm1" not in data:
+            raise InputError(f"{at}: T_cn_cnm1: missing; must be 4 rows of 4 numbers")
+        if i:
+            step = rigid(data["T_cn_cnm1"], at, "T_cn_cnm1")
+            step[:3, 3] *= MM
+            first_from_camera = first_from_camera @ inverse(step)
+        made.append((name, first_from_camera.copy()))
+    return made
+
+
+def _chain(path: Path) -> dict[str, Mapping[str, Any]]:
+    where = shown(path)
+    try:
+        data = parse_yaml(read_text(path, "camera"))
+    except ValueError as error:
+        raise InputError(f"{where}: not valid YAML: {shown(error, 80)}") from error
+    found = (
+        {name: value for name, value in data.items() if KALIBR_CAMERA.fullmatch(name)}
+        if isinstance(data, Mapping)
+        else {}
+    )
+    if not found:
+        raise InputError(f"{where}: holds no camera; must have the keys cam0, cam1, ...")
+    for name, value in found.items():
+        if not isinstance(value, Mapping):
+            raise InputError(f"{where}: {name} = {shown(repr(value), 60)}: must be a table of keys")
+    return dict(sorted(found.items(), key=lambda item: int(item[0][3:])))
+
+
+def _kalibr_camera(data: Mapping[str, Any], at: str) -> Table:
+    model = data.get("camera_model")
+    if model != "pinhole":
+        raise InputError(f"{at}: camera_model = {shown(repr(model), 40)}: simtest lacks it; must be pinhole")
+    fx, fy, cx, cy = numbers(data.get("intrinsics"), at, "intrinsics", 4)
+    width, height = numbers(data.get("resolution"), at, "resolution", 2)
+    table = {
+        "width": int(number(width, at, "resolution", whole=True)), "fx": fx, "cx": cx + PIXEL_CENTRE,
+        "height": int(number(height, at, "resolution", whole=True)), "fy": fy, "cy": cy + PIXEL_CENTRE,
+    }  # fmt: skip
+    return table | _kalibr_lens(data, at)
+
+
+def _kalibr_lens(data: Mapping[str, Any], at: str) -> Table:
+    """Return the key `distortion`, or nothing for a pinhole."""
+    name = data.get("distortion_model", "none")
+    if name not in LENSES:
+        raise InputError(
+            f"{at}: distortion_model = {shown(repr(name), 40)}: simtest lacks it; must be one of {', '.join(LENSES)}"
+        )
+    told = [] if name == "none" else numbers(data.get("distortion_coeffs"), at, "distortion_coeffs", 4)
+    if name in ("equidistant", "equi"):
+        return {"distortion": {"type": "kannala_brandt", **dict(zip(("k1", "k2", "k3", "k4"), told, strict=True))}}
+    if not any(told):
+        return {}
+    return {"distortion": {"type": "brown_conrady", **dict(zip(("k1", "k2", "p1", "p2"), told, strict=True))}}

@@ -15,7 +15,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import quaternion_of
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
-from simtest.spec.camera_formats.writing import file_contents, write_files
+from simtest.spec.camera_formats.files import file_contents, write_files
 
 TUM, TRANSFORMS, COLMAP = "trajectory.txt", "transforms.json", "colmap"
 """Files of a trajectory: TUM's, NeRF's, and the folder of COLMAP's."""
