@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration.noise_estimate import median
+from simtest.calibration.frame import median
 from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_ISOVALUE
 from simtest.geometry.patch import connected, dilated
 from simtest.runtime.arrays import Array, Image, Mask

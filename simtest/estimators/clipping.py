@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from simtest.calibration.noise_estimate import median
+from simtest.calibration.frame import median
 from simtest.geometry import Array, Mask, Patch
 
 NEARLY_CLIPPED = 0.93

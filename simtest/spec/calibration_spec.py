@@ -18,8 +18,8 @@ from simtest.calibration import (
     Uniform,
     exactly,
 )
-from simtest.calibration.angular_profile import AngularProfile
 from simtest.calibration.calibration import OPTICAL_AXIS
+from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import (
     UNTOLD_FALLOFF_POWER,
     UNTOLD_OFFSET_MM,

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from simtest.calibration.angular_profile import AngularProfile
+from simtest.calibration.photometry import AngularProfile
 from simtest.runtime.arrays import Array
 from simtest.spec.spec_model import Coordinate, Spec
 

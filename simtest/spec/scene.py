@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
-from simtest.calibration.angular_profile import AngularProfile
+from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
 from simtest.runtime.limits import check_limit

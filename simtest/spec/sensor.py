@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from simtest.calibration import NoiseModel, Response
-from simtest.calibration.response import check_table
+from simtest.calibration.photometry import check_table
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
 from simtest.spec.lights import CosineProfile, Profile

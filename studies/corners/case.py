@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from simtest.calibration import Calibration
-from simtest.calibration.angular_profile import AngularProfile
+from simtest.calibration.photometry import AngularProfile
 from simtest.dataset import read
 from simtest.dataset.shard_writer import write_dataset
 from simtest.estimators.protocol import Target

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from simtest.calibration import Calibration, NoiseModel, Response, estimate_noise
-from simtest.calibration.angular_profile import AngularProfile
+from simtest.calibration.photometry import AngularProfile
 from simtest.geometry import Camera, smooth
 from simtest.geometry.patch import share_of_noise
 from simtest.runtime.arrays import Array, Image

@@ -22,7 +22,7 @@ from simtest.calibration import (
     Uniform,
     exactly,
 )  # fmt: skip
-from simtest.calibration.angular_profile import AngularProfile
+from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
 from simtest.estimators.process.requests import priors_message

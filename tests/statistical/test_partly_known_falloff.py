@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import binom
 
 from simtest.calibration import Calibration, Priors, exactly
-from simtest.calibration.angular_profile import AngularProfile
+from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.estimators.prior_parts import TILT
 from simtest.estimators.registry import load_estimators

@@ -7,8 +7,8 @@ import pytest
 
 import simtest
 from simtest.calibration import Calibration, NoiseModel, Priors, Response, Uniform
-from simtest.calibration.angular_profile import AngularProfile
 from simtest.calibration.calibration import MIN_FALLOFF
+from simtest.calibration.photometry import AngularProfile
 from simtest.detection import detect, estimate_noise
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.cone_axis import cone_axis

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import NO_PRIORS, Calibration, Frame, NoiseModel, Response, srgb_encode
-from simtest.calibration.angular_profile import AngularProfile
+from simtest.calibration.photometry import AngularProfile
 from simtest.detection import Detection, Detector, Region, load_detector, peak_shape
 from simtest.detection.colour import ColourDetector, colour
 from simtest.detection.peaks import PeakDetector, peaks

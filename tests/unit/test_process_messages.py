@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import NO_PRIORS, Calibration, Frame, Priors
-from simtest.calibration.distributions import LogUniform, Normal, exactly
+from simtest.calibration.priors import LogUniform, Normal, exactly
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.process.answers import estimate_of, estimates_of

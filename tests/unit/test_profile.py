@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.calibration.angular_profile import AngularProfile
+from simtest.calibration.photometry import AngularProfile
 from simtest.errors import InputError
 from simtest.spec.lights import CosineProfile, TableProfile
 from simtest.spec.spec_model import validate

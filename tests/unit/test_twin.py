@@ -21,7 +21,7 @@ from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot, usable_spots
 from simtest.advice.twin.tissue import NAMES, WIDER, tissue_of
 from simtest.advice.twin.writing import COLUMNS, write_twins
 from simtest.calibration import Calibration, CameraPrior, Normal, Priors, Response, Uniform
-from simtest.calibration.angular_profile import AngularProfile
+from simtest.calibration.photometry import AngularProfile
 from simtest.errors import InputError, SimtestError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration.lights.mirrors import Index, Mirrors
-from simtest.geometry import Array
 from simtest.geometry.camera import Camera
+from simtest.runtime.arrays import Array
 
 REACH_MM = 30.0
 """A light of an endoscope lies about so far from the camera, at most. A prior of this standard deviation along each

@@ -11,9 +11,9 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from simtest.geometry import Array
 from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import basis_across
+from simtest.runtime.arrays import Array
 
 Index = npt.NDArray[np.intp]
 

@@ -22,8 +22,9 @@ from simtest.calibration.lights.bundle import (
     with_error,
 )
 from simtest.calibration.lights.mirrors import Mirrors
-from simtest.geometry import Array, chi_squared
+from simtest.geometry import chi_squared
 from simtest.geometry.camera import Camera
+from simtest.runtime.arrays import Array
 
 Labels = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]

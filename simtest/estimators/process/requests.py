@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
-from simtest.calibration.distributions import Distribution, LogUniform, Normal
+from simtest.calibration.priors import Distribution, LogUniform, Normal
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators.process.core import Hello, outline_names

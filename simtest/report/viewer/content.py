@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from simtest.calibration.response import srgb_encode
+from simtest.calibration.photometry import srgb_encode
 from simtest.errors import Failure, InputError
 from simtest.pages.palette import estimator_order
 from simtest.reconstruction.pipeline import reconstruct

@@ -9,9 +9,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 from simtest.calibration import Priors
-from simtest.calibration.distributions import LogUniform, Uniform, exactly
-from simtest.calibration.distributions import Normal as NormalPrior
-from simtest.calibration.priors import CameraPrior
+from simtest.calibration.priors import CameraPrior, LogUniform, Uniform, exactly
+from simtest.calibration.priors import Normal as NormalPrior
 from simtest.errors import Failure
 from simtest.estimators import load_estimators
 from simtest.geometry import Camera, Patch, ViewMask
