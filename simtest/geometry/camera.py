@@ -323,6 +323,8 @@ def focal_of_view(
 ) -> float:
     """Return the focal length, px, of a camera with square pixels that has a stated field of view.
 
+    Raises `InputError` if the lens cannot span that angle: a pinhole not 180 deg, others not beyond their fold.
+
     Parameters
     ----------
     fov_deg : float
@@ -335,11 +337,6 @@ def focal_of_view(
         The lens, whose field it is; default a pinhole.
     across : {"width", "height", "diagonal"}
         What the angle spans.
-
-    Raises
-    ------
-    InputError
-        If the lens cannot span that angle: a pinhole not 180 deg, others not beyond their fold.
     """
     wanted, ends = np.radians(fov_deg), _ends(*size, centre, across)
     lengths = np.linalg.norm(ends, axis=1)

@@ -317,24 +317,18 @@ def _null_vector(M: Array, root: Array) -> Array:
     return np.asarray(crosses[each, best] / np.sqrt(squares[each, best])[:, None])
 
 
-class _Failures:
-    """The first failure of each contour."""
+_Noted = list[tuple[Mask, Reason, str]]
+"""Which contours fail, and why; of several reasons of one the first counts."""
 
-    def __init__(self) -> None:
-        self._noted: list[tuple[Mask, Reason, str]] = []
 
-    def add(self, which: Mask, reason: Reason, detail: str) -> None:
-        self._noted.append((which, reason, detail))
-
-    @property
-    def found(self) -> dict[int, Failure]:
-        found: dict[int, Failure] = {}
-        # Usually there are none, which one test of all finds.
-        if np.array([which for which, _, _ in self._noted]).any():
-            for which, reason, detail in self._noted:
-                for index in np.flatnonzero(which).tolist():
-                    found.setdefault(index, Failure(reason, detail))
-        return found
+def _first_failures(noted: _Noted) -> dict[int, Failure]:
+    found: dict[int, Failure] = {}
+    # Usually there are none, which one test of all finds.
+    if np.array([which for which, _, _ in noted]).any():
+        for which, reason, detail in noted:
+            for index in np.flatnonzero(which).tolist():
+                found.setdefault(index, Failure(reason, detail))
+    return found
 
 
 def _parts(members: list[int], lengths: list[int]) -> Iterator[list[int]]:
@@ -401,19 +395,20 @@ class _Batch:
 
 def _fit_together(contours: list[Array]) -> FittedConics:
     """Fit B contours."""
-    batch, failures = _Batch.of(contours), _Failures()
+    batch = _Batch.of(contours)
+    failures: _Noted = []
     extent = np.maximum.reduceat(np.abs(batch.points), batch.first, axis=1).max(axis=0)
-    failures.add(~np.isfinite(extent), Reason.NOT_FINITE, "contour points hold NaN or infinity")
-    failures.add(extent > MAX_COORDINATE, Reason.NOT_FINITE, f"contour points beyond {MAX_COORDINATE:g}")
-    if found := failures.found:
+    failures.append((~np.isfinite(extent), Reason.NOT_FINITE, "contour points hold NaN or infinity"))
+    failures.append((extent > MAX_COORDINATE, Reason.NOT_FINITE, f"contour points beyond {MAX_COORDINATE:g}"))
+    if found := _first_failures(failures):
         batch.points[:, batch.spread(np.isin(np.arange(len(contours)), list(found)))] = 0.0
     transforms = _normalise(batch, failures)
     conics = _fit_normalised(batch, failures)
     _check(conics, failures)
-    return FittedConics(conics, transforms, failures.found)
+    return FittedConics(conics, transforms, _first_failures(failures))
 
 
-def _normalise(batch: _Batch, failures: _Failures) -> Array:
+def _normalise(batch: _Batch, failures: _Noted) -> Array:
     """Move points to their centre, principal axes and unit spread; return the similarities, shape (B, 3, 3).
 
     In the principal axes the moments of a long ellipse are graded, and no digits are lost between them.
@@ -430,7 +425,7 @@ def _normalise(batch: _Batch, failures: _Failures) -> Array:
     xx, xy, yy = batch.sums(np.array([x * x, x * y, y * y]))
     scale = np.sqrt((xx + yy) / counts / 2)
     together = ~(scale > 1e-12 * (1 + np.abs(centre).max(axis=0)))
-    failures.add(together, Reason.DEGENERATE_CONIC, "all points coincide")
+    failures.append((together, Reason.DEGENERATE_CONIC, "all points coincide"))
     if together.any():
         points[:, batch.spread(together)] = 0.0
         scale[together] = 1.0
@@ -450,18 +445,13 @@ def _normalise(batch: _Batch, failures: _Failures) -> Array:
 def _moments(batch: _Batch) -> Array:
     """Sum x^4, x^3 y, x^2 y^2, x y^3, y^4, x^3, x^2 y, x y^2, y^3, x^2, x y, y^2 over each contour; shape (B, 12)."""
     x, y = batch.points
-    table = np.empty((12, len(x)))
-    xx, yy = table[9], table[11]
-    np.multiply(x, batch.points, out=table[9:11])
-    np.multiply(y, y, out=yy)
-    np.multiply(xx, table[_QUADRATIC], out=table[0:3])
-    np.multiply(yy, table[10:12], out=table[3:5])
-    np.multiply(xx, batch.points, out=table[5:7])
-    np.multiply(yy, batch.points, out=table[7:9])
+    squares = np.array([x * x, x * y, y * y])
+    xx, _, yy = squares
+    table = np.concatenate([xx * squares, yy * squares[1:], xx * batch.points, yy * batch.points, squares])
     return np.ascontiguousarray(batch.sums(table).T)
 
 
-def _fit_normalised(batch: _Batch, failures: _Failures) -> Array:
+def _fit_normalised(batch: _Batch, failures: _Noted) -> Array:
     """Fit conics to normalised points by the reduced 3 x 3 eigenproblem [HF98], shape (B, 3, 3).
 
     The sums of x and of y are 0, so the linear and the constant part do not mix.
@@ -473,7 +463,7 @@ def _fit_normalised(batch: _Batch, failures: _Failures) -> Array:
     xx, xy, yy = S3.T
     spread = xx * yy - xy * xy
     on_line = ~(spread > _LINE * (xx + yy) ** 2)
-    failures.add(on_line, Reason.DEGENERATE_CONIC, "the points lie on a line")
+    failures.append((on_line, Reason.DEGENERATE_CONIC, "the points lie on a line"))
     # eliminate d, e, f: for given a, b, c the residual is least at (d, e) = -linear (a, b, c), f = -constant (a, b, c)
     inverse = np.array([yy, -xy, -xy, xx]) / np.where(on_line, 1.0, spread)
     linear = np.ascontiguousarray(inverse.T).reshape(-1, 2, 2) @ S2.transpose(0, 2, 1)
@@ -484,7 +474,7 @@ def _fit_normalised(batch: _Batch, failures: _Failures) -> Array:
     trace, rounding = np.einsum("nii->n", M), _RANK * np.einsum("nii->n", S1)
     minors = (trace * trace - (M * M).sum(axis=(1, 2))) / 2
     many = ~((trace > rounding) & (minors > rounding * trace))
-    failures.add(many, Reason.DEGENERATE_CONIC, "the points do not determine an ellipse")
+    failures.append((many, Reason.DEGENERATE_CONIC, "the points do not determine an ellipse"))
     # solve; a circle's problem stands in for those without a solution
     M[many | on_line] = _CIRCLE
     quadratic = _constrained_minimum(M)
@@ -497,16 +487,16 @@ def _fit_normalised(batch: _Batch, failures: _Failures) -> Array:
     return np.asarray(conics.reshape(-1, 3, 3))
 
 
-def _check(conics: Array, failures: _Failures) -> None:
+def _check(conics: Array, failures: _Noted) -> None:
     """Note a failure for conics that are no real ellipse, or so long that they are lines."""
     a, b, c = conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]
     high = (a + c + np.hypot(a - c, 2 * b)) / 2
     # The smaller eigenvalue as product over the larger one: the difference would cancel.
     low = (a * c - b * b) / high
     not_real = ~((low > 0) & (np.linalg.det(conics) < 0))
-    failures.add(not_real, Reason.NOT_AN_ELLIPSE, "the fitted conic is no real ellipse")
+    failures.append((not_real, Reason.NOT_AN_ELLIPSE, "the fitted conic is no real ellipse"))
     too_long = ~(high <= MAX_AXIS_RATIO**2 * low)
-    failures.add(too_long, Reason.DEGENERATE_CONIC, f"axes differ by more than a factor {MAX_AXIS_RATIO:g}")
+    failures.append((too_long, Reason.DEGENERATE_CONIC, f"axes differ by more than a factor {MAX_AXIS_RATIO:g}"))
 
 
 def _residuals(xy: Array, parameters: Array) -> tuple[Array, Array]:

@@ -33,7 +33,8 @@ def replace_values(
     """Replace values at key paths as `apply_settings` does, and drop what a table's new type does not have.
 
     Setting ``reflectance.type`` to another type leaves no key of the former one behind, unless it is set as well: then
-    it is refused by its name. Keys that both types have stay. In the same way a key replaces its `RIVALS`.
+    it is refused by its name. Keys that both types have stay. In the same way a key replaces its `RIVALS`. Raises
+    `InputError` as `apply_settings` does.
 
     Parameters
     ----------
@@ -45,11 +46,6 @@ def replace_values(
         Values by key path.
     where : str
         Name of the file, for messages.
-
-    Raises
-    ------
-    InputError
-        As `apply_settings` does.
     """
     result = apply_settings(_without_rivals(data, settings), settings, where)
     for path, value in settings.items():
@@ -112,7 +108,7 @@ def full_keys(models: Sequence[BaseModel], given: Mapping[str, Any], others: Seq
     """Return values by full key path, of values by the last name of a key.
 
     Keys that the scene's file states come before those that it leaves at their defaults, and keys of tables before
-    those of lists of tables.
+    those of lists of tables. Raises `InputError` if several keys end in a name, whose paths are listed, or none does.
 
     Parameters
     ----------
@@ -122,11 +118,6 @@ def full_keys(models: Sequence[BaseModel], given: Mapping[str, Any], others: Seq
         Values by name; a name may be a full path too.
     others : sequence of str
         Names that the caller takes itself; a mistyped one may mean one of them.
-
-    Raises
-    ------
-    InputError
-        If several keys end in a name, whose paths are listed, or none does.
     """
     found = [each for model in models for each in _paths(model)]
     stated = dict.fromkeys(path for path, is_stated in found if is_stated)

@@ -122,7 +122,7 @@ ROWS = (
     row("half-pixel shift of the isophotes", "pixel centre", "geometry.patch:Patch._first_centre",
         "np.array(self.origin_px) + PIXEL_CENTRE", "np.array(self.origin_px)", "isophotes peak"),
     row("ellipse fit unscaled", "conic", "geometry.ellipse_fit:_fit_together",
-        "batch, failures = _Batch.of(contours), _Failures()",
+        "batch = _Batch.of(contours)",
         "return __import__('studies.gate.faults', fromlist=['_']).unscaled_fit(contours)", "ellipse_fit"),
     row("rotations turn the other way", "transposes", "geometry.vectors:rotation", "np.eye(3) + first * across",
         "np.eye(3) - first * across", "round_trips"),

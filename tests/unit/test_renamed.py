@@ -8,7 +8,6 @@ import pytest
 
 import simtest
 from simtest._renamed import MODULES, NAMES
-from simtest.calibration import Normal, exactly
 
 DOCUMENTED = {
     "simtest.colour": ("detect_in_picture", "reconstruct_colour"),
@@ -47,15 +46,6 @@ def test_old_names_that_went_elsewhere():
     with pytest.warns(DeprecationWarning, match="NightlyRun"):
         from simtest.gate.records import Night
     assert Night is importlib.import_module("simtest.nightly.records").NightlyRun
-
-
-def test_old_names_in_modules_that_stayed():
-    with pytest.warns(DeprecationWarning, match=r"Known is now simtest.calibration.Priors"):
-        from simtest.calibration import Known
-    told = Known(((1.0, 0.0, 0.0),), 10.0, 0.5, 200.0)
-    assert told == simtest.calibration.Priors(((1.0, 0.0, 0.0),), Normal(10.0, 0.5), exactly(200.0))
-    with pytest.raises(ImportError, match="cannot import name 'Unknown'"):
-        from simtest.calibration import Unknown  # noqa: F401
 
 
 def test_names_that_never_were_are_errors():

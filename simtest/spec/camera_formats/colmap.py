@@ -235,10 +235,7 @@ def _images_text(poses: Poses) -> str:
 def read_transforms(path: Path) -> dict[str, Table]:
     """Read the camera, or those of the frames where they have their own, by file_path.
 
-    Raises
-    ------
-    InputError
-        If the file is malformed, or its camera model is none of simtest's.
+    Raises `InputError` if the file is malformed, or its camera model is none of simtest's.
     """
     data, where = read_json(path), shown(path)
     frames = _frames(data, where)
@@ -256,10 +253,7 @@ def read_transforms(path: Path) -> dict[str, Table]:
 def transforms_poses(path: Path) -> Poses:
     """Read world_from_camera of the frames, by file_path, with OpenCV's camera axes, in the file's unit of length.
 
-    Raises
-    ------
-    InputError
-        If the file is malformed, or a frame has no pose.
+    Raises `InputError` if the file is malformed, or a frame has no pose.
     """
     data, where = read_json(path), shown(path)
     made: list[tuple[str, Array]] = []

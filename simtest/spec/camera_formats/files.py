@@ -171,11 +171,8 @@ def _first(syntax: str, text: str, otherwise: str) -> str:
 def read_table(path: str | Path) -> Table:
     """Read a camera of a file of another program as the table of a `CameraSpec`; "FILE#ID" names one of several.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, malformed, holds no camera, a lens that simtest lacks, or several different cameras
-        of which none is named. TOML is read elsewhere.
+    Raises `InputError` if the file is missing, malformed, holds no camera, a lens that simtest lacks, or several
+    different cameras of which none is named. TOML is read elsewhere.
     """
     path, wanted = split_id(path)
     where, form = shown(path), FORMATS[recognise(path)]

@@ -71,6 +71,8 @@ def scaramuzza_table(
 ) -> Table:
     """Return the table of a `CameraSpec` of Scaramuzza's model with x before y and z along the viewing direction.
 
+    Raises `InputError` if a0 is not positive.
+
     Parameters
     ----------
     size : sequence of float
@@ -83,11 +85,6 @@ def scaramuzza_table(
         c, d, e of the matrix ((c, d), (e, 1)).
     where : str
         The file, for messages.
-
-    Raises
-    ------
-    InputError
-        If a0 is not positive.
     """
     a0, a2, a3, a4 = mapping
     if not a0 > 0:
@@ -104,12 +101,8 @@ def scaramuzza_table(
 def read_c3vd(path: Path) -> dict[str, Table]:
     """Read the parameters of C3VD: JSON, or lines ``key = value`` as in its config.ini.
 
-    The published Python loader takes c, d, e as ((c, d), (e, 1)), which is the model's definition; so does this.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, or a parameter is missing.
+    The published Python loader takes c, d, e as ((c, d), (e, 1)), which is the model's definition; so does this. Raises
+    `InputError` if the file is malformed, or a parameter is missing.
     """
     where = shown(path)
     text = read_text(path, "camera")
@@ -151,11 +144,8 @@ def read_ocamcalib(path: Path) -> dict[str, Table]:
     """Read calib_results.txt: both polynomials, centre, affine parameters, size.
 
     The direct polynomial, from pixels to directions, is the model; the inverse one, a fit to it, is only compared.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, its polynomial has more terms than a0, a2, a3, a4, or the two contradict each other.
+    Raises `InputError` if the file is malformed, its polynomial has more terms than a0, a2, a3, a4, or the two
+    contradict each other.
     """
     where = shown(path)
     rows = [line.split() for line in read_text(path, "camera").splitlines()]
@@ -269,12 +259,8 @@ def values(element: ElementTree.Element, at: str, name: str, count: int) -> list
 def read_photometric(path: Path) -> Tables:
     """Read a photometric calibration as tables of a calibration file: response, vignetting, emission, rig.
 
-    Several lights must spread their light alike.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, or holds a model of another kind.
+    Several lights must spread their light alike. Raises `InputError` if the file is malformed, or holds a model of
+    another kind.
     """
     where, root = shown(path), read_xml(path)
     tables: Tables = {}

@@ -58,10 +58,7 @@ MM = 1000.0
 def read_opencv(path: Path) -> dict[str, Table]:
     """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json): its one camera, whose id is empty.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, malformed, or holds a lens that simtest does not know.
+    Raises `InputError` if the file is missing, malformed, or holds a lens that simtest does not know.
     """
     data, where = _parse(path), shown(path)
     width, height = _size(data, where)

@@ -27,6 +27,8 @@ MM_PER_M = 1000.0
 class Trajectory:
     """Poses of a sequence's frames.
 
+    Raises `InputError` if the numbers of names, poses and times differ.
+
     Parameters
     ----------
     names : sequence of str
@@ -35,11 +37,6 @@ class Trajectory:
         Poses, mm.
     times_s : sequence of float, optional
         When the frames were taken, s; None where they are no sequence in time.
-
-    Raises
-    ------
-    InputError
-        If the numbers of names, poses and times differ.
     """
 
     names: Sequence[str]
@@ -78,6 +75,8 @@ def tum_text(trajectory: Trajectory) -> str:
 def write_trajectory(trajectory: Trajectory, camera: Camera, folder: Path) -> tuple[list[Path], list[str]]:
     """Write a trajectory in every format that can hold it.
 
+    Raises `InputError` if a file cannot be written.
+
     Parameters
     ----------
     trajectory : Trajectory
@@ -93,11 +92,6 @@ def write_trajectory(trajectory: Trajectory, camera: Camera, folder: Path) -> tu
         What was written.
     left_out : list of str
         Why a format was not: it lacks the camera's lens.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
     """
     files: list[Path] = []
     left_out: list[str] = []
