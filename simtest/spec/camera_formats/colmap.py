@@ -26,14 +26,15 @@ from simtest.spec.camera_formats.common import (
     Table,
     check_alike,
     inverse,
+    json_object,
     mask_of_text,
     mask_table,
     mask_text,
     number,
-    read_json,
+    of_text,
     rigid,
+    within,
 )
-from simtest.spec.toml_files import read_text
 
 COLMAP_MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f",),
@@ -94,44 +95,45 @@ GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera axes from OpenCV's; its own inverse."""
 
 
-def read_colmap(path: Path) -> dict[str, Table]:
+@of_text()
+def read_colmap(text: str) -> dict[str, Table]:
     """Read cameras.txt as tables of `CameraSpec` by camera id; raise `InputError` where it is malformed."""
-    where = shown(path)
     cameras: dict[str, Table] = {}
     mask: Table | None = None
-    for count, line in enumerate(read_text(path, "camera").splitlines(), 1):
-        at, words = f"{where}: line {count}", line.split()
-        if line.startswith(MASK):
-            mask = mask_of_text(line.removeprefix(MASK), at)
-        if not words or words[0].startswith("#"):
-            continue
-        name = words[0]
-        if name in cameras:
-            raise InputError(f"{at}: camera {shown(name, 40)} is given twice")
-        cameras[name] = _colmap_camera(words, at)
+    for count, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        with within(f"line {count}"):
+            if line.startswith(MASK):
+                mask = mask_of_text(line.removeprefix(MASK))
+            if not words or words[0].startswith("#"):
+                continue
+            name = words[0]
+            if name in cameras:
+                raise InputError(f"camera {shown(name, 40)} is given twice")
+            cameras[name] = _colmap_camera(words)
         if mask is not None:
             cameras[name]["view_mask"], mask = mask, None
     return cameras
 
 
-def _colmap_camera(words: Sequence[str], at: str) -> Table:
+def _colmap_camera(words: Sequence[str]) -> Table:
     """Return the camera of a line: id, model, width, height, parameters."""
     if len(words) < 4:
-        raise InputError(f"{at}: {len(words)} words; must be CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
-    number(words[0], at, "CAMERA_ID", whole=True)
+        raise InputError(f"{len(words)} words; must be CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
+    number(words[0], "CAMERA_ID", whole=True)
     model = words[1]
     if model not in COLMAP_MODELS:
         reason = "simtest lacks this lens" if model in OTHER_MODELS else "unknown camera model"
         allowed = f"{', '.join(COLMAP_MODELS)}{suggestion(model, COLMAP_MODELS)}"
-        raise InputError(f"{at}: {shown(model, 40)}: {reason}; must be one of {allowed}")
-    width, height = int(number(words[2], at, "WIDTH", whole=True)), int(number(words[3], at, "HEIGHT", whole=True))
+        raise InputError(f"{shown(model, 40)}: {reason}; must be one of {allowed}")
+    width, height = int(number(words[2], "WIDTH", whole=True)), int(number(words[3], "HEIGHT", whole=True))
     # the principal point comes after the focal lengths
     names = list(COLMAP_MODELS[model])
     first = 1 if names[0] == "f" else 2
     names[first:first] = ["cx", "cy"]
     if len(words) - 4 != len(names):
-        raise InputError(f"{at}: {model}: {len(words) - 4} parameters; must be {len(names)}: {', '.join(names)}")
-    told = {name: number(word, at, name) for name, word in zip(names, words[4:], strict=True)}
+        raise InputError(f"{model}: {len(words) - 4} parameters; must be {len(names)}: {', '.join(names)}")
+    told = {name: number(word, name) for name, word in zip(names, words[4:], strict=True)}
     if "f" in told:
         told["fx"] = told["fy"] = told.pop("f")
     table: Table = {"width": width, "height": height}
@@ -143,31 +145,34 @@ def _colmap_camera(words: Sequence[str], at: str) -> Table:
     return table
 
 
-def read_images(path: Path) -> Poses:
+@of_text("pose", "record_bytes")
+def read_images(text: str) -> Poses:
     """Read world_from_camera of each image of images.txt, in its unit; raise `InputError` where it is malformed."""
-    where = shown(path)
     poses: list[tuple[str, Array]] = []
     # Each image has two lines, of which the second, its points, may be empty.
     points_follow = False
-    for count, line in enumerate(read_text(path, "pose", "record_bytes").splitlines(), 1):
+    for count, line in enumerate(text.splitlines(), 1):
+        words, at = line.split(), f"line {count}"
         if points_follow:
             points_follow = False
-            if len(line.split()) % 3:
-                raise InputError(f"{where}: line {count}: must hold an image's points, three words each, or be empty")
-            continue
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        at = f"{where}: line {count}"
-        if len(words) != 10:
-            raise InputError(f"{at}: {len(words)} words; must be IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
-        names = ("IMAGE_ID", "QW", "QX", "QY", "QZ", "TX", "TY", "TZ", "CAMERA_ID")
-        told = [number(word, at, name) for name, word in zip(names, words, strict=False)]
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation_of(np.array(told[1:5]), at), told[5:8]
-        poses.append((words[9], inverse(T)))
-        points_follow = True
+            if len(words) % 3:
+                raise InputError(f"{at}: must hold an image's points, three words each, or be empty")
+        elif words and not words[0].startswith("#"):
+            poses.append((words[-1], _pose(words, at)))
+            points_follow = True
     return poses
+
+
+def _pose(words: Sequence[str], at: str) -> Array:
+    """Return world_from_camera of an image's line."""
+    if len(words) != 10:
+        raise InputError(f"{at}: {len(words)} words; must be IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
+    names = ("IMAGE_ID", "QW", "QX", "QY", "QZ", "TX", "TY", "TZ", "CAMERA_ID")
+    with within(at):
+        told = [number(word, name) for name, word in zip(names, words, strict=False)]
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation_of(np.array(told[1:5]), at), told[5:8]
+    return inverse(T)
 
 
 def colmap_files(camera: Camera, path: Path, poses: Poses | None) -> Files:
@@ -232,43 +237,44 @@ def _images_text(poses: Poses) -> str:
     return "\n".join([*lines, ""])
 
 
-def read_transforms(path: Path) -> dict[str, Table]:
+@of_text(limit="record_bytes")
+def read_transforms(text: str) -> dict[str, Table]:
     """Read the camera, or those of the frames where they have their own, by file_path.
 
     Raises `InputError` if the file is malformed, or its camera model is none of simtest's.
     """
-    data, where = read_json(path), shown(path)
-    frames = _frames(data, where)
-    own = [frame for frame in frames if set(frame) & set(INTRINSICS)]
-    if not own:
-        return {"": _nerf_camera(data, where)}
+    data = json_object(text)
+    frames = _frames(data)
+    if not any(set(frame) & set(INTRINSICS) for frame in frames):
+        return {"": _nerf_camera(data)}
     cameras: dict[str, Table] = {}
     for i, frame in enumerate(frames):
-        name, camera = _name(frame, where, i), _nerf_camera(_of_frame(data, frame), f"{where}: frames[{i}]")
-        if cameras.setdefault(name, camera) != camera:
-            raise InputError(f"{where}: frames[{i}]: file_path {shown(name, 60)} has two cameras; must have one")
+        with within(f"frames[{i}]"):
+            name, camera = _name(frame), _nerf_camera(_of_frame(data, frame))
+            if cameras.setdefault(name, camera) != camera:
+                raise InputError(f"file_path {shown(name, 60)} has two cameras; must have one")
     return cameras
 
 
-def transforms_poses(path: Path) -> Poses:
+@of_text(limit="record_bytes")
+def transforms_poses(text: str) -> Poses:
     """Read world_from_camera of the frames, by file_path, with OpenCV's camera axes, in the file's unit of length.
 
     Raises `InputError` if the file is malformed, or a frame has no pose.
     """
-    data, where = read_json(path), shown(path)
     made: list[tuple[str, Array]] = []
-    for i, frame in enumerate(_frames(data, where)):
-        at = f"{where}: frames[{i}]"
-        if "transform_matrix" not in frame:
-            raise InputError(f"{at}: transform_matrix: missing; must be 4 rows of 4 numbers")
-        made.append((_name(frame, where, i), rigid(frame["transform_matrix"], at, "transform_matrix") @ GL_FROM_CV))
+    for i, frame in enumerate(_frames(json_object(text))):
+        with within(f"frames[{i}]"):
+            if "transform_matrix" not in frame:
+                raise InputError("transform_matrix: missing; must be 4 rows of 4 numbers")
+            made.append((_name(frame), rigid(frame["transform_matrix"], "transform_matrix") @ GL_FROM_CV))
     return made
 
 
-def _frames(data: Mapping[str, Any], where: str) -> list[Mapping[str, Any]]:
+def _frames(data: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     frames = data.get("frames", [])
     if not isinstance(frames, list) or not all(isinstance(frame, Mapping) for frame in frames):
-        raise InputError(f"{where}: frames = {shown(repr(frames), 60)}: must be a list of objects")
+        raise InputError(f"frames = {shown(repr(frames), 60)}: must be a list of objects")
     return frames
 
 
@@ -279,66 +285,65 @@ def _of_frame(data: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, An
     return {key: value for key, value in data.items() if key not in replaced} | dict(frame)
 
 
-def _name(frame: Mapping[str, Any], where: str, index: int) -> str:
+def _name(frame: Mapping[str, Any]) -> str:
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
-        raise InputError(f"{where}: frames[{index}]: file_path = {shown(repr(name), 60)}: must name a picture")
+        raise InputError(f"file_path = {shown(repr(name), 60)}: must name a picture")
     return name
 
 
-def _nerf_camera(data: Mapping[str, Any], where: str) -> Table:
+def _nerf_camera(data: Mapping[str, Any]) -> Table:
     """Return the camera that keys describe."""
-    told = {key: number(data[key], where, key) for key in INTRINSICS if data.get(key) is not None}
+    told = {key: number(data[key], key) for key in INTRINSICS if data.get(key) is not None}
     for key in ("w", "h"):
         if key not in told:
-            raise InputError(f"{where}: {key}: missing; a camera needs the size of its pictures, px")
-        number(told[key], where, key, whole=True)
+            raise InputError(f"{key}: missing; a camera needs the size of its pictures, px")
+        number(told[key], key, whole=True)
     width, height = int(told["w"]), int(told["h"])
-    lens = _nerf_lens(data, told, where)
+    lens = _nerf_lens(data, told)
     # The angle that a fisheye spans does not follow from its focal length alone.
     both = lens is None or lens["type"] != "kannala_brandt"
-    fx = _nerf_focal(told, FOCAL_KEYS[0], width, where, both)
-    fy = fx if not set(FOCAL_KEYS[1]) & set(told) else _nerf_focal(told, FOCAL_KEYS[1], height, where, both)
+    fx = _nerf_focal(told, FOCAL_KEYS[0], width, both)
+    fy = fx if not set(FOCAL_KEYS[1]) & set(told) else _nerf_focal(told, FOCAL_KEYS[1], height, both)
     return {
         "width": width, "height": height, "fx": fx, "fy": fy, "cx": told.get("cx", width / 2),
         "cy": told.get("cy", height / 2), "distortion": lens, "view_mask": data.get("view_mask"),
     }  # fmt: skip
 
 
-def _nerf_focal(told: Mapping[str, float], keys: tuple[str, str], extent: int, where: str, both: bool) -> float:
+def _nerf_focal(told: Mapping[str, float], keys: tuple[str, str], extent: int, both: bool) -> float:
     """Return a focal length, px, given itself or by the angle, rad, that the picture spans; compare these if `both`."""
     focal, angle = keys
     if angle not in told:
         if focal not in told:
-            raise InputError(f"{where}: {focal}: missing; must be given, or {angle}")
+            raise InputError(f"{focal}: missing; must be given, or {angle}")
         return told[focal]
     if not 0 < told[angle] < math.pi:
-        raise InputError(f"{where}: {angle} = {told[angle]:g}: must be 0 to pi, rad")
+        raise InputError(f"{angle} = {told[angle]:g}: must be 0 to pi, rad")
     spanned = extent / 2 / math.tan(told[angle] / 2)
     if focal in told and both:
-        check_alike(where, keys, told[focal], spanned)
+        check_alike(keys, told[focal], spanned)
     return told.get(focal, spanned)
 
 
-def _nerf_lens(data: Mapping[str, Any], told: Mapping[str, float], where: str) -> Table | None:
+def _nerf_lens(data: Mapping[str, Any], told: Mapping[str, float]) -> Table | None:
     """Return the lens as a table; None for a pinhole."""
     model = data.get("camera_model")
     if model is not None and (not isinstance(model, str) or model not in NERF_MODELS):
         hint = suggestion(model, NERF_MODELS) if isinstance(model, str) else ""
         raise InputError(
-            f"{where}: camera_model = {shown(repr(model), 40)}: simtest lacks it; must be one of "
-            f"{', '.join(NERF_MODELS)}{hint}"
+            f"camera_model = {shown(repr(model), 40)}: simtest lacks it; must be one of {', '.join(NERF_MODELS)}{hint}"
         )
     told_fisheye = data.get("is_fisheye", False)
     if told_fisheye not in (False, True, None):
-        raise InputError(f"{where}: is_fisheye = {shown(repr(told_fisheye), 40)}: must be true or false")
+        raise InputError(f"is_fisheye = {shown(repr(told_fisheye), 40)}: must be true or false")
     fisheye = bool(told_fisheye) if model is None else NERF_MODELS[model]
     if told_fisheye is not None and "is_fisheye" in data and bool(told_fisheye) != fisheye:
-        raise InputError(f"{where}: is_fisheye = {told_fisheye}: does not fit camera_model = {model!r}")
+        raise InputError(f"is_fisheye = {told_fisheye}: does not fit camera_model = {model!r}")
     if fisheye:
         return {"type": "kannala_brandt", **{key: told.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")}}
     if told.get("k4"):
-        raise InputError(f"{where}: k4 = {told['k4']:g}: must be 0; simtest's perspective lens has no term r^8")
+        raise InputError(f"k4 = {told['k4']:g}: must be 0; simtest's perspective lens has no term r^8")
     lens = {key: told[key] for key in ("k1", "k2", "p1", "p2", "k3") if told.get(key)}
     return {"type": "brown_conrady", **lens} if lens else None
 

@@ -18,7 +18,7 @@ from simtest.geometry.camera import Camera
 from simtest.runtime.files import write_atomically
 from simtest.runtime.machine_errors import cannot_write
 from simtest.runtime.resources import shown, suggestion
-from simtest.spec.camera_formats.common import LARGEST, Files, Poses, Table, chosen
+from simtest.spec.camera_formats.common import LARGEST, Files, Poses, Table, chosen, within
 from simtest.spec.camera_tables import camera_toml
 from simtest.spec.toml_files import read_text
 
@@ -181,7 +181,8 @@ def read_table(path: str | Path) -> Table:
     if not form.cameras:
         raise InputError(f"{where}: {form.title} holds no camera; must be a camera file of another program")
     cameras: dict[str, Table] = form.function(form.cameras)(path / "cameras.txt" if path.is_dir() else path)
-    return chosen(cameras, wanted, where)
+    with within(where):
+        return chosen(cameras, wanted)
 
 
 def read_poses(path: str | Path) -> Poses:

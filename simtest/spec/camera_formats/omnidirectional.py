@@ -15,7 +15,6 @@ frame.
 import math
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -25,8 +24,7 @@ from numpy.polynomial import Polynomial
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.runtime.resources import shown, suggestion
-from simtest.spec.camera_formats.common import Table, number, numbers, read_json, read_xml
-from simtest.spec.toml_files import read_text
+from simtest.spec.camera_formats.common import Table, json_object, number, numbers, of_text, within, xml_root
 
 C3VD_KEYS = ("width", "height", "cx", "cy", "a0", "a2", "a3", "a4", "c", "d", "e")
 
@@ -67,7 +65,6 @@ def scaramuzza_table(
     centre: Sequence[float],
     mapping: Sequence[float],
     stretch: Sequence[float],
-    where: str,
 ) -> Table:
     """Return the table of a `CameraSpec` of Scaramuzza's model with x before y and z along the viewing direction.
 
@@ -83,14 +80,12 @@ def scaramuzza_table(
         a0, a2, a3, a4 for radii in px: px, 1/px, 1/px^2, 1/px^3.
     stretch : sequence of float
         c, d, e of the matrix ((c, d), (e, 1)).
-    where : str
-        The file, for messages.
     """
     a0, a2, a3, a4 = mapping
     if not a0 > 0:
-        raise InputError(f"{where}: a0 = {a0:g}: must be > 0, since z points along the viewing direction")
+        raise InputError(f"a0 = {a0:g}: must be > 0, since z points along the viewing direction")
     if not a0 <= LONGEST:
-        raise InputError(f"{where}: a0 = {a0:g}: must be at most {LONGEST:g} px")
+        raise InputError(f"a0 = {a0:g}: must be at most {LONGEST:g} px")
     lens = {"k2": a2 * a0, "k3": a3 * a0**2, "k4": a4 * a0**3, **dict(zip("cde", stretch, strict=True))}
     return {
         "width": int(size[0]), "height": int(size[1]), "fx": a0, "fy": a0, "cx": centre[0], "cy": centre[1],
@@ -98,33 +93,31 @@ def scaramuzza_table(
     }  # fmt: skip
 
 
-def read_c3vd(path: Path) -> dict[str, Table]:
+@of_text()
+def read_c3vd(text: str) -> dict[str, Table]:
     """Read the parameters of C3VD: JSON, or lines ``key = value`` as in its config.ini.
 
     The published Python loader takes c, d, e as ((c, d), (e, 1)), which is the model's definition; so does this. Raises
     `InputError` if the file is malformed, or a parameter is missing.
     """
-    where = shown(path)
-    text = read_text(path, "camera")
-    data = read_json(path) if text.lstrip().startswith("{") else _lines(text, where)
+    data = json_object(text) if text.lstrip().startswith("{") else _lines(text)
     missing = next((key for key in C3VD_KEYS if key not in data), None)
     if missing is not None:
-        raise InputError(f"{where}: {missing}: missing{suggestion(missing, data)}; must give {', '.join(C3VD_KEYS)}")
-    told = {key: number(data[key], where, key, whole=key in ("width", "height")) for key in C3VD_KEYS}
-    if number(data.get("a1", 0.0), where, "a1") != 0:
-        raise InputError(f"{where}: a1 = {data['a1']}: must be 0, as in Scaramuzza's model")
+        raise InputError(f"{missing}: missing{suggestion(missing, data)}; must give {', '.join(C3VD_KEYS)}")
+    told = {key: number(data[key], key, whole=key in ("width", "height")) for key in C3VD_KEYS}
+    if number(data.get("a1", 0.0), "a1") != 0:
+        raise InputError(f"a1 = {data['a1']}: must be 0, as in Scaramuzza's model")
     return {
         "": scaramuzza_table(
             (told["width"], told["height"]),
             (told["cx"] + PIXEL_CENTRE, told["cy"] + PIXEL_CENTRE),
             [told[key] for key in ("a0", "a2", "a3", "a4")],
             [told[key] for key in "cde"],
-            where,
         )
     }
 
 
-def _lines(text: str, where: str) -> Mapping[str, Any]:
+def _lines(text: str) -> Mapping[str, Any]:
     """Return what lines of ``key = value`` or ``key: value`` say; comments begin with ; or #."""
     data: dict[str, Any] = {}
     for count, line in enumerate(text.splitlines(), 1):
@@ -133,108 +126,105 @@ def _lines(text: str, where: str) -> Mapping[str, Any]:
             continue
         found = re.fullmatch(r"(\w+)\s*[=:]\s*(.*)", content)
         if not found:
-            raise InputError(f"{where}: line {count}: {shown(content, 60)}: must be key = value")
+            raise InputError(f"line {count}: {shown(content, 60)}: must be key = value")
         if found[1] in data:
-            raise InputError(f"{where}: line {count}: {shown(found[1], 40)} is given twice")
+            raise InputError(f"line {count}: {shown(found[1], 40)} is given twice")
         data[found[1]] = found[2].strip()
     return data
 
 
-def read_ocamcalib(path: Path) -> dict[str, Table]:
+@of_text()
+def read_ocamcalib(text: str) -> dict[str, Table]:
     """Read calib_results.txt: both polynomials, centre, affine parameters, size.
 
     The direct polynomial, from pixels to directions, is the model; the inverse one, a fit to it, is only compared.
     Raises `InputError` if the file is malformed, its polynomial has more terms than a0, a2, a3, a4, or the two
     contradict each other.
     """
-    where = shown(path)
-    rows = [line.split() for line in read_text(path, "camera").splitlines()]
+    rows = [line.split() for line in text.splitlines()]
     rows = [row for row in rows if row and not row[0].startswith("#")]
     if len(rows) < 5:
-        raise InputError(f"{where}: {len(rows)} lines of numbers; must be 5: two polynomials, centre, c d e, size")
-    direct, back = _polynomial(rows[0], where, "direct polynomial"), _polynomial(rows[1], where, "inverse polynomial")
-    row, column = numbers(rows[2], where, "centre (row, column)", 2)
-    c, d, e = numbers(rows[3], where, "affine parameters c d e", 3)
-    height, width = (number(word, where, "size (height, width)", whole=True) for word in _pair(rows[4], where))
+        raise InputError(f"{len(rows)} lines of numbers; must be 5: two polynomials, centre, c d e, size")
+    direct, back = _polynomial(rows[0], "direct polynomial"), _polynomial(rows[1], "inverse polynomial")
+    row, column = numbers(rows[2], "centre (row, column)", 2)
+    c, d, e = numbers(rows[3], "affine parameters c d e", 3)
+    height, width = (number(word, "size (height, width)", whole=True) for word in _pair(rows[4]))
     if any(direct[5:]) or len(direct) < 1 or (len(direct) > 1 and direct[1] != 0):
-        raise InputError(f"{where}: direct polynomial: must have the terms a0, a2, a3, a4 alone")
+        raise InputError("direct polynomial: must have the terms a0, a2, a3, a4 alone")
     a0, _, a2, a3, a4 = (*direct, 0.0, 0.0, 0.0, 0.0)[:5]
     if not a0 < 0:
-        raise InputError(f"{where}: direct polynomial: a0 = {a0:g}: must be < 0, since OCamCalib's z points backwards")
+        raise InputError(f"direct polynomial: a0 = {a0:g}: must be < 0, since OCamCalib's z points backwards")
     if not c > 0:
-        raise InputError(f"{where}: affine parameters: c = {c:g}: must be > 0")
-    _check_inverse(direct, back, min(width, height) / 4, where)
+        raise InputError(f"affine parameters: c = {c:g}: must be > 0")
+    _check_inverse(direct, back, min(width, height) / 4)
     # From (row, column) to (x, y) the matrix ((c, d), (e, 1)) becomes ((1, e), (d, c)), c times ((1/c, e/c), (d/c, 1)).
     table = scaramuzza_table(
         (width, height),
         (column + PIXEL_CENTRE, row + PIXEL_CENTRE),
         (-a0, -a2, -a3, -a4),
         (1 / c, e / c, d / c),
-        where,
     )
     return {"": table | {"fx": -a0 * c, "fy": -a0 * c}}
 
 
-def _pair(row: list[str], where: str) -> list[str]:
+def _pair(row: list[str]) -> list[str]:
     if len(row) != 2:
-        raise InputError(f"{where}: size: {len(row)} values; must be 2, height and width")
+        raise InputError(f"size: {len(row)} values; must be 2, height and width")
     return row
 
 
-def _polynomial(row: list[str], where: str, name: str) -> list[float]:
+def _polynomial(row: list[str], name: str) -> list[float]:
     """Return the coefficients of a line that begins with their number."""
-    count = number(row[0], where, f"{name}: number of coefficients", whole=True)
+    count = number(row[0], f"{name}: number of coefficients", whole=True)
     if count != len(row) - 1 or count < 1:
-        raise InputError(f"{where}: {name}: says {count:g} coefficients and holds {len(row) - 1}; must be as many")
-    return numbers(row[1:], where, name, len(row) - 1)
+        raise InputError(f"{name}: says {count:g} coefficients and holds {len(row) - 1}; must be as many")
+    return numbers(row[1:], name, len(row) - 1)
 
 
-def _check_inverse(direct: list[float], back: list[float], most: float, where: str) -> None:
+def _check_inverse(direct: list[float], back: list[float], most: float) -> None:
     """Raise `InputError` where the inverse polynomial does not lead back from radii up to `most`, px."""
     radius = np.linspace(0.1, 1.0, 10) * most
     # world2cam takes the angle from the image plane, which is negative in front of the camera.
     apart = np.abs(Polynomial(back)(np.arctan2(Polynomial(direct)(radius), radius)) - radius).max()
     if not apart <= MOST_APART:
         raise InputError(
-            f"{where}: the two polynomials differ by {apart:.3g} px; must be each other's inverse within "
-            f"{MOST_APART:g} px"
+            f"the two polynomials differ by {apart:.3g} px; must be each other's inverse within {MOST_APART:g} px"
         )
 
 
-def read_vicalib(path: Path) -> dict[str, Table]:
+@of_text()
+def read_vicalib(text: str) -> dict[str, Table]:
     """Read the cameras of a rig, by their index; raise `InputError` where the file is malformed."""
-    where, root = shown(path), read_xml(path)
     cameras: dict[str, Table] = {}
-    for i, element in enumerate(root.iter("camera_model")):
+    for i, element in enumerate(xml_root(text).iter("camera_model")):
         name = element.get("index") or str(i)
         if name in cameras:
-            raise InputError(f"{where}: camera index {shown(name, 40)} is given twice")
-        cameras[name] = _vicalib_camera(element, f"{where}: camera {shown(name, 40)}")
+            raise InputError(f"camera index {shown(name, 40)} is given twice")
+        with within(f"camera {shown(name, 40)}"):
+            cameras[name] = _vicalib_camera(element)
     return cameras
 
 
-def _vicalib_camera(element: ElementTree.Element, at: str) -> Table:
+def _vicalib_camera(element: ElementTree.Element) -> Table:
     kind = element.get("type") or ""
     if kind not in VICALIB_MODELS:
         raise InputError(
-            f"{at}: type = {shown(repr(kind), 60)}: simtest lacks it; must be one of {', '.join(VICALIB_MODELS)}"
+            f"type = {shown(repr(kind), 60)}: simtest lacks it; must be one of {', '.join(VICALIB_MODELS)}"
             f"{suggestion(kind, VICALIB_MODELS)}"
         )
     for axis, wanted in AXES.items():
         found = element.find(axis)
-        if found is not None and values(found, at, axis, 3) != list(wanted):
-            raise InputError(
-                f"{at}: {axis} = {shown(' '.join((found.text or '').split()), 40)}: must be {list(wanted)}"
-            )
-    width, height = (int(number(text_of(element, key, at), at, key, whole=True)) for key in ("width", "height"))
+        if found is not None and values(found, axis, 3) != list(wanted):
+            raise InputError(f"{axis} = {shown(' '.join((found.text or '').split()), 40)}: must be {list(wanted)}")
+    width, height = (int(number(text_of(element, key), key, whole=True)) for key in ("width", "height"))
     params = element.find("params")
     if params is None:
-        raise InputError(f"{at}: params: missing; must be a list of numbers")
+        raise InputError("params: missing; must be a list of numbers")
     lens, names = VICALIB_MODELS[kind]
     if lens == "scaramuzza":
-        cx, cy, *mapping, e, f, g = values(params, at, "params", 9)
-        return scaramuzza_table((width, height), (cx + PIXEL_CENTRE, cy + PIXEL_CENTRE), mapping, (e, f, g), at)
-    told = dict(zip((*FOCAL, *names), values(params, at, "params", 4 + len(names)), strict=True))
+        cx, cy, *mapping, e, f, g = values(params, "params", 9)
+        return scaramuzza_table((width, height), (cx + PIXEL_CENTRE, cy + PIXEL_CENTRE), mapping, (e, f, g))
+    told = dict(zip((*FOCAL, *names), values(params, "params", 4 + len(names)), strict=True))
     table: Table = {"width": width, "height": height, "fx": told["fx"], "fy": told["fy"]}
     table |= {key: told[key] + PIXEL_CENTRE for key in ("cx", "cy")}
     if lens:
@@ -242,84 +232,89 @@ def _vicalib_camera(element: ElementTree.Element, at: str) -> Table:
     return table
 
 
-def text_of(element: ElementTree.Element, key: str, at: str) -> str:
+def text_of(element: ElementTree.Element, key: str) -> str:
     """Return the text of a child; raise `InputError` where there is none."""
     found = element.find(key)
     if found is None or not (found.text or "").strip():
-        raise InputError(f"{at}: {key}: missing")
+        raise InputError(f"{key}: missing")
     return (found.text or "").strip()
 
 
-def values(element: ElementTree.Element, at: str, name: str, count: int) -> list[float]:
+def values(element: ElementTree.Element, name: str, count: int) -> list[float]:
     """Return the numbers of a text such as ``[ 1; 2; 3 ]``."""
     words = re.split(r"[;,\s]+", (element.text or "").strip().strip("[]").strip())
-    return numbers([word for word in words if word], at, name, count)
+    return numbers([word for word in words if word], name, count)
 
 
-def read_photometric(path: Path) -> Tables:
+@of_text()
+def read_photometric(text: str) -> Tables:
     """Read a photometric calibration as tables of a calibration file: response, vignetting, emission, rig.
 
     Several lights must spread their light alike. Raises `InputError` if the file is malformed, or holds a model of
     another kind.
     """
-    where, root = shown(path), read_xml(path)
+    root = xml_root(text)
     tables: Tables = {}
     cameras = root.findall("camera")
     if len(cameras) > 1:
-        raise InputError(f"{where}: holds {len(cameras)} cameras; must be one")
+        raise InputError(f"holds {len(cameras)} cameras; must be one")
     model = cameras[0].find("camera_model") if cameras else None
     if model is not None:
-        tables |= _lens_and_response(model, f"{where}: camera")
-    lights = [_light(element, f"{where}: light {i}") for i, element in enumerate(root.findall("light/light_model"))]
+        with within("camera"):
+            tables |= _lens_and_response(model)
+    lights = []
+    for i, element in enumerate(root.findall("light/light_model")):
+        with within(f"light {i}"):
+            lights.append(_light(element))
     if lights:
-        tables |= _rig(lights, where)
+        tables |= _rig(lights)
     if not tables:
-        raise InputError(f"{where}: holds neither a camera_model nor a light_model; must hold one of them")
+        raise InputError("holds neither a camera_model nor a light_model; must hold one of them")
     return tables
 
 
-def _lens_and_response(model: ElementTree.Element, at: str) -> Tables:
+def _lens_and_response(model: ElementTree.Element) -> Tables:
     if model.get("type") != "gamma":
-        raise InputError(f"{at}: type = {shown(repr(model.get('type')), 40)}: simtest lacks it; must be 'gamma'")
-    gamma = _number(model, "gamma", at)
+        raise InputError(f"type = {shown(repr(model.get('type')), 40)}: simtest lacks it; must be 'gamma'")
+    gamma = _number(model, "gamma")
     if not 0.1 <= gamma <= 10:
-        raise InputError(f"{at}: gamma = {gamma:g}: must be 0.1 to 10")
+        raise InputError(f"gamma = {gamma:g}: must be 0.1 to 10")
     tables: Tables = {"response": {"type": "gamma", "gamma": gamma}}
-    power = _number(model, "vignetting", at) if model.find("vignetting") is not None else 0.0
+    power = _number(model, "vignetting") if model.find("vignetting") is not None else 0.0
     if not 0 <= power <= 1000:
-        raise InputError(f"{at}: vignetting = {power:g}: must be 0 to 1000")
+        raise InputError(f"vignetting = {power:g}: must be 0 to 1000")
     tables["vignetting"] = {"type": "cosine", "power": power}
     return tables
 
 
-def _light(model: ElementTree.Element, at: str) -> dict[str, Any]:
+def _light(model: ElementTree.Element) -> dict[str, Any]:
     """Return the spread, position, mm, and direction of a light."""
     if model.get("type") != "sls":
-        raise InputError(f"{at}: type = {shown(repr(model.get('type')), 40)}: simtest lacks it; must be 'sls'")
-    mu = _number(model, "mu", at)
+        raise InputError(f"type = {shown(repr(model.get('type')), 40)}: simtest lacks it; must be 'sls'")
+    mu = _number(model, "mu")
     if not 0 <= mu <= MOST_SPREAD:
-        raise InputError(f"{at}: mu = {mu:g}: must be 0 to {MOST_SPREAD:g}")
-    _number(model, "sigma", at)
+        raise InputError(f"mu = {mu:g}: must be 0 to {MOST_SPREAD:g}")
+    _number(model, "sigma")
     told = {}
     for key in ("P", "D"):
         element = model.find(key)
         if element is None:
-            raise InputError(f"{at}: {key}: missing; must be [ x; y; z ]")
-        told[key] = np.array(values(element, at, key, 3))
+            raise InputError(f"{key}: missing; must be [ x; y; z ]")
+        told[key] = np.array(values(element, key, 3))
     position, length = told["P"] * MM, float(np.linalg.norm(told["D"]))
     if not np.abs(position).max() <= FARTHEST_MM:
-        raise InputError(f"{at}: P = {told['P'].tolist()}: must be metres, within 1 m of the camera")
+        raise InputError(f"P = {told['P'].tolist()}: must be metres, within 1 m of the camera")
     if not abs(length - 1) <= 0.01:
-        raise InputError(f"{at}: D has length {length:.3g}; must be a unit vector")
+        raise InputError(f"D has length {length:.3g}; must be a unit vector")
     return {"mu": mu, "position": position.round(9).tolist(), "direction": (told["D"] / length).tolist()}
 
 
-def _rig(lights: list[dict[str, Any]], where: str) -> Tables:
+def _rig(lights: list[dict[str, Any]]) -> Tables:
     """Return where the lights are and how they emit."""
     first = lights[0]
     for light in lights[1:]:
         if light["mu"] != first["mu"] or not np.allclose(light["direction"], first["direction"], atol=1e-3):
-            raise InputError(f"{where}: lights of different mu or D; must spread their light alike")
+            raise InputError("lights of different mu or D; must spread their light alike")
     angles = np.arange(0.0, 180 + STEP_DEG, STEP_DEG)
     emission = {
         "type": "table", "angle_deg": angles.tolist(),
@@ -329,6 +324,6 @@ def _rig(lights: list[dict[str, Any]], where: str) -> Tables:
     return {"emission": emission, "rig": {"lights_mm": [light["position"] for light in lights]}}
 
 
-def _number(model: ElementTree.Element, key: str, at: str) -> float:
+def _number(model: ElementTree.Element, key: str) -> float:
     """Return a number, in brackets or not."""
-    return number(text_of(model, key, at).strip("[] "), at, key)
+    return number(text_of(model, key).strip("[] "), key)
