@@ -85,17 +85,9 @@ def estimate_coarse_noise(
     """Estimate the noise of a smoothed frame, as the standard deviation of white noise that would leave as much of it.
 
     Demosaicing and coding take noise from the finest scale, where `estimate_noise` looks, and leave or add it at the
-    coarser one that isophotes are found at. Second differences of the smoothed frame, two widths of the smoothing
-    apart, show it there.
-
-    Parameters
-    ----------
-    smoothed : ndarray of float32, shape (H, W)
-        The frame, smoothed by a Gaussian of `sigma_px`.
-    sigma_px : float
-        px; below 1, where pixels are no fine grid, and of frames too small for the differences, 0: not known.
-    seen, clipped : ndarray of bool, shape (H, W), optional
-        As in `estimate_noise`.
+    coarser one that isophotes are found at. Second differences of the frame, smoothed by a Gaussian of `sigma_px`, two
+    widths of the smoothing apart, show it there. It is 0, not known, of a width below 1 px, where pixels are no fine
+    grid, and of frames too small for the differences. `seen` and `clipped` are as in `estimate_noise`.
     """
     step = round(sigma_px)
     reach = 2 * SPACING * step

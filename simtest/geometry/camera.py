@@ -321,22 +321,11 @@ def focal_of_view(
     lens: Distortion | None = None,
     across: FovExtent = "width",
 ) -> float:
-    """Return the focal length, px, of a camera with square pixels that has a stated field of view.
+    """Return the focal length, px, of a camera with square pixels that has a given field of view.
 
-    Raises `InputError` if the lens cannot span that angle: a pinhole not 180 deg, others not beyond their fold.
-
-    Parameters
-    ----------
-    fov_deg : float
-        As `field_of_view` gives it.
-    size : (int, int)
-        Width and height of the picture, px.
-    centre : (float, float)
-        Principal point, px.
-    lens : Distortion, optional
-        The lens, whose field it is; default a pinhole.
-    across : {"width", "height", "diagonal"}
-        What the angle spans.
+    The angle, deg, is as `field_of_view` gives it. Size and principal point of the picture are px; the lens, whose
+    field it is, is by default a pinhole. Raises `InputError` if the lens cannot span that angle: a pinhole not 180 deg,
+    others not beyond their fold.
     """
     wanted, ends = np.radians(fov_deg), _ends(*size, centre, across)
     lengths = np.linalg.norm(ends, axis=1)

@@ -9,18 +9,9 @@ from functools import lru_cache
 
 
 def survival(x: float, freedom: int) -> float:
-    """Return the probability that a chi-squared variable exceeds x > 0, by its finite sums [AS, 26.4.4, 26.4.5].
+    """Return the probability that a chi-squared variable exceeds x > 0, by its finite sums.
 
-    Parameters
-    ----------
-    x : float
-        Value, > 0.
-    freedom : int
-        Degrees of freedom, >= 1.
-
-    Notes
-    -----
-    [AS] M. Abramowitz, I. A. Stegun, "Handbook of Mathematical Functions", 1964.
+    Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964, 26.4.4 and 26.4.5.
     """
     half = x / 2
     # Q(a + 1) = Q(a) + half^a exp(-half) / Gamma(a + 1), from a = 1/2 or from a = 1 up to freedom/2.

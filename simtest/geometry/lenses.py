@@ -95,6 +95,19 @@ def invert(curve: Curve, value: Array, top: float, reach: float) -> Array:
     return found.reshape(np.shape(value))
 
 
+def _field_angle(P: Array) -> Array:
+    """Return the angle of directions, shape (..., 3), off the optical axis, rad; NaN of no direction."""
+    return np.where(np.abs(P).max(axis=-1) > 0, np.arctan2(np.hypot(P[..., 0], P[..., 1]), P[..., 2]), np.nan)
+
+
+def _share(r: Array, P: Array, theta: Array) -> Array:
+    """Return radii in the image over the distance of directions from the axis, by which these are multiplied."""
+    across = np.hypot(P[..., 0], P[..., 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # On the axis the share is 0/0; the coordinates are 0 there whatever it is.
+        return np.where((across == 0) & (theta == 0), 0.0, r / across)
+
+
 @dataclass(frozen=True)
 class BrownConrady:
     """Radial and tangential distortion of a perspective lens: OpenCV's models of 5 and of 8 coefficients.
@@ -332,12 +345,8 @@ class Scaramuzza:
     def distort(self, rays: npt.ArrayLike) -> Array:
         """Return image coordinates as `BrownConrady.distort` does, by Newton's method; NaN beyond the branch."""
         P = np.asarray(rays, dtype=float)
-        across = np.hypot(P[..., 0], P[..., 1])
-        theta = np.where(np.abs(P).max(axis=-1) > 0, np.arctan2(across, P[..., 2]), np.nan)
-        r = invert(self._angle, theta, self.limit, self.limit_angle)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            # On the axis the share is 0/0; the coordinates are 0 there whatever it is.
-            share = np.where((across == 0) & (theta == 0), 0.0, r / across)
+        theta = _field_angle(P)
+        share = _share(invert(self._angle, theta, self.limit, self.limit_angle), P, theta)
         x, y = P[..., 0] * share, P[..., 1] * share
         return np.stack([self.c * x + self.d * y, self.e * x + y], axis=-1)
 
@@ -412,14 +421,9 @@ class KannalaBrandt:
     def distort(self, rays: npt.ArrayLike) -> Array:
         """Return image coordinates as `BrownConrady.distort` does; NaN beyond the branch, and straight behind."""
         P = np.asarray(rays, dtype=float)
-        across = np.hypot(P[..., 0], P[..., 1])
-        theta = np.arctan2(across, P[..., 2])
-        theta = np.where((theta < self.limit_angle) & (np.abs(P).max(axis=-1) > 0), theta, np.nan)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = self.radial(theta)[0] / across
-        # On the axis the share is 0/0; the coordinates are 0 there whatever it is.
-        share = np.where((across == 0) & (theta == 0), 0.0, share)
-        return np.asarray(P[..., :2] * share[..., None])
+        theta = _field_angle(P)
+        r = self.radial(np.where(theta < self.limit_angle, theta, np.nan))[0]
+        return np.asarray(P[..., :2] * _share(r, P, theta)[..., None])
 
     def undistort(self, m: npt.ArrayLike) -> Array:
         """Return unit directions as `BrownConrady.undistort` does."""

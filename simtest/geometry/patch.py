@@ -32,51 +32,18 @@ MIN_PLATEAU_PX = 12
 
 
 @dataclass(frozen=True, eq=False)
-class IsophoteTracer:
-    """The level sets around one peak, each found once; the fields are those of `simtest.geometry.Patch`.
+class _LevelSets:
+    """The level sets around a peak that were found, and the values, view, peak and smoothing that they are of."""
 
-    What it holds depends on its fields alone, so nobody needs to clear it.
-    """
+    of: tuple[object, ...]
+    closed: dict[float, LevelSet | Failure] = field(default_factory=dict)
+    cut: dict[float, LevelSet] = field(default_factory=dict)
+    crossings: dict[tuple[LevelSet, ...], Crossings] = field(default_factory=dict)
 
-    values: Image | Array
-    peak_pixel: tuple[int, int]
-    peak_value: float
-    seen: Mask | None
-    smoothing_px: float
-    _closed: dict[float, LevelSet | Failure] = field(default_factory=dict, init=False, repr=False)
-    _cut: dict[float, LevelSet] = field(default_factory=dict, init=False, repr=False)
-    _crossings: dict[tuple[LevelSet, ...], Crossings] = field(default_factory=dict, init=False, repr=False)
-
-    def finds_the_same_as(self, other: "IsophoteTracer") -> bool:
-        """Return whether another tracer works on the same arrays, not copies, with the same peak and smoothing."""
-        arrays = self.values is other.values and self.seen is other.seen
-        peaks = self.peak_pixel == other.peak_pixel and self.peak_value == other.peak_value
-        return arrays and peaks and self.smoothing_px == other.smoothing_px
-
-    def closed(self, isovalue: float) -> LevelSet | Failure:
-        """Return the region above t times the peak; a Failure where its border does not close."""
-        if isovalue not in self._closed:
-            level = _checked(isovalue) * self.peak_value
-            self._closed[isovalue] = level_set_around(self.values, self.peak_pixel, level, self.seen) or Failure(
-                Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}"
-            )
-        return self._closed[isovalue]
-
-    def cut(self, isovalue: float) -> LevelSet:
-        """Return the same region where the border or the view may cut it, its border open there."""
-        if isovalue not in self._cut:
-            margin = max(int(np.ceil(CUT_SIGMAS * self.smoothing_px)), 1)
-            level = _checked(isovalue) * self.peak_value
-            self._cut[isovalue] = cut_level_set_around(self.values, self.peak_pixel, level, margin, self.seen)
-        return self._cut[isovalue]
-
-    def crossings(self, sets: list[LevelSet]) -> Crossings:
-        """Return where the borders of level sets cross the lines between pixel centres."""
-        # Usually the points are used first, then how they move.
-        key = tuple(sets)
-        if key not in self._crossings:
-            self._crossings[key] = crossings(sets)
-        return self._crossings[key]
+    def are_of(self, of: tuple[object, ...]) -> bool:
+        """Return whether they are of the same arrays, not copies, with the same peak and smoothing."""
+        pairs = zip(self.of, of, strict=True)
+        return all(one is other or (isinstance(one, int | float | tuple) and one == other) for one, other in pairs)
 
 
 @dataclass(frozen=True)
@@ -109,8 +76,8 @@ class Patch:
         Peaks of the frame's other specularities, px; None: not known, empty: there are none.
     others_value : tuple of float
         Smoothed intensities of those, 0 where one has no patch; empty: not known.
-    tracer : IsophoteTracer, optional
-        Made from the fields above, unless it is one that was.
+    found : optional
+        The level sets found so far: those of the patch that this one is a copy of, where it has the same.
     kept : dict
         What estimators have fitted to this patch, by a name, each with the camera; a copy starts without.
 
@@ -136,16 +103,16 @@ class Patch:
     smoothing_px: float = 0.0
     others_px: tuple[tuple[float, float], ...] | None = None
     others_value: tuple[float, ...] = ()
-    tracer: IsophoteTracer | None = field(default=None, compare=False, repr=False)
+    found: _LevelSets | None = field(default=None, compare=False, repr=False)
     kept: dict[Hashable, tuple[object, object]] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         # A copy with other neighbours or noise keeps its level sets; one with other values or another peak does not.
-        fresh = IsophoteTracer(self.values, self.peak_pixel, self.peak_value, self.seen, self.smoothing_px)
-        if self.tracer is None or not self.tracer.finds_the_same_as(fresh):
-            object.__setattr__(self, "tracer", fresh)
+        of = (self.values, self.seen, self.peak_pixel, self.peak_value, self.smoothing_px)
+        if self.found is None or not self.found.are_of(of):
+            object.__setattr__(self, "found", _LevelSets(of))
 
     @classmethod
     def cut(
@@ -247,11 +214,11 @@ class Patch:
 
     def crossings_of(self, isovalues: Sequence[float]) -> list[Array | Failure]:
         """Return the points of several isophotes (see `crossings`), at little more than the cost of one."""
-        found = [self._isophotes.closed(t) for t in isovalues]
+        found = [self._closed(t) for t in isovalues]
         closed = [each for each in found if not isinstance(each, Failure)]
         if not closed:
             return [each for each in found if isinstance(each, Failure)]
-        traced = self._isophotes.crossings(closed)
+        traced = self._crossings(closed)
         points = iter(traced.each(traced.points + self._first_centre))
         return [each if isinstance(each, Failure) else next(points) for each in found]
 
@@ -260,29 +227,55 @@ class Patch:
 
         Points nearer to the cut than 1.5 times the smoothing's width are left out.
         """
-        return self._isophotes.crossings([self._isophotes.cut(isovalue)]).points + self._first_centre
+        return self._crossings([self._cut(isovalue)]).points + self._first_centre
 
     def traced(self, isovalues: Sequence[float], cut: Sequence[bool]) -> Crossings:
         """Return the points of `crossings`, or of `arc` where `cut` is true, and how they move with the values.
 
         The isophotes must have been found; pixels and points are those of the region.
         """
-        tracer = self._isophotes
-        found = [tracer.cut(t) if arc else tracer.closed(t) for t, arc in zip(isovalues, cut, strict=True)]
-        return tracer.crossings([each for each in found if isinstance(each, LevelSet)])
+        found = [self._cut(t) if arc else self._closed(t) for t, arc in zip(isovalues, cut, strict=True)]
+        return self._crossings([each for each in found if isinstance(each, LevelSet)])
 
     def isophote(self, isovalue: float) -> Array | Failure:
         """Return the points of `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end.
 
         Where the border meets itself, at a pixel whose value is the level, a point is passed more than once.
         """
-        found = self._isophotes.closed(isovalue)
+        found = self._closed(isovalue)
         return found if isinstance(found, Failure) else found.polygon() + PIXEL_CENTRE + self.origin_px
 
     @property
-    def _isophotes(self) -> IsophoteTracer:
-        assert self.tracer is not None
-        return self.tracer
+    def _level_sets(self) -> _LevelSets:
+        assert self.found is not None
+        return self.found
+
+    def _closed(self, isovalue: float) -> LevelSet | Failure:
+        """Return the region above t times the peak; a Failure where its border does not close."""
+        found = self._level_sets.closed
+        if isovalue not in found:
+            level = _checked(isovalue) * self.peak_value
+            found[isovalue] = level_set_around(self.values, self.peak_pixel, level, self.seen) or Failure(
+                Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}"
+            )
+        return found[isovalue]
+
+    def _cut(self, isovalue: float) -> LevelSet:
+        """Return the same region where the border or the view may cut it, its border open there."""
+        found = self._level_sets.cut
+        if isovalue not in found:
+            margin = max(int(np.ceil(CUT_SIGMAS * self.smoothing_px)), 1)
+            level = _checked(isovalue) * self.peak_value
+            found[isovalue] = cut_level_set_around(self.values, self.peak_pixel, level, margin, self.seen)
+        return found[isovalue]
+
+    def _crossings(self, sets: list[LevelSet]) -> Crossings:
+        """Return where the borders of level sets cross the lines between pixel centres."""
+        # Usually the points are used first, then how they move.
+        found, key = self._level_sets.crossings, tuple(sets)
+        if key not in found:
+            found[key] = crossings(sets)
+        return found[key]
 
     @property
     def _first_centre(self) -> Array:
@@ -294,10 +287,10 @@ class Patch:
 
         Where it does not close: all seen pixels, or with `cut` those that it encloses together with the cut.
         """
-        found = self._isophotes.closed(isovalue)
+        found = self._closed(isovalue)
         if isinstance(found, Failure):
             if cut:
-                return np.asarray(self._isophotes.cut(isovalue).inside[1:-1, 1:-1])
+                return np.asarray(self._cut(isovalue).inside[1:-1, 1:-1])
             return np.ones(self.values.shape, dtype=bool) if self.seen is None else self.seen
         mask = np.zeros(self.values.shape, dtype=bool)
         height, width = found.inside.shape
@@ -307,7 +300,7 @@ class Patch:
 
     def area_px(self, isovalue: float) -> int | None:
         """Return how many pixels an isophote encloses; None where it does not close."""
-        found = self._isophotes.closed(isovalue)
+        found = self._closed(isovalue)
         return None if isinstance(found, Failure) else int(np.count_nonzero(found.inside))
 
     @property

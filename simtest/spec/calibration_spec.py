@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import astuple, fields, is_dataclass, replace
 from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
@@ -33,7 +33,7 @@ from simtest.spec.camera import CameraSpec
 from simtest.spec.camera_tables import camera_table
 from simtest.spec.lights import CosineProfile, Profile, TableProfile
 from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
-from simtest.spec.spec_model import Millimetres, Spec
+from simtest.spec.spec_model import Millimetres, Spec, validate
 from simtest.spec.toml_files import toml_tables
 
 Bound = Annotated[float, Field(ge=0, le=1e6)]
@@ -383,46 +383,37 @@ def degrees_of(angle: float) -> float:
 
 def _check_read_back(calibration: Calibration, tables: Tables) -> None:
     """Raise `InputError` where a file would not state the whole of a calibration."""
-    from simtest.spec.calibration_spec import CalibrationSpec
-    from simtest.spec.spec_model import validate
-
-    stated = {**tables, "camera": {}}
-    read = validate(CalibrationSpec, stated, "calibration").calibration(calibration.camera)
-    for name, given, back in _parts(calibration, read):
-        if not _alike(given, back):
-            raise InputError(f"calibration {name} = {given!r}: a calibration file cannot state it")
-
-
-def _parts(one: Calibration, other: Calibration) -> Iterator[tuple[str, object, object]]:
-    """Yield name and both values of what two calibrations hold, the priors one by one."""
-    for name in ("response", "vignetting", "emission", "noise", "saturation_level"):
-        yield name, getattr(one, name), getattr(other, name)
-    if not one.emission.is_uniform:
-        yield "emission_axis", one.emission_axis, other.emission_axis
-    for item in fields(Priors):
-        yield item.name, getattr(one.priors, item.name), getattr(other.priors, item.name)
+    read = validate(CalibrationSpec, {**tables, "camera": {}}, "calibration").calibration(calibration.camera)
+    names = ["response", "vignetting", "emission", "noise", "saturation_level"]
+    names += [] if calibration.emission.is_uniform else ["emission_axis"]
+    parts = [(name, getattr(calibration, name), getattr(read, name)) for name in names]
+    parts += [
+        (each.name, getattr(calibration.priors, each.name), getattr(read.priors, each.name)) for each in fields(Priors)
+    ]
+    for name, one, other in parts:
+        if not _alike(one, other):
+            raise InputError(f"calibration {name} = {one!r}: a calibration file cannot state it")
 
 
-def _alike(one: object, other: object) -> bool:
-    """Return whether values are the same, angles up to the rounding of their degrees."""
-    if one == other:
-        return True
-    if isinstance(one, AngularProfile) and isinstance(other, AngularProfile):
-        pairs = zip(one.angles, other.angles, strict=False)
-        close = all(math.isclose(a, b, rel_tol=CLOSE) for a, b in pairs)
-        return close and (one.power, one.values) == (other.power, other.values)
+def _alike(one: Any, other: Any) -> bool:
+    """Return whether values are the same, numbers up to the rounding of angles in degrees."""
+    if isinstance(one, NoiseModel) and one.bits is None:
+        # Of a frame without steps between its values the response makes no difference to the noise.
+        other = replace(other, response=one.response)
     # Also what nobody gave, which is given once a file states it.
-    if (isinstance(one, Uniform) and isinstance(other, Uniform)) or (
-        isinstance(one, Normal) and isinstance(other, Normal)
-    ):
-        return all(math.isclose(a, b, rel_tol=CLOSE) for a, b in zip(_numbers(one), _numbers(other), strict=True))
-    # Of a frame without steps between its values the response makes no difference to the noise.
-    if isinstance(one, NoiseModel) and isinstance(other, NoiseModel):
-        return one.bits is None and NoiseModel(one.sigma, one.full_well, one.read_noise) == NoiseModel(
-            other.sigma, other.full_well, other.read_noise
-        )
-    return False
+    of_a_kind = is_dataclass(one) and (isinstance(one, type(other)) or isinstance(other, type(one)))
+    if one == other or not of_a_kind:
+        return bool(one == other)
+    ones, others = (list(_numbers(astuple(each))) for each in (one, other))
+    return len(ones) == len(others) and all(
+        a == b or (isinstance(a, float) and isinstance(b, float) and math.isclose(a, b, rel_tol=CLOSE))
+        for a, b in zip(ones, others, strict=True)
+    )
 
 
-def _numbers(distribution: Uniform | Normal) -> tuple[float, ...]:
-    return tuple(getattr(distribution, item.name) for item in fields(distribution))
+def _numbers(value: Any) -> Iterator[Any]:
+    if isinstance(value, tuple):
+        for each in value:
+            yield from _numbers(each)
+    else:
+        yield value

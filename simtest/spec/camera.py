@@ -10,7 +10,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera, FovExtent, ViewMask, focal_of_view
-from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
+from simtest.geometry.lenses import LENSES, Distortion
 from simtest.geometry.vectors import rotation
 from simtest.runtime.arrays import Array
 from simtest.spec.spec_model import Spec, validate
@@ -131,7 +131,14 @@ NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor", "
 """Tables that a calibration file may hold beside the camera; `simtest.spec.calibration_spec` describes them."""
 
 
-class BrownConradySpec(Spec):
+class _Lens(Spec):
+    def model(self) -> Distortion:
+        """Return the lens as the geometry package uses it."""
+        told = self.model_dump()
+        return LENSES[told.pop("type")](**told)
+
+
+class BrownConradySpec(_Lens):
     """A perspective lens: OpenCV's models of 5 and 8 coefficients, ROS' plumb_bob and rational_polynomial.
 
     With x = X/Z, y = Y/Z, u = x^2 + y^2, x and y are multiplied by
@@ -149,12 +156,8 @@ class BrownConradySpec(Spec):
     k5: Coefficient = Field(0.0, description="radial, of the denominator")
     k6: Coefficient = Field(0.0, description="radial, of the denominator")
 
-    def model(self) -> BrownConrady:
-        """Return the lens as the geometry package uses it."""
-        return BrownConrady(**self.model_dump(exclude={"type"}))
 
-
-class KannalaBrandtSpec(Spec):
+class KannalaBrandtSpec(_Lens):
     """A fisheye: OpenCV's fisheye model, ROS' equidistant.
 
     A direction at theta from the axis is imaged at theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal
@@ -167,12 +170,8 @@ class KannalaBrandtSpec(Spec):
     k3: Coefficient = 0.0
     k4: Coefficient = 0.0
 
-    def model(self) -> KannalaBrandt:
-        """Return the lens as the geometry package uses it."""
-        return KannalaBrandt(**self.model_dump(exclude={"type"}))
 
-
-class ScaramuzzaSpec(Spec):
+class ScaramuzzaSpec(_Lens):
     """An omnidirectional lens: the model of OCamCalib, of MATLAB's fisheye calibration and of C3VD.
 
     The image point (x, y) sees the direction (x, y, 1 + k2 r^2 + k3 r^3 + k4 r^4), r its distance from the centre, and
@@ -187,10 +186,6 @@ class ScaramuzzaSpec(Spec):
     c: float = Field(1.0, gt=0, le=1e3, description="of the matrix ((c, d), (e, 1))")
     d: float = Field(0.0, ge=-1e3, le=1e3, description="of the matrix")
     e: float = Field(0.0, ge=-1e3, le=1e3, description="of the matrix")
-
-    def model(self) -> Scaramuzza:
-        """Return the lens as the geometry package uses it."""
-        return Scaramuzza(**self.model_dump(exclude={"type"}))
 
 
 DistortionSpec = Annotated[BrownConradySpec | KannalaBrandtSpec | ScaramuzzaSpec, Field(discriminator="type")]

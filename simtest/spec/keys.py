@@ -33,19 +33,8 @@ def replace_values(
     """Replace values at key paths as `apply_settings` does, and drop what a table's new type does not have.
 
     Setting ``reflectance.type`` to another type leaves no key of the former one behind, unless it is set as well: then
-    it is refused by its name. Keys that both types have stay. In the same way a key replaces its `RIVALS`. Raises
-    `InputError` as `apply_settings` does.
-
-    Parameters
-    ----------
-    model : type
-        Of the tables.
-    data : mapping
-        The tables.
-    settings : mapping
-        Values by key path.
-    where : str
-        Name of the file, for messages.
+    it is refused by its name. Keys that both types have stay. In the same way a key replaces its `RIVALS`. `model` is
+    the type of the tables, `where` the name of their file.
     """
     result = apply_settings(_without_rivals(data, settings), settings, where)
     for path, value in settings.items():
@@ -105,19 +94,12 @@ CLOSE = 3
 
 
 def full_keys(models: Sequence[BaseModel], given: Mapping[str, Any], others: Sequence[str] = ()) -> dict[str, Any]:
-    """Return values by full key path, of values by the last name of a key.
+    """Return values by full key path, of values by the last name of a key or its full path.
 
-    Keys that the scene's file states come before those that it leaves at their defaults, and keys of tables before
-    those of lists of tables. Raises `InputError` if several keys end in a name, whose paths are listed, or none does.
-
-    Parameters
-    ----------
-    models : sequence of BaseModel
-        Whose keys may be meant: a scene, or those of an experiment.
-    given : mapping
-        Values by name; a name may be a full path too.
-    others : sequence of str
-        Names that the caller takes itself; a mistyped one may mean one of them.
+    `models` hold the keys that may be meant: a scene, or those of an experiment. Keys that the scene's file states come
+    before those that it leaves at their defaults, and keys of tables before those of lists of tables. A mistyped name
+    may mean one of `others`, which the caller takes itself. Raises `InputError` if several keys end in a name, or none
+    does.
     """
     found = [each for model in models for each in _paths(model)]
     stated = dict.fromkeys(path for path, is_stated in found if is_stated)

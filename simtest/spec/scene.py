@@ -149,14 +149,9 @@ class Scene(Spec):
     def _as_ever(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out what says nothing: a scene without instruments is written as it was before there were any."""
         dumped: dict[str, Any] = dump(self)
-        if not self.instruments:
-            dumped.pop("instruments", None)
-        if not self.deformation:
-            dumped.pop("deformation", None)
-        if not self.time_s:
-            dumped.pop("time_s", None)
-        if self.views is None:
-            dumped.pop("views", None)
+        for name in ("instruments", "deformation", "time_s", "views"):
+            if not getattr(self, name):
+                dumped.pop(name, None)
         if self.camera.moved is None:
             dumped.get("camera", {}).pop("moved", None)
         return dumped

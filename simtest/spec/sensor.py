@@ -187,38 +187,33 @@ def check_electrons(full_well: float | None, read_noise: float) -> None:
         raise ValueError(f"read_noise = {read_noise:g} electrons: needs full_well as well")
 
 
-class LinearResponse(Spec):
+class _Response(Spec):
+    def model(self) -> Response:
+        """Return the response as reconstruction uses it."""
+        told = self.model_dump()
+        return Response(told.pop("type"), **told)
+
+
+class LinearResponse(_Response):
     """Values are proportional to light."""
 
     type: Literal["linear"] = "linear"
 
-    def model(self) -> Response:
-        """Return the response as reconstruction uses it."""
-        return Response()
 
-
-class GammaResponse(Spec):
+class GammaResponse(_Response):
     """value = light^(1/gamma)."""
 
     type: Literal["gamma"] = "gamma"
     gamma: float = Field(2.2, ge=0.1, le=10, description="2.2: dark values are spread, as in most pictures")
 
-    def model(self) -> Response:
-        """Return the response as reconstruction uses it."""
-        return Response("gamma", self.gamma)
 
-
-class SrgbResponse(Spec):
+class SrgbResponse(_Response):
     """The curve of sRGB pictures (IEC 61966-2-1)."""
 
     type: Literal["srgb"] = "srgb"
 
-    def model(self) -> Response:
-        """Return the response as reconstruction uses it."""
-        return Response("srgb")
 
-
-class TableResponse(Spec):
+class TableResponse(_Response):
     """A measured curve, linear between its points; both lists rise from 0 to 1."""
 
     type: Literal["table"] = "table"
@@ -233,10 +228,6 @@ class TableResponse(Spec):
         except InputError as error:
             raise ValueError(str(error)) from None
         return self
-
-    def model(self) -> Response:
-        """Return the response as reconstruction uses it."""
-        return Response("table", light=self.light, value=self.value)
 
 
 ResponseSpec = Annotated[LinearResponse | GammaResponse | SrgbResponse | TableResponse, Field(discriminator="type")]

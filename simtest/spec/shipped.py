@@ -19,13 +19,7 @@ FOLDERS = {
 
 
 def shipped_files(kind: str) -> dict[str, str]:
-    """Return the shipped files of a kind: name, and title and first sentence, or else that of the file's comment.
-
-    Parameters
-    ----------
-    kind : str
-        One of `FOLDERS`.
-    """
+    """Return the shipped files of one of `FOLDERS`: name, and title and first sentence, or that of its comment."""
     folder = data_root("scenes") / FOLDERS[kind]
     return {path.stem: _about(path) for path in sorted(folder.glob("*.toml"))}
 

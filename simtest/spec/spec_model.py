@@ -215,15 +215,10 @@ def _short(value: Any) -> str:
 
 
 def nodes_at(schema: Mapping[str, Any], path: Sequence[str | int]) -> Iterator[Mapping[str, Any]]:
-    """Yield the nodes of a schema at a path, through references, unions, lists and maps.
+    """Yield the nodes of a JSON schema at a path of keys and indices, through references, unions, lists and maps.
 
-    Parameters
-    ----------
-    schema : mapping
-        From ``model_json_schema``.
-    path : sequence of str or int
-        Keys and indices, an index as number or text. The type of a tagged union may stand in between; without it the
-        nodes of all its members are yielded.
+    An index is a number or text. The type of a tagged union may stand in between; without it the nodes of all its
+    members are yielded.
     """
     yield from _walk(schema, schema, list(path))
 

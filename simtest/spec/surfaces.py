@@ -3,7 +3,7 @@
 import math
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -122,6 +122,9 @@ MOST_RINGS = 20
 class _Periodic(Spec):
     """A displacement that repeats; points and directions are in the model frame."""
 
+    lengths: ClassVar[tuple[str, ...]]
+    """Names of the lengths over which the displacement varies."""
+
     amplitude_mm: Amplitude = Field(description="largest displacement, mm")
     period_s: float = Field(ge=1e-3, le=1e6, description="time of one repetition, s")
     phase: float = Field(0.0, ge=0, le=1, description="share of the period that has passed at time 0")
@@ -153,14 +156,9 @@ class _Periodic(Spec):
             raise ValueError(
                 f"amplitude_mm = {self.amplitude_mm:g}: neighbouring points move apart by up to {self.stretch:.3g} of "
                 f"their distance, so space could fold; must be below {MAX_STRETCH:g}: lower amplitude_mm, or lengthen "
-                f"{' or '.join(self._lengths)}"
+                f"{' or '.join(self.lengths)}"
             )
         return self
-
-    @property
-    def _lengths(self) -> tuple[str, ...]:
-        """Names of the lengths over which the displacement varies."""
-        raise NotImplementedError
 
 
 class _Centred(_Periodic):
@@ -174,6 +172,8 @@ class Peristalsis(_Centred):
     A w(z, t) (r/R) exp((1 - (r/R)^2)/2), w = (1 + cos(2 pi (z/wavelength - t/period)))/2: by A at most, at r = R.
     """
 
+    lengths = ("radius_mm", "wavelength_mm")
+
     type: Literal["peristalsis"] = "peristalsis"
     axis: Direction = Field(description="along which the waves travel, model frame, any length; through centre_mm")
     radius_mm: Size = Field(description="distance from the axis at which the displacement is largest, mm")
@@ -185,10 +185,6 @@ class Peristalsis(_Centred):
         amplitude = abs(self.amplitude_mm)
         return math.hypot(amplitude * math.exp(0.5) / self.radius_mm, math.pi * amplitude / self.wavelength_mm)
 
-    @property
-    def _lengths(self) -> tuple[str, ...]:
-        return "radius_mm", "wavelength_mm"
-
 
 class Breathing(_Centred):
     """A slow motion to and fro, with a turn, that does not reach everything alike.
@@ -196,6 +192,8 @@ class Breathing(_Centred):
     With s = (1 - cos(2 pi t/period))/2 and b the coordinate along `along` from centre_mm, points move along `direction`
     by A s (1 - warp (1 - cos(2 pi b/wavelength))/2); then all is turned by s turn_deg about `axis`, through centre_mm.
     """
+
+    lengths = ("wavelength_mm",)
 
     type: Literal["breathing"] = "breathing"
     direction: Direction = Field(description="of the motion, model frame, any length")
@@ -210,16 +208,14 @@ class Breathing(_Centred):
         """Bound pi A warp/wavelength; the turn is rigid."""
         return math.pi * abs(self.amplitude_mm) * self.warp / self.wavelength_mm
 
-    @property
-    def _lengths(self) -> tuple[str, ...]:
-        return ("wavelength_mm",)
-
 
 class Dent(_Centred):
     """The dent of a probe that presses and lets go.
 
     Points move along `direction` by A s exp(-|X - centre|^2/(2 radius^2)), s = (1 - cos(2 pi t/period))/2.
     """
+
+    lengths = ("radius_mm",)
 
     type: Literal["dent"] = "dent"
     direction: Direction = Field(description="in which the probe presses, model frame, any length")
@@ -230,10 +226,6 @@ class Dent(_Centred):
         """Bound A exp(-1/2)/radius: the steepest slope of the Gaussian."""
         return abs(self.amplitude_mm) * math.exp(-0.5) / self.radius_mm
 
-    @property
-    def _lengths(self) -> tuple[str, ...]:
-        return ("radius_mm",)
-
 
 class Contractions(_Periodic):
     """Rings of contraction that travel along a curved path, such as the centreline of a colon with bends.
@@ -243,6 +235,8 @@ class Contractions(_Periodic):
     on by as much in each period, and grow and fade within half of it from the path's ends. The maps of the rings are
     applied one after the other, so rings that overlap at a bend do not fold space.
     """
+
+    lengths = ("radius_mm", "width_mm")
 
     type: Literal["contractions"] = "contractions"
     path_mm: tuple[Point, ...] = Field(
@@ -277,10 +271,6 @@ class Contractions(_Periodic):
     def stretch(self) -> float:
         """Bound A sqrt(e/R^2 + 1/(e width^2)) for one ring: of the parts across the path and along it."""
         return abs(self.amplitude_mm) * math.hypot(math.exp(0.5) / self.radius_mm, math.exp(-0.5) / self.width_mm)
-
-    @property
-    def _lengths(self) -> tuple[str, ...]:
-        return "radius_mm", "width_mm"
 
 
 Deformation = Annotated[Peristalsis | Breathing | Dent | Contractions, Field(discriminator="type")]

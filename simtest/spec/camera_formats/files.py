@@ -220,24 +220,11 @@ def read_poses(path: str | Path) -> Poses:
 
 
 def write_camera(camera: Camera, path: str | Path, format: str | None = None, poses: Poses | None = None) -> None:
-    """Write a camera file, and the poses of a sequence's frames where they are given.
+    """Write a camera file, and the poses of a sequence's frames where they are given (see `simtest.save_camera`).
 
-    Parameters
-    ----------
-    camera : Camera
-        What to write.
-    path : str or Path
-        The file; replaced if it exists. COLMAP's images.txt and an empty points3D.txt are written beside cameras.txt.
-    format : str, optional
-        One of `WRITTEN`; default the first that the suffix fits.
-    poses : list of (str, ndarray), optional
-        Names of frames and their world_from_camera, shape (4, 4), OpenCV axes, mm. Lengths are written as they are,
-        and both formats state mm.
-
-    Raises
-    ------
-    InputError
-        If format and suffix do not fit, the format cannot hold the camera or poses, or the file cannot be written.
+    COLMAP's images.txt and an empty points3D.txt are written beside cameras.txt. Poses are world_from_camera, shape (4,
+    4), OpenCV axes, mm: lengths are written as they are, and both formats state mm. Raises `InputError` if format and
+    suffix do not fit, the format cannot hold the camera or poses, or the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()

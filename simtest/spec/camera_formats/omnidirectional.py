@@ -68,18 +68,8 @@ def scaramuzza_table(
 ) -> Table:
     """Return the table of a `CameraSpec` of Scaramuzza's model with x before y and z along the viewing direction.
 
-    Raises `InputError` if a0 is not positive.
-
-    Parameters
-    ----------
-    size : sequence of float
-        Width and height, px.
-    centre : sequence of float
-        cx and cy, px, pixel centres at integer + 0.5.
-    mapping : sequence of float
-        a0, a2, a3, a4 for radii in px: px, 1/px, 1/px^2, 1/px^3.
-    stretch : sequence of float
-        c, d, e of the matrix ((c, d), (e, 1)).
+    `mapping` is a0, a2, a3, a4 for radii in px, `stretch` c, d, e of the matrix ((c, d), (e, 1)); the centre has pixel
+    centres at integer + 0.5. Raises `InputError` if a0 is not positive.
     """
     a0, a2, a3, a4 = mapping
     if not a0 > 0:

@@ -73,25 +73,10 @@ def tum_text(trajectory: Trajectory) -> str:
 
 
 def write_trajectory(trajectory: Trajectory, camera: Camera, folder: Path) -> tuple[list[Path], list[str]]:
-    """Write a trajectory in every format that can hold it.
+    """Write a trajectory of one camera in every format that can hold it, into an existing folder.
 
-    Raises `InputError` if a file cannot be written.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-        The poses.
-    camera : Camera
-        Of all frames.
-    folder : Path
-        An existing folder; it gets `TRANSFORMS`, the folder `COLMAP` and, for frames with times, `TUM`.
-
-    Returns
-    -------
-    files : list of Path
-        What was written.
-    left_out : list of str
-        Why a format was not: it lacks the camera's lens.
+    It gets `TRANSFORMS`, the folder `COLMAP` and, for frames with times, `TUM`. Returns the files that were written,
+    and why a format was left out: it lacks the camera's lens. Raises `InputError` if a file cannot be written.
     """
     files: list[Path] = []
     left_out: list[str] = []
