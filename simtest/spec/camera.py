@@ -232,11 +232,8 @@ class CameraSpec(Spec):
             raise ValueError(f"skew = {self.skew:g}: must be 0 with fov_deg, which means square pixels")
         if given := sorted({"fx", "fy"} & self.model_fields_set):
             raise ValueError(f"fov_deg and {' and '.join(given)} exclude each other; give one of them")
-        try:
-            lens = None if self.distortion is None else self.distortion.model()
-            focal = focal_of_view(self.fov_deg, (self.width, self.height), self._centre_px, lens, self.fov_of)
-        except InputError as error:
-            raise ValueError(str(error)) from None
+        lens = None if self.distortion is None else self.distortion.model()
+        focal = focal_of_view(self.fov_deg, (self.width, self.height), self._centre_px, lens, self.fov_of)
         # Known from here on; a frozen model has no other way.
         self.__dict__.update(fx=focal, fy=focal)
         return self

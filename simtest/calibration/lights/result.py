@@ -15,8 +15,6 @@ from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array
 from simtest.runtime.statistics import NORMAL_QUANTILE
 
-"""Standard deviations in half of a 95 % interval."""
-
 UNLIKELY = 1e-3
 """Residuals that are so unlikely to be as large by chance are told."""
 
