@@ -160,13 +160,6 @@ class Camera:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        self._check_numbers()
-        if self.view_mask is not None and not self.view_mask.contains(self.pixel_centres()).any():
-            raise InputError(f"camera.view_mask = {self.view_mask}: must cover a pixel of the image")
-        if self.distortion is not None:
-            self._check_fold(self.distortion)
-
-    def _check_numbers(self) -> None:
         for name in ("width", "height"):
             check_integer(f"camera.{name}", getattr(self, name), 1)
         for name in ("fx", "fy", "cx", "cy", "skew"):
@@ -174,6 +167,10 @@ class Camera:
         for name in ("fx", "fy"):
             if getattr(self, name) <= 0:
                 raise InputError(f"camera.{name} = {getattr(self, name)!r}: must be > 0, else K is singular")
+        if self.view_mask is not None and not self.view_mask.contains(self.pixel_centres()).any():
+            raise InputError(f"camera.view_mask = {self.view_mask}: must cover a pixel of the image")
+        if self.distortion is not None:
+            self._check_fold(self.distortion)
 
     def _check_fold(self, distortion: Distortion) -> None:
         """Raise `InputError` where a pixel that should be seen has no sightline on the lens's first branch."""

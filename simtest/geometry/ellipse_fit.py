@@ -292,15 +292,10 @@ def _constrained_minimum(M: Array) -> Array:
     for _ in range(_NEWTON_STEPS):
         slope = c1 + root * (2 * c2 - 12 * root)
         root = root - (c0 + root * (c1 + root * (c2 - 4 * root))) / slope
-    vector = _null_vector(M, root)
-    # A Rayleigh quotient squares the vector's error: one more step gives full precision.
-    vector = _null_vector(M, _rayleigh(M, vector))
-    return vector
-
-
-def _rayleigh(M: Array, q: Array) -> Array:
-    """Return q^T M q / q^T C q."""
-    return np.asarray(np.einsum("ni,nij,nj->n", q, M, q) / (4 * q[:, 0] * q[:, 2] - q[:, 1] ** 2))
+    q = _null_vector(M, root)
+    # The Rayleigh quotient q^T M q / q^T C q squares the vector's error: one more step gives full precision.
+    root = np.einsum("ni,nij,nj->n", q, M, q) / (4 * q[:, 0] * q[:, 2] - q[:, 1] ** 2)
+    return _null_vector(M, root)
 
 
 def _null_vector(M: Array, root: Array) -> Array:

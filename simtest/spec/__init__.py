@@ -17,13 +17,12 @@ if TYPE_CHECKING:
     from simtest.spec.calibration_spec import CalibrationSpec, calibration_toml
     from simtest.spec.camera import CameraSpec, load_camera, save_camera
     from simtest.spec.camera_tables import camera_table, camera_toml, describe_camera
-    from simtest.spec.lights import Emission, LightSpec, Rig
+    from simtest.spec.lights import LightSpec
     from simtest.spec.recipes import (
         Dataset,
         Experiment,
         Group,
         Profile,
-        ProfileEntry,
         Uniform,
         experiments_of,
         load_dataset,
@@ -31,14 +30,7 @@ if TYPE_CHECKING:
         load_profile,
     )
     from simtest.spec.scene import Scene, load_scene, scene_from_dict
-    from simtest.spec.surfaces import (
-        AnatomySurface,
-        CylinderSurface,
-        PlaneSurface,
-        QuadricSurface,
-        SphereSurface,
-        Surface,
-    )
+    from simtest.spec.surfaces import AnatomySurface
     from simtest.spec.toml_files import apply_settings, parse_settings, read_toml
 
 _HOMES = {
@@ -46,25 +38,21 @@ _HOMES = {
     "simtest.spec.calibration_spec": ("CalibrationSpec", "calibration_toml"),
     "simtest.spec.camera": ("CameraSpec", "load_camera", "save_camera"),
     "simtest.spec.camera_tables": ("camera_table", "camera_toml", "describe_camera"),
-    "simtest.spec.lights": ("Emission", "LightSpec", "Rig"),
+    "simtest.spec.lights": ("LightSpec",),
     "simtest.spec.recipes": (
-        "Dataset", "Experiment", "Group", "Profile", "ProfileEntry", "Uniform", "experiments_of", "load_dataset",
+        "Dataset", "Experiment", "Group", "Profile", "Uniform", "experiments_of", "load_dataset",
         "load_experiment", "load_profile",
     ),
     "simtest.spec.scene": ("Scene", "load_scene", "scene_from_dict"),
-    "simtest.spec.surfaces": (
-        "AnatomySurface", "CylinderSurface", "PlaneSurface", "QuadricSurface", "SphereSurface", "Surface",
-    ),
+    "simtest.spec.surfaces": ("AnatomySurface",),
     "simtest.spec.toml_files": ("apply_settings", "parse_settings", "read_toml"),
 }  # fmt: skip
 
 __all__ = [
-    "AnatomySurface", "CalibrationSpec", "CameraSpec", "CylinderSurface", "Dataset", "Emission", "Experiment",
-    "Group", "LightSpec", "PlaneSurface", "Profile", "ProfileEntry", "QuadricSurface", "Rig", "Scene",
-    "SphereSurface", "Surface", "Uniform", "apply_settings", "calibration_toml", "camera_table", "camera_toml",
-    "describe_camera", "experiments_of", "load_calibration", "load_camera", "load_dataset", "load_experiment",
-    "load_profile", "load_scene", "parse_settings", "read_toml", "save_calibration", "save_camera",
-    "scene_from_dict",
+    "AnatomySurface", "CalibrationSpec", "CameraSpec", "Dataset", "Experiment", "Group", "LightSpec", "Profile",
+    "Scene", "Uniform", "apply_settings", "calibration_toml", "camera_table", "camera_toml", "describe_camera",
+    "experiments_of", "load_calibration", "load_camera", "load_dataset", "load_experiment", "load_profile",
+    "load_scene", "parse_settings", "read_toml", "save_calibration", "save_camera", "scene_from_dict",
 ]  # fmt: skip
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.calibration.photometry import AngularProfile
+from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Array
 from simtest.spec.spec_model import Coordinate, Spec
 
@@ -297,10 +298,7 @@ class Emission(Spec):
         They are those of the camera, turned with z onto the axis by the shortest rotation; for an axis towards the
         camera's back y is flipped first.
         """
-        x, y, z = self.axis
-        sign = 1.0 if z >= 0 else -1.0
-        a = -1 / (sign + z)
-        return np.array([[1 + sign * x * x * a, sign * x * y * a, -sign * x], [x * y * a, sign + y * y * a, -y]])
+        return basis_across(self.axis)
 
     @property
     def is_isotropic(self) -> bool:

@@ -138,7 +138,9 @@ def read_ocamcalib(text: str) -> dict[str, Table]:
     direct, back = _polynomial(rows[0], "direct polynomial"), _polynomial(rows[1], "inverse polynomial")
     row, column = numbers(rows[2], "centre (row, column)", 2)
     c, d, e = numbers(rows[3], "affine parameters c d e", 3)
-    height, width = (number(word, "size (height, width)", whole=True) for word in _pair(rows[4]))
+    if len(rows[4]) != 2:
+        raise InputError(f"size: {len(rows[4])} values; must be 2, height and width")
+    height, width = (number(word, "size (height, width)", whole=True) for word in rows[4])
     if any(direct[5:]) or len(direct) < 1 or (len(direct) > 1 and direct[1] != 0):
         raise InputError("direct polynomial: must have the terms a0, a2, a3, a4 alone")
     a0, _, a2, a3, a4 = (*direct, 0.0, 0.0, 0.0, 0.0)[:5]
@@ -155,12 +157,6 @@ def read_ocamcalib(text: str) -> dict[str, Table]:
         (1 / c, e / c, d / c),
     )
     return {"": table | {"fx": -a0 * c, "fy": -a0 * c}}
-
-
-def _pair(row: list[str]) -> list[str]:
-    if len(row) != 2:
-        raise InputError(f"size: {len(row)} values; must be 2, height and width")
-    return row
 
 
 def _polynomial(row: list[str], name: str) -> list[float]:
