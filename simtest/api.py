@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
+from simtest.runtime.files import check_count
 from simtest.runtime.lazy_names import lazy_names
-from simtest.runtime.limits import check_count
 
 if TYPE_CHECKING:
     from simtest.reconstruction import reconstruct
     from simtest.reconstruction.description import PictureRecord
     from simtest.reconstruction.picture import Options
     from simtest.report.run_results import RunResults
-    from simtest.runtime.engines import Engine
+    from simtest.runtime.processes import Engine
     from simtest.simulation.labelled_frame import LabelledFrame
     from simtest.simulation.viewpoints import SampledViews
     from simtest.spec import Experiment, Scene
@@ -228,7 +228,7 @@ def validate(
     workers : int
         Processes of this machine that work at once, >= 1.
     engine : Engine, optional
-        What runs the work, in place of `workers` (see `simtest.runtime.engines.make_engine`).
+        What runs the work, in place of `workers` (see `simtest.runtime.processes.make_engine`).
     export : str or Path, optional
         Folder for the frames without their truth, for methods that run elsewhere (docs/howto/score.md).
     **overrides
@@ -260,9 +260,9 @@ def validate(
     ('index.html', ['cone_axis'])
     """
     from simtest.estimators.process.naming import close_cores
-    from simtest.runtime.engines import make_engine
+    from simtest.runtime.boundary import disk_problem, write_error
     from simtest.runtime.locks import exclusive_folder
-    from simtest.runtime.machine_errors import disk_problem, write_error
+    from simtest.runtime.processes import make_engine
 
     described = _experiment(experiment, settings, overrides)
     chosen = engine or make_engine(workers=workers)

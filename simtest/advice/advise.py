@@ -14,8 +14,8 @@ from simtest.advice.figures import Found, read_results
 from simtest.advice.plan import Question, main_experiment, surroundings, write_experiment
 from simtest.errors import InputError
 from simtest.pages.sheet import Pixels
-from simtest.runtime.engines import make_engine
 from simtest.runtime.files import make_folder, write_atomically
+from simtest.runtime.processes import make_engine
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import Experiment, load_scene

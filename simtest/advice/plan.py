@@ -14,8 +14,8 @@ from simtest.advice.organs import ORGANS, Organ, Surroundings, is_smooth, wall
 from simtest.advice.scope import Interval, Scope
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
+from simtest.runtime.boundary import shown, suggestion
 from simtest.runtime.files import write_atomically
-from simtest.runtime.resources import shown, suggestion
 from simtest.spec import Experiment, load_experiment, load_scene
 from simtest.spec.toml_files import toml_value
 

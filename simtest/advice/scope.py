@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import shown, suggestion
 from simtest.spec.camera_spec import SceneCamera, load_camera
 from simtest.spec.camera_tables import camera_table
 from simtest.spec.rig import Rig

@@ -11,8 +11,8 @@ from simtest.bench.certificate_form import CertificateForm
 from simtest.bench.suite import SUITES, Suite, digest_of, layout_of
 from simtest.errors import InputError
 from simtest.runtime import provenance
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject, require_plain, write_json
-from simtest.runtime.resources import shown
 from simtest.spec.spec_model import validate
 
 CERTIFICATE = "certificate.json"

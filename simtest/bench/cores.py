@@ -12,7 +12,7 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process.command import INTERPRETERS, parse_core
 from simtest.estimators.process.naming import core_hashes, core_records, has_files, short_name
 from simtest.runtime.files import Json, JsonObject
-from simtest.runtime.model_names import parse_model
+from simtest.runtime.resources import parse_model
 
 
 def load_core(text: str) -> tuple[str, AnyEstimator]:

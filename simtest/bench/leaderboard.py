@@ -13,8 +13,8 @@ from simtest.bench.suite import Suite
 from simtest.errors import InputError
 from simtest.pages.html import environment
 from simtest.runtime import provenance
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject, make_folder, write_atomically
-from simtest.runtime.resources import shown
 
 PAGE = "index.html"
 MOST_CERTIFICATES = 1000

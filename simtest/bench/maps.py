@@ -14,8 +14,8 @@ from simtest.dataset.scoring.dense.scorer import ANGLE, NORMAL, depth_source
 from simtest.dataset.scoring.record import read_record
 from simtest.errors import InputError
 from simtest.runtime import provenance
-from simtest.runtime.engines import Engine, make_engine
 from simtest.runtime.files import Json, JsonObject
+from simtest.runtime.processes import Engine, make_engine
 from simtest.validation.runner import Progress, run_experiments
 
 PART = "dense"

@@ -13,9 +13,9 @@ from simtest.bench.ranking import CAP_DEG
 from simtest.bench.scores import score_part
 from simtest.bench.suite import Suite, layout_of
 from simtest.errors import InputError
-from simtest.runtime.engines import Engine
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject, make_folder
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine
 from simtest.validation.runner import Progress, run_experiments
 
 if TYPE_CHECKING:

@@ -14,9 +14,10 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
+from simtest.runtime.boundary import close_names, shown
 from simtest.runtime.files import Json
 from simtest.runtime.provenance import file_hash
-from simtest.runtime.resources import close_names, data_root, shown
+from simtest.runtime.resources import data_root
 from simtest.spec import AnatomySurface, Scene, read_toml, scene_from_dict
 from simtest.spec.spec_model import Name, Spec, load
 from simtest.surfaces.recipe import load_recipe

@@ -15,7 +15,7 @@ from simtest.geometry import Array, Image, Mask
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_kind, check_number, check_numbers
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
 
 OPTICAL_AXIS = (0.0, 0.0, 1.0)
 

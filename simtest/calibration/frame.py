@@ -9,7 +9,7 @@ from simtest.calibration.calibration import Calibration, CorrectedFrame
 from simtest.calibration.noise_estimate import COLOURED, estimate_coarse_noise, estimate_noise
 from simtest.errors import Failure
 from simtest.geometry import Camera, Image, Mask, Patch, smooth
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
 
 FINEST_SHARE = 0.8
 """Of a told noise that nothing has correlated, the finest scale shows so much or more."""

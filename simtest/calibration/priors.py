@@ -14,7 +14,7 @@ from simtest.calibration.distributions import Assumed, Distribution, Uniform, ch
 from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.checks import check_kind, check_number
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
 
 MAX_LIGHTS = 32
 

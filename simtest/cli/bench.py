@@ -48,8 +48,8 @@ def run(
     from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar
     from simtest.dataset.scoring.dense.conventions import MapOptions
-    from simtest.runtime.engines import make_engine
     from simtest.runtime.locks import exclusive_folder
+    from simtest.runtime.processes import make_engine
 
     if (core is None) == (maps is None):
         raise InputError("--core and --maps: give one of them; --maps runs the part dense, --core all others")
@@ -114,8 +114,8 @@ def frames(
     from simtest.bench.suite import load_suite
     from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar
-    from simtest.runtime.engines import make_engine
     from simtest.runtime.locks import exclusive_folder
+    from simtest.runtime.processes import make_engine
 
     read = load_suite(suite)
     with exclusive_folder(out), progress_bar() as progress:

@@ -45,7 +45,7 @@ def make(
     from simtest.cli.progress import progress_bar
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS, write_dataset
     from simtest.rendering.backend import needs_gpu
-    from simtest.runtime.engines import make_engine
+    from simtest.runtime.processes import make_engine
     from simtest.spec import load_dataset, parse_settings
 
     values = parse_settings(settings or []) | {
@@ -77,7 +77,7 @@ def verify(
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS
     from simtest.dataset.verify import repair_files
     from simtest.dataset.verify import verify as check
-    from simtest.runtime.engines import make_engine
+    from simtest.runtime.processes import make_engine
 
     left = None
     with progress_bar("done") as progress:
@@ -168,7 +168,7 @@ def export(
     from simtest.cli.progress import progress_bar
     from simtest.dataset.export import export_dataset
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS
-    from simtest.runtime.engines import make_engine
+    from simtest.runtime.processes import make_engine
 
     with progress_bar("writing the tables") as progress:
         chosen = make_engine(engine, workers, address, renew_after=SHARDS_PER_PROCESS)

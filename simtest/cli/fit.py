@@ -46,7 +46,7 @@ def fit(
     from simtest.realism.fitting.outcome import check_out, report_json, write_fit
     from simtest.realism.fitting.parameters import one_family
     from simtest.realism.frame_sets import open_frames
-    from simtest.runtime.limits import check_count
+    from simtest.runtime.files import check_count
     from simtest.runtime.locks import exclusive_file, exclusive_folder
     from simtest.spec.dataset_recipe import load_dataset
 

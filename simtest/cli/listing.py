@@ -50,7 +50,7 @@ def listing(kind: Kind | None = None, /, *, as_json: AsJson = False) -> None:
 
 def names_of(kind: str) -> dict[str, str]:
     """Return the names of a kind, with a line about each."""
-    from simtest.runtime.entry_points import EntryPointGroup
+    from simtest.runtime.resources import EntryPointGroup
     from simtest.spec import shipped
 
     if kind in shipped.FOLDERS:

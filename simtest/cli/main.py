@@ -105,7 +105,7 @@ def _missing(error: "MissingArgumentError") -> str:
 
 def _problem(error: Exception) -> str:
     """Return an error that no command foresaw as text: of the output, of the machine, or of the program."""
-    from simtest.runtime.machine_errors import machine_problem
+    from simtest.runtime.boundary import machine_problem
 
     # Only the output's stream has neither a name nor a reason of its own to fail.
     what = machine_problem(error) or _damaged_bytecode(error)
@@ -173,7 +173,7 @@ def _answer_warnings(quiet: bool, plain: bool) -> None:
 
 
 def _warn(message: Warning | str, *_: object, **__: object) -> None:
-    from simtest.runtime.resources import shown
+    from simtest.runtime.boundary import shown
 
     print(f"simtest: warning: {shown(message, LONGEST)}", file=sys.stderr)
 
@@ -193,7 +193,7 @@ def _mend_terminal() -> None:
 
 def _report(text: str, code: int) -> int:
     """Print an error as one line and return the exit code."""
-    from simtest.runtime.resources import shown
+    from simtest.runtime.boundary import shown
 
     line = " ".join(text.split())
     print(f"simtest: {shown(line, LONGEST)}", file=sys.stderr)

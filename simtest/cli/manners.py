@@ -57,7 +57,7 @@ def meant_flag(word: str, options: Iterable[str]) -> str | None:
     str, optional
         None where no flag is meant.
     """
-    from simtest.runtime.resources import close_names, shown
+    from simtest.runtime.boundary import close_names, shown
 
     name = word.partition("=")[0]
     if name in FLAGS:

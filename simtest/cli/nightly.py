@@ -62,7 +62,7 @@ def _run(
     from simtest.nightly.measure import RunOptions
     from simtest.nightly.run import run_nightly
     from simtest.rendering.backend import needs_gpu
-    from simtest.runtime.engines import make_engine
+    from simtest.runtime.processes import make_engine
     from simtest.spec import load_profile
 
     described = load_profile(profile)

@@ -59,7 +59,7 @@ def score(
     from simtest.cli.progress import progress_bar
     from simtest.dataset.scoring.run import score_table
     from simtest.report import write_report
-    from simtest.runtime.engines import make_engine
+    from simtest.runtime.processes import make_engine
 
     command = shlex.join(["simtest", *sys.argv[1:]])
     folder = out or DEFAULT_OUT / (name or answers.stem)

@@ -66,7 +66,7 @@ def validate(
     from simtest.cli.progress import progress_bar
     from simtest.errors import InputError
     from simtest.rendering.backend import needs_gpu
-    from simtest.runtime.engines import make_engine
+    from simtest.runtime.processes import make_engine
     from simtest.spec import load_experiment, parse_settings
     from simtest.validation.mesh_verdicts import mesh_verdicts
 

@@ -6,7 +6,7 @@ from cyclopts import Parameter
 
 from simtest.cli.options import AsJson, Out, SceneName, Settings, Variant, whole_number
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 
 
 def views(

@@ -31,11 +31,10 @@ from simtest.errors import InputError
 from simtest.reconstruction.picture_values import scale_picture
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image
-from simtest.runtime.engines import Engine, OnStep
+from simtest.runtime.boundary import shown, write_error
 from simtest.runtime.files import are_nested, write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_folder
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine, OnStep
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.frame_files import encoded_png
 from simtest.spec import Experiment, calibration_toml, camera_table

@@ -13,9 +13,8 @@ from simtest.dataset.plan import Plan
 from simtest.errors import InputError
 from simtest.estimators.process.naming import core_hashes, short_name
 from simtest.runtime import provenance
-from simtest.runtime.files import write_json
-from simtest.runtime.limits import check_limit
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.files import check_limit, write_json
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.spec_model import validate
 

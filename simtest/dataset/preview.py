@@ -20,8 +20,8 @@ from simtest.errors import InputError
 from simtest.pages import palette
 from simtest.pages.pixels import jpeg_address
 from simtest.runtime.arrays import AnyArray, Array
+from simtest.runtime.boundary import cannot_write
 from simtest.runtime.files import write_atomically
-from simtest.runtime.machine_errors import cannot_write
 
 WIDTH = 240
 """Width of a thumbnail, px."""

@@ -13,8 +13,8 @@ from simtest.dataset.sample import Sample
 from simtest.dataset.shard import BrokenShardError, StoredSample, read_member, samples
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import shown
 
 Record = dict[str, Any]
 """A sample as `read` yields it: array by field name, and ``meta``, a `SampleMeta`."""

@@ -7,8 +7,8 @@ from simtest.dataset.reader import open_manifest
 from simtest.dataset.sample import sample_key
 from simtest.dataset.shard import BrokenShardError, read_member, samples
 from simtest.errors import InputError
+from simtest.runtime.boundary import write_error
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.machine_errors import write_error
 
 
 def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:

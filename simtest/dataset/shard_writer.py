@@ -32,11 +32,10 @@ from simtest.dataset.shard import PART, finish, whole_samples, write_sample
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.process.naming import absolute_names
-from simtest.runtime.engines import Engine, OnStep
+from simtest.runtime.boundary import shown, write_error
 from simtest.runtime.files import sync_folder
 from simtest.runtime.locks import LOCK, exclusive_folder, waiting_for
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine, OnStep
 from simtest.spec.dataset_recipe import Dataset
 from simtest.validation.runner import Progress
 

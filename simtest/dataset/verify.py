@@ -30,8 +30,8 @@ from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
 from simtest.runtime.arrays import AnyArray
-from simtest.runtime.engines import Engine
 from simtest.runtime.locks import LOCK
+from simtest.runtime.processes import Engine
 from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.relief import Relief
 from simtest.validation.run_folder import EXPORT, EXPORTING

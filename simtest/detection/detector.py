@@ -14,9 +14,9 @@ from simtest.detection.regions import Region
 from simtest.detection.view_mask import WHOLE, View
 from simtest.errors import Failure, InputError
 from simtest.geometry import Camera
-from simtest.runtime.entry_points import EntryPointGroup
-from simtest.runtime.resources import shown
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
+from simtest.runtime.boundary import shown
+from simtest.runtime.resources import EntryPointGroup
 
 DETECTORS = EntryPointGroup("simtest.detectors", "detector")
 

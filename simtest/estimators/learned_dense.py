@@ -28,8 +28,9 @@ from simtest.estimators.spot_inputs import LOG_RANGE
 from simtest.estimators.turned_normals import turned_normals
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.runtime.arrays import Image
+from simtest.runtime.boundary import shown
 from simtest.runtime.onnx_model import OnnxModel
-from simtest.runtime.resources import data_root, shown
+from simtest.runtime.resources import data_root
 from simtest.runtime.training_range import TrainingRange, inflation, read_usual
 
 FORMAT = "simtest dense_normals, version 2"

@@ -25,8 +25,9 @@ from simtest.estimators.spot_inputs import (
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
+from simtest.runtime.boundary import shown
 from simtest.runtime.onnx_model import OnnxModel
-from simtest.runtime.resources import data_root, shown
+from simtest.runtime.resources import data_root
 from simtest.runtime.training_range import TrainingRange, inflation, read_usual
 
 FORMAT = "simtest spot_normals, version 3"
@@ -76,7 +77,7 @@ class LearnedSpot:
             raise InputError(f"target = {shown(self.target)}: must be base or fine")
 
     def with_model(self, model: Path) -> "LearnedSpot":
-        """Return the estimator with another network, which is read (see `simtest.runtime.entry_points`)."""
+        """Return the estimator with another network, which is read (see `simtest.runtime.resources`)."""
         made = replace(self, model=model)
         made.check()
         return made

@@ -11,8 +11,8 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
 from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
 from simtest.geometry import Camera, Patch
-from simtest.runtime.model_names import SUFFIX, parse_model
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.resources import SUFFIX, parse_model
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[st
 
     A name is as registered, or "package:name" where two packages register it; or it is a core's
     (`simtest.estimators.process.command.parse_core`), which is started, or that of a network of the user's own
-    ("learned_spot:FILE.onnx", `simtest.runtime.model_names`), which is read. Both stand under their short names.
+    ("learned_spot:FILE.onnx", `simtest.runtime.resources`), which is read. Both stand under their short names.
 
     Raises
     ------

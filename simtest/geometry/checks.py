@@ -5,7 +5,7 @@ from numbers import Integral, Real
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 
 
 def check_number(name: str, value: Any, least: float | None = None, above: float | None = None) -> None:

@@ -10,8 +10,7 @@ from simtest.errors import Failure, InputError, Reason
 from simtest.geometry import pixel_sets
 from simtest.geometry.isophotes import IsophoteTracer
 from simtest.geometry.level_sets import Crossings, LevelSet
-from simtest.runtime.arrays import Array, Image, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Image, Mask, short_repr
 
 MIN_PLATEAU_PX = 12
 """Fewer clipped pixels leave a smoothed peak round; more leave it flat, and its highest pixel an accident."""

@@ -28,8 +28,8 @@ from simtest.nightly.storage import (
     load_run,
     save_run,
 )
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import shown
 from simtest.validation.results_table import SCHEMA
 
 LOG = "log.jsonl"

@@ -11,8 +11,8 @@ from pathlib import Path
 import polars as pl
 
 from simtest.nightly.records import CELL, FIGURES, NightlyRun, Verdict
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import require_plain, sync_folder, write_atomically
-from simtest.runtime.resources import shown
 
 HISTORY: dict[str, pl.DataType] = {
     **FIGURES, "run_id": pl.String(), "started": pl.Datetime("us", "UTC"), "commit": pl.String(),

@@ -10,10 +10,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from simtest.errors import InputError
+from simtest.runtime.boundary import cannot_write, shown
 from simtest.runtime.files import sync_folder
 from simtest.runtime.locks import exclusive_file, is_held, waiting_for
-from simtest.runtime.machine_errors import cannot_write
-from simtest.runtime.resources import shown
 
 LOCK = "lock"
 _ENTRY, _OLD = ".lock", ".old"

@@ -10,10 +10,9 @@ import polars as pl
 
 from simtest.errors import InputError, SimtestError
 from simtest.nightly.records import FIGURES, NightlyRun, RunRecord
+from simtest.runtime.boundary import disk_problem, shown
 from simtest.runtime.files import require_plain, sync_folder, write_atomically, write_json
-from simtest.runtime.machine_errors import disk_problem
 from simtest.runtime.provenance import file_hash
-from simtest.runtime.resources import shown
 
 FIGURES_FILE, RUN_FILE = "figures.parquet", "run.json"
 LATEST_ROWS, BASELINE_ROWS = "rows.parquet", "night.parquet"

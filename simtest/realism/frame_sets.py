@@ -11,10 +11,9 @@ import numpy as np
 from simtest.dataset.reader import read_samples, shard_names
 from simtest.errors import InputError
 from simtest.reconstruction.image_io import Source, is_sequence, open_source, read_picture
-from simtest.runtime.arrays import AnyArray, Image
-from simtest.runtime.kept_arrays import only_reading
-from simtest.runtime.limits import check_count, check_file
-from simtest.runtime.resources import shown
+from simtest.runtime.arrays import AnyArray, Image, only_reading
+from simtest.runtime.boundary import shown
+from simtest.runtime.files import check_count, check_file
 from simtest.spec.scene import Scene, load_scene
 
 if TYPE_CHECKING:

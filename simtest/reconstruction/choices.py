@@ -15,9 +15,8 @@ from simtest.detection.peaks import PeakDetector
 from simtest.errors import InputError
 from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.picture_values import is_coloured
-from simtest.runtime.arrays import Image
-from simtest.runtime.resources import shown
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Image, short_repr
+from simtest.runtime.boundary import shown
 
 AUTO = "auto"
 ENCODINGS = ("srgb", "linear")

@@ -14,8 +14,8 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.quaternions import rotation_of
 from simtest.runtime.arrays import Array
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import shown
 
 POSITION, ROTATION = "SavedPosition_", "SavedRotationQuaternion_"
 """Begins of the names of SimCol3D's files."""

@@ -1,6 +1,10 @@
 """Reading pictures, folders of pictures and videos: values in [0, 1], or an error of one line that says why not."""
 
+import contextlib
+import os
 import re
+import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,9 +19,8 @@ from PIL import Image as PillowImage
 from simtest.errors import InputError
 from simtest.reconstruction.picture_values import scale_picture
 from simtest.runtime.arrays import Image
-from simtest.runtime.limits import check_file, check_limit, check_picture_size
-from simtest.runtime.quiet import quiet_libraries
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.files import check_file, check_limit, check_picture_size
 
 PATIENCE_MS = 5000
 """After so long FFmpeg gives up opening a film, or reading a frame."""
@@ -33,6 +36,8 @@ TURNED = {"JPEG": "as they are stored", "MPO": "as they are stored", "TIFF": "as
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
+
+_ERROR_STREAM = threading.RLock()
 
 
 def read_picture(path: Path) -> Image:
@@ -64,7 +69,7 @@ def read_raw(path: Path, wanted: str) -> npt.NDArray[np.generic]:
     Raises
     ------
     InputError
-        If the file is missing, no plain file, no picture, or beyond a limit (`simtest.runtime.limits`): checked before
+        If the file is missing, no plain file, no picture, or beyond a limit (`simtest.runtime.files`): checked before
         it is decoded.
     """
     check_file(path, "picture_bytes", wanted)
@@ -261,3 +266,26 @@ def _is_film(head: bytes) -> bool:
 def _natural(path: Path) -> list[tuple[int, int, str]]:
     """Return the key that sorts frame10 behind frame9."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", path.name) if part]
+
+
+@contextlib.contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Send nowhere what is written to the process's error stream meanwhile; for single calls of a library.
+
+    libpng, libtiff and FFmpeg write to the descriptor itself, which no setting of OpenCV prevents.
+    """
+    with _ERROR_STREAM:
+        try:
+            sys.stderr.flush()
+            kept = os.dup(2)
+        except (OSError, ValueError, AttributeError):
+            # There is no error stream.
+            yield
+            return
+        try:
+            with open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)

@@ -17,7 +17,7 @@ from simtest.reconstruction.description import SpecularityRecord
 from simtest.reconstruction.motion_record import MotionRecord
 from simtest.reconstruction.tracking import TrackedFrame
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 
 MOST_VIEWS = 6
 """Other frames that judge a highlight: evenly spaced ones of all that may."""

@@ -17,8 +17,8 @@ from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.result_page import write_picture_page
 from simtest.runtime.arrays import Array, Image
+from simtest.runtime.boundary import write_error
 from simtest.runtime.files import make_folder, write_atomically, write_json
-from simtest.runtime.machine_errors import write_error
 
 MANY = 10
 """Above this many specularities normals.json is written on one line, since most of it is outlines."""

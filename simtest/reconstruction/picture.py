@@ -16,7 +16,7 @@ from simtest.reconstruction.description import PictureRecord, describe
 from simtest.reconstruction.picture_values import check_size
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 
 TARGETS = ("fine", "base")
 

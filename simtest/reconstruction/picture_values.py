@@ -9,7 +9,7 @@ import numpy.typing as npt
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 
 LARGEST = {"uint8": 2**8 - 1, "uint16": 2**16 - 1}
 """The value that light of full scale has, by the type of the values."""

@@ -36,7 +36,7 @@ from simtest.reconstruction.choices import (
 from simtest.reconstruction.found import Reconstruction, Specularities, Specularity
 from simtest.reconstruction.picture_values import check_frame, check_roi, check_size, image_size
 from simtest.runtime.arrays import Image, Mask
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
 MAX_SMOOTHING_PX = 50

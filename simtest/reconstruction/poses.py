@@ -20,8 +20,8 @@ from simtest.estimators.two_views import PoseError
 from simtest.geometry.quaternions import rotation_of
 from simtest.reconstruction.dataset_poses import dataset_poses
 from simtest.runtime.arrays import Array
+from simtest.runtime.boundary import close_names, shown
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import close_names, shown
 
 UNITS_MM = {"mm": 1.0, "m": 1000.0}
 

@@ -34,11 +34,10 @@ from simtest.reconstruction.pipeline import default_estimators
 from simtest.reconstruction.poses import Poses, read_poses
 from simtest.reconstruction.result_page import write_sequence_page
 from simtest.reconstruction.tracking import Track, TrackedFrame, Tracker, tracks_of
+from simtest.runtime.boundary import shown, write_error
 from simtest.runtime.files import JsonObject, make_folder, require_plain, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.machine_errors import write_error
 from simtest.runtime.provenance import environment
-from simtest.runtime.resources import shown
 
 Progress = Callable[[int, int, str], None]
 

@@ -19,9 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import BackendError, InputError
-from simtest.runtime.files import Json, write_json
-from simtest.runtime.resources import shown, suggestion
-from simtest.runtime.user_cache import user_cache
+from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.files import Json, user_cache, write_json
 
 LLVM, CUDA = DEVICES = ("llvm", "cuda")
 """What kernels are compiled for: the processor, or an NVIDIA GPU. Nothing outside this module names a variant."""

@@ -12,8 +12,8 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.rendering import backend
 from simtest.runtime.arrays import Image
-from simtest.runtime.limits import check_picture_size
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.files import check_picture_size
 
 HEADER_BYTES = 65536
 """In which the size of an image must stand."""

@@ -18,8 +18,8 @@ from simtest.rendering.mitsuba_values import MitsubaDict
 from simtest.rendering.shapes import make_shape
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
+from simtest.runtime.boundary import write_error
 from simtest.runtime.files import make_folder, write_atomically
-from simtest.runtime.machine_errors import write_error
 from simtest.spec import Scene
 from simtest.spec.falloff import CosineProfile
 from simtest.spec.light_source import DiscSource

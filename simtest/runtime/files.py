@@ -1,4 +1,8 @@
-"""Atomic writing of files: a reader never meets half of one."""
+"""Files: written atomically, so that a reader never meets half of one, and refused beyond limits before they are read.
+
+The environment variable SIMTEST_LIMITS replaces limits by name: ``SIMTEST_LIMITS="picture_pixels=1e8,settings=50000"``.
+The ranges of single values (a width, an exponent) stand in the schemas and are fixed.
+"""
 
 import contextlib
 import errno
@@ -6,13 +10,12 @@ import json
 import os
 import stat
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.limits import VARIABLE, limit
-from simtest.runtime.machine_errors import cannot_write
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import cannot_write, kind_of, leads_nowhere, shown, suggestion
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 """What a JSON file can hold."""
@@ -51,7 +54,7 @@ def are_nested(one: Path, other: Path) -> bool:
 
 
 def require_plain(path: Path, limited_by: str | None = None) -> Path:
-    """Return a path that is a plain file, and within a limit of `simtest.runtime.limits` where one is named.
+    """Return a path that is a plain file, and within a limit of `simtest.runtime.files` where one is named.
 
     Raises `OSError` if it is none: a pipe or a device might never end.
     """
@@ -111,3 +114,153 @@ def as_json(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     return value.to_json() if hasattr(value, "to_json") else vars(value)
+
+
+VARIABLE = "SIMTEST_LIMITS"
+
+DEFAULTS = {
+    # files, bytes
+    "text_bytes": 1_000_000,  # TOML, YAML, XML, JSON
+    "matlab_bytes": 50_000_000,
+    "picture_bytes": 250_000_000,
+    "film_bytes": 100_000_000_000,  # read frame by frame: hours of lossless video
+    "mesh_bytes": 1_500_000_000,  # five million faces: an STL of text takes about 250 bytes a face, others less
+    "manifest_bytes": 100_000_000,
+    "record_bytes": 20_000_000,  # JSON that a run has written
+    # pictures and frames, px
+    "picture_pixels": 50_000_000,  # 8K has 33 million; a picture that is read takes 26 bytes a pixel and more
+    "picture_side": 16_384,
+    "frame_pixels": 20_000_000,
+    "frame_samples": 4_000_000_000,  # rays of one rendered frame: pixels times samples
+    # meshes
+    "mesh_faces": 5_000_000,
+    # experiments
+    "sweep_values": 20_000,  # of one list of a sweep or pool
+    "settings": 10_000,  # of one experiment, pooled ones counted singly
+    "realisations": 10_000_000,  # of one experiment, over all settings
+    # work
+    "workers": 256,
+    "views": 1000,
+    "generated_frames": 10_000,  # that realism takes or fit renders
+}
+
+
+def limit(name: str) -> int:
+    """Return a limit by name, as SIMTEST_LIMITS replaces it or the default; raise `InputError` if that is malformed."""
+    return _limits(os.environ.get(VARIABLE, ""))[name]
+
+
+def check_limit(name: str, value: float, where: object, unit: str, hint: str = "") -> None:
+    """Raise `InputError` where a value exceeds a limit.
+
+    Parameters
+    ----------
+    name : str
+        Of the limit.
+    value : float
+        To be compared.
+    where : object
+        File, key or option, for the message.
+    unit : str
+        What is counted.
+    hint : str
+        What can be done instead.
+    """
+    most = limit(name)
+    if value > most:
+        raise InputError(
+            f"{shown(where)}: {_number(value)} {unit}; at most {_number(most)} are allowed"
+            f"{hint and f': {hint}'} ({VARIABLE}={name}=N sets another limit)"
+        )
+
+
+def check_count(name: str, value: object, where: str) -> None:
+    """Raise `InputError` unless a value is a whole number from 1 to a limit.
+
+    Parameters
+    ----------
+    name : str
+        Of the limit.
+    value : object
+        To be checked.
+    where : str
+        Key or option, for the message.
+    """
+    most = limit(name)
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+        joined = f"{where} {value!r}" if where.startswith("--") else f"{where} = {value!r}"
+        raise InputError(f"{joined}: must be 1 to {most} ({VARIABLE}={name}=N sets another limit)")
+
+
+def check_picture_size(path: Path, width: int, height: int) -> None:
+    """Raise `InputError` where a picture has more pixels, or a longer side, than allowed."""
+    check_limit("picture_side", max(width, height), f"{path}: {width} x {height} px", "px along a side")
+    check_limit("picture_pixels", width * height, f"{path}: {width} x {height} px", "px")
+
+
+def check_file(path: Path, name: str, wanted: str, hint: str = "") -> int:
+    """Check that a path is a plain file within a limit, without opening it, and return its size in bytes.
+
+    Parameters
+    ----------
+    path : Path
+        To be read next. A pipe or a device has no size and might never end.
+    name : str
+        Of the limit, bytes.
+    wanted : str
+        What the file should be, for messages, such as "a picture".
+    hint : str
+        What can be done with a file that is too large.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it is a folder, a pipe or a device, or it is larger.
+    """
+    where = shown(path)
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        raise InputError(f"{where}: no such file{leads_nowhere(path)}; must be {wanted}") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{where}: cannot be read ({reason})") from error
+    if not stat.S_ISREG(found.st_mode):
+        raise InputError(f"{where}: is {kind_of(path)}; must be {wanted}")
+    check_limit(name, found.st_size, path, "bytes", hint)
+    return found.st_size
+
+
+@lru_cache(maxsize=4)
+def _limits(text: str) -> dict[str, int]:
+    """Return all limits, those that a text replaces among them."""
+    found = dict(DEFAULTS)
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name, _, value = (piece.strip() for piece in part.partition("="))
+        if name not in DEFAULTS:
+            raise InputError(
+                f"{VARIABLE}: {shown(name)}: unknown limit; allowed: {', '.join(DEFAULTS)}{suggestion(name, DEFAULTS)}"
+            )
+        try:
+            number = float(value)
+        except ValueError:
+            number = 0.0
+        if not 1 <= number < 2**63:
+            raise InputError(f"{VARIABLE}: {name} = {shown(value)}: must be a number from 1 on")
+        found[name] = int(number)
+    return found
+
+
+def _number(value: float) -> str:
+    """Return a number in digits, or with an exponent where it is beyond counting."""
+    return f"{value:.0f}" if value < 1e15 else f"{value:.3g}"
+
+
+def user_cache() -> Path | None:
+    """Return the user's cache folder of this package; None for a user without a home, as in some containers."""
+    import platformdirs
+
+    try:
+        return Path(platformdirs.user_cache_dir("simtest"))
+    except RuntimeError:
+        return None

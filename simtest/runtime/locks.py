@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import IO
 
 from simtest.errors import InputError
+from simtest.runtime.boundary import cannot_write, shown
 from simtest.runtime.files import make_folder, refuse_file
-from simtest.runtime.machine_errors import cannot_write
-from simtest.runtime.resources import shown
 
 LOCK = ".lock"
 """Name of the lock file in a folder, and end of the name of one beside a file."""

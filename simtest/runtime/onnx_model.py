@@ -12,8 +12,8 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject, require_plain
-from simtest.runtime.resources import shown
 
 METADATA = "simtest"
 """Key of the metadata, a JSON object, in the file."""

@@ -11,10 +11,9 @@ import numpy.typing as npt
 from simtest.calibration import Calibration, Response
 from simtest.rendering.bitmap import write_exr
 from simtest.runtime import provenance
-from simtest.runtime.array_files import write_arrays
-from simtest.runtime.arrays import Image
+from simtest.runtime.arrays import Image, write_arrays
+from simtest.runtime.boundary import write_error
 from simtest.runtime.files import Json, make_folder, write_atomically, write_json
-from simtest.runtime.machine_errors import write_error
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.labelled_frame import LabelledFrame

@@ -7,8 +7,7 @@ from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
-from simtest.runtime.arrays import Array, Image
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Image, short_repr
 from simtest.simulation.coding import check_codec
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import TrueHighlight

@@ -6,7 +6,7 @@ from typing import Any
 
 from simtest.calibration import Calibration
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.files import FOREIGN_SUFFIXES, recognise
 from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, load_camera
 from simtest.spec.spec_model import validate
@@ -109,8 +109,8 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     if path.suffix.lower() in FOREIGN_SUFFIXES:
         raise InputError(f"{shown(path)}: a calibration is TOML, not {path.suffix}; name it .toml")
     # Imported on demand: reading needs neither.
+    from simtest.runtime.boundary import cannot_write
     from simtest.runtime.files import write_atomically
-    from simtest.runtime.machine_errors import cannot_write
     from simtest.spec.calibration_tables import calibration_toml
 
     text = calibration_toml(calibration)

@@ -7,8 +7,9 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
-from simtest.runtime.resources import find, shown, suggestion
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
+from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.resources import find
 from simtest.spec.paper import PaperScene
 from simtest.spec.scene import Scene
 from simtest.spec.spec_model import Name, Spec, load

@@ -7,7 +7,8 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
-from simtest.runtime.resources import find, shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.resources import find
 from simtest.spec.experiment import Experiment, Group, load_experiment
 from simtest.spec.spec_model import Name, Spec, load
 

@@ -10,9 +10,10 @@ from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Respons
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
 from simtest.geometry.angular_profile import AngularProfile
-from simtest.runtime.limits import check_limit
-from simtest.runtime.resources import find, shown
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
+from simtest.runtime.boundary import shown
+from simtest.runtime.files import check_limit
+from simtest.runtime.resources import find
 from simtest.spec.camera_formats.common import read_json
 from simtest.spec.camera_spec import SceneCamera
 from simtest.spec.deformation import MOST_DEFORMATIONS, Deformation

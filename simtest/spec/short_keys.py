@@ -6,7 +6,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from simtest.errors import InputError
-from simtest.runtime.resources import find, shown, suggestion
+from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.resources import find
 from simtest.spec.experiment import Experiment
 from simtest.spec.paper import PaperScene, is_paper
 from simtest.spec.scene import Scene

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import PydanticCustomError
 
 from simtest.errors import InputError
-from simtest.runtime.resources import close_names, shown, suggestion
+from simtest.runtime.boundary import close_names, shown, suggestion
 from simtest.spec.json_schema import nodes_at
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.limits import check_file
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.files import check_file
 
 MAX_DEPTH = 32
 """Tables and lists within each other, and parts of a key path; the deepest key of a scene has 6."""

@@ -8,8 +8,7 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import AnyArray, Array, IntArray
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
 from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
 from simtest.surfaces.cutting import halve, off_between, rough_edges
 from simtest.surfaces.mesh_geometry import area_vectors, face_edges

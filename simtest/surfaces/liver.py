@@ -20,8 +20,7 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import Array, IntArray, kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
 from simtest.surfaces.cutting import halve, rough_edges

@@ -11,10 +11,8 @@ import numpy as np
 
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.files import write_atomically
-from simtest.runtime.limits import check_file, check_limit, limit
-from simtest.runtime.machine_errors import cannot_write, write_error
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import cannot_write, shown, write_error
+from simtest.runtime.files import check_file, check_limit, limit, write_atomically
 from simtest.surfaces.model import TriangleMesh
 from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.ply_polygons import read_mixed_polygons

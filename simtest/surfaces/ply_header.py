@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from simtest.errors import InputError
-from simtest.runtime.limits import check_limit
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.files import check_limit
 
 HEADER_BYTES = 65536
 NUMPY_TYPES = {

@@ -8,7 +8,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.surfaces.ply_header import NUMPY_TYPES, Element, read_header
 
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}

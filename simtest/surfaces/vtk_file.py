@@ -10,7 +10,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.reader_process import limit_memory, read_apart, serve
+from simtest.runtime.processes import limit_memory, read_apart, serve
 
 MEMORY_BYTES, MEMORY_PER_BYTE = 4e9, 40
 """What VTK may take, in all and for each byte of the file.

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from simtest.conventions import MOTION_COLUMNS, ON_INSTRUMENT
 from simtest.errors import InputError
-from simtest.runtime.files import Json
-from simtest.runtime.limits import check_limit
-from simtest.runtime.resources import find, shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.files import Json, check_limit
+from simtest.runtime.resources import find
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, apply_settings, read_toml, scene_from_dict
 from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict

@@ -14,8 +14,8 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction.image_io import read_raw
 from simtest.runtime.arrays import Array, Mask
-from simtest.runtime.limits import check_file, check_limit
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.files import check_file, check_limit
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 

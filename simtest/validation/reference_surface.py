@@ -21,7 +21,7 @@ from simtest.reconstruction.description import (
     SpecularityRecord,
 )
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.spec.toml_files import read_toml
 from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,

@@ -7,10 +7,9 @@ from typing import Any
 
 from simtest.errors import InputError
 from simtest.runtime import provenance
+from simtest.runtime.boundary import shown, write_error
 from simtest.runtime.files import require_plain, write_json
 from simtest.runtime.locks import LOCK
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
 
 RESULTS = "results.parquet"
 MOST_DIGEST_BYTES = 1000

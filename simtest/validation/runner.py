@@ -13,9 +13,9 @@ from simtest.estimators.process import is_core
 from simtest.estimators.process.naming import close_cores, core_records
 from simtest.rendering import backend
 from simtest.runtime import provenance
-from simtest.runtime.engines import Engine, make_engine
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import Json
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine, make_engine
 from simtest.spec import Experiment
 from simtest.validation.fingerprints import input_hashes
 from simtest.validation.jobs import Job, make_jobs

@@ -21,7 +21,7 @@ from simtest.bench.suite import Suite, digest_of, layout_of
 from simtest.cli import bench
 from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.runtime.provenance import file_hash, version
 from tests.bench_tiny import tiny_suite
 

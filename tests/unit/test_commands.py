@@ -21,8 +21,8 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.registry import load_estimators
 from simtest.rendering import backend_check
 from simtest.rendering.backend import BackendReport
-from simtest.runtime.entry_points import OWN
-from simtest.runtime.resources import suggestion
+from simtest.runtime.boundary import suggestion
+from simtest.runtime.resources import OWN
 from simtest.spec import load_dataset, load_experiment, load_profile, load_scene
 
 MAIN = "from simtest.cli.main import main; main()"

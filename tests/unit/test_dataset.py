@@ -31,8 +31,7 @@ from simtest.dataset.shard_writer import _write_shards, write_dataset
 from simtest.dataset.verify import repair_files, verify
 from simtest.errors import InputError, SimtestError
 from simtest.pages.markdown import escaped, yaml_string
-from simtest.runtime.engines import make_engine
-from simtest.runtime.engines.cluster import cores_per_task
+from simtest.runtime.processes import cores_per_task, make_engine
 from simtest.simulation.frame_files import write_frame
 from simtest.spec import load_dataset, load_scene, scene_from_dict
 from simtest.spec.dataset_recipe import Dataset, Distribution, Splits

@@ -17,10 +17,9 @@ from simtest.dataset.manifest import ManifestError, read_manifest
 from simtest.errors import InputError, SimtestError
 from simtest.realism.frame_sets import open_generated
 from simtest.reconstruction.image_io import _tiff_size, read_picture
-from simtest.runtime.engines.engine import check_workers
-from simtest.runtime.files import require_plain
-from simtest.runtime.limits import DEFAULTS, VARIABLE, check_file, check_limit, limit
-from simtest.runtime.machine_errors import disk_problem
+from simtest.runtime.boundary import disk_problem
+from simtest.runtime.files import DEFAULTS, VARIABLE, check_file, check_limit, limit, require_plain
+from simtest.runtime.processes import check_workers
 from simtest.spec import load_experiment, load_scene
 from simtest.spec.toml_files import apply_settings, parse_settings
 from simtest.surfaces import mesh_file, vtk_file

@@ -18,10 +18,10 @@ import simtest
 from simtest.cli.main import main
 from simtest.cli.stopping import Termination
 from simtest.errors import InputError, SimtestError
-from simtest.runtime.engines import local
+from simtest.runtime import processes
+from simtest.runtime.boundary import machine_problem, write_error
 from simtest.runtime.files import write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held, waiting_for
-from simtest.runtime.machine_errors import machine_problem, write_error
 from simtest.surfaces.mesh_file import write_mesh
 from simtest.surfaces.model import TriangleMesh
 from simtest.validation import runner
@@ -379,7 +379,7 @@ def test_a_worker_hands_on_errors_of_the_disk(raised, kind):
     def task(*_):
         raise raised
 
-    state, error = local._answer(None, task, None)
+    state, error = processes._answer(None, task, None)
     assert state == "error"
     assert type(error) is kind
     assert kind is OSError or str(error).startswith(("not enough memory; ", "a worker failed (KeyError"))

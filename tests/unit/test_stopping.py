@@ -14,8 +14,8 @@ import pytest
 from simtest.cli.main import main
 from simtest.cli.stopping import INTERRUPTED, TERMINATED
 from simtest.errors import InputError, SimtestError
+from simtest.runtime.boundary import cannot_write
 from simtest.runtime.files import make_folder, refuse_file
-from simtest.runtime.machine_errors import cannot_write
 from simtest.simulation import view_folder
 from tests.refusals import refused
 

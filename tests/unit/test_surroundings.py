@@ -19,8 +19,8 @@ from simtest.geometry import Camera
 from simtest.reconstruction import reconstruct_colour
 from simtest.reconstruction.picture_values import is_coloured
 from simtest.rendering import bitmap
-from simtest.runtime.kept_arrays import cache_folder
-from simtest.runtime.user_cache import user_cache
+from simtest.runtime.arrays import cache_folder
+from simtest.runtime.files import user_cache
 from simtest.spec import load_calibration, load_scene
 from simtest.surfaces.mesh_file import read_mesh
 

@@ -8,7 +8,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 SCRIPT = """
 import signal
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from tests.unit.engine_tasks import blocked_signals
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from simtest.reconstruction.image_io import is_sequence, read_picture
 from simtest.reconstruction.picture import Options, read_calibration
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Array, Image
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 
 LEAST_TWINS = 20
 """A bank with fewer highlights measures nothing."""

@@ -7,8 +7,8 @@ from simtest.advice.twin.page import render_page
 from simtest.advice.twin.run import SpotTwins, TwinResult
 from simtest.reconstruction.output_files import write_csv
 from simtest.runtime import provenance
+from simtest.runtime.boundary import write_error
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
-from simtest.runtime.machine_errors import write_error
 
 FILES = ("twin.json", "twin.csv", "index.html")
 

@@ -11,8 +11,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from simtest.errors import InputError
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import require_plain, write_atomically
-from simtest.runtime.resources import shown
 
 LAST, BEST = "last.safetensors", "best.safetensors"
 

@@ -25,9 +25,9 @@ from simtest.dataset.reader import open_manifest
 from simtest.errors import InputError
 from simtest.pages.markdown import escaped, paragraphs
 from simtest.runtime import provenance
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject, require_plain, write_atomically
 from simtest.runtime.onnx_model import METADATA
-from simtest.runtime.resources import shown
 
 MEASURED = "## Measured on unseen anatomies"
 """Heading of the card's last part, which people write; what stands below it is kept when the card is made again."""

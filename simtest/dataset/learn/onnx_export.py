@@ -14,9 +14,9 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from simtest.errors import SimtestError
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject, write_atomically
 from simtest.runtime.onnx_model import METADATA
-from simtest.runtime.resources import shown
 
 MODEL = "model.onnx"
 """Name of the file in a training's folder."""

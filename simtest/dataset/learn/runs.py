@@ -19,8 +19,8 @@ try:
     from simtest.dataset.learn.tasks import load_task
 except ImportError as error:
     raise InputError(f"training needs the package {error.name}: install the extra learn") from error
+from simtest.runtime.boundary import shown
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.resources import shown
 from simtest.validation.runner import Progress
 
 

@@ -8,7 +8,7 @@ from torch import Generator, Tensor, nn
 
 from simtest.dataset.learn.training import Training
 from simtest.errors import InputError
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import shown, suggestion
 from simtest.validation.runner import Progress
 
 Batch = dict[str, Tensor]

@@ -8,7 +8,7 @@ from simtest.dataset.scoring.record import Record, Source, check_frame, open_sou
 from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.simulation.rendered_view import RenderedView
 from simtest.validation.results_table import Value
 

@@ -16,8 +16,8 @@ from simtest.dataset.scoring.views import ShardViews, Views, views_of_cases
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import require_plain, write_json
-from simtest.runtime.resources import shown
 from simtest.spec import Experiment
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.spec_model import validate

@@ -20,11 +20,10 @@ from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
 from simtest.rendering import backend
 from simtest.runtime import provenance
-from simtest.runtime.engines import Engine, OnStep, make_engine
+from simtest.runtime.boundary import shown, write_error
 from simtest.runtime.files import Json, are_nested
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine, OnStep, make_engine
 from simtest.validation import gallery_items
 from simtest.validation.cases import swept_example
 from simtest.validation.execution import forget, gallery_cases

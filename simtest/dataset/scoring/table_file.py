@@ -13,8 +13,8 @@ import polars as pl
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
+from simtest.runtime.boundary import close_names, shown
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import close_names, shown
 
 NORMAL = ("normal_x", "normal_y", "normal_z")
 SECOND = ("second_x", "second_y", "second_z")

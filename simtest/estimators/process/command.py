@@ -13,7 +13,7 @@ from pydantic import Field
 from simtest.errors import InputError
 from simtest.estimators.process import PREFIX
 from simtest.runtime import provenance
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
 

@@ -18,7 +18,7 @@ from simtest.estimators.process.child import Child
 from simtest.estimators.process.command import CoreCommand, parse_core
 from simtest.estimators.process.wire import PROTOCOL, CoreFault, Message, broken, encode, excerpt
 from simtest.runtime import provenance
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 
 PATCH_ARRAYS = ("values", "raw", "noise", "saturated", "seen", "rays")
 FRAME_ARRAYS = ("encoded", "channels", "intensity", "smoothed", "noise", "clipped", "seen", "rays")

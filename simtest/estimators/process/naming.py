@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from simtest.errors import InputError
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
-from simtest.runtime.model_names import parse_model
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.resources import parse_model
 
 if TYPE_CHECKING:
     from simtest.estimators.process.command import CoreCommand

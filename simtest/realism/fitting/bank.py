@@ -14,9 +14,9 @@ from simtest.realism.fitting.parameters import Parameter
 from simtest.realism.fitting.summaries import NAMES, summarise
 from simtest.realism.frame_statistics import measure
 from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import Json, make_folder, require_plain, write_json
 from simtest.runtime.provenance import source_hash
-from simtest.runtime.resources import shown
 from simtest.spec.dataset_recipe import Dataset, Splits
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from simtest.dataset.maker import colour_variant
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.errors import InputError
 from simtest.rendering import Session
-from simtest.runtime.arrays import Image
-from simtest.runtime.kept_arrays import only_reading
+from simtest.runtime.arrays import Image, only_reading
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.rendered_view import expose_picture

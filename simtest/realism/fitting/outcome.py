@@ -12,9 +12,8 @@ from simtest.errors import InputError
 from simtest.realism.fitting.fit import FittedRecipe
 from simtest.realism.fitting.parameters import KNOWN
 from simtest.realism.fitting.summaries import NAMES
+from simtest.runtime.boundary import shown, write_error
 from simtest.runtime.files import Json, write_atomically, write_json
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.toml_files import toml_value
 

@@ -15,7 +15,7 @@ from simtest.geometry.camera import Camera
 from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
 from simtest.reconstruction.light_calibration.ball_search import find_ball, trace_outline
 from simtest.reconstruction.light_calibration.outline import BallOutline, has_dark_ring, refine_outline
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 
 OUTLINE_FLOOR_PX = 0.02
 """Error of an outline that stays however little noise there is, px: pixels are squares, lenses no Gaussians."""
@@ -333,7 +333,7 @@ def circles_of(path: Path) -> dict[str, Circle]:
     """Read rough outlines: lines of name, x, y, radius, px, separated by commas; a header line is skipped."""
     import csv
 
-    from simtest.runtime.limits import check_file
+    from simtest.runtime.files import check_file
 
     check_file(path, "record_bytes", "a file of outlines (name,x,y,radius)")
     found: dict[str, Circle] = {}

@@ -16,9 +16,8 @@ from simtest.errors import InputError
 from simtest.pages.palette import LIGHT, colours
 from simtest.report.viewer.content import CAMERA, TRUE, TRUE_BASE, Content, estimators
 from simtest.report.viewer.web_page import curvature_limit
+from simtest.runtime.boundary import cannot_write, shown
 from simtest.runtime.files import write_atomically
-from simtest.runtime.machine_errors import cannot_write
-from simtest.runtime.resources import shown
 
 OFF_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 """VTK's ways to draw without a display: libegl1, libosmesa6."""

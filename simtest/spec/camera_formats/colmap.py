@@ -14,7 +14,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from simtest.geometry.quaternions import quaternion_of, rotation_of
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import shown, suggestion
 from simtest.spec.camera_formats.common import Poses, Table, inverse, mask_of_text, mask_text, number
 from simtest.spec.toml_files import read_text
 

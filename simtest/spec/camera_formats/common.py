@@ -13,7 +13,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.camera import ViewMask
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import shown, suggestion
 from simtest.spec.toml_files import read_text
 
 Table = dict[str, Any]

@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.common import LARGEST, Poses, Table, chosen
 from simtest.spec.toml_files import read_text
 

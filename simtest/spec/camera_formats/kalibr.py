@@ -14,7 +14,7 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.common import Poses, Table, inverse, number, numbers, rigid
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
 from simtest.spec.toml_files import read_text

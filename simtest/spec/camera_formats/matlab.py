@@ -14,7 +14,7 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.common import Table, check_alike, mask_of_text, mask_text, number
 from simtest.spec.camera_formats.matlab_struct import HOW, read_struct
 from simtest.spec.camera_formats.omnidirectional import scaramuzza_table

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.limits import check_file
-from simtest.runtime.reader_process import limit_memory, read_apart, serve
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
+from simtest.runtime.files import check_file
+from simtest.runtime.processes import limit_memory, read_apart, serve
 
 HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
 

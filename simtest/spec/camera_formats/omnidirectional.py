@@ -15,7 +15,7 @@ from numpy.polynomial import Polynomial
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import shown, suggestion
 from simtest.spec.camera_formats.common import Table, number, numbers, read_json
 from simtest.spec.toml_files import read_text
 

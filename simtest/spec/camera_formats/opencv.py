@@ -16,7 +16,7 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.common import Table, parse_json
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
 from simtest.spec.toml_files import read_text

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.common import number, read_xml
 from simtest.spec.camera_formats.vicalib import text_of, values
 

@@ -16,7 +16,7 @@ from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import shown, suggestion
 from simtest.spec.camera_formats.common import Poses, Table, check_alike, mask_table, number, read_json, rigid
 
 MODELS = {

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import shown, suggestion
 from simtest.spec.camera_formats.common import Table, number, numbers, read_xml
 from simtest.spec.camera_formats.omnidirectional import scaramuzza_table
 

@@ -7,9 +7,8 @@ from typing import Literal, get_args
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
+from simtest.runtime.boundary import cannot_write, shown, suggestion
 from simtest.runtime.files import write_atomically
-from simtest.runtime.machine_errors import cannot_write
-from simtest.runtime.resources import shown, suggestion
 from simtest.spec.camera_formats.common import Poses
 from simtest.spec.camera_tables import camera_toml
 

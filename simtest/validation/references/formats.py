@@ -7,7 +7,7 @@ the user must state it.
 from dataclasses import dataclass
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import shown, suggestion
 
 
 @dataclass(frozen=True)

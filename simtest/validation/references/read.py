@@ -9,7 +9,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.geometry.axes import ALL, described, matrix
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.validation.depth_maps import (
     FARTHEST_MM,
     depth_normals,

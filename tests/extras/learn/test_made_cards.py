@@ -40,7 +40,7 @@ class TestMade:
     @pytest.fixture(scope="class")
     def data(self, tmp_path_factory):
         from simtest.dataset.shard_writer import write_dataset
-        from simtest.runtime.engines import make_engine
+        from simtest.runtime.processes import make_engine
         from simtest.spec import load_dataset
 
         folder = tmp_path_factory.mktemp("cards") / "tiny"

@@ -11,8 +11,8 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.axes import ALL, NAMED, matrix
 from simtest.runtime.arrays import Array
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject
-from simtest.runtime.resources import shown
 
 LEAST_COSINE = 0.5
 """A mean cosine between map and truth below this, 60 deg, is no fit."""

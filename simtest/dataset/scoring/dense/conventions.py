@@ -20,8 +20,8 @@ from simtest.dataset.scoring.dense.map_files import (
 from simtest.errors import InputError
 from simtest.geometry.axes import described
 from simtest.runtime.arrays import Array
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject
-from simtest.runtime.resources import shown
 
 MOST_PIXELS = 20_000
 """Of a frame, by which conventions are found out, evenly spread."""

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 from simtest.validation.depth_maps import DEPTH_SUFFIXES, read_values
 
 Kind = Literal["normal", "depth"]

@@ -13,7 +13,7 @@ from simtest.dataset.scoring.dense.frame_truth import FrameTruth
 from simtest.dataset.scoring.dense.map_files import Kind, MapFile, RawMap, find_maps, read_map
 from simtest.errors import InputError
 from simtest.estimators.shading_maps import shading_maps
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import shown
 
 
 class Method(Protocol):

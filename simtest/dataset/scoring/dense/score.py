@@ -17,9 +17,9 @@ from simtest.dataset.scoring.dense.scorer import ANGLE, NORMAL, Key, Scorer, dep
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.resources import shown
 
 TABLE, SUMMARY, PAGE = "dense.parquet", "dense.json", "index.html"
 SCHEMA = 2
