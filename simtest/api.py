@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
+from simtest.runtime.boundary import plain, plain_errors
 from simtest.runtime.files import check_count
 from simtest.runtime.lazy_names import lazy_names
 
@@ -48,6 +49,7 @@ TRIES = 10
 """Viewpoints that are tried for each view wanted."""
 
 
+@plain_errors
 def render(
     scene: "Scene | str | Path",
     settings: Mapping[str, Any] | None = None,
@@ -94,6 +96,7 @@ def render(
     return make_frame(_scene(scene, settings, overrides), variant, progress)
 
 
+@plain_errors
 def export(
     scene: "Scene | str | Path",
     out: str | Path,
@@ -137,6 +140,7 @@ def export(
         return export_scene(_scene(scene, settings, overrides), Path(out), variant)
 
 
+@plain_errors
 def sample_views(
     scene: "Scene | str | Path",
     out: str | Path,
@@ -197,6 +201,7 @@ def sample_views(
         return sample_into(Path(out), described, count, viewpoints, variant, progress, along is not None, fps, labels)
 
 
+@plain_errors
 def validate(
     experiment: "Experiment | str | Path",
     out: str | Path,
@@ -260,7 +265,6 @@ def validate(
     ('index.html', ['cone_axis'])
     """
     from simtest.estimators.process.naming import close_cores
-    from simtest.runtime.boundary import disk_problem, write_error
     from simtest.runtime.locks import exclusive_folder
     from simtest.runtime.processes import make_engine
 
@@ -273,10 +277,8 @@ def validate(
             made.warn_of_faults()
             return made
         except OSError as error:
-            if disk_problem(error) is None:
-                raise
             kept = "what is finished is kept, and the same command goes on from there"
-            raise write_error(error, out, kept) from error
+            raise plain(error, kept, Path(out)) from error
         finally:
             # The page's worst cases are estimated again.
             close_cores()
@@ -369,6 +371,7 @@ class Extras:
     """Data set whose map the reference is."""
 
 
+@plain_errors
 def reconstruct_picture(
     image: Path, out: Path, options: "Options", extras: Extras | None = None
 ) -> tuple["PictureRecord", list[Path]]:

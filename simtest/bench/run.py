@@ -13,7 +13,6 @@ from simtest.bench.ranking import CAP_DEG
 from simtest.bench.scores import score_part
 from simtest.bench.suite import Suite, layout_of
 from simtest.errors import InputError
-from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject, make_folder
 from simtest.runtime.processes import Engine
 from simtest.validation.runner import Progress, run_experiments
@@ -56,7 +55,7 @@ def chosen_parts(suite: Suite, wanted: Sequence[str] | None) -> list[str]:
         if suite.part(name).kind != HIGHLIGHTS:
             raise InputError(f"--part {name}: is scored by maps of normals or depths; give --maps in place of --core")
         if list(wanted).count(name) > 1:
-            raise InputError(f"--part {shown(name, 60)}: named twice")
+            raise InputError(f"--part {name}: named twice")
     return [part.name for part in suite.spec.parts if part.name in wanted]
 
 

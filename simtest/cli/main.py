@@ -11,12 +11,6 @@ from simtest.cli.stopping import INTERRUPTED, TERMINATED, Termination
 if TYPE_CHECKING:
     from cyclopts import MissingArgumentError
 
-NARROWEST = 20
-"""Columns of a terminal; tables and help cannot be laid out in fewer."""
-
-LONGEST = 900
-"""Characters of a line; a longer one is cut."""
-
 BAD_USE = 2
 
 GOING_ON = ("validate", "advise", "dataset", "nightly", "bench")
@@ -56,7 +50,6 @@ def _run(stop: Termination) -> int:  # noqa: C901 - a branch for each way in whi
             return _code(APP(words, result_action="return_value"))
     try:
         with stop.working():
-            _require_folder()
             if MANNERS.quiet and MANNERS.verbose:
                 raise InputError("--quiet and --verbose exclude each other; give one of them")
             # A command's result is its exit code.
@@ -90,7 +83,7 @@ def _run(stop: Termination) -> int:  # noqa: C901 - a branch for each way in whi
             return 0
         raise
     except Exception as error:
-        return _report(_problem(error), failed)
+        return _unforeseen(error, failed)
 
 
 def _missing(error: "MissingArgumentError") -> str:
@@ -103,27 +96,19 @@ def _missing(error: "MissingArgumentError") -> str:
     return f"{error.keyword or argument.name}: {lacks}{f' ({what})' if what else ''}; {command} --help describes it"
 
 
-def _problem(error: Exception) -> str:
-    """Return an error that no command foresaw as text: of the output, of the machine, or of the program."""
-    from simtest.runtime.boundary import machine_problem
+def _unforeseen(error: Exception, failed: int) -> int:
+    """Report an error that no command foresaw: of the output, of a file, of the machine, or of the program."""
+    from simtest.errors import InputError, SimtestError
+    from simtest.runtime.boundary import plain
 
+    told = plain(error)
     # Only the output's stream has neither a name nor a reason of its own to fail.
-    what = machine_problem(error) or _damaged_bytecode(error)
-    if what is not None and isinstance(error, OSError) and error.filename is None and _output_fails():
-        return f"the output cannot be written ({what})"
-    return what or f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
-
-
-def _damaged_bytecode(error: Exception) -> str | None:
-    """Return which compiled file of Python is cut short, as a full disk leaves it; None for any other error."""
-    if not isinstance(error, EOFError | ValueError) or "marshal data" not in str(error):
-        return None
-    import traceback
-
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        if path := frame.f_locals.get("bytecode_path"):
-            return f"{path}: a compiled file of Python that is cut short, perhaps by a full disk; delete it"
-    return None
+    if isinstance(error, OSError) and error.filename is None and _output_fails():
+        return _report(f"the output cannot be written ({told})", failed)
+    if isinstance(told, SimtestError):
+        return _report(str(told), BAD_USE if isinstance(told, InputError) else failed)
+    internal = f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
+    return _report(internal, failed)
 
 
 def _output_fails() -> bool:
@@ -149,19 +134,6 @@ def _code(result: object) -> int:
     return result if isinstance(result, int) else 0
 
 
-def _require_folder() -> None:
-    """Raise `InputError` where the working folder was deleted: libraries and child processes end without one."""
-    import os
-
-    from simtest.errors import InputError
-
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        if not {"--help", "-h", "--version"} & set(sys.argv):
-            raise InputError("the working folder was deleted; change to another one") from None
-
-
 def _answer_warnings(quiet: bool, plain: bool) -> None:
     """Have warnings printed in one line, or not at all where `quiet`, or as Python does where `plain`."""
     import warnings
@@ -173,28 +145,25 @@ def _answer_warnings(quiet: bool, plain: bool) -> None:
 
 
 def _warn(message: Warning | str, *_: object, **__: object) -> None:
-    from simtest.runtime.boundary import shown
 
-    print(f"simtest: warning: {shown(message, LONGEST)}", file=sys.stderr)
+    from simtest.errors import one_line
+
+    print(f"simtest: warning: {one_line(message)}", file=sys.stderr)
 
 
 def _mend_terminal() -> None:
-    """Let output never fail: characters that a terminal lacks are replaced, and one of no width gets the usual one."""
+    """Let output never fail: characters that a terminal lacks are replaced."""
     import io
-    import os
 
     for stream in (sys.stdout, sys.stderr):
         # None where it is closed.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    if os.environ.get("COLUMNS", "").isdecimal() and int(os.environ["COLUMNS"]) < NARROWEST:
-        del os.environ["COLUMNS"]
 
 
 def _report(text: str, code: int) -> int:
     """Print an error as one line and return the exit code."""
-    from simtest.runtime.boundary import shown
+    from simtest.errors import one_line
 
-    line = " ".join(text.split())
-    print(f"simtest: {shown(line, LONGEST)}", file=sys.stderr)
+    print(f"simtest: {one_line(' '.join(text.split()))}", file=sys.stderr)
     return code

@@ -57,10 +57,10 @@ def meant_flag(word: str, options: Iterable[str]) -> str | None:
     str, optional
         None where no flag is meant.
     """
-    from simtest.runtime.boundary import close_names, shown
+    from simtest.runtime.boundary import close_names
 
     name = word.partition("=")[0]
     if name in FLAGS:
         return f"{name}: takes no value"
     close = close_names(name, [*options, *FLAGS])
-    return f'Unknown option: "{shown(word, 60)}". Did you mean "{close[0]}"?' if set(close) & set(FLAGS) else None
+    return f'Unknown option: "{word!s:.60}". Did you mean "{close[0]}"?' if set(close) & set(FLAGS) else None

@@ -6,7 +6,6 @@ from cyclopts import Parameter
 
 from simtest.cli.options import AsJson, Out, SceneName, Settings, Variant, whole_number
 from simtest.errors import InputError
-from simtest.runtime.boundary import shown
 
 
 def views(
@@ -60,5 +59,5 @@ def _ends(text: str) -> tuple[float, float]:
     try:
         first, last = (float(part) for part in text.split(","))
     except ValueError:
-        raise InputError(f"--along {shown(text)}: must be two shares of the path, such as 0.2,0.8") from None
+        raise InputError(f"--along {text}: must be two shares of the path, such as 0.2,0.8") from None
     return first, last

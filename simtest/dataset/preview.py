@@ -20,7 +20,6 @@ from simtest.errors import InputError
 from simtest.pages import palette
 from simtest.pages.pixels import jpeg_address
 from simtest.runtime.arrays import AnyArray, Array
-from simtest.runtime.boundary import cannot_write
 from simtest.runtime.files import write_atomically
 
 WIDTH = 240
@@ -69,10 +68,7 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
         histograms=list(_histograms(index, highlights)),
         cards=[_card(sample) for sample in sorted(shown, key=lambda sample: sample.index)],
     )
-    try:
-        write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
-    except OSError as error:
-        raise cannot_write(error, f"--out {page}", page) from error
+    write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
     return page
 
 

@@ -28,7 +28,6 @@ from simtest.estimators.spot_inputs import LOG_RANGE
 from simtest.estimators.turned_normals import turned_normals
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.runtime.arrays import Image
-from simtest.runtime.boundary import shown
 from simtest.runtime.onnx_model import OnnxModel
 from simtest.runtime.resources import data_root
 from simtest.runtime.training_range import TrainingRange, inflation, read_usual
@@ -115,7 +114,7 @@ class LearnedDense:
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
-        network = shown(self.model or SHIPPED[-1])
+        network = str(self.model or SHIPPED[-1])
         return f"The normal of the base surface at each highlight, by the network {network} of the whole frame."
 
     @cached_property

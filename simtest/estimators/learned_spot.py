@@ -25,7 +25,6 @@ from simtest.estimators.spot_inputs import (
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
-from simtest.runtime.boundary import shown
 from simtest.runtime.onnx_model import OnnxModel
 from simtest.runtime.resources import data_root
 from simtest.runtime.training_range import TrainingRange, inflation, read_usual
@@ -74,7 +73,7 @@ class LearnedSpot:
 
     def __post_init__(self) -> None:
         if self.target not in SURFACES:
-            raise InputError(f"target = {shown(self.target)}: must be base or fine")
+            raise InputError(f"target = {self.target}: must be base or fine")
 
     def with_model(self, model: Path) -> "LearnedSpot":
         """Return the estimator with another network, which is read (see `simtest.runtime.resources`)."""
@@ -85,7 +84,7 @@ class LearnedSpot:
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
-        network = shown(self.model or SHIPPED[-1])
+        network = str(self.model or SHIPPED[-1])
         return f"The normal of the {self.target} surface at each highlight, by the network {network}."
 
     def check(self) -> None:

@@ -11,7 +11,6 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
 from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
 from simtest.geometry import Camera, Patch
-from simtest.runtime.boundary import shown
 from simtest.runtime.resources import SUFFIX, parse_model
 
 
@@ -78,13 +77,11 @@ def _plain(name: str) -> tuple[str, object]:
         raise InputError(f"estimator {name!r}: one name each; several are given as {each}")
     if name.endswith(SUFFIX):
         raise InputError(
-            f"estimator {shown(name, 120)!r}: is no estimator's name; a network stands behind what runs it, as in "
-            f"learned_spot:{shown(Path(name), 80)}"
+            f"estimator {name!r}: is no estimator's name; a network stands behind what runs it, as in "
+            f"learned_spot:{Path(name)}"
         )
     if " " in name.strip() or "/" in name:
-        raise InputError(
-            f"estimator {shown(name, 120)!r}: is no estimator's name; a program of yours needs 'command: ' before it"
-        )
+        raise InputError(f"estimator {name!r}: is no estimator's name; a program of yours needs 'command: ' before it")
     return name, _installed(name)
 
 
@@ -105,7 +102,7 @@ def _installed(name: str) -> object:
         if name in ESTIMATORS.names() or not Path(name).is_file():
             raise
         how = f"python {name}" if name.endswith(".py") else f"./{name}"
-        raise InputError(f"{error}; the file {shown(name, 80)} is run by 'command: {how}'") from error
+        raise InputError(f"{error}; the file {name} is run by 'command: {how}'") from error
 
 
 def _core(name: str) -> tuple[str, object]:

@@ -28,7 +28,6 @@ from simtest.nightly.storage import (
     load_run,
     save_run,
 )
-from simtest.runtime.boundary import shown
 from simtest.runtime.files import require_plain
 from simtest.validation.results_table import SCHEMA
 
@@ -61,7 +60,7 @@ def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
     run = load_run(folder, BASELINE_ROWS)
     if run.record.profile != profile:
         raise InputError(
-            f"{shown(folder / RUN_FILE)}: profile = {shown(run.record.profile)}; the baseline of this night must be "
+            f"{folder / RUN_FILE}: profile = {run.record.profile}; the baseline of this night must be "
             f"of the profile {profile}"
         )
     rows = whole(run.rows, folder / BASELINE_ROWS)
@@ -79,13 +78,13 @@ def log_note(reports: Reports, profile: str) -> str | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        return f"{shown(path)}: cannot be read ({error.strerror})."
+        return f"{path}: cannot be read ({error.strerror})."
     broken = [number for number, line in enumerate(lines, 1) if not _is_entry(line)]
     if not broken:
         return None
     more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
     return (
-        f"{shown(path)}: damaged (line {broken[0]}{more} of {len(lines)} is no entry; cut off?); the rest is kept, "
+        f"{path}: damaged (line {broken[0]}{more} of {len(lines)} is no entry; cut off?); the rest is kept, "
         "the baseline itself is sound."
     )
 
@@ -123,12 +122,12 @@ def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
     source, target = reports.latest(profile), reports.baseline(profile)
     # Nothing is made where there never was a night.
     if not source.parent.is_dir():
-        raise InputError(f"{shown(source)}: no night of the profile {profile}; run simtest nightly first")
+        raise InputError(f"{source}: no night of the profile {profile}; run simtest nightly first")
     reports.make()
     # Read tonight's run under its lock, so that no other run replaces it meanwhile.
     with exclusive_replacement(source):
         if not source.is_dir():
-            raise InputError(f"{shown(source)}: no night of the profile {profile}; run simtest nightly first")
+            raise InputError(f"{source}: no night of the profile {profile}; run simtest nightly first")
         run = load_run(source, LATEST_ROWS)
     now = datetime.now(UTC)
     record = run.record.model_copy(update={"reason": reason, "accepted": now.isoformat(timespec="seconds")})

@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from simtest.errors import InputError
-from simtest.runtime.boundary import cannot_write, shown
 from simtest.runtime.files import sync_folder
 from simtest.runtime.locks import exclusive_file, is_held, waiting_for
 
@@ -46,9 +45,7 @@ class Reports:
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except FileExistsError:
-            raise InputError(f"--reports {shown(self.root)}: is a file; must be a folder") from None
-        except OSError as error:
-            raise cannot_write(error, f"--reports {shown(self.root)}", self.root) from error
+            raise InputError(f"--reports {self.root}: is a file; must be a folder") from None
 
 
 def new_run_id(now: datetime) -> str:

@@ -10,7 +10,7 @@ import polars as pl
 
 from simtest.errors import InputError, SimtestError
 from simtest.nightly.records import FIGURES, NightlyRun, RunRecord
-from simtest.runtime.boundary import disk_problem, shown
+from simtest.runtime.boundary import explain
 from simtest.runtime.files import require_plain, sync_folder, write_atomically, write_json
 from simtest.runtime.provenance import file_hash
 
@@ -34,10 +34,10 @@ def disk_errors_in_one_line(root: Path, what: str, left: str) -> Iterator[None]:
     except (OSError, pl.exceptions.PolarsError, SimtestError) as error:
         # A full disk under an experiment's scratch folder is told by the name of that; the user gave the reports'.
         cause = error.__cause__ if type(error) is SimtestError else error
-        why = None if cause is None or isinstance(cause, SimtestError) else disk_problem(cause, root)
+        why = None if cause is None or isinstance(cause, SimtestError) else explain(cause)
         if why is None:
             raise
-        raise SimtestError(f"--reports {shown(root)}: {what} ({why}); {left}") from error
+        raise SimtestError(f"--reports {root}: {what} ({why}); {left}") from error
 
 
 def save_run(folder: Path, run: NightlyRun, rows_file: str, smallest: bool = False) -> None:
@@ -72,19 +72,18 @@ def check_columns(path: Path, table: pl.DataFrame, schema: Mapping[str, pl.DataT
     """Raise `InputError`, with file and column, where a table lacks a column or holds one of another type."""
     for name, dtype in schema.items():
         if name not in table.columns:
-            raise InputError(f"{shown(path)}: damaged (no column {name})")
+            raise InputError(f"{path}: damaged (no column {name})")
         if table.schema[name] != dtype:
-            raise InputError(f"{shown(path)}: damaged (column {name} is of type {table.schema[name]}, not {dtype})")
+            raise InputError(f"{path}: damaged (column {name} is of type {table.schema[name]}, not {dtype})")
 
 
 def _record(path: Path) -> tuple[RunRecord, dict[str, str]]:
     """Read a run's record, and the hashes of its tables by file name."""
+    require_plain(path, "record_bytes", "a run's record")
     try:
-        data = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+        data = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{shown(path)}: damaged (not JSON: {error})") from error
+        raise InputError(f"{path}: damaged (not JSON: {error})") from error
     try:
         hashes = data.pop("files", None)
         record = RunRecord.model_validate(data)
@@ -92,9 +91,9 @@ def _record(path: Path) -> tuple[RunRecord, dict[str, str]]:
     except (AttributeError, TypeError, KeyError, ValueError):
         sound = False
     if not sound:
-        raise InputError(f"{shown(path)}: damaged (no record of a night, with id, profile and started)")
+        raise InputError(f"{path}: damaged (no record of a night, with id, profile and started)")
     if not isinstance(hashes, dict):
-        raise InputError(f"{shown(path)}: damaged (no hashes under files)")
+        raise InputError(f"{path}: damaged (no hashes under files)")
     return record, hashes
 
 
@@ -103,8 +102,6 @@ def _table(path: Path, hashes: Mapping[str, str]) -> pl.DataFrame:
         same = file_hash(path) == hashes.get(path.name)
         if same:
             return pl.read_parquet(path, memory_map=False)
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
     except pl.exceptions.PolarsError as error:
-        raise InputError(f"{shown(path)}: damaged ({str(error).splitlines()[0]})") from error
-    raise InputError(f"{shown(path)}: damaged, or not of the same night as {RUN_FILE} (another SHA-256)")
+        raise InputError(f"{path}: damaged ({str(error).splitlines()[0]})") from error
+    raise InputError(f"{path}: damaged, or not of the same night as {RUN_FILE} (another SHA-256)")

@@ -14,7 +14,6 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.quaternions import rotation_of
 from simtest.runtime.arrays import Array
-from simtest.runtime.boundary import shown
 from simtest.runtime.files import require_plain
 
 POSITION, ROTATION = "SavedPosition_", "SavedRotationQuaternion_"
@@ -50,15 +49,15 @@ def _simcol3d(path: Path, text: str, where: str) -> list[Array]:
     other = path.with_name(ROTATION + path.name.removeprefix(POSITION))
     try:
         turned = require_plain(other, "record_bytes").read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        raise InputError(f"{where}: needs {shown(other.name)} beside it, which cannot be read") from None
-    at, of = _numbers(text, 3, None, where), _numbers(turned, 4, None, f"--poses {shown(other)}")
+    except (OSError, ValueError):
+        raise InputError(f"{where}: needs {other.name} beside it, which cannot be read") from None
+    at, of = _numbers(text, 3, None, where), _numbers(turned, 4, None, f"--poses {other}")
     if len(at) != len(of):
-        raise InputError(f"{where}: {len(at)} positions, but {shown(other.name)} has {len(of)} rotations")
+        raise InputError(f"{where}: {len(at)} positions, but {other.name} has {len(of)} rotations")
     poses = []
     for number, (position, (x, y, z, w)) in enumerate(zip(at, of, strict=True)):
         T = np.eye(4)
-        T[:3, :3] = DOWN @ rotation_of((w, x, y, z), f"--poses {shown(other)}: pose {number}") @ DOWN
+        T[:3, :3] = DOWN @ rotation_of((w, x, y, z), f"--poses {other}: pose {number}") @ DOWN
         T[:3, 3] = DOWN @ position * MM_PER_CM
         poses.append(T)
     return poses
@@ -75,6 +74,6 @@ def _numbers(text: str, count: int, separator: str | None, where: str) -> list[l
         except ValueError:
             row = []
         if len(row) != count or not np.isfinite(row).all():
-            raise InputError(f"{where}: line {number}: {shown(line.strip(), 60)}; must be {count} numbers")
+            raise InputError(f"{where}: line {number}: {line.strip()!s:.60}; must be {count} numbers")
         rows.append(row)
     return rows

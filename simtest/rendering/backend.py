@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import BackendError, InputError
-from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.runtime.files import Json, user_cache, write_json
 
 LLVM, CUDA = DEVICES = ("llvm", "cuda")
@@ -88,7 +88,7 @@ def requested_variant(variant: str | None = None, coloured: bool = False) -> str
         allowed = (*DEVICES, *VARIANTS)
         meant = suggestion(name, allowed)
         given = "variant" if variant else VARIANT_VARIABLE
-        raise InputError(f"{given} {shown(name, 60)!r}: cannot be used; allowed: {', '.join(allowed)}{meant}")
+        raise InputError(f"{given} {name!r}: cannot be used; allowed: {', '.join(allowed)}{meant}")
     return f"{name}_ad_{'rgb' if coloured else 'mono'}" if name in DEVICES else name
 
 

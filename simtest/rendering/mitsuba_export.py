@@ -18,7 +18,6 @@ from simtest.rendering.mitsuba_values import MitsubaDict
 from simtest.rendering.shapes import make_shape
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
-from simtest.runtime.boundary import write_error
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.spec import Scene
 from simtest.spec.falloff import CosineProfile
@@ -78,17 +77,14 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
     text = _xml(mi, scene, surface, shape, plugin)
     make_folder(out)
     files = [out / SCENE_FILE]
-    try:
-        if shape.mesh:
-            files.append(out / MESH_FILE)
-            mesh = make_shape(mi, shape, {"type": "diffuse"})
-            # By way of memory, since Mitsuba does not tell which of the system's errors it met.
-            stream = mi.MemoryStream()
-            mesh.write_ply(stream)
-            write_atomically(files[1], lambda part: part.write_bytes(stream.raw_buffer()))
-        write_atomically(files[0], lambda part: part.write_text(text, encoding="utf-8"))
-    except OSError as error:
-        raise write_error(error, out) from error
+    if shape.mesh:
+        files.append(out / MESH_FILE)
+        mesh = make_shape(mi, shape, {"type": "diffuse"})
+        # By way of memory, since Mitsuba does not tell which of the system's errors it met.
+        stream = mi.MemoryStream()
+        mesh.write_ply(stream)
+        write_atomically(files[1], lambda part: part.write_bytes(stream.raw_buffer()))
+    write_atomically(files[0], lambda part: part.write_text(text, encoding="utf-8"))
     return files
 
 

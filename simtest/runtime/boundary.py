@@ -1,14 +1,22 @@
-"""What is said of errors: a user's text on one line, near names, and what disk and memory lack."""
+"""What a user is told of an error: one line, said in one place; and the names that a wrong one may mean.
+
+Readers and writers raise what they run into. The command line, and the public functions under `plain_errors`, turn it
+into a `SimtestError` of one line; what is a fault of the program stays what it is.
+"""
 
 import errno
 import os
 import re
 import shutil
-import stat
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import wraps
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 from simtest.errors import InputError, SimtestError
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _ALIKE = 0.6
 """Of two names that are taken for one mistyped: twice the letters in common over those of both."""
@@ -16,32 +24,16 @@ _ALIKE = 0.6
 _LONGEST_NAME = 80
 """Of what may be a mistyped name; comparing takes time with its square."""
 
+_OF_THE_DISK = {
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ENOTDIR,
+    errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ENOENT, errno.ELOOP, errno.ENOTEMPTY, errno.EMFILE,
+    errno.ENFILE, errno.EBUSY, errno.ESTALE, errno.EINVAL, errno.ENXIO,
+}  # fmt: skip
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""The disk is full, or fails: no other folder or file is asked for."""
 
-def shown(text: object, limit: int = 300) -> str:
-    """Return a user's text fit for a message: on one line, of at most `limit` characters."""
-    # A line break in a user's text would make two lines of the message.
-    line = str(text)
-    if not line or not line.isprintable():
-        line = repr(line)
-    return line if len(line) <= limit else line[: limit - 3] + "..."
-
-
-def kind_of(path: Path) -> str:
-    """Return what a path that is no plain file is, in words."""
-    mode = path.stat().st_mode
-    if stat.S_ISDIR(mode):
-        return "a folder"
-    # What a shell's pipe hands on as /dev/stdin has no size and can be read but once.
-    pipe = stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)
-    return "no plain file but a pipe (write it to a file first)" if pipe else "no plain file but a device"
-
-
-def leads_nowhere(path: Path) -> str:
-    """Return where a link leads that leads nowhere, for a message; nothing for what is no link."""
-    try:
-        return f" (a link to {shown(os.readlink(path))}, which does not exist)" if path.is_symlink() else ""
-    except OSError:
-        return ""
+_OS_ERROR = re.compile(r"\(os error (\d+)\)")
+"""How libraries written in Rust (polars) hand an error of the system on."""
 
 
 def close_names(name: object, known: Iterable[str], count: int = 1, alike: float = _ALIKE) -> list[str]:
@@ -60,88 +52,59 @@ def suggestion(name: object, known: Iterable[str], count: int = 1) -> str:
     return f" (did you mean {' or '.join(close)}?)" if close else ""
 
 
-_OF_THE_DISK = {
-    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ENOTDIR,
-    errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ENOENT, errno.ELOOP, errno.ENOTEMPTY, errno.EMFILE,
-    errno.ENFILE, errno.EBUSY, errno.ESTALE, errno.EINVAL, errno.ENXIO,
-}  # fmt: skip
-_OS_ERROR = re.compile(r"\(os error (\d+)\)")
-"""How libraries written in Rust (polars) hand an error of the system on."""
+def explain(error: BaseException, near: Path | None = None) -> str | None:
+    """Return what a user is told of an error; None for one that is a fault of the program.
 
-
-def disk_problem(error: BaseException, near: Path | None = None) -> str | None:
-    """Return an error of the disk as text: the file, what is wrong, what is free; None for any other error.
-
-    `near` is a path on the same disk, for errors that name no file.
+    An error of the disk names its file, what is wrong and, of a full one, what is free; `near` is named by one that
+    knows no file.
     """
+    if isinstance(error, SimtestError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        lacks = " ".join(str(error).split())
+        return f"not enough memory{f' ({lacks:.150})' if lacks else ''}; smaller frames or fewer workers need less"
+    if isinstance(error, RecursionError):
+        return "a value is nested too deeply"
     number = _number(error)
     if number not in _OF_THE_DISK:
         return None
-    name = getattr(error, "filename", None)
+    name = getattr(error, "filename", None) or near
+    file = f"{name}: " if name else ""
     what = getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
-    file = f"{shown(name, 200)}: " if name else ""
-    if number in (errno.ENOSPC, errno.EDQUOT):
-        return f"{file}{what}" + (f"; {_free(path)}" if (path := name or near) is not None else "")
-    # A limit of ours (`require_plain`) has the same number, and says so in its text.
-    if number == errno.EFBIG and os.strerror(errno.EFBIG) in what:
+    if name and number in (errno.ENOSPC, errno.EDQUOT):
+        return f"{file}{what}; {_free(name)}"
+    if number == errno.EFBIG:
         return f"{file}{what}; the system limits the size of a file (ulimit -f)"
     return f"{file}{what}"
 
 
-def write_error(error: OSError, out: str | Path, kept: str = "") -> SimtestError:
-    """Return the error, for a user, that came up while `--out` was written; `kept` says what stays of it.
+def plain(error: BaseException, kept: str = "", near: Path | None = None) -> BaseException:
+    """Return the error that a user gets in place of one; a fault of the program stays what it is.
 
-    It is an `InputError` where another folder would do, and a plain `SimtestError` where the disk is full or fails, or
-    the error is of a file elsewhere: an input that has gone, or a program that is missing, is no fault of the folder.
+    It is an `InputError` where another file or folder would do, and a plain `SimtestError` where the machine lacks
+    something. `kept` says what stays of the work, and `near` is a path of an error that knows no file.
     """
-    told = disk_problem(error, Path(out)) or error
-    if not lies_in(error, out):
-        return SimtestError(f"{told}{kept and f'; {kept}'}")
-    kind = SimtestError if is_disk_full(error) else InputError
-    return kind(f"--out {shown(out)}: cannot be written ({told}){kept and f'; {kept}'}")
+    told = explain(error, near)
+    if told is None or isinstance(error, SimtestError):
+        return error
+    kind = InputError if isinstance(error, OSError) and error.errno not in _FULL else SimtestError
+    return kind(f"{told}; {kept}" if kept else told)
 
 
-def cannot_write(error: OSError, what: str, near: Path) -> SimtestError:
-    """Return the error, for a user, that a path cannot be written: a plain one where its disk is full or fails.
+def plain_errors(function: Callable[P, R]) -> Callable[P, R]:
+    """Let a public function raise a `SimtestError` of one line for every error that is no fault of the program."""
 
-    Parameters
-    ----------
-    error : OSError
-        What the system said.
-    what : str
-        Option and path, as the message names them.
-    near : Path
-        The path, by which the disk is found.
-    """
-    full = is_disk_full(error)
-    told = disk_problem(error, near) if full else error.strerror
-    return (SimtestError if full else InputError)(f"{what}: cannot be written ({told})")
+    @wraps(function)
+    def call(*arguments: P.args, **named: P.kwargs) -> R:
+        try:
+            return function(*arguments, **named)
+        except Exception as error:
+            told = plain(error)
+            if told is error:
+                raise
+            raise told from error
 
-
-def is_disk_full(error: BaseException) -> bool:
-    """Return whether an error says that a disk is full, or fails."""
-    return _number(error) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-
-
-def lies_in(error: OSError, folder: str | Path) -> bool:
-    """Return whether an error is of a file below a folder, or beside an output file, or names no file."""
-    name = error.filename
-    if not isinstance(name, str | bytes | os.PathLike):
-        return True
-    path, folder = Path(os.fsdecode(name)), Path(folder)
-    # A file is written under another name beside its own.
-    folder = folder if folder.is_dir() else folder.parent
-    return path.absolute().is_relative_to(folder.absolute()) or path.resolve().is_relative_to(folder.resolve())
-
-
-def machine_problem(error: BaseException) -> str | None:
-    """Return an error of disk, memory or the depth of nesting as text; None for any other, which is a fault of ours."""
-    if isinstance(error, MemoryError):
-        told = " ".join(str(error).split())
-        return f"not enough memory{f' ({shown(told, 150)})' if told else ''}; smaller frames or fewer workers need less"
-    if isinstance(error, RecursionError):
-        return "a value is nested too deeply"
-    return disk_problem(error)
+    return call
 
 
 def _number(error: BaseException) -> int | None:
@@ -154,13 +117,13 @@ def _number(error: BaseException) -> int | None:
 
 def _free(name: str | Path) -> str:
     """Return how much of a file's disk is free."""
-    path = Path(name).absolute()
+    path = Path(os.fsdecode(name)).absolute()
     for folder in (path, *path.parents):
         try:
             usage = shutil.disk_usage(folder)
         except OSError:
             continue
-        return f"{_mb(usage.free)} of {_mb(usage.total)} MB are free on the disk of {shown(folder, 120)}"
+        return f"{_mb(usage.free)} of {_mb(usage.total)} MB are free on the disk of {folder}"
     return "the disk is full"
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.boundary import cannot_write, kind_of, leads_nowhere, shown, suggestion
+from simtest.runtime.boundary import suggestion
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 """What a JSON file can hold."""
@@ -28,23 +28,16 @@ def refuse_file(folder: Path, option: str = "--out") -> None:
 
     `option` is how the user names it.
     """
-    what = f"{option} {shown(folder)}"
-    try:
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{what}: is a file; must be a folder")
-        if not folder.exists() and folder.is_symlink():
-            raise InputError(f"{what}: is a link to {shown(os.readlink(folder))}, which does not exist; make it first")
-    except OSError as error:
-        raise cannot_write(error, what, folder) from error
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{option} {folder}: is a file; must be a folder")
+    if not folder.exists() and folder.is_symlink():
+        raise InputError(f"{option} {folder}: is a link to {os.readlink(folder)}, which does not exist; make it first")
 
 
 def make_folder(folder: Path, option: str = "--out") -> None:
-    """Make a folder for results; raise `InputError` if that is impossible, `SimtestError` if its disk is full."""
+    """Make a folder for results; raise `InputError` if a file is in its place."""
     refuse_file(folder, option)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(error, f"{option} {shown(folder)}", folder) from error
+    folder.mkdir(parents=True, exist_ok=True)
 
 
 def are_nested(one: Path, other: Path) -> bool:
@@ -53,25 +46,46 @@ def are_nested(one: Path, other: Path) -> bool:
     return first == second or first in second.parents or second in first.parents
 
 
-def require_plain(path: Path, limited_by: str | None = None) -> Path:
-    """Return a path that is a plain file, and within a limit of `simtest.runtime.files` where one is named.
+def require_plain(path: Path, limited_by: str | None = None, wanted: str = "a file", hint: str = "") -> Path:
+    """Return a path that is a plain file, without opening it: a pipe or a device might never end.
 
-    Raises `OSError` if it is none: a pipe or a device might never end.
+    Parameters
+    ----------
+    path : Path
+        To be read next.
+    limited_by : str, optional
+        Name of the limit of its bytes.
+    wanted, hint : str
+        What the file should be, such as "a picture", and what can be done with one that is too large; for messages.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it is a folder, a pipe or a device, or it is larger.
     """
-    found = path.stat()
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; must be {wanted}") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: cannot be read ({reason})") from error
+    if stat.S_ISDIR(found.st_mode):
+        raise InputError(f"{path}: is a folder; must be {wanted}")
     if not stat.S_ISREG(found.st_mode):
-        raise OSError(errno.ENXIO, "is no plain file", str(path))
-    if limited_by is not None and found.st_size > limit(limited_by):
-        told = f"at most {limit(limited_by)} are allowed ({VARIABLE}={limited_by}=N sets another limit)"
-        raise OSError(errno.EFBIG, f"{found.st_size} bytes; {told}", str(path))
+        # What a shell's pipe hands on as /dev/stdin has no size and can be read but once.
+        told = "is no plain file but a pipe or a device (write it to a file first)"
+        raise InputError(f"{path}: {told}; must be {wanted}")
+    if limited_by is not None:
+        check_limit(limited_by, found.st_size, path, "bytes", hint)
     return path
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     """Write a file under a temporary name, flush it to disk, then rename it.
 
-    `write` is called with the temporary path, which has the final file's suffix. An `OSError` names the file, also
-    where the system's own does not (a full disk), or where `write` returns False, as OpenCV does.
+    `write` is called with the temporary path, which has the final file's suffix. An `OSError` names the final file,
+    also where the system's own names none (a full disk), or where `write` returns False, as OpenCV does.
     """
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
@@ -82,7 +96,7 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
             os.fsync(file.fileno())
         os.replace(part, path)
     except OSError as error:
-        if error.errno is not None and error.filename is None:
+        if error.errno is not None and error.filename in (None, str(part)):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
     finally:
@@ -169,7 +183,7 @@ def check_limit(name: str, value: float, where: object, unit: str, hint: str = "
     most = limit(name)
     if value > most:
         raise InputError(
-            f"{shown(where)}: {_number(value)} {unit}; at most {_number(most)} are allowed"
+            f"{where}: {_number(value)} {unit}; at most {_number(most)} are allowed"
             f"{hint and f': {hint}'} ({VARIABLE}={name}=N sets another limit)"
         )
 
@@ -198,39 +212,6 @@ def check_picture_size(path: Path, width: int, height: int) -> None:
     check_limit("picture_pixels", width * height, f"{path}: {width} x {height} px", "px")
 
 
-def check_file(path: Path, name: str, wanted: str, hint: str = "") -> int:
-    """Check that a path is a plain file within a limit, without opening it, and return its size in bytes.
-
-    Parameters
-    ----------
-    path : Path
-        To be read next. A pipe or a device has no size and might never end.
-    name : str
-        Of the limit, bytes.
-    wanted : str
-        What the file should be, for messages, such as "a picture".
-    hint : str
-        What can be done with a file that is too large.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, it is a folder, a pipe or a device, or it is larger.
-    """
-    where = shown(path)
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        raise InputError(f"{where}: no such file{leads_nowhere(path)}; must be {wanted}") from None
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{where}: cannot be read ({reason})") from error
-    if not stat.S_ISREG(found.st_mode):
-        raise InputError(f"{where}: is {kind_of(path)}; must be {wanted}")
-    check_limit(name, found.st_size, path, "bytes", hint)
-    return found.st_size
-
-
 @lru_cache(maxsize=4)
 def _limits(text: str) -> dict[str, int]:
     """Return all limits, those that a text replaces among them."""
@@ -239,14 +220,14 @@ def _limits(text: str) -> dict[str, int]:
         name, _, value = (piece.strip() for piece in part.partition("="))
         if name not in DEFAULTS:
             raise InputError(
-                f"{VARIABLE}: {shown(name)}: unknown limit; allowed: {', '.join(DEFAULTS)}{suggestion(name, DEFAULTS)}"
+                f"{VARIABLE}: {name}: unknown limit; allowed: {', '.join(DEFAULTS)}{suggestion(name, DEFAULTS)}"
             )
         try:
             number = float(value)
         except ValueError:
             number = 0.0
         if not 1 <= number < 2**63:
-            raise InputError(f"{VARIABLE}: {name} = {shown(value)}: must be a number from 1 on")
+            raise InputError(f"{VARIABLE}: {name} = {value or repr(value)}: must be a number from 1 on")
         found[name] = int(number)
     return found
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import IO
 
 from simtest.errors import InputError
-from simtest.runtime.boundary import cannot_write, shown
 from simtest.runtime.files import make_folder, refuse_file
 
 LOCK = ".lock"
@@ -47,7 +46,7 @@ def exclusive_folder(folder: Path, option: str = "--out") -> Iterator[None]:
     made = _missing(folder, option)
     make_folder(folder, option)
     try:
-        with _exclusive(folder / LOCK, f"{option} {shown(folder)}"):
+        with _exclusive(folder / LOCK, f"{option} {folder}"):
             yield
     finally:
         # What was refused leaves nothing behind.
@@ -62,14 +61,11 @@ def exclusive_file(path: Path, option: str = "--out") -> Iterator[None]:
 
     Raises `InputError` as `exclusive_folder` does.
     """
-    what = f"{option} {shown(path)}"
+    what = f"{option} {path}"
     if path.name in ("", ".."):
         raise InputError(f"{what}: is a folder; must be a file")
-    try:
-        if not path.parent.is_dir():
-            raise InputError(f"{what}: no such folder {shown(path.parent)}")
-    except OSError as error:
-        raise cannot_write(error, what, path) from error
+    if not path.parent.is_dir():
+        raise InputError(f"{what}: no such folder {path.parent}")
     with _exclusive(path.with_name(f".{path.name[:200]}{LOCK}"), what):
         yield
 
@@ -80,7 +76,8 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
         file = _open(lock)
     except OSError as error:
         # Where nothing can be written nobody writes; a finished run can still be looked at.
-        _require_without_locks(error, what, lock)
+        if error.errno not in _WITHOUT_LOCKS:
+            raise
         yield
         return
     except KeyboardInterrupt:
@@ -94,7 +91,8 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
             taken = _taken(lock, file)
         except OSError as error:
             # A file system without locks refuses nobody.
-            _require_without_locks(error, what, lock)
+            if error.errno not in _WITHOUT_LOCKS:
+                raise
             taken = True
         if not taken:
             raise InputError(f"{what}: is in use by {_holder(lock)}; wait until it ends, or name another")
@@ -109,12 +107,6 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
             # In a folder such as /tmp another user's file stays; without its lock it locks nothing.
             with contextlib.suppress(OSError):
                 lock.unlink(missing_ok=True)
-
-
-def _require_without_locks(error: OSError, what: str, lock: Path) -> None:
-    """Raise what tells the user, unless an error says that nothing can be locked, or written, at this place."""
-    if error.errno not in _WITHOUT_LOCKS:
-        raise cannot_write(error, what, lock.parent) from error
 
 
 def _open(lock: Path) -> IO[bytes]:
@@ -204,10 +196,8 @@ def _holder(lock: Path) -> str:
     try:
         with lock.open("rb") as file:
             told = json.loads(file.read(_MOST_BYTES))
-        own = "" if told["machine"] == socket.gethostname() else f" on {shown(told['machine'], 60)}"
-        return (
-            f"process {int(told['process'])}{own} ({shown(told['command'], 120)}, since {shown(told['started'], 40)})"
-        )
+        own = "" if told["machine"] == socket.gethostname() else f" on {told['machine']!s:.60}"
+        return f"process {int(told['process'])}{own} ({told['command']!s:.120}, since {told['started']!s:.40})"
     except (OSError, ValueError, KeyError, TypeError):
         # Just taken, or just given back.
         return "another process"

@@ -12,7 +12,6 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray
-from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject, require_plain
 
 METADATA = "simtest"
@@ -61,7 +60,7 @@ class OnnxModel:
             text = self._session.get_modelmeta().custom_metadata_map.get(METADATA, "")
         except Exception as error:  # its exceptions share no base but this
             reason = " ".join(str(error).split())
-            raise InputError(f"{shown(path)}: is no ONNX model ({shown(reason, 100)})") from None
+            raise InputError(f"{path}: is no ONNX model ({reason!s:.100})") from None
         with self.reading():
             self.content: JsonObject = json.loads(text)
             if self.content["format"] != form:
@@ -74,7 +73,7 @@ class OnnxModel:
             yield
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
             raise InputError(
-                f"{shown(self._path)}: is no network of simtest train ({type(error).__name__}: {shown(error, 80)}); "
+                f"{self._path}: is no network of simtest train ({type(error).__name__}: {error!s:.80}); "
                 f"its metadata must hold {METADATA!r} of the form {self._form!r}"
             ) from None
 
@@ -104,7 +103,7 @@ class OnnxModel:
                     raise ValueError(f"{name} holds values that are not finite")
         except Exception as error:  # of ONNX Runtime, as above
             reason = " ".join(str(error).split())
-            raise InputError(f"{shown(self._path)}: cannot be run ({shown(reason, 120)})") from None
+            raise InputError(f"{self._path}: cannot be run ({reason!s:.120})") from None
         return made
 
 
@@ -117,7 +116,7 @@ def _bytes(path: Path) -> bytes:
     try:
         size = require_plain(path).stat().st_size
         if size > LARGEST_MODEL_BYTES:
-            raise InputError(f"{shown(path)}: has {size} bytes; may have {LARGEST_MODEL_BYTES}")
+            raise InputError(f"{path}: has {size} bytes; may have {LARGEST_MODEL_BYTES}")
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None

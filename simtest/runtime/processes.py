@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from simtest.errors import InputError, SimtestError
-from simtest.runtime.boundary import disk_problem, machine_problem, shown
+from simtest.runtime.boundary import explain, plain
 from simtest.runtime.files import check_count
 
 OnStep = Callable[[], None]
@@ -271,13 +271,13 @@ def _answer(pipe: Connection, task: Task, argument: Any) -> tuple[str, Any]:
     try:
         return "done", task(argument, lambda: pipe.send(("step", None)))
     except Exception as error:
-        answer = error
-        # Whoever knows the folder says which one it is.
-        if not isinstance(error, SimtestError) and not (isinstance(error, OSError) and disk_problem(error)):
-            answer = SimtestError(machine_problem(error) or f"a worker failed ({type(error).__name__}: {error})")
+        # Whoever knows the folder says what stays of the work.
+        told = error if isinstance(error, OSError) and explain(error) else plain(error)
+        if not isinstance(told, SimtestError | OSError):
+            told = SimtestError(f"a worker failed ({type(error).__name__}: {error})")
         # A traceback does not pass the pipe; its text does.
-        answer.add_note(f"In a worker: {''.join(traceback.format_exception(error))}")
-        return "error", answer
+        told.add_note(f"In a worker: {''.join(traceback.format_exception(error))}")
+        return "error", told
 
 
 def _die_with_parent() -> None:
@@ -454,16 +454,16 @@ def read_apart(path: Path, module: str, load: Callable[[Path], T], program: str,
         try:
             child = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            raise InputError(f"{shown(path)}: not read within {TIMEOUT_S} s; must be a smaller file") from None
+            raise InputError(f"{path}: not read within {TIMEOUT_S} s; must be a smaller file") from None
         if child.returncode == 0:
             return load(made)
     # What the machine did is no damage of the file.
     if child.returncode == -signal.SIGKILL:
-        raise SimtestError(f"{shown(path)}: {program} was killed while it read the file, mostly for want of memory")
+        raise SimtestError(f"{path}: {program} was killed while it read the file, mostly for want of memory")
     told = _told(child.stdout) if child.returncode in (REFUSED, FAILED) else ""
     if child.returncode == FAILED:
-        raise SimtestError(f"{shown(path)}: {told or 'not read'}")
-    raise InputError(f"{shown(path)}: {told or breakdown}")
+        raise SimtestError(f"{path}: {told or 'not read'}")
+    raise InputError(f"{path}: {told or breakdown}")
 
 
 def _told(output: str) -> str:
@@ -498,14 +498,14 @@ def serve(read: Callable[[str], T], store: Callable[[T, str], None], kind: str, 
     except InputError as error:
         return _ended(str(error), REFUSED)
     except MemoryError as error:
-        return _ended(str(machine_problem(error)), FAILED)
+        return _ended(str(explain(error)), FAILED)
     except Exception as error:
         # The reader raises whatever it runs into; the file is at fault.
         return _ended(f"not a readable {kind} ({' '.join(str(error).split())[:160] or type(error).__name__})", REFUSED)
     try:
         store(made, sys.argv[2])
     except OSError as error:
-        return _ended(f"{content} cannot be stored ({disk_problem(error, Path(sys.argv[2])) or error})", FAILED)
+        return _ended(f"{content} cannot be stored ({explain(error) or error})", FAILED)
     return 0
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.boundary import kind_of, leads_nowhere, shown, suggestion
+from simtest.runtime.boundary import suggestion
+from simtest.runtime.files import require_plain
 from simtest.runtime.provenance import file_hash
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -49,10 +50,8 @@ def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...
         path = Path(name).expanduser()
         if path.is_file():
             return path
-    except OSError as error:
-        raise InputError(f"{shown(name)}: cannot be read ({error.strerror})") from error
     except RuntimeError as error:
-        raise InputError(f"{shown(name)}: no such home folder") from error
+        raise InputError(f"{name}: no such home folder") from error
     # a shipped file, by its bare name
     root = data_root(kind) / folder
     if path.name == str(name):
@@ -60,10 +59,10 @@ def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...
             if (shipped := root / f"{path.name}{suffix}").is_file():
                 return shipped
     if path.exists():
-        raise InputError(f"{shown(name)}: is {kind_of(path)}; must be a file")
+        require_plain(path)
     names = sorted({p.stem for s in suffixes for p in root.glob(f"*{s}")})
     meant = suggestion(path.name, names)
-    raise InputError(f"{shown(name)}: no such file{leads_nowhere(path)}; shipped by name: {', '.join(names)}{meant}")
+    raise InputError(f"{name or repr(name)}: no such file; shipped by name: {', '.join(names)}{meant}")
 
 
 SUFFIX = ".onnx"
@@ -100,10 +99,7 @@ class ModelName:
 
     def hashes(self) -> dict[str, str]:
         """Return the SHA-256 of the file, by path; raise `InputError` if it cannot be read."""
-        try:
-            return {str(self.file.absolute()): file_hash(self.file)}
-        except OSError as error:
-            raise InputError(f"{shown(self.file)}: cannot be read ({error.strerror})") from None
+        return {str(self.file.absolute()): file_hash(self.file)}
 
 
 def parse_model(text: str) -> ModelName | None:
@@ -155,7 +151,7 @@ class EntryPointGroup:
         found = self._registered(name)
         if not found:
             names, meant = self.names(), suggestion(name, self.names())
-            raise InputError(f"{self.kind} {shown(name, 80)!r}: not installed; allowed: {', '.join(names)}{meant}")
+            raise InputError(f"{self.kind} {name!r}: not installed; allowed: {', '.join(names)}{meant}")
         if len(found) > 1:
             full = " or ".join(sorted(f"{_package(point)}:{point.name}" for point in found))
             raise InputError(f"{self.kind} {name!r}: registered by {len(found)} packages; name one of them: {full}")
@@ -173,7 +169,7 @@ class EntryPointGroup:
         """Return a member with a user's network, which is read here, so that errors come before any work."""
         with_model = getattr(self.load(model.runner), "with_model", None)
         if with_model is None:
-            raise InputError(f"{self.kind} {shown(name, 120)!r}: {model.runner} runs no network; must stand alone")
+            raise InputError(f"{self.kind} {name!r}: {model.runner} runs no network; must stand alone")
         return with_model(model.file)
 
     def described(self, own: Mapping[str, str] | None = None) -> dict[str, str]:

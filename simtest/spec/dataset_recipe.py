@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
+from simtest.runtime.boundary import plain_errors
 from simtest.runtime.resources import find
 from simtest.spec.experiment import check_first_parts, replaced, still_varied
 from simtest.spec.scene import Scene
@@ -175,6 +176,7 @@ class Dataset(Spec):
 _DATASET_KEYS = frozenset(Dataset.model_fields) - {"families", "per_sample", "name"}
 
 
+@plain_errors
 def load_dataset(name: str | Path, settings: Mapping[str, Any] | None = None) -> Dataset:
     """Read a dataset file.
 

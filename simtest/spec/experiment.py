@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import short_repr
-from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.boundary import plain_errors, suggestion
 from simtest.runtime.resources import find
 from simtest.spec.paper import PaperScene
 from simtest.spec.scene import Scene
@@ -101,6 +101,7 @@ OWN_KEYS = ("description", "estimators", "realisations", "seed", "title", "viewp
 """Settings of the experiment itself; all others are keys of its scenes."""
 
 
+@plain_errors
 def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None) -> Experiment:
     """Read an experiment file.
 
@@ -136,7 +137,7 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     if viewpoints is not None:
         groups = tuple(_thinned(group, viewpoints) for group in groups)
         if not any(VIEWPOINT in table for group in groups for table in (*group.sweep, *group.pool)):
-            raise InputError(f"--set viewpoints: no group of {shown(path)} varies {VIEWPOINT}")
+            raise InputError(f"--set viewpoints: no group of {path} varies {VIEWPOINT}")
     if "realisations" in own:
         # In all groups, also in those that have a number of their own.
         groups = tuple(group.model_copy(update={"realisations": None}) for group in groups)
@@ -157,7 +158,7 @@ def check_first_parts(settings: Mapping[str, Any], scene: Iterable[str], own: It
         first = path.partition(".")[0]
         if first not in scene:
             allowed = f"allowed: {', '.join(own)}, and of the scenes {', '.join(scene)}"
-            raise InputError(f"--set {shown(path, 60)}: unknown key; {allowed}{suggestion(first, [*own, *scene])}")
+            raise InputError(f"--set {path}: unknown key; {allowed}{suggestion(first, [*own, *scene])}")
 
 
 def still_varied(varied: Iterable[str], settings: Mapping[str, Any], what: str) -> set[str]:
@@ -187,7 +188,7 @@ def _is_replaced(key: str, settings: Mapping[str, Any]) -> bool:
 def _thinned(group: Group, count: object) -> Group:
     """Keep the first viewpoints of a group that varies them."""
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise InputError(f"--set viewpoints={shown(str(count), 60)}: must be a whole number from 1 on")
+        raise InputError(f"--set viewpoints={count!s}: must be a whole number from 1 on")
 
     def first(tables: tuple[dict[str, tuple[Any, ...]], ...]) -> tuple[dict[str, tuple[Any, ...]], ...]:
         return tuple(

@@ -7,7 +7,6 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
-from simtest.runtime.boundary import shown
 from simtest.runtime.resources import find
 from simtest.spec.experiment import Experiment, Group, load_experiment
 from simtest.spec.spec_model import Name, Spec, load
@@ -82,10 +81,8 @@ def _experiment(profile: Profile, entry: ProfileEntry) -> Experiment:
     if entry.labels is not None:
         labels = [group.label for group in groups]
         if missing := next((label for label in entry.labels if label not in labels), None):
-            allowed = ", ".join(shown(label) for label in labels if label)
-            raise InputError(
-                f"profile {profile.name}: {experiment.name} has no group {shown(missing)!r}; allowed: {allowed}"
-            )
+            allowed = ", ".join(str(label) for label in labels if label)
+            raise InputError(f"profile {profile.name}: {experiment.name} has no group {missing!r}; allowed: {allowed}")
         groups = tuple(group for group in groups if group.label in entry.labels)
     # the first viewpoints of each
     if entry.pool is not None:

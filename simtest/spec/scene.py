@@ -11,7 +11,7 @@ from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
 from simtest.geometry.angular_profile import AngularProfile
 from simtest.runtime.arrays import short_repr
-from simtest.runtime.boundary import shown
+from simtest.runtime.boundary import plain_errors
 from simtest.runtime.files import check_limit
 from simtest.runtime.resources import find
 from simtest.spec.camera_formats.common import read_json
@@ -259,6 +259,7 @@ def _differing(table: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, 
     }
 
 
+@plain_errors
 def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> Scene:
     """Read a scene file.
 
@@ -295,5 +296,5 @@ def _tables(path: Path) -> dict[str, Any]:
         return read_toml(path)
     scene = read_json(path, "scene").get("scene")
     if not isinstance(scene, dict):
-        raise InputError(f"{shown(path)}: scene: must be a table, as in a dataset's sample or in frame.json")
+        raise InputError(f"{path}: scene: must be a table, as in a dataset's sample or in frame.json")
     return scene

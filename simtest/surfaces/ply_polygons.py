@@ -8,7 +8,6 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.boundary import shown
 from simtest.surfaces.ply_header import NUMPY_TYPES, Element, read_header
 
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
@@ -51,7 +50,7 @@ def _read(path: Path, data: mmap, order: str, elements: list[Element], start: in
         if dtype is None:
             return None
         if len(data) < start + element.count * dtype.itemsize:
-            raise InputError(f"{shown(path)}: ends within its {element.name} elements: it is cut short")
+            raise InputError(f"{path}: ends within its {element.name} elements: it is cut short")
         if element.name == "vertex":
             rows = np.frombuffer(data, dtype, element.count, start)
             vertices = np.column_stack([rows[axis] for axis in "xyz"]).astype(np.float64)

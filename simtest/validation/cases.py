@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from simtest.conventions import MOTION_COLUMNS, ON_INSTRUMENT
 from simtest.errors import InputError
-from simtest.runtime.boundary import shown
 from simtest.runtime.files import Json, check_limit
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import Stage, generator, integer
@@ -182,7 +181,7 @@ def expand(experiment: Experiment) -> list[Case]:
     for case in cases:
         if case.name in names:
             raise InputError(
-                f"experiment {experiment.name}: two settings are called {shown(case.setting)!r}; "
+                f"experiment {experiment.name}: two settings are called {case.setting!r}; "
                 "give the groups different labels, and each value of a sweep once"
             )
         names.add(case.name)
@@ -199,7 +198,7 @@ def check_effort(experiment: Experiment) -> None:
         for kind, tables in (("sweep", group.sweep), ("pool", group.pool)):
             for table in tables:
                 key, values = next(iter(table.items()))
-                check_limit("sweep_values", len(values), f"{where}.{kind}: {shown(key, 60)}", "values")
+                check_limit("sweep_values", len(values), f"{where}.{kind}: {key}", "values")
                 count *= len(values)
         settings += count
         realisations += count * (experiment.realisations if group.realisations is None else group.realisations)

@@ -21,7 +21,6 @@ from simtest.reconstruction.description import (
     SpecularityRecord,
 )
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.boundary import shown
 from simtest.spec.toml_files import read_toml
 from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,
@@ -128,7 +127,7 @@ def load_reference(
         if pose is not None:
             raise InputError("--camera-from-model: needs --reference, the mesh that it places")
         if map_format is not None:
-            raise InputError(f"--reference-format {shown(map_format)}: needs --reference, the map of that format")
+            raise InputError(f"--reference-format {map_format}: needs --reference, the map of that format")
         return None
     if path.suffix.lower() in DEPTH_SUFFIXES:
         if pose is not None:
@@ -142,9 +141,9 @@ def load_reference(
         normals = depth_normals(points)
         return DepthReference(normals, str(path), depth_problems(points[..., 2], normals, camera))
     if map_format is not None:
-        raise InputError(f"--reference-format {shown(map_format)}: is for maps; --reference {shown(path)} is a mesh")
+        raise InputError(f"--reference-format {map_format}: is for maps; --reference {path} is a mesh")
     if pose is None:
-        raise InputError(f"--reference {shown(path)}: needs --camera-from-model, the pose of the mesh")
+        raise InputError(f"--reference {path}: needs --camera-from-model, the pose of the mesh")
     from simtest.surfaces.mesh_surface import prepare
 
     camera_from_model = read_pose(pose)
@@ -166,7 +165,7 @@ def read_pose(path: Path) -> Array:
         If a key is missing or malformed, or the 3 x 3 part is no rotation.
     """
     data = read_toml(path)
-    where = shown(path)
+    where = str(path)
     allowed = {"matrix", "rotation", "translation_mm"}
     if unknown := sorted(set(data) - allowed):
         raise InputError(f"{where}: {unknown[0]}: unknown key; allowed: {', '.join(sorted(allowed))}")
@@ -210,7 +209,7 @@ def _numbers(data: Mapping[str, Any], key: str, shapes: Sequence[tuple[int, ...]
         values = np.empty(0)
     if values.shape not in shapes or not np.isfinite(values).all():
         wanted = " or ".join(" x ".join(str(n) for n in shape) for shape in shapes)
-        raise InputError(f"{where}: {key} = {shown(str(data[key]), 60)}: must be {wanted} finite numbers")
+        raise InputError(f"{where}: {key} = {data[key]!s}: must be {wanted} finite numbers")
     return values
 
 

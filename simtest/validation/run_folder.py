@@ -7,7 +7,6 @@ from typing import Any
 
 from simtest.errors import InputError
 from simtest.runtime import provenance
-from simtest.runtime.boundary import shown, write_error
 from simtest.runtime.files import require_plain, write_json
 from simtest.runtime.locks import LOCK
 
@@ -53,16 +52,13 @@ def prepare(folder: Path, digest: str) -> None:
     """Make the run's folder; keep the finished cases of the same run, stopped, and drop those of another."""
     parts = folder / PARTS
     record = parts / "fingerprint.json"
-    try:
-        if not (record.is_file() and record.stat().st_size < MOST_DIGEST_BYTES and _told_digest(record) == digest):
-            # Results of an earlier run stay until the new ones replace them.
-            remove_folder(parts)
-            remove_folder(folder / "gallery")
-        parts.mkdir(parents=True, exist_ok=True)
-        (folder / "gallery").mkdir(exist_ok=True)
-        write_json(record, digest)
-    except OSError as error:
-        raise write_error(error, folder) from error
+    if not (record.is_file() and record.stat().st_size < MOST_DIGEST_BYTES and _told_digest(record) == digest):
+        # Results of an earlier run stay until the new ones replace them.
+        remove_folder(parts)
+        remove_folder(folder / "gallery")
+    parts.mkdir(parents=True, exist_ok=True)
+    (folder / "gallery").mkdir(exist_ok=True)
+    write_json(record, digest)
 
 
 def _told_digest(record: Path) -> str:
@@ -71,17 +67,14 @@ def _told_digest(record: Path) -> str:
 
 def check_folder(folder: Path) -> None:
     """Raise `InputError` if a folder holds something other than a run; remove what a killed run was writing."""
-    try:
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"--out {shown(folder)}: is a file; must be a folder")
-        # Leftovers of a killed run.
-        held = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
-        for name in [name for name in held if re.fullmatch(r"\.(results|summary|guide|index)\.\d+\.part\.\w+", name)]:
-            held.pop(name).unlink()
-        for left in (*folder.glob(f"{PARTS}/.*.part.*"), *folder.glob("gallery/.*.part.*")):
-            left.unlink()
-    except OSError as error:
-        raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {folder}: is a file; must be a folder")
+    # Leftovers of a killed run.
+    held = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
+    for name in [name for name in held if re.fullmatch(r"\.(results|summary|guide|index)\.\d+\.part\.\w+", name)]:
+        held.pop(name).unlink()
+    for left in (*folder.glob(f"{PARTS}/.*.part.*"), *folder.glob("gallery/.*.part.*")):
+        left.unlink()
     # What is no part of a run.
     held.pop(LOCK, None)
     own = {"results.parquet", "summary.json", "gallery", "figures", "guide.json", "index.html"}
@@ -91,10 +84,8 @@ def check_folder(folder: Path) -> None:
     if not strangers and not held.keys() & {"results.parquet", PARTS}:
         strangers = sorted(held)
     if strangers:
-        stranger = shown(strangers[0])
-        raise InputError(
-            f"--out {shown(folder)}: holds {stranger}, which is no part of a run; must be empty or hold a run"
-        )
+        stranger = str(strangers[0])
+        raise InputError(f"--out {folder}: holds {stranger}, which is no part of a run; must be empty or hold a run")
 
 
 def remove_folder(folder: Path) -> None:

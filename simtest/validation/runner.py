@@ -13,7 +13,6 @@ from simtest.estimators.process import is_core
 from simtest.estimators.process.naming import close_cores, core_records
 from simtest.rendering import backend
 from simtest.runtime import provenance
-from simtest.runtime.boundary import shown
 from simtest.runtime.files import Json
 from simtest.runtime.processes import Engine, make_engine
 from simtest.spec import Experiment
@@ -198,7 +197,7 @@ def _warn_of_kept(finished: Sequence[Job]) -> None:
     kept = [job.folder for job in finished if any(map(is_core, job.experiment.estimators))]
     if kept:
         warnings.warn(
-            f"{shown(kept[0])}: is kept, since the core's command and files are the same; other files that it reads "
+            f"{kept[0]}: is kept, since the core's command and files are the same; other files that it reads "
             "are not compared (core.files of its TOML file names them)", stacklevel=4,
         )  # fmt: skip
 

@@ -514,7 +514,7 @@ def test_full_disk_keeps_what_is_written(made, tmp_path, monkeypatch):
         write_sample(file, key, members)
 
     monkeypatch.setattr("simtest.dataset.shard_writer.write_sample", full)
-    said = r"\(No space left on device; .* are free .*\); what is written stays valid"
+    said = r"full: No space left on device; .* are free .*; what is written stays valid"
     with pytest.raises(SimtestError, match=said) as error:
         write_dataset(tiny(**SIX), tmp_path / "full", make_engine())
     assert error.type is SimtestError

@@ -14,8 +14,8 @@ import pytest
 from simtest.cli.main import main
 from simtest.cli.stopping import INTERRUPTED, TERMINATED
 from simtest.errors import InputError, SimtestError
-from simtest.runtime.boundary import cannot_write
-from simtest.runtime.files import make_folder, refuse_file
+from simtest.runtime.boundary import plain
+from simtest.runtime.files import make_folder
 from simtest.simulation import view_folder
 from tests.refusals import refused
 
@@ -32,24 +32,6 @@ def shell(line, folder=None):
     return subprocess.run(
         ["/bin/bash", "-c", line], cwd=folder, capture_output=True, text=True, timeout=60, check=False, env=environment
     )
-
-
-def test_a_compiled_file_that_a_full_disk_cut_short_is_named(tmp_path):
-    """Python itself leaves such a file, and cannot read it afterwards."""
-    (tmp_path / "module.py").write_text("value = 1\n")
-    done = script(f"""
-        import importlib, pathlib, py_compile, sys
-        from simtest.cli.main import _problem
-        sys.path.insert(0, {str(tmp_path)!r})
-        made = pathlib.Path(py_compile.compile({str(tmp_path / "module.py")!r}))
-        made.write_bytes(made.read_bytes()[:-20])
-        try:
-            import module
-        except Exception as error:
-            told = "a compiled file of Python that is cut short, perhaps by a full disk; delete it"
-            print(_problem(error) == f"{{made}}: {{told}}")
-    """)
-    assert (done.stdout, done.stderr) == ("True\n", "")
 
 
 # Signals ---------------------------------------------------------------------------------------------------------
@@ -155,23 +137,6 @@ def test_an_output_that_is_full_is_told(command):
 # Folders and disks -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", ["render plane --out {0}/x", "doctor", "schema scene", "list"])
-def test_a_deleted_working_folder_is_told(command, tmp_path):
-    gone = tmp_path / "gone"
-    gone.mkdir()
-    line = f"cd {gone}; rmdir {gone}; {sys.executable} -P -m simtest {command.format(tmp_path)}"
-    done = shell(line)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "simtest: the working folder was deleted; change to another one\n"
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_help_needs_no_folder(tmp_path):
-    gone = tmp_path / "gone"
-    gone.mkdir()
-    assert shell(f"cd {gone}; rmdir {gone}; {sys.executable} -P -m simtest --help").returncode == 0
-
-
 def test_a_link_that_leads_nowhere_is_told(tmp_path):
     out = tmp_path / "out"
     out.symlink_to(tmp_path / "nothing")
@@ -180,23 +145,12 @@ def test_a_link_that_leads_nowhere_is_told(tmp_path):
     make_folder(out)
 
 
-def test_a_full_disk_is_no_bad_input(tmp_path, monkeypatch):
-    def full(*_, **__):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("pathlib.Path.mkdir", full)
-    with pytest.raises(SimtestError, match=r"No space left on device; .* MB are free") as caught:
-        make_folder(tmp_path / "x")
-    assert not isinstance(caught.value, InputError)
-    refused(lambda: refuse_file(tmp_path / ("n" * 300)), "cannot be written (File name too long)")
-
-
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG])
-def test_what_the_disk_cannot_do_is_told_from_what_the_user_may_change(tmp_path, number):
-    error = cannot_write(OSError(number, os.strerror(number)), "--screenshot x.png", tmp_path)
+def test_what_the_disk_cannot_do_is_told_from_what_the_user_may_change(number):
+    error = plain(OSError(number, os.strerror(number), "x.png"))
     assert type(error) is SimtestError
-    assert str(error).startswith(f"--screenshot x.png: cannot be written ({os.strerror(number)}")
-    assert isinstance(cannot_write(OSError(errno.EACCES, "Permission denied"), "x", tmp_path), InputError)
+    assert str(error).startswith(f"x.png: {os.strerror(number)}")
+    assert isinstance(plain(OSError(errno.EACCES, "Permission denied", "x.png")), InputError)
 
 
 def saved_calibration(path):
@@ -218,7 +172,7 @@ def test_files_that_are_saved_tell_a_full_disk(tmp_path, monkeypatch, save):
 
     for write in ("write_text", "write_bytes"):
         monkeypatch.setattr(f"pathlib.Path.{write}", full)
-    with pytest.raises(SimtestError, match=r"c\.toml: cannot be written") as caught:
+    with pytest.raises(SimtestError, match=r"c\.toml: No space left on device; ") as caught:
         save(tmp_path / "c.toml")
     assert not isinstance(caught.value, InputError)
 
@@ -241,7 +195,7 @@ def test_standard_input_is_a_pipe(tmp_path):
     for command in ("reconstruct /dev/stdin --fov 60", "render /dev/stdin", "realism /dev/stdin --against plane"):
         done = shell(f"cat /dev/null | $SIMTEST {command} --out {tmp_path}/x")
         assert done.returncode == 2
-        assert done.stderr.startswith("simtest: /dev/stdin: is no plain file but a pipe (write it to a file first); ")
+        assert done.stderr.startswith("simtest: /dev/stdin: is no plain file but a pipe or a device (write it")
         assert done.stderr.count("/dev/stdin") == 1
     assert list(tmp_path.iterdir()) == []
 

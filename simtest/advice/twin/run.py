@@ -21,7 +21,6 @@ from simtest.reconstruction.image_io import is_sequence, read_picture
 from simtest.reconstruction.picture import Options, read_calibration
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Array, Image
-from simtest.runtime.boundary import shown
 
 LEAST_TWINS = 20
 """A bank with fewer highlights measures nothing."""
@@ -155,12 +154,12 @@ def twin_picture(
     """
     started = time.process_time()
     if is_sequence(image):
-        raise InputError(f"{shown(image)}: is a folder or a film; twin takes one picture")
+        raise InputError(f"{image}: is a folder or a film; twin takes one picture")
     # A wrong name is told before minutes of rendering.
     tissue_of(organ)
     picture = read_picture(image)
     calibration, warnings = read_calibration(options, picture)
-    found, bank, look, assumed = twins_of(picture, calibration, options, shown(image), frames, seed, progress, organ)
+    found, bank, look, assumed = twins_of(picture, calibration, options, str(image), frames, seed, progress, organ)
     spots = all_spots(bank)
     return TwinResult(
         image.name, picture, found, bank, spots, look, assumed, warnings, time.process_time() - started

@@ -19,7 +19,6 @@ try:
     from simtest.dataset.learn.tasks import load_task
 except ImportError as error:
     raise InputError(f"training needs the package {error.name}: install the extra learn") from error
-from simtest.runtime.boundary import shown
 from simtest.runtime.locks import exclusive_folder
 from simtest.validation.runner import Progress
 
@@ -60,7 +59,7 @@ def run_training(training: Training, data: Path, out: Path, progress: Progress |
             trained = train(training, task, taught, judged, out, progress)
         finally:
             if (out / LAST).exists():
-                page = write_page(training, read_state(out / LAST), out, shown(data))
+                page = write_page(training, read_state(out / LAST), out, str(data))
         files = task.finish(trained.network, taught, judged, out, about | validation_of(trained.state))
         cards = [write_card(file) for file in files if file.suffix == ".onnx"]
     return TrainingRun(trained.state, [page, *files, *cards])

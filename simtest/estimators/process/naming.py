@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from simtest.errors import InputError
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
-from simtest.runtime.boundary import shown
 from simtest.runtime.resources import parse_model
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ def short_name(name: str) -> str:
     if short in ESTIMATORS.names():
         how = "in a TOML file (core.name)" if model is None else "by its file"
         raise InputError(
-            f"estimator {shown(name, 120)!r}: is called {short}, as an installed estimator is; name it otherwise {how}"
+            f"estimator {name!r}: is called {short}, as an installed estimator is; name it otherwise {how}"
         )
     return short
 

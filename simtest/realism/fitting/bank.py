@@ -14,7 +14,6 @@ from simtest.realism.fitting.parameters import Parameter
 from simtest.realism.fitting.summaries import NAMES, summarise
 from simtest.realism.frame_statistics import measure
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.boundary import shown
 from simtest.runtime.files import Json, make_folder, require_plain, write_json
 from simtest.runtime.provenance import source_hash
 from simtest.spec.dataset_recipe import Dataset, Splits
@@ -144,9 +143,9 @@ def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
                 else:
                     reason = str(row["left_out"])
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{shown(path)}: no file of a bank ({error}); remove it, and it is made again") from error
+            raise InputError(f"{path}: no file of a bank ({error}); remove it, and it is made again") from error
     if not shares:
-        raise InputError(f"{shown(folder)}: the bank holds no frame that can be measured ({reason})")
+        raise InputError(f"{folder}: the bank holds no frame that can be measured ({reason})")
     return Bank(np.array(shares), np.array(summaries, dtype=float), np.array(radiance))
 
 
@@ -174,9 +173,9 @@ def _claim(recipe: Dataset, folder: Path, chains: int) -> None:
     try:
         held = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"{shown(path)}: not valid JSON ({error}); remove the folder") from error
+        raise InputError(f"{path}: not valid JSON ({error}); remove the folder") from error
     if held != json.loads(json.dumps(wanted)):
         raise InputError(
-            f"{shown(folder)}: holds the bank of another recipe, seed, size or release of simtest; remove it or name "
+            f"{folder}: holds the bank of another recipe, seed, size or release of simtest; remove it or name "
             "another --out"
         )

@@ -14,7 +14,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from simtest.geometry.quaternions import quaternion_of, rotation_of
 from simtest.runtime.arrays import Array
-from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.spec.camera_formats.common import Poses, Table, inverse, mask_of_text, mask_text, number
 from simtest.spec.toml_files import read_text
 
@@ -44,7 +44,7 @@ MASK = "# simtest view_mask "
 
 def read_cameras(path: Path) -> dict[str, Table]:
     """Read cameras.txt as tables of `CameraSpec` by camera id; raise `InputError` where it is malformed."""
-    where = shown(path)
+    where = str(path)
     cameras: dict[str, Table] = {}
     mask: Table | None = None
     for count, line in enumerate(read_text(path, "camera").splitlines(), 1):
@@ -55,7 +55,7 @@ def read_cameras(path: Path) -> dict[str, Table]:
             continue
         name = words[0]
         if name in cameras:
-            raise InputError(f"{at}: camera {shown(name, 40)} is given twice")
+            raise InputError(f"{at}: camera {name} is given twice")
         cameras[name] = _camera(words, at)
         if mask is not None:
             cameras[name]["view_mask"], mask = mask, None
@@ -70,9 +70,7 @@ def _camera(words: Sequence[str], at: str) -> Table:
     model = words[1]
     if model not in MODELS:
         reason = "simtest lacks this lens" if model in UNKNOWN_MODELS else "unknown camera model"
-        raise InputError(
-            f"{at}: {shown(model, 40)}: {reason}; must be one of {', '.join(MODELS)}{suggestion(model, MODELS)}"
-        )
+        raise InputError(f"{at}: {model}: {reason}; must be one of {', '.join(MODELS)}{suggestion(model, MODELS)}")
     width, height = int(number(words[2], at, "WIDTH", whole=True)), int(number(words[3], at, "HEIGHT", whole=True))
     # the principal point comes after the focal lengths
     names = list(MODELS[model])
@@ -94,7 +92,7 @@ def _camera(words: Sequence[str], at: str) -> Table:
 
 def read_images(path: Path) -> Poses:
     """Read world_from_camera of each image of images.txt, in its unit; raise `InputError` where it is malformed."""
-    where = shown(path)
+    where = str(path)
     poses: list[tuple[str, Array]] = []
     # Each image has two lines, of which the second, its points, may be empty.
     points_follow = False

@@ -13,7 +13,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.camera import ViewMask
 from simtest.runtime.arrays import Array
-from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.spec.toml_files import read_text
 
 Table = dict[str, Any]
@@ -38,13 +38,13 @@ MOST_SHOWN = 12
 def read_json(path: Path, kind: str = "camera") -> dict[str, Any]:
     """Read a JSON object; raise `InputError` where the file holds none."""
     # Programs write these files, too, with a pose for each of many frames.
-    where, text = shown(path), read_text(path, kind, "record_bytes")
+    where, text = str(path), read_text(path, kind, "record_bytes")
     try:
         data = parse_json(text)
     except RecursionError:
         raise InputError(f"{where}: not valid JSON: nested too deeply") from None
     except ValueError as error:
-        raise InputError(f"{where}: not valid JSON: {shown(error, 80)}") from error
+        raise InputError(f"{where}: not valid JSON: {error!s:.80}") from error
     if not isinstance(data, dict):
         raise InputError(f"{where}: holds a {type(data).__name__}; must be an object of keys and values")
     return data
@@ -70,14 +70,14 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def read_xml(path: Path) -> ElementTree.Element:
     """Read an XML file without a document type, and return its root; raise `InputError` where it is malformed."""
-    where, text = shown(path), read_text(path, "camera")
+    where, text = str(path), read_text(path, "camera")
     # Entities, which a document type declares, can grow without end; no calibration has any.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InputError(f"{where}: not valid XML: document types and entities are not allowed")
     try:
         return ElementTree.fromstring(text)  # nosec B314: without entities nothing grows or is fetched
     except (ElementTree.ParseError, ValueError, RecursionError) as error:
-        raise InputError(f"{where}: not valid XML: {shown(error, 80)}") from error
+        raise InputError(f"{where}: not valid XML: {error!s:.80}") from error
 
 
 def number(value: Any, where: str, name: str, whole: bool = False) -> float:
@@ -90,7 +90,7 @@ def number(value: Any, where: str, name: str, whole: bool = False) -> float:
         found = math.nan
     if not math.isfinite(found) or (whole and found != round(found)):
         kind = "whole" if whole else "finite"
-        raise InputError(f"{where}: {name} = {shown(repr(value), 60)}: must be a {kind} number")
+        raise InputError(f"{where}: {name} = {value!r:.60}: must be a {kind} number")
     return found
 
 
@@ -98,7 +98,7 @@ def numbers(values: Any, where: str, name: str, counts: int | Sequence[int]) -> 
     """Return a list of finite numbers of an allowed length."""
     allowed = (counts,) if isinstance(counts, int) else tuple(counts)
     if not isinstance(values, list | tuple):
-        raise InputError(f"{where}: {name} = {shown(repr(values), 60)}: must be a list of numbers")
+        raise InputError(f"{where}: {name} = {values!r:.60}: must be a list of numbers")
     if len(values) not in allowed:
         said = " or ".join(str(count) for count in allowed)
         raise InputError(f"{where}: {name}: {len(values)} values; must be {said}")
@@ -117,14 +117,14 @@ def check_alike(where: str, names: tuple[str, str], told: float, other: float, u
 def rigid(rows: Any, where: str, name: str) -> Array:
     """Return a rigid transform, shape (4, 4), of 3 or 4 rows of 4 numbers; the rotation's rounding is taken out."""
     if not isinstance(rows, list) or len(rows) not in (3, 4):
-        raise InputError(f"{where}: {name} = {shown(repr(rows), 60)}: must be 4 rows of 4 numbers")
+        raise InputError(f"{where}: {name} = {rows!r:.60}: must be 4 rows of 4 numbers")
     T = np.eye(4)
     T[: len(rows)] = [numbers(row, where, f"{name}[{i}]", 4) for i, row in enumerate(rows)]
     R = T[:3, :3]
     if not np.abs(T).max() <= LARGEST:
         raise InputError(f"{where}: {name}: holds {np.abs(T).max():.3g}; must be at most {LARGEST:g}")
     if not np.allclose(R @ R.T, np.eye(3), atol=ROUNDED) or np.linalg.det(R) < 0:
-        raise InputError(f"{where}: {name}: must begin with a rotation; R R^T is {shown((R @ R.T).round(3).tolist())}")
+        raise InputError(f"{where}: {name}: must begin with a rotation; R R^T is {(R @ R.T).round(3).tolist()}")
     if not np.allclose(T[3], [0, 0, 0, 1]):
         raise InputError(f"{where}: {name}: last row is {T[3].tolist()}; must be 0, 0, 0, 1")
     U, _, V = np.linalg.svd(R)
@@ -147,9 +147,7 @@ def chosen(cameras: Mapping[str, Table], wanted: str | None, where: str) -> Tabl
     listed = ", ".join(list(cameras)[:MOST_SHOWN]) + (", ..." if len(cameras) > MOST_SHOWN else "")
     if wanted is not None:
         if wanted not in cameras:
-            raise InputError(
-                f"{where}: no camera {shown(wanted, 40)}; must be one of {listed}{suggestion(wanted, list(cameras))}"
-            )
+            raise InputError(f"{where}: no camera {wanted}; must be one of {listed}{suggestion(wanted, list(cameras))}")
         return cameras[wanted]
     tables = list(cameras.values())
     if any(table != tables[0] for table in tables):
@@ -169,7 +167,7 @@ def mask_of_text(text: Any, where: str) -> Table:
     except (TypeError, ValueError):
         made = None
     if not isinstance(made, dict):
-        raise InputError(f"{where}: view mask {shown(repr(text), 60)}: must be a JSON object")
+        raise InputError(f"{where}: view mask {text!r:.60}: must be a JSON object")
     return made
 
 

@@ -11,7 +11,6 @@ from typing import Literal, get_args
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.common import LARGEST, Poses, Table, chosen
 from simtest.spec.toml_files import read_text
 
@@ -87,7 +86,7 @@ def recognise(path: str | Path) -> Kind:
         return "toml"
     if suffix == ".bin":
         how = "colmap model_converter --output_type TXT writes text files"
-        raise InputError(f"{shown(path)}: binary models are not read; {how}")
+        raise InputError(f"{path}: binary models are not read; {how}")
     text = read_text(path, "camera", "record_bytes")
     head = text[:HEAD]
     if head.lstrip().startswith("<"):
@@ -126,9 +125,9 @@ def read_cameras(path: str | Path) -> dict[str, Table]:
     if path.is_dir():
         path = path / "cameras.txt"
     if kind == "photometric":
-        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no lens; give it as --photometric beside a camera file")
+        raise InputError(f"{path}: {NAMES[kind]} holds no lens; give it as --photometric beside a camera file")
     if kind in ("colmap images", "toml"):
-        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no camera; must be a camera file of another program")
+        raise InputError(f"{path}: {NAMES[kind]} holds no camera; must be a camera file of another program")
     return _readers()[kind](path)
 
 
@@ -164,7 +163,7 @@ def read_table(path: str | Path) -> Table:
         As `read_cameras` does, and where a file holds several different cameras and none is named.
     """
     file, wanted = split_id(path)
-    return chosen(read_cameras(file), wanted, shown(file))
+    return chosen(read_cameras(file), wanted, str(file))
 
 
 def read_poses(path: str | Path) -> Poses:
@@ -198,14 +197,14 @@ def read_poses(path: str | Path) -> Poses:
         poses = kalibr.read_poses(path)
     else:
         must = "COLMAP's images.txt, transforms.json or a Kalibr chain"
-        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no poses; must be {must}")
+        raise InputError(f"{path}: {NAMES[kind]} holds no poses; must be {must}")
     if not poses:
-        raise InputError(f"{shown(path)}: holds no pose; must hold one for each frame")
+        raise InputError(f"{path}: holds no pose; must hold one for each frame")
     seen: set[str] = set()
     for name, pose in poses:
         if name in seen:
-            raise InputError(f"{shown(path)}: names {shown(name, 60)} twice; must give each frame one pose")
+            raise InputError(f"{path}: names {name} twice; must give each frame one pose")
         if not np.abs(pose).max() <= LARGEST:
-            raise InputError(f"{shown(path)}: {shown(name, 60)}: a position beyond {LARGEST:g}; must be within it")
+            raise InputError(f"{path}: {name}: a position beyond {LARGEST:g}; must be within it")
         seen.add(name)
     return poses

@@ -14,7 +14,6 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
-from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.common import Poses, Table, inverse, number, numbers, rigid
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
 from simtest.spec.toml_files import read_text
@@ -26,7 +25,7 @@ MM = 1000.0
 
 def read_cameras(path: Path) -> dict[str, Table]:
     """Read the cameras of a chain by name (cam0, cam1, ...); raise `InputError` where it is malformed."""
-    return {name: _camera(data, f"{shown(path)}: {name}") for name, data in _chain(path).items()}
+    return {name: _camera(data, f"{path}: {name}") for name, data in _chain(path).items()}
 
 
 def read_poses(path: Path) -> Poses:
@@ -34,7 +33,7 @@ def read_poses(path: Path) -> Poses:
     made: list[tuple[str, Array]] = []
     first_from_camera = np.eye(4)
     for i, (name, data) in enumerate(_chain(path).items()):
-        at = f"{shown(path)}: {name}"
+        at = f"{path}: {name}"
         if i and "T_cn_cnm1" not in data:
             raise InputError(f"{at}: T_cn_cnm1: missing; must be 4 rows of 4 numbers")
         if i:
@@ -46,24 +45,24 @@ def read_poses(path: Path) -> Poses:
 
 
 def _chain(path: Path) -> dict[str, Mapping[str, Any]]:
-    where = shown(path)
+    where = str(path)
     try:
         data = parse_yaml(read_text(path, "camera"))
     except ValueError as error:
-        raise InputError(f"{where}: not valid YAML: {shown(error, 80)}") from error
+        raise InputError(f"{where}: not valid YAML: {error!s:.80}") from error
     found = {name: value for name, value in data.items() if CAMERA.fullmatch(name)} if isinstance(data, Mapping) else {}
     if not found:
         raise InputError(f"{where}: holds no camera; must have the keys cam0, cam1, ...")
     for name, value in found.items():
         if not isinstance(value, Mapping):
-            raise InputError(f"{where}: {name} = {shown(repr(value), 60)}: must be a table of keys")
+            raise InputError(f"{where}: {name} = {value!r:.60}: must be a table of keys")
     return dict(sorted(found.items(), key=lambda item: int(item[0][3:])))
 
 
 def _camera(data: Mapping[str, Any], at: str) -> Table:
     model = data.get("camera_model")
     if model != "pinhole":
-        raise InputError(f"{at}: camera_model = {shown(repr(model), 40)}: simtest lacks it; must be pinhole")
+        raise InputError(f"{at}: camera_model = {model!r:.40}: simtest lacks it; must be pinhole")
     fx, fy, cx, cy = numbers(data.get("intrinsics"), at, "intrinsics", 4)
     width, height = numbers(data.get("resolution"), at, "resolution", 2)
     table = {
@@ -77,9 +76,7 @@ def _lens(data: Mapping[str, Any], at: str) -> Table:
     """Return the key `distortion`, or nothing for a pinhole."""
     name = data.get("distortion_model", "none")
     if name not in LENSES:
-        raise InputError(
-            f"{at}: distortion_model = {shown(repr(name), 40)}: simtest lacks it; must be one of {', '.join(LENSES)}"
-        )
+        raise InputError(f"{at}: distortion_model = {name!r:.40}: simtest lacks it; must be one of {', '.join(LENSES)}")
     told = [] if name == "none" else numbers(data.get("distortion_coeffs"), at, "distortion_coeffs", 4)
     if name in ("equidistant", "equi"):
         return {"distortion": {"type": "kannala_brandt", **dict(zip(("k1", "k2", "k3", "k4"), told, strict=True))}}

@@ -14,7 +14,6 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
-from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.common import Table, check_alike, mask_of_text, mask_text, number
 from simtest.spec.camera_formats.matlab_struct import HOW, read_struct
 from simtest.spec.camera_formats.omnidirectional import scaramuzza_table
@@ -40,7 +39,7 @@ def read_matlab(path: Path) -> Table:
     InputError
         If the file is missing, malformed, of version 7.3, or holds a cameraParameters object instead of a struct.
     """
-    where, fields = shown(path), read_struct(path)
+    where, fields = str(path), read_struct(path)
     mask = mask_of_text(fields["ViewMask"], where) if "ViewMask" in fields else None
     if "MappingCoefficients" in fields:
         return _fisheye(fields, where) | {"view_mask": mask}
@@ -108,7 +107,7 @@ def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...], 
     value = np.asarray(fields[name])
     if value.dtype.kind not in "iuf" or value.size not in allowed:
         said = " or ".join(str(count) for count in allowed)
-        raise InputError(f"{where}: {name} = {shown(repr(fields[name]), 80)}: must be {said} numbers")
+        raise InputError(f"{where}: {name} = {fields[name]!r:.80}: must be {said} numbers")
     return value.astype(float).ravel()
 
 

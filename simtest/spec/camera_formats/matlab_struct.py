@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.boundary import shown
-from simtest.runtime.files import check_file
+from simtest.runtime.files import require_plain
 from simtest.runtime.processes import limit_memory, read_apart, serve
 
 HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
@@ -42,12 +41,9 @@ def read_struct(path: Path) -> Mapping[str, Any]:
     SimtestError
         If memory, or the disk of temporary files, does not hold it.
     """
-    try:
-        check_file(path, "matlab_bytes", "a .mat file")
-        with path.open("rb") as file:
-            file.read(1)
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror or error})") from error
+    require_plain(path, "matlab_bytes", "a .mat file")
+    with path.open("rb") as file:
+        file.read(1)
     breakdown = f"a damaged MATLAB file: SciPy breaks down over it; {HOW}"
     return read_apart(path, "simtest.spec.camera_formats.matlab_struct", _load, "SciPy", breakdown)
 
@@ -70,7 +66,7 @@ def struct_of(path: str) -> dict[str, Any]:
         raise InputError(f"MATLAB 7.3 files (HDF5) are not read; {HOW}") from error
     except Exception as error:
         # SciPy raises whatever its parser runs into.
-        told = shown(error, 80) if str(error).strip() else type(error).__name__
+        told = f"{error!s:.80}" if str(error).strip() else type(error).__name__
         raise InputError(f"{_kind(path)}: {told}; {HOW}") from error
     # The variables themselves may be the fields of the struct.
     nested = {name: value["Intrinsics"] for name, value in data.items() if _holds_intrinsics(value)}
@@ -82,7 +78,7 @@ def struct_of(path: str) -> dict[str, Any]:
     if any(isinstance(value, MatlabOpaque | MatlabObject | MatlabFunction) for value in data.values()):
         raise InputError(f"holds an object, which only MATLAB can read; {HOW}")
     names = [name for name in data if not name.startswith("__")]
-    raise InputError(f"holds no struct with IntrinsicMatrix or K (but {shown(names, 80)}); {HOW}")
+    raise InputError(f"holds no struct with IntrinsicMatrix or K (but {names!s:.80}); {HOW}")
 
 
 def _kind(path: str) -> str:
@@ -98,7 +94,7 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, bool | int | float | str):
         return value
-    return shown(repr(value), 80)
+    return f"{value!r:.80}"
 
 
 def _is_calibration(value: Any) -> bool:

@@ -15,7 +15,7 @@ from numpy.polynomial import Polynomial
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
-from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.spec.camera_formats.common import Table, number, numbers, read_json
 from simtest.spec.toml_files import read_text
 
@@ -79,7 +79,7 @@ def read_c3vd(path: Path) -> dict[str, Table]:
     InputError
         If the file is malformed, or a parameter is missing.
     """
-    where = shown(path)
+    where = str(path)
     text = read_text(path, "camera")
     data = read_json(path) if text.lstrip().startswith("{") else _lines(text, where)
     missing = next((key for key in C3VD_KEYS if key not in data), None)
@@ -108,9 +108,9 @@ def _lines(text: str, where: str) -> Mapping[str, Any]:
             continue
         found = re.fullmatch(r"(\w+)\s*[=:]\s*(.*)", content)
         if not found:
-            raise InputError(f"{where}: line {count}: {shown(content, 60)}: must be key = value")
+            raise InputError(f"{where}: line {count}: {content!s:.60}: must be key = value")
         if found[1] in data:
-            raise InputError(f"{where}: line {count}: {shown(found[1], 40)} is given twice")
+            raise InputError(f"{where}: line {count}: {found[1]!s:.40} is given twice")
         data[found[1]] = found[2].strip()
     return data
 
@@ -128,7 +128,7 @@ def read_ocamcalib(path: Path) -> dict[str, Table]:
     InputError
         If the file is malformed, its polynomial has more terms than a0, a2, a3, a4, or the two contradict each other.
     """
-    where = shown(path)
+    where = str(path)
     rows = [line.split() for line in read_text(path, "camera").splitlines()]
     rows = [row for row in rows if row and not row[0].startswith("#")]
     if len(rows) < 5:

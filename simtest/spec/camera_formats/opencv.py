@@ -16,7 +16,6 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
-from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.common import Table, parse_json
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
 from simtest.spec.toml_files import read_text
@@ -54,7 +53,7 @@ def read_opencv(path: Path) -> Table:
     InputError
         If the file is missing, malformed, or holds a lens that simtest does not know.
     """
-    data, where = _parse(path), shown(path)
+    data, where = _parse(path), str(path)
     width, height = _size(data, where)
     # K, upper triangular
     name, given = _one_of(data, MATRIX_NAMES, where)
@@ -78,14 +77,14 @@ def read_opencv(path: Path) -> Table:
 
 def _parse(path: Path) -> Mapping[str, Any]:
     """Read a file into plain dicts, lists, numbers and text."""
-    text, where = read_text(path, "camera"), shown(path)
+    text, where = read_text(path, "camera"), str(path)
     kind = {".json": "JSON", ".xml": "XML"}.get(path.suffix.lower()) or ("XML" if text.startswith("<") else "YAML")
     try:
         data = {"JSON": parse_json, "XML": _parse_xml, "YAML": parse_yaml}[kind](text)
     except RecursionError:
         raise InputError(f"{where}: not valid {kind}: nested too deeply") from None
     except (ValueError, ElementTree.ParseError) as error:
-        raise InputError(f"{where}: not valid {kind}: {shown(error, 80)}") from error
+        raise InputError(f"{where}: not valid {kind}: {error!s:.80}") from error
     if not isinstance(data, Mapping) or not data:
         raise InputError(f"{where}: holds no keys; must be a calibration of OpenCV or ROS")
     return data
@@ -140,7 +139,7 @@ def _numbers(
         flat += item if isinstance(item, list) else [item]
     wrong = next((item for item in flat if isinstance(item, bool) or not isinstance(item, int | float)), None)
     if not isinstance(value, list) or wrong is not None:
-        raise InputError(f"{where}: {name} = {shown(repr(value), 80)}: must be a matrix or a list of numbers")
+        raise InputError(f"{where}: {name} = {value!r:.80}: must be a matrix or a list of numbers")
     if len(flat) not in counts:
         allowed = " or ".join(str(count) for count in counts)
         raise InputError(f"{where}: {name}: {len(flat)} values; must be {allowed}")
@@ -160,7 +159,7 @@ def _check_matrix(matrix: Mapping[str, Any], where: str, name: str, shape: tuple
             raise InputError(f"{where}: {name}: {len(held)} values; must be {sizes[0]} x {sizes[1]}")
     # Integers of 8 bits hold no focal length, and several channels no matrix.
     if (kind := matrix.get("dt")) not in (None, *NUMBER_TYPES):
-        raise InputError(f"{where}: {name}: dt = {shown(kind, 40)}: must be one of {', '.join(NUMBER_TYPES)}")
+        raise InputError(f"{where}: {name}: dt = {kind}: must be one of {', '.join(NUMBER_TYPES)}")
 
 
 def _size(data: Mapping[str, Any], where: str) -> tuple[Any, Any]:
@@ -171,9 +170,7 @@ def _size(data: Mapping[str, Any], where: str) -> tuple[Any, Any]:
         for names, told in ((WIDTH_NAMES, width), (HEIGHT_NAMES, height)):
             other, value = _one_of(data, names, where)
             if other is not None and value != told:
-                raise InputError(
-                    f"{where}: {other} = {shown(repr(value), 40)}: does not fit {name}, which says {told:g}"
-                )
+                raise InputError(f"{where}: {other} = {value!r:.40}: does not fit {name}, which says {told:g}")
         return width, height
     found = []
     for names in (WIDTH_NAMES, HEIGHT_NAMES):
@@ -235,7 +232,7 @@ def _check_no_other_lens(data: Mapping[str, Any], where: str) -> None:
     key = next((k for k in data if k.lower().startswith("dist") and (k != "distortion_model" or data[k])), None)
     if key is not None:
         raise InputError(
-            f"{where}: {key} = {shown(repr(data[key]), 60)}: speaks of a lens whose coefficients are missing; "
+            f"{where}: {key} = {data[key]!r:.60}: speaks of a lens whose coefficients are missing; "
             f"allowed names: {', '.join(LENS_NAMES)}"
         )
 
@@ -245,7 +242,7 @@ def _is_fisheye(data: Mapping[str, Any], where: str) -> bool:
     if model in (None, ""):
         return bool(flag)
     if not isinstance(model, str) or model.lower() not in MODELS:
-        raise InputError(f"{where}: distortion_model = {shown(repr(model), 60)}: must be one of {', '.join(MODELS)}")
+        raise InputError(f"{where}: distortion_model = {model!r:.60}: must be one of {', '.join(MODELS)}")
     fisheye = MODELS[model.lower()]
     if flag is not None and bool(flag) != fisheye:
         raise InputError(f"{where}: fisheye_model = {flag!r}: does not fit distortion_model = {model!r}")

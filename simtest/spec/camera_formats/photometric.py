@@ -14,7 +14,6 @@ from xml.etree import ElementTree
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.boundary import shown
 from simtest.spec.camera_formats.common import number, read_xml
 from simtest.spec.camera_formats.vicalib import text_of, values
 
@@ -38,7 +37,7 @@ def read_photometric(path: Path) -> Tables:
     InputError
         If the file is malformed, or holds a model of another kind.
     """
-    where, root = shown(path), read_xml(path)
+    where, root = str(path), read_xml(path)
     tables: Tables = {}
     cameras = root.findall("camera")
     if len(cameras) > 1:
@@ -56,7 +55,7 @@ def read_photometric(path: Path) -> Tables:
 
 def _camera(model: ElementTree.Element, at: str) -> Tables:
     if model.get("type") != "gamma":
-        raise InputError(f"{at}: type = {shown(repr(model.get('type')), 40)}: simtest lacks it; must be 'gamma'")
+        raise InputError(f"{at}: type = {model.get('type')!r:.40}: simtest lacks it; must be 'gamma'")
     gamma = _number(model, "gamma", at)
     if not 0.1 <= gamma <= 10:
         raise InputError(f"{at}: gamma = {gamma:g}: must be 0.1 to 10")
@@ -71,7 +70,7 @@ def _camera(model: ElementTree.Element, at: str) -> Tables:
 def _light(model: ElementTree.Element, at: str) -> dict[str, Any]:
     """Return the spread, position, mm, and direction of a light."""
     if model.get("type") != "sls":
-        raise InputError(f"{at}: type = {shown(repr(model.get('type')), 40)}: simtest lacks it; must be 'sls'")
+        raise InputError(f"{at}: type = {model.get('type')!r:.40}: simtest lacks it; must be 'sls'")
     mu = _number(model, "mu", at)
     if not 0 <= mu <= MOST_SPREAD:
         raise InputError(f"{at}: mu = {mu:g}: must be 0 to {MOST_SPREAD:g}")

@@ -16,7 +16,7 @@ from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.distortion import BrownConrady, KannalaBrandt
 from simtest.runtime.arrays import Array
-from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.spec.camera_formats.common import Poses, Table, check_alike, mask_table, number, read_json, rigid
 
 MODELS = {
@@ -57,7 +57,7 @@ def read_cameras(path: Path) -> dict[str, Table]:
     InputError
         If the file is malformed, or its camera model is none of simtest's.
     """
-    data, where = read_json(path), shown(path)
+    data, where = read_json(path), str(path)
     frames = _frames(data, where)
     own = [frame for frame in frames if set(frame) & set(INTRINSICS)]
     if not own:
@@ -66,7 +66,7 @@ def read_cameras(path: Path) -> dict[str, Table]:
     for i, frame in enumerate(frames):
         name, camera = _name(frame, where, i), _camera(_of_frame(data, frame), f"{where}: frames[{i}]")
         if cameras.setdefault(name, camera) != camera:
-            raise InputError(f"{where}: frames[{i}]: file_path {shown(name, 60)} has two cameras; must have one")
+            raise InputError(f"{where}: frames[{i}]: file_path {name} has two cameras; must have one")
     return cameras
 
 
@@ -78,7 +78,7 @@ def read_poses(path: Path) -> Poses:
     InputError
         If the file is malformed, or a frame has no pose.
     """
-    data, where = read_json(path), shown(path)
+    data, where = read_json(path), str(path)
     made: list[tuple[str, Array]] = []
     for i, frame in enumerate(_frames(data, where)):
         at = f"{where}: frames[{i}]"
@@ -91,7 +91,7 @@ def read_poses(path: Path) -> Poses:
 def _frames(data: Mapping[str, Any], where: str) -> list[Mapping[str, Any]]:
     frames = data.get("frames", [])
     if not isinstance(frames, list) or not all(isinstance(frame, Mapping) for frame in frames):
-        raise InputError(f"{where}: frames = {shown(repr(frames), 60)}: must be a list of objects")
+        raise InputError(f"{where}: frames = {frames!r:.60}: must be a list of objects")
     return frames
 
 
@@ -105,7 +105,7 @@ def _of_frame(data: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, An
 def _name(frame: Mapping[str, Any], where: str, index: int) -> str:
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
-        raise InputError(f"{where}: frames[{index}]: file_path = {shown(repr(name), 60)}: must name a picture")
+        raise InputError(f"{where}: frames[{index}]: file_path = {name!r:.60}: must name a picture")
     return name
 
 
@@ -149,12 +149,11 @@ def _lens(data: Mapping[str, Any], told: Mapping[str, float], where: str) -> Tab
     if model is not None and (not isinstance(model, str) or model not in MODELS):
         hint = suggestion(model, MODELS) if isinstance(model, str) else ""
         raise InputError(
-            f"{where}: camera_model = {shown(repr(model), 40)}: simtest lacks it; must be one of "
-            f"{', '.join(MODELS)}{hint}"
+            f"{where}: camera_model = {model!r:.40}: simtest lacks it; must be one of {', '.join(MODELS)}{hint}"
         )
     told_fisheye = data.get("is_fisheye", False)
     if told_fisheye not in (False, True, None):
-        raise InputError(f"{where}: is_fisheye = {shown(repr(told_fisheye), 40)}: must be true or false")
+        raise InputError(f"{where}: is_fisheye = {told_fisheye!r:.40}: must be true or false")
     fisheye = bool(told_fisheye) if model is None else MODELS[model]
     if told_fisheye is not None and "is_fisheye" in data and bool(told_fisheye) != fisheye:
         raise InputError(f"{where}: is_fisheye = {told_fisheye}: does not fit camera_model = {model!r}")

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
-from simtest.runtime.boundary import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.spec.camera_formats.common import Table, number, numbers, read_xml
 from simtest.spec.camera_formats.omnidirectional import scaramuzza_table
 
@@ -30,13 +30,13 @@ AXES = {"right": (1.0, 0.0, 0.0), "down": (0.0, 1.0, 0.0), "forward": (0.0, 0.0,
 
 def read_cameras(path: Path) -> dict[str, Table]:
     """Read the cameras of a rig, by their index; raise `InputError` where the file is malformed."""
-    where, root = shown(path), read_xml(path)
+    where, root = str(path), read_xml(path)
     cameras: dict[str, Table] = {}
     for i, element in enumerate(root.iter("camera_model")):
         name = element.get("index") or str(i)
         if name in cameras:
-            raise InputError(f"{where}: camera index {shown(name, 40)} is given twice")
-        cameras[name] = _camera(element, f"{where}: camera {shown(name, 40)}")
+            raise InputError(f"{where}: camera index {name} is given twice")
+        cameras[name] = _camera(element, f"{where}: camera {name}")
     return cameras
 
 
@@ -44,15 +44,12 @@ def _camera(element: ElementTree.Element, at: str) -> Table:
     kind = element.get("type") or ""
     if kind not in MODELS:
         raise InputError(
-            f"{at}: type = {shown(repr(kind), 60)}: simtest lacks it; must be one of {', '.join(MODELS)}"
-            f"{suggestion(kind, MODELS)}"
+            f"{at}: type = {kind!r:.60}: simtest lacks it; must be one of {', '.join(MODELS)}{suggestion(kind, MODELS)}"
         )
     for axis, wanted in AXES.items():
         found = element.find(axis)
         if found is not None and values(found, at, axis, 3) != list(wanted):
-            raise InputError(
-                f"{at}: {axis} = {shown(' '.join((found.text or '').split()), 40)}: must be {list(wanted)}"
-            )
+            raise InputError(f"{at}: {axis} = {' '.join((found.text or '').split())!s:.40}: must be {list(wanted)}")
     width, height = (int(number(text_of(element, key, at), at, key, whole=True)) for key in ("width", "height"))
     params = element.find("params")
     if params is None:

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.runtime.boundary import cannot_write, shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.runtime.files import write_atomically
 from simtest.spec.camera_formats.common import Poses
 from simtest.spec.camera_tables import camera_toml
@@ -62,25 +62,20 @@ def write_camera(camera: Camera, path: str | Path, format: str | None = None, po
         raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera")
     chosen = format or next((name for name in FORMATS if suffix in SUFFIXES[name]), "opencv")
     if chosen not in FORMATS:
-        raise InputError(
-            f"format = {shown(chosen)!r}: must be one of {', '.join(FORMATS)}{suggestion(chosen, FORMATS)}"
-        )
+        raise InputError(f"format = {chosen!r}: must be one of {', '.join(FORMATS)}{suggestion(chosen, FORMATS)}")
     if suffix not in SUFFIXES[chosen]:
-        raise InputError(f"{shown(path)}: {chosen} needs a file name that ends in {', '.join(SUFFIXES[chosen])}")
+        raise InputError(f"{path}: {chosen} needs a file name that ends in {', '.join(SUFFIXES[chosen])}")
     if chosen == "colmap" and path.name in BESIDE:
-        raise InputError(f"{shown(path)}: COLMAP keeps no camera under this name; must be cameras.txt")
+        raise InputError(f"{path}: COLMAP keeps no camera under this name; must be cameras.txt")
     if poses is not None and chosen not in WITH_POSES:
-        raise InputError(f"{shown(path)}: {chosen} holds no poses; must be one of {', '.join(WITH_POSES)}")
+        raise InputError(f"{path}: {chosen} holds no poses; must be one of {', '.join(WITH_POSES)}")
     write_files(file_contents(camera, path, chosen, poses))
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
     """Write files whole or not at all; raise `InputError` for one that cannot be written."""
     for file, data in files.items():
-        try:
-            write_atomically(file, partial(Path.write_bytes, data=data))
-        except OSError as error:
-            raise cannot_write(error, shown(file), file) from error
+        write_atomically(file, partial(Path.write_bytes, data=data))
 
 
 def file_contents(camera: Camera, path: Path, format: str, poses: Poses | None) -> dict[Path, bytes]:
@@ -118,4 +113,4 @@ def _check_no_points(path: Path) -> None:
     except OSError:
         return
     if any(line.strip() and not line.startswith(b"#") for line in head.splitlines()):
-        raise InputError(f"{shown(path)}: exists and holds points; poses must go to a folder without them")
+        raise InputError(f"{path}: exists and holds points; poses must go to a folder without them")

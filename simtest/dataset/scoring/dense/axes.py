@@ -11,7 +11,6 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.axes import ALL, NAMED, matrix
 from simtest.runtime.arrays import Array
-from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject
 
 LEAST_COSINE = 0.5
@@ -32,8 +31,7 @@ def parse_axes(text: str) -> str:
     axes = NAMED.get(text.strip().lower(), text.replace(" ", "").replace("+", "").lower())
     if axes not in ALL:
         raise InputError(
-            f"--frame {shown(text)}: unknown; allowed: {', '.join(NAMED)}, or the axes of the three channels, such as "
-            "x,-y,-z"
+            f"--frame {text}: unknown; allowed: {', '.join(NAMED)}, or the axes of the three channels, such as x,-y,-z"
         )
     return axes
 

@@ -20,7 +20,6 @@ from simtest.dataset.scoring.dense.map_files import (
 from simtest.errors import InputError
 from simtest.geometry.axes import described
 from simtest.runtime.arrays import Array
-from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject
 
 MOST_PIXELS = 20_000
@@ -57,11 +56,11 @@ class MapOptions:
     def check(self) -> None:
         """Raise `InputError` for what is not allowed."""
         if self.encoding is not None and self.encoding not in ENCODINGS:
-            raise InputError(f"--encoding {shown(self.encoding)}: unknown; allowed: {', '.join(ENCODINGS)}")
+            raise InputError(f"--encoding {self.encoding}: unknown; allowed: {', '.join(ENCODINGS)}")
         if self.frame is not None:
             parse_axes(self.frame)
         if self.depth is not None and self.depth not in KINDS:
-            raise InputError(f"--depth {shown(self.depth)}: unknown; allowed: {', '.join(KINDS)}")
+            raise InputError(f"--depth {self.depth}: unknown; allowed: {', '.join(KINDS)}")
         if self.unit_mm is not None and not 1e-9 <= self.unit_mm <= 1e6:
             raise InputError(f"--unit-mm {self.unit_mm:g}: must be 1e-9 to 1e6 mm")
 

@@ -17,7 +17,6 @@ from simtest.dataset.scoring.dense.scorer import ANGLE, NORMAL, Key, Scorer, dep
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
-from simtest.runtime.boundary import shown
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
 
@@ -131,9 +130,9 @@ def score_frames(
     score = _pass(frames, method, options, None, evidence, sources, names)
     if not is_checked:
         method.check(names)
-    what = f"maps {shown(method.name)}"
+    what = f"maps {method.name}"
     if score is None:
-        raise InputError(f"{shown(on) if on else 'the run'}: holds no frame")
+        raise InputError(f"{str(on) if on else 'the run'}: holds no frame")
     final = evidence.decide(what)
     if final != score.conventions:
         again = _pass(frames, method, options, final, None, sources, [])
@@ -253,7 +252,7 @@ def score_maps(
 def _refuse_run(out: Path) -> None:
     """Raise `InputError` where a folder for figures holds something else that has a page."""
     if out.is_dir() and (out / PAGE).exists() and not (out / SUMMARY).exists():
-        raise InputError(f"--out {shown(out)}: holds another page; must be an empty folder or one of such figures")
+        raise InputError(f"--out {out}: holds another page; must be an empty folder or one of such figures")
 
 
 __all__ = ["DenseScore", "Key", "score_frames", "score_maps", "write_score"]
