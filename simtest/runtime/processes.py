@@ -4,18 +4,17 @@ Engines run tasks in processes of this machine (`LocalEngine`) or on a Ray clust
 is a module-level function of one picklable argument; its result must not depend on where, when or beside what it runs.
 A process may die during a task, which is then repeated: so a task must tolerate running twice.
 
-Files whose reader may crash or take all memory are read in a process of their own under a memory limit: a module calls
-`serve` in its `main`, and is run as ``python -m MODULE FILE OUT``; `read_apart` starts it.
+Files whose reader may crash or take all memory are read in a process of their own under a memory limit (`call_apart`).
 """
 
-import json
+import importlib
 import multiprocessing
 import os
+import pickle
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import traceback
 from collections import deque
@@ -29,6 +28,8 @@ from typing import Any, Protocol, TypeVar
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.boundary import explain, plain
 from simtest.runtime.files import check_count
+
+T = TypeVar("T")
 
 OnStep = Callable[[], None]
 """Called by a task after each step; an exception from it stops the task."""
@@ -416,103 +417,73 @@ def _work_on_node(task: Task, argument: Any, threads: int) -> tuple[Any, int]:
 
 
 TIMEOUT_S = 300
-REFUSED = 3
-"""Exit code of a file that is refused; the last line of the output says why."""
-FAILED = 4
-"""Exit code where the machine lacks memory or room on its disk; the last line of the output says which."""
+"""How long a reader may take over one file."""
 
-T = TypeVar("T")
+_CALL = "import sys; from simtest.runtime.processes import _answer_apart; _answer_apart(*sys.argv[1:])"
 
 
-def read_apart(path: Path, module: str, load: Callable[[Path], T], program: str, breakdown: str) -> T:
-    """Read a file in a process of its own.
-
-    Parameters
-    ----------
-    path : Path
-        The file; its name begins every message.
-    module : str
-        What the process runs; its `main` calls `serve`.
-    load : callable
-        Reads what the process has stored.
-    program : str
-        The reader's name in messages, such as "VTK".
-    breakdown : str
-        What is said of a file over which the reader breaks down.
-
-    Raises
-    ------
-    InputError
-        If the file is refused, takes more than `TIMEOUT_S`, or the reader breaks down over it.
-    SimtestError
-        If memory, or the disk of temporary files, does not hold it.
-    """
-    with tempfile.TemporaryDirectory() as scratch:
-        made = Path(scratch) / "made"
-        # -P: no file of the current folder may stand in for a package.
-        command = [sys.executable, "-P", "-m", module, str(path.absolute()), str(made)]
-        try:
-            child = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            raise InputError(f"{path}: not read within {TIMEOUT_S} s; must be a smaller file") from None
-        if child.returncode == 0:
-            return load(made)
-    # What the machine did is no damage of the file.
-    if child.returncode == -signal.SIGKILL:
-        raise SimtestError(f"{path}: {program} was killed while it read the file, mostly for want of memory")
-    told = _told(child.stdout) if child.returncode in (REFUSED, FAILED) else ""
-    if child.returncode == FAILED:
-        raise SimtestError(f"{path}: {told or 'not read'}")
-    raise InputError(f"{path}: {told or breakdown}")
-
-
-def _told(output: str) -> str:
-    """Return the text that `serve` printed last; nothing where it printed none."""
-    try:
-        return str(json.loads(output.strip().splitlines()[-1]))
-    except (IndexError, ValueError):
-        return ""
-
-
-def serve(read: Callable[[str], T], store: Callable[[T, str], None], kind: str, content: str) -> int:
-    """Read the file that the command line names, and store it; print why that cannot be.
+def call_apart(read: Callable[[str], T], path: Path, memory_bytes: float, kind: str, breakdown: str) -> T:
+    """Return what a function makes of a file, called in a process of its own: its library may crash over it.
 
     Parameters
     ----------
     read : callable
-        Reads the file. It raises `InputError` where the content is not what it must be, without the file's name.
-    store : callable
-        Writes what was read under a name.
+        At the top level of a module. It raises `InputError` where the content is not what it must be, without the
+        file's name.
+    path : Path
+        The file; its name begins every message.
+    memory_bytes : float
+        What the process may take beside its libraries.
     kind : str
-        What the file must be, for messages, such as "VTK mesh".
-    content : str
-        What is stored, for messages.
+        What the file must be, such as "VTK mesh", for messages.
+    breakdown : str
+        What is said of a file over which the library breaks down.
 
-    Returns
-    -------
-    code : int
-        Exit code.
+    Raises
+    ------
+    InputError
+        If the file is refused, takes more than `TIMEOUT_S`, or the library breaks down over it.
+    SimtestError
+        If memory does not hold it.
     """
+    # -P: no file of the current folder may stand in for a package.
+    command = [sys.executable, "-P", "-c", _CALL, read.__module__, read.__name__, str(path.absolute())]
     try:
-        made = read(sys.argv[1])
+        child = subprocess.run([*command, str(memory_bytes), kind], capture_output=True, timeout=TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{path}: not read within {TIMEOUT_S} s; must be a smaller file") from None
+    # What the machine did is no damage of the file.
+    if child.returncode == -signal.SIGKILL:
+        raise SimtestError(f"{path}: the reader of a {kind} was killed, mostly for want of memory")
+    try:
+        error, made = pickle.loads(child.stdout)
+    except (pickle.UnpicklingError, EOFError):
+        raise InputError(f"{path}: {breakdown}") from None
+    if error is not None:
+        raise error(f"{path}: {made}")
+    return made
+
+
+def _answer_apart(module: str, name: str, path: str, memory_bytes: str, kind: str) -> None:
+    """Call a function on a file; write what it makes of it, or the error's type and text, to the standard output."""
+    # Where libraries print nothing.
+    output = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    read = getattr(importlib.import_module(module), name)
+    limit_memory(float(memory_bytes))
+    answer: tuple[type[SimtestError] | None, Any]
+    try:
+        answer = None, read(path)
     except InputError as error:
-        return _ended(str(error), REFUSED)
+        answer = InputError, str(error)
     except MemoryError as error:
-        return _ended(str(explain(error)), FAILED)
+        answer = SimtestError, explain(error)
     except Exception as error:
         # The reader raises whatever it runs into; the file is at fault.
-        return _ended(f"not a readable {kind} ({' '.join(str(error).split())[:160] or type(error).__name__})", REFUSED)
-    try:
-        store(made, sys.argv[2])
-    except OSError as error:
-        return _ended(f"{content} cannot be stored ({explain(error) or error})", FAILED)
-    return 0
-
-
-def _ended(text: str, code: int) -> int:
-    # JSON is ASCII on one line, whatever the encoding of the output.
-    print(json.dumps(text))
-    return code
+        text = " ".join(str(error).split())[:160] or type(error).__name__
+        answer = InputError, f"not a readable {kind} ({text})"
+    with output:
+        pickle.dump(answer, output)
 
 
 def limit_memory(most: float) -> None:

@@ -36,3 +36,15 @@ def meets_a_full_disk(number, tell):
 def blocked_signals(_, tell):
     """Return which signals the worker has blocked: as it was started, since nothing changes that."""
     return sorted(map(int, signal.pthread_sigmask(signal.SIG_BLOCK, [])))
+
+
+def swallows_memory(path):
+    """Need more memory than there is."""
+    return len(bytearray(2**40))
+
+
+def prints(path):
+    """Read a file as a library that prints would."""
+    print("a warning of the library")
+    os.write(1, b"another\n")
+    return Path(path).read_text()

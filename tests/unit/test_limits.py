@@ -4,7 +4,6 @@ import os
 import signal
 import struct
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,10 +17,10 @@ from simtest.errors import InputError, SimtestError
 from simtest.realism.frame_sets import open_generated
 from simtest.reconstruction.image_io import _tiff_size, read_picture
 from simtest.runtime.files import DEFAULTS, VARIABLE, check_limit, limit, require_plain
-from simtest.runtime.processes import check_workers
+from simtest.runtime.processes import call_apart, check_workers
 from simtest.spec import load_experiment, load_scene
 from simtest.spec.toml_files import apply_settings, parse_settings
-from simtest.surfaces import mesh_file, vtk_file
+from simtest.surfaces import mesh_file
 from simtest.surfaces.mesh_file import read_mesh
 from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.vtk_file import read_vtk
@@ -30,6 +29,7 @@ from simtest.validation.cases import check_effort
 from simtest.validation.depth_maps import read_depth
 from studies.bad_inputs import files
 from tests.refusals import refused
+from tests.unit.engine_tasks import prints, swallows_memory
 
 
 @pytest.fixture(autouse=True)
@@ -258,28 +258,30 @@ def test_a_vtk_file_that_breaks_vtk_down_is_refused(tmp_path):
     refused(lambda: read_mesh(path), "POINTS 9000000000: the file has", "too few for them")
 
 
-def test_what_the_machine_lacks_is_no_damage_of_a_vtk_file(tmp_path, monkeypatch, capsys):
+def test_what_the_machine_lacks_is_no_damage_of_a_vtk_file(tmp_path, monkeypatch):
     path = tmp_path / "m.vtk"
     path.write_text(files.vtk())
 
-    def ended(code, said=""):
+    def ended(code, said=b""):
         monkeypatch.setattr(subprocess, "run", lambda command, **_: subprocess.CompletedProcess(command, code, said))
         with pytest.raises(SimtestError) as error:
             read_mesh(path)
         return error
 
     killed = ended(-signal.SIGKILL)
-    assert str(killed.value) == f"{path}: VTK was killed while it read the file, mostly for want of memory"
+    assert str(killed.value) == f"{path}: the reader of a VTK mesh was killed, mostly for want of memory"
     assert killed.type is SimtestError
     assert ended(-signal.SIGSEGV).type is InputError
-    # In VTK's process: no room for the triangles, no memory.
-    monkeypatch.setattr(sys, "argv", ["vtk_file", str(path), str(tmp_path / "none" / "out.npz")])
-    code, said = vtk_file.main(), capsys.readouterr().out
-    full = ended(code, said)
-    assert full.type is SimtestError
-    assert str(full.value).startswith(f"{path}: its triangles cannot be stored ({tmp_path / 'none' / 'out.npz'}: No")
-    monkeypatch.setattr(vtk_file, "_triangles", lambda _: np.empty(2**58))
-    assert str(ended(vtk_file.main(), capsys.readouterr().out).value).startswith(f"{path}: not enough memory (")
+
+
+def test_what_a_process_of_its_own_makes_of_a_file(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("content")
+    assert call_apart(prints, path, 1e9, "text", "damaged") == "content"
+    with pytest.raises(SimtestError, match=r"a\.txt: not enough memory") as error:
+        call_apart(swallows_memory, path, 1e9, "text", "damaged")
+    assert error.type is SimtestError
+    refused(lambda: call_apart(prints, tmp_path / "none", 1e9, "text", "damaged"), "none: not a readable text (")
 
 
 def test_the_first_bytes_of_a_film_tell_its_container(tmp_path):

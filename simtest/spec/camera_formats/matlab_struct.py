@@ -1,12 +1,8 @@
 """The struct of a camera in a .mat file, read in a process of its own.
 
 SciPy crashes over some damaged files, and takes gigabytes over others.
-
-python -m simtest.spec.camera_formats.matlab_struct CAMERA.mat OUT.json
 """
 
-import json
-import sys
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +10,7 @@ from typing import Any
 
 from simtest.errors import InputError
 from simtest.runtime.files import require_plain
-from simtest.runtime.processes import limit_memory, read_apart, serve
+from simtest.runtime.processes import call_apart
 
 HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
 
@@ -39,18 +35,11 @@ def read_struct(path: Path) -> Mapping[str, Any]:
     InputError
         If the file is missing, damaged, of version 7.3, or holds no struct of a camera, or several.
     SimtestError
-        If memory, or the disk of temporary files, does not hold it.
+        If memory does not hold it.
     """
     require_plain(path, "matlab_bytes", "a .mat file")
-    with path.open("rb") as file:
-        file.read(1)
     breakdown = f"a damaged MATLAB file: SciPy breaks down over it; {HOW}"
-    return read_apart(path, "simtest.spec.camera_formats.matlab_struct", _load, "SciPy", breakdown)
-
-
-def _load(made: Path) -> Mapping[str, Any]:
-    fields: Mapping[str, Any] = json.loads(made.read_text(encoding="ascii"))
-    return fields
+    return call_apart(struct_of, path, MEMORY_BYTES, "MATLAB file", breakdown)
 
 
 def struct_of(path: str) -> dict[str, Any]:
@@ -104,17 +93,3 @@ def _is_calibration(value: Any) -> bool:
 def _holds_intrinsics(value: Any) -> bool:
     """Return whether a variable is a struct of fisheyeParameters, which holds its intrinsics as a struct."""
     return isinstance(value, Mapping) and isinstance(value.get("Intrinsics"), Mapping)
-
-
-def _store(fields: dict[str, Any], out: str) -> None:
-    Path(out).write_text(json.dumps(fields), encoding="ascii")
-
-
-def main() -> int:
-    """Read a file and store its fields; print why that cannot be."""
-    return serve(struct_of, _store, "MATLAB file", "its fields")
-
-
-if __name__ == "__main__":
-    limit_memory(MEMORY_BYTES)
-    sys.exit(main())
