@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from simtest.api import sample_views
-from simtest.cli.fit import fit
+from simtest.cli.data import fit
 from simtest.dataset.manifest import ManifestError, read_manifest
 from simtest.errors import InputError, SimtestError
 from simtest.realism.frame_sets import open_generated

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 import simtest
-from simtest.cli.main import main
-from simtest.cli.stopping import Termination
+from simtest.cli.main import Termination, main
 from simtest.errors import InputError, SimtestError
 from simtest.runtime import processes
 from simtest.runtime.boundary import explain, plain, plain_errors
@@ -159,7 +158,7 @@ def test_termination_is_answered_as_ctrl_c_is():
     before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
     presses = []
     try:
-        with Termination() as stop, stop.working():
+        with Termination() as stop:
             signal.signal(signal.SIGINT, lambda *_: presses.append("press"))
             signal.raise_signal(signal.SIGTERM)
             assert (presses, stop.came) == (["press"], True)

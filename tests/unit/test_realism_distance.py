@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 import simtest.rendering
-from simtest.cli.realism import realism
+from simtest.cli.data import realism
 from simtest.errors import InputError
 from simtest.realism.comparison import compare
 from simtest.realism.distance import distances

@@ -12,8 +12,8 @@ import platformdirs
 import pytest
 
 from simtest.calibration import Calibration
+from simtest.cli.common import named_path
 from simtest.cli.main import _mend_terminal
-from simtest.cli.options import named_path
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction import reconstruct_colour
