@@ -2,6 +2,8 @@
 
 import glob
 import json
+import shlex
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,8 @@ from simtest.runtime.files import as_json
 
 if TYPE_CHECKING:
     from simtest.reconstruction.picture import Options
+    from simtest.runtime.processes import Engine
+
 
 _SEPARATOR = "\0"
 """No argument of a command can hold it."""
@@ -122,11 +126,29 @@ Views = Annotated[
     Parameter(help="Viewpoints of each group that varies them, the first ones; default all.", converter=whole_number),
 ]
 Seed = Annotated[int | None, Parameter(help="Seed of the run.", converter=seed_number)]
-Workers = Annotated[
-    int, Parameter(help="Processes that work at once; each takes its share of the cores.", converter=whole_number)
-]
 EngineName = Annotated[Literal["local", "ray"], Parameter(name="--engine", help="Local processes, or a Ray cluster.")]
 Address = Annotated[str | None, Parameter(help="Of the Ray cluster's head, HOST:PORT; default: one is started here.")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class EngineOptions:
+    """What runs the work."""
+
+    engine: EngineName = "local"
+    workers: Annotated[
+        int, Parameter(help="Processes that work at once; each takes its share of the cores.", converter=whole_number)
+    ] = 1
+    address: Address = None
+
+    def make(self, gpu: bool = False, renew_after: int | None = None) -> "Engine":
+        """Return the engine, of processes that need a GPU or are replaced after so many tasks."""
+        from simtest.runtime.processes import make_engine
+
+        return make_engine(self.engine, self.workers, self.address, gpu, renew_after)
+
+
+ONE_PROCESS = EngineOptions()
 
 
 @Parameter(name="*")
@@ -205,6 +227,11 @@ MOST_ROWS = 20
 """A longer table is cut, or replaced by a summary, unless --verbose is given."""
 
 TABLE_WIDTH = 125
+
+
+def command_line() -> str:
+    """Return this command as a shell takes it."""
+    return shlex.join(["simtest", *sys.argv[1:]])
 
 
 def print_json(value: Any) -> None:

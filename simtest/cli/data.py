@@ -1,7 +1,5 @@
 """Commands about frames for learning and about real ones: dataset, realism, fit, advise."""
 
-import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import App, Parameter, Token
 
 from simtest.cli.common import (
-    Address,
+    ONE_PROCESS,
     AsJson,
-    EngineName,
+    EngineOptions,
     Out,
     Seed,
-    Workers,
+    command_line,
     counted,
     named,
     named_path,
@@ -55,9 +53,7 @@ def make(
     samples: Samples = None,
     seed: Seed = None,
     settings: Settings = None,
-    engine: EngineName = "local",
-    workers: Workers = 1,
-    address: Address = None,
+    engine: EngineOptions = ONE_PROCESS,
     variant: Variant = None,
     as_json: AsJson = False,
 ) -> None:
@@ -71,7 +67,6 @@ def make(
     """
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS, write_dataset
     from simtest.rendering.backend import needs_gpu
-    from simtest.runtime.processes import make_engine
     from simtest.spec import load_dataset, parse_settings
 
     values = parse_settings(settings or []) | {
@@ -79,7 +74,7 @@ def make(
     }
     wanted = load_dataset(described, values)
     with progress_bar("writing the tables") as progress:
-        chosen = make_engine(engine, workers, address, needs_gpu(variant), SHARDS_PER_PROCESS)
+        chosen = engine.make(needs_gpu(variant), SHARDS_PER_PROCESS)
         write_dataset(wanted, out, chosen, variant, progress)
     print_files([out / "README.md"], as_json, dataset=wanted.name, samples=wanted.samples)
 
@@ -92,16 +87,13 @@ def verify(
     repair: Annotated[
         bool, Parameter(negative="", help="Make again what is broken; remove files that do not belong.")
     ] = False,
-    engine: EngineName = "local",
-    workers: Workers = 1,
-    address: Address = None,
+    engine: EngineOptions = ONE_PROCESS,
     as_json: AsJson = False,
 ) -> int:
     """Check a dataset's files and values; exit 1 if anything is broken, and name it."""
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS
     from simtest.dataset.verify import repair_files
     from simtest.dataset.verify import verify as check
-    from simtest.runtime.processes import make_engine
 
     left = None
     with progress_bar("done") as progress:
@@ -109,7 +101,7 @@ def verify(
         if not as_json:
             print_lines(list(map(str, faults)))
         if faults and repair:
-            chosen = make_engine(engine, workers, address, renew_after=SHARDS_PER_PROCESS)
+            chosen = engine.make(renew_after=SHARDS_PER_PROCESS)
             left = repair_files(folder, faults, chosen, progress)
     broken = faults if left is None else left
     if as_json:
@@ -179,18 +171,15 @@ def export(
     /,
     *,
     out: Annotated[Path, Parameter(help="Folder for the frames; made if need be.", converter=named_path)],
-    engine: EngineName = "local",
-    workers: Workers = 1,
-    address: Address = None,
+    engine: EngineOptions = ONE_PROCESS,
     as_json: AsJson = False,
 ) -> None:
     """Export a dataset's frames without their truth, for methods that run elsewhere; `simtest score` takes answers."""
     from simtest.dataset.export import export_dataset
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS
-    from simtest.runtime.processes import make_engine
 
     with progress_bar("writing the tables") as progress:
-        chosen = make_engine(engine, workers, address, renew_after=SHARDS_PER_PROCESS)
+        chosen = engine.make(renew_after=SHARDS_PER_PROCESS)
         readme = export_dataset(folder, out, chosen, progress)
     print_files([readme], as_json)
 
@@ -224,7 +213,7 @@ def realism(
     from simtest.realism.page import write_comparison
 
     real, generated = open_frames(frames), open_generated(against, count, surfaces or ())
-    command = shlex.join(["simtest", *sys.argv[1:]])
+    command = command_line()
     try:
         with exclusive_folder(out), progress_bar("compared") as progress:
             found = compare(real, generated, progress, seed or 0)
@@ -372,7 +361,7 @@ def advise(
         raise InputError(f"--distances: {len(distances)} numbers; must be two, the nearest and the farthest, mm")
     scope = read_scope(rig, camera)
     question = Question(scope, organ, (distances[0], distances[1]), bound, frames, seed or 0)
-    command = shlex.join(["simtest", *sys.argv[1:]])
+    command = command_line()
     with exclusive_folder(out), progress_bar("writing the page") as progress:
         found = run(question, out, progress, workers)
         page = write_advice(found, out, command)

@@ -1,8 +1,6 @@
 """Commands about pictures and cameras: reconstruct, twin, calibrate, camera."""
 
 import math
-import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,6 +13,7 @@ from simtest.cli.common import (
     Out,
     PictureOptions,
     Seed,
+    command_line,
     counted,
     named_path,
     print_files,
@@ -273,7 +272,7 @@ def twin(
     if frames is not None and not FEWEST <= frames <= MOST:
         raise InputError(f"--frames {frames}: must be {FEWEST} to {MOST}")
     options = known.checked()
-    command = shlex.join(["simtest", *sys.argv[1:]])
+    command = command_line()
     with exclusive_folder(out):
         with progress_bar("writing the page") as progress:
             result = twin_picture(frame, options, frames, seed or 0, progress, organ)
@@ -363,7 +362,7 @@ def light(
     from simtest.spec.calibration_file import load_calibration
 
     mirror = _mirror(ball_radius, ball_radius_sd, outlines, plate, (plate_sd, plate_tilt_sd))
-    command = shlex.join(["simtest", *sys.argv[1:]])
+    command = command_line()
     with exclusive_folder(out):
         made = calibrate_lights(picture_readers(pictures), load_calibration(camera), mirror, encoding, most)
         files = write_calibration(made, out, command)

@@ -1,8 +1,6 @@
 """Commands that run experiments and judge methods: validate, score, core, nightly, bench."""
 
 import itertools
-import shlex
-import sys
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,9 +9,11 @@ from cyclopts import App, Parameter
 
 from simtest.cli.common import (
     MOST_ROWS,
+    ONE_PROCESS,
     Address,
     AsJson,
     EngineName,
+    EngineOptions,
     Estimators,
     Out,
     Realisations,
@@ -21,7 +21,7 @@ from simtest.cli.common import (
     Settings,
     Variant,
     Views,
-    Workers,
+    command_line,
     named,
     named_path,
     print_files,
@@ -61,9 +61,7 @@ def validate(
     settings: Settings = None,
     estimators: Estimators = None,
     variant: Variant = None,
-    engine: EngineName = "local",
-    workers: Workers = 1,
-    address: Address = None,
+    engine: EngineOptions = ONE_PROCESS,
     export: Annotated[
         Path | None,
         Parameter(help="Folder for the frames without their truth, for methods elsewhere.", converter=named_path),
@@ -81,7 +79,6 @@ def validate(
     """
     from simtest.api import validate as run
     from simtest.rendering.backend import needs_gpu
-    from simtest.runtime.processes import make_engine
     from simtest.spec import load_experiment, parse_settings
     from simtest.validation.mesh_verdicts import mesh_verdicts
 
@@ -96,10 +93,10 @@ def validate(
         if not mesh.usable:
             # Before the work: it takes long, and its figures may mean nothing.
             warnings.warn(str(mesh), stacklevel=1)
-    command = shlex.join(["simtest", *sys.argv[1:]])
+    command = command_line()
     with progress_bar() as progress:
         folder = out or RUNS / described.name
-        chosen = make_engine(engine, workers, address, gpu=needs_gpu(variant))
+        chosen = engine.make(needs_gpu(variant))
         run(described, folder, None, command, variant, progress, engine=chosen, export=export)
     if as_json:
         exported = {} if export is None else {"export": export / "README.md"}
@@ -222,7 +219,7 @@ def score_dense(
     from simtest.dataset.scoring.dense import MapOptions, score_maps
     from simtest.pages.style import number
 
-    command = shlex.join(["simtest", *sys.argv[1:]])
+    command = command_line()
     folder = out or Path("reports/scores") / (name or maps.resolve().name)
     options = MapOptions(name, encoding, frame, depth, unit_mm)
     try:
@@ -261,9 +258,7 @@ def score(
         Path | None, Parameter(help="Folder of the scored run; default reports/scores/NAME.", converter=named_path)
     ] = None,
     name: Annotated[str | None, Parameter(help="Name of the method in the results; default that of the file.")] = None,
-    engine: EngineName = "local",
-    workers: Workers = 1,
-    address: Address = None,
+    engine: EngineOptions = ONE_PROCESS,
     encoding: MapEncoding = None,
     frame: MapFrame = None,
     depth: MapDepth = None,
@@ -284,12 +279,11 @@ def score(
     refuse_dense_options(encoding=encoding, frame=frame, depth=depth, unit_mm=unit_mm)
     from simtest.dataset.scoring.run import score_table
     from simtest.report import write_report
-    from simtest.runtime.processes import make_engine
 
-    command = shlex.join(["simtest", *sys.argv[1:]])
+    command = command_line()
     folder = out or SCORES / (name or answers.stem)
     with progress_bar() as progress:
-        chosen = make_engine(engine, workers, address)
+        chosen = engine.make()
         run = score_table(answers, on, folder, name, command, chosen, progress)
         page = write_report(run.folder, progress)
     if as_json:
@@ -350,7 +344,7 @@ def run_nightly(
     address: Address = None,
     as_json: AsJson = False,
 ) -> int:
-    """Run a profile; exit 0 fine, 1 a regression or a change to explain, 2 it could not be run_nightly.
+    """Run a profile; exit 0 fine, 1 a regression or a change to explain, 2 it could not be run.
 
     The night is kept in the history, compared with the accepted baseline, and its page written.
     """
@@ -369,9 +363,6 @@ def run_nightly(
 def _run(
     profile: str, reports: Path, variant: str | None, engine: str, workers: int | None, address: str | None
 ) -> "Outcome":
-    import shlex
-    import sys
-
     from simtest.nightly.layout import Reports
     from simtest.nightly.measure import RunOptions
     from simtest.nightly.run import run_nightly
@@ -380,7 +371,7 @@ def _run(
     from simtest.spec import load_profile
 
     described = load_profile(profile)
-    command = shlex.join(["simtest", *sys.argv[1:]])
+    command = command_line()
     count = _cores() if workers is None else workers
     chosen = make_engine(engine, count, address, gpu=needs_gpu(variant))
     with progress_bar("writing the page") as progress:
@@ -419,7 +410,7 @@ def _cores() -> int:
 
 
 def _print_json(outcome: "Outcome") -> None:
-    """Print the verdict as it stands in the folder of the last run_nightly, with the page."""
+    """Print the verdict as it stands in the folder of the last run, with the page."""
     import json
 
     from simtest.nightly.outputs import VERDICT
@@ -475,22 +466,19 @@ def run(
         list[str] | None, Parameter(name="--part", negative="", help="Run this part alone; may be repeated.")
     ] = None,
     suite: SuiteVersion = "v1",
-    engine: EngineName = "local",
-    workers: Workers = 1,
-    address: Address = None,
+    engine: EngineOptions = ONE_PROCESS,
     as_json: AsJson = False,
 ) -> None:
     """Run a core on the frozen cases; print its table and write certificate.json. A stopped run goes on."""
     from simtest.bench.run import run_bench, run_maps
     from simtest.bench.suite import load_suite
     from simtest.dataset.scoring.dense.conventions import MapOptions
-    from simtest.runtime.processes import make_engine
 
     if (core is None) == (maps is None):
         raise InputError("--core and --maps: give one of them; --maps runs the part dense, --core all others")
     if core is None and parts not in (None, ["dense"]):
         raise InputError(f"--part {parts[0] if parts else ''}: maps are scored on the part dense alone")
-    read, chosen = load_suite(suite), make_engine(engine, workers, address)
+    read, chosen = load_suite(suite), engine.make()
     with exclusive_folder(out), progress_bar() as progress:
         if core is None:
             options = MapOptions(name, encoding, frame, depth, unit_mm)
@@ -538,19 +526,16 @@ def frames(
     *,
     out: Out,
     suite: SuiteVersion = "v1",
-    engine: EngineName = "local",
-    workers: Workers = 1,
-    address: Address = None,
+    engine: EngineOptions = ONE_PROCESS,
     as_json: AsJson = False,
 ) -> None:
     """Write the frames of the part dense without their truth, for methods that give maps."""
     from simtest.bench.maps import export_frames
     from simtest.bench.suite import load_suite
-    from simtest.runtime.processes import make_engine
 
     read = load_suite(suite)
     with exclusive_folder(out), progress_bar() as progress:
-        folder = export_frames(read, out, make_engine(engine, workers, address), progress)
+        folder = export_frames(read, out, engine.make(), progress)
     print_files([folder], as_json)
 
 
