@@ -26,12 +26,7 @@ if TYPE_CHECKING:
     from simtest.spec import Experiment, Scene
     from simtest.validation.runner import Progress
 
-_HOMES = {
-    "simtest.simulation.labelled_frame": ("LabelledFrame",),
-    "simtest.reconstruction": ("reconstruct",),
-    "simtest.report.run_results": ("RunResults",),
-}
-__getattr__, _ = lazy_names(__name__, _HOMES)
+__getattr__, *_ = lazy_names(__name__)
 
 __all__ = [
     "Extras",

@@ -18,34 +18,7 @@ if TYPE_CHECKING:
     from simtest.calibration.priors import LIGHT_AT_CAMERA, NO_PRIORS, CameraPrior, Priors
     from simtest.calibration.response import Response, srgb_decode, srgb_encode
 
-_HOMES = {
-    "simtest.calibration.calibration": (
-        "Calibration",
-        "CorrectedFrame",
-    ),
-    "simtest.calibration.distributions": (
-        "Distribution",
-        "LogUniform",
-        "Normal",
-        "Uniform",
-        "exactly",
-    ),
-    "simtest.calibration.frame": ("Frame",),
-    "simtest.calibration.noise_estimate": ("estimate_noise",),
-    "simtest.calibration.noise_model": ("NoiseModel",),
-    "simtest.calibration.priors": (
-        "LIGHT_AT_CAMERA",
-        "NO_PRIORS",
-        "CameraPrior",
-        "Priors",
-    ),
-    "simtest.calibration.response": (
-        "Response",
-        "srgb_decode",
-        "srgb_encode",
-    ),
-}
-_named, __dir__ = lazy_names(__name__, _HOMES)
+_named, __dir__, _ = lazy_names(__name__)
 
 __all__ = [
     "LIGHT_AT_CAMERA",

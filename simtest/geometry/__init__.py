@@ -22,20 +22,6 @@ if TYPE_CHECKING:
     from simtest.geometry.perspective import BrownConrady
     from simtest.runtime.arrays import Array, Image, Index, Mask
 
-_HOMES = {
-    "simtest.geometry.arc_fit": ("FittedArc", "fit_arc"),
-    "simtest.geometry.camera": ("Camera", "ViewMask"),
-    "simtest.geometry.circle_from_cone": ("CirclePose", "CirclePoses", "circle_pose", "circle_poses", "cone_axes"),
-    "simtest.geometry.conics": ("Ellipse", "cone_of_conic", "cone_rays", "ellipse_of_conic"),
-    "simtest.geometry.distortion": ("Distortion", "KannalaBrandt"),
-    "simtest.geometry.ellipse_fit": ("FittedConic", "fit_ellipse", "fit_ellipses"),
-    "simtest.geometry.gaussian_smoothing": ("smooth",),
-    "simtest.geometry.omnidirectional": ("Scaramuzza",),
-    "simtest.geometry.patch": ("Patch",),
-    "simtest.geometry.perspective": ("BrownConrady",),
-    "simtest.runtime.arrays": ("Array", "Image", "Index", "Mask"),
-}
-
 __all__ = [
     "Array",
     "BrownConrady",
@@ -65,4 +51,4 @@ __all__ = [
     "smooth",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, _ = lazy_names(__name__)

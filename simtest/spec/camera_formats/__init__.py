@@ -12,11 +12,4 @@ if TYPE_CHECKING:
     from simtest.spec.camera_formats.files import read_poses, read_table, recognise
     from simtest.spec.camera_formats.writing import FORMATS, write_camera
 
-_HOMES = {
-    "simtest.spec.camera_formats.files": ("read_poses", "read_table", "recognise"),
-    "simtest.spec.camera_formats.writing": ("FORMATS", "write_camera"),
-}
-
-__all__ = ["FORMATS", "read_poses", "read_table", "recognise", "write_camera"]
-
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)
