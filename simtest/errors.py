@@ -15,7 +15,7 @@ LONGEST = 900
 
 def one_line(text: object) -> str:
     """Return a text as one line of printable characters, since it may quote what a user or a file gave."""
-    line = re.sub(r"\S{300,}", lambda word: f"{word[0][:200]}...{word[0][-80:]}", str(text))
+    line = re.sub(r"\S{300,}", lambda word: f"{word[0][:120]}...{word[0][-60:]}", str(text))
     if not line.isprintable():
         line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
     half = LONGEST // 2 - 3
