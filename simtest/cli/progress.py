@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import timedelta
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from simtest.cli.main import MANNERS
 from simtest.pages import WRITTEN
@@ -90,16 +90,6 @@ def stop_between_steps() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, before)
 
 
-class Display(Protocol):
-    """What shows the steps of some work."""
-
-    def show(self, done: int, total: int, what: str) -> None:
-        """Show how many steps are done, and the present one."""
-
-    def close(self) -> None:
-        """End the display."""
-
-
 @contextmanager
 def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[int, int, str], None]]:
     """Show a bar, or lines, while the body runs, and yield the callable that moves it: (done, total, what).
@@ -108,17 +98,19 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
     nothing follows it. A single step shows no bar. What comes after all steps of a bar, such as the steps of a page,
     has a bar of its own below.
     """
-    display: Display | None = None
+    display: _Lines | _Bar | None = None
     with stop_between_steps() as check:
 
         def move(done: int, total: int, what: str) -> None:
             nonlocal display
             check()
+            if MANNERS.quiet:
+                return
             if display is None:
                 if done == total:
                     return
                 # Not before the first step: bad input is reported in one line, and nothing to do takes no time.
-                display = _display()
+                display = _Lines() if MANNERS.verbose or not at_terminal() else _Bar()
             display.show(done, total, afterwards if done == total and what != WRITTEN else what)
 
         try:
@@ -131,20 +123,6 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
 def at_terminal() -> bool:
     """Return whether a person sees the error stream."""
     return sys.stderr is not None and sys.stderr.isatty()
-
-
-def _display() -> Display:
-    if MANNERS.quiet:
-        return _Nothing()
-    return _Lines() if MANNERS.verbose or not at_terminal() else _Bar()
-
-
-class _Nothing:
-    def show(self, done: int, total: int, what: str) -> None:
-        """Show nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
 
 
 class _Lines:

@@ -28,7 +28,7 @@ from simtest.nightly.storage import (
     load_run,
     save_run,
 )
-from simtest.runtime.files import require_plain
+from simtest.runtime.files import read_json
 from simtest.validation.results_table import SCHEMA
 
 LOG = "log.jsonl"
@@ -158,9 +158,7 @@ def _end_line(log: Path) -> None:
 def _replaced(reports: Reports, profile: str) -> str | None:
     """Return the id of the run that was the baseline, if its record can still be read."""
     try:
-        found = json.loads(
-            require_plain(reports.baseline(profile) / RUN_FILE, "record_bytes").read_text(encoding="utf-8")
-        )
+        found = read_json(reports.baseline(profile) / RUN_FILE)
         return str(found["id"])
     except (OSError, ValueError, KeyError, TypeError):
         return None

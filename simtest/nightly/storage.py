@@ -1,7 +1,6 @@
 """A run as files: the rows, the figures, and the run's record with their hashes."""
 
 import contextlib
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import polars as pl
 from simtest.errors import InputError, SimtestError
 from simtest.nightly.records import FIGURES, NightlyRun, RunRecord
 from simtest.runtime.boundary import explain
-from simtest.runtime.files import require_plain, sync_folder, write_atomically, write_json
+from simtest.runtime.files import read_json, sync_folder, write_atomically, write_json
 from simtest.runtime.provenance import file_hash
 
 FIGURES_FILE, RUN_FILE = "figures.parquet", "run.json"
@@ -79,11 +78,7 @@ def check_columns(path: Path, table: pl.DataFrame, schema: Mapping[str, pl.DataT
 
 def _record(path: Path) -> tuple[RunRecord, dict[str, str]]:
     """Read a run's record, and the hashes of its tables by file name."""
-    require_plain(path, "record_bytes", "a run's record")
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: damaged (not JSON: {error})") from error
+    data = read_json(path, "a run's record")
     try:
         hashes = data.pop("files", None)
         record = RunRecord.model_validate(data)

@@ -35,7 +35,7 @@ from simtest.reconstruction.poses import Poses, read_poses
 from simtest.reconstruction.result_page import write_sequence_page
 from simtest.reconstruction.tracking import Track, TrackedFrame, Tracker, tracks_of
 from simtest.runtime.boundary import plain_errors
-from simtest.runtime.files import JsonObject, make_folder, require_plain, write_atomically, write_json
+from simtest.runtime.files import JsonObject, make_folder, read_json, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.provenance import environment
 
@@ -235,7 +235,7 @@ class _Run:
         self.is_flipped = fits_flipped_axes(self.frames, told, poses.error, priors)
         for frame in self.frames:
             path = self.folder / f"{frame.index:06d}.json"
-            data = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+            data = read_json(path)
             for entry, spot in zip(data["specularities"], frame.specularities, strict=True):
                 entry["motion"] = spot.motion
             write_json(path, data, compact=True)
@@ -256,7 +256,7 @@ def _slim(spot: SpecularityRecord, needed: Sequence[str]) -> SpecularityRecord:
 
 def _read(path: Path) -> TrackedFrame:
     """Read the file of a frame."""
-    return TrackedFrame.from_json(json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8")))
+    return TrackedFrame.from_json(read_json(path))
 
 
 def _read_done(path: Path, name: str) -> TrackedFrame | None:
@@ -324,7 +324,7 @@ def _check_settings(path: Path, settings: JsonObject) -> None:
     if not path.is_file():
         return
     try:
-        before = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+        before = read_json(path)
     except (OSError, ValueError):
         before = None
     if before != settings:

@@ -123,6 +123,15 @@ def write_json(path: Path, value: Any, compact: bool = False) -> None:
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
+def read_json(path: Path, wanted: str = "a JSON file") -> Any:
+    """Read what a run has written as JSON; raise `InputError` where it is missing, too large or damaged."""
+    require_plain(path, "record_bytes", wanted)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: damaged (not JSON: {error!s:.80})") from None
+
+
 def as_json(value: Any) -> Any:
     """Return what JSON holds of an array or a record."""
     if hasattr(value, "tolist"):

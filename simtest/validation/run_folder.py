@@ -1,13 +1,12 @@
 """The folder of a run: what it holds while the run goes on and afterwards, and what else it may be refused for."""
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
 from simtest.runtime import provenance
-from simtest.runtime.files import require_plain, write_json
+from simtest.runtime.files import read_json, write_json
 from simtest.runtime.locks import LOCK
 
 RESULTS = "results.parquet"
@@ -31,7 +30,7 @@ def record_in(folder: Path) -> dict[str, Any] | None:
         if (folder / PARTS).is_dir():
             # Beside the parts of a stopped run anything may be incomplete.
             return None
-        record = json.loads(require_plain(folder / "summary.json", "record_bytes").read_text(encoding="utf-8"))["run"]
+        record = read_json(folder / "summary.json")["run"]
         return dict(record) if "fingerprint" in record else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None

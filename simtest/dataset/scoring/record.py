@@ -1,7 +1,6 @@
 """What was exported of a run or a dataset, as the run keeps it: frames by name, their hashes, what they show."""
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from simtest.dataset.scoring.views import ShardViews, Views, views_of_cases
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image
-from simtest.runtime.files import require_plain, write_json
+from simtest.runtime.files import read_json, require_plain, write_json
 from simtest.spec import Experiment
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.spec_model import validate
@@ -168,7 +167,7 @@ def read_summary(folder: Path) -> Mapping[str, str]:
     """Return how a finished run was made, from its summary.json; raise `InputError` where there is none."""
     path = folder / "summary.json"
     try:
-        run = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))["run"]
+        run = read_json(path)["run"]
         return {key: str(run[key]) for key in ("version", "fingerprint", "variant")}
     except InputError as error:
         raise InputError(f"{folder}: no finished run ({error})") from None

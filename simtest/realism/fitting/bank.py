@@ -14,7 +14,7 @@ from simtest.realism.fitting.parameters import Parameter
 from simtest.realism.fitting.summaries import NAMES, summarise
 from simtest.realism.frame_statistics import measure
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.files import Json, make_folder, require_plain, write_json
+from simtest.runtime.files import Json, make_folder, read_json, write_json
 from simtest.runtime.provenance import source_hash
 from simtest.spec.dataset_recipe import Dataset, Splits
 
@@ -132,7 +132,7 @@ def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
     for index in range(size):
         path = folder / f"{index:06d}.json"
         try:
-            rows = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+            rows = read_json(path)
             for row in rows:
                 told = [np.nan if value is None else value for value in row["summaries"]]
                 values = [row["values"][parameter.key] for parameter in parameters]
@@ -171,9 +171,9 @@ def _claim(recipe: Dataset, folder: Path, chains: int) -> None:
         write_json(path, wanted)
         return
     try:
-        held = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not valid JSON ({error}); remove the folder") from error
+        held = read_json(path)
+    except InputError as error:
+        raise InputError(f"{error}; remove the folder") from None
     if held != json.loads(json.dumps(wanted)):
         raise InputError(
             f"{folder}: holds the bank of another recipe, seed, size or release of simtest; remove it or name "
