@@ -38,6 +38,13 @@ def blocked_signals(_, tell):
     return sorted(map(int, signal.pthread_sigmask(signal.SIG_BLOCK, [])))
 
 
+def threads(_, tell):
+    """Return what the worker's libraries read, or were told, of their threads."""
+    import cv2
+
+    return os.environ["SIMTEST_THREADS"], os.environ["OPENBLAS_NUM_THREADS"], cv2.getNumThreads()
+
+
 def swallows_memory(path):
     """Need more memory than there is."""
     return len(bytearray(2**40))
