@@ -201,15 +201,7 @@ class PictureOptions:
     ] = False
 
     def checked(self, roi: tuple[int, int, int, int] | None = None, poses: Path | None = None) -> "Options":
-        """Return them as the reconstruction takes them; raise `InputError` where they are malformed.
-
-        Parameters
-        ----------
-        roi : tuple of int, optional
-            Region of interest: column, row, width, height, px.
-        poses : Path, optional
-            Of the camera over a sequence.
-        """
+        """Return them as the reconstruction takes them; raise `InputError` where they are malformed."""
         from simtest.reconstruction.picture import Options
 
         names = None if self.estimators is None else tuple(self.estimators)
@@ -282,20 +274,9 @@ def print_rest(count: int, rest: str = "", tell: Callable[[str], object] = print
 def print_table(
     columns: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None, rest: str = "", width: int = 0
 ) -> None:
-    """Print a table.
+    """Print a table of at most `MOST_ROWS` rows, all with --verbose; `rest` says where the others can be read.
 
-    Parameters
-    ----------
-    columns : sequence of str
-        Headings.
-    rows : sequence of sequences of str
-        At most `MOST_ROWS` of them are printed, all with --verbose.
-    title : str, optional
-        Above the table.
-    rest : str
-        Where the rows that are left out can be read.
-    width : int
-        Least number of columns of the terminal; narrower, cells would be cut off. Default `TABLE_WIDTH`.
+    A terminal of fewer columns than `width` (default `TABLE_WIDTH`) counts as that wide, or cells would be cut off.
     """
     from rich.console import Console
     from rich.markup import escape

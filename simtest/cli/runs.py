@@ -116,15 +116,7 @@ _WIDTHS = (16, 17, 15, 10)  # of all columns but the last
 
 
 def print_guide(run: Path, console: "Console | None" = None) -> None:
-    """Print the guide of a run folder as a table, without colours or frames where nobody looks on at a terminal.
-
-    Parameters
-    ----------
-    run : Path
-        Folder with guide.json, whose rows the page shows too.
-    console : rich.console.Console, optional
-        Where to; default the standard output, as wide as the terminal, else `GUIDE_WIDTH` columns.
-    """
+    """Print the guide of a run folder as a table, without colours or frames where nobody looks on at a terminal."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

@@ -136,13 +136,7 @@ LEVEL = 1
 
 
 def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Write arrays by name to an .npz file; the same arrays give the same bytes.
-
-    Raises
-    ------
-    ValueError
-        If an array holds Python objects.
-    """
+    """Write arrays by name to an .npz file; the same arrays give the same bytes."""
     with zipfile.ZipFile(path, "w") as file:
         for name, array in arrays.items():
             content = io.BytesIO()
@@ -195,16 +189,10 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 
 def kept(kind: str, key: str, make: Callable[[], Arrays]) -> Arrays:
-    """Return arrays by name that were kept under a key, or else make and keep them.
+    """Return arrays by name that were kept under a kind and key, or else make and keep them.
 
-    Parameters
-    ----------
-    kind : str
-        Beginning of the file's name.
-    key : str
-        All that the arrays depend on besides the code: recipe, settings, seed.
-    make : Callable
-        Makes the arrays. If it warns they are not kept, so that it warns each time.
+    The key holds all that the arrays depend on besides the code: recipe, settings, seed. Where `make` warns they are not
+    kept, so that it warns each time.
     """
     folder = cache_folder()
     if folder is None:
@@ -226,10 +214,7 @@ def kept(kind: str, key: str, make: Callable[[], Arrays]) -> Arrays:
 
 @contextlib.contextmanager
 def only_reading(*kinds: str) -> Iterator[None]:
-    """Within it nothing more of some kinds is kept, by default of all: for what is made once and never again.
-
-    Such are a dataset's anatomies, and reliefs that are drawn for one frame.
-    """
+    """Keep nothing more of some kinds, by default of all: for what is made once and never again."""
     before = _unkept.set(kinds or _All())
     try:
         yield

@@ -47,21 +47,10 @@ def are_nested(one: Path, other: Path) -> bool:
 
 
 def require_plain(path: Path, limited_by: str | None = None, wanted: str = "a file", hint: str = "") -> Path:
-    """Return a path that is a plain file, without opening it: a pipe or a device might never end.
+    """Return a path that is a plain file within a limit of its bytes, unopened: a pipe or a device might never end.
 
-    Parameters
-    ----------
-    path : Path
-        To be read next.
-    limited_by : str, optional
-        Name of the limit of its bytes.
-    wanted, hint : str
-        What the file should be, such as "a picture", and what can be done with one that is too large; for messages.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, it is a folder, a pipe or a device, or it is larger.
+    Raises `InputError` otherwise; its message says what the file should be (`wanted`), and what can be done with one
+    that is too large (`hint`).
     """
     try:
         found = path.stat()
@@ -174,21 +163,7 @@ def limit(name: str) -> int:
 
 
 def check_limit(name: str, value: float, where: object, unit: str, hint: str = "") -> None:
-    """Raise `InputError` where a value exceeds a limit.
-
-    Parameters
-    ----------
-    name : str
-        Of the limit.
-    value : float
-        To be compared.
-    where : object
-        File, key or option, for the message.
-    unit : str
-        What is counted.
-    hint : str
-        What can be done instead.
-    """
+    """Raise `InputError` where a value exceeds a limit; `where` is the file, key or option."""
     most = limit(name)
     if value > most:
         raise InputError(
@@ -198,17 +173,7 @@ def check_limit(name: str, value: float, where: object, unit: str, hint: str = "
 
 
 def check_count(name: str, value: object, where: str) -> None:
-    """Raise `InputError` unless a value is a whole number from 1 to a limit.
-
-    Parameters
-    ----------
-    name : str
-        Of the limit.
-    value : object
-        To be checked.
-    where : str
-        Key or option, for the message.
-    """
+    """Raise `InputError` unless the value of a key or option (`where`) is a whole number from 1 to a limit."""
     most = limit(name)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
         joined = f"{where} {value!r}" if where.startswith("--") else f"{where} = {value!r}"

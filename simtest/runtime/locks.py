@@ -31,17 +31,8 @@ _WITHOUT_LOCKS = {errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOLCK, errno.EO
 def exclusive_folder(folder: Path, option: str = "--out") -> Iterator[None]:
     """Keep a folder for results to this run; it is made if need be, and removed again if it stays empty.
 
-    Parameters
-    ----------
-    folder : Path
-        The folder.
-    option : str
-        How the user names it, for messages.
-
-    Raises
-    ------
-    InputError
-        If another run is at work in the folder: the message names its process.
+    Raises `InputError` if another run is at work in the folder: the message names its process. `option` is how the user
+    names the folder.
     """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     make_folder(folder, option)

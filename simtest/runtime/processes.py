@@ -47,26 +47,10 @@ class Engine(Protocol):
     """Runs tasks."""
 
     def run(self, task: Task, arguments: Sequence[Any], on_step: OnStep) -> Iterator[tuple[int, Any]]:
-        """Run a task for each argument.
+        """Run a task for each argument; yield index and result in the order in which tasks finish.
 
-        Parameters
-        ----------
-        task : callable
-            See `Task`.
-        arguments : sequence
-            One for each run.
-        on_step : callable
-            Called in this process for each step.
-
-        Yields
-        ------
-        tuple
-            Index of the argument, and result, in the order in which tasks finish.
-
-        Raises
-        ------
-        SimtestError
-            What a task raised, or if processes keep dying during the same task.
+        `on_step` is called in this process for each step. Raises `SimtestError` if a task did, or if processes keep
+        dying during the same task.
         """
 
 
@@ -82,25 +66,10 @@ def make_engine(
     gpu: bool = False,
     renew_after: int | None = None,
 ) -> Engine:
-    """Return an engine by name.
+    """Return an engine by name: "local" (processes of this machine) or "ray" (a cluster; needs the extra ``ray``).
 
-    Parameters
-    ----------
-    name : {"local", "ray"}
-        Processes of this machine, or a Ray cluster (needs the extra ``ray``).
-    workers : int
-        How many tasks run at once, 1 to 256.
-    address : str, optional
-        Of the Ray cluster's head; default: a cluster is started here.
-    gpu : bool
-        Whether each of a cluster's tasks needs a GPU.
-    renew_after : int, optional
-        Tasks after which a process is replaced, so that leaks of libraries do not add up; default never.
-
-    Raises
-    ------
-    InputError
-        If there is no such engine, its packages are missing, or the number is out of range.
+    So many `workers` tasks run at once. `address` is that of the cluster's head, by default one is started here; with
+    `gpu` each of its tasks needs one. A process is replaced after `renew_after` tasks, so that leaks do not add up.
     """
     check_workers(workers)
     if name == "local":
@@ -425,26 +394,10 @@ _CALL = "import sys; from simtest.runtime.processes import _answer_apart; _answe
 def call_apart(read: Callable[[str], T], path: Path, memory_bytes: float, kind: str, breakdown: str) -> T:
     """Return what a function makes of a file, called in a process of its own: its library may crash over it.
 
-    Parameters
-    ----------
-    read : callable
-        At the top level of a module. It raises `InputError` where the content is not what it must be, without the
-        file's name.
-    path : Path
-        The file; its name begins every message.
-    memory_bytes : float
-        What the process may take beside its libraries.
-    kind : str
-        What the file must be, such as "VTK mesh", for messages.
-    breakdown : str
-        What is said of a file over which the library breaks down.
-
-    Raises
-    ------
-    InputError
-        If the file is refused, takes more than `TIMEOUT_S`, or the library breaks down over it.
-    SimtestError
-        If memory does not hold it.
+    The function stands at the top level of a module, and raises `InputError` where the content is not what it must be,
+    without the file's name. The process may take `memory_bytes` beside its libraries. For messages: `kind` is what the
+    file must be, such as "VTK mesh", and `breakdown` is said of a file over which the library breaks down. Raises
+    `InputError` then, where the file is refused or takes more than `TIMEOUT_S`, and `SimtestError` where memory lacks.
     """
     # -P: no file of the current folder may stand in for a package.
     command = [sys.executable, "-P", "-c", _CALL, read.__module__, read.__name__, str(path.absolute())]

@@ -18,33 +18,15 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def data_root(kind: str) -> Path:
-    """Return the folder of the shipped data.
-
-    Parameters
-    ----------
-    kind : {"scenes", "meshes"}
-        Top-level folder of the checkout; inside a wheel it lies under ``simtest/_data``.
-    """
+    """Return the folder of the shipped data, "scenes" or "meshes": of the checkout, or inside a wheel."""
     installed = _PACKAGE / "_data" / kind
     return installed if installed.is_dir() else _PACKAGE.parent / kind
 
 
 def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...] = (".toml",)) -> Path:
-    """Find a file by its path, or a shipped one by its name.
+    """Find a file by its path, or a shipped one in ``data_root(kind) / folder`` by its name without the suffix.
 
-    Parameters
-    ----------
-    name : str or Path
-        A path to a file, or the stem of a shipped file.
-    kind, folder : str
-        Shipped files lie in ``data_root(kind) / folder``.
-    suffixes : tuple of str
-        Suffixes tried for a bare name.
-
-    Raises
-    ------
-    InputError
-        If there is no such file; the message lists the names that exist.
+    Raises `InputError` if there is no such file; the message lists the names that exist.
     """
     try:
         path = Path(name).expanduser()
@@ -73,15 +55,7 @@ _NAMED = re.compile(rf"(?P<runner>[A-Za-z0-9_.-]+):(?P<file>\S.*{re.escape(SUFFI
 
 @dataclass(frozen=True)
 class ModelName:
-    """A name of this form.
-
-    Parameters
-    ----------
-    runner : str
-        The registered name of what runs the network.
-    file : Path
-        The network.
-    """
+    """A name of this form: the registered name of what runs the network, and the network's file."""
 
     runner: str
     file: Path
@@ -114,18 +88,11 @@ OWN = "simtest"
 
 @dataclass(frozen=True)
 class EntryPointGroup:
-    """One entry-point group.
+    """An entry-point group, and what its members are called in messages.
 
     A name that two packages register is refused, unless the package is named too: "package:name", which is accepted for
     every name. "name:FILE.onnx" is the member with a network of the user's own; the member must have a method
     ``with_model(path)``, which returns it.
-
-    Parameters
-    ----------
-    group : str
-        Of the entry points.
-    kind : str
-        What its members are called in messages.
     """
 
     group: str
@@ -138,14 +105,7 @@ class EntryPointGroup:
         return sorted(p.name if plain.count(p.name) == 1 else f"{_package(p)}:{p.name}" for p in points)
 
     def load(self, name: str) -> Any:
-        """Import a member.
-
-        Raises
-        ------
-        InputError
-            If the name is unknown, several packages register it, its package cannot be imported, or it names a file
-            for a member that runs none, or that the member refuses.
-        """
+        """Import a member; raise `InputError` where that cannot be, or it refuses the file in its name."""
         if model := parse_model(name):
             return self._with_model(model, name)
         found = self._registered(name)
@@ -173,14 +133,7 @@ class EntryPointGroup:
         return with_model(model.file)
 
     def described(self, own: Mapping[str, str] | None = None) -> dict[str, str]:
-        """Return a line about each member, by name.
-
-        Parameters
-        ----------
-        own : mapping, optional
-            Lines of this package's members, by name. Of all others it is the first line of the module, which is read,
-            not imported.
-        """
+        """Return a line about each member: of `own`, or the first of the module, which is read, not imported."""
         points = {name: point for name in self.names() for point in self._registered(name)[:1]}
         lines = {n: (own or {}).get(p.name, "") if _normalised(_package(p)) == OWN else "" for n, p in points.items()}
         return {name: line.rstrip(".") or _first_line(points[name]) for name, line in lines.items()}
