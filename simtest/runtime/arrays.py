@@ -191,8 +191,8 @@ _ROOT = Path(__file__).resolve().parents[1]
 def kept(kind: str, key: str, make: Callable[[], Arrays]) -> Arrays:
     """Return arrays by name that were kept under a kind and key, or else make and keep them.
 
-    The key holds all that the arrays depend on besides the code: recipe, settings, seed. Where `make` warns they are not
-    kept, so that it warns each time.
+    The key holds all that the arrays depend on besides the code: recipe, settings, seed. Where `make` warns they are
+    not kept, so that it warns each time.
     """
     folder = cache_folder()
     if folder is None:
