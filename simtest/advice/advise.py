@@ -94,13 +94,6 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
         Called with steps done, steps in all, and what is done.
     workers : int
         Processes that render at once.
-
-    Raises
-    ------
-    InputError
-        If something does not fit, or no surface can be rendered so.
-    BackendError
-        If the rendering backend cannot be used.
     """
     engine = make_engine(workers=workers)
     make_folder(out)

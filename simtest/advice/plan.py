@@ -62,11 +62,6 @@ class Question:
         Frames; default as many as `BUDGET_S` allows.
     seed : int
         Of everything that is drawn.
-
-    Raises
-    ------
-    InputError
-        If the organ is unknown, or a number out of range.
     """
 
     scope: Scope

@@ -140,11 +140,6 @@ def read_scope(name: str, camera: Path | None = None) -> Scope:
         In ``[rig]``, ``lights_mm`` may give the positions alone, as in a calibration file.
     camera : Path, optional
         Camera file that replaces the scope's camera.
-
-    Raises
-    ------
-    InputError
-        If there is no such scope, or something does not fit.
     """
     scope = _named(name)
     if camera is None:

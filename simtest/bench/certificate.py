@@ -80,13 +80,7 @@ def write_certificate(folder: Path, content: JsonObject) -> Path:
 
 
 def read_certificate(path: Path) -> Certificate:
-    """Read a certificate.
-
-    Raises
-    ------
-    InputError
-        If it is no certificate, was altered, lacks a figure, or is of another version of the format.
-    """
+    """Read a certificate."""
     if path.is_dir():
         path = path / CERTIFICATE
     require_plain(path, "record_bytes", "a certificate")

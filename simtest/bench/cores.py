@@ -27,11 +27,6 @@ def core_record(text: str) -> JsonObject:
     `sha256` is of the core's own files and of the words of its command. An interpreter or another program of the
     machine, such as docker, is no part of it, since it differs from machine to machine: it stands under `program`.
     Modules that a script loads are seen only where the command or the TOML file (`core.files`) names them.
-
-    Raises
-    ------
-    InputError
-        If it is unknown or cannot be started.
     """
     name, _ = load_core(text)
     if not has_files(text):

@@ -91,13 +91,7 @@ def _name(certificate: Certificate) -> str:
 
 
 def read_entries(folder: Path, suite: Suite) -> Board:
-    """Read the certificates below a folder and rank them.
-
-    Raises
-    ------
-    InputError
-        If there are none, or one was altered, is malformed, or is of another version.
-    """
+    """Read the certificates below a folder and rank them."""
     if not folder.is_dir():
         raise InputError(f"{folder}: must be a folder that holds certificates")
     files = sorted(file for file in folder.rglob("*.json") if _is_certificate(file))

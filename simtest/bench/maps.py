@@ -36,13 +36,7 @@ OF_RUN = "brightest_point"
 
 
 def export_frames(suite: Suite, folder: Path, engine: Engine | None = None, progress: Progress | None = None) -> Path:
-    """Write the frames of the dense part without their truth; return their folder.
-
-    Raises
-    ------
-    InputError
-        If the folder holds something else.
-    """
+    """Write the frames of the dense part without their truth; return their folder."""
     experiment = experiment_of(suite, PART, OF_RUN)
     check_exportable(experiment)
     chosen = engine or make_engine()

@@ -82,11 +82,6 @@ def run_bench(
         Default all that are scored by highlights.
     engine, progress, variant
         See `simtest.validate`. The figures do not depend on the engine.
-
-    Raises
-    ------
-    InputError
-        If a part or the core is unknown, or the folder holds something else.
     """
     check_core(core)
     chosen = chosen_parts(suite, parts)

@@ -188,13 +188,7 @@ def read_suite(folder: Path) -> Suite:
 
 
 def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
-    """Read a shipped suite and check it against its pinned hashes.
-
-    Raises
-    ------
-    InputError
-        If the version is unknown, a file is malformed, or a case is not the frozen one.
-    """
+    """Read a shipped suite and check it against its pinned hashes."""
     folder = folder or suite_folder(version)
     suite = read_suite(folder)
     try:

@@ -125,12 +125,6 @@ def export_run(
     -------
     Path
         README.md of the export.
-
-    Raises
-    ------
-    InputError
-        If the experiment renders no frames, a calibration cannot be written as a file, or the folder holds something
-        else.
     """
     source = source_of_run(folder, experiment, expand(experiment))
     return _export(source, experiment.model_dump(mode="json"), out, engine, progress, "--export")

@@ -76,11 +76,6 @@ def write_dataset(
     progress : callable, optional
         Called with samples done, samples in all, and what is being done.
 
-    Raises
-    ------
-    InputError
-        If the dataset cannot be made as described, or the folder holds something else or cannot be written.
-
     Warns
     -----
     UserWarning

@@ -92,11 +92,6 @@ class LearnedDense:
     ----------
     model : str or Path, optional
         The file model.onnx. Default: the shipped network.
-
-    Raises
-    ------
-    InputError
-        At the first use, if ONNX Runtime (extra ``onnx``) is missing, or the file is no such network.
     """
 
     model: str | Path | None = None

@@ -60,12 +60,6 @@ class LearnedSpot:
         The file model.onnx. Default: the shipped network.
     target : {"base", "fine"}
         Which surface's normals are stated.
-
-    Raises
-    ------
-    InputError
-        If the target is neither; at the first use, if ONNX Runtime (extra ``onnx``) is missing, or the file is no such
-        network.
     """
 
     model: str | Path | None = None

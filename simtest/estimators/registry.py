@@ -26,13 +26,7 @@ class PlainCallable:
 
 
 def as_estimator(name: str, given: object) -> AnyEstimator:
-    """Return an object as an estimator; a plain callable is wrapped, with a DeprecationWarning.
-
-    Raises
-    ------
-    InputError
-        If it is neither an estimator nor callable, or a class where an instance is meant.
-    """
+    """Return an object as an estimator; a plain callable is wrapped, with a DeprecationWarning."""
     if isinstance(given, type):
         raise InputError(f"estimator {name!r}: {given.__qualname__} is a class; must be an instance of it")
     if isinstance(given, Estimator | FrameEstimator):

@@ -22,11 +22,6 @@ class AngularProfile:
         Angles of a table, rad, rising from 0 to at most pi; empty for cos^k.
     values : tuple of float
         Factors at those angles, >= 0; interpolated linearly, constant beyond the table.
-
-    Raises
-    ------
-    InputError
-        If the power is no finite number >= 0, or the table is malformed.
     """
 
     power: float = 0.0

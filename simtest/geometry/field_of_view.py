@@ -51,11 +51,6 @@ def focal_of_view(
         The lens, whose field it is; default a pinhole.
     across : {"width", "height", "diagonal"}
         What the angle spans.
-
-    Raises
-    ------
-    InputError
-        If the lens cannot span that angle: a pinhole not 180 deg, others not beyond their fold.
     """
     wanted, ends = np.radians(fov_deg), _ends(*size, centre, across)
     lengths = np.linalg.norm(ends, axis=1)

@@ -45,14 +45,7 @@ NEEDED = (*CELL, "realisation", *OLDEST_COLUMNS)
 
 
 def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
-    """Read the baseline of a profile, with `reason` and `accepted` in its record; None where there is none.
-
-    Raises
-    ------
-    InputError
-        If a file of it is missing or damaged, lacks what `simtest.nightly.gate.compare` reads, or is another profile's;
-        the message names it.
-    """
+    """Read the baseline of a profile, with `reason` and `accepted` in its record; None where there is none."""
     # Without a lock: the folder is kept in git, and whoever reads it writes nothing there.
     folder = current(reports.baseline(profile))
     if not folder.is_dir():
@@ -103,13 +96,6 @@ def accept(reports: Reports, profile: str, reason: str) -> RunRecord:
     -------
     RunRecord
         The baseline's.
-
-    Raises
-    ------
-    InputError
-        If there is no last run, it is damaged, or no reason is given.
-    SimtestError
-        If the disk is full, or may not be written.
     """
     reason = " ".join(reason.split())
     if not reason or len(reason) > MAX_REASON:

@@ -66,11 +66,6 @@ def measure_run(
         How.
     planned : tuple, optional
         What `plan_run` returned, where it was asked before.
-
-    Raises
-    ------
-    SimtestError
-        If an experiment is malformed or cannot be run, or nothing was measured.
     """
     started, clock = datetime.now(UTC), time.monotonic()
     # Asked at the start: the checkout may have moved on before the run ends.

@@ -41,11 +41,6 @@ def whole(rows: pl.DataFrame, path: Path) -> pl.DataFrame:
     """Return the rows of a baseline in double precision, errors restored; `path` is their file, for messages.
 
     Baselines of older versions, which hold the errors themselves, are read too.
-
-    Raises
-    ------
-    InputError
-        If a column is of another type than `small` gives it.
     """
     for name in NEAR_REFERENCE:
         held = name + _BITS

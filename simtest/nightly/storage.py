@@ -52,13 +52,7 @@ def save_run(folder: Path, run: NightlyRun, rows_file: str, smallest: bool = Fal
 
 
 def load_run(folder: Path, rows_file: str) -> NightlyRun:
-    """Read a run.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, damaged, or not the one that was written; the message names it.
-    """
+    """Read a run."""
     record, hashes = _record(folder / RUN_FILE)
     # A table of another run has another hash.
     rows, figures = (_table(folder / name, hashes) for name in (rows_file, FIGURES_FILE))

@@ -40,11 +40,6 @@ def open_frames(paths: Sequence[Path]) -> list[NamedFrame]:
     """Open picture files, each a scene; films, each a scene; and folders of pictures, each picture a scene.
 
     Pictures of one film lie in a folder whose name ends in ``.film``: it is one scene.
-
-    Raises
-    ------
-    InputError
-        If a path is missing or holds no frame.
     """
     frames: list[NamedFrame] = []
     for path in paths:
@@ -102,11 +97,6 @@ def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> li
     folder's pictures `count` are taken, evenly spread. `surfaces` names those that are taken of a dataset, by default
     all. A scene is rendered `count` times, from another viewpoint and with another seed of relief, pattern and noise
     each time; each frame counts as a scene.
-
-    Raises
-    ------
-    InputError
-        If there is nothing to open, `count` is below 1, or surfaces are named where they cannot be told apart.
     """
     check_count("generated_frames", count, "--count")
     if not against.strip():

@@ -26,13 +26,7 @@ DOWN = np.diag([1.0, -1.0, 1.0])
 
 
 def dataset_poses(path: Path, text: str, where: str) -> list[Array] | None:
-    """Return the poses of a data set's file, world_from_camera, shape (4, 4), mm; None where it is none of them.
-
-    Raises
-    ------
-    InputError
-        If a line is malformed, or SimCol3D's other file is missing or of another length.
-    """
+    """Return the poses of a data set's file, world_from_camera, shape (4, 4), mm; None where it is none of them."""
     if path.name.startswith(POSITION):
         return _simcol3d(path, text, where)
     first = next((line for line in text.splitlines() if line.strip()), "")

@@ -65,14 +65,7 @@ def read_picture(path: Path) -> Image:
 
 @plain_errors
 def read_raw(path: Path, wanted: str) -> npt.NDArray[np.generic]:
-    """Read the pixels of a picture file as they are, in OpenCV's order of channels; of several pages the first.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, no plain file, no picture, or beyond a limit (`simtest.runtime.files`): checked before
-        it is decoded.
-    """
+    """Read the pixels of a picture file as they are, in OpenCV's order of channels; of several pages the first."""
     require_plain(path, "picture_bytes", wanted)
     _check_header(path)
     data = np.fromfile(path, dtype=np.uint8)

@@ -56,12 +56,6 @@ class Options:
         What the field of view spans; "view": the round view in the picture, whose centre is then the principal point.
     poses : Path, optional
         Of the camera over the frames of a sequence: tells convex from concave (`simtest.reconstruction.motion`).
-
-    Raises
-    ------
-    InputError
-        If the camera is given twice or not at all, the target is none of these, or no detector of that name is
-        registered.
     """
 
     camera: Path | None = None

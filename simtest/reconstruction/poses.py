@@ -75,11 +75,6 @@ class Poses:
         ----------
         names, indices : sequence
             Names of the frames' files, and their numbers in the sequence, which count where the poses have no names.
-
-        Raises
-        ------
-        InputError
-            If no frame is named in the file, or there are fewer poses than frames.
         """
         if self.names:
             table = {name: pose for name, pose in zip(self.names, self.world_from_camera, strict=True)}

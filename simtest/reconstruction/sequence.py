@@ -78,11 +78,6 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
     progress : callable, optional
         Called with frames done, frames in all, and the frame's name; what it raises stops the run, and what is done
         is kept.
-
-    Raises
-    ------
-    InputError
-        If the source or the camera is malformed, no frame can be read, or `out` holds a run of other settings.
     """
     source = open_source(path)
     poses = None

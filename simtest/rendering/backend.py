@@ -227,11 +227,6 @@ def load(variant: str | None = None) -> Any:
     -------
     module
         mitsuba.
-
-    Raises
-    ------
-    BackendError
-        If no libLLVM works, or the variant does not exist; the message says how to mend it.
     """
     name = requested_variant(variant)
     # Library: chosen before Dr.Jit is imported, checked afterwards.

@@ -48,13 +48,7 @@ def _two_threads() -> Iterator[None]:
 
 
 def read_bitmap(path: Path, variant: str | None = None) -> Image:
-    """Read an OpenEXR file as float32, shape (H, W) or (H, W, C).
-
-    Raises
-    ------
-    InputError
-        If the file is not an image, or of more pixels than allowed.
-    """
+    """Read an OpenEXR file as float32, shape (H, W) or (H, W, C)."""
     _check_size(path)
     mi = backend.load(variant)
     try:

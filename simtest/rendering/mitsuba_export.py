@@ -57,14 +57,6 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
     """Write a scene for Mitsuba: scene.xml and, for surfaces that are meshes, surface.ply (see `simtest.export`).
 
     The world is the surface's model frame, mm. What belongs to the sensor (noise, exposure) is left out.
-
-    Raises
-    ------
-    InputError
-        If the camera or a light has what Mitsuba cannot express, the surface's file is malformed, or the folder cannot
-        be written.
-    BackendError
-        If the rendering backend cannot be used.
     """
     # Check before anything is written.
     for key, value, why in _inexpressible(scene):

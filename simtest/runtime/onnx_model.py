@@ -36,12 +36,6 @@ class OnnxModel:
     ----------
     content : dict
         The metadata; read it inside of `reading`.
-
-    Raises
-    ------
-    InputError
-        If onnxruntime is missing, or the file cannot be read, is too large, is no ONNX model, or has no metadata of
-        this form.
     """
 
     def __init__(self, path: Path, form: str, core: str) -> None:
@@ -86,11 +80,6 @@ class OnnxModel:
             Arrays of float32 by name.
         shapes : mapping
             Names of the wanted outputs with their shapes; None stands for any number.
-
-        Raises
-        ------
-        InputError
-            If the network has other inputs or outputs, or an output holds no floating-point numbers or is not finite.
         """
         try:
             made = [np.asarray(each) for each in self._session.run(list(shapes), dict(inputs))]

@@ -86,15 +86,7 @@ class LabelledFrame:
 
 
 def make_frame(scene: Scene, variant: str | None = None, progress: Progress | None = None) -> LabelledFrame:
-    """Render a labelled frame (see `simtest.render`).
-
-    Raises
-    ------
-    InputError
-        If no pixel sees the surface, or a package for the coding is missing.
-    BackendError
-        If the rendering backend cannot be used.
-    """
+    """Render a labelled frame (see `simtest.render`)."""
     check_codec(scene.sensor.coding)
     session = Session(scene, variant, labelled=True)
     # The frame's labels are not used, but the truth starts from their hits.

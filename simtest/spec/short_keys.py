@@ -43,11 +43,6 @@ def full_keys(models: Sequence[BaseModel], given: Mapping[str, Any], others: Seq
         Values by name; a name may be a full path too.
     others : sequence of str
         Names that the caller takes itself; a mistyped one may mean one of them.
-
-    Raises
-    ------
-    InputError
-        If several keys end in a name, whose paths are listed, or none does.
     """
     found = [each for model in models for each in _paths(model)]
     stated = dict.fromkeys(path for path, is_stated in found if is_stated)

@@ -35,11 +35,6 @@ class Trajectory:
         Poses, mm.
     times_s : sequence of float, optional
         When the frames were taken, s; None where they are no sequence in time.
-
-    Raises
-    ------
-    InputError
-        If the numbers of names, poses and times differ.
     """
 
     names: Sequence[str]
@@ -93,11 +88,6 @@ def write_trajectory(trajectory: Trajectory, camera: Camera, folder: Path) -> tu
         What was written.
     left_out : list of str
         Why a format was not: it lacks the camera's lens.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
     """
     files: list[Path] = []
     left_out: list[str] = []

@@ -38,11 +38,6 @@ def replace_values(
         Values by key path.
     where : str
         Name of the file, for messages.
-
-    Raises
-    ------
-    InputError
-        As `apply_settings` does.
     """
     result = apply_settings(_without_rivals(data, settings), settings, where)
     for path, value in settings.items():

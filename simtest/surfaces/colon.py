@@ -97,11 +97,6 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
     recipe : ColonRecipe
     edge_mm : float, optional
         Side of the mesh's cells on the bare tube, mm; default about `TRIANGLES` triangles.
-
-    Raises
-    ------
-    InputError
-        If the folds close the lumen, the tube bends into itself, or there would be too many triangles.
     """
     tube, key = Tube(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = {**kept("colon", key, lambda: _mesh(tube, edge_mm))}

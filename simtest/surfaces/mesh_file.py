@@ -60,11 +60,6 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
     faces : ndarray of int, shape (F, 3)
     repairs : Repairs
         What was repaired.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or no usable mesh; one line with the file, the value and what is allowed.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -276,13 +271,6 @@ def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] |
         mm.
     attributes : mapping, optional
         Numbers at the vertices by name, each of shape (V,), for PLY.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    SimtestError
-        If its disk is full.
     """
     import trimesh  # slow to import
 

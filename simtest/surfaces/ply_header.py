@@ -43,12 +43,6 @@ def check_ply(path: Path, size: int) -> tuple[int, int]:
     -------
     tuple of int
         Vertices and faces that the header announces.
-
-    Raises
-    ------
-    InputError
-        If the header is malformed, there is no vertex or face in it, there are more faces than allowed, or the file
-        ends before the announced ones.
     """
     where = str(path)
     kind, elements, start = read_header(path)

@@ -26,11 +26,6 @@ def read_mixed_polygons(path: Path) -> tuple[Array, IntArray] | None:
     tuple of ndarray, or None
         Vertices, shape (V, 3), and faces, shape (F, 3); None for text, and where all faces have like numbers of
         corners.
-
-    Raises
-    ------
-    InputError
-        If the file ends within its faces, or what stands before them has lists too.
     """
     kind, elements, start = read_header(path)
     if kind not in _BYTE_ORDERS:

@@ -22,13 +22,6 @@ def read_vtk(path: Path) -> tuple[Array, IntArray]:
     vertices : ndarray, shape (V, 3)
         In the file's unit.
     faces : ndarray of int, shape (F, 3)
-
-    Raises
-    ------
-    InputError
-        If the file is no such mesh, or VTK breaks down over it.
-    SimtestError
-        If memory does not hold it.
     """
     memory = MEMORY_BYTES + MEMORY_PER_BYTE * path.stat().st_size
     return call_apart(_triangles, path, memory, "VTK mesh", "damaged: VTK breaks down over its points or cells")

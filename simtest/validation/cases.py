@@ -110,13 +110,7 @@ class Case:
         return range(self.part * self.realisations, (self.part + 1) * self.realisations)
 
     def scene(self, experiment: Experiment, realisation: int) -> tuple[Scene, dict[str, float]]:
-        """Make the scene of a realisation; return it with the values drawn for it, by key path.
-
-        Raises
-        ------
-        InputError
-            If a swept or drawn value does not fit the schema.
-        """
+        """Make the scene of a realisation; return it with the values drawn for it, by key path."""
         # Drawn values.
         rng = generator(experiment.seed, experiment.name, self.name, realisation, Stage.SWEEP)
         drawn = {path: float(rng.uniform(d.low, d.high)) for path, d in self.random.items()}
@@ -166,14 +160,7 @@ class Case:
 
 
 def expand(experiment: Experiment) -> list[Case]:
-    """Return an experiment's cases, in the order of its groups.
-
-    Raises
-    ------
-    InputError
-        If a scene is missing or malformed, a swept value or an end of a drawn range does not fit, or two settings
-        share a name: found before anything is rendered.
-    """
+    """Return an experiment's cases, in the order of its groups."""
     check_effort(experiment)
     cases = [case for group in experiment.groups for case in _expand_group(experiment, group)]
     names: set[str] = set()

@@ -54,11 +54,6 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
     -------
     ndarray, shape (H, W)
         mm; NaN where the file holds none (0, negative or not finite).
-
-    Raises
-    ------
-    InputError
-        If the file is missing or of another kind, its channels differ, or an integer map has no scale.
     """
     if scale_mm is not None and not 1e-9 <= scale_mm <= FARTHEST_MM:
         raise InputError(f"--depth-scale {scale_mm:g}: must be 1e-9 to {FARTHEST_MM:g} mm")

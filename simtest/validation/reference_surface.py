@@ -117,11 +117,6 @@ def load_reference(
     """Read a reference: a mesh with its pose, or a map in the camera frame; None where no file is named.
 
     `map_format` names the data set whose map it is (`simtest.validation.references`); None: a plain depth map.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or malformed, a mesh has no pose, a pose no mesh, or sizes differ.
     """
     if path is None:
         if pose is not None:
@@ -158,11 +153,6 @@ def read_pose(path: Path) -> Array:
     ----------
     path : Path
         TOML with ``matrix``, 4 x 4 or 3 x 4, or with ``rotation``, 3 x 3, and ``translation_mm``.
-
-    Raises
-    ------
-    InputError
-        If a key is missing or malformed, or the 3 x 3 part is no rotation.
     """
     data = read_toml(path)
     where = str(path)

@@ -125,13 +125,6 @@ def run_experiment(
         returned as it is.
     command, variant, progress, engine
         See `simtest.validate`; by default this process does the work. The rows do not depend on the engine.
-
-    Raises
-    ------
-    InputError
-        If the experiment does not fit the schema, an estimator is unknown or the folder holds something else.
-    BackendError
-        If the rendering backend cannot be used.
     """
     return run_experiments([(experiment, folder)], command, variant, progress, engine)[0]
 

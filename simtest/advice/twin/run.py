@@ -143,14 +143,6 @@ def twin_picture(
         Called with frames rendered, frames in all, and what is done.
     organ : str, optional
         Whose relief and film the twins have (`simtest.advice.twin.tissue.NAMES`); default: any tissue's.
-
-    Raises
-    ------
-    InputError
-        If the picture, the calibration or the organ is malformed, the picture holds no usable highlight, or the bank
-        too few.
-    BackendError
-        If the rendering backend cannot be used.
     """
     started = time.process_time()
     if is_sequence(image):

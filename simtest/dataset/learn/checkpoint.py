@@ -64,13 +64,7 @@ def save_checkpoint(path: Path, network: nn.Module, optimiser: torch.optim.Optim
 
 
 def load_checkpoint(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer, made_of: dict[str, Any]) -> State:
-    """Read a checkpoint into a network and an optimiser; return its state.
-
-    Raises
-    ------
-    InputError
-        If the file is no checkpoint of this network, or one of another training.
-    """
+    """Read a checkpoint into a network and an optimiser; return its state."""
     tensors, state = _read(path)
     for key in sorted({*made_of, *state.made_of}):
         there, here = state.made_of.get(key), made_of.get(key)

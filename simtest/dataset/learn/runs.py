@@ -45,11 +45,6 @@ def run_training(training: Training, data: Path, out: Path, progress: Progress |
         model.onnx and its card, model.md.
     progress : callable, optional
         As in `simtest.dataset.learn.engine.train`. Whatever stops the training, the page shows the epochs done.
-
-    Raises
-    ------
-    InputError
-        If the task or the dataset cannot be used, or the folder holds another training.
     """
     task = load_task(training.task)
     about = origin_of(training, data)

@@ -54,11 +54,6 @@ def scored_frames(folder: Path | str) -> Iterator[ScoredFrame]:
     """Render the exported frames of a run or dataset again, in the order of its cases, or of its shards.
 
     A frame that stands for several realisations comes once for each.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no export, or one of another version, or a frame comes out otherwise than it was exported.
     """
     folder = Path(folder)
     record = read_record(folder)

@@ -202,13 +202,7 @@ def read_record(folder: Path) -> Record:
 
 
 def open_source(folder: Path, record: Record) -> Source:
-    """Return the run or dataset that a record is of, ready to be rendered again.
-
-    Raises
-    ------
-    InputError
-        If another version of simtest made it, or it has changed since.
-    """
+    """Return the run or dataset that a record is of, ready to be rendered again."""
     here = provenance.version()
     if record.version != here:
         raise InputError(

@@ -100,11 +100,6 @@ def score_table(
     -------
     Run
         With results.parquet, summary.json and gallery/; `simtest.report.write_report` makes its page.
-
-    Raises
-    ------
-    InputError
-        If the table is malformed, nothing was exported, or a frame comes out otherwise than it was exported.
     """
     started, clock = datetime.now(UTC), time.monotonic()
     method = table.stem if name is None else name

@@ -43,12 +43,6 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
     mapping
         Answers by estimator and frame. Rows whose status is missed are left out, as highlights without a row are; their
         estimator is there all the same.
-
-    Raises
-    ------
-    InputError
-        If the table cannot be read, lacks a column, or a row is malformed: the message names it, counted from 1 without
-        the header.
     """
     table = read_table(path)
     is_answer = _answered(table)

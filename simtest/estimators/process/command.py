@@ -114,11 +114,6 @@ def parse_core(text: str) -> CoreCommand:
 
     Arguments that name existing files become absolute. Relative ones are looked for in the current folder; those of a
     TOML file in that file's folder.
-
-    Raises
-    ------
-    InputError
-        If the file or the command is malformed, or the program is missing or cannot be run.
     """
     if text.startswith(PREFIX):
         arguments, files, name = _resolved(text, text.removeprefix(PREFIX), Path.cwd())

@@ -269,11 +269,6 @@ def kept_core(text: str) -> Core:
 
     One that was closed, as the cores of a run are at its end, greets anew: a module that its script imports may have
     changed.
-
-    Raises
-    ------
-    InputError
-        If the name is malformed, or the core does not start.
     """
     command = parse_core(text)
     signature = (os.getpid(), *command.signature())

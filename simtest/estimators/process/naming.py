@@ -24,13 +24,7 @@ def has_files(name: str) -> bool:
 
 
 def short_name(name: str) -> str:
-    """Return the short name of a core, or of an estimator with a network's file.
-
-    Raises
-    ------
-    InputError
-        If the name is malformed, or the short one is that of an installed estimator, for which it would be taken.
-    """
+    """Return the short name of a core, or of an estimator with a network's file."""
     model = parse_model(name)
     short = _parsed(name).name if model is None else model.short
     if short in ESTIMATORS.names():

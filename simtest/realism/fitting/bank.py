@@ -95,11 +95,6 @@ def make_bank(
         Radiances, and pictures of each.
     progress : callable, optional
         See `Progress`.
-
-    Raises
-    ------
-    InputError
-        If the folder holds another bank or cannot be written, or the recipe is malformed.
     """
     recipe = bank_recipe(dataset, size)
     _claim(recipe, folder, chains)

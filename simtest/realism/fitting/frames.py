@@ -53,11 +53,6 @@ class FrameMaker:
         The recipe; all its ranges are drawn.
     variant : str, optional
         Mitsuba variant.
-
-    Raises
-    ------
-    InputError
-        If the recipe is malformed (`Plan`).
     """
 
     def __init__(self, dataset: Dataset, variant: str | None = None) -> None:
@@ -68,13 +63,7 @@ class FrameMaker:
         self._anatomy: Anatomy | None = None
 
     def frames(self, index: int, chains: int) -> Iterator[DrawnFrame]:
-        """Render one radiance and yield its pictures, each by another draw of the sensor; the first is the sample's.
-
-        Raises
-        ------
-        InputError
-            If no draw of this number can be rendered.
-        """
+        """Render one radiance and yield its pictures, each by another draw of the sensor; the first is the sample's."""
         drawn = self.plan.draw(index)
         for attempt in range(1, TRIES + 1):
             try:

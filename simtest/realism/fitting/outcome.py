@@ -20,13 +20,7 @@ UNITS = {kind: unit for kind, _, unit in KNOWN}
 
 
 def write_fit(found: FittedRecipe, path: Path) -> tuple[Path, Path]:
-    """Write the recipe, and the report beside it with the suffix .json; return both paths.
-
-    Raises
-    ------
-    InputError
-        If they cannot be written.
-    """
+    """Write the recipe, and the report beside it with the suffix .json; return both paths."""
     report = path.with_suffix(".json")
     write_atomically(path, lambda part: part.write_text(recipe_toml(found.recipe), encoding="utf-8"))
     write_json(report, report_json(found))

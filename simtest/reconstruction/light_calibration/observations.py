@@ -117,11 +117,6 @@ def read_balls(
         Of the camera, with the response.
     circles : dict
         Rough outline of the ball by the picture's name, where it need not be searched.
-
-    Raises
-    ------
-    InputError
-        If a picture cannot be read, or has another size than the camera.
     """
     found = Views()
     camera = calibration.camera

@@ -113,13 +113,7 @@ def _first(kinds: tuple[tuple[str, Kind], ...], head: str, otherwise: Kind) -> K
 
 
 def read_cameras(path: str | Path) -> dict[str, Table]:
-    """Read all cameras of a file of another program, as tables of `CameraSpec` by id; TOML is read elsewhere.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, malformed, holds no camera, or a lens that simtest lacks.
-    """
+    """Read all cameras of a file of another program, as tables of `CameraSpec` by id; TOML is read elsewhere."""
     path, _ = split_id(path)
     kind = recognise(path)
     if path.is_dir():
@@ -155,13 +149,7 @@ def _readers() -> dict[str, Callable[[Path], dict[str, Table]]]:
 
 
 def read_table(path: str | Path) -> Table:
-    """Read a camera of a file of another program as the table of a `CameraSpec`; "FILE#ID" names one of several.
-
-    Raises
-    ------
-    InputError
-        As `read_cameras` does, and where a file holds several different cameras and none is named.
-    """
+    """Read a camera of a file of another program as the table of a `CameraSpec`; "FILE#ID" names one of several."""
     file, wanted = split_id(path)
     return chosen(read_cameras(file), wanted, str(file))
 
@@ -171,11 +159,6 @@ def read_poses(path: str | Path) -> Poses:
 
     Axes are OpenCV's: x right, y down, z forward. The unit of length is the file's: COLMAP's and NeRF's is arbitrary,
     Kalibr's is made mm.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed, or its format holds no poses.
     """
     path, _ = split_id(path)
     kind = recognise(path)

@@ -33,11 +33,6 @@ def read_matlab(path: Path) -> Table:
     The .mat file holds one struct, under any name, with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
     RadialDistortion and TangentialDistortion; or, of a fisheye, with MappingCoefficients, StretchMatrix,
     DistortionCenter and ImageSize.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, malformed, of version 7.3, or holds a cameraParameters object instead of a struct.
     """
     where, fields = str(path), read_struct(path)
     mask = mask_of_text(fields["ViewMask"], where) if "ViewMask" in fields else None

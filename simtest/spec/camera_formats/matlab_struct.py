@@ -28,15 +28,7 @@ MEMORY_BYTES = 1e9
 
 
 def read_struct(path: Path) -> Mapping[str, Any]:
-    """Read the fields of the one struct in a .mat file that is a calibration: numbers, text and nested lists.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, of version 7.3, or holds no struct of a camera, or several.
-    SimtestError
-        If memory does not hold it.
-    """
+    """Read the fields of the one struct in a .mat file that is a calibration: numbers, text and nested lists."""
     require_plain(path, "matlab_bytes", "a .mat file")
     breakdown = f"a damaged MATLAB file: SciPy breaks down over it; {HOW}"
     return call_apart(struct_of, path, MEMORY_BYTES, "MATLAB file", breakdown)

@@ -48,11 +48,6 @@ def scaramuzza_table(
         c, d, e of the matrix ((c, d), (e, 1)).
     where : str
         The file, for messages.
-
-    Raises
-    ------
-    InputError
-        If a0 is not positive.
     """
     a0, a2, a3, a4 = mapping
     if not a0 > 0:
@@ -73,11 +68,6 @@ def read_c3vd(path: Path) -> dict[str, Table]:
     """Read the parameters of C3VD: JSON, or lines ``key = value`` as in its config.ini.
 
     The published Python loader takes c, d, e as ((c, d), (e, 1)), which is the model's definition; so does this.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, or a parameter is missing.
     """
     where = str(path)
     text = read_text(path, "camera")
@@ -122,11 +112,6 @@ def read_ocamcalib(path: Path) -> dict[str, Table]:
     """Read calib_results.txt: both polynomials, centre, affine parameters, size.
 
     The direct polynomial, from pixels to directions, is the model; the inverse one, a fit to it, is only compared.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, its polynomial has more terms than a0, a2, a3, a4, or the two contradict each other.
     """
     where = str(path)
     rows = [line.split() for line in read_text(path, "camera").splitlines()]

@@ -46,13 +46,7 @@ def read_cameras(path: Path) -> dict[str, Table]:
 
 
 def read_opencv(path: Path) -> Table:
-    """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json) as the table of a `CameraSpec`.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, malformed, or holds a lens that simtest does not know.
-    """
+    """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json) as the table of a `CameraSpec`."""
     data, where = _parse(path), str(path)
     width, height = _size(data, where)
     # K, upper triangular

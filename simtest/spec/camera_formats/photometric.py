@@ -31,11 +31,6 @@ def read_photometric(path: Path) -> Tables:
     """Read a photometric calibration as tables of a calibration file: response, vignetting, emission, rig.
 
     Several lights must spread their light alike.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, or holds a model of another kind.
     """
     where, root = str(path), read_xml(path)
     tables: Tables = {}

@@ -50,13 +50,7 @@ GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read_cameras(path: Path) -> dict[str, Table]:
-    """Read the camera, or those of the frames where they have their own, by file_path.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, or its camera model is none of simtest's.
-    """
+    """Read the camera, or those of the frames where they have their own, by file_path."""
     data, where = read_json(path), str(path)
     frames = _frames(data, where)
     own = [frame for frame in frames if set(frame) & set(INTRINSICS)]
@@ -71,13 +65,7 @@ def read_cameras(path: Path) -> dict[str, Table]:
 
 
 def read_poses(path: Path) -> Poses:
-    """Read world_from_camera of the frames, by file_path, with OpenCV's camera axes, in the file's unit of length.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, or a frame has no pose.
-    """
+    """Read world_from_camera of the frames, by file_path, with OpenCV's camera axes, in the file's unit of length."""
     data, where = read_json(path), str(path)
     made: list[tuple[str, Array]] = []
     for i, frame in enumerate(_frames(data, where)):

@@ -50,11 +50,6 @@ def write_camera(camera: Camera, path: str | Path, format: str | None = None, po
     poses : list of (str, ndarray), optional
         Names of frames and their world_from_camera, shape (4, 4), OpenCV axes, mm. Lengths are written as they are,
         and both formats state mm.
-
-    Raises
-    ------
-    InputError
-        If format and suffix do not fit, the format cannot hold the camera or poses, or the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -48,11 +48,6 @@ def load_map_reference(path: Path, name: str, camera: Camera, scale_mm: float | 
     -------
     DepthReference
         Unit normals in the camera frame, and what a user must know of the maps.
-
-    Raises
-    ------
-    InputError
-        If the map is not of the format, the camera is of another size, or the scale is missing or not wanted.
     """
     form = map_format(name)
     _check_scale(path, name, form, scale_mm)

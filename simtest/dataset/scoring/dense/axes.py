@@ -68,13 +68,7 @@ class AxesEvidence:
         return ALL[int(np.argmax(self.mean))]
 
     def decide(self, what: str) -> str:
-        """Return the axes that fit best by a clear margin.
-
-        Raises
-        ------
-        InputError
-            If there is no normal, none fits, or the best cannot be told from the next; `what` names the maps.
-        """
+        """Return the axes that fit best by a clear margin."""
         if not self.cosines:
             raise InputError(
                 f"{what}: hold no normal: every pixel is NaN, 0, transparent or too long or short for a unit vector; "

@@ -41,13 +41,7 @@ class MapFile:
 
 
 def find_maps(folder: Path) -> list[MapFile]:
-    """Return the maps of a folder, and of its folders normal/ and depth/.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be read, holds none, or two of one frame and kind.
-    """
+    """Return the maps of a folder, and of its folders normal/ and depth/."""
     places: list[tuple[Path, Kind | None]] = [
         (folder, None),
         (folder / "normal", "normal"),
@@ -109,13 +103,7 @@ class RawMap:
 
 
 def read_map(one: MapFile, size: tuple[int, int]) -> RawMap:
-    """Read a map of a frame of a size, height and width.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is of another size or kind.
-    """
+    """Read a map of a frame of a size, height and width."""
     path = one.path
     values = read_values(path, "a map of normals or depths")
     if values.ndim == 3 and values.shape[1:] == size and values.shape[0] in (1, 3):
@@ -198,13 +186,7 @@ def length_error(vectors: Array) -> float:
 
 
 def decode_depth(raw: RawMap, unit_mm: float | None) -> Array:
-    """Return the depths of a map in mm, or in its own unit where that is not told; NaN where there is no answer.
-
-    Raises
-    ------
-    InputError
-        If integers have no unit.
-    """
+    """Return the depths of a map in mm, or in its own unit where that is not told; NaN where there is no answer."""
     if raw.is_encoded and unit_mm is None:
         raise InputError(
             f"{raw.path}: holds integers; --unit-mm must say how many mm one step is (1 where nobody knows; "

@@ -116,11 +116,6 @@ def score_frames(
     Conventions that nobody stated are those that fit the truth of all frames best. The frames are scored by those
     that fit the frames so far; where all of them together say otherwise, all are scored once more. `is_checked` says
     that the names of the method's maps were checked against the frames before.
-
-    Raises
-    ------
-    InputError
-        If a map cannot be read, no convention fits, or two fit alike.
     """
     options.check()
     options = method.options(options)
@@ -228,11 +223,6 @@ def score_maps(
         How the scoring was called.
     progress : callable, optional
         Called with the frames done, frames in all, and the frame's name.
-
-    Raises
-    ------
-    InputError
-        If a folder or a map cannot be read, no convention fits, or two fit alike.
     """
     from simtest.dataset.scoring.dense.from_folder import frame_names, frames_of
 
