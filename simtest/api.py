@@ -147,41 +147,11 @@ def sample_views(
     fps: float | None = None,
     labels: bool = False,
 ) -> "SampledViews":
-    """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path.
+    """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path (docs/howto/sequences.md).
 
-    At most ten viewpoints are tried for each view wanted: 0, 1, 2, ..., or, where ``surface.view`` is not auto, evenly
-    spread over the camera path. The folder gets views.json, with the poses and what was left out, a picture of each
-    view, sheet.png, which shows all of them, the poses in the files of other programs (transforms.json, colmap/), and
-    film.avi and trajectory.txt of a sequence.
-
-    Parameters
-    ----------
-    scene, settings, variant
-        As of `render`; the scene is one of an anatomy.
-    out : str or Path
-        Folder, made if need be.
-    count : int
-        Views wanted, 1 to 1000.
-    progress : callable, optional
-        Called with views found, views wanted, and what was tried.
-    along : tuple of float, optional
-        First and last share of the camera path: a sequence of views evenly spaced between them, none left out.
-    fps : float, optional
-        Frames a second of the sequence, 0.1 to 1000; default 25.
-    labels : bool
-        Whether to write the sequence's optical flow (flow_NNNN.npz, flow_sheet.png) and covisibility.npy.
-
-    Returns
-    -------
-    SampledViews
-
-    Raises
-    ------
-    InputError
-        If the scene is malformed or no anatomy's, `count` or `fps` is out of range, or `fps` or `labels` is given
-        without `along`.
-    BackendError
-        If the rendering backend cannot be used.
+    At most ten viewpoints are tried for each view wanted. `along` are the first and last share of the camera path: a
+    sequence of `count` views evenly spaced between them, at `fps` frames a second (default 25), with optical flow and
+    co-visibility where `labels`. The folder gets views.json, pictures, sheet.png, and the poses for other programs.
     """
     from simtest.runtime.locks import exclusive_folder
     from simtest.simulation.view_folder import sample_into
@@ -370,31 +340,7 @@ class Extras:
 def reconstruct_picture(
     image: Path, out: Path, options: "Options", extras: Extras | None = None
 ) -> tuple["PictureRecord", list[Path]]:
-    """Reconstruct the normals of a picture and write them.
-
-    Parameters
-    ----------
-    image : Path
-        The picture.
-    out : Path
-        Folder, made if need be.
-    options : Options
-        Camera, detector and estimators.
-    extras : Extras, optional
-        Reference surface and depths.
-
-    Returns
-    -------
-    record : PictureRecord
-        The specularities found, with their normals.
-    files : list of Path
-        normals.json, normals.csv, normals.ply, overlay.png, and the others.
-
-    Raises
-    ------
-    InputError
-        If the input is malformed or the folder cannot be written.
-    """
+    """Reconstruct the normals of a picture and write them; return what was found, and the files."""
     from simtest.runtime.locks import exclusive_folder
 
     with exclusive_folder(out):

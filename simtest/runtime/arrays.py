@@ -16,7 +16,7 @@ import time
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -159,8 +159,6 @@ def _shrinks(data: memoryview) -> bool:
 FOLDER_VARIABLE = "SIMTEST_CACHE"
 """Environment variable: the folder in which arrays are kept, or "off"."""
 
-OFF = "off"
-
 MAX_BYTES = 1_000_000_000
 """Of all files together."""
 
@@ -172,16 +170,8 @@ SOURCES = ("surfaces", "geometry", "spec", "runtime/seeds.py")
 
 LIBRARIES = ("numpy", "scipy", "scikit-image")
 
-_unkept: ContextVar[Container[str]] = ContextVar("unkept", default=())
-"""Kinds of arrays that are read but not kept."""
-
-
-class _All:
-    """Holds every kind."""
-
-    def __contains__(self, kind: object) -> bool:
-        return True
-
+_unkept: ContextVar[tuple[str, ...]] = ContextVar("unkept", default=())
+"""How the kinds begin of which nothing is kept."""
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -207,7 +197,7 @@ def kept(kind: str, key: str, make: Callable[[], Arrays]) -> Arrays:
         arrays = make()
     for warning in caught:
         warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-    if not caught and kind not in _unkept.get():
+    if not caught and not kind.startswith(_unkept.get()):
         _write(path, arrays)
     return arrays
 
@@ -215,7 +205,7 @@ def kept(kind: str, key: str, make: Callable[[], Arrays]) -> Arrays:
 @contextlib.contextmanager
 def only_reading(*kinds: str) -> Iterator[None]:
     """Keep nothing more of some kinds, by default of all: for what is made once and never again."""
-    before = _unkept.set(kinds or _All())
+    before = _unkept.set(kinds or ("",))
     try:
         yield
     finally:
@@ -225,7 +215,7 @@ def only_reading(*kinds: str) -> Iterator[None]:
 def cache_folder() -> Path | None:
     """Return the folder of kept arrays; None where the user wants none."""
     chosen = os.environ.get(FOLDER_VARIABLE, "")
-    if chosen.lower() == OFF:
+    if chosen.lower() == "off":
         return None
     if chosen:
         return Path(chosen).expanduser()
@@ -255,7 +245,8 @@ def _read(path: Path) -> Arrays | None:
             arrays = {name: file[name] for name in file.files}
         # The time of change is that of the last use.
         os.utime(path)
-    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+    except Exception:
+        # What cannot be read is made anew, whatever is wrong with it.
         return None
     return arrays
 
