@@ -12,7 +12,7 @@ GONE = "0.3.0"
 
 MODULES = {
     "simtest.colour": "simtest.reconstruction",
-    "simtest.engines": "simtest.runtime.engines",
+    "simtest.engines": "simtest.runtime.processes",
     "simtest.estimators.base": "simtest.estimators.protocol",
     "simtest.estimators.peak": "simtest.estimators.extrapolation",
     "simtest.gate.records": "simtest.nightly.records",

@@ -12,7 +12,6 @@ from simtest.bench.suite import SUITES, Suite, digest_of, layout_of
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.files import JsonObject, require_plain, write_json
-from simtest.runtime.resources import shown
 from simtest.spec.spec_model import validate
 
 CERTIFICATE = "certificate.json"
@@ -81,29 +80,23 @@ def write_certificate(folder: Path, content: JsonObject) -> Path:
 
 
 def read_certificate(path: Path) -> Certificate:
-    """Read a certificate.
-
-    Raises
-    ------
-    InputError
-        If it is no certificate, was altered, lacks a figure, or is of another version of the format.
-    """
+    """Read a certificate."""
     if path.is_dir():
         path = path / CERTIFICATE
+    require_plain(path, "record_bytes", "a certificate")
     try:
-        told = _parsed(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise InputError(f"{shown(path)}: cannot be read as a certificate ({why})") from error
+        told = _parsed(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read as a certificate ({error})") from error
     if not isinstance(told, dict) or told.get("kind") != KIND:
-        raise InputError(f"{shown(path)}: is no certificate; its kind must be {KIND!r}")
+        raise InputError(f"{path}: is no certificate; its kind must be {KIND!r}")
     if told.get("format") != FORMAT:
-        raise InputError(f"{shown(path)}: format = {shown(told.get('format'), 20)}; this release reads {FORMAT}")
+        raise InputError(f"{path}: format = {told.get('format')!s:.20}; this release reads {FORMAT}")
     stated = told.pop(OF_CERTIFICATE, None)
     if missing := sorted(_KEYS - told.keys()):
-        raise InputError(f"{shown(path)}: has no key {missing[0]}; a certificate has {', '.join(sorted(_KEYS))}")
+        raise InputError(f"{path}: has no key {missing[0]}; a certificate has {', '.join(sorted(_KEYS))}")
     if not isinstance(stated, str) or stated != digest_of(told):
-        raise InputError(f"{shown(path)}: was altered: its content does not have the hash that it states")
+        raise InputError(f"{path}: was altered: its content does not have the hash that it states")
     validate(CertificateForm, told, str(path))
     return Certificate(path, told, stated)
 
@@ -118,7 +111,7 @@ def _parsed(text: str) -> Any:
 
     def finite(number: str) -> float:
         if not math.isfinite(value := float(number)):
-            raise ValueError(f"{shown(number, 20)}: must be a finite number")
+            raise ValueError(f"{number}: must be a finite number")
         return value
 
     told = json.loads(text, object_pairs_hook=once, parse_float=finite, parse_constant=finite)
@@ -132,22 +125,18 @@ def check_suite(certificate: Certificate, suite: Suite) -> None:
     told = certificate.content["suite"]
     if told.get("version") != suite.version:
         own = SUITES.get(suite.version, suite.version)
-        raise InputError(
-            f"{shown(certificate.path)}: is of version {shown(told.get('version'), 20)!r}; must be of {own}"
-        )
+        raise InputError(f"{certificate.path}: is of version {told.get('version')!r:.20}; must be of {own}")
     for part in certificate.parts:
         if part not in {each.name for each in suite.spec.parts}:
-            raise InputError(f"{shown(certificate.path)}: part {shown(part, 60)!r} is none of {SUITES[suite.version]}")
+            raise InputError(f"{certificate.path}: part {part!r} is none of {SUITES[suite.version]}")
     stated, frozen = certificate.content["cases"], cases_of(suite, certificate.parts)
     for name in (*stated, *frozen):
         if name not in frozen or stated.get(name) != frozen[name]:
-            raise InputError(
-                f"{shown(certificate.path)}: case {shown(name, 60)} is not that of {SUITES[suite.version]}"
-            )
+            raise InputError(f"{certificate.path}: case {name} is not that of {SUITES[suite.version]}")
     if told.get("sha256") != suite.digest:
-        raise InputError(f"{shown(certificate.path)}: its suite's hash is not that of {SUITES[suite.version]}")
+        raise InputError(f"{certificate.path}: its suite's hash is not that of {SUITES[suite.version]}")
     for part, figures in certificate.parts.items():
         layout = {case: scenes for case, (scenes, _) in layout_of(suite, part).items()}
         if {case: len(held) for case, held in figures["scenes"].items()} != layout:
             wanted = ", ".join(f"{count} of {case}" for case, count in layout.items())
-            raise InputError(f"{shown(certificate.path)}: parts.{part}.scenes: must be {wanted}")
+            raise InputError(f"{certificate.path}: parts.{part}.scenes: must be {wanted}")

@@ -12,7 +12,7 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process.command import INTERPRETERS, parse_core
 from simtest.estimators.process.naming import core_hashes, core_records, has_files, short_name
 from simtest.runtime.files import Json, JsonObject
-from simtest.runtime.model_names import parse_model
+from simtest.runtime.resources import parse_model
 
 
 def load_core(text: str) -> tuple[str, AnyEstimator]:
@@ -27,11 +27,6 @@ def core_record(text: str) -> JsonObject:
     `sha256` is of the core's own files and of the words of its command. An interpreter or another program of the
     machine, such as docker, is no part of it, since it differs from machine to machine: it stands under `program`.
     Modules that a script loads are seen only where the command or the TOML file (`core.files`) names them.
-
-    Raises
-    ------
-    InputError
-        If it is unknown or cannot be started.
     """
     name, _ = load_core(text)
     if not has_files(text):

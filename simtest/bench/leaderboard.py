@@ -14,7 +14,6 @@ from simtest.errors import InputError
 from simtest.pages.html import environment
 from simtest.runtime import provenance
 from simtest.runtime.files import JsonObject, make_folder, write_atomically
-from simtest.runtime.resources import shown
 
 PAGE = "index.html"
 MOST_CERTIFICATES = 1000
@@ -92,18 +91,12 @@ def _name(certificate: Certificate) -> str:
 
 
 def read_entries(folder: Path, suite: Suite) -> Board:
-    """Read the certificates below a folder and rank them.
-
-    Raises
-    ------
-    InputError
-        If there are none, or one was altered, is malformed, or is of another version.
-    """
+    """Read the certificates below a folder and rank them."""
     if not folder.is_dir():
-        raise InputError(f"{shown(folder)}: must be a folder that holds certificates")
+        raise InputError(f"{folder}: must be a folder that holds certificates")
     files = sorted(file for file in folder.rglob("*.json") if _is_certificate(file))
     if not files or len(files) > MOST_CERTIFICATES:
-        raise InputError(f"{shown(folder)}: holds {len(files)} certificates; must be 1 to {MOST_CERTIFICATES}")
+        raise InputError(f"{folder}: holds {len(files)} certificates; must be 1 to {MOST_CERTIFICATES}")
     certificates = [read_certificate(file) for file in files]
     for certificate in certificates:
         check_suite(certificate, suite)

@@ -14,8 +14,8 @@ from simtest.dataset.scoring.dense.scorer import ANGLE, NORMAL, depth_source
 from simtest.dataset.scoring.record import read_record
 from simtest.errors import InputError
 from simtest.runtime import provenance
-from simtest.runtime.engines import Engine, make_engine
 from simtest.runtime.files import Json, JsonObject
+from simtest.runtime.processes import Engine, make_engine
 from simtest.validation.runner import Progress, run_experiments
 
 PART = "dense"
@@ -36,13 +36,7 @@ OF_RUN = "brightest_point"
 
 
 def export_frames(suite: Suite, folder: Path, engine: Engine | None = None, progress: Progress | None = None) -> Path:
-    """Write the frames of the dense part without their truth; return their folder.
-
-    Raises
-    ------
-    InputError
-        If the folder holds something else.
-    """
+    """Write the frames of the dense part without their truth; return their folder."""
     experiment = experiment_of(suite, PART, OF_RUN)
     check_exportable(experiment)
     chosen = engine or make_engine()

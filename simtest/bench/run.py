@@ -13,9 +13,8 @@ from simtest.bench.ranking import CAP_DEG
 from simtest.bench.scores import score_part
 from simtest.bench.suite import Suite, layout_of
 from simtest.errors import InputError
-from simtest.runtime.engines import Engine
 from simtest.runtime.files import JsonObject, make_folder
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine
 from simtest.validation.runner import Progress, run_experiments
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ def chosen_parts(suite: Suite, wanted: Sequence[str] | None) -> list[str]:
         if suite.part(name).kind != HIGHLIGHTS:
             raise InputError(f"--part {name}: is scored by maps of normals or depths; give --maps in place of --core")
         if list(wanted).count(name) > 1:
-            raise InputError(f"--part {shown(name, 60)}: named twice")
+            raise InputError(f"--part {name}: named twice")
     return [part.name for part in suite.spec.parts if part.name in wanted]
 
 
@@ -83,11 +82,6 @@ def run_bench(
         Default all that are scored by highlights.
     engine, progress, variant
         See `simtest.validate`. The figures do not depend on the engine.
-
-    Raises
-    ------
-    InputError
-        If a part or the core is unknown, or the folder holds something else.
     """
     check_core(core)
     chosen = chosen_parts(suite, parts)

@@ -14,9 +14,10 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
+from simtest.runtime.boundary import close_names
 from simtest.runtime.files import Json
 from simtest.runtime.provenance import file_hash
-from simtest.runtime.resources import close_names, data_root, shown
+from simtest.runtime.resources import data_root
 from simtest.spec import AnatomySurface, Scene, read_toml, scene_from_dict
 from simtest.spec.spec_model import Name, Spec, load
 from simtest.surfaces.recipe import load_recipe
@@ -144,7 +145,7 @@ class Suite:
                 return part
         names = [part.name for part in self.spec.parts]
         meant = "".join(f" (did you mean {close}?)" for close in close_names(name, names))
-        raise InputError(f"--part {shown(name, 60)}: unknown; allowed: {', '.join(names)}{meant}")
+        raise InputError(f"--part {name}: unknown; allowed: {', '.join(names)}{meant}")
 
     def of_part(self, name: str) -> list[FrozenCase]:
         """Return the cases of a part."""
@@ -164,7 +165,7 @@ def digest_of(value: Json) -> str:
 def suite_folder(version: str) -> Path:
     """Return the folder of a shipped suite; raise `InputError` for an unknown version."""
     if version not in SUITES:
-        raise InputError(f"suite {shown(version, 40)!r}: unknown; allowed: {', '.join(SUITES)}")
+        raise InputError(f"suite {version!r}: unknown; allowed: {', '.join(SUITES)}")
     return data_root("scenes") / "bench" / version
 
 
@@ -187,20 +188,14 @@ def read_suite(folder: Path) -> Suite:
 
 
 def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
-    """Read a shipped suite and check it against its pinned hashes.
-
-    Raises
-    ------
-    InputError
-        If the version is unknown, a file is malformed, or a case is not the frozen one.
-    """
+    """Read a shipped suite and check it against its pinned hashes."""
     folder = folder or suite_folder(version)
     suite = read_suite(folder)
     try:
         pinned = json.loads((folder / HASHES).read_text(encoding="utf-8"))
         told, of_suite = dict(pinned["cases"]), str(pinned["suite"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{shown(folder / HASHES)}: cannot be read as the pinned hashes ({error})") from error
+        raise InputError(f"{folder / HASHES}: cannot be read as the pinned hashes ({error})") from error
     for name, digest in suite.hashes.items():
         if told.get(name) != digest:
             raise InputError(
@@ -208,7 +203,7 @@ def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
                 f"{str(told.get(name))[:12]}; a changed case must be a new version"
             )
     if suite.digest != of_suite or set(told) != set(suite.hashes):
-        raise InputError(f"{shown(folder / SUITE)}: parts, seed or list of cases are not those pinned in {HASHES}")
+        raise InputError(f"{folder / SUITE}: parts, seed or list of cases are not those pinned in {HASHES}")
     return suite
 
 
@@ -264,7 +259,7 @@ def unfrozen_keys(case: FrozenCase) -> list[str]:
     frozen = _flat(case.scene)
     for path, value in frozen.items():
         if now.get(path) != value:
-            raise InputError(f"{shown(case.file)}: {path} = {value!r} is read as {now.get(path)!r}")
+            raise InputError(f"{case.file}: {path} = {value!r} is read as {now.get(path)!r}")
     return sorted(now.keys() - frozen.keys())
 
 

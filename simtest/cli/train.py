@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from simtest.cli.options import AsJson, Seed, Settings, named_path
+from simtest.cli.common import AsJson, Seed, Settings, named_path
 
 
 def train(
@@ -27,7 +27,7 @@ def train(
     data : Path
         Folder of the dataset.
     """
-    from simtest.cli.printing import print_files
+    from simtest.cli.common import print_files
     from simtest.cli.progress import progress_bar
     from simtest.dataset.learn.training import load_training
     from simtest.spec import parse_settings

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from simtest.calibration.calibration import brightest_channel
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, ViewMask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
 
 WORKING_PX = 480
 """Longer side of the picture in which the border is searched."""

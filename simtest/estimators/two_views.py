@@ -189,11 +189,6 @@ def rank_by_motion(
         Relative standard deviation of the first picture's abs(1 + d k), > 0.
     pose_error : PoseError
         Of the motion.
-
-    Raises
-    ------
-    InputError
-        If the motion is not rigid.
     """
     T = rigid(second_from_first, "second_from_first")
     return rank_by_motions(first, [MovedView([second], T, pose_error)], priors, gain_sd)
@@ -215,11 +210,6 @@ def rank_by_motions(
     views : sequence of MovedView
         Those without an estimate, and those too far off for the patch, are passed over. Where none is left a Failure
         ``no_estimate`` or ``undecided``.
-
-    Raises
-    ------
-    InputError
-        If a motion is not rigid.
     """
     if first.curvature is None or first.curvature.hypotheses is None or priors.distance_mm is None:
         return Failure(Reason.NOT_KNOWN, "needs curvature hypotheses of the first picture, and its distance")

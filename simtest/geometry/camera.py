@@ -11,8 +11,7 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
 from simtest.geometry.lenses import BrownConrady, Distortion, with_radial_error
-from simtest.runtime.arrays import Array, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Mask, short_repr
 
 FOLD_GRID = 33
 """Points along each side of the image at which a lens is checked for a fold."""

@@ -28,8 +28,7 @@ from simtest.nightly.storage import (
     load_run,
     save_run,
 )
-from simtest.runtime.files import require_plain
-from simtest.runtime.resources import shown
+from simtest.runtime.files import read_json
 from simtest.validation.results_table import SCHEMA
 
 LOG = "log.jsonl"
@@ -46,14 +45,7 @@ NEEDED = (*CELL, "realisation", *OLDEST_COLUMNS)
 
 
 def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
-    """Read the baseline of a profile, with `reason` and `accepted` in its record; None where there is none.
-
-    Raises
-    ------
-    InputError
-        If a file of it is missing or damaged, lacks what `simtest.nightly.gate.compare` reads, or is another profile's;
-        the message names it.
-    """
+    """Read the baseline of a profile, with `reason` and `accepted` in its record; None where there is none."""
     # Without a lock: the folder is kept in git, and whoever reads it writes nothing there.
     folder = current(reports.baseline(profile))
     if not folder.is_dir():
@@ -61,7 +53,7 @@ def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
     run = load_run(folder, BASELINE_ROWS)
     if run.record.profile != profile:
         raise InputError(
-            f"{shown(folder / RUN_FILE)}: profile = {shown(run.record.profile)}; the baseline of this night must be "
+            f"{folder / RUN_FILE}: profile = {run.record.profile}; the baseline of this night must be "
             f"of the profile {profile}"
         )
     rows = whole(run.rows, folder / BASELINE_ROWS)
@@ -79,13 +71,13 @@ def log_note(reports: Reports, profile: str) -> str | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        return f"{shown(path)}: cannot be read ({error.strerror})."
+        return f"{path}: cannot be read ({error.strerror})."
     broken = [number for number, line in enumerate(lines, 1) if not _is_entry(line)]
     if not broken:
         return None
     more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
     return (
-        f"{shown(path)}: damaged (line {broken[0]}{more} of {len(lines)} is no entry; cut off?); the rest is kept, "
+        f"{path}: damaged (line {broken[0]}{more} of {len(lines)} is no entry; cut off?); the rest is kept, "
         "the baseline itself is sound."
     )
 
@@ -104,13 +96,6 @@ def accept(reports: Reports, profile: str, reason: str) -> RunRecord:
     -------
     RunRecord
         The baseline's.
-
-    Raises
-    ------
-    InputError
-        If there is no last run, it is damaged, or no reason is given.
-    SimtestError
-        If the disk is full, or may not be written.
     """
     reason = " ".join(reason.split())
     if not reason or len(reason) > MAX_REASON:
@@ -123,12 +108,12 @@ def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
     source, target = reports.latest(profile), reports.baseline(profile)
     # Nothing is made where there never was a night.
     if not source.parent.is_dir():
-        raise InputError(f"{shown(source)}: no night of the profile {profile}; run simtest nightly first")
+        raise InputError(f"{source}: no night of the profile {profile}; run simtest nightly first")
     reports.make()
     # Read tonight's run under its lock, so that no other run replaces it meanwhile.
     with exclusive_replacement(source):
         if not source.is_dir():
-            raise InputError(f"{shown(source)}: no night of the profile {profile}; run simtest nightly first")
+            raise InputError(f"{source}: no night of the profile {profile}; run simtest nightly first")
         run = load_run(source, LATEST_ROWS)
     now = datetime.now(UTC)
     record = run.record.model_copy(update={"reason": reason, "accepted": now.isoformat(timespec="seconds")})
@@ -159,9 +144,7 @@ def _end_line(log: Path) -> None:
 def _replaced(reports: Reports, profile: str) -> str | None:
     """Return the id of the run that was the baseline, if its record can still be read."""
     try:
-        found = json.loads(
-            require_plain(reports.baseline(profile) / RUN_FILE, "record_bytes").read_text(encoding="utf-8")
-        )
+        found = read_json(reports.baseline(profile) / RUN_FILE)
         return str(found["id"])
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -15,8 +15,7 @@ from simtest.nightly.gate.figures import setting_figures
 from simtest.nightly.records import NightlyRun, RunRecord
 from simtest.rendering import backend
 from simtest.runtime import provenance
-from simtest.runtime.engines import make_engine
-from simtest.runtime.engines.engine import Engine
+from simtest.runtime.processes import Engine, make_engine
 from simtest.spec import Experiment, Profile, experiments_of
 from simtest.validation.cases import Case, expand
 from simtest.validation.fingerprints import definition
@@ -67,11 +66,6 @@ def measure_run(
         How.
     planned : tuple, optional
         What `plan_run` returned, where it was asked before.
-
-    Raises
-    ------
-    SimtestError
-        If an experiment is malformed or cannot be run, or nothing was measured.
     """
     started, clock = datetime.now(UTC), time.monotonic()
     # Asked at the start: the checkout may have moved on before the run ends.

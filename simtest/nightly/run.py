@@ -33,14 +33,7 @@ class Outcome:
 
 
 def run_nightly(profile: Profile, reports: Reports, options: RunOptions = DEFAULTS) -> Outcome:
-    """Run a profile, compare it with the baseline, keep it in the history and publish its page.
-
-    Raises
-    ------
-    SimtestError
-        If the run could not be made: bad input, a damaged baseline, no rendering backend, no space on the disk. What
-        earlier runs wrote is as it was.
-    """
+    """Run a profile, compare it with the baseline, keep it in the history and publish its page."""
     # Before any folder is touched.
     planned = plan_run(profile)
     left = "what earlier nights wrote is as it was"

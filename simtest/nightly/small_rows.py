@@ -7,7 +7,6 @@ import polars as pl
 
 from simtest.errors import InputError
 from simtest.nightly.gate.quantities import OLDEST_COLUMNS, OPTIONAL_COLUMNS, RESULT_COLUMNS
-from simtest.runtime.resources import shown
 from simtest.validation.results_table import SCHEMA
 
 _TYPES = {name: SCHEMA[name] for name in RESULT_COLUMNS if name not in OLDEST_COLUMNS} | OPTIONAL_COLUMNS
@@ -42,11 +41,6 @@ def whole(rows: pl.DataFrame, path: Path) -> pl.DataFrame:
     """Return the rows of a baseline in double precision, errors restored; `path` is their file, for messages.
 
     Baselines of older versions, which hold the errors themselves, are read too.
-
-    Raises
-    ------
-    InputError
-        If a column is of another type than `small` gives it.
     """
     for name in NEAR_REFERENCE:
         held = name + _BITS
@@ -55,7 +49,7 @@ def whole(rows: pl.DataFrame, path: Path) -> pl.DataFrame:
         types = {column: rows.schema.get(column) for column in (held, REFERENCE)}
         if types != {held: pl.UInt32(), REFERENCE: pl.Float64()}:
             told = ", ".join(f"column {column} is of type {kind}" for column, kind in types.items())
-            raise InputError(f"{shown(path)}: damaged ({told}; must be UInt32 and Float64)")
+            raise InputError(f"{path}: damaged ({told}; must be UInt32 and Float64)")
         bits = rows[held].fill_null(0).to_numpy() ^ _bits(rows[REFERENCE])
         restored = pl.Series(name, bits.view(np.float32))
         restored = pl.select(pl.when(rows[held].is_not_null()).then(restored)).to_series()

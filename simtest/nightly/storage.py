@@ -1,7 +1,6 @@
 """A run as files: the rows, the figures, and the run's record with their hashes."""
 
 import contextlib
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,10 +9,9 @@ import polars as pl
 
 from simtest.errors import InputError, SimtestError
 from simtest.nightly.records import FIGURES, NightlyRun, RunRecord
-from simtest.runtime.files import require_plain, sync_folder, write_atomically, write_json
-from simtest.runtime.machine_errors import disk_problem
+from simtest.runtime.boundary import explain
+from simtest.runtime.files import read_json, sync_folder, write_atomically, write_json
 from simtest.runtime.provenance import file_hash
-from simtest.runtime.resources import shown
 
 FIGURES_FILE, RUN_FILE = "figures.parquet", "run.json"
 LATEST_ROWS, BASELINE_ROWS = "rows.parquet", "night.parquet"
@@ -35,10 +33,10 @@ def disk_errors_in_one_line(root: Path, what: str, left: str) -> Iterator[None]:
     except (OSError, pl.exceptions.PolarsError, SimtestError) as error:
         # A full disk under an experiment's scratch folder is told by the name of that; the user gave the reports'.
         cause = error.__cause__ if type(error) is SimtestError else error
-        why = None if cause is None or isinstance(cause, SimtestError) else disk_problem(cause, root)
+        why = None if cause is None or isinstance(cause, SimtestError) else explain(cause)
         if why is None:
             raise
-        raise SimtestError(f"--reports {shown(root)}: {what} ({why}); {left}") from error
+        raise SimtestError(f"--reports {root}: {what} ({why}); {left}") from error
 
 
 def save_run(folder: Path, run: NightlyRun, rows_file: str, smallest: bool = False) -> None:
@@ -54,13 +52,7 @@ def save_run(folder: Path, run: NightlyRun, rows_file: str, smallest: bool = Fal
 
 
 def load_run(folder: Path, rows_file: str) -> NightlyRun:
-    """Read a run.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, damaged, or not the one that was written; the message names it.
-    """
+    """Read a run."""
     record, hashes = _record(folder / RUN_FILE)
     # A table of another run has another hash.
     rows, figures = (_table(folder / name, hashes) for name in (rows_file, FIGURES_FILE))
@@ -73,19 +65,14 @@ def check_columns(path: Path, table: pl.DataFrame, schema: Mapping[str, pl.DataT
     """Raise `InputError`, with file and column, where a table lacks a column or holds one of another type."""
     for name, dtype in schema.items():
         if name not in table.columns:
-            raise InputError(f"{shown(path)}: damaged (no column {name})")
+            raise InputError(f"{path}: damaged (no column {name})")
         if table.schema[name] != dtype:
-            raise InputError(f"{shown(path)}: damaged (column {name} is of type {table.schema[name]}, not {dtype})")
+            raise InputError(f"{path}: damaged (column {name} is of type {table.schema[name]}, not {dtype})")
 
 
 def _record(path: Path) -> tuple[RunRecord, dict[str, str]]:
     """Read a run's record, and the hashes of its tables by file name."""
-    try:
-        data = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{shown(path)}: damaged (not JSON: {error})") from error
+    data = read_json(path, "a run's record")
     try:
         hashes = data.pop("files", None)
         record = RunRecord.model_validate(data)
@@ -93,9 +80,9 @@ def _record(path: Path) -> tuple[RunRecord, dict[str, str]]:
     except (AttributeError, TypeError, KeyError, ValueError):
         sound = False
     if not sound:
-        raise InputError(f"{shown(path)}: damaged (no record of a night, with id, profile and started)")
+        raise InputError(f"{path}: damaged (no record of a night, with id, profile and started)")
     if not isinstance(hashes, dict):
-        raise InputError(f"{shown(path)}: damaged (no hashes under files)")
+        raise InputError(f"{path}: damaged (no hashes under files)")
     return record, hashes
 
 
@@ -104,8 +91,6 @@ def _table(path: Path, hashes: Mapping[str, str]) -> pl.DataFrame:
         same = file_hash(path) == hashes.get(path.name)
         if same:
             return pl.read_parquet(path, memory_map=False)
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
     except pl.exceptions.PolarsError as error:
-        raise InputError(f"{shown(path)}: damaged ({str(error).splitlines()[0]})") from error
-    raise InputError(f"{shown(path)}: damaged, or not of the same night as {RUN_FILE} (another SHA-256)")
+        raise InputError(f"{path}: damaged ({str(error).splitlines()[0]})") from error
+    raise InputError(f"{path}: damaged, or not of the same night as {RUN_FILE} (another SHA-256)")

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import PydanticCustomError
 
 from simtest.errors import InputError
-from simtest.runtime.resources import close_names, shown, suggestion
+from simtest.runtime.boundary import close_names, suggestion
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -113,7 +113,7 @@ def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
         ]  # fmt: skip
         errors = sorted(errors, key=lambda e: _is_missing_by_typo(e, errors))
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise InputError(f"{shown(where)}: {_describe(errors[0], model, data)}{more}") from None
+        raise InputError(f"{where}: {_describe(errors[0], model, data)}{more}") from None
 
 
 def _is_missing_by_typo(error: Any, errors: list[Any]) -> bool:
@@ -128,7 +128,7 @@ def _is_missing_by_typo(error: Any, errors: list[Any]) -> bool:
 def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> str:
     """Return one of pydantic's errors as text: key path, value, and what is allowed."""
     kind, value = error["type"], error.get("input")
-    location = [shown(part, 60) for part in _without_tags(error["loc"], data, kind == "missing")]
+    location = [str(part) or "''" for part in _without_tags(error["loc"], data, kind == "missing")]
     # our own error, which names the field itself
     if kind == "coerced":
         return f"{'.'.join([*location, error['ctx']['field']])} = {_short(error['ctx']['got'])}: {error['msg']}"

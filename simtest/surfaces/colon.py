@@ -8,8 +8,7 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import AnyArray, Array, IntArray
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
 from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
 from simtest.surfaces.cutting import halve, off_between, rough_edges
 from simtest.surfaces.mesh_geometry import area_vectors, face_edges
@@ -98,11 +97,6 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
     recipe : ColonRecipe
     edge_mm : float, optional
         Side of the mesh's cells on the bare tube, mm; default about `TRIANGLES` triangles.
-
-    Raises
-    ------
-    InputError
-        If the folds close the lumen, the tube bends into itself, or there would be too many triangles.
     """
     tube, key = Tube(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = {**kept("colon", key, lambda: _mesh(tube, edge_mm))}

@@ -68,13 +68,7 @@ def needed_edge(distance_mm: float, concentration: float, k_min: Array, k_max: A
 
 
 def concentration(exponent: float | None, alpha: float | None) -> float:
-    """Return c of a lobe from a Phong exponent or a GGX roughness; by default that of `DEFAULT_EXPONENT`.
-
-    Raises
-    ------
-    InputError
-        If both are given, or one is out of range.
-    """
+    """Return c of a lobe from a Phong exponent or a GGX roughness; by default that of `DEFAULT_EXPONENT`."""
     if exponent is not None and alpha is not None:
         raise InputError("--exponent and --roughness: only one of them may be given")
     if alpha is not None:

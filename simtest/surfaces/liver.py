@@ -20,8 +20,7 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import Array, IntArray, kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
 from simtest.surfaces.cutting import halve, rough_edges
@@ -250,11 +249,6 @@ def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
     edge_mm : float, optional
         Spacing of the marching cubes and about the length of the edges, mm; default `GRID_MM`, with shorter edges
         where normals between the vertices would be wrong by more than `MAX_NORMAL_ERROR_DEG`.
-
-    Raises
-    ------
-    InputError
-        If the recipe gives no body, or one too large for the grid.
     """
     body, key = Body(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = kept("liver", key, lambda: vars(_mesh(body, edge_mm)))

@@ -187,11 +187,6 @@ def check_mesh(path: str | Path, distance_mm: float | None, concentration: float
         c of the lobe (`simtest.surfaces.fineness`).
     kind : {"auto", "lumen", "organ"}
         Which side the camera is on.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or no usable mesh.
     """
     # size, unit and side, after the repairs
     vertices, faces, repairs = read_mesh(path)

@@ -11,10 +11,7 @@ import numpy as np
 
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.files import write_atomically
-from simtest.runtime.limits import check_file, check_limit, limit
-from simtest.runtime.machine_errors import cannot_write, write_error
-from simtest.runtime.resources import shown
+from simtest.runtime.files import check_limit, limit, require_plain, write_atomically
 from simtest.surfaces.model import TriangleMesh
 from simtest.surfaces.ply_header import check_ply
 from simtest.surfaces.ply_polygons import read_mixed_polygons
@@ -63,16 +60,11 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
     faces : ndarray of int, shape (F, 3)
     repairs : Repairs
         What was repaired.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or no usable mesh; one line with the file, the value and what is allowed.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise InputError(f"{shown(path)}: unknown suffix {path.suffix!r}; allowed: {', '.join(MESH_SUFFIXES)}")
+        raise InputError(f"{path}: unknown suffix {path.suffix!r}; allowed: {', '.join(MESH_SUFFIXES)}")
     announced = _check_file(path, suffix)
     try:
         with _quiet():
@@ -87,7 +79,7 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
     held = (len(vertices), len(faces))
     if held[0] < announced[0] or held[1] < announced[1]:
         raise InputError(
-            f"{shown(path)}: holds {held[0]} vertices and {held[1]} faces, but its header announces {announced[0]} and "
+            f"{path}: holds {held[0]} vertices and {held[1]} faces, but its header announces {announced[0]} and "
             f"{announced[1]}: it is cut short, or a line is malformed"
         )
     _check_arrays(path, vertices, faces)
@@ -121,21 +113,18 @@ def _check_file(path: Path, suffix: str) -> tuple[int, int]:
     Returns the vertices and faces that the file must hold at least.
     """
     announced = (0, 0)
-    size = check_file(path, "mesh_bytes", "a mesh", "decimate the mesh")
+    size = require_plain(path, "mesh_bytes", "a mesh", "decimate the mesh").stat().st_size
     if size == 0:
-        raise InputError(f"{shown(path)}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
-    try:
-        with path.open("rb") as file:
-            head = file.read(4096)
-        if suffix == ".ply":
-            announced = check_ply(path, size)
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+        raise InputError(f"{path}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
+    with path.open("rb") as file:
+        head = file.read(4096)
+    if suffix == ".ply":
+        announced = check_ply(path, size)
     if suffix == ".stl":
         _check_stl(path, head, size)
     # OBJ is text, which its reader would make a hundred million words of before it finds nothing in them.
     if suffix == ".obj" and b"\0" in head:
-        raise InputError(f"{shown(path)}: no OBJ file; it is no text")
+        raise InputError(f"{path}: no OBJ file; it is no text")
     if suffix == ".obj":
         _check_obj(path)
     if suffix == ".vtk":
@@ -149,20 +138,15 @@ def _check_file(path: Path, suffix: str) -> tuple[int, int]:
 def _check_large_text(path: Path, size: int, word: bytes) -> None:
     """Raise `InputError` where a large file of text holds too many or too few of a word, of which each face has one."""
     count, end = 0, b""
-    try:
-        with path.open("rb") as file:
-            # By pieces, since readers keep all of the text in memory; a word may stand across two of them.
-            while piece := file.read(2**20):
-                piece = end + piece.lower()
-                count += piece.count(word)
-                end = piece[1 - len(word) :]
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+    with path.open("rb") as file:
+        # By pieces, since readers keep all of the text in memory; a word may stand across two of them.
+        while piece := file.read(2**20):
+            piece = end + piece.lower()
+            count += piece.count(word)
+            end = piece[1 - len(word) :]
     check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
     if size > MOST_BYTES_PER_FACE * count:
-        raise InputError(
-            f"{shown(path)}: {count} faces in {size} bytes; must be {MOST_BYTES_PER_FACE} bytes a face at most"
-        )
+        raise InputError(f"{path}: {count} faces in {size} bytes; must be {MOST_BYTES_PER_FACE} bytes a face at most")
 
 
 def _check_stl(path: Path, head: bytes, size: int) -> None:
@@ -176,11 +160,11 @@ def _check_stl(path: Path, head: bytes, size: int) -> None:
             file.seek(max(0, size - _END_BYTES))
             end = file.read().lower()
         if b"endsolid" not in end:
-            raise InputError(f"{shown(path)}: has no line endsolid: it is cut short")
+            raise InputError(f"{path}: has no line endsolid: it is cut short")
     elif 84 <= size < 84 + 50 * count and count <= limit("mesh_faces"):
         # Four letters of a text would be more than that.
         held = (size - 84) // 50
-        raise InputError(f"{shown(path)}: holds {held} of the {count} faces that it announces: it is cut short")
+        raise InputError(f"{path}: holds {held} of the {count} faces that it announces: it is cut short")
 
 
 def _check_obj(path: Path) -> None:
@@ -190,18 +174,16 @@ def _check_obj(path: Path) -> None:
         while piece := file.read(2**20) + file.readline(2**20):
             if wrong := _ZERO_INDEX.search(piece):
                 line = wrong[0].decode("latin-1").strip()
-                raise InputError(f"{shown(path)}: {shown(line, 60)}: vertex 0; the first vertex of an OBJ file is 1")
+                raise InputError(f"{path}: {line!s:.60}: vertex 0; the first vertex of an OBJ file is 1")
 
 
 def _check_vtk(path: Path, head: bytes, size: int) -> None:
     """Raise `InputError` where a VTK file is none, or announces more points or cells than it has bytes."""
     if not head.startswith((b"# vtk DataFile", b"<?xml", b"<VTKFile")):
-        raise InputError(f"{shown(path)}: no VTK file; its first line must be # vtk DataFile Version ...")
+        raise InputError(f"{path}: no VTK file; its first line must be # vtk DataFile Version ...")
     for name, count in re.findall(rb"^(POINTS|POLYGONS|CELLS|TRIANGLE_STRIPS)\s+(-?\d{1,18})\b", head, re.MULTILINE):
         if not 0 <= int(count) <= size:
-            raise InputError(
-                f"{shown(path)}: {name.decode()} {int(count)}: the file has {size} bytes, too few for them"
-            )
+            raise InputError(f"{path}: {name.decode()} {int(count)}: the file has {size} bytes, too few for them")
 
 
 @contextmanager
@@ -273,12 +255,9 @@ def _told(error: Exception) -> str:
 def check_target(path: Path) -> None:
     """Raise `InputError` if no mesh can be written to a path; called before any work is done."""
     if path.suffix.lower() not in WRITTEN_SUFFIXES:
-        raise InputError(f"--out {shown(path)}: suffix {path.suffix!r}; allowed: {', '.join(WRITTEN_SUFFIXES)}")
-    try:
-        if path.is_dir():
-            raise InputError(f"--out {shown(path)}: is a folder; must be a file")
-    except OSError as error:
-        raise cannot_write(error, f"--out {shown(path)}", path) from error
+        raise InputError(f"--out {path}: suffix {path.suffix!r}; allowed: {', '.join(WRITTEN_SUFFIXES)}")
+    if path.is_dir():
+        raise InputError(f"--out {path}: is a folder; must be a file")
 
 
 def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] | None = None) -> None:
@@ -292,13 +271,6 @@ def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] |
         mm.
     attributes : mapping, optional
         Numbers at the vertices by name, each of shape (V,), for PLY.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    SimtestError
-        If its disk is full.
     """
     import trimesh  # slow to import
 
@@ -314,7 +286,4 @@ def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] |
         data = built.export(file_type="obj", include_normals=True, digits=8, header=None).encode()
     else:
         data = built.export(file_type="stl")
-    try:
-        write_atomically(path, lambda part: part.write_bytes(data))
-    except OSError as error:
-        raise write_error(error, path) from error
+    write_atomically(path, lambda part: part.write_bytes(data))

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from simtest.errors import InputError
-from simtest.runtime.limits import check_limit
-from simtest.runtime.resources import shown
+from simtest.runtime.files import check_limit
 
 HEADER_BYTES = 65536
 NUMPY_TYPES = {
@@ -44,14 +43,8 @@ def check_ply(path: Path, size: int) -> tuple[int, int]:
     -------
     tuple of int
         Vertices and faces that the header announces.
-
-    Raises
-    ------
-    InputError
-        If the header is malformed, there is no vertex or face in it, there are more faces than allowed, or the file
-        ends before the announced ones.
     """
-    where = shown(path)
+    where = str(path)
     kind, elements, start = read_header(path)
     found = {element.name: element for element in elements}
     # what a mesh needs
@@ -85,7 +78,7 @@ def check_ply(path: Path, size: int) -> tuple[int, int]:
 
 def read_header(path: Path) -> tuple[str, list[Element], int]:
     """Return format, elements and length in bytes of a PLY file's header; raise `InputError` if it is malformed."""
-    where = shown(path)
+    where = str(path)
     with path.open("rb") as file:
         head = file.read(HEADER_BYTES)
     end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
@@ -105,16 +98,16 @@ def _parse(text: str, where: str) -> tuple[str, list[Element]]:
                 kind = words[1] if len(words) > 1 else ""
             case ["element"]:
                 if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > _MOST_DIGITS:
-                    raise InputError(f"{where}: header line {shown(line, 60)!r}: must be element NAME COUNT")
+                    raise InputError(f"{where}: header line {line!r:.60}: must be element NAME COUNT")
                 elements.append(Element(words[1], int(words[2])))
             case ["property"]:
                 _add_property(elements, words, line, where)
             case ["comment"] | ["obj_info"] | []:
                 pass
             case _:
-                raise InputError(f"{where}: header line {shown(line, 60)!r}: must be an element, property or comment")
+                raise InputError(f"{where}: header line {line!r:.60}: must be an element, property or comment")
     if kind not in FORMATS:
-        raise InputError(f"{where}: format {shown(kind, 40)}: must be one of {', '.join(FORMATS)}")
+        raise InputError(f"{where}: format {kind!r}: must be one of {', '.join(FORMATS)}")
     return kind, elements
 
 
@@ -123,7 +116,7 @@ def _add_property(elements: list[Element], words: list[str], line: str, where: s
     is_list = words[1:2] == ["list"]
     types = words[2:4] if is_list else words[1:2]
     if not elements or len(words) != (5 if is_list else 3) or any(name not in SIZES for name in types):
-        raise InputError(f"{where}: header line {shown(line, 60)!r}: must be property TYPE NAME of a known type")
+        raise InputError(f"{where}: header line {line!r:.60}: must be property TYPE NAME of a known type")
     last = elements[-1]
     last.properties[words[-1]] = " ".join(words[1:-1])
     # Of a list its length; a face has three corners at least, but a list may be empty.

@@ -8,7 +8,6 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.resources import shown
 from simtest.surfaces.ply_header import NUMPY_TYPES, Element, read_header
 
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
@@ -27,11 +26,6 @@ def read_mixed_polygons(path: Path) -> tuple[Array, IntArray] | None:
     tuple of ndarray, or None
         Vertices, shape (V, 3), and faces, shape (F, 3); None for text, and where all faces have like numbers of
         corners.
-
-    Raises
-    ------
-    InputError
-        If the file ends within its faces, or what stands before them has lists too.
     """
     kind, elements, start = read_header(path)
     if kind not in _BYTE_ORDERS:
@@ -51,7 +45,7 @@ def _read(path: Path, data: mmap, order: str, elements: list[Element], start: in
         if dtype is None:
             return None
         if len(data) < start + element.count * dtype.itemsize:
-            raise InputError(f"{shown(path)}: ends within its {element.name} elements: it is cut short")
+            raise InputError(f"{path}: ends within its {element.name} elements: it is cut short")
         if element.name == "vertex":
             rows = np.frombuffer(data, dtype, element.count, start)
             vertices = np.column_stack([rows[axis] for axis in "xyz"]).astype(np.float64)

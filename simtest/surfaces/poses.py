@@ -141,11 +141,6 @@ def lumen_pose(
         Signed distance of points to the wall, mm; positive in the lumen.
     cast : callable
         Distance from origins along directions to the wall, mm; inf if there is none.
-
-    Raises
-    ------
-    InputError
-        If no candidate lies in the lumen.
     """
     rng = generator(0, "viewpoint", label, viewpoint, Stage.VIEWPOINT)
     # site
@@ -187,11 +182,6 @@ def organ_pose(
         Signed distance of points to the surface, mm; positive outside.
     cast : callable
         Distance from origins along directions to the surface, mm; inf if there is none.
-
-    Raises
-    ------
-    InputError
-        If no drawn point can be seen from such a position.
     """
     rng = generator(0, "viewpoint", label, viewpoint, Stage.VIEWPOINT)
     # candidates

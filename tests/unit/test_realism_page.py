@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simtest.cli.realism import realism
+from simtest.cli.data import realism
 from simtest.errors import InputError
 from simtest.pages.chart_png import draw
 from simtest.realism.charts import distance_chart, distribution_charts

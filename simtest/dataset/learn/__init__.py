@@ -22,4 +22,4 @@ if TYPE_CHECKING:
 __all__ = ["Crops", "Samples", "read_crops"]
 
 # Crops need no PyTorch.
-__getattr__, _ = lazy_names(__name__, {"simtest.dataset.learn.samples": ("Samples",)})
+__getattr__, *_ = lazy_names(__name__)

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from simtest.errors import InputError
 from simtest.runtime.files import require_plain, write_atomically
-from simtest.runtime.resources import shown
 
 LAST, BEST = "last.safetensors", "best.safetensors"
 
@@ -65,20 +64,14 @@ def save_checkpoint(path: Path, network: nn.Module, optimiser: torch.optim.Optim
 
 
 def load_checkpoint(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer, made_of: dict[str, Any]) -> State:
-    """Read a checkpoint into a network and an optimiser; return its state.
-
-    Raises
-    ------
-    InputError
-        If the file is no checkpoint of this network, or one of another training.
-    """
+    """Read a checkpoint into a network and an optimiser; return its state."""
     tensors, state = _read(path)
     for key in sorted({*made_of, *state.made_of}):
         there, here = state.made_of.get(key), made_of.get(key)
         if there != here:
             raise InputError(
-                f"--out {shown(path.parent)}: holds another training ({key} = {shown(there, 60)} there, "
-                f"{shown(here, 60)} here); must be another folder"
+                f"--out {path.parent}: holds another training ({key} = {there} there, "
+                f"{here} here); must be another folder"
             )
     weights = {name.removeprefix(_NETWORK): t for name, t in tensors.items() if name.startswith(_NETWORK)}
     steps: dict[int, dict[str, Tensor]] = {}
@@ -91,7 +84,7 @@ def load_checkpoint(path: Path, network: nn.Module, optimiser: torch.optim.Optim
         optimiser.load_state_dict({"state": steps, "param_groups": optimiser.state_dict()["param_groups"]})
     except (RuntimeError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"{shown(path)}: fits no network of this training ({shown(reason, 120)})") from None
+        raise InputError(f"{path}: fits no network of this training ({reason!s:.120})") from None
     return state
 
 
@@ -111,5 +104,5 @@ def _read(path: Path) -> tuple[dict[str, Tensor], State]:
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{shown(path)}: is no checkpoint ({shown(error, 120)}); remove it to start anew") from None
+        raise InputError(f"{path}: is no checkpoint ({error!s:.120}); remove it to start anew") from None
     return tensors, state

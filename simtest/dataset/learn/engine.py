@@ -45,11 +45,6 @@ def train(
     progress : callable, optional
         Called with steps done, steps in all, and what is being done, after each step; what it raises stops the
         training, which keeps the last checkpoint.
-
-    Raises
-    ------
-    InputError
-        If a split holds no example, or the folder holds another training.
     """
     for name, examples in (("train", taught), ("validation", judged)):
         if _count(examples) == 0:

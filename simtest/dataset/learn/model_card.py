@@ -27,7 +27,6 @@ from simtest.pages.markdown import escaped, paragraphs
 from simtest.runtime import provenance
 from simtest.runtime.files import JsonObject, require_plain, write_atomically
 from simtest.runtime.onnx_model import METADATA
-from simtest.runtime.resources import shown
 
 MEASURED = "## Measured on unseen anatomies"
 """Heading of the card's last part, which people write; what stands below it is kept when the card is made again."""
@@ -50,7 +49,7 @@ def origin_of(training: Training, data: Path) -> dict[str, str]:
     try:
         table = pl.read_parquet(require_plain(data / SAMPLES), columns=["split", "family", "anatomy", "surface"])
     except (OSError, pl.exceptions.PolarsError) as error:
-        raise InputError(f"{shown(data / SAMPLES)}: cannot be read ({shown(error, 80)})") from None
+        raise InputError(f"{data / SAMPLES}: cannot be read ({error!s:.80})") from None
     counts = {
         str(split): [len(part), part.select("family", "anatomy").n_unique()]
         for (split,), part in table.group_by("split", maintain_order=True)
@@ -59,7 +58,7 @@ def origin_of(training: Training, data: Path) -> dict[str, str]:
     described = {key: recipe.get(key) for key in ("name", "title", "seed")}
     described |= {"scenes": [str(family["scene"]) for family in manifest.plan().dataset.model_dump()["families"]]}
     return {
-        "dataset": shown(data.name),
+        "dataset": str(data.name),
         "dataset_sha256": provenance.file_hash(data / NAME),
         "recipe": json.dumps({**described, "splits": counts}),
         "dataset_simtest": str(manifest.origin["versions"].get("simtest")),
@@ -97,11 +96,9 @@ def make_card(model: Path) -> str:
         metadata = json.loads({each.key: each.value for each in content.metadata_props}[METADATA])
         about = metadata["about"]
         training = json.loads(about["training"])
-    except OSError as error:
-        raise InputError(f"{shown(model)}: cannot be read ({error.strerror})") from None
     except Exception as error:  # of protobuf, which shares no base with the others
-        reason = f"{type(error).__name__}: {shown(error, 80)}"
-        raise InputError(f"{shown(model)}: is no network of simtest train ({reason})") from None
+        reason = f"{type(error).__name__}: {error!s:.80}"
+        raise InputError(f"{model}: is no network of simtest train ({reason})") from None
     environment = Environment(  # nosec B701
         loader=PackageLoader("simtest.dataset.learn", "."), undefined=StrictUndefined, autoescape=False,
         trim_blocks=True, lstrip_blocks=True,

@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from simtest.errors import SimtestError
 from simtest.runtime.files import JsonObject, write_atomically
 from simtest.runtime.onnx_model import METADATA
-from simtest.runtime.resources import shown
 
 MODEL = "model.onnx"
 """Name of the file in a training's folder."""
@@ -89,7 +88,7 @@ def _compare(data: bytes, inputs: Mapping[str, Tensor], wanted: Sequence[Tensor]
         values = other.float().numpy()
         off = float(np.abs(one - values).max(initial=0) / max(1.0, float(np.abs(values).max(initial=0))))
         if not off <= LARGEST_DIFFERENCE:
-            raise SimtestError(f"{shown(path)}: ONNX Runtime differs from PyTorch by {off:.2g} of the largest output")
+            raise SimtestError(f"{path}: ONNX Runtime differs from PyTorch by {off:.2g} of the largest output")
 
 
 def halved(model: onnx.ModelProto) -> onnx.ModelProto:

@@ -20,7 +20,6 @@ try:
 except ImportError as error:
     raise InputError(f"training needs the package {error.name}: install the extra learn") from error
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.resources import shown
 from simtest.validation.runner import Progress
 
 
@@ -46,11 +45,6 @@ def run_training(training: Training, data: Path, out: Path, progress: Progress |
         model.onnx and its card, model.md.
     progress : callable, optional
         As in `simtest.dataset.learn.engine.train`. Whatever stops the training, the page shows the epochs done.
-
-    Raises
-    ------
-    InputError
-        If the task or the dataset cannot be used, or the folder holds another training.
     """
     task = load_task(training.task)
     about = origin_of(training, data)
@@ -60,7 +54,7 @@ def run_training(training: Training, data: Path, out: Path, progress: Progress |
             trained = train(training, task, taught, judged, out, progress)
         finally:
             if (out / LAST).exists():
-                page = write_page(training, read_state(out / LAST), out, shown(data))
+                page = write_page(training, read_state(out / LAST), out, str(data))
         files = task.finish(trained.network, taught, judged, out, about | validation_of(trained.state))
         cards = [write_card(file) for file in files if file.suffix == ".onnx"]
     return TrainingRun(trained.state, [page, *files, *cards])

@@ -8,7 +8,7 @@ from torch import Generator, Tensor, nn
 
 from simtest.dataset.learn.training import Training
 from simtest.errors import InputError
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.validation.runner import Progress
 
 Batch = dict[str, Tensor]
@@ -56,7 +56,7 @@ TASKS = {
 def load_task(name: str) -> Task:
     """Return a task by name; raise `InputError` if there is none."""
     if name not in TASKS:
-        raise InputError(f"task = {shown(name)}: unknown; allowed: {', '.join(TASKS)}{suggestion(name, TASKS)}")
+        raise InputError(f"task = {name}: unknown; allowed: {', '.join(TASKS)}{suggestion(name, TASKS)}")
     module, _, attribute = TASKS[name].partition(":")
     task: Task = getattr(importlib.import_module(module), attribute)()
     return task

@@ -55,11 +55,5 @@ class Training(Spec):
 
 
 def load_training(name: str | Path, settings: Mapping[str, Any] | None = None) -> Training:
-    """Read a training's file, by path or as a shipped one by name; `settings` replace values by key path.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed.
-    """
+    """Read a training's file, by path or as a shipped one by name; `settings` replace values by key path."""
     return load(Training, find(name, "scenes", "learning"), dict(settings or {}))

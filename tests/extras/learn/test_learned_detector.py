@@ -154,7 +154,9 @@ def test_a_damaged_file_is_told_in_one_line(trained, tmp_path, change, said):
     assert "model.onnx" in str(error.value)
 
 
-@pytest.mark.parametrize(("content", "said"), [(b"", "no ONNX model"), (b"text", "no ONNX model"), (None, "be read")])
+@pytest.mark.parametrize(
+    ("content", "said"), [(b"", "no ONNX model"), (b"text", "no ONNX model"), (None, "no such file")]
+)
 def test_a_file_that_is_no_network_is_told_in_one_line(tmp_path, content, said):
     path = tmp_path / "model.onnx"
     if content is not None:

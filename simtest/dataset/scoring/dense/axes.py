@@ -12,7 +12,6 @@ from simtest.errors import InputError
 from simtest.geometry.axes import ALL, NAMED, matrix
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
-from simtest.runtime.resources import shown
 
 LEAST_COSINE = 0.5
 """A mean cosine between map and truth below this, 60 deg, is no fit."""
@@ -32,8 +31,7 @@ def parse_axes(text: str) -> str:
     axes = NAMED.get(text.strip().lower(), text.replace(" ", "").replace("+", "").lower())
     if axes not in ALL:
         raise InputError(
-            f"--frame {shown(text)}: unknown; allowed: {', '.join(NAMED)}, or the axes of the three channels, such as "
-            "x,-y,-z"
+            f"--frame {text}: unknown; allowed: {', '.join(NAMED)}, or the axes of the three channels, such as x,-y,-z"
         )
     return axes
 
@@ -70,13 +68,7 @@ class AxesEvidence:
         return ALL[int(np.argmax(self.mean))]
 
     def decide(self, what: str) -> str:
-        """Return the axes that fit best by a clear margin.
-
-        Raises
-        ------
-        InputError
-            If there is no normal, none fits, or the best cannot be told from the next; `what` names the maps.
-        """
+        """Return the axes that fit best by a clear margin."""
         if not self.cosines:
             raise InputError(
                 f"{what}: hold no normal: every pixel is NaN, 0, transparent or too long or short for a unit vector; "

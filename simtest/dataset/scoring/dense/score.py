@@ -19,7 +19,6 @@ from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.resources import shown
 
 TABLE, SUMMARY, PAGE = "dense.parquet", "dense.json", "index.html"
 SCHEMA = 2
@@ -117,11 +116,6 @@ def score_frames(
     Conventions that nobody stated are those that fit the truth of all frames best. The frames are scored by those
     that fit the frames so far; where all of them together say otherwise, all are scored once more. `is_checked` says
     that the names of the method's maps were checked against the frames before.
-
-    Raises
-    ------
-    InputError
-        If a map cannot be read, no convention fits, or two fit alike.
     """
     options.check()
     options = method.options(options)
@@ -131,9 +125,9 @@ def score_frames(
     score = _pass(frames, method, options, None, evidence, sources, names)
     if not is_checked:
         method.check(names)
-    what = f"maps {shown(method.name)}"
+    what = f"maps {method.name}"
     if score is None:
-        raise InputError(f"{shown(on) if on else 'the run'}: holds no frame")
+        raise InputError(f"{str(on) if on else 'the run'}: holds no frame")
     final = evidence.decide(what)
     if final != score.conventions:
         again = _pass(frames, method, options, final, None, sources, [])
@@ -229,11 +223,6 @@ def score_maps(
         How the scoring was called.
     progress : callable, optional
         Called with the frames done, frames in all, and the frame's name.
-
-    Raises
-    ------
-    InputError
-        If a folder or a map cannot be read, no convention fits, or two fit alike.
     """
     from simtest.dataset.scoring.dense.from_folder import frame_names, frames_of
 
@@ -253,7 +242,7 @@ def score_maps(
 def _refuse_run(out: Path) -> None:
     """Raise `InputError` where a folder for figures holds something else that has a page."""
     if out.is_dir() and (out / PAGE).exists() and not (out / SUMMARY).exists():
-        raise InputError(f"--out {shown(out)}: holds another page; must be an empty folder or one of such figures")
+        raise InputError(f"--out {out}: holds another page; must be an empty folder or one of such figures")
 
 
 __all__ = ["DenseScore", "Key", "score_frames", "score_maps", "write_score"]
