@@ -52,10 +52,9 @@ _HOMES = {
 }
 """Modules of the commands. The function of `list` is `listing`, since it would hide Python's own."""
 
-for _module, _names in _HOMES.items():
-    for _name in _names:
-        _function = "listing" if _name == "list" else _name
-        APP.command(f"simtest.cli.{_module}:{_function}", name=_name, help=COMMANDS[_name])
+for _name, _help in COMMANDS.items():
+    _module = next(module for module, names in _HOMES.items() if _name in names)
+    APP.command(f"simtest.cli.{_module}:{'listing' if _name == 'list' else _name}", name=_name, help=_help)
 
 
 def _version() -> str:
