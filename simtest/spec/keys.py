@@ -98,8 +98,7 @@ def full_keys(models: Sequence[BaseModel], given: Mapping[str, Any], others: Seq
 
     `models` hold the keys that may be meant: a scene, or those of an experiment. Keys that the scene's file states come
     before those that it leaves at their defaults, and keys of tables before those of lists of tables. A mistyped name
-    may mean one of `others`, which the caller takes itself. Raises `InputError` if several keys end in a name, or none
-    does.
+    may mean one of `others`, which the caller takes itself.
     """
     found = [each for model in models for each in _paths(model)]
     stated = dict.fromkeys(path for path, is_stated in found if is_stated)

@@ -229,8 +229,7 @@ def check_first_parts(settings: Mapping[str, Any], scene: Iterable[str], own: It
 def still_varied(varied: Iterable[str], settings: Mapping[str, Any], what: str) -> set[str]:
     """Return which of the key paths that an experiment or a dataset varies stay so beside settings.
 
-    A setting fixes its path, all below it and the keys that it excludes. Raises `InputError` for a part of a value that
-    is varied as a whole.
+    A setting fixes its path, all below it and the keys that it excludes.
     """
     left = dict.fromkeys(varied)
     for path in settings:

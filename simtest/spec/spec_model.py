@@ -85,8 +85,7 @@ def _leaves(value: Any) -> Iterator[Any]:
 def load(model: type[Model], path: Path, settings: Mapping[str, Any] | None = None) -> Model:
     """Read a TOML file as a model that has a `Name`, by default that of the file.
 
-    Values of `settings` replace those of the file, by key path. Raises `InputError` if the file is missing or
-    malformed.
+    Values of `settings` replace those of the file, by key path.
     """
     data = apply_settings(read_toml(path), settings or {}, str(path))
     data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])

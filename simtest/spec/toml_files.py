@@ -27,8 +27,6 @@ def read_text(path: Path, kind: str, limit: str = "text_bytes") -> str:
     """Read a text file of moderate size; `kind` is what it should be, for messages, such as "TOML".
 
     `limit` names the limit of its size.
-
-    Raises `InputError` if it is missing, no plain file, too large or not UTF-8.
     """
     name = str(path)
     require_plain(path, limit, f"a {kind} file")

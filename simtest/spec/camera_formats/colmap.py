@@ -176,10 +176,7 @@ def _pose(words: Sequence[str], at: str) -> Array:
 
 
 def colmap_files(camera: Camera, path: Path, poses: Poses | None) -> Files:
-    """Return a camera as cameras.txt, and poses, whose lengths must be mm, as images.txt beside an empty points3D.txt.
-
-    Raises `InputError` where COLMAP has no such lens, or the folder holds another model's points.
-    """
+    """Return a camera as cameras.txt, and poses, lengths in mm, as images.txt beside an empty points3D.txt."""
     files = {path: _cameras_text(camera).encode()}
     if poses is not None:
         points = path.with_name("points3D.txt")
@@ -239,10 +236,7 @@ def _images_text(poses: Poses) -> str:
 
 @of_text(limit="record_bytes")
 def read_transforms(text: str) -> dict[str, Table]:
-    """Read the camera, or those of the frames where they have their own, by file_path.
-
-    Raises `InputError` if the file is malformed, or its camera model is none of simtest's.
-    """
+    """Read the camera, or those of the frames where they have their own, by file_path."""
     data = json_object(text)
     frames = _frames(data)
     if not any(set(frame) & set(INTRINSICS) for frame in frames):
@@ -258,10 +252,7 @@ def read_transforms(text: str) -> dict[str, Table]:
 
 @of_text(limit="record_bytes")
 def transforms_poses(text: str) -> Poses:
-    """Read world_from_camera of the frames, by file_path, with OpenCV's camera axes, in the file's unit of length.
-
-    Raises `InputError` if the file is malformed, or a frame has no pose.
-    """
+    """Read world_from_camera of the frames, by file_path, with OpenCV's camera axes, in the file's unit of length."""
     made: list[tuple[str, Array]] = []
     for i, frame in enumerate(_frames(json_object(text))):
         with within(f"frames[{i}]"):
@@ -349,10 +340,7 @@ def _nerf_lens(data: Mapping[str, Any], told: Mapping[str, float]) -> Table | No
 
 
 def transforms_file(camera: Camera, path: Path, poses: Poses | None) -> Files:
-    """Return a camera, and poses of its frames, whose lengths must be mm, as transforms.json.
-
-    Raises `InputError` if the camera has a skew, or a lens that the format lacks.
-    """
+    """Return a camera, and poses of its frames, whose lengths must be mm, as transforms.json."""
     lens, name = camera.distortion, "transforms.json"
     if camera.skew != 0:
         raise InputError(f"camera.skew = {camera.skew:g}: must be 0, since {name} has none; save as TOML instead")

@@ -128,8 +128,7 @@ def split_id(path: str | Path) -> tuple[Path, str | None]:
 def recognise(path: str | Path) -> str:
     """Return the name of a camera file's format, by its suffix and by what it holds; what is nothing else is TOML.
 
-    A folder is a COLMAP model where it holds cameras.txt. Raises `InputError` if the file cannot be read, or is one of
-    COLMAP's binary ones.
+    A folder is a COLMAP model where it holds cameras.txt.
     """
     path, _ = split_id(path)
     suffix = path.suffix.lower()
@@ -170,8 +169,7 @@ def _first(syntax: str, text: str, otherwise: str) -> str:
 def read_table(path: str | Path) -> Table:
     """Read a camera of a file of another program as the table of a `CameraSpec`; "FILE#ID" names one of several.
 
-    Raises `InputError` if the file is missing, malformed, holds no camera, a lens that simtest lacks, or several
-    different cameras of which none is named. TOML is read elsewhere.
+    TOML is read elsewhere.
     """
     path, wanted = split_id(path)
     where, form = str(path), FORMATS[recognise(path)]
@@ -222,8 +220,7 @@ def write_camera(camera: Camera, path: str | Path, format: str | None = None, po
     """Write a camera file, and the poses of a sequence's frames where they are given (see `simtest.save_camera`).
 
     COLMAP's images.txt and an empty points3D.txt are written beside cameras.txt. Poses are world_from_camera, shape (4,
-    4), OpenCV axes, mm: lengths are written as they are, and both formats state mm. Raises `InputError` if format and
-    suffix do not fit, the format cannot hold the camera or poses, or the file cannot be written.
+    4), OpenCV axes, mm: lengths are written as they are, and both formats state mm.
     """
     path = Path(path)
     suffix = path.suffix.lower()

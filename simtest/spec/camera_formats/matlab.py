@@ -27,8 +27,7 @@ def read_matlab(path: Path) -> dict[str, Table]:
 
     The .mat file holds one struct, under any name, with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
     RadialDistortion and TangentialDistortion; or, of a fisheye, with MappingCoefficients, StretchMatrix,
-    DistortionCenter and ImageSize. Raises `InputError` if the file is missing, malformed, of version 7.3, or holds a
-    cameraParameters object instead of a struct.
+    DistortionCenter and ImageSize.
     """
     fields = read_struct(path)
     with within(str(path)):
@@ -112,8 +111,7 @@ def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...]) 
 def matlab_file(camera: Camera, path: Path, _: Poses | None) -> Files:
     """Return a camera as a .mat file of version 5 that holds the struct `camera`.
 
-    Its fields are the arguments of MATLAB's cameraParameters, or of fisheyeIntrinsics. Raises `InputError` if MATLAB
-    has no such lens.
+    Its fields are the arguments of MATLAB's cameraParameters, or of fisheyeIntrinsics.
     """
     from scipy.io import savemat
 

@@ -69,7 +69,7 @@ def scaramuzza_table(
     """Return the table of a `CameraSpec` of Scaramuzza's model with x before y and z along the viewing direction.
 
     `mapping` is a0, a2, a3, a4 for radii in px, `stretch` c, d, e of the matrix ((c, d), (e, 1)); the centre has pixel
-    centres at integer + 0.5. Raises `InputError` if a0 is not positive.
+    centres at integer + 0.5.
     """
     a0, a2, a3, a4 = mapping
     if not a0 > 0:
@@ -128,8 +128,6 @@ def read_ocamcalib(text: str) -> dict[str, Table]:
     """Read calib_results.txt: both polynomials, centre, affine parameters, size.
 
     The direct polynomial, from pixels to directions, is the model; the inverse one, a fit to it, is only compared.
-    Raises `InputError` if the file is malformed, its polynomial has more terms than a0, a2, a3, a4, or the two
-    contradict each other.
     """
     rows = [line.split() for line in text.splitlines()]
     rows = [row for row in rows if row and not row[0].startswith("#")]
@@ -236,8 +234,7 @@ def values(element: ElementTree.Element, name: str, count: int) -> list[float]:
 def read_photometric(text: str) -> Tables:
     """Read a photometric calibration as tables of a calibration file: response, vignetting, emission, rig.
 
-    Several lights must spread their light alike. Raises `InputError` if the file is malformed, or holds a model of
-    another kind.
+    Several lights must spread their light alike.
     """
     root = xml_root(text)
     tables: Tables = {}

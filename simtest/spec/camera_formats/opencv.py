@@ -67,10 +67,7 @@ MM = 1000.0
 
 
 def read_opencv(path: Path) -> dict[str, Table]:
-    """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json): its one camera, whose id is empty.
-
-    Raises `InputError` if the file is missing, malformed, or holds a lens that simtest does not know.
-    """
+    """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json): its one camera, whose id is empty."""
     text = read_text(path, "camera")
     with within(str(path)):
         return {"": _table(_parse(text, path.suffix.lower()))}
@@ -262,10 +259,7 @@ def _is_fisheye(data: Mapping[str, Any]) -> bool:
 
 
 def opencv_file(camera: Camera, path: Path, _: Poses | None) -> Files:
-    """Return a camera as an OpenCV FileStorage; the file's suffix selects YAML, XML or JSON.
-
-    Raises `InputError` if the camera has a skew, which OpenCV ignores.
-    """
+    """Return a camera as an OpenCV FileStorage; the file's suffix selects YAML, XML or JSON."""
     matrix, coefficients = _shifted(camera, "OpenCV")
     kinds = {".xml": cv2.FILE_STORAGE_FORMAT_XML, ".json": cv2.FILE_STORAGE_FORMAT_JSON}
     flags = (
