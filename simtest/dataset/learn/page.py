@@ -7,9 +7,7 @@ import numpy as np
 from simtest.dataset.learn.checkpoint import State
 from simtest.dataset.learn.engine import history_table
 from simtest.dataset.learn.training import Training
-from simtest.pages import chart_png, chart_web, pixels
-from simtest.pages.axes import Axis
-from simtest.pages.chart import Chart, Mark, Panel
+from simtest.pages.charts import Axis, Chart, Mark, Panel, embedded, png
 from simtest.pages.html import environment
 from simtest.pages.style import NEUTRAL, colours, symbols
 from simtest.runtime import provenance
@@ -37,15 +35,14 @@ def write_page(training: Training, state: State, out: Path, data: str, command: 
     text = environment().get_template("training.html.j2").render(
         training=training, rows=rows, best=state.best, charts=charts, data=data, command=command,
         provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"], "python": made_by["python"]},
-        figures=chart_web.packed({chart.key: chart_web.figure(chart) for chart in charts}),
-        plotly=chart_web.packed_plotly(),
+        **embedded(charts),
     )  # fmt: skip
     write_atomically(out / PAGE, lambda part: part.write_text(text, encoding="utf-8"))
     return out / PAGE
 
 
 def _write_png(path: Path, chart: Chart) -> None:
-    content = pixels.png(chart_png.draw([chart])[0])
+    content = png([chart])
     write_atomically(path, lambda part: part.write_bytes(content))
 
 

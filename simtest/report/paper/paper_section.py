@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 
-from simtest.pages import chart_png, pixels, style
-from simtest.pages.chart import Chart
+from simtest.pages import pixels, style
+from simtest.pages.charts import Chart, png
 from simtest.pages.style import labelled
 from simtest.report.figure_files import FigureFiles
 from simtest.report.paper.isocurve_figure import isocurve_charts, isocurve_figure
@@ -50,11 +50,11 @@ def paper_section(run: Run, colours: Mapping[str, str], files: FigureFiles) -> P
 
 def _draw_stages(charts: list[Chart], files: FigureFiles) -> list[str]:
     """Write the stages in one file and in a file each, and return them as data addresses."""
-    whole, parts = chart_png.draw(charts)
-    files.write("pipeline", pixels.png(whole))
+    files.write("pipeline", png(charts))
+    parts = [png([chart]) for chart in charts]
     for i, part in enumerate(parts, 1):
-        files.write(f"pipeline_{i}", pixels.png(part))
-    return [pixels.data_address(part) for part in parts]
+        files.write(f"pipeline_{i}", part)
+    return [pixels.data_address(pixels.decoded(part)) for part in parts]
 
 
 def _headline(rows: Sequence[Statement]) -> str:

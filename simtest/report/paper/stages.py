@@ -5,17 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtest.geometry.vectors import angle_deg
-from simtest.pages.axes import Axis
-from simtest.pages.chart import Chart, Mark, Panel, Picture
+from simtest.pages.charts import Axis, Chart, Mark, Panel, Picture
 from simtest.pages.pixels import displayed
-from simtest.pages.style import NEUTRAL, TRUTH, Symbol, degrees, labelled
+from simtest.pages.style import NEUTRAL, TRUTH, degrees, labelled
 from simtest.report.paper.parameters import PARAMETERS
 from simtest.report.run_folder import GalleryItem, KeptEstimate, Run
 from simtest.runtime.arrays import Array, Image
 from simtest.spec.paper import PaperSetting
 
 _ISOPHOTE, _PLANE = "#00C2D1", "#444444"
-_DOT, _CROSS = Symbol("o", "circle", "●"), Symbol("X", "x", "✖")
+_DOT, _CROSS = "●", "✖"
 PICTURES = ("texture", "clean", "smoothed")
 
 

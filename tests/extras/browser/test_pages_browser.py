@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from simtest.report.view3d import grid_triangles
 from test_nightly_page import rows_of
 from test_realism_page import frames
 from test_report import make_run
@@ -22,7 +23,6 @@ from simtest.realism.comparison import compare
 from simtest.realism.page import write_comparison
 from simtest.reconstruction.picture import Options
 from simtest.report import write_report
-from simtest.report.view3d import grid_triangles
 from simtest.report.viewer import Content, write_scene_page
 
 pytestmark = pytest.mark.slow
