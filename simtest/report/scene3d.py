@@ -8,6 +8,7 @@ import numpy as np
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.pages.palette import LIGHT, NEUTRAL, colours, estimator_order
+from simtest.pages.style import number
 from simtest.report.gallery import anchor
 from simtest.report.run_folder import GalleryItem, Run
 from simtest.runtime.arrays import AnyArray, Array, IntArray
@@ -203,17 +204,17 @@ def framed(content: Content, surface: str) -> tuple[str, list[Part]]:
         parts.append(Part(f"part{len(parts)}", name, colour, shown))
         scene.add_geometry(mesh, node_name=parts[-1].node, geom_name=f"mesh{len(parts)}")
 
-    shades = {"lit": content.lit}
+    is_curved = surface == "curvature" and content.curvature.size > 0
+    add(_mesh(content.vertices, content.faces, content.lit), "surface: lit", "", not is_curved)
     if content.curvature.size:
-        shades["curvature"] = _shades(content.curvature)
-    first = surface if surface in shades else "lit"
-    for name, shade in shades.items():
-        add(_mesh(content.vertices, content.faces, shade), f"surface: {name}", "", name == first)
+        limit = number(curvature_limit(content.curvature), 2)
+        name = f"surface: curvature from −{limit} (blue) to {limit} (red)"
+        add(_mesh(content.vertices, content.faces, _shades(content.curvature)), name, "", is_curved)
     size = float(np.linalg.norm(np.ptp(content.vertices, axis=0)))
-    for number, (name, colour) in enumerate(line_colours(content).items()):
+    for rank, (name, colour) in enumerate(line_colours(content).items()):
         own = content.names == name
         # Each kind is thicker than the one before, so that all show where they lie on each other.
-        radius = size * _THICK * (1 if name in (CAMERA, SIGHTLINE, EVERYWHERE) else 1 + 0.3 * number)
+        radius = size * _THICK * (1 if name in (CAMERA, SIGHTLINE, EVERYWHERE) else 1 + 0.3 * rank)
         shown = "field of view" if name == CAMERA else name
         add(_rods(content.starts[own], content.ends[own], radius, colour), shown, colour)
     eyes = (("camera", np.zeros((1, 3)), NEUTRAL), ("light", content.lights, LIGHT))

@@ -281,7 +281,7 @@ def test_the_3d_view_is_coloured_by_curvature_where_the_run_kept_it(tmp_path):
     np.testing.assert_array_equal(content.lights, [[1.0, 2.0, 0.0]])
     _, parts = framed(content, "curvature")
     assert [(part.name, part.shown) for part in parts if not part.colour] == [
-        ("surface: lit", False), ("surface: curvature", True)
+        ("surface: lit", False), ("surface: curvature from −0.35 (blue) to 0.35 (red)", True)
     ]  # fmt: skip
     assert {"true normal", "cone_axis", "light"} <= {part.name for part in parts}
     page = write_report(path)

@@ -47,10 +47,11 @@ def test_the_page_of_a_scene_is_one_small_file(content, tmp_path):
     assert "true normal" in page
     frame, parts = framed(content, "lit")
     assert frame.startswith("<!DOCTYPE html>") or "<html" in frame
-    assert [(part.name, part.shown) for part in parts] == [
-        ("surface: lit", True), ("surface: curvature", False), ("field of view", True), ("true normal", True),
-        ("cone_axis", True), ("circle_pose", True), ("brightest_point", True), ("curved", True), ("camera", True),
-        ("light", True),
+    lit, curved, *lines = parts
+    assert (lit.name, lit.shown) == ("surface: lit", True)
+    assert (curved.name, curved.shown) == ("surface: curvature from −0.28 (blue) to 0.28 (red)", False)
+    assert [part.name for part in lines] == [
+        "field of view", "true normal", "cone_axis", "circle_pose", "brightest_point", "curved", "camera", "light",
     ]  # fmt: skip
     # The sphere's one curvature is not the end of the colours.
     assert curvature_limit(content.curvature) == pytest.approx(0.2 * 1.4, rel=1e-3)
