@@ -51,7 +51,8 @@ _CONFIG = {
     # Texts of the page are read by `aria-label`; a node a mark would only slow it down.
     "aria": False, "background": "transparent", "font": "DejaVu Sans", "view": {"stroke": _GRID},
     "axis": {"gridColor": _GRID, "domainColor": _GRID, "tickColor": _GRID, "labelColor": _INK, "titleColor": _INK,
-             "labelFontSize": 12, "titleFontSize": 13, "titleFontWeight": "normal", "labelLimit": 340},
+             "labelFontSize": 12, "titleFontSize": 13, "titleFontWeight": "normal", "labelLimit": 340,
+             "labelSeparation": 4},
     "axisX": {"tickCount": 8}, "axisY": {"tickCount": 7},
     "title": {"color": _INK, "fontSize": 14, "fontWeight": "normal"},
 }  # fmt: skip
@@ -112,7 +113,11 @@ class Axis:
         if self.scale == "stretched":
             ticks = [*(-tick for tick in reversed(_STRETCHED_TICKS)), 0.0, *_STRETCHED_TICKS]
             scale |= {"type": "symlog", "constant": _STRETCH}
-            axis |= {"format": "~g", "values": [tick for tick in ticks if low <= tick <= high]}
+            axis |= {
+                "format": "~g",
+                "values": [tick for tick in ticks if low <= tick <= high],
+                "labelOverlap": "greedy",
+            }
         if self.named is not None:
             at, texts = [at for at, _ in self.named], [text.split("\n") for _, text in self.named]
             axis |= {"values": at, "labelExpr": f"{json.dumps(texts)}[indexof({json.dumps(at)}, datum.value)]"}

@@ -60,11 +60,12 @@ SILENT = """() => [...document.querySelectorAll(".scroll")].filter(box => {
   return box.getClientRects().length && ways.some(([cut, way]) => cut && !told.includes(way));
 }).map(box => box.getAttribute("aria-label"))"""
 
-# Texts at the ticks of a chart's axis that lie on each other, by more than the blank rim of their boxes.
+# Texts at the ticks of a chart's axis that are seen and lie on each other, by more than the blank rim of their boxes.
 OVERPRINTS = """() => {
   const found = [];
   for (const axis of document.querySelectorAll(".role-axis-label")) {
-    const texts = [...axis.querySelectorAll("text")].filter(text => text.textContent.trim());
+    const texts = [...axis.querySelectorAll("text")].filter(
+      text => text.textContent.trim() && getComputedStyle(text).opacity > 0);
     const boxes = texts.map(text => text.getBoundingClientRect());
     for (let i = 0; i < boxes.length; i++) for (let j = 0; j < i; j++) {
       const [a, b] = [boxes[i], boxes[j]];
