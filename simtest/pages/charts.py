@@ -35,6 +35,7 @@ _DASH_CHANNEL = {
     "field": "dash", "type": "nominal", "legend": None,
     "scale": {"domain": list(_DASHES), "range": [list(dash) for dash in _DASHES.values()]},
 }  # fmt: skip
+_OFF = {"name": "off", "value": []}  # the names whose marks are hidden
 _STRETCH = 0.01
 _STRETCHED_TICKS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 
@@ -97,8 +98,8 @@ class Axis:
         low, high = (float(end) for end in self.from_axis(spaced + np.array([-margin, margin])))
         return low, high
 
-    def channel(self, column: str, ends: tuple[float, float], is_titled: bool = True, is_x: bool = False) -> Spec:
-        """Return the encoding of a column by this axis, which may be the one of x."""
+    def channel(self, column: str, ends: tuple[float, float], is_titled: bool = True) -> Spec:
+        """Return the encoding of a column by this axis."""
         axis: Spec = {"title": self.title.split("\n") if self.title and is_titled else None, "labels": is_titled}
         scale: Spec = {"type": "linear", "domain": list(ends), "nice": False}
         low, high = min(ends), max(ends)
@@ -113,19 +114,12 @@ class Axis:
         if self.scale == "stretched":
             ticks = [*(-tick for tick in reversed(_STRETCHED_TICKS)), 0.0, *_STRETCHED_TICKS]
             scale |= {"type": "symlog", "constant": _STRETCH}
-            axis |= {
-                "format": "~g",
-                "values": [tick for tick in ticks if low <= tick <= high],
-                "labelOverlap": "greedy",
-            }
+            ticks = [tick for tick in ticks if low <= tick <= high]
+            axis |= {"format": "~g", "values": ticks, "labelOverlap": "greedy"}
         if self.named is not None:
             at, texts = [at for at, _ in self.named], [text.split("\n") for _, text in self.named]
             axis |= {"values": at, "labelExpr": f"{json.dumps(texts)}[indexof({json.dumps(at)}, datum.value)]"}
-            if is_x:
-                # Names that do not fit beside each other are turned.
-                narrow = f"width < {sum(8 * max(map(len, lines)) + 8 for lines in texts)}"
-                axis |= {"labelOverlap": False, "labelAngle": {"expr": f"{narrow} ? -40 : 0"},
-                         "labelAlign": {"expr": f"{narrow} ? 'right' : 'center'"}}  # fmt: skip
+            axis["labelOverlap"] = False
         if "values" in axis:
             # Or Vega would leave out every second of more than it would choose.
             axis["tickCount"] = len(axis["values"])
@@ -251,7 +245,10 @@ def spec(chart: Chart, width: int = _WIDTH) -> Spec:
     last = chart.panels[-1]
     views = [_view(panel, panel.x.ends(all_x), width, room * panel.share, panel is last) for panel in chart.panels]
     whole: Spec = {"vconcat": views, "spacing": _GAP} if len(views) > 1 else views[0]
-    return {"config": _CONFIG, "params": [{"name": "off", "value": []}], **whole}
+    # The page's script keeps the ratio of axes of one scale, and turns names that do not fit beside each other.
+    ratio = views[0]["width"] / views[0]["height"] if last.equal else None
+    names = sum(8 * max(map(len, name.split("\n"))) + 8 for _, name in last.x.named or ())
+    return {"config": _CONFIG, "params": [_OFF], "usermeta": {"ratio": ratio, "names": names}, **whole}
 
 
 def _view(panel: Panel, x_ends: tuple[float, float], width: int, height: float, is_last: bool) -> Spec:
@@ -259,11 +256,10 @@ def _view(panel: Panel, x_ends: tuple[float, float], width: int, height: float, 
     y_ends = panel.y.ends([part for mark in panel.marks for part in (mark.y, *((mark.bars or ())[:2]))])
     view: Spec = {"width": width, "height": round(height)}
     if panel.equal:
-        ratio = abs((x_ends[1] - x_ends[0]) / (y_ends[1] - y_ends[0]))
-        view |= {"width": round(ratio * height), "usermeta": {"ratio": ratio}}
+        view["width"] = round(height * abs((x_ends[1] - x_ends[0]) / (y_ends[1] - y_ends[0])))
 
     def layer(mark: Spec, rows: list[Spec], x: str = "x", y: str = "y", **more: Any) -> Spec:
-        axes = {"x": panel.x.channel(x, x_ends, is_last, is_x=True), "y": panel.y.channel(y, y_ends)}
+        axes = {"x": panel.x.channel(x, x_ends, is_last), "y": panel.y.channel(y, y_ends)}
         switched = [{"filter": "indexof(off, datum.name) < 0"}]
         return {"data": {"values": rows}, "transform": switched, "mark": mark, "encoding": axes | more}
 
@@ -288,7 +284,7 @@ def _view(panel: Panel, x_ends: tuple[float, float], width: int, height: float, 
 
 def _direct(column: str, kind: str = "quantitative") -> Spec:
     """Return the encoding of a column that holds what is drawn itself."""
-    return {"field": column, "type": kind, "scale": None, "legend": None}
+    return {"field": column, "type": kind, "scale": None}
 
 
 def _picture(panel: Panel, layer: Any, view: Spec) -> list[Spec]:
@@ -300,9 +296,9 @@ def _picture(panel: Panel, layer: Any, view: Spec) -> list[Spec]:
     values = np.clip(np.rint(255 * np.asarray(panel.picture.values, float)), 0, 255).astype(np.uint8)
     how = cv2.INTER_NEAREST if size[0] >= values.shape[1] else cv2.INTER_AREA
     drawn = np.asarray(cv2.resize(values, size, interpolation=how), np.uint8)
-    row = {"name": "", "x": (x0 + x1) / 2, "y": (y0 + y1) / 2, "url": pixels.jpeg_address(drawn, 95)}
-    mark = {"type": "image", "width": view["width"], "height": view["height"], "aspect": False}
-    return [layer(mark, [row], url={"field": "url", "type": "nominal"})]
+    row = {"name": "", "x": x0, "x2": x1, "y": y0, "y2": y1, "url": pixels.jpeg_address(drawn)}
+    ends = {"x2": {"field": "x2"}, "y2": {"field": "y2"}}
+    return [layer({"type": "image", "aspect": False}, [row], **ends, url={"field": "url", "type": "nominal"})]
 
 
 def _rows(panel: Panel, x_ends: tuple[float, float], y_ends: tuple[float, float]) -> dict[str, list[Spec]]:
@@ -424,7 +420,7 @@ def png(charts: Sequence[Chart]) -> bytes:
     named = max(len(panel.x.named or ()) for chart in charts for panel in chart.panels)
     width = width if len(charts) > 1 else max(width, 105 * named)
     cells = [_titled(chart, width) for chart in charts]
-    whole: Spec = {"config": _CONFIG, "background": "white", "params": [{"name": "off", "value": []}]}
+    whole: Spec = {"config": _CONFIG, "background": "white", "params": [_OFF]}
     whole |= {"concat": cells, "columns": _COLUMNS, "spacing": 30} if len(cells) > 1 else cells[0]
     return bytes(_converter().vegalite_to_png(whole, scale=_SCALE))
 
@@ -432,7 +428,7 @@ def png(charts: Sequence[Chart]) -> bytes:
 def _titled(chart: Chart, width: int) -> Spec:
     """Return a chart's panels with its title above and its legend below."""
     whole = spec(chart, width)
-    views = whole.get("vconcat") or [{key: whole[key] for key in whole if key not in ("config", "params")}]
+    views = whole.get("vconcat") or [{key: whole[key] for key in ("width", "height", "layer")}]
     views[0]["title"] = chart.title
     marks = [*chart.entries, *chart.keys]
     return {"vconcat": [*views, *([_legend(marks, width)] if marks else [])], "spacing": _GAP}

@@ -136,12 +136,6 @@ def font(size: float, bold: bool = False) -> "FreeTypeFont":
     return ImageFont.truetype(fonts() / name, size, layout_engine=ImageFont.Layout.BASIC)
 
 
-def decoded(content: bytes) -> Pixels:
-    """Return the picture, RGB, of a PNG file's content."""
-    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
-
-
 def png(picture: Pixels) -> bytes:
     """Return a picture, RGB, as PNG.
 
