@@ -247,7 +247,7 @@ def spec(chart: Chart, width: int = _WIDTH) -> Spec:
     whole: Spec = {"vconcat": views, "spacing": _GAP} if len(views) > 1 else views[0]
     # The page's script keeps the ratio of axes of one scale, and turns names that do not fit beside each other.
     ratio = views[0]["width"] / views[0]["height"] if last.equal else None
-    names = sum(8 * max(map(len, name.split("\n"))) + 8 for _, name in last.x.named or ())
+    names = sum(6.5 * max(map(len, name.split("\n"))) + 6 for _, name in last.x.named or ())
     return {"config": _CONFIG, "params": [_OFF], "usermeta": {"ratio": ratio, "names": names}, **whole}
 
 

@@ -222,3 +222,53 @@ def test_the_overprint_check_sees_a_planted_fault(opened):
       other.setAttribute("transform", one.getAttribute("transform"));
     }""")
     assert page.evaluate(OVERPRINTS) != []
+
+
+def test_a_chart_is_enlarged_by_dragging_and_its_names_hide_marks(opened):
+    page = opened("run", 1400)
+    box = page.locator("#error_vs_curvature .chart")
+    box.scroll_into_view_if_needed()
+    points = box.locator(".mark-symbol path")
+    points.first.wait_for()
+    axes, count, ticks = box.locator(".background[stroke]").bounding_box(), points.count(), ticks_of(box)
+    name = page.locator("#error_vs_curvature [data-name]").first
+    name.click()
+    assert 0 < points.count() < count
+    page.mouse.move(axes["x"] + 0.2 * axes["width"], axes["y"] + 0.2 * axes["height"])
+    page.mouse.down()
+    page.mouse.move(axes["x"] + 0.6 * axes["width"], axes["y"] + 0.6 * axes["height"], steps=3)
+    page.mouse.up()
+    page.wait_for_function(
+        "old => document.querySelector('#error_vs_curvature .role-axis-label').textContent != old", arg=ticks
+    )
+    # What was hidden stays so.
+    assert points.count() < count
+    box.dblclick(position={"x": 300, "y": 100})
+    page.wait_for_function(
+        "old => document.querySelector('#error_vs_curvature .role-axis-label').textContent == old", arg=ticks
+    )
+    name.click()
+    assert points.count() == count
+
+
+def ticks_of(box):
+    return box.locator(".role-axis-label").first.text_content()
+
+
+def test_a_point_tells_its_setting(opened):
+    page = opened("run", 1400)
+    box = page.locator("#error_vs_curvature .chart")
+    box.scroll_into_view_if_needed()
+    box.locator(".mark-symbol path").last.hover(force=True)
+    page.locator("#tooltip:not([hidden])").wait_for()
+    assert "mean " in page.locator("#tooltip").text_content()
+
+
+def test_the_parts_of_a_3d_view_are_hidden_by_their_names(opened):
+    page = opened("view", 1400)
+    shown = "part => document.querySelector('.scene').contentWindow.scene?.getObjectByName(part)?.visible"
+    # Of the two surfaces one is shown.
+    page.wait_for_function(f"({shown})('part0') === true && ({shown})('part1') === false")
+    page.locator("[data-part=part1]").click()
+    page.locator("[data-part=part2]").click()
+    assert [page.evaluate(shown, f"part{i}") for i in range(4)] == [False, True, False, True]
