@@ -1,6 +1,5 @@
 """The records that the nightly's stages hand on: `NightlyRun` (measure), `Verdict` (judge), `JudgedRun` (draw)."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -64,29 +63,6 @@ it; gone: tonight has nothing to say of the quantity."""
 def to_explain() -> pl.Expr:
     """Return which comparisons are no regression, and yet must be explained: errors that fell, and what changed."""
     return pl.col("outcome").is_in(["changed", "better"])
-
-
-class Figure(NamedTuple):
-    """A number that a run measured: a row of `FIGURES`, whose columns the fields are."""
-
-    cell: Cell
-    quantity: str
-    unit: str
-    value: float | None
-    low: float | None = None
-    high: float | None = None
-    n: int | None = None
-    digest: str | None = None
-
-    def to_row(self) -> tuple[Any, ...]:
-        """Return the values of the columns `FIGURES`."""
-        return (*self.cell, *self[1:])
-
-
-def figure_table(figures: Iterable[Figure]) -> pl.DataFrame:
-    """Return figures as a table with the columns `FIGURES`; NaN becomes null."""
-    table = pl.DataFrame([figure.to_row() for figure in figures], schema=FIGURES, orient="row")
-    return table.with_columns(pl.col("value", "low", "high").fill_nan(None))
 
 
 class RunRecord(BaseModel):

@@ -14,7 +14,6 @@ DOCUMENTED = {
     "simtest.colour": ("detect_in_picture", "reconstruct_colour"),
     "simtest.engines": ("make_engine",),
     "simtest.estimators.base": ("Estimate", "FittedIsophote"),
-    "simtest.gate.limits": ("Limits",),
     "simtest.gate.records": ("COMPARISONS", "FIGURES", "Verdict"),
     "simtest.imaging.depth": ("depth_points", "read_depth"),
     "simtest.learn": ("Crops", "read_crops"),

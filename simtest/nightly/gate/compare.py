@@ -6,37 +6,43 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from simtest.nightly.gate.causes import causes
-from simtest.nightly.gate.contrasts import Outcomes, paired, unpaired
-from simtest.nightly.gate.holm import holm
-from simtest.nightly.gate.limits import Limits
-from simtest.nightly.gate.missing_results import digests, lost_highlights, missing_cells
-from simtest.nightly.gate.notes import large_and_undecided, notes_on, redefined
-from simtest.nightly.gate.pairing import frames_taken, pairing, pairs, with_all_frames
-from simtest.nightly.gate.pairing_units import paired_sums, sums
-from simtest.nightly.gate.pooling import pooled
+from simtest.nightly.gate.contrasts import Outcomes, holm, paired, pooled, unit_sums, unpaired
+from simtest.nightly.gate.findings import causes, large_and_undecided, notes_on, redefined
+from simtest.nightly.gate.pairing import (
+    digests,
+    frames_taken,
+    lost_highlights,
+    missing_cells,
+    pairing,
+    pairs,
+    with_all_frames,
+)
 from simtest.nightly.gate.quantities import (
+    MIXED,
     OPTIONAL_COLUMNS,
+    QUANTITIES,
     RESULT_COLUMNS,
     SAME_AS,
-    WHERE_MIXED,
     Quantity,
     harms,
-    quantities,
     told_twice,
 )
 from simtest.nightly.gate.single_results import moved
 from simtest.nightly.records import CELL, COMPARISONS, POOLED, Cell, NightlyRun, RunRecord, Verdict, to_explain
 from simtest.validation.results_table import SCHEMA
 
-DEFAULTS = Limits()
+ALPHA = 0.01
+"""Family-wise level: chance that a run without a change is called one, at most."""
+
+POOLED_WEIGHT = 0.5
+"""Share of `ALPHA`, in [0, 1), of all comparisons over many settings together."""
 
 _WORK = {**COMPARISONS, "better": pl.Float64(), "within": pl.Boolean()}
 """Columns of comparisons before `_judged`: `p` is that of a rise, `better` that of a fall, `within` as in `Outcomes`;
 an outcome that is set already stands."""
 
 
-def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = DEFAULTS) -> Verdict:
+def compare(tonight: NightlyRun, baseline: NightlyRun | None) -> Verdict:
     """Compare a run with the baseline; without one there is nothing to compare, and the causes are faults alone.
 
     Cells whose results are the same bytes are the same; the others are tested, pair by pair where seeds and versions
@@ -57,11 +63,11 @@ def compare(tonight: NightlyRun, baseline: NightlyRun | None, limits: Limits = D
     shared = first.join(second, on=CELL, suffix="_2", maintain_order="left")
     equal = pl.col("digest") == pl.col("digest_2")
     aligned, absent = _aligned(baseline, tonight)
-    tested, unmatched, short = _tested(*aligned, shared.filter(~equal).select(CELL), limits, same_machine)
+    tested, unmatched, short = _tested(*aligned, shared.filter(~equal).select(CELL), same_machine)
     made = [missing_cells(first, second), _same(shared.filter(equal).select(CELL), tonight.figures), *tested]
     held = [table for table in made if table.height]
-    comparisons = _judged(pl.concat([pl.DataFrame(schema=_WORK), *held], how="diagonal_relaxed"), limits)
-    notes = notes_on(baseline, tonight, bit_equal, unmatched, short, absent, limits)
+    comparisons = _judged(pl.concat([pl.DataFrame(schema=_WORK), *held], how="diagonal_relaxed"))
+    notes = notes_on(baseline, tonight, bit_equal, unmatched, short, absent)
     notes += large_and_undecided(comparisons)
     found = causes(comparisons, tonight, baseline)
     return Verdict(_state(comparisons), bit_equal, comparisons, notes, baseline.record, found)
@@ -107,7 +113,7 @@ def _same(equal: pl.DataFrame, figures: pl.DataFrame) -> pl.DataFrame:
 
 
 def _tested(
-    baseline: NightlyRun, tonight: NightlyRun, differing: pl.DataFrame, limits: Limits, same_machine: bool
+    baseline: NightlyRun, tonight: NightlyRun, differing: pl.DataFrame, same_machine: bool
 ) -> tuple[list[pl.DataFrame], int, int]:
     """Compare cells whose results differ; return also how many are no pairs, and how many lost highlights."""
     if differing.is_empty():
@@ -127,19 +133,19 @@ def _tested(
     without = _not_tested(pl.concat([before, after]), *(told_twice(run.rows, cells) for run in (baseline, tonight)))
     chosen = [run.join(without, on=("cell", "quantity"), how="anti", maintain_order="left") for run in (before, after)]
     taken = frames_taken(baseline.figures, tonight.figures, cells)
-    of_pairs = paired_sums(with_all_frames(pairs(*(run.filter(in_pairs) for run in chosen)), taken, before, after))
-    of_each = [sums(with_all_frames(run.filter(~in_pairs), taken, run)) for run in chosen]
+    of_pairs = unit_sums(with_all_frames(pairs(*(run.filter(in_pairs) for run in chosen)), taken, before, after))
+    of_each = [unit_sums(with_all_frames(run.filter(~in_pairs), taken, run)) for run in chosen]
     # Test
-    for name, quantity in quantities(limits).items():
-        own = of_pairs.filter(pl.col("quantity") == name).sort("cell")
-        first, second = _shared(*(table.filter(pl.col("quantity") == name) for table in of_each))
-        for table, outcomes, method in (
+    for name, quantity in QUANTITIES.items():
+        own, first, second = (table.filter(pl.col("quantity") == name) for table in (of_pairs, *of_each))
+        first, second = (one.join(other, on="cell", how="semi") for one, other in ((first, second), (second, first)))
+        for units, outcomes, method in (
             (own, paired(own, quantity), "paired"), (first, unpaired(first, second, quantity), "unpaired")
         ):  # fmt: skip
-            names = table.select("cell").join(cells, on="cell", maintain_order="left").select(CELL)
+            names = cells.join(units, on="cell", how="semi").sort("cell").select(CELL)
             made.append(_compared(names, name, quantity, outcomes, method, quantity.unit))
             made += _pooled(names, name, quantity, outcomes, method)
-        if name not in SAME_AS and name not in WHERE_MIXED:
+        if name not in SAME_AS and name not in MIXED:
             rest = cells.join(own, on="cell", how="anti").join(first, on="cell", how="anti").sort("cell")
             made.append(_untested(rest, name, quantity, before, after))
     return made, cells.height - len(matched.cells), matched.lost.height
@@ -157,19 +163,13 @@ def _not_tested(harms: pl.DataFrame, *twice: pl.DataFrame) -> pl.DataFrame:
     """Return the cells and quantities of two runs' harms that are not tested.
 
     A quantity that is another one in both runs would be tested twice (`twice`, of each run); an indicator of
-    `WHERE_MIXED` is tested in the cells where it takes both values across the two runs.
+    `MIXED` is tested in the cells where it takes both values across the two runs.
     """
     found = harms.group_by("cell", "quantity").agg(kinds=pl.col("value").n_unique())
-    alike = found.filter(pl.col("quantity").is_in(WHERE_MIXED), pl.col("kinds") == 1)
+    alike = found.filter(pl.col("quantity").is_in(MIXED), pl.col("kinds") == 1)
     first, second = twice
     both = first.join(second, on=("cell", "quantity"), how="semi")
     return pl.concat([both, alike.select("cell", "quantity")])
-
-
-def _shared(first: pl.DataFrame, second: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Return the rows of cells that both tables hold, in the order of the cells."""
-    kept = [one.join(other, on="cell", how="semi").sort("cell") for one, other in ((first, second), (second, first))]
-    return kept[0], kept[1]
 
 
 def _compared(
@@ -227,11 +227,11 @@ def _untested(
     )  # fmt: skip
 
 
-def _judged(made: pl.DataFrame, limits: Limits) -> pl.DataFrame:
+def _judged(made: pl.DataFrame) -> pl.DataFrame:
     """Correct the p-values, of one family of both sides, and settle the outcomes."""
     # Correct both sides together: a fall is a finding as a rise is.
     family = made["p"].is_not_null().to_numpy()
-    weights = _weights((made["setting"] == POOLED).fill_null(False).to_numpy()[family], limits.pooled_weight)
+    weights = _weights((made["setting"] == POOLED).fill_null(False).to_numpy()[family])
     p = np.stack([made[name].to_numpy()[family] for name in ("p", "better")])
     corrected = np.full((2, made.height), np.nan)
     corrected[:, family] = holm(p.ravel(), np.tile(weights, 2)).reshape(p.shape)
@@ -241,13 +241,13 @@ def _judged(made: pl.DataFrame, limits: Limits) -> pl.DataFrame:
     # Settle
     margin = pl.col("margin")
     inside = (pl.col("low") >= -margin) & (pl.col("high") <= margin)
-    level = pl.col("quantity").is_in([name for name, own in quantities(limits).items() if own.level])
-    changed = pl.min_horizontal("rises", "falls") <= limits.alpha
+    level = pl.col("quantity").is_in([name for name, own in QUANTITIES.items() if own.level])
+    changed = pl.min_horizontal("rises", "falls") <= ALPHA
     outcome = (
         pl.when(pl.col("outcome").is_not_null()).then("outcome")
         .when(level & changed).then(pl.lit("changed"))
-        .when(pl.col("rises") <= limits.alpha).then(pl.lit("worse"))
-        .when(pl.col("falls") <= limits.alpha).then(pl.lit("better"))
+        .when(pl.col("rises") <= ALPHA).then(pl.lit("worse"))
+        .when(pl.col("falls") <= ALPHA).then(pl.lit("better"))
         .when(inside.fill_null(False) | pl.col("within").fill_null(False)).then(pl.lit("equivalent"))
         .otherwise(pl.lit("undecided"))
     )  # fmt: skip
@@ -257,8 +257,8 @@ def _judged(made: pl.DataFrame, limits: Limits) -> pl.DataFrame:
     return made.with_columns(outcome=outcome, **shown).select(*COMPARISONS)
 
 
-def _weights(is_pooled: np.ndarray, share: float) -> np.ndarray:
+def _weights(is_pooled: np.ndarray) -> np.ndarray:
     """Return each test's weight in the family: the pooled ones share a part of it, where there are both."""
     if is_pooled.all() or not is_pooled.any():
         return np.ones(len(is_pooled))
-    return np.where(is_pooled, share / is_pooled.sum(), (1 - share) / (~is_pooled).sum())
+    return np.where(is_pooled, POOLED_WEIGHT / is_pooled.sum(), (1 - POOLED_WEIGHT) / (~is_pooled).sum())

@@ -2,13 +2,14 @@
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import polars as pl
 
 from simtest.conventions import MOTION_COLUMNS, ON_INSTRUMENT
 from simtest.nightly.gate.quantities import COVERED, IS_TRUE, RATIO_OFF
-from simtest.nightly.records import CELL, Cell, Figure, figure_table
+from simtest.nightly.records import CELL, FIGURES, Cell
 from simtest.runtime.statistics import mean_interval, share_interval
 from simtest.validation.results_table import SCHEMA
 from simtest.validation.statistics import figures, units
@@ -57,14 +58,19 @@ def setting_figures(rows: pl.DataFrame, frames: Frames | None = None) -> pl.Data
     several = set(shared.select("experiment", "setting").iter_rows())
     known = {key: count for key, count in (frames or {}).items() if key not in several}
     cells, hashes = rows.group_by(CELL, maintain_order=True), digests_of(rows)
-    return figure_table(
-        figure
-        for cell, own in ((Cell(*names), own) for names, own in cells)
-        for figure in _cell_figures(cell, own, known.get((cell.experiment or "", cell.setting or ""), 0), hashes[cell])
-    )
+    made: list[tuple[Any, ...]] = []
+    for names, own in cells:
+        cell = Cell(*names)
+        taken = known.get((cell.experiment or "", cell.setting or ""), 0)
+        made += ((*cell, *figure, hashes[cell]) for figure in _cell_figures(own, taken))
+    return pl.DataFrame(made, schema=FIGURES, orient="row")
 
 
-def _cell_figures(cell: Cell, rows: pl.DataFrame, taken: int, hashed: str) -> Iterator[Figure]:
+Figure = tuple[str, str, float, float | None, float | None, int]
+"""Quantity, unit, value, both ends of its interval, and the number that it is of."""
+
+
+def _cell_figures(rows: pl.DataFrame, taken: int) -> Iterator[Figure]:
     """Yield the known figures of one cell, of which so many frames are known to have been taken."""
 
     def figure(
@@ -74,16 +80,16 @@ def _cell_figures(cell: Cell, rows: pl.DataFrame, taken: int, hashed: str) -> It
         # A result that is no number makes a figure of its cell unknown.
         value, low, high = (float(v) if v is not None and np.isfinite(v) else None for v in (value, *interval))
         if value is not None:
-            yield Figure(cell, quantity, unit, value, low, high, n, hashed)
+            yield quantity, unit, value, low, high, n
 
     def share(quantity: str, of: pl.DataFrame, hits: pl.Expr) -> Iterator[Figure]:
         held = of.select(hits.fill_null(False).alias("hit"))["hit"].to_numpy()
         count, n = int(held.sum()), len(held)
         return figure(quantity, "", count / n, n, share_interval(held, *units(of)))
 
-    # Counts and shares
     found, frames = figures(rows), max(taken, rows["realisation"].n_unique())
     n, n_ok = found.n, found.n_ok
+    # Counts and shares
     yield from figure("frames", "", frames, frames)
     yield from figure("n", "", n, n)
     yield from figure("n_ok", "", n_ok, n)
@@ -109,12 +115,6 @@ def _cell_figures(cell: Cell, rows: pl.DataFrame, taken: int, hashed: str) -> It
         off = known["off"].to_numpy()
         yield from figure("axis_ratio", "", float(np.mean(off)), len(off), mean_interval(off, *units(known)))
         yield from figure("axis_ratio_median", "", float(np.median(off)), len(off))
-
-
-def digest(rows: pl.DataFrame) -> str:
-    """Hash the results of one cell; see `digests_of`."""
-    nameless = rows.with_columns(pl.lit("").alias(name) for name in CELL)
-    return digests_of(nameless).get(Cell(), "")
 
 
 def digests_of(rows: pl.DataFrame) -> dict[Cell, str]:

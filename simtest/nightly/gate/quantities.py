@@ -1,12 +1,12 @@
 """The quantities that the gate tests, each as one number of a row: a harm, of which more is worse, or a level."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import polars as pl
 from scipy import stats
 
 from simtest.conventions import MOTION, ON_INSTRUMENT
-from simtest.nightly.gate.limits import Limits
 from simtest.nightly.records import CELL
 from simtest.runtime.statistics import CONFIDENCE
 from simtest.validation.results_table import BUDGET_COLUMNS
@@ -39,64 +39,7 @@ OPTIONAL_COLUMNS: dict[str, pl.DataType] = {
 """Columns that `compare` reads too, by type: results have them only where a scene has instruments, or further views."""
 
 PENALISED = "mean_penalised_deg"
-"""Mean error with `PENALTY_DEG` for unanswered highlights: every true highlight has a value."""
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A compared quantity.
-
-    `span` is the range of a row's harm, where most rows are at one of its ends: two invented units then keep
-    small samples, which may all be alike by chance, from showing no variance. It is 0 where rows differ by nature.
-    """
-
-    unit: str
-    relative: float  # margin as a share of the baseline
-    absolute: float  # margin in the unit; the larger of the two counts
-    span: float = 0.0
-    falls: bool = False  # whether the figure shown is 1 less the harm: coverage is worse where it falls
-    level: bool = False  # whether neither side is better: a change either way has to be explained
-
-    @property
-    def scale_floor(self) -> float:
-        """Baseline at which both margins are equal; 0 where there is no relative one."""
-        return self.absolute / self.relative if self.relative else 0.0
-
-
-def quantities(limits: Limits) -> dict[str, Quantity]:
-    """Return the compared quantities by name."""
-    error = Quantity("deg", limits.relative, limits.absolute_deg)
-    ratio = Quantity("", limits.relative, limits.absolute_ratio)
-    share = Quantity("", 0.0, limits.rate, span=1.0)
-    level_deg = Quantity("deg", limits.relative, limits.absolute_deg, level=True)
-    return {
-        "mean_deg": error,
-        PENALISED: Quantity("deg", limits.relative, limits.absolute_deg, span=PENALTY_DEG),
-        "oracle_deg": error,
-        "base_deg": error,
-        "look_deg": error,
-        "law_deg": level_deg,
-        "axis_ratio": ratio,
-        "axis_ratio_level": Quantity("", limits.relative, limits.absolute_ratio, level=True),
-        "gain_error": ratio,
-        "gain_oracle_error": ratio,
-        "direction_deg": error,
-        "eps_over_d": Quantity("", limits.relative, limits.absolute_eps, level=True),
-        "peak_snr": Quantity("", limits.relative, limits.absolute_snr, level=True),
-        "region_deg": level_deg,
-        "noise_part_deg": level_deg,
-        "truth_in_region": Quantity("", 0.0, limits.coverage, level=True),
-        "unanswered": share,
-        "missed": Quantity("", 0.0, limits.rate, span=1.0, level=True),
-        "false": Quantity("a frame", 0.0, limits.rate, span=1.0),
-        "coverage95": Quantity("", 0.0, limits.coverage, span=1.0, falls=True),
-        "no_region": share,
-        "no_axis_ratio": share,
-        "no_law": share,
-        "flagged": Quantity("", 0.0, limits.rate, span=1.0, level=True),
-        "wrong_sign": share,
-    }
-
+"""Mean error with `PENALTY_DEG` for unanswered highlights."""
 
 IS_TRUE = pl.col("true_id").is_not_null()
 
@@ -118,11 +61,14 @@ REGION_DEG = (pl.col("cov_11") + pl.col("cov_22")).sqrt().degrees()
 """Size of the stated uncertainty: the square root of the covariance's trace, deg."""
 
 
-def _of_answers(value: pl.Expr) -> pl.Expr:
+def _of_answers(of: str | pl.Expr) -> pl.Expr:
+    value = pl.col(of) if isinstance(of, str) else of
     return pl.when(ANSWERED & value.is_finite()).then(value)
 
 
-_LAW = pl.col("error_law_deg")
+def _of_true(name: str) -> pl.Expr:
+    return pl.when(IS_TRUE & pl.col(name).is_finite()).then(pl.col(name))
+
 
 _SIGNS = [pl.col(f"motion_sign_{i}").fill_null(0) for i in (1, 2)]
 _TOLD = sum(((sign != 0).cast(pl.Float64) for sign in _SIGNS), pl.lit(0.0))
@@ -131,47 +77,102 @@ _WRONG = sum(
     pl.lit(0.0),
 )
 
-HARMS: dict[str, pl.Expr] = {
-    "mean_deg": pl.when(ANSWERED).then(pl.col("error_deg")),
-    PENALISED: pl.when(ANSWERED).then(pl.col("error_deg")).when(IS_TRUE).then(PENALTY_DEG),
-    "oracle_deg": _of_answers(pl.col("error_oracle_deg")),
-    "base_deg": _of_answers(pl.col("error_base_deg")),
-    "look_deg": _of_answers(pl.col("error_look_deg")),
-    "law_deg": _of_answers(_LAW),
-    "axis_ratio": RATIO_OFF,
-    "axis_ratio_level": _of_answers(pl.col("axis_ratio")),
-    "gain_error": _of_answers(pl.col("gain_error")).clip(upper_bound=WORST_RATIO),
-    "gain_oracle_error": _of_answers(pl.col("gain_oracle_error")).clip(upper_bound=WORST_RATIO),
-    "direction_deg": _of_answers(pl.col("direction_error_deg")),
-    "eps_over_d": pl.when(IS_TRUE & pl.col("eps_over_d").is_finite()).then(pl.col("eps_over_d")),
-    "peak_snr": pl.when(IS_TRUE & pl.col("peak_snr").is_finite()).then(pl.col("peak_snr")),
-    "region_deg": _of_answers(REGION_DEG),
-    "noise_part_deg": _of_answers(pl.col("budget_noise_deg")),
+
+@dataclass(frozen=True)
+class Quantity:
+    """A compared quantity.
+
+    `span` is the range of a row's harm, where most rows are at one of its ends: two invented units then keep
+    small samples, which may all be alike by chance, from showing no variance. It is 0 where rows differ by nature.
+    """
+
+    unit: str
+    relative: float  # margin as a share of the baseline
+    absolute: float  # margin in the unit; the larger of the two counts
+    words: str = ""  # names it in a sentence
+    value: pl.Expr | None = None  # harm or level of a row; null where it has none; None: counted by frames
+    span: float = 0.0
+    falls: bool = False  # whether the figure shown is 1 less the harm: coverage is worse where it falls
+    level: bool = False  # whether neither side is better: a change either way has to be explained
+    same_as: str = ""  # quantity that it is in most cells, where it would be tested twice
+    mixed: bool = False  # whether it counts what some results have and others lack: compared where both occur
+
+    @property
+    def scale_floor(self) -> float:
+        """Baseline at which both margins are equal; 0 where there is no relative one."""
+        return self.absolute / self.relative if self.relative else 0.0
+
+
+def _error(words: str, value: pl.Expr, **more: Any) -> Quantity:
+    """Return an angle, of which 2 % and 0.002 deg do no harm."""
+    return Quantity("deg", 0.02, 0.002, words, value, **more)
+
+
+def _ratio(words: str, value: pl.Expr, absolute: float = 0.002, **more: Any) -> Quantity:
+    """Return a ratio, of which 2 % and so much do no harm."""
+    return Quantity("", 0.02, absolute, words, value, **more)
+
+
+def _share(words: str, value: pl.Expr, **more: Any) -> Quantity:
+    """Return a share of highlights, of which 0.02 do no harm."""
+    return Quantity("", 0.0, 0.02, words, value.cast(pl.Float64), **{"span": 1.0, **more})
+
+
+_ERROR = pl.when(ANSWERED).then(pl.col("error_deg"))
+_DISTANCE = pl.col("mahalanobis2")
+
+QUANTITIES = {
+    "mean_deg": _error("the mean error", _ERROR),
+    # Every true highlight has a value.
+    PENALISED: _error("the mean error, 90 deg for each unanswered highlight,",
+                      pl.when(ANSWERED).then(pl.col("error_deg")).when(IS_TRUE).then(PENALTY_DEG),
+                      span=PENALTY_DEG, same_as="mean_deg"),
+    "oracle_deg": _error("the mean error of the better candidate", _of_answers("error_oracle_deg"), same_as="mean_deg"),
+    "base_deg": _error("the mean error against the base's normal", _of_answers("error_base_deg"), same_as="mean_deg"),
+    "look_deg": _error("the mean error where the estimate looks", _of_answers("error_look_deg"), same_as="mean_deg"),
+    "law_deg": _error("the error that the law predicts", _of_answers("error_law_deg"), level=True),
+    "axis_ratio": _ratio("the axis ratio's deviation from its law", RATIO_OFF),
+    "axis_ratio_level": _ratio("the mean axis ratio", _of_answers("axis_ratio"), level=True),
+    "gain_error": _ratio("the error of the gains 1 + d k", _of_answers("gain_error").clip(upper_bound=WORST_RATIO)),
+    "gain_oracle_error": _ratio("the error of the better gains 1 + d k",
+                                _of_answers("gain_oracle_error").clip(upper_bound=WORST_RATIO), same_as="gain_error"),
+    "direction_deg": _error("the error of the curvature's direction", _of_answers("direction_error_deg")),
+    "eps_over_d": _ratio("the light's distance over the surface's", _of_true("eps_over_d"), 1e-4, level=True),
+    "peak_snr": _ratio("the highlights' peak over the noise", _of_true("peak_snr"), 0.1, level=True),
+    "region_deg": _error("the size of the reported regions", _of_answers(REGION_DEG), level=True),
+    "noise_part_deg": _error("the noise's part of the reported uncertainty", _of_answers("budget_noise_deg"),
+                             level=True),
     # Uniform over 0 to 1 where regions are right; near 1 where they are too wide, near 0 where they are too narrow.
-    "truth_in_region": _of_answers((-pl.col("mahalanobis2") / 2).exp()),
-    "unanswered": pl.when(IS_TRUE).then((~ANSWERED).cast(pl.Float64)),
-    "missed": pl.when(IS_TRUE).then((pl.col("status") == "missed").cast(pl.Float64)),
+    "truth_in_region": _share("the truth's place in the reported regions (0.5 where they are right, 1 where too wide)",
+                              _of_answers((-_DISTANCE / 2).exp()), span=0.0, level=True),
+    "unanswered": _share("the share of unanswered highlights", pl.when(IS_TRUE).then(~ANSWERED)),
+    "missed": _share("the share of missed highlights", pl.when(IS_TRUE).then(pl.col("status") == "missed"), level=True,
+                     same_as="unanswered"),
+    "false": Quantity("a frame", 0.0, 0.02, "the number of false detections a frame", span=1.0),
     # Outside too: a distance that is no number or infinite, as in `simtest.validation.statistics.figures`.
-    "coverage95": pl.when(ANSWERED & pl.col("mahalanobis2").is_not_null()).then(
-        (~(pl.col("mahalanobis2").is_finite() & (pl.col("mahalanobis2") <= COVERED))).cast(pl.Float64)
-    ),
-    "no_region": pl.when(ANSWERED).then(pl.col("mahalanobis2").is_null().cast(pl.Float64)),
-    "no_axis_ratio": pl.when(ANSWERED).then(RATIO_OFF.is_null().cast(pl.Float64)),
-    "no_law": pl.when(ANSWERED).then((~_LAW.is_finite().fill_null(False)).cast(pl.Float64)),
-    "flagged": pl.when(ANSWERED).then((pl.col("flags").fill_null("") != "").cast(pl.Float64)),
+    "coverage95": _share("the share of true normals inside the 95 % region",
+                         pl.when(ANSWERED & _DISTANCE.is_not_null()).then(
+                             ~(_DISTANCE.is_finite() & (_DISTANCE <= COVERED))), falls=True),
+    "no_region": _share("the share of answers without a region", pl.when(ANSWERED).then(_DISTANCE.is_null()),
+                        mixed=True),
+    "no_axis_ratio": _share("the share of answers without an axis ratio to judge",
+                            pl.when(ANSWERED).then(RATIO_OFF.is_null()), mixed=True),
+    "no_law": _share("the share of answers without a law",
+                     pl.when(ANSWERED).then(~pl.col("error_law_deg").is_finite().fill_null(False)), mixed=True),
+    "flagged": _share("the share of answers with a flag", pl.when(ANSWERED).then(pl.col("flags").fill_null("") != ""),
+                      level=True, mixed=True),
     # Signs of curvatures that motion tells of a highlight: the wrong ones among them.
-    "wrong_sign": pl.when(IS_TRUE & (pl.col("estimator") == MOTION) & (_TOLD > 0)).then(_WRONG / _TOLD),
-}
-"""Value of a row by quantity; null where the row has none. False detections are counted by frames instead."""
-
-WHERE_MIXED = ("no_region", "no_axis_ratio", "no_law", "flagged")
-"""Quantities that count what some results have and others lack: compared where both occur."""
-
-SAME_AS = {
-    PENALISED: "mean_deg", "oracle_deg": "mean_deg", "base_deg": "mean_deg", "look_deg": "mean_deg",
-    "gain_oracle_error": "gain_error", "missed": "unanswered",
+    "wrong_sign": _share("the share of wrong signs among those that motion told",
+                         pl.when(IS_TRUE & (pl.col("estimator") == MOTION) & (_TOLD > 0)).then(_WRONG / _TOLD)),
 }  # fmt: skip
-"""Quantities that are another one in most cells, where they would be tested twice."""
+"""The compared quantities by name, with the differences that do no harm."""
+
+HARMS = {name: quantity.value for name, quantity in QUANTITIES.items() if quantity.value is not None}
+MIXED = [name for name, quantity in QUANTITIES.items() if quantity.mixed]
+SAME_AS = {name: quantity.same_as for name, quantity in QUANTITIES.items() if quantity.same_as}
+
+TWICE = 1e-6
+"""Values of two quantities that differ by a smaller share are the same: a baseline keeps some in single precision."""
 
 KEY = (*CELL, "realisation", "true_id", "seed")
 """Columns that name the row of a true highlight in two runs."""
@@ -211,7 +212,3 @@ def told_twice(rows: pl.DataFrame, cells: pl.DataFrame) -> pl.DataFrame:
     ]  # fmt: skip
     found = own.group_by("cell").agg(same).unpivot(list(SAME_AS), index="cell", variable_name="quantity")
     return found.filter("value").select("cell", "quantity")
-
-
-TWICE = 1e-6
-"""Values of two quantities that differ by a smaller share are the same: a baseline keeps some in single precision."""
