@@ -4,8 +4,7 @@ import copy
 from pathlib import Path
 from typing import Any
 
-from simtest.bench.certificate import write_certificate
-from simtest.bench.run import BenchRun
+from simtest.bench.run import BenchRun, write_certificate
 from simtest.bench.suite import HASHES, SUITE, Suite, load_suite, read_suite, resolved_tables
 from simtest.runtime.files import write_json
 from simtest.spec import load_scene

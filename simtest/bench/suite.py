@@ -1,4 +1,4 @@
-"""A suite of the benchmark: frozen cases by part, and the hashes that pin them.
+"""A suite of the benchmark: frozen cases by part, the hashes that pin them, and the scenes that are drawn of them.
 
 A case is a scene with every default written out (scenes/bench/v1/PART/NAME.toml), and the values that are drawn for
 each of its scenes (suite.toml). No later release changes it: a changed case is a new version of the suite.
@@ -6,7 +6,8 @@ each of its scenes (suite.toml). No later release changes it: a changed case is 
 
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +18,8 @@ from simtest.errors import InputError
 from simtest.runtime.files import Json
 from simtest.runtime.provenance import file_hash
 from simtest.runtime.resources import close_names, data_root, shown
-from simtest.spec import AnatomySurface, Scene, read_toml, scene_from_dict
+from simtest.runtime.seeds import Stage, generator
+from simtest.spec import AnatomySurface, Experiment, Group, Scene, read_toml, scene_from_dict
 from simtest.spec.spec_model import Name, Spec, load
 from simtest.surfaces.recipe import load_recipe
 
@@ -26,6 +28,11 @@ FORMAT = 1
 
 SUITES = {"v1": "simtest-bench v1"}
 HASHES, SUITE = "hashes.json", "suite.toml"
+
+HIGHLIGHTS = "highlights"
+
+DIGITS = 6
+"""Of a drawn value: mathematical libraries differ in the last ones."""
 
 PartKind = Literal["highlights", "maps"]
 
@@ -212,6 +219,16 @@ def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
     return suite
 
 
+def cases_of(suite: Suite, parts: Iterable[str]) -> dict[str, str]:
+    """Return the hashes of the cases of some parts, by part and name."""
+    return {case.name: case.digest for part in parts for case in suite.of_part(part)}
+
+
+def parts_of_overall(suite: Suite) -> list[str]:
+    """Return the parts whose scores make the headline: those whose unit is the highlight."""
+    return [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
+
+
 def layout_of(suite: Suite, part: str) -> Layout:
     """Return how many scenes each case of a part has, and how many frames each scene is taken in."""
     return {case.spec.name: (case.spec.draws, case.spec.realisations) for case in suite.of_part(part)}
@@ -275,3 +292,57 @@ def _flat(value: Any, above: str = "") -> dict[str, Any]:
     for key, item in items:
         flat |= _flat(item, f"{above}.{key}" if above else str(key))
     return flat or ({above: value} if above else {})
+
+
+def part_seed(suite: Suite, part: str) -> int:
+    """Return the seed of a part, in [0, 2^63)."""
+    text = f"{suite.spec.name} {suite.version} | {part} | {suite.spec.seed}"
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+
+
+def experiment_of(suite: Suite, part: str, core: str) -> Experiment:
+    """Return a part as an experiment of one estimator.
+
+    Each drawn scene is a pooled value of its case, so that a case is one setting of the results.
+    """
+    seed, name = part_seed(suite, part), f"{suite.spec.name}-{suite.version}-{part}"
+    groups = []
+    for case in suite.of_part(part):
+        pool = pooled(seed, name, case.spec)
+        groups.append(
+            Group(
+                scene=str(Path(case.file).resolve()),
+                label=case.spec.name,
+                pool=(pool,) if pool else (),
+                realisations=case.spec.realisations,
+                isolated=case.spec.isolated,
+            )
+        )
+    about = suite.part(part)
+    return Experiment(
+        name=name, title=f"{suite.spec.title}: {about.title}", description=about.description, seed=seed,
+        estimators=(core,), groups=tuple(groups),
+    )  # fmt: skip
+
+
+def pooled(seed: int, experiment: str, case: CaseSpec) -> dict[str, tuple[float | int, ...]]:
+    """Return the drawn values of a case's scenes by key path; each hangs on its key and its number alone."""
+    made = {}
+    for key, draw in sorted(case.draw.items()):
+        numbers = [n if draw.blocks is None else n * draw.blocks // case.draws for n in range(case.draws)]
+        made[key] = tuple(_drawn(seed, experiment, f"{case.name} | {key}", n, draw) for n in numbers)
+    return made
+
+
+def _drawn(seed: int, experiment: str, name: str, number: int, draw: Draw) -> float | int:
+    rng = generator(seed, experiment, name, number, Stage.SWEEP)
+    low, high = draw.low or 0.0, draw.high
+    if draw.kind == "normal":
+        value = low + high * float(rng.standard_normal())
+    elif draw.kind == "log_uniform":
+        value = math.exp(float(rng.uniform(math.log(low), math.log(high))))
+    elif draw.kind == "integer":
+        return int(rng.integers(int(low), int(high), endpoint=True))
+    else:
+        value = float(rng.uniform(low, high))
+    return float(f"{value:.{DIGITS}g}")

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from simtest.bench.certificate import CERTIFICATE, read_certificate
-from simtest.bench.leaderboard import Board, ranked, read_entries, write_leaderboard
 from simtest.bench.run import BenchRun, overall_of, run_bench
+from simtest.bench.scores import CERTIFICATE
 from simtest.bench.suite import Suite
+from simtest.bench.table import Board, ranked, read_certificate, read_entries, write_leaderboard
 from simtest.errors import InputError
 from tests.bench_tiny import copied, tiny_suite
 
@@ -150,7 +150,7 @@ def test_the_table_ranks_and_ties(suite: Suite, made: BenchRun, tmp_path: Path) 
 
 
 def test_a_core_without_a_score_has_no_rank(tmp_path: Path) -> None:
-    from simtest.bench.certificate import Certificate
+    from simtest.bench.table import Certificate
 
     held = [
         Certificate(tmp_path / name, {"value": value, "parts": {"smooth": {"scenes": {"plane": scenes}}}})
@@ -163,7 +163,7 @@ def test_a_core_without_a_score_has_no_rank(tmp_path: Path) -> None:
 
 def test_certificates_of_one_name_each_have_a_rank(tmp_path: Path) -> None:
     """A command with two options has one name."""
-    from simtest.bench.certificate import Certificate
+    from simtest.bench.table import Certificate
 
     held = [
         Certificate(

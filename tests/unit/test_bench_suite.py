@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from simtest.bench.draws import experiment_of, pooled
 from simtest.bench.suite import (
     SUITE,
     CaseSpec,
@@ -17,7 +16,9 @@ from simtest.bench.suite import (
     Suite,
     SuiteSpec,
     canonical,
+    experiment_of,
     load_suite,
+    pooled,
     suite_folder,
     unfrozen_keys,
 )  # fmt: skip
