@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import polars as pl
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from simtest.bench.suite import Layout, digest_of
 from simtest.geometry import chi_squared
@@ -106,20 +106,6 @@ class UncertaintyScore(Form):
     # Mean energy score: a proper score; smaller is better, and only the right covariance has the smallest
     energy_deg: Figure | None
 
-    @model_validator(mode="after")
-    def _consistent(self) -> "UncertaintyScore":
-        if (self.coverage is None) != (self.n == 0) or (self.interval is None) != (self.n == 0):
-            raise ValueError(f"n = {self.n}: coverage and interval stand where n is not 0")
-        low, high = self.interval or (0.0, 1.0)
-        if self.coverage is not None and not low - 1e-9 <= self.coverage <= high + 1e-9:
-            raise ValueError(f"coverage = {self.coverage}: lies outside its interval")
-        if (self.verdict == UNTESTED) != (self.n < LEAST_STATED):
-            raise ValueError(f"verdict = {self.verdict}: does not go with n = {self.n}")
-        share = LEVEL if self.coverage is None else self.coverage
-        if (self.verdict == NARROW and share >= LEVEL) or (self.verdict == SCALED and share <= LEVEL):
-            raise ValueError(f"verdict = {self.verdict}: does not go with a coverage of {share}")
-        return self
-
 
 class ZoneScore(Form):
     """Figures of a zone of maps; see `simtest.bench.run.dense_figures`."""
@@ -169,14 +155,6 @@ class PartScore(Form):
     zones: dict[Text, ZoneScore] | None = None
     conventions: list[Annotated[str, Field(max_length=2000)]] | None = None
     stated: StatedForm | None = None
-
-    @model_validator(mode="after")
-    def _consistent(self) -> "PartScore":
-        if None not in (self.median_deg, self.p95_deg) and self.median_deg > self.p95_deg:  # type: ignore[operator]
-            raise ValueError(f"median_deg = {self.median_deg}: exceeds p95_deg = {self.p95_deg}")
-        if self.uncertainty.n > self.answered:
-            raise ValueError(f"uncertainty.n = {self.uncertainty.n}: exceeds answered = {self.answered}")
-        return self
 
 
 class SuiteForm(Form):

@@ -19,9 +19,8 @@ from simtest.runtime.files import Json
 from simtest.runtime.provenance import file_hash
 from simtest.runtime.resources import close_names, data_root, shown
 from simtest.runtime.seeds import Stage, generator
-from simtest.spec import AnatomySurface, Experiment, Group, Scene, read_toml, scene_from_dict
+from simtest.spec import AnatomySurface, Experiment, Group, read_toml
 from simtest.spec.spec_model import Name, Spec, load
-from simtest.surfaces.recipe import load_recipe
 
 FORMAT = 1
 """Of the cases' files; it enters their hashes."""
@@ -250,62 +249,14 @@ def _meshes(scene: Mapping[str, Any]) -> dict[str, str]:
     return {} if file.suffix == ".toml" else {file.name: file_hash(file)}
 
 
-def resolved_tables(scene: Scene) -> dict[str, Any]:
-    """Return a scene's tables with every default written out, and every preset and recipe replaced by its numbers.
-
-    Keys without a value are left out: TOML has none.
-    """
-    tables: dict[str, Any] = scene.model_dump(mode="json", exclude_none=True)
-    if scene.rig.preset is not None:
-        lights = [light.model_dump(mode="json", exclude_none=True) for light in scene.rig.lights]
-        lights = [
-            {key: value for key, value in light.items() if key not in ("offset_mm", "azimuth_deg")} for light in lights
-        ]
-        tables["rig"] = {"lights": lights, "seed": scene.rig.seed, "emission_known": scene.rig.emission_known}
-    tables["sensor"].pop("preset", None)
-    tables["reflectance"].get("albedo", {}).pop("preset", None)
-    if isinstance(scene.surface, AnatomySurface) and (file := scene.surface.file()).suffix == ".toml":
-        recipe = load_recipe(file, scene.surface.recipe_values)
-        # The type says which file it is read with, and the seed is the surface's own.
-        tables["surface"]["recipe"] = recipe.model_dump(mode="json", exclude_none=True, exclude={"type", "seed"})
-        tables["surface"]["seed"] = recipe.seed
-    return tables
-
-
-def unfrozen_keys(case: FrozenCase) -> list[str]:
-    """Return the key paths whose values the frozen file does not state: defaults that were added after the freeze.
-
-    Raises `InputError` if the file's scene resolves to another one than it states.
-    """
-    now = _flat(resolved_tables(scene_from_dict(case.scene, str(case.file))))
-    frozen = _flat(case.scene)
-    for path, value in frozen.items():
-        if now.get(path) != value:
-            raise InputError(f"{shown(case.file)}: {path} = {value!r} is read as {now.get(path)!r}")
-    return sorted(now.keys() - frozen.keys())
-
-
-def _flat(value: Any, above: str = "") -> dict[str, Any]:
-    """Return the leaves of nested tables and lists by key path; empty tables and lists are leaves."""
-    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
-    flat: dict[str, Any] = {}
-    for key, item in items:
-        flat |= _flat(item, f"{above}.{key}" if above else str(key))
-    return flat or ({above: value} if above else {})
-
-
-def part_seed(suite: Suite, part: str) -> int:
-    """Return the seed of a part, in [0, 2^63)."""
-    text = f"{suite.spec.name} {suite.version} | {part} | {suite.spec.seed}"
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
-
-
 def experiment_of(suite: Suite, part: str, core: str) -> Experiment:
     """Return a part as an experiment of one estimator.
 
     Each drawn scene is a pooled value of its case, so that a case is one setting of the results.
     """
-    seed, name = part_seed(suite, part), f"{suite.spec.name}-{suite.version}-{part}"
+    text = f"{suite.spec.name} {suite.version} | {part} | {suite.spec.seed}"
+    seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+    name = f"{suite.spec.name}-{suite.version}-{part}"
     groups = []
     for case in suite.of_part(part):
         pool = pooled(seed, name, case.spec)

@@ -20,12 +20,12 @@ from simtest.bench.suite import (
     load_suite,
     pooled,
     suite_folder,
-    unfrozen_keys,
 )  # fmt: skip
 from simtest.errors import InputError
 from simtest.spec import scene_from_dict
 from simtest.surfaces.factory import make_surface
 from simtest.validation.cases import expand
+from studies.bench_cases import unfrozen_keys
 from tests.bench_tiny import tiny_suite
 
 V1 = "d4ca908db0cf32f945db653d3cdff8a803ddec1b4946d63b1fee0de21422a6b3"
