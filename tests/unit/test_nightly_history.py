@@ -12,15 +12,27 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from simtest.errors import InputError
-from simtest.nightly import layout
-from simtest.nightly.baseline import accept, load_baseline, log_note
+from simtest.nightly import store
 from simtest.nightly.gate.quantities import OLDEST_COLUMNS
 from simtest.nightly.history import HISTORY, TREND_COLUMNS, TRENDS, append, clock_note, history_rows, read_history
-from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
 from simtest.nightly.phrases import short_commit
 from simtest.nightly.records import CELL
-from simtest.nightly.storage import BASELINE_ROWS, LATEST_ROWS, load_run, save_run
-from simtest.nightly.verdict import judge
+from simtest.nightly.run import judge
+from simtest.nightly.store import (
+    BASELINE_ROWS,
+    LATEST_ROWS,
+    Reports,
+    accept,
+    exclusive_replacement,
+    load_baseline,
+    load_run,
+    log_note,
+    new_run_id,
+    remove_dead,
+    replace_folder,
+    save_run,
+    scratch,
+)
 from tests.unit.nightly_samples import STARTED, make_rows, make_run, no_baseline
 
 
@@ -396,7 +408,10 @@ def test_an_accept_that_is_killed_leaves_one_of_the_two(reports, monkeypatch, re
         with pytest.raises(KeyboardInterrupt):
             accept(reports, "quick", "second")
     else:
-        monkeypatch.setattr(layout, "sync_folder", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        swapped = reports.baseline("quick").parent
+        monkeypatch.setattr(
+            store, "sync_folder", lambda made: (_ for _ in ()).throw(KeyboardInterrupt) if made == swapped else None
+        )
         with pytest.raises(KeyboardInterrupt):
             accept(reports, "quick", "second")
     monkeypatch.undo()

@@ -12,10 +12,8 @@ from contextlib import contextmanager
 import polars as pl
 import pytest
 
-from simtest.nightly.baseline import load_baseline
 from simtest.nightly.history import read_history
-from simtest.nightly.layout import Reports
-from simtest.nightly.storage import LATEST_ROWS, load_run
+from simtest.nightly.store import LATEST_ROWS, Reports, load_baseline, load_run
 
 MAIN = "from simtest.cli.main import main; main()"
 ROUNDS = 2

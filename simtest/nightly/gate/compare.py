@@ -138,7 +138,10 @@ def _tested(
     # Test
     for name, quantity in QUANTITIES.items():
         own, first, second = (table.filter(pl.col("quantity") == name) for table in (of_pairs, *of_each))
-        first, second = (one.join(other, on="cell", how="semi") for one, other in ((first, second), (second, first)))
+        first, second = (
+            one.join(other, on="cell", how="semi", maintain_order="left")
+            for one, other in ((first, second), (second, first))
+        )
         for units, outcomes, method in (
             (own, paired(own, quantity), "paired"), (first, unpaired(first, second, quantity), "unpaired")
         ):  # fmt: skip

@@ -87,18 +87,16 @@ class _Units:
 
     def __init__(self, units: pl.DataFrame, span: float, **invented: tuple[float, float]) -> None:
         names = ("n", *invented)
-        held = units.group_by("cell", maintain_order=True).agg(real=pl.len(), **{n: pl.col(n).sum() for n in names})
-        held = held.sort("cell")
-        self.real = held["real"].to_numpy().astype(float)
-        self.totals = {name: held[name].to_numpy() for name in names}
+        numbers, self.cell = np.unique(units["cell"].to_numpy(), return_inverse=True)
         self.sums = {name: units[name].to_numpy() for name in names}
-        cells = np.arange(len(self.real))
-        self.cell = np.searchsorted(held["cell"].to_numpy(), units["cell"].to_numpy())
+        self.real = np.bincount(self.cell, minlength=len(numbers)).astype(float)
+        # Added up one by one, so that equal units have equal sums to the last bit, wherever they lie in memory.
+        self.totals = {name: self._add(values) for name, values in self.sums.items()}
         if span:
             size = self.totals["n"] / self.real
             for i in (0, 1):
                 added = {"n": size, **{name: shares[i] * span * size for name, shares in invented.items()}}
-                self.cell = np.concatenate([self.cell, cells])
+                self.cell = np.concatenate([self.cell, np.arange(len(numbers))])
                 self.sums = {name: np.concatenate([self.sums[name], added[name]]) for name in names}
 
     def shown(self, name: str) -> Array:

@@ -65,7 +65,9 @@ def _groups(comparisons: pl.DataFrame) -> list[dict[str, Any]]:
     kind = pl.when(pl.col("quantity") == "n").then(1).when(pl.col("method") == SINGLE).then(3).otherwise(2)
     scale = pl.max_horizontal(pl.col("margin").abs(), pl.col("baseline").abs(), pl.lit(1e-9))
     found = comparisons.filter(worse | to_explain()).with_columns(
-        kind=kind + pl.when(worse).then(0).otherwise(10), size=(pl.col("difference").abs() / scale).fill_null(0.0),
+        kind=kind + pl.when(worse).then(0).otherwise(10),
+        # Rounding does not decide which of those that moved alike is named.
+        size=(pl.col("difference").abs() / scale).fill_null(0.0).round_sig_figs(9),
         # A row over many settings names none.
         own=pl.col("setting") != POOLED,
     )  # fmt: skip

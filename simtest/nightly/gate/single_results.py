@@ -70,64 +70,55 @@ def moved(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
         for rows in (before, after)
     )  # fmt: skip
     both = first.join(second, on=_KEY, suffix="_2", nulls_equal=True, maintain_order="left")
-    made = [_status(both), _flags(both), _false(before, after), *(_number(both, *item) for item in STEPS.items())]
+    was, now = pl.col("answered"), pl.col("answered_2")
+    answered = both.filter(was & now)
+    # An answer whose error is no number is none, whatever its status.
+    other = pl.col("status").ne_missing(pl.col("status_2")) | (was != now)
+    lost = (was & ~now).sum()
+    many = (lost > 0) & (lost >= _LOST_HALF * was.sum())
+    made = [_told(both, "single answers", "", other.sum(), was.sum(), now.sum(), many)]
+    was, now = (pl.col(name).fill_null("") for name in ("flags", "flags_2"))
+    made.append(_told(answered, "single flags", "", (was != now).sum(), (was != "").sum(), (now != "").sum()))
+    was, now = pl.col("found").fill_null(0), pl.col("found_2").fill_null(0)
+    false = _false_by_frame(before, after)
+    made.append(_told(false, "single false", "", (was != now).sum(), was.sum(), now.sum()))
+    made += [_number(answered if step.of_answers else both, name, step) for name, step in STEPS.items()]
     return pl.concat(made, how="diagonal").with_columns(method=pl.lit(SINGLE), margin=pl.lit(0.0))
 
 
-def _told(found: pl.DataFrame, quantity: str, unit: str, outcome: pl.Expr | None = None) -> pl.DataFrame:
-    """Return comparisons of cells, with `n`, `baseline` and `tonight`; those without a moved result are left out."""
+def _told(
+    results: pl.DataFrame, quantity: str, unit: str, n: pl.Expr, baseline: pl.Expr, tonight: pl.Expr,
+    worse: pl.Expr | None = None,
+) -> pl.DataFrame:  # fmt: skip
+    """Return comparisons of cells, by what is aggregated of their results; those without a moved one are left out."""
+    found = results.group_by(CELL, maintain_order=True).agg(
+        n=n.cast(pl.Int64), baseline=baseline.cast(pl.Float64), tonight=tonight.cast(pl.Float64),
+        worse=pl.lit(False) if worse is None else worse,
+    )  # fmt: skip
     return found.filter(pl.col("n") > 0).select(
-        *CELL, quantity=pl.lit(quantity), unit=pl.lit(unit), n=pl.col("n").cast(pl.Int64),
-        baseline=pl.col("baseline").cast(pl.Float64), tonight=pl.col("tonight").cast(pl.Float64),
-        difference=pl.col("tonight").cast(pl.Float64) - pl.col("baseline").cast(pl.Float64),
-        outcome=pl.lit("changed") if outcome is None else outcome,
+        *CELL, "n", "baseline", "tonight", quantity=pl.lit(quantity), unit=pl.lit(unit),
+        difference=pl.col("tonight") - pl.col("baseline"),
+        outcome=pl.when(pl.col("worse")).then(pl.lit("worse")).otherwise(pl.lit("changed")),
     )  # fmt: skip
 
 
-def _status(both: pl.DataFrame) -> pl.DataFrame:
-    before, after = pl.col("answered"), pl.col("answered_2")
-    # An answer whose error is no number is none, whatever its status.
-    other = pl.col("status").ne_missing(pl.col("status_2")) | (before != after)
-    found = both.group_by(CELL, maintain_order=True).agg(
-        n=other.sum(), baseline=before.sum(), tonight=after.sum(),
-        lost=(before & ~after).sum(),
-    )  # fmt: skip
-    many = (pl.col("lost") > 0) & (pl.col("lost") >= _LOST_HALF * pl.col("baseline"))
-    return _told(found, "single answers", "", pl.when(many).then(pl.lit("worse")).otherwise(pl.lit("changed")))
-
-
-def _flags(both: pl.DataFrame) -> pl.DataFrame:
-    answered = both.filter(pl.col("answered") & pl.col("answered_2"))
-    was, now = (pl.col(name).fill_null("") for name in ("flags", "flags_2"))
-    found = answered.group_by(CELL, maintain_order=True).agg(
-        n=(was != now).sum(), baseline=(was != "").sum(), tonight=(now != "").sum()
-    )
-    return _told(found, "single flags", "")
-
-
-def _false(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
+def _false_by_frame(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
+    """Count the false detections of each frame, `found` before and `found_2` after."""
     frame = (*CELL, "realisation")
     first, second = (
         rows.group_by(frame, maintain_order=True).agg(found=is_false(rows).sum().cast(pl.Int64))
         for rows in (before, after)
     )
-    both = first.join(second, on=frame, how="full", coalesce=True, suffix="_2", maintain_order="left_right")
-    was, now = pl.col("found").fill_null(0), pl.col("found_2").fill_null(0)
-    found = both.group_by(CELL, maintain_order=True).agg(n=(was != now).sum(), baseline=was.sum(), tonight=now.sum())
-    return _told(found, "single false", "")
+    return first.join(second, on=frame, how="full", coalesce=True, suffix="_2", maintain_order="left_right")
 
 
-def _number(both: pl.DataFrame, name: str, step: Step) -> pl.DataFrame:
+def _number(results: pl.DataFrame, name: str, step: Step) -> pl.DataFrame:
     was, now = pl.col(name), pl.col(f"{name}_2")
-    compared = both.filter(pl.col("answered") & pl.col("answered_2")) if step.of_answers else both
     size = (now - was).abs()
     far = (size > step.absolute) & (size > step.share * pl.min_horizontal(was.abs(), now.abs()))
     # A number that appears or vanishes has moved as well.
     far = far.fill_null(False) | (was.is_finite().fill_null(False) != now.is_finite().fill_null(False))
-    marked = compared.with_columns(far=far, size=size.fill_nan(None).fill_null(float("inf")))
+    marked = results.with_columns(far=far, size=size.fill_nan(None).fill_null(float("inf")))
     worst = pl.col("size").filter("far").arg_max()
-    found = marked.group_by(CELL, maintain_order=True).agg(
-        n=pl.col("far").sum(), baseline=was.filter("far").get(worst, null_on_oob=True),
-        tonight=now.filter("far").get(worst, null_on_oob=True),
-    )  # fmt: skip
-    return _told(found, f"single {name}", step.unit)
+    farthest = (value.filter("far").get(worst, null_on_oob=True) for value in (was, now))
+    return _told(marked, f"single {name}", step.unit, pl.col("far").sum(), *farthest)
