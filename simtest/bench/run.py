@@ -61,18 +61,10 @@ OF_RUN = "brightest_point"
 
 @dataclass(frozen=True)
 class BenchRun:
-    """A finished run of the benchmark.
-
-    Parameters
-    ----------
-    certificate : Path
-        Its file.
-    content : dict
-        As in the file, without its hash.
-    """
+    """A finished run of the benchmark."""
 
     certificate: Path
-    content: JsonObject
+    content: JsonObject  # as in the file, without its hash
 
 
 def chosen_parts(suite: Suite, wanted: Sequence[str] | None) -> list[str]:
@@ -146,7 +138,17 @@ def run_maps(
     `maps` is a folder of maps, each called as its frame (`export_frames`), or "shading".
     """
     make_folder(folder)
-    score, figures = score_dense(suite, maps, folder / PART, options, engine, progress)
+    own = folder / PART
+    export_frames(suite, own, engine, progress)
+
+    def tell(done: int, total: int, what: str) -> None:
+        if progress:
+            progress(done, total, f"scoring {what}")
+
+    score = score_maps(maps, own / RUN, own / SCORES, options, "", tell)
+    numbers = {use.frame: use.realisation for use in read_record(own / RUN).uses}
+    stated = {key: getattr(options or MapOptions(), key) for key in STATED}
+    figures = dense_figures(score, layout_of(suite, PART), numbers) | {"stated": stated}
     return _certified(suite, folder, maps_record(maps, score), {PART: figures})
 
 
@@ -164,35 +166,6 @@ def export_frames(suite: Suite, folder: Path, engine: Engine | None = None, prog
     (run,) = run_experiments([(experiment, folder / RUN)], "", None, progress, chosen)
     export_run(run.folder, experiment, folder / FRAMES, chosen, progress)
     return folder / FRAMES
-
-
-def score_dense(
-    suite: Suite, maps: str | Path, folder: Path, options: MapOptions | None = None,
-    engine: Engine | None = None, progress: Progress | None = None,
-) -> tuple[DenseScore, JsonObject]:  # fmt: skip
-    """Score maps on the frames of the dense part; return the whole score, and the part's figures for a certificate.
-
-    Parameters
-    ----------
-    suite, engine, progress
-        As of `simtest.bench.run.run_bench`.
-    maps : str or Path
-        Folder of the maps, each called as its frame, or "shading".
-    folder : Path
-        Gets the run, the frames and the scores, a folder each.
-    options : MapOptions, optional
-        What is stated of the maps.
-    """
-    export_frames(suite, folder, engine, progress)
-
-    def tell(done: int, total: int, what: str) -> None:
-        if progress:
-            progress(done, total, f"scoring {what}")
-
-    score = score_maps(maps, folder / RUN, folder / SCORES, options, "", tell)
-    numbers = {use.frame: use.realisation for use in read_record(folder / RUN).uses}
-    stated = {key: getattr(options or MapOptions(), key) for key in STATED}
-    return score, dense_figures(score, layout_of(suite, PART), numbers) | {"stated": stated}
 
 
 def dense_figures(score: DenseScore, layout: Layout, numbers: Mapping[str, int]) -> JsonObject:
@@ -313,14 +286,17 @@ def _is_shared(program: Path) -> bool:
 
 
 def _certified(suite: Suite, folder: Path, core: JsonObject, scores: dict[str, JsonObject]) -> BenchRun:
-    """Write the certificate of a run's figures by part."""
+    """Write the certificate of a run's figures by part, and what of the machine these may depend on."""
+    environment: dict[str, Any] = dict(provenance.environment())
+    # The kernel says nothing of the figures, and its text may name the host.
+    del environment["system"]
     content: JsonObject = {
         "kind": KIND,
         "format": FORMAT,
         "suite": {"name": suite.spec.name, "version": suite.version, "sha256": suite.digest},
         "cases": cases_of(suite, scores),
         "core": core,
-        "environment": environment(),
+        "environment": environment | {"source_sha256": provenance.source_hash()},
         "parts": scores,
         "overall": overall_of(suite, scores),
     }
@@ -344,14 +320,6 @@ def overall_of(suite: Suite, parts: "dict[str, JsonObject]") -> JsonObject:
     below, above = (math.hypot(*(span[i] - value for span, value in zip(spans, values, strict=True))) for i in (0, 1))
     interval = [max(mean - below / len(spans), 0.0), min(mean + above / len(spans), CAP_DEG)]
     return {"complete": True, "score_deg": mean, "score_interval": interval}
-
-
-def environment() -> JsonObject:
-    """Return what of the machine and its packages the figures may depend on; neither paths nor the host's name."""
-    made_by: dict[str, Any] = dict(provenance.environment())
-    # The kernel says nothing of the figures, and its text may name the host.
-    del made_by["system"]
-    return made_by | {"source_sha256": provenance.source_hash()}
 
 
 def write_certificate(folder: Path, content: JsonObject) -> Path:

@@ -104,24 +104,12 @@ class SuiteSpec(Spec):
 
 @dataclass(frozen=True)
 class FrozenCase:
-    """A case with its scene's tables and its hash.
+    """A case with its scene's tables and its hash."""
 
-    Parameters
-    ----------
-    spec : CaseSpec
-        Its entry in suite.toml.
-    file : Path
-        The scene's file.
-    scene : dict
-        The scene's tables.
-    digest : str
-        SHA-256 of what defines the case.
-    """
-
-    spec: CaseSpec
-    file: Path
-    scene: dict[str, Any]
-    digest: str
+    spec: CaseSpec  # its entry in suite.toml
+    file: Path  # of the scene
+    scene: dict[str, Any]  # its tables
+    digest: str  # SHA-256 of what defines the case
 
     @property
     def name(self) -> str:

@@ -21,7 +21,6 @@ Two cores that neither is ranked above the other are tied.
 """
 
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,21 +66,10 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Certificate:
-    """A certificate that was read and checked.
-
-    Parameters
-    ----------
-    path : Path
-        Of its file.
-    content : dict
-        As it stands there, without its own hash.
-    digest : str
-        Its own hash.
-    """
+    """A certificate that was read and checked."""
 
     path: Path
-    content: JsonObject
-    digest: str = ""
+    content: JsonObject  # as it stands there, without its own hash
 
     @property
     def core(self) -> JsonObject:
@@ -105,7 +93,9 @@ def read_certificate(path: Path) -> Certificate:
     if path.is_dir():
         path = path / CERTIFICATE
     try:
-        told = _parsed(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+        told = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+        # What has no hash is none: numbers that are not finite, and what is nested too deeply.
+        digest_of(told)
     except (OSError, ValueError, RecursionError) as error:
         why = getattr(error, "strerror", None) or error
         raise InputError(f"{shown(path)}: cannot be read as a certificate ({why})") from error
@@ -119,26 +109,7 @@ def read_certificate(path: Path) -> Certificate:
     if not isinstance(stated, str) or stated != digest_of(told):
         raise InputError(f"{shown(path)}: was altered: its content does not have the hash that it states")
     validate(CertificateForm, told, str(path))
-    return Certificate(path, told, stated)
-
-
-def _parsed(text: str) -> Any:
-    """Return what JSON text holds; raise `ValueError` for what has no hash or no one meaning."""
-
-    def once(pairs: list[tuple[str, Any]]) -> JsonObject:
-        if len(table := dict(pairs)) < len(pairs):
-            raise ValueError("a key stands twice")
-        return table
-
-    def finite(number: str) -> float:
-        if not math.isfinite(value := float(number)):
-            raise ValueError(f"{shown(number, 20)}: must be a finite number")
-        return value
-
-    told = json.loads(text, object_pairs_hook=once, parse_float=finite, parse_constant=finite)
-    # What is nested too deeply to be written has no hash.
-    digest_of(told)
-    return told
+    return Certificate(path, told)
 
 
 def check_suite(certificate: Certificate, suite: Suite) -> None:
@@ -169,21 +140,11 @@ def check_suite(certificate: Certificate, suite: Suite) -> None:
 
 @dataclass(frozen=True)
 class Ranking:
-    """Cores compared in pairs.
+    """N cores compared in pairs."""
 
-    Parameters
-    ----------
-    scores : ndarray, shape (N,)
-        Mean capped errors, deg; of several parts their mean.
-    errors : ndarray, shape (N, N)
-        Standard errors of the scores' differences, deg.
-    better : ndarray of int, shape (N, N)
-        1 where the core of the row is ranked above that of the column, -1 where below, 0 where they are tied.
-    """
-
-    scores: Array
-    errors: Array
-    better: IntMatrix
+    scores: Array  # mean capped errors, deg; of several parts their mean; shape (N,)
+    errors: Array  # standard errors of the scores' differences, deg; shape (N, N)
+    better: IntMatrix  # 1 where the core of the row ranks above that of the column, -1 where below, 0 where tied
 
     @property
     def first(self) -> npt.NDArray[np.intp]:
@@ -276,18 +237,10 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Board:
-    """Certificates, ranked over all parts and by part.
+    """Certificates, ranked over all parts and by part."""
 
-    Parameters
-    ----------
-    overall : list of Ranked
-        By the mean of the parts' scores.
-    parts : dict
-        By each part's score.
-    """
-
-    overall: list[Ranked]
-    parts: dict[str, list[Ranked]]
+    overall: list[Ranked]  # by the mean of the parts' scores
+    parts: dict[str, list[Ranked]]  # by each part's score
 
     def to_json(self) -> JsonObject:
         """Return the ranks by core."""

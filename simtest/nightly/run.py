@@ -27,10 +27,8 @@ from simtest.nightly.store import (
     log_note,
     new_run_id,
     only_night,
-    remove_dead,
     replace_folder,
     save_run,
-    scratch,
 )
 from simtest.rendering import backend
 from simtest.report import write_report
@@ -78,18 +76,15 @@ def run_nightly(profile: Profile, reports: Reports, options: RunOptions = DEFAUL
     """
     # Before any folder is touched.
     planned = plan_run(profile)
-    left = "what earlier nights wrote is as it was"
-    disk = disk_errors_in_one_line(reports.root, "the night could not be written", left)
-    with disk, only_night(reports, profile.name):
+    disk = disk_errors_in_one_line(
+        reports.root, "the night could not be written", "what earlier nights wrote is as it was"
+    )
+    with disk, only_night(reports, profile.name) as folder:
         # Before the work: a damaged baseline must not cost a run.
         baseline = load_baseline(reports, profile.name)
-        remove_dead(reports)
-        run_id = new_run_id(datetime.now(UTC))
-        with scratch(reports, run_id) as folder:
-            run = measure_run(profile, folder, run_id, options, planned)
-            judged = judge(run, baseline, reports)
-            judged = draw(judged, folder / "tonight")
-            return _published(reports, judged, folder / "tonight")
+        run = measure_run(profile, folder, new_run_id(datetime.now(UTC)), options, planned)
+        judged = draw(judge(run, baseline, reports), folder / "tonight")
+        return _published(reports, judged, folder / "tonight")
 
 
 def _published(reports: Reports, judged: JudgedRun, page: Path) -> Outcome:

@@ -22,14 +22,11 @@ from simtest.errors import InputError, SimtestError
 from simtest.nightly.gate.quantities import OLDEST_COLUMNS, OPTIONAL_COLUMNS, RESULT_COLUMNS
 from simtest.nightly.records import CELL, FIGURES, NightlyRun, RunRecord
 from simtest.runtime.files import require_plain, sync_folder, write_atomically, write_json
-from simtest.runtime.locks import exclusive_file, is_held, waiting_for
+from simtest.runtime.locks import exclusive_file, waiting_for
 from simtest.runtime.machine_errors import cannot_write, disk_problem
 from simtest.runtime.provenance import file_hash
 from simtest.runtime.resources import shown
 from simtest.validation.results_table import SCHEMA
-
-LOCK = "lock"
-_ENTRY, _OLD = ".lock", ".old"
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,7 @@ class Reports:
 
     @property
     def work(self) -> Path:
-        """Scratch of runs in progress, a folder each."""
+        """Scratch of runs in progress, a folder for each profile."""
         return self.root / "work"
 
     def baseline(self, profile: str) -> Path:
@@ -71,41 +68,32 @@ def new_run_id(now: datetime) -> str:
 
 
 @contextlib.contextmanager
-def scratch(reports: Reports, run_id: str) -> Iterator[Path]:
-    """Make a run's scratch folder, locked while the run lives and removed when it ends."""
-    folder = reports.work / run_id
-    with contextlib.ExitStack() as stack:
-        # Together with the lock, or another run would take the folder for a dead one's.
-        with waiting_for(reports.work / _ENTRY):
-            folder.mkdir()
-            stack.callback(shutil.rmtree, folder, ignore_errors=True)
-            stack.enter_context(waiting_for(folder / LOCK))
+def only_night(reports: Reports, profile: str) -> Iterator[Path]:
+    """Keep a profile's nights to this process, and yield its scratch folder, which is removed at the end.
+
+    What a killed night left there is removed first. Raises `InputError`, which names the other process, where one is at
+    work.
+    """
+    reports.make()
+    with exclusive_file(reports.root / profile, "--reports"), scratch(reports.work / profile) as folder:
         yield folder
 
 
-def remove_dead(reports: Reports) -> list[str]:
-    """Remove the leftovers of killed runs and return their names; living runs hold a lock and are left alone."""
-    dead = []
-    with waiting_for(reports.work / _ENTRY):
-        for folder in sorted(path for path in reports.work.iterdir() if path.is_dir()):
-            if not is_held(folder / LOCK):
-                shutil.rmtree(folder, ignore_errors=True)
-                dead.append(folder.name)
-    return dead
-
-
 @contextlib.contextmanager
-def only_night(reports: Reports, profile: str) -> Iterator[None]:
-    """Keep a profile's nights to this process; raise `InputError`, which names the other one, where one is at work."""
-    reports.make()
-    with exclusive_file(reports.root / profile, "--reports"):
-        yield
+def scratch(folder: Path) -> Iterator[Path]:
+    """Make a folder that nobody else uses, anew, and remove it at the end."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def exclusive_replacement(folder: Path) -> Iterator[None]:
     """Lock the folder for replacement; first roll back an interrupted swap."""
-    with waiting_for(folder.parent / f".{folder.name}.{LOCK}"):
+    with waiting_for(folder.parent / f".{folder.name}.lock"):
         if (where := current(folder)) != folder:
             where.rename(folder)
         shutil.rmtree(_old(folder), ignore_errors=True)
@@ -132,7 +120,7 @@ def replace_folder(new: Path, folder: Path) -> None:
 
 
 def _old(folder: Path) -> Path:
-    return folder.with_name(f".{folder.name}{_OLD}")
+    return folder.with_name(f".{folder.name}.old")
 
 
 FIGURES_FILE, RUN_FILE = "figures.parquet", "run.json"
@@ -389,10 +377,7 @@ def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
         run = load_run(source, LATEST_ROWS)
     now = datetime.now(UTC)
     record = run.record.model_copy(update={"reason": reason, "accepted": now.isoformat(timespec="seconds")})
-    remove_dead(reports)
-    with scratch(reports, new_run_id(now)) as folder, exclusive_replacement(target):
-        new = folder / "baseline"
-        new.mkdir()
+    with exclusive_replacement(target), scratch(reports.work / f".{profile}.baseline") as new:
         rows = small(run.rows.select(name for name in COLUMNS if name in run.rows.columns))
         save_run(new, NightlyRun(record, rows, run.figures), BASELINE_ROWS, smallest=True)
         replaced: str | None = None

@@ -104,9 +104,7 @@ def test_what_has_not_the_form_of_a_certificate_is_refused(
 
 
 @pytest.mark.render
-@pytest.mark.parametrize(
-    "number", ["NaN", "1e999", "-Infinity", "1" * 5000, "[" * 900 + "]" * 900, "[" * 10**6, '1, "kind": 2']
-)
+@pytest.mark.parametrize("number", ["NaN", "1e999", "-Infinity", "1" * 5000, "[" * 900 + "]" * 900, "[" * 10**6])
 def test_what_has_no_hash_is_refused(made: BenchRun, tmp_path: Path, number: str) -> None:
     text = made.certificate.read_text()
     (tmp_path / CERTIFICATE).write_text(text.rstrip().removesuffix("}") + f', "x": {number}}}')

@@ -28,10 +28,9 @@ from simtest.nightly.store import (
     load_run,
     log_note,
     new_run_id,
-    remove_dead,
+    only_night,
     replace_folder,
     save_run,
-    scratch,
 )
 from tests.unit.nightly_samples import STARTED, make_rows, make_run, no_baseline
 
@@ -278,7 +277,7 @@ def test_a_baseline_is_the_last_night_with_a_reason(reports):
     assert pl.read_parquet_schema(reports.baseline("quick") / BASELINE_ROWS)["peak_snr"] == pl.Float32()
     assert_frame_equal(found.rows, kept)
     assert {"error_deg", "seed", "true_id", "realisation"} <= set(kept.columns)
-    assert not list(reports.work.glob("2*"))
+    assert list(reports.work.iterdir()) == []
 
 
 def test_reading_a_baseline_writes_nothing(reports):
@@ -424,18 +423,20 @@ def test_an_accept_that_is_killed_leaves_one_of_the_two(reports, monkeypatch, re
 # Scratch ---------------------------------------------------------------------------------------------------------
 
 
-def test_what_dead_nights_left_is_removed_and_the_living_are_left_alone(tmp_path):
+def test_what_a_killed_night_left_is_removed_and_other_profiles_are_left_alone(tmp_path):
     reports = Reports(tmp_path)
-    dead = reports.work / "20260101T000000Z-1-dead"
-    dead.mkdir(parents=True)
-    (dead / "lock").touch()
-    (dead / "rows").write_text("half")
-    with scratch(reports, "20260102T000000Z-1-alive") as alive:
-        assert remove_dead(reports) == [dead.name]
-        assert alive.is_dir()
-    assert not alive.exists()
-    assert not dead.exists()
-    assert remove_dead(reports) == []
+    dead, other = reports.work / "quick" / "rows", reports.work / "full" / "rows"
+    for rows in (dead, other):
+        rows.parent.mkdir(parents=True)
+        rows.write_text("half")
+    with only_night(reports, "quick") as folder:
+        assert folder == dead.parent
+        assert list(folder.iterdir()) == []
+        with pytest.raises(InputError, match="is in use by process"), only_night(reports, "quick"):
+            pass
+        assert folder.is_dir()
+    assert not folder.exists()
+    assert other.exists()
 
 
 def test_a_folder_is_replaced_whole(tmp_path):

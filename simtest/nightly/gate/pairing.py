@@ -114,17 +114,15 @@ def missing_cells(baseline: pl.DataFrame, tonight: pl.DataFrame) -> pl.DataFrame
     """Compare the cells that one of two runs lacks, by `n`: worse where tonight lacks them, else new; see `digests`."""
     zero, count = pl.lit(0.0), pl.col("highlights")
     # What vanishes is a regression until it is accepted; what is new is not.
-    gone = _only_in(baseline, tonight).select(
-        *CELL, baseline=count, tonight=zero, difference=-count, margin=zero, outcome=pl.lit("worse")
+    gone, new = (
+        one.join(other, on=CELL, how="anti", maintain_order="left")
+        for one, other in ((baseline, tonight), (tonight, baseline))
     )
-    new = _only_in(tonight, baseline).select(*CELL, tonight=count, outcome=pl.lit("new"))
+    gone = gone.select(*CELL, baseline=count, tonight=zero, difference=-count, margin=zero, outcome=pl.lit("worse"))
+    new = new.select(*CELL, tonight=count, outcome=pl.lit("new"))
     return pl.concat([gone, new], how="diagonal").with_columns(
         quantity=pl.lit("n"), unit=pl.lit(""), method=pl.lit("none")
     )
-
-
-def _only_in(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
-    return first.join(second, on=CELL, how="anti", maintain_order="left")
 
 
 def lost_highlights(lost: pl.DataFrame, cells: pl.DataFrame, comparable: frozenset[int]) -> pl.DataFrame:
