@@ -27,6 +27,9 @@ POOLED = "all"
 """Stands for label, surface and setting of a comparison over all settings of an experiment, and for the experiment too
 of one over all experiments."""
 
+SINGLE = "single"
+"""Method of comparisons of results one by one."""
+
 _CELL_TYPES: dict[str, pl.DataType] = dict.fromkeys(CELL, pl.String())
 
 FIGURES: dict[str, pl.DataType] = {

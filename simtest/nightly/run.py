@@ -13,7 +13,7 @@ import polars as pl
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.quantities import setting_figures
 from simtest.nightly.history import append, clock_note, history_rows, read_history, trend_rows
 from simtest.nightly.outputs import FILES, write_outputs
 from simtest.nightly.page import REPORTS, write_nightly_page

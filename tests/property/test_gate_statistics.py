@@ -11,8 +11,7 @@ from scipy import stats
 
 from simtest.nightly.gate.compare import compare
 from simtest.nightly.gate.contrasts import holm, paired, pooled, unit_sums, unpaired
-from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.gate.quantities import QUANTITIES
+from simtest.nightly.gate.quantities import QUANTITIES, setting_figures
 from simtest.nightly.records import OUTCOMES, NightlyRun, RunRecord
 from simtest.runtime.statistics import mean_interval
 from simtest.validation.results_table import SCHEMA

@@ -6,7 +6,7 @@ import pytest
 from gate_nights import changed, night, raised, rows, whole
 
 from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.figures import digests_of, setting_figures
+from simtest.nightly.gate.quantities import digests_of, setting_figures
 from simtest.nightly.records import COMPARISONS, FIGURES, OUTCOMES, POOLED
 from tests.marked import marked
 

@@ -18,7 +18,7 @@ import pytest
 from simtest.cli import main as command_line
 from simtest.errors import BackendError, InputError, SimtestError
 from simtest.nightly import run as run_module
-from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.quantities import setting_figures
 from simtest.nightly.history import read_history
 from simtest.nightly.run import RunOptions, run_nightly
 from simtest.nightly.store import BASELINE_ROWS, Reports, accept, load_baseline, save_run

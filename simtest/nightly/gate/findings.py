@@ -7,8 +7,7 @@ import polars as pl
 
 from simtest.errors import FAULTS, Reason
 from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE, KEY, QUANTITIES
-from simtest.nightly.gate.single_results import SINGLE
-from simtest.nightly.records import CELL, POOLED, NightlyRun, RunRecord, to_explain
+from simtest.nightly.records import CELL, POOLED, SINGLE, NightlyRun, RunRecord, to_explain
 from simtest.validation.faults import fault_sentences, faults_of
 from simtest.validation.results_table import BUDGET_COLUMNS
 
