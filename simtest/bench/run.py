@@ -91,25 +91,11 @@ def run_bench(
     progress: Progress | None = None,
     variant: str | None = None,
 ) -> BenchRun:
-    """Run a core on a suite and write its certificate; a stopped run goes on.
+    """Run a core, an installed estimator or a command, on a suite and write its certificate; a stopped run goes on.
 
-    Parameters
-    ----------
-    suite : Suite
-        What to run.
-    core : str
-        An installed estimator, or a command.
-    folder : Path
-        Gets a run's folder for each part, and certificate.json.
-    parts : sequence of str, optional
-        Default all that are scored by highlights.
-    engine, progress, variant
-        See `simtest.validate`. The figures do not depend on the engine.
-
-    Raises
-    ------
-    InputError
-        If a part or the core is unknown, or the folder holds something else.
+    `folder` gets a run's folder for each part, by default all that are scored by highlights, and certificate.json. The
+    figures do not depend on the engine. Raises `InputError` if a part or the core is unknown, or the folder holds
+    something else.
     """
     if not core.strip():
         raise InputError('--core: is empty; must be an installed estimator, or a command as in "command: ./core"')
@@ -155,10 +141,7 @@ def run_maps(
 def export_frames(suite: Suite, folder: Path, engine: Engine | None = None, progress: Progress | None = None) -> Path:
     """Write the frames of the dense part without their truth; return their folder.
 
-    Raises
-    ------
-    InputError
-        If the folder holds something else.
+    Raises `InputError` if the folder holds something else.
     """
     experiment = experiment_of(suite, PART, OF_RUN)
     check_exportable(experiment)
@@ -237,16 +220,11 @@ def maps_record(maps: str | Path, score: DenseScore) -> JsonObject:
 
 
 def core_record(text: str) -> JsonObject:
-    """Return what a certificate tells of a core, without paths.
+    """Return what a certificate tells of a core, without paths; raise `InputError` if it is unknown or cannot start.
 
     `sha256` is of the core's own files and of the words of its command. An interpreter or another program of the
     machine, such as docker, is no part of it, since it differs from machine to machine: it stands under `program`.
     Modules that a script loads are seen only where the command or the TOML file (`core.files`) names them.
-
-    Raises
-    ------
-    InputError
-        If it is unknown or cannot be started.
     """
     (name,) = load_estimators([text])
     if not has_files(text):

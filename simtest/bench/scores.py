@@ -303,17 +303,10 @@ UNSTATED = UncertaintyScore(
 
 
 def score_uncertainty(answered: pl.DataFrame, scenes: IntArray, cases: IntArray | None = None) -> UncertaintyScore:
-    """Score the uncertainties of answers.
+    """Score the uncertainties of answers: rows of results with status "ok" and a true highlight.
 
-    Parameters
-    ----------
-    answered : polars.DataFrame
-        Rows of results with status "ok" and a true highlight. A stated covariance without a finite Mahalanobis
-        distance is singular.
-    scenes : ndarray of int, shape (N,)
-        Which scene each row is of: rows of one scene are not independent.
-    cases : ndarray of int, shape (N,), optional
-        Which case each row is of: they are frozen, and not drawn.
+    `scenes` and `cases` say which scene and case each row is of: rows of one scene are not independent, cases are
+    frozen, and not drawn. A stated covariance without a finite Mahalanobis distance is singular.
     """
     distances = answered["mahalanobis2"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
     covariances = answered.select("cov_11", "cov_12", "cov_22").cast(pl.Float64).to_numpy().astype(float)
@@ -379,23 +372,12 @@ def verdict_of(share: float, error: float, n: int) -> Verdict:
 
 
 def energy_scores(misses: Array, covariances: Array) -> Array:
-    """Compute the energy score of normal distributions in the plane, E|X - y| - E|X - X'| / 2.
+    """Compute the energy score of normal distributions in the plane, E|X - y| - E|X - X'| / 2, in the unit of `misses`.
 
     The length of a vector is pi/2 times the mean of its parts along all directions, so the score is pi/2 times the
     mean over directions of the continuous ranked probability score of a normal distribution on a line, which has a
-    closed form (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102, equation 21).
-
-    Parameters
-    ----------
-    misses : ndarray, shape (N, 2)
-        True values less the distributions' means.
-    covariances : ndarray, shape (N, 2, 2)
-        Of the distributions.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Scores, in the unit of `misses`.
+    closed form (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102, equation 21). `misses` are the true values less the
+    distributions' means, shape (N, 2); `covariances` have the shape (N, 2, 2).
     """
     from scipy.special import ndtr
 

@@ -183,10 +183,7 @@ def read_suite(folder: Path) -> Suite:
 def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
     """Read a shipped suite and check it against its pinned hashes.
 
-    Raises
-    ------
-    InputError
-        If the version is unknown, a file is malformed, or a case is not the frozen one.
+    Raises `InputError` if the version is unknown, a file is malformed, or a case is not the frozen one.
     """
     folder = folder or suite_folder(version)
     suite = read_suite(folder)

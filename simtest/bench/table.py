@@ -83,13 +83,7 @@ class Certificate:
 
 
 def read_certificate(path: Path) -> Certificate:
-    """Read a certificate.
-
-    Raises
-    ------
-    InputError
-        If it is no certificate, was altered, lacks a figure, or is of another version of the format.
-    """
+    """Read a certificate; raise `InputError` if it is none, was altered, lacks a figure, or is of another format."""
     if path.is_dir():
         path = path / CERTIFICATE
     try:
@@ -158,19 +152,9 @@ class Ranking:
 
 
 def rank(parts: Sequence[Part], alpha: float = ALPHA) -> Ranking:
-    """Compare cores in pairs on one part, or by the mean over several.
+    """Compare cores in pairs on one part, or by the mean over several, at a stated risk of the whole table.
 
-    Parameters
-    ----------
-    parts : sequence
-        For each part, what each core's scenes sum up to. A part must hold a highlight for each core.
-    alpha : float
-        Stated risk of the whole table, 0 to 1.
-
-    Returns
-    -------
-    Ranking
-        Of the cores, in the order of each part.
+    `parts` holds for each part what each core's scenes sum up to: a highlight at least for each core.
     """
     from scipy.special import stdtrit
 
@@ -282,10 +266,7 @@ def _name(certificate: Certificate) -> str:
 def read_entries(folder: Path, suite: Suite) -> Board:
     """Read the certificates below a folder and rank them.
 
-    Raises
-    ------
-    InputError
-        If there are none, or one was altered, is malformed, or is of another version.
+    Raises `InputError` if there are none, or one was altered, is malformed, or is of another version.
     """
     if not folder.is_dir():
         raise InputError(f"{shown(folder)}: must be a folder that holds certificates")

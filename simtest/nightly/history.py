@@ -73,21 +73,10 @@ def trend_rows(rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def read_history(folder: Path, newest: int = NEWEST) -> tuple[pl.DataFrame, list[str]]:
-    """Read what the page shows of a profile's history; damaged and foreign files are skipped, with a warning each.
+    """Read what the page shows of the `newest` runs of a profile's history, and notes of what was skipped.
 
-    Parameters
-    ----------
-    folder : Path
-        The profile's history; may be missing.
-    newest : int
-        Files that are read, the last ones by name, which begins with the run's start.
-
-    Returns
-    -------
-    rows : polars.DataFrame
-        `TREND_COLUMNS` of the quantities `TRENDS`, run after run in the order of their start.
-    notes : list of str
-        What was skipped, for the page.
+    The rows are `TREND_COLUMNS` of the quantities `TRENDS`, run after run in the order of their start. Files are chosen
+    by name, which begins with the run's start; damaged and foreign ones are skipped, with a warning each.
     """
     runs: dict[str, pl.DataFrame] = {}
     skipped = []

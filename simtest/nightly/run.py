@@ -68,11 +68,8 @@ class Outcome:
 def run_nightly(profile: Profile, reports: Reports, options: RunOptions = DEFAULTS) -> Outcome:
     """Run a profile, compare it with the baseline, keep it in the history and publish its page.
 
-    Raises
-    ------
-    SimtestError
-        If the run could not be made: bad input, a damaged baseline, no rendering backend, no space on the disk. What
-        earlier runs wrote is as it was.
+    Raises `SimtestError` if the run could not be made: bad input, a damaged baseline, no rendering backend, no space on
+    the disk. What earlier runs wrote is as it was.
     """
     # Before any folder is touched.
     planned = plan_run(profile)
@@ -117,25 +114,10 @@ def plan_run(profile: Profile) -> Planned:
 def measure_run(
     profile: Profile, folder: Path, run_id: str, options: RunOptions = DEFAULTS, planned: Planned | None = None
 ) -> NightlyRun:
-    """Run a profile.
+    """Run a profile; each experiment's run stands in a folder of its name in the scratch `folder` afterwards.
 
-    Parameters
-    ----------
-    profile : Profile
-        What to run.
-    folder : Path
-        Scratch: each experiment's run stands in a folder of its name afterwards.
-    run_id : str
-        For the run's record.
-    options : RunOptions
-        How.
-    planned : tuple, optional
-        What `plan_run` returned, where it was asked before.
-
-    Raises
-    ------
-    SimtestError
-        If an experiment is malformed or cannot be run, or nothing was measured.
+    `planned` is what `plan_run` returned, where it was asked before. Raises `SimtestError` if an experiment is
+    malformed or cannot be run, or nothing was measured.
     """
     started, clock = datetime.now(UTC), time.monotonic()
     # Asked at the start: the checkout may have moved on before the run ends.

@@ -162,13 +162,7 @@ def save_run(folder: Path, run: NightlyRun, rows_file: str, smallest: bool = Fal
 
 
 def load_run(folder: Path, rows_file: str) -> NightlyRun:
-    """Read a run.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, damaged, or not the one that was written; the message names it.
-    """
+    """Read a run; raise `InputError`, which names the file, if one is missing, damaged, or not of this run."""
     record, hashes = _record(folder / RUN_FILE)
     # A table of another run has another hash.
     rows, figures = (_table(folder / name, hashes) for name in (rows_file, FIGURES_FILE))
@@ -250,12 +244,8 @@ def small(rows: pl.DataFrame) -> pl.DataFrame:
 def whole(rows: pl.DataFrame, path: Path) -> pl.DataFrame:
     """Return the rows of a baseline in double precision, errors restored; `path` is their file, for messages.
 
-    Baselines of older versions, which hold the errors themselves, are read too.
-
-    Raises
-    ------
-    InputError
-        If a column is of another type than `small` gives it.
+    Baselines of older versions, which hold the errors themselves, are read too. Raises `InputError` if a column is of
+    another type than `small` gives it.
     """
     for name in NEAR_REFERENCE:
         held = name + _BITS
@@ -293,11 +283,8 @@ NEEDED = (*CELL, "realisation", *OLDEST_COLUMNS)
 def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
     """Read the baseline of a profile, with `reason` and `accepted` in its record; None where there is none.
 
-    Raises
-    ------
-    InputError
-        If a file of it is missing or damaged, lacks what `simtest.nightly.gate.compare` reads, or is another profile's;
-        the message names it.
+    Raises `InputError`, which names the file, if one is missing or damaged, lacks what `simtest.nightly.gate.compare`
+    reads, or is another profile's.
     """
     # Without a lock: the folder is kept in git, and whoever reads it writes nothing there.
     folder = current(reports.baseline(profile))
@@ -343,19 +330,10 @@ def _is_entry(line: str) -> bool:
 
 
 def accept(reports: Reports, profile: str, reason: str) -> RunRecord:
-    """Make a profile's last run its baseline, and store the reason why its numbers are right.
+    """Make a profile's last run its baseline, and store the reason why its numbers are right; return its record.
 
-    Returns
-    -------
-    RunRecord
-        The baseline's.
-
-    Raises
-    ------
-    InputError
-        If there is no last run, it is damaged, or no reason is given.
-    SimtestError
-        If the disk is full, or may not be written.
+    Raises `InputError` if there is no last run, it is damaged, or no reason is given, and `SimtestError` if the disk is
+    full, or may not be written.
     """
     reason = " ".join(reason.split())
     if not reason or len(reason) > MAX_REASON:

@@ -42,13 +42,8 @@ def compare(tonight: NightlyRun, baseline: NightlyRun | None) -> Verdict:
     """Compare a run with the baseline; without one there is nothing to compare, and the causes are faults alone.
 
     Cells whose results are the same bytes are the same; the others are tested, pair by pair where seeds and versions
-    are the same, with all tests as one family (docs/concepts/gate.md).
-
-    Returns
-    -------
-    Verdict
-        "regression" where a comparison is worse, "changed" where one is better or has changed, else "fine"; "no
-        baseline" without one. What tonight lacks (a cell, true highlights of a cell whose seeds are the same) is worse.
+    are the same, with all tests as one family (docs/concepts/gate.md). What tonight lacks, a cell or true highlights of
+    a cell whose seeds are the same, is worse.
     """
     if baseline is None:
         none = pl.DataFrame(schema=COMPARISONS)
@@ -321,16 +316,9 @@ def frames_taken(first: pl.DataFrame, second: pl.DataFrame, cells: pl.DataFrame)
 
 
 def with_all_frames(values: pl.DataFrame, frames: pl.DataFrame, *rows: pl.DataFrame) -> pl.DataFrame:
-    """Add a value of 0 for the false detections of each frame that has no row.
+    """Add a value of 0 for the false detections of each frame that has no row in the `harms` of `rows`.
 
-    Parameters
-    ----------
-    values : polars.DataFrame
-        `UNIT`, and numbers by run.
-    frames : polars.DataFrame
-        See `frames_taken`.
-    rows : polars.DataFrame
-        `harms` that hold all frames with rows.
+    `values` holds `UNIT`, and numbers by run; `frames` is as of `frames_taken`.
     """
     held = values.filter(_FALSE).select("cell").unique()
     # Realisations of a choice (0, 2, 4) are no count: which frames have no row is then not known.
@@ -417,20 +405,11 @@ _LOST_HALF = 0.5
 def moved(before: pl.DataFrame, after: pl.DataFrame) -> pl.DataFrame:
     """Compare the results of two runs one by one, as comparisons; a row for each cell and number that moved.
 
-    Unchanged code gives the same result again, to the last digits. So no test is needed: a result that moved by more
-    than rounding could move it was moved by the code, and a night that holds one has changed.
-
-    Parameters
-    ----------
-    before, after : polars.DataFrame
-        Rows of cells whose seeds mean the same in both runs, of the same columns.
-
-    Returns
-    -------
-    polars.DataFrame
-        `n` counts the results that moved; `baseline` and `tonight` are those of the one that moved farthest, of the
-        status the numbers of answers, of flags those of answers with a flag, of false detections their numbers.
-        "worse" where half of a cell's answers are lost, else "changed".
+    Unchanged code gives the same result again, to the last digits: what moved by more than rounding could move it was
+    moved by the code, without a test. The rows are those of cells whose seeds mean the same in both runs. `n` counts
+    the results that moved; `baseline` and `tonight` are those of the one that moved farthest, of the status the numbers
+    of answers, of flags those of answers with a flag, of false detections their numbers. "worse" where half of a cell's
+    answers are lost, else "changed".
     """
     chosen = (*_KEY, "answered", "status", "flags", *STEPS)
     first, second = (

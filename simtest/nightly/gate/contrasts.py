@@ -59,16 +59,9 @@ class Outcomes:
 def unit_sums(values: pl.DataFrame) -> pl.DataFrame:
     """Add up rows by unit, in the order of the units: equal inputs have equal sums to the last bit.
 
-    Parameters
-    ----------
-    values : polars.DataFrame
-        `UNIT`, and `value` of one run, or `baseline` and `tonight`: a row a pair.
-
-    Returns
-    -------
-    polars.DataFrame
-        `UNIT`, `n` (rows), `x` (sum of the values, or of the baseline's), and of pairs `d` (sum of the differences) and
-        `largest`, the largest difference of a row.
+    `values` holds `UNIT`, and `value` of one run, or `baseline` and `tonight`: a row a pair. Returns `UNIT`, `n` (its
+    rows), `x` (sum of the values, or of the baseline's), and of pairs `d` (sum of the differences) and `largest`, the
+    largest difference of a row.
     """
     if "value" in values.columns:
         terms = {"x": pl.col("value").sum()}
@@ -227,17 +220,12 @@ def _welch(first: _Arm, second: _Arm, a: float, b: float) -> tuple[Array, Array]
 
 
 def pooled(found: Outcomes, quantity: Quantity) -> Outcomes:
-    """Test many cells at once: what is too small to show in ten realisations of one setting shows in many.
+    """Test many cells at once, with outcomes of shape (1,): what is too small to show in one setting shows in many.
 
     Each cell contributes one number, its difference over the mean of the two runs' figures: symmetric about 0 where
     nothing changed, and never beyond 2, however heavy the errors' tails. A sum of many such shares cannot hang on one.
-
-    Returns
-    -------
-    Outcomes
-        Of shape (1,). Relative quantities are shares of the cells' own means: the baseline is 1, the margin the
-        relative one, which is the absolute margin where a mean is so small that this is the larger. p-values are NaN
-        where the cells are too few, with too few units.
+    Of relative quantities the baseline is 1, the margin the relative one, which is the absolute margin where a mean is
+    so small that this is the larger. p-values are NaN where the cells are too few, with too few units.
     """
     shares, deviations = found.difference, found.deviation
     margin = quantity.relative or quantity.absolute
@@ -279,20 +267,9 @@ def _mean_of_cells(shares: Array, deviations: Array, found: Outcomes, span: floa
 def holm(p: npt.ArrayLike, weights: npt.ArrayLike | None = None) -> Array:
     """Correct p-values for the size of their family by Holm's step-down procedure [H79], section 2 and 4.
 
-    Rejecting those of at most alpha keeps the chance of any false rejection at alpha, under arbitrary dependence. Ours,
-    since scipy has no Holm correction and that of statsmodels has no weights.
-
-    Parameters
-    ----------
-    p : array_like, shape (N,)
-        p-values in [0, 1].
-    weights : array_like, shape (N,), optional
-        Share of alpha of each test, positive; only their ratios count. Default equal ones.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Corrected p-values in [0, 1].
+    Rejecting those of at most alpha keeps the chance of any false rejection at alpha, under arbitrary dependence. The
+    weights are each test's share of alpha, positive; only their ratios count. Ours, since scipy has no Holm correction
+    and that of statsmodels has no weights.
     """
     own = np.asarray(p, dtype=float)
     share = np.ones_like(own) if weights is None else np.asarray(weights, dtype=float)

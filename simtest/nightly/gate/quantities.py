@@ -237,24 +237,10 @@ Frames = Mapping[tuple[str, str], int]
 
 
 def setting_figures(rows: pl.DataFrame, frames: Frames | None = None) -> pl.DataFrame:
-    """Compute the figures of a run's rows by cell.
+    """Compute the figures of a run's rows by cell, with the columns `FIGURES`; unknown ones are left out.
 
-    Parameters
-    ----------
-    rows : polars.DataFrame
-        Columns of `simtest.validation.results_table.SCHEMA`.
-    frames : mapping, optional
-        How many frames were taken. Without it frames without a row, in which nothing is found and nothing is isolated,
-        are not known, and false detections are divided by those that have one.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns `FIGURES`, in the order of the rows: of each cell `frames`, `n` (true highlights),
-        `n_ok`, `failed`, `missed`, `unanswered` (shares of n), `false` (detections a frame), `mean_deg`, `rms_deg`,
-        `std_deg`, `median_deg`, `p95_deg`, `max_deg`, `mean_oracle_deg`, `mean_base_deg`, `mean_penalised_deg`,
-        `coverage95`, `axis_ratio` (mean deviation from the law over the law, at most 1 a row) and `axis_ratio_median`.
-        Unknown figures are left out.
+    `frames` says how many frames were taken. Without it frames without a row, in which nothing is found and nothing is
+    isolated, are not known, and false detections are divided by those that have one.
     """
     # Where surfaces share a setting's name, each has some of its frames.
     shared = rows.group_by("experiment", "setting").agg(pl.col("surface").n_unique()).filter(pl.col("surface") > 1)
