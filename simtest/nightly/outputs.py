@@ -66,16 +66,18 @@ def summary(judged: JudgedRun) -> str:
     if len(verdict.notes) > MAX_NOTES:
         notes.append(f"- ... and {len(verdict.notes) - MAX_NOTES} more notes")
     causes = [f"- {escaped(cause)}" for cause in verdict.causes]
+    counts = OUTCOMES if verdict.baseline is not None else ()
+    columns = ("experiment", "rows", "answered", "missed", "false", *counts)
     parts = [
         f"## Nightly {escaped(record.profile)}: {headline(verdict)}",
         *(["\n".join(causes)] if causes else []),
         _compared(verdict),
         *(["\n".join(notes)] if notes else []),
-        *_changes("Worse", judged.with_outcome("worse")),
-        *_changes("Changed, to be explained", judged.with_outcome("changed")),
-        *_changes("Better", judged.with_outcome("better")),
+        *_changes("Worse", verdict, "worse"),
+        *_changes("Changed, to be explained", verdict, "changed"),
+        *_changes("Better", verdict, "better"),
         "### By experiment",
-        _by_experiment(judged),
+        _table(columns, judged.by_experiment().select(columns).rows()),
         f"{escaped(record.started)}, commit {short_commit(record.commit)}, {record.duration_s or 0:.0f} s on "
         f"{escaped(record.processor)}; run `{escaped(record.id)}`",
     ]
@@ -96,7 +98,11 @@ def _compared(verdict: Verdict) -> str:
     return f"{equal} the baseline of {escaped(baseline.started)}, commit {short_commit(baseline.commit)}{reason}."
 
 
-def _changes(title: str, changes: pl.DataFrame) -> list[str]:
+def _changes(title: str, verdict: Verdict, outcome: str) -> list[str]:
+    # The surest first
+    changes = verdict.comparisons.filter(pl.col("outcome") == outcome).sort(
+        "p_holm", "experiment", "label", "setting", "estimator", "quantity", nulls_last=True, maintain_order=True
+    )
     if not changes.height:
         return []
     rows = []
@@ -109,12 +115,6 @@ def _changes(title: str, changes: pl.DataFrame) -> list[str]:
     head = ("experiment", "cell", "figure", "baseline", "tonight", "difference [95 %]", "p (Holm)")
     more = [f"... and {changes.height - MAX_ROWS} more; the page has them."] if changes.height > MAX_ROWS else []
     return [f"### {title}: {changes.height}", _table(head, rows), *more]
-
-
-def _by_experiment(judged: JudgedRun) -> str:
-    counts = OUTCOMES if judged.verdict.baseline is not None else ()
-    columns = ("experiment", "rows", "answered", "missed", "false", *counts)
-    return _table(columns, judged.by_experiment().select(columns).rows())
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str | int | None]]) -> str:

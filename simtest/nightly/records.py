@@ -159,12 +159,6 @@ class JudgedRun:
     history: pl.DataFrame  # columns `simtest.nightly.history.HISTORY`, the run's own rows among them
     reports: tuple[str, ...] = ()  # experiments with findings whose own page lies in reports/NAME, the worst first
 
-    def with_outcome(self, outcome: str) -> pl.DataFrame:
-        """Return the comparisons of an outcome, the surest first."""
-        return self.verdict.comparisons.filter(pl.col("outcome") == outcome).sort(
-            "p_holm", "experiment", "label", "setting", "estimator", "quantity", nulls_last=True, maintain_order=True
-        )
-
     def by_experiment(self) -> pl.DataFrame:
         """Count by experiment: `rows` (true highlights), those `answered`, the other `KINDS` of rows, and `OUTCOMES`.
 
