@@ -12,12 +12,12 @@ from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.rendering.frames import Frame, HighlightPoint, Labels, Radiance, TruthMaps
-    from simtest.rendering.integrate import Progress
     from simtest.rendering.session import Session
+    from simtest.rendering.trace import Progress
 
 _HOMES = {
     "simtest.rendering.frames": ("Frame", "HighlightPoint", "Labels", "Radiance", "TruthMaps"),
-    "simtest.rendering.integrate": ("Progress",),
+    "simtest.rendering.trace": ("Progress",),
     "simtest.rendering.session": ("Session",),
 }
 

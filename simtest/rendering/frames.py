@@ -177,21 +177,13 @@ class MisfitMaps:
     """Normal minus bisector across the sightline (see `exact_misfit`) of the rendered shape, a map for each light.
 
     The maps reach beyond the frame, so that a zero next to its border lies between pixels too.
-
-    Parameters
-    ----------
-    distance : ndarray of float32, shape (h, w)
-        Distance along the ray, mm; NaN where there is no surface.
-    fine, base : ndarray of float32, shape (L, 2, h, w)
-        Of the fine normal and of the base's; one array where there is no relief.
-    margin : int
-        Cells beyond the frame on each side.
     """
 
-    distance: Image
+    distance: Image  # (h, w): distance along the ray, mm; NaN where there is no surface
+    # fine, base: (L, 2, h, w): of the fine normal and of the base's; one array where there is no relief
     fine: Image
     base: Image
-    margin: int
+    margin: int  # Cells beyond the frame on each side
 
     __repr__ = short_repr
 

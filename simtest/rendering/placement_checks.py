@@ -8,7 +8,7 @@ from simtest.runtime.arrays import Array
 from simtest.spec.rig import LightSpec, Rig
 from simtest.spec.scene import Scene
 from simtest.surfaces import SurfaceModel
-from simtest.surfaces.deformed import DeformedSurface, stays_in_free_space
+from simtest.surfaces.deformation import DeformedSurface, stays_in_free_space
 from simtest.surfaces.instrument import RoundCones
 
 RIM_COPIES = (1.0, 0.75, 0.5, 0.25)

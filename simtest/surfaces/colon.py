@@ -10,12 +10,18 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray, Array, IntArray
 from simtest.runtime.kept_arrays import kept
-from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
-from simtest.surfaces.cutting import halve, off_between, rough_edges
-from simtest.surfaces.mesh_geometry import area_vectors, face_edges
 from simtest.surfaces.model import RayHits, TriangleMesh
 from simtest.surfaces.poses import Generator, lumen_pose
 from simtest.surfaces.recipe import ColonRecipe
+from simtest.surfaces.triangles import (
+    BuiltMesh,
+    MeshedSurface,
+    area_vectors,
+    face_edges,
+    halve,
+    off_between,
+    rough_edges,
+)
 from simtest.surfaces.tube import Tube, TubeChart
 
 TRIANGLES = 200_000
@@ -40,18 +46,10 @@ MAX_TRIANGLES = 5_000_000
 
 @dataclass(frozen=True)
 class BuiltColon(BuiltMesh):
-    """A recipe's surface and mesh.
+    """A recipe's surface and mesh."""
 
-    Parameters
-    ----------
-    tube : Tube
-        The surface.
-    corners : ndarray, shape (F, 3, 2)
-        (u, v) of each triangle's corners.
-    """
-
-    tube: Tube
-    corners: Array
+    tube: Tube  # The surface
+    corners: Array  # (F, 3, 2): (u, v) of each triangle's corners
 
     @property
     def shape_operators(self) -> Array:
@@ -93,16 +91,8 @@ class BuiltColon(BuiltMesh):
 def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
     """Make the surface and the mesh of a recipe, with normals into the lumen.
 
-    Parameters
-    ----------
-    recipe : ColonRecipe
-    edge_mm : float, optional
-        Side of the mesh's cells on the bare tube, mm; default about `TRIANGLES` triangles.
-
-    Raises
-    ------
-    InputError
-        If the folds close the lumen, the tube bends into itself, or there would be too many triangles.
+    `edge_mm` is the side of the mesh's cells on the bare tube; default about `TRIANGLES` triangles. Raises `InputError`
+    if the folds close the lumen, the tube bends into itself, or there would be too many triangles.
     """
     tube, key = Tube(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = {**kept("colon", key, lambda: _mesh(tube, edge_mm))}

@@ -9,14 +9,11 @@ import numpy as np
 
 from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.runtime.arrays import Array, IntArray
-from simtest.surfaces.fineness import needed_edge
-from simtest.surfaces.mesh_file import other_unit, read_mesh
-from simtest.surfaces.mesh_geometry import area_quantile, edge_lengths, edge_uses, vertex_areas
-from simtest.surfaces.mesh_surface import is_lumen
+from simtest.surfaces.mesh_file import MAX_CROSSING_FACES, Condition, Repairs, examine, other_unit, read_mesh
+from simtest.surfaces.mesh_surface import is_lumen, needed_edge, shape_operators
 from simtest.surfaces.model import principal_curvatures
 from simtest.surfaces.poses import nearest_mm
-from simtest.surfaces.repair import MAX_CROSSING_FACES, Condition, Repairs, examine
-from simtest.surfaces.subdivision import shape_operators
+from simtest.surfaces.triangles import area_quantile, edge_lengths, edge_uses, vertex_areas
 
 TUBE_RIMS = 2
 """A mesh with as many wide rims may be a tube that is cut open at both ends; ..."""
@@ -184,7 +181,7 @@ def check_mesh(path: str | Path, distance_mm: float | None, concentration: float
     distance_mm : float or None
         Distance of camera and light from the surface, mm; None: that of the nearest viewpoints on the camera's side.
     concentration : float
-        c of the lobe (`simtest.surfaces.fineness`).
+        c of the lobe (`simtest.surfaces.mesh_surface`).
     kind : {"auto", "lumen", "organ"}
         Which side the camera is on.
 

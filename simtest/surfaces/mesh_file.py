@@ -1,11 +1,14 @@
-"""Mesh files: PLY, OBJ, STL and VTK read, with errors of one line; PLY, OBJ and STL written."""
+"""Mesh files: PLY, OBJ, STL and VTK read and repaired, with errors of one line; PLY, OBJ and STL written."""
 
 import logging
 import re
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -16,10 +19,349 @@ from simtest.runtime.limits import check_file, check_limit, limit
 from simtest.runtime.machine_errors import cannot_write, write_error
 from simtest.runtime.resources import shown
 from simtest.surfaces.model import TriangleMesh
-from simtest.surfaces.ply_header import check_ply
-from simtest.surfaces.ply_polygons import read_mixed_polygons
-from simtest.surfaces.repair import Repairs, repair
+from simtest.surfaces.triangles import edge_uses
 from simtest.surfaces.vtk_file import check_indices, read_vtk
+
+HEADER_BYTES = 65536
+NUMPY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+SIZES = {name: int(kind[1]) for name, kind in NUMPY_TYPES.items()}
+FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
+_MOST_DIGITS = 18
+
+
+@dataclass
+class Element:
+    """An element: its name, how many there are, its properties by name, and the bytes that each takes at least."""
+
+    name: str
+    count: int
+    properties: dict[str, str] = field(default_factory=dict)
+    bytes: int = 0
+    words: int = 0
+
+
+def check_ply(path: Path, size: int) -> tuple[int, int]:
+    """Return vertices and faces that the header of a PLY file announces, if its bytes can hold them.
+
+    Checked before any memory is asked for. Raises `InputError` if the header is malformed, there is no vertex or face
+    in it, there are more faces than allowed, or the file ends before the announced ones.
+    """
+    where = shown(path)
+    kind, elements, start = read_header(path)
+    found = {element.name: element for element in elements}
+    # what a mesh needs
+    for name, properties in (("vertex", ("x", "y", "z")), ("face", ())):
+        if name not in found:
+            raise InputError(f"{where}: its header has no element {name}; a mesh has vertices and faces")
+        for needed in properties:
+            if needed not in found[name].properties:
+                raise InputError(f"{where}: its vertices have no property {needed}; they need x, y and z")
+    if not {"vertex_indices", "vertex_index"} & found["face"].properties.keys() and found["face"].count:
+        raise InputError(f"{where}: its faces have no list of vertices; property list uchar int vertex_indices is it")
+    for name, element in found.items():
+        # Ten vertices a face would be a strange mesh, and ten faces a vertex too.
+        if name in ("vertex", "face"):
+            check_limit(
+                "mesh_faces",
+                element.count / (1 if name == "face" else 3),
+                path,
+                "faces" if name == "face" else "vertices over 3",
+                "decimate the mesh",
+            )
+    # A number of a text takes two bytes at least, with what separates it from the next.
+    each = {e.name: (2 * e.words if kind == "ascii" else e.bytes) for e in elements}
+    least = sum(element.count * each[element.name] for element in elements)
+    held = size - start
+    if held + 1 < least:
+        announced = " and ".join(f"{found[name].count} {name} elements" for name in ("vertex", "face"))
+        raise InputError(f"{where}: {held} bytes follow the header; {announced} take {least} at least: it is cut short")
+    return found["vertex"].count, found["face"].count
+
+
+def read_header(path: Path) -> tuple[str, list[Element], int]:
+    """Return format, elements and length in bytes of a PLY file's header; raise `InputError` if it is malformed."""
+    where = shown(path)
+    with path.open("rb") as file:
+        head = file.read(HEADER_BYTES)
+    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
+    if not head.startswith(b"ply") or end is None:
+        raise InputError(f"{where}: no PLY file; it must begin with ply, and its header end with end_header")
+    return *_parse(head[: end.start()].decode("latin-1"), where), end.end()
+
+
+def _parse(text: str, where: str) -> tuple[str, list[Element]]:
+    """Return the format and the elements that a header announces."""
+    kind, elements = "", list[Element]()
+    # Not by splitlines: in Latin-1 it also ends lines at bytes of UTF-8 text, such as 0x85 of a capital A with a ring.
+    for line in (line.rstrip("\r") for line in text.split("\n")[1:]):
+        words = line.split()
+        match words[:1]:
+            case ["format"]:
+                kind = words[1] if len(words) > 1 else ""
+            case ["element"]:
+                if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > _MOST_DIGITS:
+                    raise InputError(f"{where}: header line {shown(line, 60)!r}: must be element NAME COUNT")
+                elements.append(Element(words[1], int(words[2])))
+            case ["property"]:
+                _add_property(elements, words, line, where)
+            case ["comment"] | ["obj_info"] | []:
+                pass
+            case _:
+                raise InputError(f"{where}: header line {shown(line, 60)!r}: must be an element, property or comment")
+    if kind not in FORMATS:
+        raise InputError(f"{where}: format {shown(kind, 40)}: must be one of {', '.join(FORMATS)}")
+    return kind, elements
+
+
+def _add_property(elements: list[Element], words: list[str], line: str, where: str) -> None:
+    """Add a line's property to the last element."""
+    is_list = words[1:2] == ["list"]
+    types = words[2:4] if is_list else words[1:2]
+    if not elements or len(words) != (5 if is_list else 3) or any(name not in SIZES for name in types):
+        raise InputError(f"{where}: header line {shown(line, 60)!r}: must be property TYPE NAME of a known type")
+    last = elements[-1]
+    last.properties[words[-1]] = " ".join(words[1:-1])
+    # Of a list its length; a face has three corners at least, but a list may be empty.
+    last.bytes += SIZES[types[0]]
+    last.words += 1
+
+
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def read_mixed_polygons(path: Path) -> tuple[Array, IntArray] | None:
+    """Read a binary PLY file that mixes triangles with larger polygons, which become fans of triangles.
+
+    The header is one that `check_ply` has accepted. Returns vertices and faces; None for text, and where all faces have
+    like numbers of corners. Raises `InputError` if the file ends within its faces, or what stands before them has
+    lists.
+    """
+    kind, elements, start = read_header(path)
+    if kind not in _BYTE_ORDERS:
+        return None
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        return _read(path, data, _BYTE_ORDERS[kind], elements, start)
+
+
+def _read(path: Path, data: mmap, order: str, elements: list[Element], start: int) -> tuple[Array, IntArray] | None:
+    """Read the elements that follow the header."""
+    vertices = None
+    for element in elements:
+        if element.name == "face":
+            found = _corners(data, start, element, order)
+            return None if found is None or vertices is None else (vertices, _fans(data, *found))
+        dtype = _row(element, order)
+        if dtype is None:
+            return None
+        if len(data) < start + element.count * dtype.itemsize:
+            raise InputError(f"{shown(path)}: ends within its {element.name} elements: it is cut short")
+        if element.name == "vertex":
+            rows = np.frombuffer(data, dtype, element.count, start)
+            vertices = np.column_stack([rows[axis] for axis in "xyz"]).astype(np.float64)
+            del rows  # or the file could not be closed
+        start += element.count * dtype.itemsize
+    return None
+
+
+def _row(element: Element, order: str) -> np.dtype | None:
+    """Return the layout of an element without lists; None with one."""
+    if any(kind.startswith("list") for kind in element.properties.values()):
+        return None
+    return np.dtype([(name, order + NUMPY_TYPES[kind]) for name, kind in element.properties.items()])
+
+
+def _corners(data: mmap, start: int, faces: Element, order: str) -> tuple[IntArray, IntArray, np.dtype] | None:
+    """Return where each face's corners begin, their number, and their type; None where all have the same number.
+
+    None also where a face has several lists, or the file ends before its last face: trimesh tells what is wrong.
+    """
+    before = after = 0
+    length = corner = None
+    for kind in faces.properties.values():
+        words = kind.split()
+        if words[0] != "list":
+            size = np.dtype(NUMPY_TYPES[kind]).itemsize
+            before, after = before + size * (length is None), after + size * (length is not None)
+        elif length is None:
+            length, corner = (np.dtype(order + NUMPY_TYPES[word]) for word in words[1:])
+        else:
+            return None
+    if length is None or corner is None or length.kind == "f":
+        return None
+    if _are_alike(data, start, faces.count, before, after, length, corner):
+        return None
+    byte_order: Literal["little", "big"] = "little" if order == "<" else "big"
+    begins, counts, at = np.empty(faces.count, np.int64), np.empty(faces.count, np.int64), start
+    for i in range(faces.count):
+        at += before + length.itemsize
+        # An empty slice, beyond the end, is a face without corners.
+        counts[i] = count = int.from_bytes(data[at - length.itemsize : at], byte_order)
+        begins[i] = at
+        at += count * corner.itemsize + after
+        if at > len(data):
+            return None
+    return None if len(np.unique(counts)) < 2 else (begins, counts, corner)
+
+
+def _are_alike(data: mmap, start: int, count: int, before: int, after: int, length: np.dtype, corner: np.dtype) -> bool:
+    """Return whether all faces have as many corners as the first; told without a loop over millions of faces."""
+    if count == 0 or start + before + length.itemsize > len(data):
+        return True
+    first = int(np.frombuffer(data, length, 1, start + before)[0])
+    stride = before + length.itemsize + first * corner.itemsize + after
+    if first < 0 or start + count * stride > len(data):
+        return False
+    lengths = np.ndarray((count,), length, data, start + before, (stride,))
+    return bool((lengths == first).all())
+
+
+def _fans(data: mmap, begins: IntArray, counts: IntArray, corner: np.dtype) -> IntArray:
+    """Cut polygons into triangles that share the first corner."""
+    octets, parts = np.frombuffer(data, np.uint8), []
+    for count in np.unique(counts[counts >= 3]):
+        own = begins[counts == count]
+        raw = octets[own[:, None] + np.arange(count * corner.itemsize)]
+        polygons = raw.reshape(-1).view(corner).reshape(-1, count).astype(np.int64)
+        parts += [polygons[:, [0, k, k + 1]] for k in range(1, count - 1)]
+    return np.concatenate(parts)
+
+
+SLIVER = 1e-14
+"""Area over the squared extent below which rounding decides the direction of a face."""
+
+MAX_CROSSING_FACES = 1_000_000
+"""Above this many faces self-intersections are not searched for (about 5 s and 2 GB at the limit)."""
+
+
+@dataclass(frozen=True)
+class Repairs:
+    """Counts of what was repaired."""
+
+    # Vertices at the position of another; the three that each triangle of an STL file has of its own do not count
+    merged_vertices: int = 0
+    # repeated_faces, faces_without_area: Faces left out
+    repeated_faces: int = 0
+    faces_without_area: int = 0
+    reversed_faces: int = 0  # Faces turned so that neighbours wind the same way
+    turned_pieces: int = 0  # Whole pieces that were inside out
+
+    def sentences(self, lumen: bool = False) -> Iterator[str]:
+        """Yield a sentence for each repair; for a lumen, faces may wind inward or outward."""
+        if self.merged_vertices:
+            yield f"merged {_many(self.merged_vertices, 'repeated vertex', 'repeated vertices')}"
+        if self.faces_without_area:
+            yield f"left out {_many(self.faces_without_area, 'face without area', 'faces without area')}"
+        if self.repeated_faces:
+            yield f"left out {_many(self.repeated_faces, 'repeated face', 'repeated faces')}"
+        if self.reversed_faces:
+            yield f"reversed {_many(self.reversed_faces, 'face that winds', 'faces that wind')} against the neighbours"
+        if self.turned_pieces and not lumen:
+            yield f"turned {_many(self.turned_pieces, 'piece that was', 'pieces that were')} inside out"
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Faults of the repaired mesh that are left as they are."""
+
+    pieces: int  # Connected pieces
+    open_edges: int  # Edges of one face; 0 for a watertight mesh
+    non_manifold_edges: int  # Edges of more than two faces
+    crossing_faces: int | None  # Faces that cut through another; None if they were not searched for
+
+    @property
+    def watertight(self) -> bool:
+        """Whether each edge belongs to two faces."""
+        return self.open_edges == 0 and self.non_manifold_edges == 0
+
+    def to_json(self) -> dict[str, int | bool | None]:
+        """Return the fields, and whether the mesh is watertight."""
+        return {"watertight": self.watertight, **asdict(self)}
+
+
+def _many(count: int, one: str, more: str) -> str:
+    return f"{count} {one if count == 1 else more}"
+
+
+def repair(vertices: Array, faces: IntArray, soup: bool = False) -> tuple[Array, IntArray, Repairs]:
+    """Repair what can be repaired without a guess at the shape.
+
+    `soup` says that by the file's format each face has its own vertices, so that merging them is no repair. Vertices
+    are used, and none repeated; the winding is consistent within each piece, with outward normals: positive volume
+    about the piece's centroid.
+    """
+    import trimesh  # slow to import
+
+    # vertices
+    used = len(np.unique(faces))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    merged = 0 if soup else used - len(np.unique(mesh.faces))
+    before = len(mesh.faces)
+    # Faces without area, relative to the extent, and repeated faces
+    mesh.update_faces(mesh.area_faces > SLIVER * float(np.ptp(vertices, axis=0).max()) ** 2)
+    flat = before - len(mesh.faces)
+    before = len(mesh.faces)
+    mesh.update_faces(mesh.unique_faces())
+    repeated = before - len(mesh.faces)
+    mesh.remove_unreferenced_vertices()
+    # winding
+    points = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    triangles = np.ascontiguousarray(mesh.faces, dtype=np.int64)
+    if not len(triangles):
+        return points, triangles, Repairs(merged, repeated, flat)
+    triangles, against, turned = _outward(points, triangles)
+    return points, triangles, Repairs(merged, repeated, flat, against, turned)
+
+
+def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
+    """Make the winding consistent within each connected piece, and the normals of each piece point outward.
+
+    Returns the faces, how many of them wound against the majority of their piece, and how many pieces pointed inward.
+    """
+    import igl
+
+    oriented, piece = igl.bfs_orient(faces)
+    piece = np.asarray(piece).ravel()
+    count = int(piece.max()) + 1
+    corners = vertices[oriented]
+    # Volumes about each piece's own centroid, so that an open piece has a meaningful sign.
+    size = np.maximum(np.bincount(piece, minlength=count), 1)
+    middle = np.stack([np.bincount(piece, c, count) for c in corners.mean(axis=1).T], axis=1) / size[:, None]
+    a, b, c = (corners[:, i] - middle[piece] for i in range(3))
+    volume = np.bincount(piece, np.einsum("ni,ni->n", a, np.cross(b, c)), count)
+    # Pieces of negative volume are inside out.
+    outward = np.where((volume[piece] < 0)[:, None], oriented[:, ::-1], oriented)
+    # A face and its reverse differ by an odd permutation: compare the corner that follows the smallest.
+    inward = np.bincount(piece, _follower(faces) != _follower(outward), count)
+    turned = inward > size / 2
+    against = np.where(turned, size - inward, inward).sum()
+    return np.ascontiguousarray(outward, dtype=np.int64), int(against), int(turned.sum())
+
+
+def _follower(faces: IntArray) -> IntArray:
+    """Return the corner that comes after the smallest one in each face, shape (F,)."""
+    after = (np.argmin(faces, axis=1) + 1) % 3
+    return faces[np.arange(len(faces)), after]
+
+
+def examine(vertices: Array, faces: IntArray, crossings: bool = True) -> Condition:
+    """Find the faults of a mesh from `repair`; `crossings`, the search for self-intersections, takes longest."""
+    import igl
+    from igl import predicates
+
+    _, uses = edge_uses(faces)
+    # Connected by shared vertices: two pieces that touch in one vertex count as one.
+    pieces = int(np.max(igl.vertex_components(faces))) + 1
+    crossing = None
+    if crossings and len(faces) <= MAX_CROSSING_FACES:
+        found, pairs, _ = predicates.find_self_intersections(vertices, faces)
+        crossing = len(np.unique(pairs)) if found else 0
+    return Condition(pieces, int((uses == 1).sum()), int((uses > 2).sum()), crossing)
+
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".vtk")
 WRITTEN_SUFFIXES = (".ply", ".obj", ".stl")

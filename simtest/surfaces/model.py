@@ -220,21 +220,9 @@ def pack_points(
 ) -> SurfacePoints:
     """Make `SurfacePoints` from distances, normals and shape operators, turned to face the rays' origins.
 
-    Parameters
-    ----------
-    origins, directions : ndarray, shape (N, 3)
-        Rays; unit directions.
-    distance : ndarray, shape (N,)
-        mm; NaN or inf if there is no point.
-    normal : ndarray, shape (N, 3)
-        Unit normals of either sign.
-    shape_operator : ndarray, shape (N, 3, 3)
-        S with dN = S dP for the given sign of N: symmetric, S N = 0.
-
-    Returns
-    -------
-    SurfacePoints
-        k_min, k_max are the eigenvalues of S in the tangent plane (theory.md section 0).
+    Distances are in mm, NaN or inf if there is no point; normals, shape (N, 3), are unit and of either sign; S, shape
+    (N, 3, 3), has dN = S dP for the given sign of N, is symmetric, and S N = 0. Its eigenvalues in the tangent plane
+    are k_min and k_max (theory.md section 0).
     """
     # Facing the origin; S changes its sign with the normal.
     sign = np.where(np.einsum("ij,ij->i", normal, directions) > 0, -1.0, 1.0)

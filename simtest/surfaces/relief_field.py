@@ -53,40 +53,20 @@ MENISCUS = 0.1
 
 @dataclass(frozen=True)
 class HeightJets:
-    """Height of the relief with its first two derivatives in space.
+    """Height of the relief with its first two derivatives in space."""
 
-    Parameters
-    ----------
-    height : ndarray, shape (N,)
-        mm, towards the camera.
-    gradient : ndarray, shape (N, 3)
-        Model frame.
-    hessian : ndarray, shape (N, 3, 3)
-        1/mm.
-    """
-
-    height: Array
-    gradient: Array
-    hessian: Array
+    height: Array  # (N,): mm, towards the camera
+    gradient: Array  # (N, 3): model frame
+    hessian: Array  # (N, 3, 3): 1/mm
 
 
 @dataclass(frozen=True)
 class BandField:
-    """One band: a periodic cubic B-spline.
+    """One band: a periodic cubic B-spline."""
 
-    Parameters
-    ----------
-    lattice_from_model : ndarray, shape (3, 3)
-        Lattice cells over mm.
-    coefficients : ndarray, shape (NODES, NODES, NODES)
-        Of the B-splines, mm.
-    diffused : ndarray, shape (NODES, NODES, NODES)
-        Those of the field that diffuse light sees.
-    """
-
-    lattice_from_model: Array
-    coefficients: Array
-    diffused: Array
+    lattice_from_model: Array  # (3, 3): lattice cells over mm
+    coefficients: Array  # (NODES, NODES, NODES): of the B-splines, mm
+    diffused: Array  # (NODES, NODES, NODES): those of the field that diffuse light sees
 
     @cached_property
     def is_seen_diffusely(self) -> bool:
@@ -128,24 +108,12 @@ def _spline_weights(t: Array) -> Array:
 
 @dataclass(frozen=True)
 class ReliefField:
-    """The relief of one surface.
+    """The relief of one surface."""
 
-    Parameters
-    ----------
-    bands : tuple of BandField
-        Their heights add up.
-    deviation : float
-        Standard deviation of the height, mm.
-    finest_wave : float
-        Least wavelength of the bands that hold a share of the slope above `FELT`, mm.
-    level : float or None
-        Height up to which a film fills the valleys, mm; None: it follows the relief.
-    """
-
-    bands: tuple[BandField, ...]
-    deviation: float
-    finest_wave: float
-    level: float | None = None
+    bands: tuple[BandField, ...]  # Their heights add up
+    deviation: float  # Standard deviation of the height, mm
+    finest_wave: float  # Least wavelength of the bands that hold a share of the slope above `FELT`, mm
+    level: float | None = None  # Height up to which a film fills the valleys, mm; None: it follows the relief
 
     @property
     def meniscus(self) -> float:
@@ -260,15 +228,7 @@ def _add(parts: list[HeightJets]) -> HeightJets:
 
 
 def make_relief(spec: Relief, level: float | None = None) -> ReliefField:
-    """Make the relief of a description.
-
-    Parameters
-    ----------
-    spec : Relief
-        Its bands and seed.
-    level : float, optional
-        Height up to which a film fills the valleys, in standard deviations of the height about its mean.
-    """
+    """Make the relief of a description; a film fills its valleys up to `level` deviations of the height."""
     field = _make_field(spec)
     return field if level is None else replace(field, level=level * field.deviation)
 
@@ -307,20 +267,11 @@ def _drawn(spec: Relief) -> ReliefField:
 
 @dataclass(frozen=True)
 class _Unscaled:
-    """A band before its slope and wavelength are set.
+    """A band before its slope and wavelength are set."""
 
-    Parameters
-    ----------
-    turn : ndarray, shape (3, 3)
-        Of the lattice.
-    coefficients : ndarray, shape (NODES, NODES, NODES)
-        Of the B-splines.
-    slope, wave : float
-        What `_plane_statistics` measures.
-    """
-
-    turn: Array
-    coefficients: Array
+    turn: Array  # (3, 3): of the lattice
+    coefficients: Array  # (NODES, NODES, NODES): of the B-splines
+    # slope, wave: What `_plane_statistics` measures
     slope: float
     wave: float
 

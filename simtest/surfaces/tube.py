@@ -20,12 +20,45 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.seeds import Stage, generator
-from simtest.surfaces.components import Components, chosen, components, solve3
-from simtest.surfaces.jets import Jet
 from simtest.surfaces.recipe import ColonRecipe
-from simtest.surfaces.stalk import Stalk
+from simtest.surfaces.stalk import Jet, Stalk
+
+Components = tuple[Array, Array, Array]
+"""The components of N vectors, each of shape (N,)."""
+
+
+def components(vectors: Array) -> Components:
+    """Return the components of vectors, shape (N, 3)."""
+    x, y, z = np.ascontiguousarray(vectors.T)
+    return x, y, z
+
+
+def chosen(vectors: Components, rows: IntArray) -> Components:
+    """Return some of the vectors, by their numbers."""
+    x, y, z = vectors
+    return x[rows], y[rows], z[rows]
+
+
+def solve3(a: Components, b: Components, c: Components, right: Components) -> tuple[Array, Array, Array]:
+    """Solve [a b c] (x, y, z) = right by Cramer's rule; inf or NaN for a singular matrix."""
+    bc = cross(b, c)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / dot(a, bc)
+        x, y, z = (dot(right, minor) * inverse for minor in (bc, cross(c, a), cross(a, b)))
+    return x, y, z
+
+
+def cross(a: Components, b: Components) -> Components:
+    """Return the cross products of vectors."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def dot(a: Components, b: Components) -> Array:
+    """Return the dot products of vectors, shape (N,)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
 
 NEWTON_STEPS = 12
 NEWTON_TOLERANCE_MM = 1e-10
@@ -54,23 +87,13 @@ class _Fold:
 
 @dataclass(frozen=True)
 class TubeNumbers:
-    """A tube without pedunculated polyps as numbers, for a kernel.
+    """A tube without pedunculated polyps as numbers, for a kernel."""
 
-    Parameters
-    ----------
-    constants : dict
-        Scalars of the module's formulas.
-    folds : ndarray, shape (K, 7)
-        along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see `_Fold`).
-    waves : ndarray, shape (W, 3)
-        q, m and phase of the relief's waves.
-    panels : ndarray, shape (knots, 2 + 2 * powers)
-        x and z of each knot, then of the polynomial's coefficients about it, the lowest first.
-    """
-
-    constants: dict[str, float]
+    constants: dict[str, float]  # Scalars of the module's formulas
+    # (K, 7): along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see `_Fold`)
     folds: Array
-    waves: Array
+    waves: Array  # (W, 3): q, m and phase of the relief's waves
+    # (knots, 2 + 2 * powers): x and z of each knot, then of the polynomial's coefficients about it, the lowest first
     panels: Array
 
 

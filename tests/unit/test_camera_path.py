@@ -8,9 +8,8 @@ import pytest
 from simtest.errors import InputError
 from simtest.spec.surface import AnatomySurface
 from simtest.surfaces import make_surface
-from simtest.surfaces.centreline import camera_path
 from simtest.surfaces.model import RayHits, Shape, SurfaceModel, TriangleMesh
-from simtest.surfaces.poses import MIN_CLEARANCE_MM
+from simtest.surfaces.poses import MIN_CLEARANCE_MM, camera_path
 from tests.marked import marked
 
 

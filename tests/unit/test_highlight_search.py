@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from simtest.rendering import Session, highlights
-from simtest.rendering.exact_misfit import exact_misfit
-from simtest.rendering.misfit_grid import crossed, turned_pixels
+from simtest.rendering.misfits import crossed, exact_misfit, turned_pixels
 from simtest.spec.scene import scene_from_dict
 
 CAMERA = {"width": 200, "height": 160, "fx": 200.0, "fy": 200.0, "cx": 100.0, "cy": 80.0}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from simtest.rendering import Session, backend
-from simtest.rendering.kernel_arrays import to_kernel, vectors_from_kernel, vectors_to_kernel
+from simtest.rendering.kernel_values import to_kernel, vectors_from_kernel, vectors_to_kernel
 from simtest.spec import load_scene
 
 
