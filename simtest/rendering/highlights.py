@@ -63,7 +63,7 @@ def find_smooth(session: "Session", radiance: Radiance, stride: int) -> list[Hig
     # Reject what left the frame and what was found twice.
     inside = session.camera.contains(solutions)
     solutions, owners = solutions[inside], owners[inside]
-    kept = _first_of_each(solutions, owners, SAME_PX)
+    kept = _first_of_each(solutions, SAME_PX, owners)
     return brightest_first(describe(session, radiance, solutions[kept], owners[kept], fine=False))
 
 
@@ -90,7 +90,7 @@ def _seeds(grid: MisfitGrid, camera: "Camera") -> tuple[Array, IntArray]:
         rows, columns = rows[held], columns[held]
         own = np.concatenate([near, grid.pixels(rows + 0.5, columns + 0.5)])
         own = own[np.isfinite(own).all(axis=1)]
-        own = own[_first_of_each(own, np.zeros(len(own), dtype=np.int64), SAME_PX)][:MAX_SEEDS]
+        own = own[_first_of_each(own, SAME_PX)][:MAX_SEEDS]
         seeds.append(own)
         owners.append(np.full(len(own), light))
     return np.concatenate(seeds), np.concatenate(owners)
@@ -120,7 +120,7 @@ def _newton(session: "Session", seeds: Array, owners: IntArray, lights: Array) -
         of_light.append(light[done])
         kept = np.flatnonzero(going & ~done)
         if number in MERGING:
-            kept = kept[_first_of_each(position[kept], light[kept], MERGED_PX)]
+            kept = kept[_first_of_each(position[kept], MERGED_PX, light[kept])]
         position, light, least, since = position[kept], light[kept], least[kept], since[kept]
     return np.concatenate(found), np.concatenate(of_light)
 
@@ -343,7 +343,7 @@ def _glint_zeros(session: "Session", seeds: Array, light: Array) -> Array:
         position, before = position[going] + step, state.length[going]
         # Seeds of one zero have met after a few steps.
         if number in (2, 4):
-            kept = _without_neighbours(position, SAME_GLINT_PX / 4)
+            kept = _first_of_each(position, SAME_GLINT_PX / 4)
             position, before = position[kept], before[kept]
     return np.concatenate(finished) if finished else np.empty((0, 2))
 
@@ -399,25 +399,23 @@ def _widths() -> Array:
 def distinct(points: Array, apart: float) -> Array:
     """Keep one of the finite points, shape (N, 2), that lie within `apart` of each other."""
     points = points[np.isfinite(points).all(axis=1)]
-    return points[_without_neighbours(points, apart)]
+    return points[_first_of_each(points, apart)]
 
 
-def _without_neighbours(points: Array, apart: float) -> Mask:
-    """Return which points are no nearer to an earlier one that stays than `apart`."""
+def _first_of_each(points: Array, apart: float, owners: IntArray | None = None) -> Mask:
+    """Return which points, shape (N, 2), have no earlier one that stays, of the same owner, within a distance."""
     kept = np.ones(len(points), dtype=bool)
     if len(points) < 2:
         return kept
     from scipy.spatial import cKDTree
 
-    for i, j in _ordered(cKDTree(points).query_pairs(apart, output_type="ndarray")):
+    pairs = np.sort(cKDTree(points).query_pairs(apart, output_type="ndarray"), axis=1)
+    if owners is not None:
+        pairs = pairs[owners[pairs[:, 0]] == owners[pairs[:, 1]]]
+    for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].tolist():
         if kept[i]:
             kept[j] = False
     return kept
-
-
-def _ordered(pairs: IntArray) -> IntArray:
-    pairs = np.sort(pairs, axis=1)
-    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
 FINE_STRIDE_PX = 2

@@ -7,7 +7,7 @@ which of both is nearer, and shadow rays ask both. Here is also which pixels the
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +37,7 @@ PER_METAL = 8
 
 @dataclass(frozen=True)
 class Metal:
-    """The reflectance of instruments at the points that a kernel hits; evaluated as `direct.Material` is.
+    """The reflectance of instruments at the points that a kernel hits; evaluated as `Material` is.
 
     A rough conductor, GGX with Schlick's Fresnel term, blended with a matt base.
     """
@@ -268,6 +268,10 @@ def _tip(session: "Session", index: int, instrument: Instrument) -> Array:
     return np.asarray(share * distance[nearest] * sightline)
 
 
+_NORMALS = ("normal", "shading_normal", "geometric_normal", "normal_base")
+Maps = TypeVar("Maps", Labels, TruthMaps)
+
+
 @dataclass(frozen=True)
 class Cover:
     """What instruments cover of a frame, on the rays through the pixels' centres."""
@@ -289,47 +293,23 @@ class Cover:
         """1 + the index, 0 where no instrument is seen, shape (H, W)."""
         return (self.instrument + 1).astype(np.uint8)
 
-    def labels(self, labels: Labels) -> Labels:
-        """Return the labels of a frame with those of the instruments over those of the surface."""
-        seen, vector = self.seen, self.seen[..., None]
-        normal = np.where(vector, self.normal, labels.normal).astype(np.float32)
-        smooth = labels.normal_base is labels.normal
-        unknown = {
-            name: np.where(seen, np.float32(np.nan), getattr(labels, name))
-            for name in ("k_min", "k_max", "k_min_base", "k_max_base")
-        }
-        return replace(
-            labels,
-            depth=np.where(seen, self.distance, labels.depth).astype(np.float32),
-            position=np.where(vector, self.position, labels.position).astype(np.float32),
-            normal=normal,
-            geometric_normal=np.where(vector, self.normal, labels.geometric_normal).astype(np.float32),
-            normal_base=normal if smooth else np.where(vector, self.normal, labels.normal_base).astype(np.float32),
-            pool=labels.pool & ~seen,
-            instance=np.where(seen, self.instrument + 1, labels.instance).astype(np.int32),
-            face=np.where(seen, 0, labels.face).astype(np.int32),
-            **unknown,
-        )
+    def every(self, stride: int) -> "Cover":
+        """Return what is covered of every `stride`-th pixel."""
+        return Cover(*(values[::stride, ::stride] for values in vars(self).values()))
 
-    def truth(self, truth: TruthMaps, stride: int = 1) -> TruthMaps:
-        """Return the truth of every `stride`-th pixel with that of the instruments over that of the surface."""
-        own = Cover(*(values[::stride, ::stride] for values in vars(self).values()))
-        seen, vector = own.seen, own.seen[..., None]
-        of_normal = ("normal", "shading_normal", "geometric_normal", "normal_base")
-        unknown = ("direction_min", "direction_max", "k_min", "k_max", "k_min_base", "k_max_base")
-        maps: dict[str, Array] = {name: np.where(vector, own.normal, getattr(truth, name)) for name in of_normal}
-        for name in unknown:
-            values = getattr(truth, name)
-            maps[name] = np.where(vector if values.ndim == 3 else seen, np.nan, values)
-        return replace(
-            truth,
-            depth=np.where(seen, own.distance, truth.depth),
-            position=np.where(vector, own.position, truth.position),
-            pool=truth.pool & ~seen,
-            mask=truth.mask | seen,
-            instrument=own.numbers,
-            **maps,
-        )
+    def over(self, maps: Maps) -> Maps:
+        """Return labels or truth of a frame with those of the instruments over those of the surface."""
+        above: dict[str, Any] = {
+            "depth": self.distance, "position": self.position, "pool": False, "mask": True, "face": 0,
+            **dict.fromkeys(_NORMALS, self.normal), **dict.fromkeys(("instance", "instrument"), self.instrument + 1),
+        }  # fmt: skip
+        made = {}
+        for name, below in vars(maps).items():
+            seen = self.seen[..., None] if below.ndim == 3 else self.seen
+            made[name] = np.where(seen, above.get(name, np.nan), below).astype(below.dtype)
+        if maps.normal_base is maps.normal:
+            made["normal_base"] = made["normal"]
+        return replace(maps, **made)
 
 
 def cover_of(session: "Session", kernel: InstrumentKernel, depth: Image) -> Cover:

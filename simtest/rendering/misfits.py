@@ -173,7 +173,7 @@ def _gain(r: Any, si: Any) -> Any:
 
 
 def _misfit_and_step(ray: Any, basis: tuple[Any, Any], si: Any, light: Any) -> list[Any]:
-    """Compute the misfit along a basis (see `exact_misfit.exact_misfit`) and the sightline's turn to its zero."""
+    """Compute the misfit along a basis (see `exact_misfit`) and the sightline's turn to its zero."""
     r = ray.d
     facing = dr.select(dr.dot(si.sh_frame.n, r) > 0, mi.Float(-1), mi.Float(1))
     normal = mi.Vector3f(si.sh_frame.n) * facing

@@ -228,7 +228,7 @@ class Session:
         """
         radiance = self.labelled_radiance(progress)
         labels, cover = as_labels(self._labels), self.cover()
-        return Frame(radiance, labels if cover is None else cover.labels(labels))
+        return Frame(radiance, labels if cover is None else cover.over(labels))
 
     @_at_its_variant
     def labelled_radiance(self, progress: Progress | None = None) -> Radiance:
@@ -342,30 +342,18 @@ class Session:
     def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
         """Cast rays through pixel positions, shape (N, 2), onto the exact surface.
 
-        Returns
-        -------
-        points : SurfacePoints
-            Exact, in the camera frame.
-        shading_normal, geometric_normal : ndarray, shape (N, 3)
-            Normals of the rendered shape, camera frame, without its relief; NaN where the ray misses.
+        Returns the exact points and the shading and geometric normals of the rendered shape, shape (N, 3), without its
+        relief; in the camera frame, NaN where the ray misses.
         """
-        return self._cast(*self.sightlines.in_model(points_px))
+        return self._cast(*self.sightlines.in_model(points_px), None)
 
     def _cast(
-        self, origins: Array, directions: Array, relief: ReliefKernel | None = None
+        self, origins: Array, directions: Array, relief: ReliefKernel | None
     ) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays of the model frame (see `cast`); a NaN direction hits nothing.
-
-        With a `relief` the shading normals follow it; the exact points always do.
-        """
-        hits, shading, geometric = self._hits(origins, directions, relief)
+        """Cast rays of the model frame (see `cast`); with a `relief` the shading normals follow it."""
+        hits, shading, geometric = truth.trace_hits(self._built.scene, self._shape, origins, directions, relief)
         rotation = self.surface.model_from_camera[:3, :3]
         return truth.solve(self.surface, origins, directions, hits), shading @ rotation, geometric @ rotation
-
-    def _hits(
-        self, origins: Array, directions: Array, relief: ReliefKernel | None = None
-    ) -> tuple[RayHits, Array, Array]:
-        return truth.trace_hits(self._built.scene, self._shape, origins, directions, relief)
 
     @_at_its_variant
     def exact_points(self, points_px: Array, fine: bool = True) -> SurfacePoints:
@@ -393,7 +381,7 @@ class Session:
 
     @_at_its_variant
     def tile_misfits(self, light: int, division: int, corners: IntArray, size: int) -> Image:
-        """Return the fine misfit of one light in tiles of divided pixels (see `misfit_maps.trace_tiles`)."""
+        """Return the fine misfit of one light in tiles of divided pixels (see `trace_tiles`)."""
         return trace_tiles(self._tracer(), self.scene.rig.true_mm()[light], division, corners, size)
 
     @_at_its_variant
@@ -406,7 +394,7 @@ class Session:
             self._truth = self._cast_maps(1)
         maps = self._truth if stride == 1 else None
         maps, cover = maps or self._cast_maps(stride), self.cover()
-        return maps if cover is None else cover.truth(maps, stride)
+        return maps if cover is None else cover.every(stride).over(maps)
 
     def _cast_maps(self, stride: int) -> TruthMaps:
         centres = self.camera.pixel_centres()[::stride, ::stride]

@@ -240,7 +240,7 @@ def _principal(form: tuple[Any, Any, Any], facing: Any) -> list[Any]:
 
 
 def _fine_form(hit: Hit, tangents: tuple[Any, Any], form: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-    """Compute the fine surface's second fundamental form from the base's, as `relief.fine_curvatures` does."""
+    """Compute the fine surface's second fundamental form from the base's, as `relief_field.fine_curvatures` does."""
     jets, N, n = hit.jets, mi.Vector3f(hit.base.sh_frame.n), mi.Vector3f(hit.fine.sh_frame.n)
     assert jets is not None
     assert jets.hessian is not None
@@ -323,7 +323,7 @@ _OF_BASE = {"normal_base": "normal", "k_min_base": "k_min", "k_max_base": "k_max
 
 
 def solve_frame(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
-    """Compute the exact points of many rays, shape (N, 3), as `exact_points.solve` does of a few.
+    """Compute the exact points of many rays, shape (N, 3), as `solve` does of a few.
 
     A surface with a chart is solved in a kernel of `mi`, mitsuba with the variant set.
     """

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 
@@ -28,20 +28,48 @@ NUMPY_TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-SIZES = {name: int(kind[1]) for name, kind in NUMPY_TYPES.items()}
-FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
+BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MOST_DIGITS = 18
 
 
 @dataclass
 class Element:
-    """An element: its name, how many there are, its properties by name, and the bytes that each takes at least."""
+    """An element of a PLY file: its name, how many there are, and NumPy's type of each property, or of a list both."""
 
     name: str
     count: int
-    properties: dict[str, str] = field(default_factory=dict)
-    bytes: int = 0
-    words: int = 0
+    properties: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def read_header(path: Path) -> tuple[str, list[Element], int]:
+    """Return byte order, empty of text, elements and length of a PLY file's header; `InputError` if it is malformed."""
+    where = shown(path)
+    with path.open("rb") as file:
+        head = file.read(HEADER_BYTES)
+    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
+    if not head.startswith(b"ply") or end is None:
+        raise InputError(f"{where}: no PLY file; it must begin with ply, and its header end with end_header")
+    kind, elements = "", list[Element]()
+    # Not by splitlines: in Latin-1 it also ends lines at bytes of UTF-8 text, such as 0x85 of a capital A with a ring.
+    for line in head[: end.start()].decode("latin-1").split("\n")[1:]:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", *words]:
+                kind = words[0] if words else ""
+            case ["element", name, count] if count.isdecimal() and len(count) <= _MOST_DIGITS:
+                elements.append(Element(name, int(count)))
+            case ["property", "list", *types, name] if elements and len(types) == 2 and NUMPY_TYPES.keys() >= {*types}:
+                elements[-1].properties[name] = tuple(NUMPY_TYPES[kind] for kind in types)
+            case ["property", number, name] if elements and number in NUMPY_TYPES:
+                elements[-1].properties[name] = (NUMPY_TYPES[number],)
+            case [first, *_]:
+                forms = {"element": "element NAME COUNT", "property": "property TYPE NAME of a known type"}
+                wanted = forms.get(first, "an element, property or comment")
+                raise InputError(f"{where}: header line {shown(line.rstrip(chr(13)), 60)!r}: must be {wanted}")
+    if kind not in BYTE_ORDERS:
+        raise InputError(f"{where}: format {shown(kind, 40)}: must be one of {', '.join(BYTE_ORDERS)}")
+    return BYTE_ORDERS[kind], elements, end.end()
 
 
 def check_ply(path: Path, size: int) -> tuple[int, int]:
@@ -51,127 +79,64 @@ def check_ply(path: Path, size: int) -> tuple[int, int]:
     in it, there are more faces than allowed, or the file ends before the announced ones.
     """
     where = shown(path)
-    kind, elements, start = read_header(path)
+    order, elements, start = read_header(path)
     found = {element.name: element for element in elements}
-    # what a mesh needs
-    for name, properties in (("vertex", ("x", "y", "z")), ("face", ())):
+    for name in ("vertex", "face"):
         if name not in found:
             raise InputError(f"{where}: its header has no element {name}; a mesh has vertices and faces")
-        for needed in properties:
-            if needed not in found[name].properties:
-                raise InputError(f"{where}: its vertices have no property {needed}; they need x, y and z")
-    if not {"vertex_indices", "vertex_index"} & found["face"].properties.keys() and found["face"].count:
+    vertex, face = found["vertex"], found["face"]
+    for needed in "xyz":
+        if needed not in vertex.properties:
+            raise InputError(f"{where}: its vertices have no property {needed}; they need x, y and z")
+    if not {"vertex_indices", "vertex_index"} & face.properties.keys() and face.count:
         raise InputError(f"{where}: its faces have no list of vertices; property list uchar int vertex_indices is it")
-    for name, element in found.items():
-        # Ten vertices a face would be a strange mesh, and ten faces a vertex too.
-        if name in ("vertex", "face"):
-            check_limit(
-                "mesh_faces",
-                element.count / (1 if name == "face" else 3),
-                path,
-                "faces" if name == "face" else "vertices over 3",
-                "decimate the mesh",
-            )
-    # A number of a text takes two bytes at least, with what separates it from the next.
-    each = {e.name: (2 * e.words if kind == "ascii" else e.bytes) for e in elements}
-    least = sum(element.count * each[element.name] for element in elements)
-    held = size - start
-    if held + 1 < least:
-        announced = " and ".join(f"{found[name].count} {name} elements" for name in ("vertex", "face"))
-        raise InputError(f"{where}: {held} bytes follow the header; {announced} take {least} at least: it is cut short")
-    return found["vertex"].count, found["face"].count
+    # Ten vertices a face would be a strange mesh, and ten faces a vertex too.
+    check_limit("mesh_faces", vertex.count / 3, path, "vertices over 3", "decimate the mesh")
+    check_limit("mesh_faces", face.count, path, "faces", "decimate the mesh")
+    # A number of a text takes two bytes at least, with what separates it from the next. Of a list its length counts: a
+    # face has three corners at least, but a list may be empty.
+    least = sum(
+        element.count * sum(_size(types[0]) if order else 2 for types in element.properties.values())
+        for element in elements
+    )
+    if size - start + 1 < least:
+        announced = f"{vertex.count} vertex elements and {face.count} face elements"
+        raise InputError(
+            f"{where}: {size - start} bytes follow the header; {announced} take {least} at least: it is cut short"
+        )
+    return vertex.count, face.count
 
 
-def read_header(path: Path) -> tuple[str, list[Element], int]:
-    """Return format, elements and length in bytes of a PLY file's header; raise `InputError` if it is malformed."""
-    where = shown(path)
-    with path.open("rb") as file:
-        head = file.read(HEADER_BYTES)
-    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
-    if not head.startswith(b"ply") or end is None:
-        raise InputError(f"{where}: no PLY file; it must begin with ply, and its header end with end_header")
-    return *_parse(head[: end.start()].decode("latin-1"), where), end.end()
-
-
-def _parse(text: str, where: str) -> tuple[str, list[Element]]:
-    """Return the format and the elements that a header announces."""
-    kind, elements = "", list[Element]()
-    # Not by splitlines: in Latin-1 it also ends lines at bytes of UTF-8 text, such as 0x85 of a capital A with a ring.
-    for line in (line.rstrip("\r") for line in text.split("\n")[1:]):
-        words = line.split()
-        match words[:1]:
-            case ["format"]:
-                kind = words[1] if len(words) > 1 else ""
-            case ["element"]:
-                if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > _MOST_DIGITS:
-                    raise InputError(f"{where}: header line {shown(line, 60)!r}: must be element NAME COUNT")
-                elements.append(Element(words[1], int(words[2])))
-            case ["property"]:
-                _add_property(elements, words, line, where)
-            case ["comment"] | ["obj_info"] | []:
-                pass
-            case _:
-                raise InputError(f"{where}: header line {shown(line, 60)!r}: must be an element, property or comment")
-    if kind not in FORMATS:
-        raise InputError(f"{where}: format {shown(kind, 40)}: must be one of {', '.join(FORMATS)}")
-    return kind, elements
-
-
-def _add_property(elements: list[Element], words: list[str], line: str, where: str) -> None:
-    """Add a line's property to the last element."""
-    is_list = words[1:2] == ["list"]
-    types = words[2:4] if is_list else words[1:2]
-    if not elements or len(words) != (5 if is_list else 3) or any(name not in SIZES for name in types):
-        raise InputError(f"{where}: header line {shown(line, 60)!r}: must be property TYPE NAME of a known type")
-    last = elements[-1]
-    last.properties[words[-1]] = " ".join(words[1:-1])
-    # Of a list its length; a face has three corners at least, but a list may be empty.
-    last.bytes += SIZES[types[0]]
-    last.words += 1
-
-
-_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+def _size(kind: str) -> int:
+    return np.dtype(kind).itemsize
 
 
 def read_mixed_polygons(path: Path) -> tuple[Array, IntArray] | None:
     """Read a binary PLY file that mixes triangles with larger polygons, which become fans of triangles.
 
     The header is one that `check_ply` has accepted. Returns vertices and faces; None for text, and where all faces have
-    like numbers of corners. Raises `InputError` if the file ends within its faces, or what stands before them has
-    lists.
+    like numbers of corners. Raises `InputError` if the file ends before its faces.
     """
-    kind, elements, start = read_header(path)
-    if kind not in _BYTE_ORDERS:
+    order, elements, start = read_header(path)
+    if not order:
         return None
     with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-        return _read(path, data, _BYTE_ORDERS[kind], elements, start)
-
-
-def _read(path: Path, data: mmap, order: str, elements: list[Element], start: int) -> tuple[Array, IntArray] | None:
-    """Read the elements that follow the header."""
-    vertices = None
-    for element in elements:
-        if element.name == "face":
-            found = _corners(data, start, element, order)
-            return None if found is None or vertices is None else (vertices, _fans(data, *found))
-        dtype = _row(element, order)
-        if dtype is None:
-            return None
-        if len(data) < start + element.count * dtype.itemsize:
-            raise InputError(f"{shown(path)}: ends within its {element.name} elements: it is cut short")
-        if element.name == "vertex":
-            rows = np.frombuffer(data, dtype, element.count, start)
-            vertices = np.column_stack([rows[axis] for axis in "xyz"]).astype(np.float64)
-            del rows  # or the file could not be closed
-        start += element.count * dtype.itemsize
+        vertices = None
+        for element in elements:
+            if element.name == "face":
+                corners = _corners(data, start, element, order)
+                return None if corners is None or vertices is None else (vertices, _fans(data, *corners))
+            if any(len(types) > 1 for types in element.properties.values()):
+                return None
+            row = np.dtype([(name, order + kind) for name, (kind,) in element.properties.items()])
+            if len(data) < start + element.count * row.itemsize:
+                raise InputError(f"{shown(path)}: ends within its {element.name} elements: it is cut short")
+            if element.name == "vertex":
+                rows = np.frombuffer(data, row, element.count, start)
+                vertices = np.column_stack([rows[axis] for axis in "xyz"]).astype(np.float64)
+                del rows  # or the file could not be closed
+            start += element.count * row.itemsize
     return None
-
-
-def _row(element: Element, order: str) -> np.dtype | None:
-    """Return the layout of an element without lists; None with one."""
-    if any(kind.startswith("list") for kind in element.properties.values()):
-        return None
-    return np.dtype([(name, order + NUMPY_TYPES[kind]) for name, kind in element.properties.items()])
 
 
 def _corners(data: mmap, start: int, faces: Element, order: str) -> tuple[IntArray, IntArray, np.dtype] | None:
@@ -179,19 +144,12 @@ def _corners(data: mmap, start: int, faces: Element, order: str) -> tuple[IntArr
 
     None also where a face has several lists, or the file ends before its last face: trimesh tells what is wrong.
     """
-    before = after = 0
-    length = corner = None
-    for kind in faces.properties.values():
-        words = kind.split()
-        if words[0] != "list":
-            size = np.dtype(NUMPY_TYPES[kind]).itemsize
-            before, after = before + size * (length is None), after + size * (length is not None)
-        elif length is None:
-            length, corner = (np.dtype(order + NUMPY_TYPES[word]) for word in words[1:])
-        else:
-            return None
-    if length is None or corner is None or length.kind == "f":
+    types = list(faces.properties.values())
+    lists = [i for i, kinds in enumerate(types) if len(kinds) > 1]
+    if len(lists) != 1 or types[lists[0]][0][0] == "f":
         return None
+    length, corner = (np.dtype(order + kind) for kind in types[lists[0]])
+    before, after = (sum(_size(kind) for (kind,) in some) for some in (types[: lists[0]], types[lists[0] + 1 :]))
     if _are_alike(data, start, faces.count, before, after, length, corner):
         return None
     byte_order: Literal["little", "big"] = "little" if order == "<" else "big"
@@ -458,48 +416,33 @@ def other_unit(extent: float) -> str:
 
 
 def _check_file(path: Path, suffix: str) -> tuple[int, int]:
-    """Check what can be checked without reading the file: kind, size, and what its header announces.
-
-    Returns the vertices and faces that the file must hold at least.
-    """
-    announced = (0, 0)
+    """Check what can be checked without a reader; return the vertices and faces that the file must hold at least."""
     size = check_file(path, "mesh_bytes", "a mesh", "decimate the mesh")
     if size == 0:
         raise InputError(f"{shown(path)}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
     try:
+        if suffix == ".ply":
+            return check_ply(path, size)
         with path.open("rb") as file:
             head = file.read(4096)
-        if suffix == ".ply":
-            announced = check_ply(path, size)
+            {".stl": _check_stl, ".obj": _check_obj, ".vtk": _check_vtk}[suffix](path, file, head, size)
+            is_text = suffix == ".obj" or (suffix == ".stl" and size != 84 + 50 * _announced(head))
+            if is_text and size > LARGE_BYTES:
+                _check_large_text(path, file, size, b"endfacet" if suffix == ".stl" else b"\nf")
     except OSError as error:
         raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
-    if suffix == ".stl":
-        _check_stl(path, head, size)
-    # OBJ is text, which its reader would make a hundred million words of before it finds nothing in them.
-    if suffix == ".obj" and b"\0" in head:
-        raise InputError(f"{shown(path)}: no OBJ file; it is no text")
-    if suffix == ".obj":
-        _check_obj(path)
-    if suffix == ".vtk":
-        _check_vtk(path, head, size)
-    is_text = suffix == ".obj" or (suffix == ".stl" and size != 84 + 50 * int.from_bytes(head[80:84], "little"))
-    if is_text and size > LARGE_BYTES:
-        _check_large_text(path, size, b"endfacet" if suffix == ".stl" else b"\nf")
-    return announced
+    return 0, 0
 
 
-def _check_large_text(path: Path, size: int, word: bytes) -> None:
+def _check_large_text(path: Path, file: BinaryIO, size: int, word: bytes) -> None:
     """Raise `InputError` where a large file of text holds too many or too few of a word, of which each face has one."""
     count, end = 0, b""
-    try:
-        with path.open("rb") as file:
-            # By pieces, since readers keep all of the text in memory; a word may stand across two of them.
-            while piece := file.read(2**20):
-                piece = end + piece.lower()
-                count += piece.count(word)
-                end = piece[1 - len(word) :]
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+    file.seek(0)
+    # By pieces, since readers keep all of the text in memory; a word may stand across two of them.
+    while piece := file.read(2**20):
+        piece = end + piece.lower()
+        count += piece.count(word)
+        end = piece[1 - len(word) :]
     check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
     if size > MOST_BYTES_PER_FACE * count:
         raise InputError(
@@ -507,17 +450,20 @@ def _check_large_text(path: Path, size: int, word: bytes) -> None:
         )
 
 
-def _check_stl(path: Path, head: bytes, size: int) -> None:
+def _announced(head: bytes) -> int:
+    """Return how many faces a binary STL file announces."""
+    return int.from_bytes(head[80:84], "little")
+
+
+def _check_stl(path: Path, file: BinaryIO, head: bytes, size: int) -> None:
     """Raise `InputError` where an STL file ends before its last face, or announces too many of them."""
-    count = int.from_bytes(head[80:84], "little")
+    count = _announced(head)
     if size >= 84 and size == 84 + 50 * count:
         check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
     elif head[:5].lower() == b"solid" and b"facet" in head.lower():
         # A header of a binary file may begin so too.
-        with path.open("rb") as file:
-            file.seek(max(0, size - _END_BYTES))
-            end = file.read().lower()
-        if b"endsolid" not in end:
+        file.seek(max(0, size - _END_BYTES))
+        if b"endsolid" not in file.read().lower():
             raise InputError(f"{shown(path)}: has no line endsolid: it is cut short")
     elif 84 <= size < 84 + 50 * count and count <= limit("mesh_faces"):
         # Four letters of a text would be more than that.
@@ -525,17 +471,20 @@ def _check_stl(path: Path, head: bytes, size: int) -> None:
         raise InputError(f"{shown(path)}: holds {held} of the {count} faces that it announces: it is cut short")
 
 
-def _check_obj(path: Path) -> None:
-    """Raise `InputError` where a face names vertex 0, which its reader takes for the last one."""
-    with path.open("rb") as file:
-        # By pieces that end with a line, unless that is longer than any line of a mesh.
-        while piece := file.read(2**20) + file.readline(2**20):
-            if wrong := _ZERO_INDEX.search(piece):
-                line = wrong[0].decode("latin-1").strip()
-                raise InputError(f"{shown(path)}: {shown(line, 60)}: vertex 0; the first vertex of an OBJ file is 1")
+def _check_obj(path: Path, file: BinaryIO, head: bytes, _: int) -> None:
+    """Raise `InputError` where a file is no text, or a face names vertex 0, which its reader takes for the last one."""
+    # Its reader would make a hundred million words of it before it finds nothing in them.
+    if b"\0" in head:
+        raise InputError(f"{shown(path)}: no OBJ file; it is no text")
+    file.seek(0)
+    # By pieces that end with a line, unless that is longer than any line of a mesh.
+    while piece := file.read(2**20) + file.readline(2**20):
+        if wrong := _ZERO_INDEX.search(piece):
+            line = wrong[0].decode("latin-1").strip()
+            raise InputError(f"{shown(path)}: {shown(line, 60)}: vertex 0; the first vertex of an OBJ file is 1")
 
 
-def _check_vtk(path: Path, head: bytes, size: int) -> None:
+def _check_vtk(path: Path, _: BinaryIO, head: bytes, size: int) -> None:
     """Raise `InputError` where a VTK file is none, or announces more points or cells than it has bytes."""
     if not head.startswith((b"# vtk DataFile", b"<?xml", b"<VTKFile")):
         raise InputError(f"{shown(path)}: no VTK file; its first line must be # vtk DataFile Version ...")
@@ -624,23 +573,10 @@ def check_target(path: Path) -> None:
 
 
 def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] | None = None) -> None:
-    """Write a mesh; single precision in PLY and STL, the same bytes for the same mesh.
+    """Write a mesh, mm; single precision in PLY and STL, the same bytes for the same mesh.
 
-    Parameters
-    ----------
-    path : Path
-        The suffix selects the format: PLY holds vertex normals and attributes, OBJ vertex normals, STL neither.
-    mesh : TriangleMesh
-        mm.
-    attributes : mapping, optional
-        Numbers at the vertices by name, each of shape (V,), for PLY.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    SimtestError
-        If its disk is full.
+    The suffix selects the format: PLY holds vertex normals and attributes, numbers at the vertices by name, OBJ vertex
+    normals, STL neither. Raises `InputError` if the file cannot be written, `SimtestError` if its disk is full.
     """
     import trimesh  # slow to import
 

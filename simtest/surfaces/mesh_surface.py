@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import blake2b
@@ -16,7 +17,7 @@ from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.resources import find
 from simtest.spec.surface import AnatomySurface
-from simtest.surfaces.mesh_file import MESH_SUFFIXES, examine, other_unit, read_mesh
+from simtest.surfaces.mesh_file import MESH_SUFFIXES, Repairs, examine, other_unit, read_mesh
 from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures
 from simtest.surfaces.poses import lumen_pose, nearest_mm, organ_pose
 from simtest.surfaces.triangles import (
@@ -141,39 +142,6 @@ def subdivisions_within_limit(faces: int, wanted: int) -> int:
     while allowed and faces * 4**allowed > MAX_SUBDIVIDED_FACES:
         allowed -= 1
     return allowed
-
-
-def allowed_subdivisions(path: str, faces: IntArray, wanted: int) -> int:
-    """Return how often a mesh may be subdivided: `wanted`, or fewer with a warning that names the reason."""
-    allowed = subdivisions_within_limit(len(faces), wanted)
-    if allowed < wanted:
-        # One subdivision more of a quarter of the limit's faces ends finer than what this mesh allows.
-        fewer = MAX_SUBDIVIDED_FACES // 4 ** (allowed + 1)
-        warnings.warn(
-            f"{path}: {wanted} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {allowed}"
-            f". Decimated to {fewer} faces it would take {allowed + 1} and end finer",
-            stacklevel=5,
-        )
-    if allowed and (bad := int((edge_uses(faces)[1] > 2).sum())) > 0:
-        warnings.warn(
-            f"{path}: {bad} edges belong to more than two faces; Loop subdivision needs a manifold, using 0",
-            stacklevel=5,
-        )
-        return 0
-    return allowed
-
-
-def allowed_smoothing(path: str, faces: IntArray, wanted: float) -> float:
-    """Return the wavelength that may be smoothed, mm: `wanted`, or 0 with a warning that names the reason."""
-    problem = ""
-    if len(faces) > MAX_SMOOTHED_FACES:
-        problem = f"{len(faces)} faces, at most {MAX_SMOOTHED_FACES} can be smoothed"
-    elif (bad := int((edge_uses(faces)[1] > 2).sum())) > 0:
-        problem = f"{bad} edges belong to more than two faces, smoothing needs a manifold"
-    if not wanted or not problem:
-        return wanted
-    warnings.warn(f"{path}: {problem}; using smoothing_mm = 0", stacklevel=5)
-    return 0.0
 
 
 def refine(vertices: Array, faces: IntArray, times: int, smoothing_mm: float) -> tuple[Array, IntArray]:
@@ -325,22 +293,10 @@ class Refinement:
 def prepare(path: str | Path, refinement: Refinement | int = 1, kind: str = "auto") -> PreparedMesh:
     """Read a mesh and prepare it; the last few are cached until their file changes.
 
-    Repairs are warned of, and so are self-intersections, around which the truth is meaningless.
-
-    Parameters
-    ----------
-    path : str or Path
-        A mesh file (see `read_mesh`).
-    refinement : Refinement or int
-        How to refine it; a number is that of Loop subdivisions. Fewer are made, with a warning, if the faces would
-        exceed `MAX_SUBDIVIDED_FACES`.
-    kind : {"auto", "lumen", "organ"}
-        "auto": a lumen if the isoperimetric quotient is below `LUMEN_QUOTIENT`.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed.
+    A number in place of a `Refinement` is that of Loop subdivisions; fewer are made, with a warning, if the faces would
+    exceed `MAX_SUBDIVIDED_FACES`. Of `kind` "auto" it is a lumen if the isoperimetric quotient is below
+    `LUMEN_QUOTIENT`. Repairs are warned of, and self-intersections, around which the truth is meaningless. Raises
+    `InputError` if the file is missing or malformed.
     """
     path = Path(path).expanduser().resolve()
     try:
@@ -354,12 +310,12 @@ def prepare(path: str | Path, refinement: Refinement | int = 1, kind: str = "aut
 @lru_cache(maxsize=4)
 def _prepare(path: str, mtime_ns: int, size: int, how: Refinement, kind: str) -> PreparedMesh:
     vertices, faces, repairs = read_mesh(path)
-    # what is wrong with the file
     lumen = is_lumen(vertices, faces, kind)
-    _warn(path, vertices, faces, list(repairs.sentences(lumen)))
     # smooth and fine
-    times, smoothing = _plan(path, vertices, faces, how, lumen)
-    shortest = max(smoothing, SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces))))
+    times, smoothing, reasons = _plan(vertices, faces, how, lumen)
+    for problem in (*_doubts(vertices, faces, repairs, lumen), *reasons):
+        warnings.warn(f"{path}: {problem}", stacklevel=3)
+    shortest = max(smoothing, _own_wave(vertices, faces))
     vertices, faces = refine(vertices, faces, times, smoothing)
     normals, operators = vertex_normals(vertices, faces), shape_operators(vertices, faces)
     if lumen:
@@ -374,31 +330,52 @@ def is_lumen(vertices: Array, faces: IntArray, kind: str) -> bool:
     return kind == "lumen" or (kind == "auto" and isoperimetric_quotient(vertices, faces) < LUMEN_QUOTIENT)
 
 
-def _warn(path: str, vertices: Array, faces: IntArray, repairs: list[str]) -> None:
-    """Warn of what was repaired, of a doubtful unit, and of self-intersections."""
-    if repairs:
-        warnings.warn(f"{path}: {'; '.join(repairs)}", stacklevel=4)
+def _doubts(vertices: Array, faces: IntArray, repairs: Repairs, lumen: bool) -> Iterator[str]:
+    """Yield what was repaired, a doubtful unit, and self-intersections."""
+    if sentences := list(repairs.sentences(lumen)):
+        yield "; ".join(sentences)
     if unit := other_unit(float(np.ptp(vertices, axis=0).max())):
-        warnings.warn(f"{path}: lengths are taken as mm; by its extent the file may be in {unit}", stacklevel=4)
+        yield f"lengths are taken as mm; by its extent the file may be in {unit}"
     if len(faces) <= MAX_CROSSING_FACES and (crossing := examine(vertices, faces).crossing_faces):
-        warnings.warn(
-            f"{path}: {crossing} faces cut through others; normals and curvatures around them mean nothing",
-            stacklevel=4,
-        )
+        yield f"{crossing} faces cut through others; normals and curvatures around them mean nothing"
 
 
-def _plan(path: str, vertices: Array, faces: IntArray, how: Refinement, lumen: bool) -> tuple[int, float]:
-    """Return how often to subdivide, and the wavelength to smooth, mm."""
-    smoothing, wanted = how.smoothing_mm or 0.0, how.subdivisions
+def _plan(vertices: Array, faces: IntArray, how: Refinement, lumen: bool) -> tuple[int, float, list[str]]:
+    """Return how often to subdivide, the wavelength to smooth, mm, and why either is less than asked for."""
+    branching, reasons = int((edge_uses(faces)[1] > 2).sum()), []
     # smoothing, by default of what is the mesh's own
+    smoothing = how.smoothing_mm or 0.0
     if how.edge_mm is not None and how.smoothing_mm is None:
-        smoothing = SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
-    smoothing = allowed_smoothing(path, faces, smoothing)
+        smoothing = _own_wave(vertices, faces)
+    problem = ""
+    if len(faces) > MAX_SMOOTHED_FACES:
+        problem = f"{len(faces)} faces, at most {MAX_SMOOTHED_FACES} can be smoothed"
+    elif branching:
+        problem = f"{branching} edges belong to more than two faces, smoothing needs a manifold"
+    if smoothing and problem:
+        reasons, smoothing = [f"{problem}; using smoothing_mm = 0"], 0.0
     # subdivisions, as many as the edge length needs
+    wanted = how.subdivisions
     if how.edge_mm is not None:
         edge = automatic_edge(vertices, faces, lumen, smoothing) if how.edge_mm == "auto" else how.edge_mm
         wanted = halvings(vertices, faces, edge)
-    return allowed_subdivisions(path, faces, wanted), smoothing
+    times = subdivisions_within_limit(len(faces), wanted)
+    if times < wanted:
+        # One subdivision more of a quarter of the limit's faces ends finer than what this mesh allows.
+        fewer = MAX_SUBDIVIDED_FACES // 4 ** (times + 1)
+        reasons.append(
+            f"{wanted} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {times}"
+            f". Decimated to {fewer} faces it would take {times + 1} and end finer"
+        )
+    if times and branching:
+        reasons.append(f"{branching} edges belong to more than two faces; Loop subdivision needs a manifold, using 0")
+        times = 0
+    return times, smoothing, reasons
+
+
+def _own_wave(vertices: Array, faces: IntArray) -> float:
+    """Return the shortest wave, mm, that a file of these edges can hold."""
+    return SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
 
 
 def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: float) -> float:

@@ -228,15 +228,12 @@ def pack_points(
     sign = np.where(np.einsum("ij,ij->i", normal, directions) > 0, -1.0, 1.0)
     normal = normal * sign[:, None]
     S = shape_operator * sign[:, None, None]
-    # Eigenvalues and eigenvectors of the 2 x 2 matrix (a b; b c) of S in a tangent basis.
-    tangent, other = tangent_basis(normal)
+    tangents = tangent_basis(normal)
+    tangent, other = tangents
     a = np.einsum("ni,nij,nj->n", tangent, S, tangent)
     b = np.einsum("ni,nij,nj->n", tangent, S, other)
     c = np.einsum("ni,nij,nj->n", other, S, other)
-    mean, half = (a + c) / 2, np.hypot((a - c) / 2, b)
-    angle = 0.5 * np.arctan2(b, (a - c) / 2)  # direction of the larger eigenvalue
-    direction_max = np.cos(angle)[:, None] * tangent + np.sin(angle)[:, None] * other
-    direction_min = np.cos(angle)[:, None] * other - np.sin(angle)[:, None] * tangent
+    mean, half, direction_min, direction_max = principal(a, b, c, tangents)
     valid = np.isfinite(distance) & np.isfinite(normal).all(axis=1) & np.isfinite(mean)
 
     # Whatever is not finite in one field is NaN in all.
@@ -259,6 +256,14 @@ def pack_points(
         pool=np.zeros(len(valid), dtype=bool),
         valid=valid,
     )
+
+
+def principal(a: Array, b: Array, c: Array, tangents: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
+    """Return mean and half difference of the eigenvalues of (a b; b c) in a tangent basis, and their directions."""
+    mean, half = (a + c) / 2, np.hypot((a - c) / 2, b)
+    angle = 0.5 * np.arctan2(b, (a - c) / 2)  # direction of the larger eigenvalue
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return mean, half, cosine * tangents[1] - sine * tangents[0], cosine * tangents[0] + sine * tangents[1]
 
 
 def shape_operator(points: SurfacePoints) -> Array:

@@ -18,7 +18,7 @@ from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.kept_arrays import kept
 from simtest.spec.relief import Relief, ReliefBand
-from simtest.surfaces.model import SurfacePoints
+from simtest.surfaces.model import SurfacePoints, principal
 
 NODES = 96
 """Nodes of the lattice along each side; the field repeats after as many."""
@@ -202,13 +202,9 @@ def fine_curvatures(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array,
     tangents = tangent_basis(normal)
     below = [f - N * np.sum(N * f, axis=1, keepdims=True) for f in tangents]
     form = [[np.einsum("ni,nij,nj->n", f, derivative, t) for t in below] for f in tangents]
-    a, b, c = form[0][0], (form[0][1] + form[1][0]) / 2, form[1][1]
-    mean, half = (a + c) / 2, np.hypot((a - c) / 2, b)
-    angle = 0.5 * np.arctan2(b, (a - c) / 2)
-    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    direction_max = cosine * tangents[0] + sine * tangents[1]
-    direction_min = cosine * tangents[1] - sine * tangents[0]
-    return normal, np.stack([mean - half, mean + half], axis=1), (direction_min, direction_max)
+    mixed = (form[0][1] + form[1][0]) / 2
+    mean, half, *directions = principal(form[0][0], mixed, form[1][1], tangents)
+    return normal, np.stack([mean - half, mean + half], axis=1), (directions[0], directions[1])
 
 
 def _outer(weight: Array, vector: Array) -> Array:

@@ -124,5 +124,5 @@ def test_seeds_beside_the_surface_find_nothing():
 
 def test_first_of_each_keeps_the_earliest_of_each_light():
     points = np.array([[1.0, 1.0], [1.3, 1.0], [1.0, 1.0], [9.0, 1.0], [9.2, 1.4], [9.2, 1.5]])
-    kept = highlights._first_of_each(points, np.array([0, 0, 1, 0, 0, 0]), 0.5)
+    kept = highlights._first_of_each(points, 0.5, np.array([0, 0, 1, 0, 0, 0]))
     assert kept.tolist() == [True, False, True, True, False, True]
