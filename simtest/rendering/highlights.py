@@ -125,20 +125,6 @@ def _newton(session: "Session", seeds: Array, owners: IntArray, lights: Array) -
     return np.concatenate(found), np.concatenate(of_light)
 
 
-def _first_of_each(points: Array, owners: IntArray, apart: float) -> Mask:
-    """Return which points, shape (N, 2), have no earlier one that stays of the same owner within a distance."""
-    kept = np.zeros(len(points), dtype=bool)
-    # Hash points into cells, so that only neighbours are compared.
-    cells: dict[tuple[int, int, int], list[tuple[float, float]]] = {}
-    for i, ((x, y), owner) in enumerate(zip(points.tolist(), owners.tolist(), strict=True)):
-        column, row = int(x // apart), int(y // apart)
-        around = [p for a in (-1, 0, 1) for b in (-1, 0, 1) for p in cells.get((owner, column + a, row + b), ())]
-        if all((x - p) ** 2 + (y - q) ** 2 > apart**2 for p, q in around):
-            cells.setdefault((owner, column, row), []).append((x, y))
-            kept[i] = True
-    return kept
-
-
 def describe(
     session: "Session", radiance: Radiance, solutions: Array, lights: IntArray, fine: bool = True
 ) -> list[HighlightPoint]:

@@ -7,14 +7,14 @@ which of both is nearer, and shadow rays ask both. Here is also which pixels the
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.rendering.backend import dr, mi
-from simtest.rendering.frames import HighlightPoint, Labels, TruthMaps
+from simtest.rendering.frames import HighlightPoint, Maps, Real
 from simtest.rendering.kernel_values import channels, spectrum
 from simtest.rendering.placement_checks import check_instruments
 from simtest.rendering.rays import Hit
@@ -269,7 +269,6 @@ def _tip(session: "Session", index: int, instrument: Instrument) -> Array:
 
 
 _NORMALS = ("normal", "shading_normal", "geometric_normal", "normal_base")
-Maps = TypeVar("Maps", Labels, TruthMaps)
 
 
 @dataclass(frozen=True)
@@ -297,18 +296,19 @@ class Cover:
         """Return what is covered of every `stride`-th pixel."""
         return Cover(*(values[::stride, ::stride] for values in vars(self).values()))
 
-    def over(self, maps: Maps) -> Maps:
+    def over(self, maps: Maps[Real]) -> Maps[Real]:
         """Return labels or truth of a frame with those of the instruments over those of the surface."""
         above: dict[str, Any] = {
             "depth": self.distance, "position": self.position, "pool": False, "mask": True, "face": 0,
-            **dict.fromkeys(_NORMALS, self.normal), **dict.fromkeys(("instance", "instrument"), self.instrument + 1),
+            "instrument": self.instrument + 1, **dict.fromkeys(_NORMALS, self.normal),
         }  # fmt: skip
-        made = {}
+        made: dict[str, Any] = {}
         for name, below in vars(maps).items():
-            seen = self.seen[..., None] if below.ndim == 3 else self.seen
-            made[name] = np.where(seen, above.get(name, np.nan), below).astype(below.dtype)
-        if maps.normal_base is maps.normal:
-            made["normal_base"] = made["normal"]
+            if name in _NORMALS[1:] and below is maps.normal:
+                made[name] = made["normal"]
+            elif below is not None:
+                seen = self.seen[..., None] if below.ndim == 3 else self.seen
+                made[name] = np.where(seen, above.get(name, np.nan), below).astype(below.dtype)
         return replace(maps, **made)
 
 

@@ -137,7 +137,7 @@ def in_camera(surface: SurfaceModel, exact: SurfacePoints) -> SurfacePoints:
 
 def truth_maps(points: SurfacePoints, shading: Array, geometric: Array, size: tuple[int, int]) -> TruthMaps:
     """Arrange points and the renderer's normals, all of H W rays in the camera frame, as maps of `size` (H, W)."""
-    maps = {"depth": points.distance, "shading_normal": shading, "geometric_normal": geometric}
+    maps: dict[str, Any] = {"depth": points.distance, "shading_normal": shading, "geometric_normal": geometric}
     maps |= {name: getattr(points, name) for name in _OF_POINTS}
     images = {name: values.reshape(*size, *values.shape[1:]) for name, values in maps.items()}
     none = np.zeros(size, dtype=np.uint8)
@@ -283,6 +283,7 @@ def as_labels(channels: list[Image]) -> Labels:
         depth=named["depth"],
         position=vector("x", "y", "z"),
         normal=normal,
+        shading_normal=normal,
         geometric_normal=vector("geometric_x", "geometric_y", "geometric_z"),
         k_min=named["k_min"],
         k_max=named["k_max"],
@@ -290,7 +291,8 @@ def as_labels(channels: list[Image]) -> Labels:
         k_min_base=named["k_min_base"] if has_relief else named["k_min"],
         k_max_base=named["k_max_base"] if has_relief else named["k_max"],
         pool=named["pool"] > 0 if has_relief else np.zeros(seen.shape, dtype=bool),
-        instance=np.where(seen, np.int32(0), np.int32(-1)),
+        mask=seen,
+        instrument=np.zeros(seen.shape, dtype=np.uint8),
         face=np.where(seen, named["face"].view(np.int32), np.int32(-1)),
     )
 

@@ -21,7 +21,7 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.kept_arrays import kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator
@@ -53,10 +53,13 @@ def level_grid(values: Callable[[Array], Array], slopes: Callable[[Array, float]
     radius = width * math.sqrt(3) / 2
     f = in_blocks(values, centres)
     may_cross = np.abs(f) <= in_blocks(lambda some: slopes(some, radius), centres) * radius * (1 + ROUNDING)
-    grid, near = (part.reshape([len(middle) for middle in middles]) for part in (f, may_cross))
+    blocks = [len(middle) for middle in middles]
+    grid: Array = f.reshape(blocks)
+    near: Mask = may_cross.reshape(blocks)
     for axis, nodes in enumerate(axes):
         # From blocks to nodes; some of the last blocks lie beyond the grid.
-        grid, near = (np.repeat(part, SIDE, axis=axis).take(range(len(nodes)), axis=axis) for part in (grid, near))
+        inside = range(len(nodes))
+        grid, near = np.repeat(grid, SIDE, axis).take(inside, axis), np.repeat(near, SIDE, axis).take(inside, axis)
     # The corners of all cells of the blocks that are left: a block's own nodes, and the next ones along each axis.
     for axis in range(3):
         rolled = np.moveaxis(near, axis, 0)

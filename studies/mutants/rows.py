@@ -260,7 +260,7 @@ ROWS = (
     row("mask of the surface full everywhere", "masks", "rendering.truth:truth_maps",
         "mask=points.valid.reshape(size)", "mask=np.ones(size, dtype=bool)", "frames"),
     row("traced instance 0 where there is nothing", "masks", "rendering.truth:as_labels",
-        "instance=np.where(seen, np.int32(0), np.int32(-1))", "instance=np.zeros(seen.shape, dtype=np.int32)",
+        "mask=seen,", "mask=np.ones_like(seen),",
         "frames mesh_surface instruments"),
     row("curvature of a highlight without its distance", "labels", "rendering.highlights:describe",
         "kd_max=float(points.distance[i] * points.k_max[i])", "kd_max=float(points.k_max[i])",
