@@ -40,10 +40,7 @@ class PatchRenderer:
         )
 
     def radiance(self, patch: "RenderedQuadric", kept: list[bool]) -> tuple[Array, Array]:
-        """Compute intensities, shape (m,), and their derivatives by the p parameters that are kept, shape (m, p).
-
-        `kept` holds a bool for each of the seven parameters: s (2), stretch (3), log scale, base.
-        """
+        """Compute intensities, shape (m,), and their derivatives by those of the seven parameters that are kept."""
         # lanes: a copy of all pixels for each parameter
         columns, count = int(sum(kept)), self._opaque(self.count, mi.UInt32)
         lane = self._lanes(self.count * columns)

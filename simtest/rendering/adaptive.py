@@ -223,10 +223,7 @@ class MeshEdges:
 
 
 def edges_of(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the edges of triangles: their vertices and the triangles on both sides, shape (E, 2) each.
-
-    An edge of one triangle alone, or of more than two, has that triangle, or the first, on both sides.
-    """
+    """Return vertices and triangles on both sides of edges, (E, 2) each; twice the first where not of two."""
     count = int(faces.max()) + 1 if len(faces) else 0
     starts, ends = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
     keys = np.minimum(starts, ends) * count + np.maximum(starts, ends)
@@ -309,10 +306,7 @@ class Clues:
     px_per_rad: float  # See `pixels_per_rad`
 
     def trace(self, preliminary: Any, hit: Hit, rays: Rays, rotation: Any, relief: ReliefKernel | None) -> list[Any]:
-        """Compute the labels' channels, the gaps of all lights and the least scale, px, of any light.
-
-        The gap is the normal minus the bisector of the directions to light and camera, three channels for each light.
-        """
+        """Compute labels, gaps (normal minus bisector, three channels a light), and the least scale of lights, px."""
         channels = self.labels.trace(preliminary, hit, rays, rotation, relief)
         seats = [(mi.Vector3f(*light.tolist()), mi.Float(beam)) for light, beam in
                  zip(self.lights, self.beams, strict=True)]  # fmt: skip

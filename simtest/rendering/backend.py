@@ -32,7 +32,8 @@ class _Late:
         self._name = name
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(importlib.import_module(self._name), name)
+        # Looked up each time: what a variant is made of changes with it.
+        return getattr(sys.modules.get(self._name) or importlib.import_module(self._name), name)
 
 
 dr: Any = _Late("drjit")
@@ -362,10 +363,7 @@ class BackendReport:
 
 
 def library_report(variant: str | None = None) -> BackendReport:
-    """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered.
-
-    Raises `InputError` for a name that is no variant's.
-    """
+    """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered."""
     versions = {package: importlib.metadata.version(package) for package in ("mitsuba", "drjit")}
     name = requested_variant(variant)
     chosen, tried = choose_library() if needs_llvm(name) else (None, [])

@@ -94,10 +94,7 @@ class BuiltScene:
         self.mesh, self.labels, self.edges = mesh, None, None
 
     def place_lights(self, rig: Rig, model_from_camera: Array) -> DirectLight:
-        """Write the lights of a rig at a pose of the camera, shape (4, 4), and all that was set before.
-
-        Returns the lights' own kernel.
-        """
+        """Write the lights of a rig at a pose of the camera, and all set before; return their own kernel."""
         lights, rotation = rig.lights, model_from_camera[:3, :3]
         positions = rig.true_mm() @ rotation.T + model_from_camera[:3, 3]
         axes = np.array([light.axis for light in lights]) @ rotation.T

@@ -51,10 +51,7 @@ MERGING, MERGED_PX = (1, 2, 4, 8), 0.05
 
 
 def find_smooth(session: "Session", radiance: Radiance, stride: int) -> list[HighlightPoint]:
-    """Find the highlight points of all lights in view, without any relief, the brightest first.
-
-    `radiance` is that of the same frame; the seeds' grid has a spacing of `stride` px.
-    """
+    """Find all lights' highlight points without relief, the brightest first; seeds are `stride` px apart."""
     lights = session.scene.rig.true_mm()
     # Candidates: where the Newton steps of the rendered shape are short.
     seeds, owners = _seeds(session.misfit_grid(stride), session.camera)
@@ -128,10 +125,7 @@ def _newton(session: "Session", seeds: Array, owners: IntArray, lights: Array) -
 def describe(
     session: "Session", radiance: Radiance, solutions: Array, lights: IntArray, fine: bool = True
 ) -> list[HighlightPoint]:
-    """Describe the highlight points at pixels, shape (N, 2), of lights by their index, with the frame's radiance.
-
-    Normals and curvatures are those of the `fine` surface, or else of its base.
-    """
+    """Describe the highlight points at pixels, shape (N, 2), of lights by index, of the `fine` surface or the base."""
     if not len(solutions):
         return []
     points = session.exact_points(solutions, fine)
@@ -204,10 +198,7 @@ def is_resolved(session: "Session") -> bool:
 
 
 def find_glints(session: "Session", radiance: Radiance) -> list[HighlightPoint]:
-    """Search for the glints of all lights in view; return them with the frame's radiance, the brightest first.
-
-    Those of parts of the frame that do not resolve the relief are left out.
-    """
+    """Search for all lights' glints where the frame resolves the relief; return them, the brightest first."""
     found = []
     for index in range(len(session.scene.rig.lights)):
         pixels = search_glints(session, index)
@@ -256,10 +247,7 @@ def _glint_seeds(session: "Session", index: int) -> Array:
 
 
 def tiles_near_zeros(w: Image) -> IntArray:
-    """Return the first columns and rows, shape (T, 2), of the tiles of a map in which the misfit may have a zero.
-
-    Those are left out in which one component, of shape (h, w) in `w`, is farther from 0 than it varies.
-    """
+    """Return first columns and rows, (T, 2), of tiles where no component of `w` is farther from 0 than it varies."""
     low, high = w, w
     for axis in (1, 2):
         # From one pixel before each tile to one after it.
@@ -299,10 +287,7 @@ def _grid_seeds(w: Image, first: IntArray, margin: int, parts: int) -> Array:
 
 
 def _in_rows(cells: tuple[IntArray, ...], first: IntArray) -> tuple[IntArray, IntArray]:
-    """Return columns and rows, shape (N, 2), in one map, of cells by grid, row and column, row by row; and the order.
-
-    Whatever the grids, the same cells come in the same order.
-    """
+    """Return columns and rows in one map of cells by grid, row and column, row by row whatever the grids; the order."""
     grid, row, column = cells
     whole = np.stack([column, row], axis=1) + first[grid]
     order = np.lexsort((whole[:, 0], whole[:, 1]))
@@ -412,10 +397,7 @@ COARSE_STRIDE_PX = 4
 
 
 def search(session: "Session", base: bool) -> list[HighlightPoint]:
-    """Find the highlight points of all lights in view, of the `base` or of the fine surface, in a dark frame.
-
-    Their radiance is 0, and equal values are not sorted: they stand in the order in which they were found.
-    """
+    """Find all lights' highlight points, of the base or of the fine surface, in a dark frame, as they come."""
     camera = session.camera
     dark = np.zeros((camera.height, camera.width), dtype=np.float32)
     radiance = Radiance(dark, dark, dark)

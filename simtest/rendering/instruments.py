@@ -37,10 +37,7 @@ PER_METAL = 8
 
 @dataclass(frozen=True)
 class Metal:
-    """The reflectance of instruments at the points that a kernel hits; evaluated as `Material` is.
-
-    A rough conductor, GGX with Schlick's Fresnel term, blended with a matt base.
-    """
+    """Instruments' reflectance, in place of `Material`: GGX with Schlick's Fresnel term, blended with a matt base."""
 
     alpha: Any
     share: Any

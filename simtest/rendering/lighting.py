@@ -50,10 +50,7 @@ class Draw:
     shifts: tuple[Any, Any, Any] | None
 
     def square(self, kind: str, number: Any, light: int) -> tuple[Any, Any]:
-        """Return u and v in [0, 1), mitsuba.Float, of a sample's point by its number, for the light of an index.
-
-        Around a ring v is in equal steps, elsewhere u is.
-        """
+        """Return u and v in [0, 1) of a sample's point by number, for a light by index; even in v around a ring."""
         index = self.first + number * self.step
         if self.shifts is None:
             # Pairs of opposite points, so that the centroid is exact: where it is off the highlight moves.
@@ -402,10 +399,7 @@ class DirectLight:
         return Drawer(lanes, samples) if any(kind.source != "point" for kind in self.kinds) else None
 
     def radiance(self, scene: Any, material: Reflecting, hit: Hit, draw: Draw | None) -> tuple[Any, Any]:
-        """Compute the radiance off the lobe and the base, mitsuba.Spectrum, at surface points, with shadow rays.
-
-        `draw` says which points of sources of finite size are taken; None where all are points.
-        """
+        """Compute the radiance off lobe and base at surface points; `draw` chooses points of finite sources."""
         with material.painted(hit):
             return self._of_lights(scene, material, hit, draw)
 

@@ -210,10 +210,7 @@ def turned_pixels(camera: Camera, pixels: Array, turns: Array) -> Array:
 
 
 def crossed(w: Image) -> tuple[IntArray, ...]:
-    """Return the indices of the cells of grids in which the linear misfit of a triangle half has its zero.
-
-    The misfit is of shape (2, ..., h, w); a cell is named by its first corner: (grid,) row and column.
-    """
+    """Return (grid,) row and column of the cells in which the linear misfit of a triangle half has its zero."""
     corners = [w[..., :-1, :-1], w[..., :-1, 1:], w[..., 1:, :-1], w[..., 1:, 1:]]
     with np.errstate(invalid="ignore"):
         low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)

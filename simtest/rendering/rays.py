@@ -86,10 +86,7 @@ class Sightlines:
         return -(-self.camera.height // TILE) * TILE, -(-self.camera.width // TILE) * TILE
 
     def lanes(self, first: int, count: int, tiled: bool, seed: int) -> Lanes:
-        """Return `count` pixels from `first` on: in tiles, which trace faster, or in rows, which need no sorting.
-
-        The sample points depend on seed and pixel alone.
-        """
+        """Return `count` pixels from `first` on, in tiles or rows; samples depend on seed and pixel alone."""
         start, salt = mi.UInt32(first), mi.UInt32(seed)
         dr.make_opaque(start, salt)
         index = dr.arange(mi.UInt32, count) + start
@@ -147,10 +144,7 @@ class Sightlines:
         return Rays(traced, self._origin, direction, mi.Vector3f(sightline), active)
 
     def in_model(self, points_px: Array) -> tuple[Array, Array]:
-        """Return origins and unit directions, model frame, float64, of pixel positions, two arrays of shape (N, 3).
-
-        Positions outside the field of view have rays too; NaN where the camera has no sightline.
-        """
+        """Return origins and unit directions, model frame, of pixel positions; NaN where there is no sightline."""
         directions = self.camera.unproject(points_px) @ self.pose[:3, :3].T
         return np.broadcast_to(self.pose[:3, 3], directions.shape), directions
 

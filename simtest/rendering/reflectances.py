@@ -91,10 +91,7 @@ PHONG = "simtest_phong"
 
 @cache
 def register_phong(variant: str) -> str:
-    """Register the plugin for a variant, once; return its name for `mi.load_dict`.
-
-    Each variant gets a class of its own, since the base class `mi.BSDF` is the variant's.
-    """
+    """Register the plugin for a variant, whose own class it derives from, once; return its name."""
     mi.register_bsdf(PHONG, lambda props: _make_phong(variant)(props))
     return PHONG
 
@@ -406,10 +403,7 @@ def compiled_form(reflectance: Reflectance) -> tuple[object, ...]:
 
 
 def parameter_updates(reflectance: Reflectance) -> MitsubaDict:
-    """Return the values that can change without a rebuild, by Mitsuba's parameter path below the BSDF.
-
-    The paths hold for the whole BSDF and for its diffuse base; Phong's lobe has no base of its own.
-    """
+    """Return the values that change without a rebuild, by Mitsuba's path below the BSDF or its base alone."""
     base = spectrum([reflectance.diffuse * c for c in reflectance.colour])
     match reflectance:
         case PhongReflectance():

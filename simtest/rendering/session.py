@@ -232,10 +232,7 @@ class Session:
 
     @_at_its_variant
     def labelled_radiance(self, progress: Progress | None = None) -> Radiance:
-        """Render the radiance of `frame`, and trace its labels.
-
-        The labels are kept while surface and camera stay: a frame of more samples takes them over.
-        """
+        """Render the radiance of `frame`, and trace its labels, or keep them while surface and camera stay."""
         kept = self._labels if self.scene.render.samples_per_pixel > 1 else []
         radiance, channels = self._render(None if kept else self._shape_labels(), progress)
         self._centre = self._labels = kept or channels
@@ -386,10 +383,7 @@ class Session:
 
     @_at_its_variant
     def truth(self, stride: int = 1) -> TruthMaps:
-        """Return the ground truth at the centre of every pixel, or of every `stride`-th along both axes.
-
-        The full maps are kept while surface and camera stay.
-        """
+        """Return the truth at the centre of every `stride`-th pixel along both axes; of all pixels it is kept."""
         if stride == 1 and self._truth is None:
             self._truth = self._cast_maps(1)
         maps = self._truth if stride == 1 else None
@@ -409,10 +403,7 @@ class Session:
 
     @_at_its_variant
     def depths(self) -> Array:
-        """Return the exact distance of the surface at each pixel's centre, shape (H, W), mm; NaN off the surface.
-
-        The values are those of `truth`, without instruments, at a fraction of its cost.
-        """
+        """Return the distances of `truth`, shape (H, W), mm, without instruments, at a fraction of its cost."""
         if self._truth is not None:
             return self._truth.depth
         rays = self.sightlines.in_view(self.camera.pixel_centres().reshape(-1, 2))

@@ -107,10 +107,7 @@ class ReliefKernel:
 
 
 def turned(si: Any, gradient: Any) -> Any:
-    """Return a copy of surface points whose shading normal is that of a relief with this gradient.
-
-    The normal is N - grad h, the gradient along the surface, normalised.
-    """
+    """Return a copy of surface points with the normal of a relief, N - grad h along the surface, normalised."""
     copy = mi.SurfaceInteraction3f(si)
     N, view = si.sh_frame.n, si.to_world(si.wi)
     m = N - gradient + N * dr.dot(N, gradient)

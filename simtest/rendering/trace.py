@@ -112,10 +112,7 @@ class Tracer:
         return make_hit(si, self.relief, bent)
 
     def _direct(self, rays: Rays, hit: Hit, draw: Draw | None) -> list[Any]:
-        """Compute the channels of direct light off the lobe and off the base.
-
-        Where there are instruments those of their metal follow, and each is 0 where the other is in front.
-        """
+        """Compute the channels of direct light off lobe and base, then of metal; each is 0 behind the other."""
         if self.instruments is None:
             specular, diffuse = self.light.radiance(self.scene, self.material, hit, draw)
             return [*specular, *diffuse]
@@ -229,10 +226,7 @@ class Tracer:
         return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
 
     def means_at(self, pixels: Pixels, samples: int, seed: int, tell: Tell | None = None) -> Image:
-        """Compute what `mean` does, without bounces, at some pixels alone, by number: channels, shape (C, N).
-
-        `tell` is called with how many samples have been traced.
-        """
+        """Compute channels, shape (C, N), of `mean` at some pixels by number; `tell` gets the samples traced."""
         blocks = ((self.sightlines.lanes_of(pixels[first : first + count], seed), count)
                   for first, count in blocks_of(len(pixels)))  # fmt: skip
         return self._means(blocks, samples, range(samples), None, tell)
@@ -240,10 +234,7 @@ class Tracer:
     def _means(
         self, blocks: Iterable[tuple[Lanes, int]], samples: int, own: range, bounces: Bounces | None, tell: Tell | None
     ) -> Image:
-        """Compute the channels, shape (C, N), of the mean over some samples of blocks of lanes and their numbers.
-
-        `own` are the samples' numbers, of `samples` in all.
-        """
+        """Compute channels, shape (C, N), of the mean over samples, by number of `samples`, of blocks of lanes."""
         means: list[Image] = []
         traced = 0
         for block, (lanes, count) in enumerate(blocks):

@@ -8,7 +8,9 @@ On a relief, normals and curvatures are those of the fine surface, and those of 
 surface they are the same, so they are neither traced nor stored twice.
 """
 
+from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -114,10 +116,7 @@ def pack_hits(distance: Any, face: Any, barycentric: Any) -> RayHits:
 
 
 def solve(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits, fine: bool = True) -> SurfacePoints:
-    """Compute the exact points, in the camera frame, on rays of the model frame, shape (N, 3).
-
-    Normals and curvatures are those of the `fine` surface, or else of its base.
-    """
+    """Compute the exact points, camera frame, of the fine surface or its base, on rays of the model frame."""
     exact = (surface.fine_points if fine else surface.points)(np.asarray(origins), directions, hits)
     return in_camera(surface, exact)
 
@@ -173,11 +172,7 @@ class ShapeLabels:
             self._operators = mi.Float(upper.ravel())
 
     def trace(self, preliminary: Any, hit: Hit, rays: Rays, rotation: Any, relief: ReliefKernel | None) -> list[Any]:
-        """Compute the channels at the hits (see `CHANNELS`, `BASE_CHANNELS`); NaN where there is no surface.
-
-        `hit` are the surface points, with all derivatives, on the surface's `relief`; `rotation` leads from the model
-        frame to the camera frame.
-        """
+        """Compute the channels at hits with all derivatives (see `CHANNELS`, `BASE_CHANNELS`); NaN at misses."""
         si = hit.base
         seen = si.is_valid()
         # Rendered shapes are seen from either side: turn the triangle's normal towards the camera.
@@ -298,10 +293,7 @@ def as_labels(channels: list[Image]) -> Labels:
 
 
 def as_hits(channels: list[Image]) -> tuple[RayHits, Array, Array]:
-    """Return the hits that the exact truth starts from, and shading and geometric normals, camera frame, (N, 3).
-
-    The shading normal is that of the light off the lobe: on a relief the fine one.
-    """
+    """Return the hits that exact truth starts from, and shading (off the lobe) and geometric normals, (N, 3)."""
     named = {name: channel.ravel() for name, channel in _named(channels).items()}
     barycentric = np.stack([named["second"], named["third"]], axis=1)
     hits = pack_hits(named["depth"], named["face"].view(np.int32), barycentric)
@@ -324,23 +316,17 @@ _OF_BASE = {"normal_base": "normal", "k_min_base": "k_min", "k_max_base": "k_max
 """Fields of the base, which are those of the fine surface where there is no relief."""
 
 
-def solve_frame(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
-    """Compute the exact points of many rays, shape (N, 3), as `solve` does of a few.
+Fields = dict[str, Array]
+Solver = Callable[[Array, Array, RayHits], Fields]
 
-    A surface with a chart is solved in a kernel of `mi`, mitsuba with the variant set.
-    """
-    kernel = None if surface.chart is None else TubeKernel(surface.chart)
-    block = BLOCK if kernel is None else tube_kernel.BLOCK
-    whole: dict[str, Array] = {}
-    for start in range(0, max(len(directions), 1), block):
-        some = slice(start, start + block)
-        part = RayHits(hits.distance[some], hits.face[some], hits.barycentric[some])
-        rays = origins[some], directions[some], part
-        solved = _of_numpy(surface, *rays) if kernel is None else _of_kernel(kernel, surface, *rays)
-        for name, values in solved.items():
-            if not start:
-                whole[name] = np.empty((len(directions), *values.shape[1:]), dtype=values.dtype)
-            whole[name][some] = values
+
+def solve_frame(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+    """Compute the exact points of many rays as `solve` does of a few; with a chart in a kernel."""
+    if surface.chart is None:
+        whole = _in_blocks(partial(_of_numpy, surface), BLOCK, origins, directions, hits)
+    else:
+        solver = partial(_of_kernel, TubeKernel(surface.chart), surface)
+        whole = _in_blocks(solver, tube_kernel.BLOCK, origins, directions, hits)
     # One array stands for both surfaces where they are one.
     shared = {base: whole[fine] for base, fine in _OF_BASE.items() if base not in whole}
     return SurfacePoints(**{**whole, **shared})  # type: ignore[arg-type]
@@ -348,14 +334,22 @@ def solve_frame(surface: SurfaceModel, origins: Array, directions: Array, hits: 
 
 def frame_distances(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> Array:
     """Compute the exact distances of many rays, shape (N,), mm: those of `solve_frame`."""
-    kernel = None if surface.chart is None else TubeKernel(surface.chart)
-    block = BLOCK if kernel is None else tube_kernel.BLOCK
-    solver = surface.distances if kernel is None else kernel.distances
-    whole = np.empty(len(directions))
-    for start in range(0, len(directions), block):
+    block, solver = BLOCK, surface.distances
+    if surface.chart is not None:
+        block, solver = tube_kernel.BLOCK, TubeKernel(surface.chart).distances
+    return _in_blocks(lambda *rays: {"": solver(*rays)}, block, origins, directions, hits)[""]
+
+
+def _in_blocks(solver: Solver, block: int, origins: Array, directions: Array, hits: RayHits) -> Fields:
+    """Return fields of rays that are solved for some of them at a time."""
+    whole: Fields = {}
+    for start in range(0, max(len(directions), 1), block):
         some = slice(start, start + block)
         part = RayHits(hits.distance[some], hits.face[some], hits.barycentric[some])
-        whole[some] = solver(origins[some], directions[some], part)
+        for name, values in solver(origins[some], directions[some], part).items():
+            if not start:
+                whole[name] = np.empty((len(directions), *values.shape[1:]), dtype=values.dtype)
+            whole[name][some] = values
     return whole
 
 

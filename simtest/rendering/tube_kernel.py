@@ -88,10 +88,7 @@ class TubeKernel:
         dr.make_opaque(list(self._n.values()), list(self._counts.values()))
 
     def solve(self, origins: Array, directions: Array, hits: RayHits, model_from_camera: Array) -> dict[str, Array]:
-        """Compute the exact points, camera frame, on rays of the model frame, shape (N, 3) (see `truth.solve`).
-
-        Returns the fields of `SurfacePoints` that are not the base's own.
-        """
+        """Compute the exact points of `truth.solve` by field, but for those that are the base's own."""
         if not len(origins):
             # Dr.Jit ends the process on a kernel without rays.
             return {name: np.empty((0, *shape), dtype=kind) for name, (shape, kind) in _FIELDS.items()}

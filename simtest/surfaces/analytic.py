@@ -222,10 +222,7 @@ class Quadric(_Analytic):
 
 
 def grid_faces(columns: int, rows: int) -> IntArray:
-    """Triangulate a grid of (rows + 1) x (columns + 1) vertices stored row by row; shape (2 rows columns, 3).
-
-    The triangles are counter-clockwise about +z.
-    """
+    """Triangulate (rows + 1) x (columns + 1) vertices stored row by row, counter-clockwise about +z."""
     row, column = np.divmod(np.arange(rows * columns, dtype=np.int64), columns)
     corner = row * (columns + 1) + column
     right, up = corner + 1, corner + columns + 1

@@ -69,11 +69,7 @@ class BuiltColon(BuiltMesh):
         return np.where(free, 1.0, -1.0) * self.probe.distance(points)
 
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return the exact points of the smooth surface (see `BuiltMesh.at_hits`).
-
-        Newton's method on P(u, v) = origin + t direction, to 1e-10 mm, from (u, v) of the mesh's hit. A ray that
-        grazes the mesh but misses the smooth surface has no point.
-        """
+        """Return exact points by Newton's method from (u, v) of the hits; a ray that only grazes the mesh has none."""
         u, v = np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
         distance, u, v = self.tube.solve(origins, directions, hits.distance, u, v)
         normals, operators = np.full((len(u), 3), np.nan), np.full((len(u), 3, 3), np.nan)
@@ -189,10 +185,7 @@ def _facing(positions: Array, normals: Array, faces: IntArray) -> Array:
 
 
 class Colon(MeshedSurface):
-    """A generated colon with a camera inside, at the pose numbered by `viewpoint`; a shell.
-
-    Raises `InputError` if the recipe gives no usable tube.
-    """
+    """A generated colon with a camera inside, at the pose numbered by `viewpoint`; a shell."""
 
     solid = False
 

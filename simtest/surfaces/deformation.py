@@ -418,10 +418,7 @@ def stays_in_free_space(rest: SurfaceModel, parts: Sequence[Deformation], time_s
 
 
 class DeformedSurface(SurfaceModel):
-    """A surface at one moment of its deformation of the model frame; the camera stays where it is.
-
-    The surface at rest must be rendered as a mesh (see `GradedMesh` for analytic ones).
-    """
+    """A surface, rendered as a mesh, at one moment of its deformation; the camera stays where it is."""
 
     def __init__(self, rest: SurfaceModel, deformation: DeformationAt) -> None:
         mesh = rest.shape().mesh

@@ -217,10 +217,7 @@ class Body:
         return rest @ self._normal - (rest * rest).sum(axis=1) / (2 * radius), self._normal - rest / radius
 
     def solve(self, origins: Array, directions: Array, distance: Array) -> Array:
-        """Solve F(origin + t direction) = 0 by Newton's method; return t, mm, shape (N,), NaN if there is no solution.
-
-        The rays are of shape (N, 3), in mm, with unit directions; `distance`, shape (N,), is a start close by.
-        """
+        """Solve F(origin + t direction) = 0 by Newton's method from a `distance` close by; NaN without solution."""
         t, found = distance.copy(), np.zeros(len(distance), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
         for _ in range(NEWTON_STEPS):
@@ -267,11 +264,7 @@ class BuiltLiver(BuiltMesh):
         return np.where(self.body.values(points) > 0, 1.0, -1.0) * self.probe.distance(points)
 
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return the exact points of the smooth surface (see `BuiltMesh.at_hits`).
-
-        Newton's method on F along the ray, to 1e-10 mm, from the mesh's hit. A ray that grazes the mesh but misses
-        the smooth surface has no point.
-        """
+        """Return exact points by Newton's method on F along the rays; a ray that only grazes the mesh has none."""
         distance = self.body.solve(origins, directions, hits.distance)
         normals, operators = np.full((len(distance), 3), np.nan), np.full((len(distance), 3, 3), np.nan)
         good = np.isfinite(distance)
@@ -363,10 +356,7 @@ def _project(body: Body, points: Array, steps: int) -> Array:
 
 
 class Liver(MeshedSurface):
-    """A generated liver with a camera outside, at the pose numbered by `viewpoint`.
-
-    Raises `InputError` if the recipe gives no body.
-    """
+    """A generated liver with a camera outside, at the pose numbered by `viewpoint`."""
 
     def __init__(self, recipe: LiverRecipe, viewpoint: int) -> None:
         self._build = build(recipe)

@@ -64,10 +64,7 @@ class Verdict:
 
     @property
     def doubt(self) -> str:
-        """Why the mesh may be the inside of a tube though it is taken for an organ by its shape; empty where not.
-
-        A tube that is cut open at both ends has two rims or more. A stated kind is not doubted.
-        """
+        """Why what its shape makes an organ may be a tube, cut open at two rims or more; empty where not."""
         if self.lumen or not self.guessed or self.rims < TUBE_RIMS:
             return ""
         return f"open at {self.rims} rims, as a tube is: if it is seen from inside, its kind is lumen"

@@ -402,10 +402,7 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
 
 
 def other_unit(extent: float) -> str:
-    """Guess the unit of a mesh whose largest extent, in the file's unit, is hardly that of an organ in mm.
-
-    The answer is such as "metres, 214 mm"; empty if no other unit is likelier than mm.
-    """
+    """Return a likelier unit than mm by the largest extent, such as "metres, 214 mm"; empty if there is none."""
     low, high = ORGAN_RANGE_MM
     if extent >= 10.0 and extent <= high:
         return ""

@@ -58,10 +58,7 @@ def half_width(distance_mm: float, concentration: float, curvature: float) -> fl
 @overload
 def half_width(distance_mm: float, concentration: float, curvature: Array) -> Array: ...
 def half_width(distance_mm: float, concentration: float, curvature: float | Array) -> float | Array:
-    """Return the half-width of a highlight on the surface at `ISOVALUE`, mm: d sqrt(-2 ln t / c) / |1 + d k|.
-
-    d is the distance of camera and light, mm, c the lobe's, k the curvature across the highlight, 1/mm.
-    """
+    """Return the half-width at `ISOVALUE`, mm, of a highlight of a lobe of c: d sqrt(-2 ln t / c) / |1 + d k|."""
     angle = math.sqrt(-2.0 * math.log(ISOVALUE) / concentration)
     return distance_mm * angle / np.maximum(np.abs(1.0 + distance_mm * curvature), LEAST_STRETCH)
 
@@ -73,10 +70,7 @@ def needed_edge(distance_mm: float, concentration: float, k_min: Array, k_max: A
 
 
 def concentration(exponent: float | None, alpha: float | None) -> float:
-    """Return c of a lobe from a Phong exponent or a GGX roughness; by default that of `DEFAULT_EXPONENT`.
-
-    Raises `InputError` if both are given, or one is out of range.
-    """
+    """Return c of a lobe by exponent or roughness, else of `DEFAULT_EXPONENT`; `InputError` if out of range."""
     if exponent is not None and alpha is not None:
         raise InputError("--exponent and --roughness: only one of them may be given")
     if alpha is not None:
@@ -165,10 +159,7 @@ def vertex_normals(vertices: Array, faces: IntArray) -> Array:
 
 
 def shape_operators(vertices: Array, faces: IntArray) -> Array:
-    """Return S at the vertices for outward normals, 1/mm, shape (V, 3, 3), from a quadric fitted to the neighbours.
-
-    For libigl a surface convex towards its normals has positive curvature, as for us (the tests check it on a sphere).
-    """
+    """Return S at the vertices for outward normals, 1/mm, (V, 3, 3), by a quadric fitted to the neighbours."""
     fitted: Any = igl.principal_curvature(vertices, faces, CURVATURE_RINGS, True)
     first, second, k1, k2 = fitted[:4]
     # S = k1 d1 d1^T + k2 d2 d2^T
@@ -379,10 +370,7 @@ def _own_wave(vertices: Array, faces: IntArray) -> float:
 
 
 def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: float) -> float:
-    """Return the edge length, mm, that highlights of `AUTO_CONCENTRATION` need as near as a camera comes.
-
-    The faces are outward. Curvatures are taken after smoothing by `smoothing_mm`.
-    """
+    """Return the edge length, mm, that `AUTO_CONCENTRATION` needs on outward faces as near as a camera comes."""
     vertices, faces = refine(vertices, faces, 0, smoothing_mm)
     # The nearest camera sees the narrowest highlights.
     distance = nearest_mm(lumen)
@@ -392,11 +380,7 @@ def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: 
 
 
 class MeshSurface(MeshedSurface):
-    """A user's mesh with a camera inside its lumen or outside the organ.
-
-    Raises `InputError` if the file is missing or malformed, no camera can be placed, or the relief has waves as long as
-    the mesh's own.
-    """
+    """A user's mesh with a camera inside its lumen or outside the organ."""
 
     faceted = True
 

@@ -182,10 +182,7 @@ class _Keyed:
 
 
 def camera_path(surface: SurfaceModel) -> CameraPath:
-    """Find the camera path through the mesh of a lumen, closed or open at its ends; the last few are cached.
-
-    Raises `InputError` if no path of `MIN_LENGTH_MM` fits into the mesh.
-    """
+    """Find the camera path through the mesh of a lumen, closed or open at its ends; the last few are cached."""
     shape = surface.shape()
     assert shape.mesh is not None
     return _camera_path(_Keyed(shape.key, shape.mesh))

@@ -180,10 +180,7 @@ def fine_normals(normal: Array, gradient: Array) -> Array:
 
 
 def normal_derivative(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array]:
-    """Return fine normals, shape (N, 3), and their derivative along the base's tangents, shape (N, 3, 3).
-
-    `N` and `S` are the base's normals and shape operators; see `ReliefField.apply`.
-    """
+    """Return fine normals and their derivative along the base's tangents (see `ReliefField.apply`)."""
     G, H = jets.gradient, jets.hessian
     along = np.sum(N * G, axis=1)
     m = N - G + N * along[:, None]

@@ -132,10 +132,7 @@ class TissuePattern:
     vessels: SegmentTable
 
     def albedo(self, points: Array) -> Array:
-        """Return the albedo at points of the surface, shape (N, 3), model frame, mm; linear RGB, shape (N, 3).
-
-        The slow reference of `simtest.rendering.tissue_kernels`.
-        """
+        """Return the albedo at points of the surface, model frame, mm, linear RGB; the kernel's slow reference."""
         field, net = self.mottling.at(points), self.capillaries.at(points)
         value = self.base * np.exp(-field[:, None] * self.mottled - net[:, None] * self.netted)
         chords = self.vessels.chords(points)

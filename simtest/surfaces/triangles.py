@@ -67,10 +67,7 @@ def area_quantile(values: Array, vertices: Array, faces: IntArray, share: float)
 
 
 def isoperimetric_quotient(vertices: Array, faces: IntArray) -> float:
-    """Return 36 pi V^2 / A^3 of a mesh with outward faces: 1 for a sphere, small for a long or folded body.
-
-    An open mesh counts as closed by cones from its centroid.
-    """
+    """Return 36 pi V^2 / A^3 of outward faces, closed by cones from their centroid: 1 for a sphere."""
     centred = vertices - vertices.mean(axis=0)
     cross = area_vectors(centred, faces)
     area = np.linalg.norm(cross, axis=1).sum() / 2
@@ -148,10 +145,7 @@ class MeshProbe:
         self._tree.init(self._vertices, self._faces)
 
     def clearance(self, points: Array) -> Array:
-        """Return the signed distance of points, shape (N, 3), to the mesh, mm; positive on the camera's side.
-
-        The sign is that of the interpolated vertex normal at the closest point, so an open mesh works too.
-        """
+        """Return signed distances of points, mm, by the interpolated normal: also of an open mesh."""
         squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points))
         # The normal at the closest point, interpolated in its triangle
         corners = self._mesh.vertices[self._mesh.faces[face]]

@@ -20,45 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import Array, IntArray, Mask
+from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.stalk import Jet, Stalk
-
-Components = tuple[Array, Array, Array]
-"""The components of N vectors, each of shape (N,)."""
-
-
-def components(vectors: Array) -> Components:
-    """Return the components of vectors, shape (N, 3)."""
-    x, y, z = np.ascontiguousarray(vectors.T)
-    return x, y, z
-
-
-def chosen(vectors: Components, rows: IntArray) -> Components:
-    """Return some of the vectors, by their numbers."""
-    x, y, z = vectors
-    return x[rows], y[rows], z[rows]
-
-
-def solve3(a: Components, b: Components, c: Components, right: Components) -> tuple[Array, Array, Array]:
-    """Solve [a b c] (x, y, z) = right by Cramer's rule; inf or NaN for a singular matrix."""
-    bc = cross(b, c)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / dot(a, bc)
-        x, y, z = (dot(right, minor) * inverse for minor in (bc, cross(c, a), cross(a, b)))
-    return x, y, z
-
-
-def cross(a: Components, b: Components) -> Components:
-    """Return the cross products of vectors."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def dot(a: Components, b: Components) -> Array:
-    """Return the dot products of vectors, shape (N,)."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
 
 NEWTON_STEPS = 12
 NEWTON_TOLERANCE_MM = 1e-10
@@ -206,10 +171,7 @@ class Tube:
         return np.stack([x, np.zeros_like(x), z], axis=1)
 
     def centreline(self, u: Array) -> Array:
-        """Return C(u), mm, shape (N, 3), from the nearest knot, exact to rounding.
-
-        Around each knot polynomials stand for the quadrature; beyond the tube's ends the quadrature itself is used.
-        """
+        """Return C(u), mm, by polynomials about the nearest knot; by the quadrature itself beyond the tube's ends."""
         spacing = self._knots[1] - self._knots[0]
         knot = np.clip(np.rint(u / spacing), 0, len(self._knots) - 1).astype(np.int64)
         points = self._knot_points[knot]
@@ -348,21 +310,6 @@ class Tube:
         moved = self._with_stalks(Jet(position, first, second, none, none, none))
         return moved.f, moved.u, moved.v
 
-    def _tangent_components(self, u: Array, v: Array) -> tuple[Components, Components, Components]:
-        """Return the components of `tangents`: P, P_u and P_v by x, y and z."""
-        if self._stalks:
-            position, first, second = self.tangents(u, v)
-            return components(position), components(first), components(second)
-        r, (psi, bend, _) = self.radius(u, v, second=False), self.heading(u)
-        s, c, sv, cv = np.sin(psi), np.cos(psi), np.sin(v), np.cos(v)
-        centre, rho = self.centreline(u), (cv * c, sv, -cv * s)
-        along, tau = 1 - bend * r.f * cv, (-sv * c, cv, sv * s)
-        return (
-            (centre[:, 0] + r.f * rho[0], r.f * rho[1], centre[:, 2] + r.f * rho[2]),
-            (along * s + r.u * rho[0], r.u * rho[1], along * c + r.u * rho[2]),
-            (r.v * rho[0] + r.f * tau[0], r.v * rho[1] + r.f * tau[1], r.v * rho[2] + r.f * tau[2]),
-        )
-
     def jet(self, u: Array, v: Array) -> Jet:
         """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
         r = self.radius(u, v)
@@ -420,21 +367,20 @@ class Tube:
     def solve(
         self, origins: Array, directions: Array, distance: Array, u: Array, v: Array
     ) -> tuple[Array, Array, Array]:
-        """Solve P(u, v) = origin + t direction by Newton's method; return t, u and v, t NaN if there is no solution.
-
-        The rays are of shape (N, 3), in mm, with unit directions; `distance`, `u` and `v`, shape (N,), are a start
-        close by.
-        """
+        """Solve P(u, v) = origin + t direction by Newton's method from a start close by; return t, NaN: none, u, v."""
         u, v, t = u.copy(), v.copy(), distance.copy()
         found = np.zeros(len(u), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
-        source, towards = components(origins[active]), components(directions[active])
         for _ in range(NEWTON_STEPS):
-            p, pu, pv = self._tangent_components(u[active], v[active])
-            x, y, z = (a - b - t[active] * c for a, b, c in zip(p, source, towards, strict=True))
-            # The linear system P_u du + P_v dv - direction dt = -miss, for -du, -dv and dt
-            du, dv, dt = solve3(pu, pv, towards, (x, y, z))
-            done = x * x + y * y + z * z < NEWTON_TOLERANCE_MM**2
+            p, pu, pv = self.tangents(u[active], v[active])
+            towards = directions[active]
+            miss = p - origins[active] - t[active, None] * towards
+            # The linear system P_u du + P_v dv - direction dt = -miss by Cramer's rule, for -du, -dv and dt
+            minor = np.cross(pv, towards)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                inverse = 1.0 / _dot(pu, minor)
+                du, dv, dt = (_dot(miss, m) * inverse for m in (minor, np.cross(towards, pu), np.cross(pu, pv)))
+            done = _dot(miss, miss) < NEWTON_TOLERANCE_MM**2
             found[active[done]] = True
             # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
             scale = np.minimum(1.0, MAX_SHIFT_MM / np.maximum(np.abs(dt), np.finfo(float).tiny))
@@ -443,12 +389,17 @@ class Tube:
             v[active] -= scale * dv
             t[active] += scale * dt
             # A ray that leaves the neighbourhood of its hit is given up; the others go on.
-            kept = np.flatnonzero(~done & (np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM))
-            active, source, towards = active[kept], chosen(source, kept), chosen(towards, kept)
+            active = active[~done & (np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM)]
             if not active.size:
                 break
         inside = (u >= -1.0) & (u <= self.recipe.length_mm + 1.0)
         return np.where(found & inside, t, np.nan), u, v
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Return the dot products of vectors, shape (N,), added in order."""
+    product = a * b
+    return np.asarray(product[:, 0] + product[:, 1] + product[:, 2])
 
 
 def _powers(chebyshev: Array) -> Array:

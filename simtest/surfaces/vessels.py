@@ -83,10 +83,7 @@ class SegmentTable:
         return _hash(np.floor(points / self.cell_mm).astype(np.int64)) & self.mask
 
     def chords(self, points: Array) -> Array:
-        """Return the chords, mm, through arteries and veins below points, shape (N, 3), mm; shape (N, 2).
-
-        Of several segments the longest chord counts: neighbours along a vessel overlap.
-        """
+        """Return the longest chords, mm, through arteries and veins below points, mm; shape (N, 2)."""
         points = self.mirrored(points)
         slot = self.slots(points)
         first, last = self.first[slot], self.first[slot + 1]
@@ -127,10 +124,7 @@ def seen_profile(radius: Array, blur_mm: float) -> tuple[Array, Array]:
 
 
 def make_table(segments: "Segments", blur_mm: float, half_mm: Array) -> SegmentTable:
-    """Sort segments into the cells in which they are seen, through a depth that blurs by a standard deviation, mm.
-
-    For `half_mm` see `SegmentTable`.
-    """
+    """Sort segments into the cells in which they are seen, through a depth that blurs by a deviation, mm."""
     width, peak = seen_profile(segments.radius, blur_mm)
     if not len(width):
         return NO_VESSELS
