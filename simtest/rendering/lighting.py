@@ -39,7 +39,7 @@ _SILVER = 0x6A09E667
 
 
 @dataclass(frozen=True)
-class Draw:
+class LightDraw:
     """Which points of the sources a sample of each pixel takes: some of one spiral over all samples of the pixel."""
 
     # first, step: Number of the first point, and from one to the next; the latter is the number of samples
@@ -90,9 +90,9 @@ class Drawer:
             first = mi.sample_tea_32(lanes.shift_x, lanes.shift_y)
             self._shifts = (*first, mi.sample_tea_32(*first)[0])
 
-    def at(self, number: Any) -> Draw:
+    def at(self, number: Any) -> LightDraw:
         """Return the draw of a pixel's sample by its number."""
-        return Draw(mi.UInt32(number), self._step, self._total, self._shifts)
+        return LightDraw(mi.UInt32(number), self._step, self._total, self._shifts)
 
 
 def source_kind(source: Source | None) -> str:
@@ -398,12 +398,12 @@ class DirectLight:
         """Return what draws points of the sources of finite size for the pixels of a launch; None if all are points."""
         return Drawer(lanes, samples) if any(kind.source != "point" for kind in self.kinds) else None
 
-    def radiance(self, scene: Any, material: Reflecting, hit: Hit, draw: Draw | None) -> tuple[Any, Any]:
+    def radiance(self, scene: Any, material: Reflecting, hit: Hit, draw: LightDraw | None) -> tuple[Any, Any]:
         """Compute the radiance off lobe and base at surface points; `draw` chooses points of finite sources."""
         with material.painted(hit):
             return self._of_lights(scene, material, hit, draw)
 
-    def _of_lights(self, scene: Any, material: Reflecting, hit: Hit, draw: Draw | None) -> tuple[Any, Any]:
+    def _of_lights(self, scene: Any, material: Reflecting, hit: Hit, draw: LightDraw | None) -> tuple[Any, Any]:
         specular, diffuse = mi.Spectrum(0), mi.Spectrum(0)
         for i, kind in enumerate(self.kinds):
             if kind.source == "point":
@@ -431,7 +431,7 @@ class DirectLight:
         lobe, base = material.towards(hit, direction, active)
         return dr.select(active, arriving * lobe, 0), dr.select(active, arriving * base, 0)
 
-    def _fixed(self, i: int, scene: Any, material: Reflecting, hit: Hit, draw: Draw) -> tuple[Any, Any]:
+    def _fixed(self, i: int, scene: Any, material: Reflecting, hit: Hit, draw: LightDraw) -> tuple[Any, Any]:
         """Compute the mean radiance over the fixed points of a source, with a shadow ray to each.
 
         Fewer rays would leave steps in penumbrae, since all pixels have the same points.
@@ -447,7 +447,7 @@ class DirectLight:
         _, specular, diffuse = dr.while_loop(start, lambda number, *_: number < end, step)
         return specular / draw.total, diffuse / draw.total
 
-    def _drawn(self, i: int, scene: Any, material: Reflecting, hit: Hit, draw: Draw) -> tuple[Any, Any]:
+    def _drawn(self, i: int, scene: Any, material: Reflecting, hit: Hit, draw: LightDraw) -> tuple[Any, Any]:
         """Compute the mean radiance over a sample's points of a source, with one shadow ray to one of them.
 
         The point is chosen in proportion to the radiance that it causes. Then the whole is without bias, and without

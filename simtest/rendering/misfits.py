@@ -15,7 +15,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import tangent_basis
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.frames import MisfitMaps
-from simtest.rendering.rays import Sightlines
+from simtest.rendering.rays import Sightlines, tangents_and_turns
 from simtest.rendering.trace import LANES, Tracer, blocks_of, evaluate
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.surfaces.model import shape_operator
@@ -161,13 +161,9 @@ def trace_grid(scene: Any, sightlines: Sightlines, lights: Array, stride: int) -
 def _gain(r: Any, si: Any) -> Any:
     """Compute the least abs(1 + d k), with the principal curvatures k of the shape's own normals."""
     facing = dr.select(dr.dot(si.sh_frame.n, r) > 0, mi.Float(-1), mi.Float(1))
-    # The change of the normal along two perpendicular tangents.
-    first, along = dr.normalize(si.dp_du), si.dn_du / dr.norm(si.dp_du)
-    share = dr.dot(first, si.dp_dv)
-    across = si.dp_dv - share * first
-    second, along_second = dr.normalize(across), (si.dn_dv - share * along) / dr.norm(across)
-    a, c = dr.dot(first, along), dr.dot(second, along_second)
-    b = (dr.dot(first, along_second) + dr.dot(second, along)) / 2
+    (first, second), (along, across) = tangents_and_turns(si)
+    a, c = dr.dot(first, along), dr.dot(second, across)
+    b = (dr.dot(first, across) + dr.dot(second, along)) / 2
     mean, half = facing * (a + c) / 2, dr.sqrt(dr.square((a - c) / 2) + dr.square(b))
     return dr.minimum(dr.abs(1 + si.t * (mean - half)), dr.abs(1 + si.t * (mean + half)))
 

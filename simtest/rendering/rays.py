@@ -211,6 +211,14 @@ def make_hit(si: Any, relief: ReliefKernel | None, bent: bool = False) -> Hit:
     return Hit(si, turned(si, jets.gradient), turned(si, jets.diffused), jets)
 
 
+def tangents_and_turns(si: Any) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    """Return two perpendicular tangents of surface points, and the change of the shape's normal along each."""
+    first, along = dr.normalize(si.dp_du), si.dn_du / dr.norm(si.dp_du)
+    share = dr.dot(first, si.dp_dv)
+    across = si.dp_dv - share * first
+    return (first, dr.normalize(across)), (along, (si.dn_dv - share * along) / dr.norm(across))
+
+
 _ROUND = {"sphere": (1.0, 1.0, 1.0), "cylinder": (1.0, 1.0, 0.0)}
 """Weights of the squared coordinates, whose sum is 1 on Mitsuba's unit shape."""
 
@@ -218,7 +226,7 @@ SAME_HIT = 1e-2
 """A solution farther than this from Mitsuba's hit, relative to the distance, is another point: Mitsuba's is kept."""
 
 
-class Refinement:
+class HitRefinement:
     """Solves the hits on one shape again in double precision; hits on a mesh are left as they are.
 
     Mitsuba's rays are single precision. At a silhouette the hit moves by the ray's rounding over the cosine of view,

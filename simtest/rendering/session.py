@@ -23,7 +23,7 @@ from simtest.rendering.kernel_values import to_kernel
 from simtest.rendering.lighting import Material
 from simtest.rendering.misfits import MisfitGrid, trace_grid, trace_misfits, trace_tiles
 from simtest.rendering.placement_checks import check_camera, check_lights, check_motion
-from simtest.rendering.rays import Refinement, Sightlines
+from simtest.rendering.rays import HitRefinement, Sightlines
 from simtest.rendering.reflectances import compiled_form
 from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel, rest_map
 from simtest.rendering.trace import Bounces, Progress, Tracer, as_radiance, evaluate, mean_over
@@ -310,7 +310,7 @@ class Session:
         """Return what traces the scene, by default from the camera's own pose."""
         built, sightlines = self._built, sightlines or self.sightlines
         material = Material(built.scene.shapes()[0].bsdf(), built.base, self._albedo)
-        refinement = Refinement(self._shape)
+        refinement = HitRefinement(self._shape)
         kernel = self._instruments
         return Tracer(built.scene, sightlines, self._light, material, refinement, self._relief, kernel)
 

@@ -16,8 +16,8 @@ from simtest.rendering.backend import dr, mi
 from simtest.rendering.frames import Radiance
 from simtest.rendering.instruments import InstrumentKernel
 from simtest.rendering.kernel_values import channels, to_kernel
-from simtest.rendering.lighting import DirectLight, Draw, Drawer, Material
-from simtest.rendering.rays import Hit, Lanes, Pixels, Rays, Refinement, Sightlines, make_hit, untile
+from simtest.rendering.lighting import DirectLight, Drawer, LightDraw, Material
+from simtest.rendering.rays import Hit, HitRefinement, Lanes, Pixels, Rays, Sightlines, make_hit, untile
 from simtest.rendering.tissue_kernels import ReliefKernel
 from simtest.rendering.truth import CHANNELS, ShapeLabels
 from simtest.runtime.arrays import Array, Image
@@ -89,7 +89,7 @@ class Tracer:
     sightlines: Sightlines  # Of the camera
     light: DirectLight  # The rig
     material: Material  # The surface's
-    refinement: Refinement  # Solves the hits again in double precision
+    refinement: HitRefinement  # Solves the hits again in double precision
     relief: ReliefKernel | None  # The surface's relief
     instruments: InstrumentKernel | None = None  # What stands before the surface
 
@@ -111,7 +111,7 @@ class Tracer:
         self.refinement.apply(rays.origin, rays.direction, si)
         return make_hit(si, self.relief, bent)
 
-    def _direct(self, rays: Rays, hit: Hit, draw: Draw | None) -> list[Any]:
+    def _direct(self, rays: Rays, hit: Hit, draw: LightDraw | None) -> list[Any]:
         """Compute the channels of direct light off lobe and base, then of metal; each is 0 behind the other."""
         if self.instruments is None:
             specular, diffuse = self.light.radiance(self.scene, self.material, hit, draw)
@@ -131,7 +131,14 @@ class Tracer:
         return seen + [dr.select(in_front, channel, 0) for part in metallic for channel in part]
 
     def _parts(
-        self, rays: Rays, hit: Hit, draw: Draw | None, bounces: Bounces | None, count: int, block: int, sample: int
+        self,
+        rays: Rays,
+        hit: Hit,
+        draw: LightDraw | None,
+        bounces: Bounces | None,
+        count: int,
+        block: int,
+        sample: int,
     ) -> list[Any]:
         """Compute the channels of direct light and, if asked for, of further bounces."""
         parts = self._direct(rays, hit, draw)

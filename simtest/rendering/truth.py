@@ -19,7 +19,7 @@ from simtest.rendering import tube_kernel
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.frames import Labels, TruthMaps
 from simtest.rendering.kernel_values import to_kernel, vectors_from_kernel, vectors_to_kernel
-from simtest.rendering.rays import Hit, Rays, make_hit
+from simtest.rendering.rays import Hit, Rays, make_hit, tangents_and_turns
 from simtest.rendering.tissue_kernels import ReliefKernel
 from simtest.rendering.tube_kernel import TubeKernel
 from simtest.runtime.arrays import Array, Image, Mask
@@ -199,14 +199,8 @@ class ShapeLabels:
     def _second_form(self, preliminary: Any, si: Any, seen: Any) -> tuple[tuple[Any, Any], tuple[Any, Any, Any]]:
         """Compute two perpendicular tangents, and the components of S along them, for the shape's own normal."""
         if self._operators is None:
-            first = dr.normalize(si.dp_du)
-            # Analytic shape: dN along the first tangent, and along the one perpendicular to it.
-            along = si.dn_du / dr.norm(si.dp_du)
-            share = dr.dot(first, si.dp_dv)
-            across = si.dp_dv - share * first
-            second = dr.normalize(across)
-            along_second = (si.dn_dv - share * along) / dr.norm(across)
-            return (first, second), (dr.dot(first, along), dr.dot(first, along_second), dr.dot(second, along_second))
+            (first, second), (along, across) = tangents_and_turns(si)
+            return (first, second), (dr.dot(first, along), dr.dot(first, across), dr.dot(second, across))
         # Mesh: S interpolated between the triangle's corners.
         corners = self._shape.face_indices(preliminary.prim_index, seen)
         u, v = preliminary.prim_uv

@@ -29,7 +29,7 @@ MAX_CURVATURE_FACES = 2_000_000
 
 
 @dataclass(frozen=True)
-class Verdict:
+class MeshCheck:
     """Result of `check_mesh`; numbers of vertices, faces and edges are those after the repairs."""
 
     file: str
@@ -134,7 +134,7 @@ class Verdict:
             yield "verdict", f"too coarse: edges of {self.needed_edge_mm:.2g} mm are needed (surface.edge_mm)"
 
 
-def check_mesh(path: str | Path, distance_mm: float | None, concentration: float, kind: str = "auto") -> Verdict:
+def check_mesh(path: str | Path, distance_mm: float | None, concentration: float, kind: str = "auto") -> MeshCheck:
     """Judge a mesh file for highlights of a lobe of c = `concentration`, seen from a distance, mm.
 
     With no distance it is that of the nearest viewpoints on the camera's side, which `kind` ("auto", "lumen", "organ")
@@ -155,7 +155,7 @@ def check_mesh(path: str | Path, distance_mm: float | None, concentration: float
         share = _fine_share(wanted, vertices, faces)
         larger = np.maximum(np.abs(k_min), np.abs(k_max))
         median, p95 = (area_quantile(larger, vertices, faces, level) for level in (0.5, 0.95))
-    return Verdict(
+    return MeshCheck(
         file=str(path),
         vertices=len(vertices),
         faces=len(faces),

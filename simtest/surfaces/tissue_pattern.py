@@ -22,7 +22,15 @@ from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.kept_arrays import kept
 from simtest.spec.tissue_colour import TissueColour
 from simtest.surfaces.model import SurfaceModel
-from simtest.surfaces.vessels import NO_VESSELS, Patch, SegmentTable, grow_vessels, make_table, segments, surface_patch
+from simtest.surfaces.vessels import (
+    NO_VESSELS,
+    PatternPatch,
+    SegmentTable,
+    grow_vessels,
+    make_table,
+    segments,
+    surface_patch,
+)
 
 EXTINCTION = (
     # Red, 600 to 650 nm: wavelength, nm; HbO2 and Hb, 1/(cm mol/l)
@@ -156,7 +164,7 @@ def _bare(spec: TissueColour) -> TissuePattern:
 
 
 @lru_cache(maxsize=4)
-def _make(patch: Patch, spec: TissueColour) -> TissuePattern:
+def _make(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
     return _unpacked(kept("tissue", f"{patch.key} {spec.model_dump_json()}", lambda: _packed(_grown(patch, spec))))
 
 
@@ -179,7 +187,7 @@ def _unpacked(arrays: Mapping[str, AnyArray]) -> TissuePattern:
     return TissuePattern(mottling=mottling, capillaries=capillaries, vessels=vessels, **plain)
 
 
-def _grown(patch: Patch, spec: TissueColour) -> TissuePattern:
+def _grown(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
     """Make the pattern of a patch."""
     grow = np.random.SeedSequence(spec.seed).spawn(3)[2]
     forest = grow_vessels(patch, spec.vessels, int(grow.generate_state(1)[0]))

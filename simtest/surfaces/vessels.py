@@ -123,7 +123,7 @@ def seen_profile(radius: Array, blur_mm: float) -> tuple[Array, Array]:
     return width, 8 * radius**2 / (3 * width)
 
 
-def make_table(segments: "Segments", blur_mm: float, half_mm: Array) -> SegmentTable:
+def make_table(segments: "VesselSegments", blur_mm: float, half_mm: Array) -> SegmentTable:
     """Sort segments into the cells in which they are seen, through a depth that blurs by a deviation, mm."""
     width, peak = seen_profile(segments.radius, blur_mm)
     if not len(width):
@@ -139,7 +139,7 @@ def make_table(segments: "Segments", blur_mm: float, half_mm: Array) -> SegmentT
     return SegmentTable(cell_mm, first, sorted_rows, half_mm)
 
 
-def _cells(segments: "Segments", width: Array, cell_mm: float) -> tuple[IntArray, IntArray]:
+def _cells(segments: "VesselSegments", width: Array, cell_mm: float) -> tuple[IntArray, IntArray]:
     """Return pairs of a segment and a cell, shapes (P,) and (P, 3), in which it is seen on the surface."""
     parts = [
         _cells_of(segments, width, cell_mm, slice(start, start + SEGMENTS)) for start in range(0, len(width), SEGMENTS)
@@ -148,7 +148,7 @@ def _cells(segments: "Segments", width: Array, cell_mm: float) -> tuple[IntArray
     return owner, cell
 
 
-def _cells_of(segments: "Segments", width: Array, cell_mm: float, some: slice) -> tuple[IntArray, IntArray]:
+def _cells_of(segments: "VesselSegments", width: Array, cell_mm: float, some: slice) -> tuple[IntArray, IntArray]:
     """Return the pairs of some segments. Lengths are in cells, in single precision: `MARGIN_MM` covers its rounding."""
     start, end = segments.start[some] / cell_mm, segments.end[some] / cell_mm
     reach = ((width[some] + MARGIN_MM) / cell_mm)[:, None]
@@ -201,7 +201,7 @@ Draw = Callable[[np.random.Generator, int], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
-class Patch:
+class PatternPatch:
     """The part of a surface that carries a pattern, model frame."""
 
     key: str  # Identity: patches of one key are equal
@@ -211,7 +211,7 @@ class Patch:
     half_mm: tuple[float, float, float] = (ENDLESS, ENDLESS, ENDLESS)
 
 
-def surface_patch(surface: SurfaceModel) -> Patch:
+def surface_patch(surface: SurfaceModel) -> PatternPatch:
     """Return what to sample of a surface: a window around the anchor of one without end, all of another."""
     if isinstance(surface, Plane):
         return _plane(WINDOW * surface.distance)
@@ -226,16 +226,16 @@ def surface_patch(surface: SurfaceModel) -> Patch:
     return _mesh(shape.mesh, shape.key)
 
 
-def _plane(half: float) -> Patch:
+def _plane(half: float) -> PatternPatch:
     def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
         points = np.zeros((count, 3))
         points[:, :2] = rng.uniform(-half, half, (count, 2))
         return points, np.tile([0.0, 0.0, 1.0], (count, 1))
 
-    return Patch(f"plane {half!r}", 4 * half**2, draw, (half, half, ENDLESS))
+    return PatternPatch(f"plane {half!r}", 4 * half**2, draw, (half, half, ENDLESS))
 
 
-def _sphere(surface: Sphere) -> Patch:
+def _sphere(surface: Sphere) -> PatternPatch:
     radius, side = surface.radius, -1.0 if surface.inside else 1.0
 
     def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
@@ -246,10 +246,10 @@ def _sphere(surface: Sphere) -> Patch:
         out = np.stack([across * np.cos(angle), across * np.sin(angle), side * z], axis=1)
         return surface.centre + radius * out, side * out
 
-    return Patch(f"sphere {radius!r} {surface.inside}", 4 * math.pi * radius**2, draw)
+    return PatternPatch(f"sphere {radius!r} {surface.inside}", 4 * math.pi * radius**2, draw)
 
 
-def _cylinder(surface: Cylinder) -> Patch:
+def _cylinder(surface: Cylinder) -> PatternPatch:
     radius, side = surface.radius, -1.0 if surface.inside else 1.0
     half = WINDOW * max(surface.distance, 2 * radius if surface.inside else 0.0)
 
@@ -259,10 +259,10 @@ def _cylinder(surface: Cylinder) -> Patch:
         return surface.centre + radius * out + along[:, None] * [0.0, 1.0, 0.0], side * out
 
     key = f"cylinder {radius!r} {half!r} {surface.inside}"
-    return Patch(key, 4 * math.pi * half * radius, draw, (ENDLESS, half, ENDLESS))
+    return PatternPatch(key, 4 * math.pi * half * radius, draw, (ENDLESS, half, ENDLESS))
 
 
-def _quadric(surface: Quadric) -> Patch:
+def _quadric(surface: Quadric) -> PatternPatch:
     half, (k1, k2, _) = QUADRIC_REACH * surface.distance, surface.curvatures
     steepest = math.hypot(1.0, k1 * half, k2 * half)
 
@@ -284,10 +284,10 @@ def _quadric(surface: Quadric) -> Patch:
     # The area by a midpoint rule.
     side = (np.arange(200) + 0.5) / 100 * half - half
     secant = np.sqrt(1 + (k1 * side[:, None]) ** 2 + (k2 * side[None, :]) ** 2)
-    return Patch(f"quadric {k1!r} {k2!r} {half!r}", float(secant.mean()) * 4 * half**2, draw)
+    return PatternPatch(f"quadric {k1!r} {k2!r} {half!r}", float(secant.mean()) * 4 * half**2, draw)
 
 
-def _mesh(mesh: TriangleMesh, key: str) -> Patch:
+def _mesh(mesh: TriangleMesh, key: str) -> PatternPatch:
     areas = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1) / 2
     total = np.cumsum(areas)
 
@@ -303,10 +303,10 @@ def _mesh(mesh: TriangleMesh, key: str) -> Patch:
         normals = np.einsum("nc,nci->ni", weights, mesh.normals[corners])
         return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
-    return Patch(f"mesh {key}", float(total[-1]), draw)
+    return PatternPatch(f"mesh {key}", float(total[-1]), draw)
 
 
-def spread_points(patch: Patch, distance_mm: float, rng: np.random.Generator) -> tuple[Array, Array]:
+def spread_points(patch: PatternPatch, distance_mm: float, rng: np.random.Generator) -> tuple[Array, Array]:
     """Draw points no two of which are nearer than a distance, about as dense as that allows.
 
     Returns points, mm, and unit normals, shape (N, 3). The distance is wider, with a warning, where there would be more
@@ -388,7 +388,7 @@ class Forest:
 
 
 @dataclass(frozen=True)
-class Segments:
+class VesselSegments:
     """Straight pieces of vessels."""
 
     # start, end: (S, 3): mm
@@ -400,7 +400,7 @@ class Segments:
 
 
 @lru_cache(maxsize=4)
-def grow_vessels(patch: Patch, spec: Vessels, seed: int) -> Forest:
+def grow_vessels(patch: PatternPatch, spec: Vessels, seed: int) -> Forest:
     """Grow the vessels of a surface; the last few are cached."""
     branches = np.random.SeedSequence(seed).spawn(SYSTEMS)
     parts = [_grow(patch, spec, np.random.Generator(np.random.SFC64(branch))) for branch in branches]
@@ -411,7 +411,7 @@ def grow_vessels(patch: Patch, spec: Vessels, seed: int) -> Forest:
     return Forest(position, normal, np.where(parent >= 0, parent + first[system], -1), radius, system == 1)
 
 
-def _grow(patch: Patch, spec: Vessels, rng: np.random.Generator) -> tuple[Array, Array, IntArray, Array]:
+def _grow(patch: PatternPatch, spec: Vessels, rng: np.random.Generator) -> tuple[Array, Array, IntArray, Array]:
     """Grow one system; return positions, normals, parents and radii."""
     # The systems share the surface: the ends of one are farther apart than those of both.
     spacing = spec.spacing_mm * math.sqrt(SYSTEMS)
@@ -545,7 +545,7 @@ def _shape_operators(points: Array, normals: Array) -> Array:
     return np.asarray((S + S.transpose(0, 2, 1)) / 2)
 
 
-def segments(forest: Forest) -> Segments:
+def segments(forest: Forest) -> VesselSegments:
     """Cut the curves through the nodes, which are smooth along each path, into straight segments."""
     parent, position, normal = forest.parent, forest.position, forest.normal
     joined = np.flatnonzero(parent >= 0)
@@ -571,7 +571,7 @@ def segments(forest: Forest) -> Segments:
     )
     normals = (1 - t[:-1]) * normal[above] + t[:-1] * normal[joined]
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    return Segments(
+    return VesselSegments(
         curve[:-1].reshape(-1, 3),
         curve[1:].reshape(-1, 3),
         normals.reshape(-1, 3),

@@ -13,7 +13,7 @@ from simtest.spec.toml_files import apply_settings
 from simtest.spec.type_change import replace_values
 
 if TYPE_CHECKING:
-    from simtest.surfaces.mesh_check import Verdict
+    from simtest.surfaces.mesh_check import MeshCheck
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
     return MeshVerdict(str(surface.path), fine and not found.problems and not doubt, text)
 
 
-def _refined_edge(found: "Verdict", target_mm: float) -> float:
+def _refined_edge(found: "MeshCheck", target_mm: float) -> float:
     """Return the length, mm, that 95 % of the edges do not exceed once the mesh is refined as far as it may be."""
     from simtest.surfaces.mesh_surface import subdivisions_within_limit
 

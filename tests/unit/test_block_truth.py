@@ -137,6 +137,3 @@ def test_first_derivatives_alone_are_the_same(recipe):
     whole, first = tube.radius(u, v), tube.radius(u, v, second=False)
     for name in ("f", "u", "v"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(first, name))
-    found = tube._tangent_components(u, v)
-    for vectors, expected in zip(found, tube.tangents(u, v), strict=True):
-        np.testing.assert_allclose(np.stack(vectors, axis=1), expected, rtol=0, atol=1e-12)

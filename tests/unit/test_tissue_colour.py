@@ -10,7 +10,7 @@ from simtest.surfaces import make_surface
 from simtest.surfaces.tissue_pattern import BLUR_PER_DEPTH, _make, blood_absorption, make_pattern, reach
 from simtest.surfaces.vessels import (
     ENDLESS,
-    Segments,
+    VesselSegments,
     grow_vessels,
     make_table,
     seen_profile,
@@ -182,7 +182,7 @@ def test_smaller_vessels_are_fainter_and_red_is_darkened_least():
     start = np.stack([np.zeros(4), 10.0 * np.arange(4), np.zeros(4)], axis=1)
     normal, half = np.tile([0.0, 0.0, 1.0], (4, 1)), np.array([2.5, 0.0, 0.0])
     for vein in (False, True):
-        lines = Segments(start, start + 2 * half, normal, radius, np.full(4, vein))
+        lines = VesselSegments(start, start + 2 * half, normal, radius, np.full(4, vein))
         table = make_table(lines, BLUR_PER_DEPTH * DEPTH_MM, np.full(3, ENDLESS))
         chord = table.chords(start + half)[:, int(vein)]
         assert (table.chords(start + half)[:, int(not vein)] == 0).all()
