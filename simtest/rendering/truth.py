@@ -339,8 +339,7 @@ def _in_blocks(solver: Solver, block: int, origins: Array, directions: Array, hi
     whole: Fields = {}
     for start in range(0, max(len(directions), 1), block):
         some = slice(start, start + block)
-        part = RayHits(hits.distance[some], hits.face[some], hits.barycentric[some])
-        for name, values in solver(origins[some], directions[some], part).items():
+        for name, values in solver(origins[some], directions[some], hits.rows(some)).items():
             if not start:
                 whole[name] = np.empty((len(directions), *values.shape[1:]), dtype=values.dtype)
             whole[name][some] = values

@@ -10,7 +10,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray, Array, IntArray
 from simtest.runtime.kept_arrays import kept
-from simtest.surfaces.model import RayHits, TriangleMesh
+from simtest.surfaces.model import RayHits, TriangleMesh, in_rows
 from simtest.surfaces.poses import Generator, lumen_pose
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.triangles import (
@@ -72,9 +72,8 @@ class BuiltColon(BuiltMesh):
         """Return exact points by Newton's method from (u, v) of the hits; a ray that only grazes the mesh has none."""
         u, v = np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
         distance, u, v = self.tube.solve(origins, directions, hits.distance, u, v)
-        normals, operators = np.full((len(u), 3), np.nan), np.full((len(u), 3, 3), np.nan)
-        good = np.isfinite(distance)
-        normals[good], operators[good] = self.tube.normal_and_shape_operator(u[good], v[good])
+        good = np.flatnonzero(np.isfinite(distance))
+        normals, operators = in_rows(len(u), good, *self.tube.normal_and_shape_operator(u[good], v[good]))
         return distance, normals, operators
 
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:

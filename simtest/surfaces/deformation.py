@@ -475,7 +475,7 @@ class DeformedSurface(SurfaceModel):
         solved = np.full(len(origins), np.nan)
         normal, operator = np.full((len(origins), 3), np.nan), np.full((len(origins), 3, 3), np.nan)
         if len(found):
-            own = RayHits(distance[found], hits.face[found], hits.barycentric[found])
+            own = replace(hits, distance=distance).rows(found)
             solved[found], points, jets = self._solve(origins[found], directions[found], own)
             normal[found], operator[found] = implicit_shape_operator(
                 *jets.carry(points.normal_base, shape_operator(points))

@@ -24,7 +24,7 @@ from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.kept_arrays import kept
 from simtest.runtime.seeds import Stage, generator
-from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator
+from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows
 from simtest.surfaces.poses import organ_pose
 from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
 from simtest.surfaces.triangles import BuiltMesh, MeshedSurface, face_edges, halve, rough_edges
@@ -266,10 +266,9 @@ class BuiltLiver(BuiltMesh):
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
         """Return exact points by Newton's method on F along the rays; a ray that only grazes the mesh has none."""
         distance = self.body.solve(origins, directions, hits.distance)
-        normals, operators = np.full((len(distance), 3), np.nan), np.full((len(distance), 3, 3), np.nan)
-        good = np.isfinite(distance)
+        good = np.flatnonzero(np.isfinite(distance))
         at = self.body.evaluate(origins[good] + distance[good, None] * directions[good])
-        normals[good], operators[good] = implicit_shape_operator(at.gradient, at.hessian)
+        normals, operators = in_rows(len(distance), good, *implicit_shape_operator(at.gradient, at.hessian))
         return distance, normals, operators
 
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:

@@ -38,6 +38,18 @@ class RayHits:
         second, third = self.barycentric.T
         return np.stack([1 - second - third, second, third], axis=1)
 
+    def rows(self, chosen: IntArray | slice) -> "RayHits":
+        """Return the hits of some of the rays."""
+        return RayHits(self.distance[chosen], self.face[chosen], self.barycentric[chosen])
+
+
+def in_rows(count: int, chosen: IntArray, *arrays: Array) -> list[Array]:
+    """Return arrays of so many rows, NaN but in those chosen, from what is there."""
+    whole = [np.full((count, *values.shape[1:]), np.nan) for values in arrays]
+    for values, some in zip(whole, arrays, strict=True):
+        values[chosen] = some
+    return whole
+
 
 @dataclass(frozen=True)
 class SurfacePoints:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from simtest.runtime.arrays import Array, IntArray, Mask
-from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh, pack_points
+from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh, in_rows, pack_points
 
 MIN_CLEARANCE_MM = 5.0
 """A camera in a lumen keeps this distance from the wall if the lumen is wide enough."""
@@ -249,17 +249,10 @@ class MeshedSurface(SurfaceModel):
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Return how far along rays the surface lies (see `SurfaceModel.distances`)."""
         hit = np.flatnonzero(np.isfinite(hits.distance))
-        found = RayHits(hits.distance[hit], hits.face[hit], hits.barycentric[hit])
-        distance = np.full(len(origins), np.nan)
-        distance[hit] = self._build.distances(origins[hit], directions[hit], found)
-        return distance
+        return in_rows(len(origins), hit, self._build.distances(origins[hit], directions[hit], hits.rows(hit)))[0]
 
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Return the points where rays meet the surface (see `SurfaceModel.points`)."""
         hit = np.flatnonzero(np.isfinite(hits.distance))
-        found = RayHits(hits.distance[hit], hits.face[hit], hits.barycentric[hit])
-        at_hits = self._build.at_hits(origins[hit], directions[hit], found)
-        whole = [np.full((len(origins), *values.shape[1:]), np.nan) for values in at_hits]
-        for values, some in zip(whole, at_hits, strict=True):
-            values[hit] = some
-        return pack_points(origins, directions, *whole)
+        at_hits = self._build.at_hits(origins[hit], directions[hit], hits.rows(hit))
+        return pack_points(origins, directions, *in_rows(len(origins), hit, *at_hits))

@@ -191,7 +191,7 @@ def test_on_a_users_mesh_the_base_is_its_interpolated_normal_and_operator():
     session = Session(scene({"type": "anatomy", "path": str(MESH)}, RELIEF))
     pixels = np.random.default_rng(5).uniform([4, 4], [60, 44], (900, 2))
     origins, directions = session.sightlines.in_model(pixels)
-    hits = session._hits(origins, directions)[0]
+    hits = session.exact_hits(origins, directions)
     base = session.surface.points(origins, directions, hits)
     fine = session.surface.fine_points(origins, directions, hits)
     keep = np.flatnonzero(base.valid)
