@@ -30,7 +30,7 @@ from simtest.nightly.storage import (
 )
 from simtest.runtime.files import require_plain
 from simtest.runtime.resources import shown
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 
 LOG = "log.jsonl"
 MAX_REASON = 1000

@@ -8,7 +8,7 @@ import polars as pl
 from simtest.errors import InputError
 from simtest.nightly.gate.quantities import OLDEST_COLUMNS, OPTIONAL_COLUMNS, RESULT_COLUMNS
 from simtest.runtime.resources import shown
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 
 _TYPES = {name: SCHEMA[name] for name in RESULT_COLUMNS if name not in OLDEST_COLUMNS} | OPTIONAL_COLUMNS
 

@@ -19,7 +19,7 @@ from simtest.nightly.gate.pooling import pooled
 from simtest.nightly.gate.quantities import quantities
 from simtest.nightly.records import OUTCOMES, NightlyRun, RunRecord
 from simtest.runtime.statistics import mean_interval
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 
 ERROR = quantities(Limits())["mean_deg"]
 probabilities = st.lists(st.floats(0, 1), min_size=1, max_size=6)

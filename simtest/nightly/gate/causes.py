@@ -8,8 +8,8 @@ from simtest.errors import FAULTS
 from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE
 from simtest.nightly.gate.single_results import SINGLE
 from simtest.nightly.records import CELL, POOLED, NightlyRun, to_explain
+from simtest.validation.columns import BUDGET_COLUMNS
 from simtest.validation.faults import fault_sentences, faults_of
-from simtest.validation.results_table import BUDGET_COLUMNS
 
 MOST = 8
 """Sentences at most; what else was found is counted in one more."""

@@ -27,7 +27,7 @@ from simtest.nightly.gate.quantities import (
 )
 from simtest.nightly.gate.single_results import moved
 from simtest.nightly.records import CELL, COMPARISONS, POOLED, Cell, NightlyRun, RunRecord, Verdict, to_explain
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 
 DEFAULTS = Limits()
 

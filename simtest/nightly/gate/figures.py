@@ -10,7 +10,7 @@ from simtest.conventions import MOTION_COLUMNS, ON_INSTRUMENT
 from simtest.nightly.gate.quantities import COVERED, IS_TRUE, RATIO_OFF
 from simtest.nightly.records import CELL, Cell, Figure, figure_table
 from simtest.runtime.statistics import mean_interval, share_interval
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 from simtest.validation.statistics import figures, units
 
 DIGEST_KEYS = ("realisation", "true_id", "specularity", "seed")
@@ -38,7 +38,7 @@ def setting_figures(rows: pl.DataFrame, frames: Frames | None = None) -> pl.Data
     Parameters
     ----------
     rows : polars.DataFrame
-        Columns of `simtest.validation.results_table.SCHEMA`.
+        Columns of `simtest.validation.columns.SCHEMA`.
     frames : mapping, optional
         How many frames were taken. Without it frames without a row, in which nothing is found and nothing is isolated,
         are not known, and false detections are divided by those that have one.

@@ -9,7 +9,7 @@ from simtest.conventions import MOTION, ON_INSTRUMENT
 from simtest.nightly.gate.limits import Limits
 from simtest.nightly.records import CELL
 from simtest.runtime.statistics import CONFIDENCE
-from simtest.validation.results_table import BUDGET_COLUMNS
+from simtest.validation.columns import BUDGET_COLUMNS
 from simtest.validation.row_kinds import is_false
 from simtest.validation.statistics import PENALTY_DEG
 
