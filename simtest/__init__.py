@@ -23,7 +23,6 @@ Public names are loaded at first use; importing the package loads neither the re
 
 from typing import TYPE_CHECKING, Any
 
-from simtest import _renamed
 from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
@@ -88,8 +87,6 @@ __all__ = [
     "save_camera",
     "validate",
 ]
-
-_renamed.install()
 
 
 def __getattr__(name: str) -> Any:

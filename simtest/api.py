@@ -44,6 +44,8 @@ __all__ = [
     "validate",
 ]
 
+MOST_VIEWS = 1000
+
 TRIES = 10
 """Viewpoints that are tried for each view wanted."""
 
@@ -188,7 +190,7 @@ def sample_views(
     from simtest.simulation.view_folder import sample_into
     from simtest.simulation.viewpoints import along_path, candidates
 
-    check_count("views", count, "count")
+    check_count(count, "count", MOST_VIEWS)
     described = _scene(scene, settings, {})
     viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     if along is None and (fps is not None or labels):

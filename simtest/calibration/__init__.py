@@ -5,7 +5,7 @@ holds what is known of lights, distance, lobe, camera and relief, and what is as
 (`distributions`).
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from simtest.runtime.lazy_names import lazy_names
 
@@ -45,7 +45,7 @@ _HOMES = {
         "srgb_encode",
     ),
 }
-_named, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)
 
 __all__ = [
     "LIGHT_AT_CAMERA",
@@ -66,30 +66,3 @@ __all__ = [
     "srgb_decode",
     "srgb_encode",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    if name != "Known":
-        return _named(name)
-    import warnings
-
-    warnings.warn(
-        "simtest.calibration.Known is now simtest.calibration.Priors; the old name goes in 0.3.0",
-        DeprecationWarning,
-        2,
-    )
-    return _known
-
-
-def _known(
-    lights_mm: tuple[tuple[float, float, float], ...] = (),
-    distance_mm: float | None = None,
-    distance_sd_mm: float = 0.0,
-    lobe_curvature: float | None = None,
-) -> "Priors":
-    """Return the priors of bare numbers, as `Known` took them."""
-    from simtest.calibration.distributions import Normal, exactly
-    from simtest.calibration.priors import Priors
-
-    distance = None if distance_mm is None else Normal(distance_mm, distance_sd_mm)
-    return Priors(lights_mm, distance, None if lobe_curvature is None else exactly(lobe_curvature))

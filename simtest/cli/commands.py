@@ -35,11 +35,13 @@ COMMANDS = {
     "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
     "bench": "Run the frozen benchmark, make a table of its certificates.",
     "dataset": "Make a labelled dataset for learning, check it, look at it.",
-    "train": "Train a network on a dataset.",
     "camera": "Show what a camera file means, or convert it to another program's format.",
     "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",
     "completion": "Print or install the completion of commands, options and names for a shell.",
 }
+GONE = {"train": "train in PyTorch on simtest.dataset.learn.Samples (examples/11_train_a_network.py)"}
+"""Commands that are gone, and what takes their place."""
+
 _MODULES = {"list": "listing"}
 """Where a command's name is not its module's; `list` would hide Python's own."""
 

@@ -39,7 +39,7 @@ def make(
     ----------
     described : str
         A dataset file, or the name of a shipped one: endoscopy, highlights, highlights_smooth,
-        highlights_tiny, learning, smooth, tiny.
+        highlights_tiny, smooth, tiny.
     """
     from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar

@@ -11,14 +11,14 @@ from simtest.errors import InputError
 
 MapEncoding = Annotated[
     str | None,
-    Parameter(help="Maps: how values hold a component: components, unit, centred or positive_z; default found out."),
+    Parameter(help="Maps: how values hold a component: components, unit, centred or positive_z; integers: unit."),
 ]
 MapFrame = Annotated[
     str | None,
-    Parameter(help="Maps: axes of the channels: opencv, opengl, directx, or such as x,-y,-z; default found out."),
+    Parameter(help="Maps: axes of the channels: opencv (default), opengl, directx, or such as x,-y,-z."),
 ]
 MapDepth = Annotated[
-    str | None, Parameter(help="Maps: depths are along the axis (z) or the pixel's ray (ray); default found out.")
+    str | None, Parameter(help="Maps: depths are along the axis (z, default) or the pixel's ray (ray).")
 ]
 MapUnit = Annotated[
     float | None, Parameter(help="Maps: mm of one unit of the depths; integers need it. Default 1 for floats.")
@@ -47,7 +47,7 @@ def score_dense(
     maps: Path, on: Path, out: Path | None, name: str | None, encoding: str | None, frame: str | None,
     depth: str | None, unit_mm: float | None, as_json: bool,
 ) -> None:  # fmt: skip
-    """Score maps, print what was found out and the figures by zone, and name the page."""
+    """Score maps, print how they were read and the figures by zone, and name the page."""
     from simtest.cli.printing import print_files, print_lines, print_table
     from simtest.cli.progress import progress_bar
     from simtest.dataset.scoring.dense import MapOptions, score_maps

@@ -45,13 +45,13 @@ def fit(
     from simtest.realism.fitting.fit import fit as fitted_to
     from simtest.realism.fitting.outcome import check_out, report_json, write_fit
     from simtest.realism.fitting.parameters import one_family
-    from simtest.realism.frame_sets import open_frames
+    from simtest.realism.frame_sets import MOST_GENERATED, open_frames
     from simtest.runtime.limits import check_count
     from simtest.runtime.locks import exclusive_file, exclusive_folder
     from simtest.spec.dataset_recipe import load_dataset
 
     check_out(out)
-    check_count("generated_frames", size, "--size")
+    check_count(size, "--size", MOST_GENERATED)
     dataset = one_family(load_dataset(recipe), scene)
     opened, kept = open_frames(frames), bank or out.with_suffix(".bank")
     with exclusive_file(out), exclusive_folder(kept, "--bank"):

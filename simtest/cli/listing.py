@@ -7,15 +7,12 @@ from simtest.cli.manners import MANNERS
 from simtest.cli.options import AsJson
 from simtest.cli.printing import print_json
 
-Kind = Literal[
-    "scenes", "experiments", "datasets", "trainings", "profiles", "estimators", "detectors", "sensors", "rigs"
-]
+Kind = Literal["scenes", "experiments", "datasets", "profiles", "estimators", "detectors", "sensors", "rigs"]
 
 HEADINGS = {
     "scenes": "for render, views, view, export",
     "experiments": "for validate",
     "datasets": "for dataset, fit --recipe",
-    "trainings": "for train",
     "profiles": "for nightly --profile",
     "estimators": "for --estimator",
     "detectors": "for reconstruct --detector",

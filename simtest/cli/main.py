@@ -45,7 +45,7 @@ def _run(stop: Termination) -> int:  # noqa: C901 - a branch for each way in whi
 
     from cyclopts import CycloptsError, MissingArgumentError, UnknownOptionError
 
-    from simtest.cli.commands import APP
+    from simtest.cli.commands import APP, GONE
     from simtest.cli.options import gather_settings
     from simtest.errors import InputError, SimtestError
 
@@ -57,6 +57,8 @@ def _run(stop: Termination) -> int:  # noqa: C901 - a branch for each way in whi
     try:
         with stop.working():
             _require_folder()
+            if words and words[0] in GONE:
+                raise InputError(f"{words[0]}: is gone; {GONE[words[0]]}")
             if MANNERS.quiet and MANNERS.verbose:
                 raise InputError("--quiet and --verbose exclude each other; give one of them")
             # A command's result is its exit code.

@@ -14,7 +14,6 @@ from simtest.errors import InputError
 from simtest.estimators.process.naming import core_hashes, short_name
 from simtest.runtime import provenance
 from simtest.runtime.files import write_json
-from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import shown
 from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.spec_model import validate
@@ -121,10 +120,7 @@ def read_manifest(folder: Path) -> Manifest:
         # A pipe or a device might never end.
         if not path.is_file() and path.exists():
             raise ManifestError(f"{NAME}: is no plain file")
-        check_limit("manifest_bytes", path.stat().st_size, NAME, "bytes")
         content = json.loads(path.read_bytes())
-    except InputError as error:
-        raise ManifestError(str(error)) from None
     except FileNotFoundError:
         raise ManifestError(f"{NAME}: missing") from None
     except OSError as error:

@@ -10,6 +10,7 @@ import numpy as np
 from simtest.calibration import Frame, Priors
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.covariance_scale import CovarianceScale
+from simtest.estimators.onnx_model import OnnxModel
 from simtest.estimators.protocol import Estimate, Target
 from simtest.estimators.spot_inputs import (
     EXTRAS,
@@ -22,12 +23,11 @@ from simtest.estimators.spot_inputs import (
     rays_of,
     spot_inputs,
 )
+from simtest.estimators.training_range import TrainingRange, inflation, read_usual
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
-from simtest.runtime.onnx_model import OnnxModel
 from simtest.runtime.resources import data_root, shown
-from simtest.runtime.training_range import TrainingRange, inflation, read_usual
 
 FORMAT = "simtest spot_normals, version 3"
 
@@ -48,7 +48,7 @@ def log_deviation(outputs: Array) -> Array:
 
 @dataclass(frozen=True)
 class LearnedSpot:
-    """A network of the task ``spot_normals`` (`simtest train`) as an estimator.
+    """A network that states the normal at one highlight (`studies.networks.spots`) as an estimator.
 
     It sees three crops around each highlight and the lights' positions, and answers for each detection on its own. It
     refuses with ``no_estimate`` what lies outside the range that it was taught: another focal length, a lens with

@@ -1,50 +1,26 @@
 """Estimators by name: those of packages (entry-point group ``simtest.estimators``), and those of the user's own."""
 
-import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from simtest.calibration import Priors
-from simtest.errors import Failure, InputError
+from simtest.errors import InputError
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
-from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
-from simtest.geometry import Camera, Patch
+from simtest.estimators.protocol import AnyEstimator, Estimator, FrameEstimator
 from simtest.runtime.model_names import SUFFIX, parse_model
 from simtest.runtime.resources import shown
 
 
-@dataclass(frozen=True)
-class PlainCallable:
-    """A function of patch and camera, the old form of an estimator, which this release still accepts."""
-
-    function: Callable[[Patch, Camera], Estimate | Failure]
-
-    def estimate(self, patch: Patch, camera: Camera, _priors: Priors, /) -> Estimate | Failure:
-        """Call the function."""
-        return self.function(patch, camera)
-
-
 def as_estimator(name: str, given: object) -> AnyEstimator:
-    """Return an object as an estimator; a plain callable is wrapped, with a DeprecationWarning.
-
-    Raises
-    ------
-    InputError
-        If it is neither an estimator nor callable, or a class where an instance is meant.
-    """
+    """Return an object as an estimator; raise `InputError` if it is none, or a class where an instance is meant."""
     if isinstance(given, type):
         raise InputError(f"estimator {name!r}: {given.__qualname__} is a class; must be an instance of it")
     if isinstance(given, Estimator | FrameEstimator):
         return given
-    if not callable(given):
-        raise InputError(f"estimator {name!r}: {given!r} is not callable and has neither estimate nor estimate_frame")
-    warnings.warn(
-        f"estimator {name!r} is a plain callable, which 0.3.0 refuses: give it a method "
-        "estimate(patch, camera, priors)", DeprecationWarning, stacklevel=3,
-    )  # fmt: skip
-    return PlainCallable(given)
+    raise InputError(
+        f"estimator {name!r}: {shown(repr(given), 80)} has neither estimate(patch, camera, priors) nor "
+        "estimate_frame(frame, camera, priors)"
+    )
 
 
 def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[str, AnyEstimator]:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
+MOST_GENERATED = 10_000
+
 FILM_FRAMES = 20
 """Frames of one film that are measured, evenly spread: neighbours are nearly the same picture."""
 
@@ -110,7 +112,7 @@ def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> li
     InputError
         If there is nothing to open, `count` is below 1, or surfaces are named where they cannot be told apart.
     """
-    check_count("generated_frames", count, "--count")
+    check_count(count, "--count", MOST_GENERATED)
     if not against.strip():
         raise InputError("--against is empty; must be a dataset's folder, a folder of pictures, or a scene")
     path = Path(against)

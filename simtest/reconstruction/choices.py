@@ -10,7 +10,6 @@ from simtest.calibration import Calibration, Priors, Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.detection.colour import ColourDetector
 from simtest.detection.detector import Detector, load_detector
-from simtest.detection.learned_detector import LearnedDetector
 from simtest.detection.peaks import PeakDetector
 from simtest.errors import InputError
 from simtest.reconstruction.assumptions import Assumption
@@ -111,17 +110,16 @@ def choose_detector(
     if isinstance(found, ColourDetector) and (picture.ndim != 3 or picture.shape[2] != 3):
         raise InputError(f"detector {name}: the picture is grey; must be peaks")
     # A detector that is given, or another package's, decides by itself what it takes.
-    if isinstance(told, str) and isinstance(found, ColourDetector | PeakDetector | LearnedDetector):
-        # The same object where it fits, which keeps a network that was read.
-        found = found if found.isolated == isolated else replace(found, isolated=isolated)
+    if isinstance(told, str) and isinstance(found, ColourDetector | PeakDetector):
+        found = replace(found, isolated=isolated)
     return name, found
 
 
 def choose_smoothing(told: float | None, finder: Detector) -> float:
-    """Return the smoothing, px: the given one, or else 1 px by colour or a network, and 2 px by other detectors."""
+    """Return the smoothing, px: the given one, or else 1 px by colour and 2 px by other detectors."""
     if told is not None:
         return told
-    return SMOOTHING_BY_COLOUR_PX if isinstance(finder, ColourDetector | LearnedDetector) else DEFAULT_SMOOTHING_PX
+    return SMOOTHING_BY_COLOUR_PX if isinstance(finder, ColourDetector) else DEFAULT_SMOOTHING_PX
 
 
 def untold(calibration: Calibration, **told: object) -> tuple[str, ...]:

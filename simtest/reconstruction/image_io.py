@@ -229,7 +229,7 @@ def open_source(path: Path) -> Source:
         if not files:
             raise InputError(f"{shown(path)}: holds no pictures ({', '.join(PICTURE_SUFFIXES)})")
         return Source(path, len(files), tuple(sorted(files, key=_natural)))
-    size = check_file(path, "film_bytes", "a film, a picture or a folder of pictures")
+    size = check_file(path, None, "a film, a picture or a folder of pictures")
     # FFmpeg takes whatever it can make sense of, playlists of other files among it.
     with path.open("rb") as file:
         head = file.read(16)

@@ -1,6 +1,6 @@
 """Limits of inputs, in one place: beyond them an input is refused before time or memory is spent on it.
 
-The environment variable SIMTEST_LIMITS replaces limits by name: ``SIMTEST_LIMITS="picture_pixels=1e8,settings=50000"``.
+The environment variable SIMTEST_LIMITS replaces limits by name: ``SIMTEST_LIMITS="picture_pixels=1e8,mesh_faces=1e7"``.
 The ranges of single values (a width, an exponent) stand in the schemas and are fixed.
 """
 
@@ -17,12 +17,9 @@ VARIABLE = "SIMTEST_LIMITS"
 DEFAULTS = {
     # files, bytes
     "text_bytes": 1_000_000,  # TOML, YAML, XML, JSON
-    "matlab_bytes": 50_000_000,
-    "picture_bytes": 250_000_000,
-    "film_bytes": 100_000_000_000,  # read frame by frame: hours of lossless video
-    "mesh_bytes": 1_500_000_000,  # five million faces: an STL of text takes about 250 bytes a face, others less
-    "manifest_bytes": 100_000_000,
     "record_bytes": 20_000_000,  # JSON that a run has written
+    "picture_bytes": 250_000_000,
+    "mesh_bytes": 1_500_000_000,  # five million faces: an STL of text takes about 250 bytes a face, others less
     # pictures and frames, px
     "picture_pixels": 50_000_000,  # 8K has 33 million; a picture that is read takes 26 bytes a pixel and more
     "picture_side": 16_384,
@@ -30,14 +27,6 @@ DEFAULTS = {
     "frame_samples": 4_000_000_000,  # rays of one rendered frame: pixels times samples
     # meshes
     "mesh_faces": 5_000_000,
-    # experiments
-    "sweep_values": 20_000,  # of one list of a sweep or pool
-    "settings": 10_000,  # of one experiment, pooled ones counted singly
-    "realisations": 10_000_000,  # of one experiment, over all settings
-    # work
-    "workers": 256,
-    "views": 1000,
-    "generated_frames": 10_000,  # that realism takes or fit renders
 }
 
 
@@ -70,22 +59,11 @@ def check_limit(name: str, value: float, where: object, unit: str, hint: str = "
         )
 
 
-def check_count(name: str, value: object, where: str) -> None:
-    """Raise `InputError` unless a value is a whole number from 1 to a limit.
-
-    Parameters
-    ----------
-    name : str
-        Of the limit.
-    value : object
-        To be checked.
-    where : str
-        Key or option, for the message.
-    """
-    most = limit(name)
+def check_count(value: object, where: str, most: int) -> None:
+    """Raise `InputError` unless a value is a whole number from 1 to the largest one; `where` names its key."""
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
         joined = f"{where} {value!r}" if where.startswith("--") else f"{where} = {value!r}"
-        raise InputError(f"{joined}: must be 1 to {most} ({VARIABLE}={name}=N sets another limit)")
+        raise InputError(f"{joined}: must be 1 to {most}")
 
 
 def check_picture_size(path: Path, width: int, height: int) -> None:
@@ -94,15 +72,15 @@ def check_picture_size(path: Path, width: int, height: int) -> None:
     check_limit("picture_pixels", width * height, f"{path}: {width} x {height} px", "px")
 
 
-def check_file(path: Path, name: str, wanted: str, hint: str = "") -> int:
+def check_file(path: Path, name: str | None, wanted: str, hint: str = "") -> int:
     """Check that a path is a plain file within a limit, without opening it, and return its size in bytes.
 
     Parameters
     ----------
     path : Path
         To be read next. A pipe or a device has no size and might never end.
-    name : str
-        Of the limit, bytes.
+    name : str or None
+        Of the limit, bytes, if there is one.
     wanted : str
         What the file should be, for messages, such as "a picture".
     hint : str
@@ -123,7 +101,8 @@ def check_file(path: Path, name: str, wanted: str, hint: str = "") -> int:
         raise InputError(f"{where}: cannot be read ({reason})") from error
     if not stat.S_ISREG(found.st_mode):
         raise InputError(f"{where}: is {kind_of(path)}; must be {wanted}")
-    check_limit(name, found.st_size, path, "bytes", hint)
+    if name is not None:
+        check_limit(name, found.st_size, path, "bytes", hint)
     return found.st_size
 
 

@@ -12,7 +12,6 @@ FOLDERS = {
     "scenes": "",
     "experiments": "experiments",
     "datasets": "datasets",
-    "trainings": "learning",
     "profiles": "profiles",
 }
 """Kinds of shipped files, and their folders below scenes/."""

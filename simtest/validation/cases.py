@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from simtest.conventions import MOTION_COLUMNS, ON_INSTRUMENT
 from simtest.errors import InputError
 from simtest.runtime.files import Json
-from simtest.runtime.limits import check_limit
 from simtest.runtime.resources import find, shown
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, apply_settings, read_toml, scene_from_dict
@@ -24,6 +23,9 @@ if TYPE_CHECKING:
     from simtest.validation.results_table import Value
 
 RELIEF_SEED = "surface.relief.seed"
+
+MOST = {"values": 20_000, "settings": 10_000, "realisations": 10_000_000}
+"""Of one list of a sweep or pool; of an experiment, pooled settings counted singly; of one, over all settings."""
 
 Tables = dict[str, Any]
 """A scene's tables, as read from TOML."""
@@ -199,12 +201,17 @@ def check_effort(experiment: Experiment) -> None:
         for kind, tables in (("sweep", group.sweep), ("pool", group.pool)):
             for table in tables:
                 key, values = next(iter(table.items()))
-                check_limit("sweep_values", len(values), f"{where}.{kind}: {shown(key, 60)}", "values")
+                _check_most(len(values), "values", f"{where}.{kind}: {shown(key, 60)}")
                 count *= len(values)
         settings += count
         realisations += count * (experiment.realisations if group.realisations is None else group.realisations)
-        check_limit("settings", settings, f"{where}", "settings, up to this group")
-        check_limit("realisations", realisations, f"{where}", "realisations, up to this group")
+        _check_most(settings, "settings", where, ", up to this group")
+        _check_most(realisations, "realisations", where, ", up to this group")
+
+
+def _check_most(value: int, what: str, where: str, counted: str = "") -> None:
+    if value > MOST[what]:
+        raise InputError(f"{where}: {value} {what}{counted}; at most {MOST[what]} are allowed")
 
 
 def _check(case: Case, experiment: Experiment, recipes: set[str]) -> None:

@@ -1,10 +1,8 @@
 """Notebook manners: short texts, HTML with pictures, overrides by the last name of a key, results of runs."""
 
-import copy
 import json
 import os
 import re
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -263,20 +261,6 @@ def test_results_of_a_run_are_read_when_asked(tmp_path):
     html = run._repr_html_()
     assert "0.25" in html
     assert "and 28 more settings" in html
-
-
-def test_results_of_a_run_still_do_what_the_path_of_the_page_did(tmp_path):
-    (tmp_path / "index.html").write_text("page")
-    run = RunResults(tmp_path / "index.html")
-    with pytest.warns(DeprecationWarning, match=r"RunResults.read_text is deprecated and goes in 0.3.0; use .page"):
-        assert run.read_text() == "page"
-    with pytest.warns(DeprecationWarning, match=r"use .page.parent"):
-        assert run.parent == tmp_path
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert copy.copy(run) == run
-        assert not hasattr(run, "_ipython_display_")
-        assert not hasattr(run, "results_of")
 
 
 @pytest.mark.slow

@@ -79,7 +79,7 @@ def test_a_setting_replaces_what_it_excludes_of_a_group_too():
     # What lies below such a key goes as well.
     cases = expand(load_experiment("known_light", {"rig.preset": "laparoscope"}))
     assert {len(scene_from_dict(case.data).rig.lights) for case in cases} == {8}
-    families = load_dataset("learning", {"camera.fov_deg": 90.0}).families
+    families = load_dataset("tiny", {"camera.fov_deg": 90.0}).families
     assert all("camera.fx" not in family.set and "camera.width" in family.set for family in families)
 
 

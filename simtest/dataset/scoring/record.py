@@ -194,7 +194,7 @@ def read_record(folder: Path) -> Record:
         f"give simtest dataset export {shown(folder)} --out DIR"
     )  # fmt: skip
     try:
-        text = require_plain(path, "manifest_bytes").read_bytes()
+        text = require_plain(path).read_bytes()
     except OSError as error:
         raise InputError(
             f"{shown(path)}: {error.strerror or 'cannot be read'}; nothing was exported: {again}"

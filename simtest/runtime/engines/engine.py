@@ -14,6 +14,8 @@ Task = Callable[[Any, OnStep], Any]
 
 ENGINES = ("local", "ray")
 
+MOST_WORKERS = 256
+
 MAX_DEATHS = 8
 """After this many processes died during the same task the run fails: the fault is the task's."""
 
@@ -47,7 +49,7 @@ class Engine(Protocol):
 
 def check_workers(workers: int) -> None:
     """Raise `InputError` if a number of workers is out of range."""
-    check_count("workers", workers, "workers")
+    check_count(workers, "workers", MOST_WORKERS)
 
 
 def make_engine(

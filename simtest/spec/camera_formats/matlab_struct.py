@@ -43,7 +43,7 @@ def read_struct(path: Path) -> Mapping[str, Any]:
         If memory, or the disk of temporary files, does not hold it.
     """
     try:
-        check_file(path, "matlab_bytes", "a .mat file")
+        check_file(path, None, "a .mat file")
         with path.open("rb") as file:
             file.read(1)
     except OSError as error:

@@ -16,7 +16,7 @@ from simtest.runtime.resources import data_root
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """Return the shipped network's copy as `simtest train --out models/spots` would leave one."""
+    """Return the shipped network's copy in a folder of its own."""
     (tmp_path / "models" / "spots").mkdir(parents=True)
     shutil.copy(data_root("scenes").joinpath(*SHIPPED), tmp_path / "models" / "spots" / "model.onnx")
     monkeypatch.chdir(tmp_path)

@@ -1,6 +1,6 @@
 """The dense track: maps of normals or depths, a pixel each, scored against the truth of a run or a dataset.
 
-`map_files` reads maps, `axes` and `depth` judge what their values mean, `conventions` decides it over all frames,
+`map_files` reads maps, `conventions` says what their values mean, `depth` aligns depths,
 `zones` and `cells` sort pixels, `tally` makes figures, `scorer` scores a frame, `score` all of them, `page`
 writes the page.
 `methods` holds what answers maps: a folder, or the baseline `shading`.

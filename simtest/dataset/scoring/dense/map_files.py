@@ -189,11 +189,6 @@ def channel_vectors(raw: RawMap, encoding: Encoding) -> Array:
     return vectors
 
 
-def candidates(raw: RawMap) -> tuple[Encoding, ...]:
-    """Return the encodings among which the length of the vectors decides, where none is stated."""
-    return ("unit", "positive_z") if raw.is_encoded else ("components", "unit")
-
-
 def length_error(vectors: Array) -> float:
     """Return how far channel vectors, shape (..., 3), are from length 1, in the mean; inf without any."""
     off = np.abs(np.linalg.norm(vectors, axis=-1) - 1)

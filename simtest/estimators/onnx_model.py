@@ -22,7 +22,7 @@ LARGEST_MODEL_BYTES = 256 * 2**20
 
 
 class OnnxModel:
-    """A network of `simtest train` in ONNX Runtime, on one thread of the processor.
+    """A trained network in ONNX Runtime, on one thread of the processor.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class OnnxModel:
             import onnxruntime
         except ImportError:
             raise InputError(f"{core} needs the package onnxruntime: install the extra onnx") from None
-        self._path, self._form = path, form
+        self._path, self._form, self._core = path, form, core
         data = _bytes(path)
         options = onnxruntime.SessionOptions()
         # The harness divides the cores among its workers.
@@ -74,7 +74,7 @@ class OnnxModel:
             yield
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
             raise InputError(
-                f"{shown(self._path)}: is no network of simtest train ({type(error).__name__}: {shown(error, 80)}); "
+                f"{shown(self._path)}: is no network for {self._core} ({type(error).__name__}: {shown(error, 80)}); "
                 f"its metadata must hold {METADATA!r} of the form {self._form!r}"
             ) from None
 

@@ -1,4 +1,4 @@
-"""Task `spot_normals`: normal and axis ratio of base and fine surface at one highlight, each with its uncertainty."""
+"""Recipe of `learned_spot`: normals and axis ratios at one highlight, each with its uncertainty."""
 
 import itertools
 from pathlib import Path
@@ -7,18 +7,31 @@ import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
-from simtest.dataset.learn import likelihood
-from simtest.dataset.learn.likelihood import number_loss, pair_loss
-from simtest.dataset.learn.spots import Spots, read_spots
-from simtest.dataset.learn.tasks import Batch
-from simtest.dataset.learn.training import Training
-from simtest.estimators.spot_inputs import EXTRAS, OUTPUTS, ROTATION_SCALE, SIDE, STEPS, SURFACES
+from simtest.estimators.covariance_scale import CovarianceScale
+from simtest.estimators.learned_spot import FORMAT, log_deviation
+from simtest.estimators.spot_inputs import (
+    EXTRAS,
+    LOG_RANGE,
+    OUTPUTS,
+    RATIO,
+    RATIO_DEVIATION,
+    ROTATION_SCALE,
+    SIDE,
+    STEPS,
+    SURFACES,
+)
+from simtest.estimators.training_range import inflation
+from simtest.runtime.arrays import Array
+from simtest.runtime.files import JsonObject
 from simtest.validation.runner import Progress
+from studies.networks import fitted
+from studies.networks.examples import Examples, read_spots
+from studies.networks.fitted import USUAL, fitted_range, fitted_scale, number_loss, pair_loss
+from studies.networks.onnx_file import export
+from studies.networks.training import Batch, Recipe
 
-VECTORS = ((1, 2), (3, 4))
-"""Columns of the extras that turn with the picture, and below those of a symmetric matrix."""
-
-MATRIX = (6, 7, 8)
+VECTORS, MATRIX = ((1, 2), (3, 4)), (6, 7, 8)
+"""Columns of the extras that turn with the picture, and those of a symmetric matrix."""
 
 RATIO_WEIGHT = 0.3
 
@@ -52,30 +65,30 @@ class SpotNetwork(nn.Module):
 
 
 class SpotNormals:
-    """The task (see `simtest.dataset.learn.tasks.Task`)."""
+    """The task (see `studies.networks.training.Task`)."""
 
-    name = "spot_normals"
+    recipe = Recipe("Normals from the crops of a highlight", "spot_normals")
     evaluated_at_once = 1024
+    bits = 16
 
-    def examples(self, folder: Path, split: str, progress: Progress | None = None) -> Batch:
+    def examples(self, folder: Path, split: str, progress: Progress | None = None) -> Examples:
         """Read the examples of a split."""
-        return batch_of(read_spots(folder, split, progress=progress))
+        return read_spots(folder, split, progress=progress)
 
     def augmented(self, batch: Batch, generator: Generator) -> Batch:
         """Return the batch mirrored and turned by right angles: what it shows is as likely."""
-        flip_x, flip_y, transpose = (bool(v) for v in torch.randint(2, (3,), generator=generator))
-        return moved(batch, flip_x, flip_y, transpose)
+        return moved(batch, *(bool(v) for v in torch.randint(2, (3,), generator=generator)))
 
-    def network(self, examples: Batch, training: Training) -> nn.Module:
+    def network(self, taught: Batch, width: float) -> nn.Module:
         """Return a fresh network with the scales of the examples' extras."""
-        extras = examples["extras"]
+        extras = taught["extras"]
         mean, spread = extras.mean(dim=0), extras.std(dim=0) + 1e-3
         # Components along x and y are drawn alike, since the examples are turned.
         for columns in (*VECTORS, (6, 8)):
             mean[list(columns)] = 0.0 if columns in VECTORS else mean[list(columns)].mean()
             spread[list(columns)] = spread[list(columns)].max()
         mean[7] = 0.0
-        return SpotNetwork(mean, spread, training.width)
+        return SpotNetwork(mean, spread, width)
 
     def loss(self, network: nn.Module, batch: Batch) -> Tensor:
         """Return the mean negative log-likelihood of the rotations and axis ratios that are known."""
@@ -86,9 +99,9 @@ class SpotNormals:
             known = torch.isfinite(rotation[:, 0])
             if not known.any():
                 continue
-            made = outputs[known, number].float()
-            of_rotation = _rotation_loss(made, rotation[known])
-            of_ratio = _ratio_loss(made, ratio[known])
+            made = outputs[known, number]
+            of_rotation = pair_loss(made, rotation[known] / ROTATION_SCALE)
+            of_ratio = number_loss(torch.sigmoid(made[:, RATIO]), made[:, RATIO_DEVIATION], ratio[known])
             total = total + (of_rotation + RATIO_WEIGHT * of_ratio).sum() / len(rotation)
         return total
 
@@ -97,29 +110,23 @@ class SpotNormals:
         outputs, _ = network(batch["crops"], batch["extras"])
         found: dict[str, float] = {}
         for number, surface in enumerate(SURFACES):
-            truth, made = batch[surface].cpu().numpy(), outputs[:, number].float().cpu().numpy()
+            truth, made = batch[surface].numpy(), outputs[:, number].numpy()
             known = np.isfinite(truth[:, 0])
             if not known.any():
                 continue
             off = made[known, :2] * ROTATION_SCALE - truth[known]
-            gone = np.abs(1 / (1 + np.exp(-made[known, 5])) - batch[f"{surface}_ratio"].cpu().numpy()[known])
+            gone = np.abs(1 / (1 + np.exp(-made[known, RATIO])) - batch[f"{surface}_ratio"].numpy()[known])
             found[f"{surface}: median error of the normal, deg"] = float(
                 np.degrees(np.median(np.linalg.norm(off, axis=1)))
             )
             found[f"{surface}: median error of the axis ratio"] = float(np.nanmedian(gone))
         return found
 
-    def finish(self, network: nn.Module, taught: Batch, judged: Batch, out: Path, about: dict[str, str]) -> list[Path]:
-        """Write model.onnx for `simtest.estimators.learned_spot`; covariances are scaled on the validation split."""
-        from simtest.dataset.learn.spot_export import export_spots
-
-        return [export_spots(network, taught, judged, out, about)]
-
-
-def batch_of(spots: Spots) -> Batch:
-    """Return highlights as tensors."""
-    names = ("crops", "extras", *SURFACES, *(f"{surface}_ratio" for surface in SURFACES))
-    return {name: torch.from_numpy(np.ascontiguousarray(getattr(spots, name), dtype=np.float32)) for name in names}
+    def export(self, network: nn.Module, taught: Batch, judged: Batch, path: Path, about: JsonObject) -> Path:
+        """Write the file; covariances are scaled, and the range of the features taken, on the validation split."""
+        content = {"format": FORMAT, **_calibration(network, taught, judged), "about": about}
+        inputs = {name: taught[name][:2] for name in ("crops", "extras")}
+        return export(network, inputs, ("outputs", "features"), content, path)
 
 
 def moved(batch: Batch, flip_x: bool, flip_y: bool, transpose: bool) -> Batch:
@@ -143,16 +150,33 @@ def moved(batch: Batch, flip_x: bool, flip_y: bool, transpose: bool) -> Batch:
     return {**batch, "crops": crops, "extras": extras, **dict(zip(SURFACES, pairs[len(VECTORS) :], strict=True))}
 
 
-def _rotation_loss(made: Tensor, rotation: Tensor) -> Tensor:
-    """Return the negative log-likelihood of rotations, rad, under a normal distribution, shape (N,)."""
-    return pair_loss(made, rotation / ROTATION_SCALE)
-
-
 def squared_distance(made: Tensor, rotation: Tensor) -> Tensor:
     """Return the squared Mahalanobis distance of rotations, rad, from outputs of one surface, shape (N,)."""
-    return likelihood.squared_distance(made, rotation / ROTATION_SCALE)
+    return fitted.squared_distance(made, rotation / ROTATION_SCALE)
 
 
-def _ratio_loss(made: Tensor, ratio: Tensor) -> Tensor:
-    """Return the negative log-likelihood of axis ratios, shape (N,); 0 where none is known."""
-    return number_loss(torch.sigmoid(made[:, 5]), made[:, 6], ratio)
+def _calibration(network: nn.Module, taught: Batch, judged: Batch) -> JsonObject:
+    """Return the covariances' scales, the ranges of the extras, and the distribution of the features."""
+    with torch.no_grad():
+        outputs, features = network(judged["crops"], judged["extras"])
+        own = network(taught["crops"], taught["extras"])[1]
+    taught_range = fitted_range(EXTRAS, taught["extras"].numpy(), own.numpy(), features.numpy())
+    distances = taught_range.distances(features.numpy())
+    usual = float(np.quantile(distances, USUAL))
+    inflated = inflation(distances, usual)
+    scales, ratio_scales = {}, {}
+    for number, surface in enumerate(SURFACES):
+        known = torch.isfinite(judged[surface][:, 0])
+        made = outputs[known, number]
+        gaps = squared_distance(made, judged[surface][known]).double().numpy() / inflated[known.numpy()]
+        scales[surface] = fitted_scale(gaps, log_deviation(made.double().numpy())).written()
+        ratio_scales[surface] = _ratio_scale(outputs[:, number], judged[f"{surface}_ratio"], inflated).written()
+    return {"scales": scales, "ratio_scales": ratio_scales, "feature_usual": usual, **taught_range.written()}
+
+
+def _ratio_scale(made: Tensor, ratio: Tensor, inflated: Array) -> CovarianceScale:
+    """Return the factor of the axis ratio's variance, where the ratio is known."""
+    known = torch.isfinite(ratio)
+    sure = made[known, RATIO_DEVIATION].clamp(*LOG_RANGE)
+    off = (ratio[known] - torch.sigmoid(made[known, RATIO])) * torch.exp(-sure)
+    return fitted_scale((off * off).double().numpy() / inflated[known.numpy()], sure.double().numpy(), dimensions=1)

@@ -1,18 +1,44 @@
-"""Task `dense_normals`: the base's normal and the distance all over a frame, each with its uncertainty."""
+"""Recipe of `learned_dense`: the base's normal and the distance all over a frame, each with its uncertainty."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Generator, Tensor, nn
+from torch.nn import functional
 
-from simtest.dataset.learn.dense_frames import DenseFrames, read_dense_frames
-from simtest.dataset.learn.dense_network import DenseNetwork
-from simtest.dataset.learn.likelihood import number_loss, pair_loss
-from simtest.dataset.learn.tasks import Batch
-from simtest.dataset.learn.training import Training
-from simtest.estimators.dense_inputs import DISTANCE_MM, DISTANCE_SCALE, ROTATION_SCALE, VIEWED
+from simtest.estimators.covariance_scale import CovarianceScale
+from simtest.estimators.dense_inputs import (
+    CAMERA,
+    DISTANCE_MM,
+    DISTANCE_SCALE,
+    OUTPUTS,
+    PLANES,
+    ROTATION_SCALE,
+    VIEWED,
+)
+from simtest.estimators.learned_dense import FORMAT, stated_deviation
+from simtest.estimators.spot_inputs import LOG_RANGE
+from simtest.estimators.training_range import inflation
+from simtest.runtime.arrays import Array
+from simtest.runtime.files import JsonObject
 from simtest.validation.runner import Progress
+from studies.networks.examples import Examples, read_dense_frames
+from studies.networks.fitted import (
+    COVERAGE,
+    USUAL,
+    fitted_range,
+    fitted_scale,
+    number_loss,
+    pair_loss,
+    squared_distance,
+)
+from studies.networks.onnx_file import export
+from studies.networks.training import Batch, Recipe
+
+CHANNELS = (16, 24, 24, 32)
+"""Of each level; the first has half the cells of the planes along each axis, and each next one half of those."""
 
 SEEN, AXIS, LIGHT = VIEWED.index("share seen"), (5, 6), (7, 8)
 """Planes: the share seen, the sightline's x and y, the mean light across the sightline."""
@@ -30,32 +56,72 @@ RELIEF_WEIGHT = 2.0
 single frame hardly tells, and would leave the shape of the distances to chance."""
 
 
+class DenseNetwork(nn.Module):
+    """A U-Net of four levels; what the deepest one sees of the whole frame goes into all its cells.
+
+    Its features are the means, over the frame, of the first level and of the deepest: the one sees noise and texture,
+    the other shape.
+    """
+
+    def __init__(self, mean: Tensor, spread: Tensor, width: float = 1.0) -> None:
+        super().__init__()
+        channels = [max(4, round(width * count)) for count in CHANNELS]
+        self.register_buffer("mean", mean.reshape(1, -1, 1, 1))
+        self.register_buffer("spread", spread.reshape(1, -1, 1, 1))
+        pairs = list(itertools.pairwise([len(PLANES), *channels]))
+        self.down = nn.ModuleList(nn.Sequential(_convolution(a, b, 2), _convolution(b, b)) for a, b in pairs)
+        self.whole = nn.Linear(channels[-1], channels[-1])
+        self.up = nn.ModuleList(_convolution(b + a, a) for a, b in itertools.pairwise(channels))
+        self.heads = nn.Conv2d(channels[0], len(OUTPUTS), 1)
+
+    def forward(self, planes: Tensor) -> tuple[Tensor, Tensor]:
+        """Return outputs, (N, 7, 48, 64), and features of the frame, (N, 48 width), for planes, (N, 10, 96, 128)."""
+        made, skipped = (planes - self.mean) / self.spread, []
+        for level in self.down:
+            made = level(made)
+            skipped.append(made)
+        first, deepest = (each.mean(dim=(2, 3)) for each in (skipped[0], made))
+        made = functional.relu(made + self.whole(deepest)[:, :, None, None])
+        for level, beside in zip(reversed(self.up), reversed(skipped[:-1]), strict=True):
+            made = functional.interpolate(made, scale_factor=2.0, mode="bilinear", align_corners=False)
+            made = level(torch.cat([made, beside], dim=1))
+        return self.heads(made), torch.cat([first, deepest], dim=1)
+
+
+def _convolution(before: int, after: int, stride: int = 1) -> nn.Sequential:
+    """Return a convolution with the normalisation of its outputs."""
+    return nn.Sequential(
+        nn.Conv2d(before, after, 3, stride=stride, padding=1, bias=False), nn.BatchNorm2d(after), nn.ReLU()
+    )
+
+
 class DenseNormals:
-    """The task (see `simtest.dataset.learn.tasks.Task`)."""
+    """The task (see `studies.networks.training.Task`)."""
 
-    name = "dense_normals"
-
+    recipe = Recipe(
+        "Normals and distances all over a frame", "dense_normals", epochs=45, batch=8, learning_rate=3e-3, patience=15
+    )
     evaluated_at_once = 16
-    """Frames of a batch without gradients."""
+    bits = 8
 
-    def examples(self, folder: Path, split: str, progress: Progress | None = None) -> Batch:
+    def examples(self, folder: Path, split: str, progress: Progress | None = None) -> Examples:
         """Read the examples of a split."""
-        return batch_of(read_dense_frames(folder, split, progress))
+        return read_dense_frames(folder, split, progress)
 
     def augmented(self, batch: Batch, generator: Generator) -> Batch:
         """Return the batch mirrored, with other response, falloff, colours, noise and view: the shape stays."""
         flip_x, flip_y = (bool(v) for v in torch.randint(2, (2,), generator=generator))
         return disturbed(moved(batch, flip_x, flip_y), generator)
 
-    def network(self, examples: Batch, training: Training) -> nn.Module:
+    def network(self, taught: Batch, width: float) -> nn.Module:
         """Return a fresh network with the scales of the examples' planes."""
-        planes = examples["planes"]
+        planes = taught["planes"]
         mean, spread = planes.mean(dim=(0, 2, 3)), planes.std(dim=(0, 2, 3)) + 0.05
         # Mirrored frames are as likely.
         mean[[*AXIS, *LIGHT]] = 0.0
         for pair in (AXIS, LIGHT):
             spread[list(pair)] = spread[list(pair)].max()
-        return DenseNetwork(mean, spread, training.width)
+        return DenseNetwork(mean, spread, width)
 
     def loss(self, network: nn.Module, batch: Batch) -> Tensor:
         """Return the mean negative log-likelihood of the normals and distances that are known."""
@@ -82,17 +148,21 @@ class DenseNormals:
             "median error of the distance after a factor, %": 100 * float(torch.cat(scaled).median()),
         }
 
-    def finish(self, network: nn.Module, taught: Batch, judged: Batch, out: Path, about: dict[str, str]) -> list[Path]:
-        """Write model.onnx for `simtest.estimators.learned_dense`; what it states is scaled on the validation split."""
-        from simtest.dataset.learn.dense_export import export_dense
-
-        return [export_dense(network, taught, judged, out, about)]
-
-
-def batch_of(frames: DenseFrames) -> Batch:
-    """Return frames as tensors."""
-    names = ("planes", "rotation", "distance", "camera")
-    return {name: torch.from_numpy(np.ascontiguousarray(getattr(frames, name), dtype=np.float32)) for name in names}
+    def export(self, network: nn.Module, taught: Batch, judged: Batch, path: Path, about: JsonObject) -> Path:
+        """Write the file; what it states is scaled, and the range of the features taken, on the validation split."""
+        (outputs, features), (_, own) = (evaluated(network, split["planes"]) for split in (judged, taught))
+        found = fitted_range(CAMERA, taught["camera"].numpy(), own.numpy(), features.numpy())
+        distances = found.distances(features.numpy())
+        usual = float(np.quantile(distances, USUAL))
+        base, distance = dense_scales(outputs, judged, inflation(distances, usual))
+        metadata = {
+            "format": FORMAT,
+            "scales": {"base": base.written(), "distance": distance.written()},
+            "feature_usual": usual,
+            **found.written(),
+            "about": about,
+        }
+        return export(network, {"planes": taught["planes"][:2]}, ("outputs", "features"), metadata, path)
 
 
 def known_cells(outputs: Tensor, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
@@ -163,3 +233,33 @@ def _kept(count: int, shape: torch.Size, generator: Generator) -> Tensor:
         frame[:top] = frame[:, :left] = False
         frame[shape[0] - bottom :] = frame[:, shape[1] - right :] = False
     return kept
+
+
+def evaluated(network: nn.Module, planes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return outputs and features of frames, some at once."""
+    with torch.no_grad():
+        made = [network(part) for part in planes.split(DenseNormals.evaluated_at_once)]
+    outputs, features = (torch.cat(parts) for parts in zip(*made, strict=True))
+    return outputs, features
+
+
+def dense_scales(outputs: Tensor, judged: Batch, inflated: Array) -> tuple[CovarianceScale, CovarianceScale]:
+    """Return the factors of the normals' covariances and of the distances' variances, fitted on frames.
+
+    `inflated`, shape (K,), are the factors by which each frame's covariances are larger already (`inflation`).
+    Cells of one frame are not independent. A frame more, besides K frames, has its cells inside at `COVERAGE` on
+    average if a share of `COVERAGE` (K + 1) / K of those K frames' cells is: a frame of the same anatomies. The few
+    anatomies of a validation split promise less for another one.
+    """
+    made, rotation, distance = known_cells(outputs, judged)
+    coverage = min(1.0, COVERAGE * (len(outputs) + 1) / len(outputs))
+    stated = made.double().numpy()
+    factors = np.repeat(inflated, cells_of(judged).numpy())
+    base = fitted_scale(_double(squared_distance(made, rotation)) / factors, stated_deviation(stated), coverage)
+    logarithm = made[:, 6].clamp(*LOG_RANGE)
+    off = _double(((distance - made[:, 5]) * torch.exp(-logarithm)) ** 2)
+    return base, fitted_scale(off / factors, _double(logarithm), coverage, dimensions=1)
+
+
+def _double(values: Tensor) -> Array:
+    return np.asarray(values.double().numpy())

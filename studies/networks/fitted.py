@@ -1,13 +1,16 @@
-"""Fits what a network states of itself beside its weights: scales of covariances, and the range it was taught."""
+"""Losses of both networks, and what is fitted beside the weights: scales of covariances, and the range taught."""
 
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from scipy.special import chdtri
+from torch import Tensor
 
 from simtest.estimators.covariance_scale import CovarianceScale
+from simtest.estimators.spot_inputs import LOG_RANGE
+from simtest.estimators.training_range import TrainingRange
 from simtest.runtime.arrays import AnyArray, Array
-from simtest.runtime.training_range import TrainingRange
 
 COVERAGE = 0.95
 """Share of the truths that a stated region holds."""
@@ -88,3 +91,32 @@ def _factor(distances: Array, coverage: float, limit: float) -> float:
     """Return the factor for N examples: the ceil((N + 1) coverage)-th smallest distance, which covers one more."""
     rank = min(int(np.ceil((len(distances) + 1) * coverage)), len(distances))
     return float(np.sort(distances)[rank - 1] / limit)
+
+
+def squared_distance(made: Tensor, wanted: Tensor) -> Tensor:
+    """Return the squared Mahalanobis distance of wanted pairs, shape (N, 2), from outputs, shape (N, 5 or more).
+
+    The outputs are the pair, log L11, L21 and log L22, with L the Cholesky factor of its covariance.
+    """
+    off = wanted - made[:, :2]
+    log_first, log_second = _logarithms(made)
+    u = off[:, 0] * torch.exp(-log_first)
+    v = (off[:, 1] - made[:, 3] * u) * torch.exp(-log_second)
+    return u * u + v * v
+
+
+def pair_loss(made: Tensor, wanted: Tensor) -> Tensor:
+    """Return the negative log-likelihood of pairs under a normal distribution but for a constant, shape (N,)."""
+    log_first, log_second = _logarithms(made)
+    return 0.5 * squared_distance(made, wanted) + log_first + log_second
+
+
+def number_loss(made: Tensor, log_deviation: Tensor, wanted: Tensor) -> Tensor:
+    """Return the negative log-likelihood of numbers but for a constant, shape (N,); 0 where none is known."""
+    log_deviation = log_deviation.clamp(*LOG_RANGE)
+    off = torch.nan_to_num(wanted - made, nan=0.0) * torch.exp(-log_deviation)
+    return torch.where(torch.isfinite(wanted), 0.5 * off * off + log_deviation, torch.zeros_like(off))
+
+
+def _logarithms(made: Tensor) -> tuple[Tensor, Tensor]:
+    return made[:, 2].clamp(*LOG_RANGE), made[:, 4].clamp(*LOG_RANGE)
