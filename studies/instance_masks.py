@@ -117,7 +117,7 @@ def peak_of(session: Session, point_px: Array) -> float:
     close = replace(
         camera, fx=camera.fx * DIVISION, fy=camera.fy * DIVISION, cx=x, cy=y, width=size, height=size, view_mask=None
     )
-    sightlines = Sightlines(session.mi, close, session.surface.model_from_camera)
+    sightlines = Sightlines(close, session.surface.model_from_camera)
     parts, _ = session._tracer(sightlines).centres(None, True, None)
     # Of an instrument in front, too.
     channels = len(parts) // (2 if session.scene.instruments else 1) // 2

@@ -6,7 +6,7 @@ from simtest.cli.options import AsJson, Variant
 def doctor(*, as_json: AsJson = False, variant: Variant = None) -> int:
     """Check the rendering backend in a child process and say how to mend it; exit 1 if it cannot render."""
     from simtest.cli.printing import print_json
-    from simtest.rendering.backend_check import examine
+    from simtest.rendering.backend import examine
 
     report = examine(variant)
     if as_json:

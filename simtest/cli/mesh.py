@@ -43,8 +43,8 @@ def check(
     """
     from simtest.cli.printing import print_json
     from simtest.errors import InputError
-    from simtest.surfaces.fineness import concentration
     from simtest.surfaces.mesh_check import check_mesh
+    from simtest.surfaces.mesh_surface import concentration
 
     if not 0.1 <= distance <= 1e4:
         raise InputError(f"--distance {distance:g}: must be 0.1 to 10000 mm")

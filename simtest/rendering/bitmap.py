@@ -11,6 +11,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.rendering import backend
+from simtest.rendering.backend import mi
 from simtest.runtime.arrays import Image
 from simtest.runtime.limits import check_picture_size
 from simtest.runtime.resources import shown
@@ -21,7 +22,7 @@ HEADER_BYTES = 65536
 
 def write_exr(path: Path, image: Image, variant: str | None = None) -> None:
     """Write linear values, shape (H, W) or (H, W, 3), as a float32 OpenEXR file; the path ends in .exr."""
-    mi = backend.load(variant)
+    backend.load(variant)
     bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
     try:
         with _two_threads():
@@ -51,13 +52,10 @@ def _two_threads() -> Iterator[None]:
 def read_bitmap(path: Path, variant: str | None = None) -> Image:
     """Read an OpenEXR file as float32, shape (H, W) or (H, W, C).
 
-    Raises
-    ------
-    InputError
-        If the file is not an image, or of more pixels than allowed.
+    Raises `InputError` if the file is not an image, or of more pixels than allowed.
     """
     _check_size(path)
-    mi = backend.load(variant)
+    backend.load(variant)
     try:
         with _two_threads():
             bitmap = mi.Bitmap(str(path))

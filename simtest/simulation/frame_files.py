@@ -147,6 +147,8 @@ def encoded_png(image: Image, sensor: Sensor) -> bytes:
 
 def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
     truth, radiance = frame.truth, frame.radiance
+    assert truth.direction_min is not None
+    assert truth.direction_max is not None
     of_instruments = {"instrument": truth.instrument} if frame.scene.shown_instruments else {}
     return {
         "depth_mm": truth.depth.astype(np.float32),

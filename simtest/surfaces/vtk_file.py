@@ -19,20 +19,10 @@ A point takes at least 6 bytes of a file, and a few arrays of 24 bytes in memory
 
 
 def read_vtk(path: Path) -> tuple[Array, IntArray]:
-    """Read a PolyData or an UnstructuredGrid as triangles.
+    """Read a PolyData or an UnstructuredGrid as triangles: vertices, in the file's unit, and faces.
 
-    Returns
-    -------
-    vertices : ndarray, shape (V, 3)
-        In the file's unit.
-    faces : ndarray of int, shape (F, 3)
-
-    Raises
-    ------
-    InputError
-        If the file is no such mesh, or VTK breaks down over it.
-    SimtestError
-        If memory, or the disk of temporary files, does not hold it.
+    Raises `InputError` if the file is no such mesh, or VTK breaks down over it, and `SimtestError` if memory, or the
+    disk of temporary files, does not hold it.
     """
     breakdown = "damaged: VTK breaks down over its points or cells"
     return read_apart(path, "simtest.surfaces.vtk_file", _load, "VTK", breakdown)

@@ -28,9 +28,8 @@ from simtest.spec.tissue_colour import TissueColour
 from simtest.surfaces import make_surface, poses
 from simtest.surfaces.liver import Body
 from simtest.surfaces.recipe import load_recipe
-from simtest.surfaces.surface_samples import surface_patch
 from simtest.surfaces.tube import Tube
-from simtest.surfaces.vessels import grow_vessels
+from simtest.surfaces.vessels import grow_vessels, surface_patch
 from simtest.validation import motion
 from simtest.validation.cases import expand
 

@@ -22,7 +22,7 @@ from simtest.errors import InputError
 from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.registry import load_estimators
-from simtest.rendering import backend_check
+from simtest.rendering import backend
 from simtest.rendering.backend import BackendReport
 from simtest.runtime.entry_points import OWN
 from simtest.runtime.resources import suggestion
@@ -205,7 +205,7 @@ def test_thousands_of_settings_take_linear_time(here):
 
 def test_doctor_prints_one_document(here, monkeypatch):
     report = BackendReport("llvm_ad_mono", None, [], {"mitsuba": "3"}, "broken")
-    monkeypatch.setattr(backend_check, "examine", lambda _: report)
+    monkeypatch.setattr(backend, "examine", lambda _: report)
     code, output, _ = here("doctor", "--json")
     assert code == 1
     assert json.loads(output)["problem"] == "broken"
@@ -287,7 +287,7 @@ def warned(*_):
 
 @pytest.mark.parametrize(("flags", "lines"), [((), ["simtest: warning: look here"]), (("--quiet",), [])])
 def test_quiet_leaves_out_warnings(here, monkeypatch, flags, lines):
-    monkeypatch.setattr(backend_check, "examine", warned)
+    monkeypatch.setattr(backend, "examine", warned)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         code, output, errors = here("doctor", *flags)

@@ -23,8 +23,7 @@ from simtest.runtime.machine_errors import disk_problem
 from simtest.spec import load_experiment, load_scene
 from simtest.spec.toml_files import apply_settings, parse_settings
 from simtest.surfaces import mesh_file, vtk_file
-from simtest.surfaces.mesh_file import read_mesh
-from simtest.surfaces.ply_header import check_ply
+from simtest.surfaces.mesh_file import check_ply, read_mesh
 from simtest.surfaces.vtk_file import read_vtk
 from simtest.validation import run_folder
 from simtest.validation.cases import check_effort

@@ -2,6 +2,7 @@
 
 A frame of one sample is traced row by row, so that nothing has to be sorted; the same kernel computes its labels.
 Several samples are traced in tiles of 4 x 4 pixels and summed in registers: memory does not grow with their number.
+Over an exposure with a moving camera the samples are shared out over the steps of the motion.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -11,19 +12,47 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from simtest.rendering.direct import DirectLight, Material
+from simtest.rendering.backend import dr, mi
 from simtest.rendering.frames import Radiance
-from simtest.rendering.hit_refinement import Refinement
-from simtest.rendering.hits import Hit, make_hit
-from simtest.rendering.indirect import Bounces
-from simtest.rendering.instrument_kernel import InstrumentKernel
-from simtest.rendering.kernel_arrays import to_kernel
-from simtest.rendering.light_points import Draw, Drawer
-from simtest.rendering.mitsuba_values import channels
-from simtest.rendering.rays import Lanes, Pixels, Rays, Sightlines, untile
-from simtest.rendering.relief_kernel import ReliefKernel
-from simtest.rendering.shape_labels import CHANNELS, ShapeLabels
-from simtest.runtime.arrays import Image
+from simtest.rendering.instruments import InstrumentKernel
+from simtest.rendering.kernel_values import channels, to_kernel
+from simtest.rendering.lighting import DirectLight, Drawer, LightDraw, Material
+from simtest.rendering.rays import Hit, HitRefinement, Lanes, Pixels, Rays, Sightlines, make_hit, untile
+from simtest.rendering.tissue_kernels import ReliefKernel
+from simtest.rendering.truth import CHANNELS, ShapeLabels
+from simtest.runtime.arrays import Array, Image
+from simtest.spec.motion import Motion
+from simtest.spec.scene import Effort
+
+
+class Bounces:
+    """Inter-reflections of a scene: the first bounce is sampled here, Mitsuba's path integrator follows it.
+
+    There are up to path_depth - 1 bounces, path_depth being more than 2; the seed is that of the samples.
+    """
+
+    def __init__(self, scene: Any, path_depth: int, seed: int) -> None:
+        self.scene, self.seed = scene, seed
+        self._integrator = mi.load_dict({"type": "path", "max_depth": path_depth - 1, "rr_depth": path_depth})
+
+    def radiance(self, si: Any, count: int, block: int, sample: int) -> Any:
+        """Sample the radiance, mitsuba.Spectrum, that `count` surface points send back after two or more bounces.
+
+        `block` is the index of the launch in the frame, `sample` that of the sample in each pixel: each pair has its
+        own random numbers.
+        """
+        sampler = mi.load_dict({"type": "independent"})
+        branch = np.random.SeedSequence(self.seed, spawn_key=(sample, block))
+        salt = mi.UInt32(int(branch.generate_state(1)[0]))
+        # Opaque: a literal seed would compile another kernel for each sample.
+        dr.make_opaque(salt)
+        sampler.seed(salt, count)
+        bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
+        active = si.is_valid() & dr.any(weight > 0)
+        bounced = mi.RayDifferential3f(si.spawn_ray(si.to_world(bs.wo)))
+        incoming, _, _ = self._integrator.sample(self.scene, sampler, bounced, None, active)
+        return dr.select(active, weight * incoming, 0)
+
 
 Progress = Callable[[int, int, str], None]
 """Called with samples traced, samples in all, and what is done; may raise to stop."""
@@ -54,36 +83,15 @@ class Labelling(Protocol):
 
 @dataclass(frozen=True)
 class Tracer:
-    """Traces one scene.
+    """Traces one scene."""
 
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    scene : mitsuba.Scene
-        Holds one surface and the lights (the latter for further bounces).
-    sightlines : Sightlines
-        Of the camera.
-    light : DirectLight
-        The rig.
-    material : Material
-        The surface's.
-    refinement : Refinement
-        Solves the hits again in double precision.
-    relief : ReliefKernel or None
-        The surface's relief.
-    instruments : InstrumentKernel or None
-        What stands before the surface.
-    """
-
-    mi: Any
-    scene: Any
-    sightlines: Sightlines
-    light: DirectLight
-    material: Material
-    refinement: Refinement
-    relief: ReliefKernel | None
-    instruments: InstrumentKernel | None = None
+    scene: Any  # Holds one surface and the lights (the latter for further bounces)
+    sightlines: Sightlines  # Of the camera
+    light: DirectLight  # The rig
+    material: Material  # The surface's
+    refinement: HitRefinement  # Solves the hits again in double precision
+    relief: ReliefKernel | None  # The surface's relief
+    instruments: InstrumentKernel | None = None  # What stands before the surface
 
     @property
     def layers(self) -> int:
@@ -98,21 +106,16 @@ class Tracer:
 
     def _points(self, rays: Rays, preliminary: Any, bent: bool) -> Hit:
         """Return the surface points of hits."""
-        flags = self.mi.RayFlags.All | self.mi.RayFlags.dNSdUV if bent else self.mi.RayFlags.All
+        flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if bent else mi.RayFlags.All
         si = preliminary.compute_surface_interaction(rays.traced, +flags, rays.active)
         self.refinement.apply(rays.origin, rays.direction, si)
-        return make_hit(self.mi, si, self.relief, bent)
+        return make_hit(si, self.relief, bent)
 
-    def _direct(self, rays: Rays, hit: Hit, draw: Draw | None) -> list[Any]:
-        """Compute the channels of direct light off the lobe and off the base.
-
-        Where there are instruments those of their metal follow, and each is 0 where the other is in front.
-        """
+    def _direct(self, rays: Rays, hit: Hit, draw: LightDraw | None) -> list[Any]:
+        """Compute the channels of direct light off lobe and base, then of metal; each is 0 behind the other."""
         if self.instruments is None:
             specular, diffuse = self.light.radiance(self.scene, self.material, hit, draw)
             return [*specular, *diffuse]
-        import drjit as dr
-
         blockers = self.instruments.before(self.scene)
         ahead, metal = self.instruments.hit(rays)
         in_front = ahead.base.t < hit.base.t
@@ -122,13 +125,20 @@ class Tracer:
             return self.light.radiance(blockers, metal, ahead, draw)
 
         # A branch, since few pixels see metal.
-        dark = self.mi.Spectrum(0), self.mi.Spectrum(0)
+        dark = mi.Spectrum(0), mi.Spectrum(0)
         metallic = dr.if_stmt(dark, in_front, shine, lambda specular, diffuse: (specular, diffuse))
         seen = [dr.select(in_front, 0, channel) for part in tissue for channel in part]
         return seen + [dr.select(in_front, channel, 0) for part in metallic for channel in part]
 
     def _parts(
-        self, rays: Rays, hit: Hit, draw: Draw | None, bounces: Bounces | None, count: int, block: int, sample: int
+        self,
+        rays: Rays,
+        hit: Hit,
+        draw: LightDraw | None,
+        bounces: Bounces | None,
+        count: int,
+        block: int,
+        sample: int,
     ) -> list[Any]:
         """Compute the channels of direct light and, if asked for, of further bounces."""
         parts = self._direct(rays, hit, draw)
@@ -148,12 +158,9 @@ class Tracer:
     ) -> tuple[list[Image], list[Image]]:
         """Trace the ray through each pixel's centre; `progress` is called after each launch.
 
-        `sample` counts the times that this is done for one frame: bounces draw other numbers each time.
-
-        Returns
-        -------
-        parts, labels : list of ndarray of float32, shape (H, W)
-            Channels of the radiance, with bounces if there are any, and of the labels; empty where not asked for.
+        `sample` counts the times that this is done for one frame: bounces draw other numbers each time. Returns
+        channels, shape (H, W), of the radiance, with bounces if there are any, and of the labels; empty where not asked
+        for.
         """
         camera = self.sightlines.camera
         pixels = camera.width * camera.height
@@ -177,9 +184,7 @@ class Tracer:
 
     def relabelled(self, channels: list[Image], labels: ShapeLabels) -> list[Image]:
         """Compute labels, as `centres` does, from other labels of the same hits: nothing is traced."""
-        import drjit as dr
-
-        mi, camera = self.mi, self.sightlines.camera
+        camera = self.sightlines.camera
         depth, face, *place = (channels[CHANNELS.index(name)].ravel() for name in ("depth", "face", "second", "third"))
         rows: list[list[Image]] = []
         for first, count in blocks_of(camera.width * camera.height):
@@ -228,10 +233,7 @@ class Tracer:
         return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
 
     def means_at(self, pixels: Pixels, samples: int, seed: int, tell: Tell | None = None) -> Image:
-        """Compute what `mean` does, without bounces, at some pixels alone, by number: channels, shape (C, N).
-
-        `tell` is called with how many samples have been traced.
-        """
+        """Compute channels, shape (C, N), of `mean` at some pixels by number; `tell` gets the samples traced."""
         blocks = ((self.sightlines.lanes_of(pixels[first : first + count], seed), count)
                   for first, count in blocks_of(len(pixels)))  # fmt: skip
         return self._means(blocks, samples, range(samples), None, tell)
@@ -239,10 +241,7 @@ class Tracer:
     def _means(
         self, blocks: Iterable[tuple[Lanes, int]], samples: int, own: range, bounces: Bounces | None, tell: Tell | None
     ) -> Image:
-        """Compute the channels, shape (C, N), of the mean over some samples of blocks of lanes and their numbers.
-
-        `own` are the samples' numbers, of `samples` in all.
-        """
+        """Compute channels, shape (C, N), of the mean over samples, by number of `samples`, of blocks of lanes."""
         means: list[Image] = []
         traced = 0
         for block, (lanes, count) in enumerate(blocks):
@@ -272,9 +271,7 @@ class Tracer:
 
     def _looped(self, lanes: Lanes, drawer: Drawer | None, start: int, stop: int) -> list[Any]:
         """Sum direct light over samples by a loop inside the kernel."""
-        import drjit as dr
-
-        mi, zeros = self.mi, [self.mi.Float(0) for _ in range(2 * self.layers * channels(self.mi))]
+        zeros = [mi.Float(0) for _ in range(2 * self.layers * channels())]
         number, end = mi.UInt32(start), mi.UInt32(stop)
         dr.make_opaque(number, end)
 
@@ -290,9 +287,7 @@ class Tracer:
         self, lanes: Lanes, drawer: Drawer | None, number: int, bounces: Bounces | None, count: int, block: int
     ) -> list[Any]:
         """Trace the sample of one number of each pixel."""
-        import drjit as dr
-
-        which = self.mi.UInt32(number)
+        which = mi.UInt32(number)
         dr.make_opaque(which)
         rays, _, hit = self.hit(*self.sightlines.sample(lanes, which))
         draw = None if drawer is None else drawer.at(which)
@@ -312,8 +307,6 @@ def _share_of(progress: Progress | None, total: int) -> Tell | None:
 
 def evaluate(values: list[Any], count: int) -> list[Image]:
     """Compute all channels in one kernel; a constant one is broadcast."""
-    import drjit as dr
-
     # Together: evaluated one by one, each would trace the rays again.
     dr.eval(values)
     return [np.broadcast_to(np.array(value, dtype=np.float32), (count,)) for value in values]
@@ -333,3 +326,41 @@ def as_radiance(parts: list[Image]) -> Radiance:
         return np.where(np.abs(made) < SMALLEST_NORMAL, np.float32(0), made)
 
     return Radiance(image(0), image(1), image(2))
+
+
+TracerAt = Callable[[Array], Tracer]
+"""Returns a tracer whose camera and lights stand at a pose, middle_from_moment."""
+
+
+def samples_per_step(effort: Effort, motion: Motion) -> int:
+    """Return the samples of a pixel at each step: as many at all steps, so that each moment has the same weight."""
+    return -(-effort.samples_per_pixel // motion.steps)
+
+
+def mean_over(
+    motion: Motion, effort: Effort, tracer_at: TracerAt, bounces: Bounces | None, progress: Progress | None
+) -> list[Image]:
+    """Return the channels, shape (H, W) each, of the mean radiance over an exposure.
+
+    With one sample a pixel each step traces the rays through the pixels' centres; no noise is added. `progress` is
+    called after each launch.
+    """
+    each = samples_per_step(effort, motion)
+    sums: list[Array] = []
+    for step, pose in enumerate(motion.poses()):
+        tracer, told = tracer_at(pose), _part(progress, step, motion.steps)
+        if effort.samples_per_pixel == 1:
+            parts, _ = tracer.centres(bounces, True, None, told, sample=step)
+        else:
+            own = range(step * each, (step + 1) * each)
+            parts = tracer.mean(each * motion.steps, effort.seed, bounces, told, own)
+        # In double precision, so that the mean of equal frames is that frame.
+        sums = sums or [np.zeros(part.shape) for part in parts]
+        for total, part in zip(sums, parts, strict=True):
+            total += part
+    return [(total / motion.steps).astype(np.float32) for total in sums]
+
+
+def _part(progress: Progress | None, step: int, steps: int) -> Progress | None:
+    """Return what tells `progress` of one step's launches as of a part of all."""
+    return progress and (lambda done, total, what: progress(step * total + done, steps * total, what))
