@@ -89,8 +89,8 @@ def table(
     folder : Path
         Holds certificates, at any depth.
     """
-    from simtest.bench.leaderboard import read_entries, write_leaderboard
     from simtest.bench.suite import load_suite
+    from simtest.bench.table import read_entries, write_leaderboard
     from simtest.cli.printing import print_files
 
     read = load_suite(suite)
@@ -110,7 +110,7 @@ def frames(
     as_json: AsJson = False,
 ) -> None:
     """Write the frames of the part dense without their truth, for methods that give maps."""
-    from simtest.bench.maps import export_frames
+    from simtest.bench.run import export_frames
     from simtest.bench.suite import load_suite
     from simtest.cli.printing import print_files
     from simtest.cli.progress import progress_bar
@@ -142,7 +142,7 @@ def cases(*, suite: SuiteVersion = "v1", as_json: AsJson = False) -> None:
 
 def _print_parts(content: dict[str, Any]) -> None:
     """Print a row for each part, the reasons of its refusals, and the headline."""
-    from simtest.bench.phrases import COLUMNS, part_cells, refusals
+    from simtest.bench.table import COLUMNS, part_cells, refusals
     from simtest.cli.printing import print_table
 
     rows = [(part, *part_cells(told)) for part, told in content["parts"].items()]

@@ -58,9 +58,8 @@ def _run(
     import sys
 
     from simtest.cli.progress import progress_bar
-    from simtest.nightly.layout import Reports
-    from simtest.nightly.measure import RunOptions
-    from simtest.nightly.run import run_nightly
+    from simtest.nightly.run import RunOptions, run_nightly
+    from simtest.nightly.store import Reports
     from simtest.rendering.backend import needs_gpu
     from simtest.runtime.engines import make_engine
     from simtest.spec import load_profile
@@ -83,9 +82,8 @@ def accept(
 ) -> None:
     """Make the last night's numbers the baseline."""
     from simtest.cli.printing import print_json
-    from simtest.nightly.baseline import accept as accept_night
-    from simtest.nightly.baseline import log_note
-    from simtest.nightly.layout import Reports
+    from simtest.nightly.store import Reports, log_note
+    from simtest.nightly.store import accept as accept_night
     from simtest.spec import load_profile
 
     folder, name = Reports(reports), load_profile(profile).name

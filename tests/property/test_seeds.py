@@ -12,8 +12,7 @@ from simtest.advice.draws import drawn_values
 from simtest.advice.plan import Question, surroundings
 from simtest.advice.scope import read_scope
 from simtest.advice.twin.patches import make_pool
-from simtest.bench.draws import pooled
-from simtest.bench.suite import CaseSpec
+from simtest.bench.suite import CaseSpec, pooled
 from simtest.dataset.plan import Plan
 from simtest.realism.distance import distances
 from simtest.realism.fitting.frames import FrameMaker

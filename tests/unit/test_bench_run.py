@@ -11,13 +11,10 @@ import numpy as np
 import polars as pl
 import pytest
 
-from simtest.bench.certificate import CERTIFICATE, check_suite, read_certificate
-from simtest.bench.cores import core_record
-from simtest.bench.draws import experiment_of
-from simtest.bench.leaderboard import read_entries
-from simtest.bench.maps import export_frames, maps_record
-from simtest.bench.run import BenchRun, chosen_parts, run_bench, run_maps
-from simtest.bench.suite import Suite, digest_of, layout_of
+from simtest.bench.run import BenchRun, chosen_parts, core_record, export_frames, maps_record, run_bench, run_maps
+from simtest.bench.scores import CERTIFICATE
+from simtest.bench.suite import Suite, digest_of, experiment_of, layout_of
+from simtest.bench.table import check_suite, read_certificate, read_entries
 from simtest.cli import bench
 from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError

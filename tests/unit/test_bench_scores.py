@@ -7,9 +7,15 @@ import polars as pl
 import pytest
 from scipy.stats import binom, chi2
 
-from simtest.bench.ranking import CAP_DEG
-from simtest.bench.scores import results_hash, score_part
-from simtest.bench.uncertainty import coverage_error, energy_scores, score_uncertainty, verdict_of
+from simtest.bench.scores import (
+    CAP_DEG,
+    coverage_error,
+    energy_scores,
+    results_hash,
+    score_part,
+    score_uncertainty,
+    verdict_of,
+)
 from simtest.geometry.vectors import basis_across
 from simtest.validation.results_table import ResultRow, table
 

@@ -302,7 +302,7 @@ def test_a_run_tells_of_its_cores(tmp_path, published):
 
 
 def test_an_experiment_and_a_nightly_profile_name_a_core(tmp_path, published):
-    from simtest.nightly.measure import measure_run, plan_run
+    from simtest.nightly.run import measure_run, plan_run
     from simtest.spec.profile import load_profile
 
     core = command(BAD_CORE, "none")

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from simtest.bench.cores import core_record
+from simtest.bench.run import core_record
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.installed import ESTIMATORS

@@ -1,12 +1,57 @@
-"""The verdict as Markdown that fits a comment on a pull request."""
+"""The verdict without the page: JSON, and Markdown that fits a comment on a pull request (docs/howto/run_in_ci.md)."""
 
+import math
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import polars as pl
 
 from simtest.nightly.phrases import cell_name, headline, plain, short_commit
 from simtest.nightly.records import OUTCOMES, JudgedRun, Verdict
 from simtest.pages.markdown import escaped
+from simtest.runtime.files import write_atomically, write_json
+
+SCHEMA_VERSION = 3
+
+FILES = VERDICT, SUMMARY = "verdict.json", "summary.md"
+"""Names of the files, which lie beside the page."""
+
+
+def write_outputs(folder: Path, judged: JudgedRun) -> None:
+    """Write the `FILES` into a folder; the same run gives the same bytes."""
+    write_json(folder / VERDICT, _verdict_json(judged))
+    text = summary(judged)
+    write_atomically(folder / SUMMARY, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def _verdict_json(judged: JudgedRun) -> dict[str, Any]:
+    run, verdict = judged.run, judged.verdict
+    return {
+        "schema": SCHEMA_VERSION,
+        "profile": run.record.profile,
+        "state": verdict.state,
+        "exit_code": verdict.exit_code,
+        "headline": headline(verdict),
+        "bit_equal": verdict.bit_equal,
+        "causes": list(verdict.causes),
+        "notes": list(verdict.notes),
+        "run": run.record.to_json(),
+        "baseline": None if verdict.baseline is None else verdict.baseline.to_json(),
+        "counts": verdict.counts,
+        "reports": list(judged.reports),
+        "comparisons": _rows_json(verdict.comparisons.filter(pl.col("outcome") != "same")),
+    }
+
+
+def _rows_json(table: pl.DataFrame) -> list[dict[str, Any]]:
+    """Return a table's rows as JSON can hold them: nulls are left out, numbers that are not finite are text."""
+    return [
+        {key: str(value) if isinstance(value, float) and not math.isfinite(value) else value
+         for key, value in row.items() if value is not None}
+        for row in table.iter_rows(named=True)
+    ]  # fmt: skip
+
 
 MAX_CHARACTERS = 60_000
 """A comment on GitHub may have 65,536."""
@@ -21,16 +66,18 @@ def summary(judged: JudgedRun) -> str:
     if len(verdict.notes) > MAX_NOTES:
         notes.append(f"- ... and {len(verdict.notes) - MAX_NOTES} more notes")
     causes = [f"- {escaped(cause)}" for cause in verdict.causes]
+    counts = OUTCOMES if verdict.baseline is not None else ()
+    columns = ("experiment", "rows", "answered", "missed", "false", *counts)
     parts = [
         f"## Nightly {escaped(record.profile)}: {headline(verdict)}",
         *(["\n".join(causes)] if causes else []),
         _compared(verdict),
         *(["\n".join(notes)] if notes else []),
-        *_changes("Worse", judged.with_outcome("worse")),
-        *_changes("Changed, to be explained", judged.with_outcome("changed")),
-        *_changes("Better", judged.with_outcome("better")),
+        *_changes("Worse", verdict, "worse"),
+        *_changes("Changed, to be explained", verdict, "changed"),
+        *_changes("Better", verdict, "better"),
         "### By experiment",
-        _by_experiment(judged),
+        _table(columns, judged.by_experiment().select(columns).rows()),
         f"{escaped(record.started)}, commit {short_commit(record.commit)}, {record.duration_s or 0:.0f} s on "
         f"{escaped(record.processor)}; run `{escaped(record.id)}`",
     ]
@@ -51,7 +98,11 @@ def _compared(verdict: Verdict) -> str:
     return f"{equal} the baseline of {escaped(baseline.started)}, commit {short_commit(baseline.commit)}{reason}."
 
 
-def _changes(title: str, changes: pl.DataFrame) -> list[str]:
+def _changes(title: str, verdict: Verdict, outcome: str) -> list[str]:
+    # The surest first
+    changes = verdict.comparisons.filter(pl.col("outcome") == outcome).sort(
+        "p_holm", "experiment", "label", "setting", "estimator", "quantity", nulls_last=True, maintain_order=True
+    )
     if not changes.height:
         return []
     rows = []
@@ -64,12 +115,6 @@ def _changes(title: str, changes: pl.DataFrame) -> list[str]:
     head = ("experiment", "cell", "figure", "baseline", "tonight", "difference [95 %]", "p (Holm)")
     more = [f"... and {changes.height - MAX_ROWS} more; the page has them."] if changes.height > MAX_ROWS else []
     return [f"### {title}: {changes.height}", _table(head, rows), *more]
-
-
-def _by_experiment(judged: JudgedRun) -> str:
-    counts = OUTCOMES if judged.verdict.baseline is not None else ()
-    columns = ("experiment", "rows", "answered", "missed", "false", *counts)
-    return _table(columns, judged.by_experiment().select(columns).rows())
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str | int | None]]) -> str:
