@@ -13,7 +13,7 @@ from simtest.advice.break_points import BreakPoint, SpotSize, break_points, spot
 from simtest.advice.figures import Found, read_results
 from simtest.advice.plan import Question, main_experiment, surroundings, write_experiment
 from simtest.errors import InputError
-from simtest.pages.sheet import Pixels
+from simtest.pages.pixels import Pixels
 from simtest.runtime.engines import make_engine
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.simulation.camera_chain import displayed

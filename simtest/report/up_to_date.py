@@ -13,8 +13,9 @@ GUIDE = "guide.json"
 
 _OPEN, _CLOSE = "<!-- made of ", " -->\n"
 _PACKAGE = Path(__file__).resolve().parents[1]
-_TEMPLATES = ("*.j2", "*.json", "*.zz")
-_DRAWING = ("pillow", "jinja2", "matplotlib")  # whose versions change a page, beside those that change results
+_TEMPLATES = ("*.j2", "*.json")
+# Whose versions change a page, beside those that change results.
+_DRAWING = ("pillow", "jinja2", "matplotlib", "trimesh", "vl-convert-python")
 
 
 def page_key(run: Path) -> str:

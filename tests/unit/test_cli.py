@@ -36,7 +36,7 @@ os.replace = and_stop
 """
 """A process that is stopped by Ctrl-C once its first case is kept, however fast it is."""
 
-SLOW_MODULES = {"mitsuba", "drjit", "vtk", "vtkmodules", "torch", "pyvista", "polars", "matplotlib", "plotly"}
+SLOW_MODULES = {"mitsuba", "drjit", "vtk", "vtkmodules", "torch", "pyvista", "polars", "matplotlib", "vl_convert"}
 SMALL = {"camera.width": 96, "camera.height": 96, "camera.fx": 96.0, "camera.fy": 96.0}
 SET_SMALL = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
 

@@ -79,7 +79,7 @@ def test_importing_the_package_loads_no_library():
     heavy = child(
         "import simtest, sys, json; dir(simtest);"
         "print(json.dumps(sorted({m.partition('.')[0] for m in sys.modules}"
-        " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'plotly', 'matplotlib', 'numpy', 'pydantic', 'cv2'})))"
+        " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'vl_convert', 'matplotlib', 'numpy', 'pydantic', 'cv2'})))"
     )
     assert heavy == []
 
@@ -88,7 +88,7 @@ def test_reconstructing_loads_neither_renderer_nor_viewer():
     loaded = child(
         "import simtest, sys, json; simtest.reconstruct; simtest.Camera; simtest.load_camera;"
         "print(json.dumps(sorted({m.partition('.')[0] for m in sys.modules}"
-        " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'plotly', 'matplotlib'})))"
+        " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'vl_convert', 'matplotlib'})))"
     )
     assert loaded == []
 

@@ -52,8 +52,8 @@ def swept(tmp_path):
 
 def marks(figure):
     """By name and symbol: the marks of a figure's only panel."""
-    return {(m.name, m.symbol.text if m.symbol else "") for m in figure.chart.panels[0].marks}, {
-        (m.name, m.symbol.text if m.symbol else ""): m for m in figure.chart.panels[0].marks
+    return {(m.name, m.symbol) for m in figure.chart.panels[0].marks}, {
+        (m.name, m.symbol): m for m in figure.chart.panels[0].marks
     }
 
 

@@ -9,9 +9,8 @@ import polars as pl
 from simtest.nightly.history import TRENDS
 from simtest.nightly.phrases import short_commit
 from simtest.nightly.records import RunRecord
-from simtest.pages.axes import Axis
-from simtest.pages.chart import Chart, Mark, Panel
-from simtest.pages.style import NEUTRAL, Symbol, number
+from simtest.pages.charts import Axis, Chart, Mark, Panel
+from simtest.pages.style import NEUTRAL, number
 
 TITLES = dict(zip(TRENDS, ("mean error (deg)", "unanswered", "in the 95 % region"), strict=True))
 """What the panels show, by quantity."""
@@ -20,7 +19,7 @@ _TICKS = 4
 """As many dates stand side by side on a phone."""
 
 _DAY_S = 86_400.0
-_POINT, _CROSS = Symbol("o", "circle", "●"), Symbol("X", "x", "✖")
+_POINT, _CROSS = "●", "✖"
 
 
 def trends(history: pl.DataFrame, baseline: RunRecord | None, colours: Mapping[str, str]) -> list[Chart]:

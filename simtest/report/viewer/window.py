@@ -14,8 +14,7 @@ from typing import Any
 
 from simtest.errors import InputError
 from simtest.pages.palette import LIGHT, colours
-from simtest.report.viewer.content import CAMERA, TRUE, TRUE_BASE, Content, estimators
-from simtest.report.viewer.web_page import curvature_limit
+from simtest.report.scene3d import CAMERA, TRUE, TRUE_BASE, Content, curvature_limit, estimators
 from simtest.runtime.files import write_atomically
 from simtest.runtime.machine_errors import cannot_write
 from simtest.runtime.resources import shown
