@@ -114,7 +114,7 @@ class NightlyRun:
     """What one run of a profile measured."""
 
     record: RunRecord  # when, where and of what it was made
-    rows: pl.DataFrame  # results of all experiments, the columns of `simtest.validation.results_table.SCHEMA`
+    rows: pl.DataFrame  # results of all experiments, the columns of `simtest.validation.columns.SCHEMA`
     figures: pl.DataFrame  # columns `FIGURES`
 
 

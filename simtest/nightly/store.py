@@ -26,7 +26,7 @@ from simtest.runtime.locks import exclusive_file, waiting_for
 from simtest.runtime.machine_errors import cannot_write, disk_problem
 from simtest.runtime.provenance import file_hash
 from simtest.runtime.resources import shown
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from simtest.spec.type_change import replace_values
 from simtest.surfaces.recipe import load_recipe
 
 if TYPE_CHECKING:
-    from simtest.validation.results_table import Value
+    from simtest.validation.columns import Value
 
 RELIEF_SEED = "surface.relief.seed"
 

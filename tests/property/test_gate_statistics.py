@@ -14,7 +14,7 @@ from simtest.nightly.gate.contrasts import holm, paired, pooled, unit_sums, unpa
 from simtest.nightly.gate.quantities import QUANTITIES, setting_figures
 from simtest.nightly.records import OUTCOMES, NightlyRun, RunRecord
 from simtest.runtime.statistics import mean_interval
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 
 ERROR = QUANTITIES["mean_deg"]
 probabilities = st.lists(st.floats(0, 1), min_size=1, max_size=6)

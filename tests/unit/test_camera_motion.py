@@ -273,7 +273,7 @@ def test_an_experiment_sweeps_a_velocity():
     for made in (still, moved):
         (truth,) = made.truths
         assert truth.bp_px == pytest.approx(still.truths[0].bp_px, abs=1e-9)
-        assert made.rows[0].swept["camera.motion.velocity_mm_s.1"] in (0.0, 25.0)
+        assert made.rows[0]["camera.motion.velocity_mm_s.1"] in (0.0, 25.0)
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,8 @@ from simtest.spec.dataset_recipe import Dataset
 from simtest.spec.experiment import Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand, swept_example
+from simtest.validation.columns import table
 from simtest.validation.realisation import Realiser
-from simtest.validation.results_table import table
 from simtest.validation.statistics import figures
 
 pytestmark = pytest.mark.render

@@ -21,7 +21,7 @@ from simtest.nightly.page.trends import trends
 from simtest.nightly.phrases import headline_sentence, measure, short_commit, signed
 from simtest.nightly.records import COMPARISONS, FIGURES, JudgedRun, NightlyRun, RunRecord, Verdict
 from simtest.pages.charts import packed_vega
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 from tests.unit.nightly_samples import make_run
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)

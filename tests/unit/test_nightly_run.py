@@ -25,8 +25,8 @@ from simtest.nightly.store import BASELINE_ROWS, Reports, accept, load_baseline,
 from simtest.runtime.resources import data_root
 from simtest.spec import Profile, experiments_of, load_profile
 from simtest.validation.cases import expand
+from simtest.validation.columns import SCHEMA
 from simtest.validation.fingerprints import definition
-from simtest.validation.results_table import SCHEMA
 from tests.marked import marked
 from tests.unit.nightly_samples import STARTED, make_rows, make_run, regression
 

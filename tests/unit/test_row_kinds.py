@@ -15,7 +15,7 @@ from simtest.report.coverage import coverage
 from simtest.report.run_folder import Run, completed
 from simtest.report.sentences import headline
 from simtest.report.surface_errors import surface_errors
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 from simtest.validation.row_kinds import KINDS, counts, is_false, row_kind
 from simtest.validation.statistics import summarise
 

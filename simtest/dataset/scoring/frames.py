@@ -10,7 +10,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Image
 from simtest.runtime.resources import shown
 from simtest.simulation.rendered_view import RenderedView
-from simtest.validation.results_table import Value
+from simtest.validation.columns import Value
 
 
 @dataclass(frozen=True)

@@ -27,11 +27,11 @@ from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
 from simtest.validation import gallery_items
 from simtest.validation.cases import swept_example
+from simtest.validation.columns import Row, Value
+from simtest.validation.columns import table as results_table
 from simtest.validation.execution import forget, gallery_cases
 from simtest.validation.fingerprints import input_hashes
 from simtest.validation.realisation import answer, realise
-from simtest.validation.results_table import ResultRow, Value
-from simtest.validation.results_table import table as results_table
 from simtest.validation.run_folder import EXPORT, check_folder, remove_folder
 from simtest.validation.run_summary import run_summary, settings_summary, write_results
 from simtest.validation.runner import Progress, Run, RunRecord
@@ -238,7 +238,7 @@ def _summary(source: Source, results: pl.DataFrame, described: Mapping[str, str]
 
 def score_part(part: ScorePart, on_step: OnStep) -> pl.DataFrame:
     """Score the frames of a part; call `on_step` after each. Raises `InputError` where a frame comes out otherwise."""
-    rows: list[ResultRow] = []
+    rows: list[Row] = []
     for count, each in enumerate(part.views):
         name = part.names.get(each.number)
         if name is None:
@@ -249,7 +249,7 @@ def score_part(part: ScorePart, on_step: OnStep) -> pl.DataFrame:
     return results_table(rows, part.swept)
 
 
-def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[ResultRow]:
+def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[Row]:
     """Score one frame, and keep it for the gallery where `item` names a file."""
     views, estimators = part.views, part.estimators(each.number)
     if isinstance(views, CaseViews):
@@ -262,4 +262,4 @@ def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[ResultRow]:
     maker = maker_of(views.dataset.model_dump_json(), views.variant)
     answers = answer(each.view, each.image, estimators)
     rows = maker.score(each.number, each.session, each.view, answers, estimators)
-    return [row.having(swept={**row.swept, ANATOMY: each.anatomy}) for row in rows]
+    return [row | {ANATOMY: each.anatomy} for row in rows]

@@ -24,7 +24,7 @@ from simtest.nightly.gate.quantities import (
     told_twice,
 )
 from simtest.nightly.records import CELL, COMPARISONS, POOLED, SINGLE, Cell, NightlyRun, RunRecord, Verdict, to_explain
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 from simtest.validation.row_kinds import is_false
 
 ALPHA = 0.01

@@ -12,7 +12,7 @@ from scipy import stats
 from simtest.conventions import MOTION, MOTION_COLUMNS, ON_INSTRUMENT
 from simtest.nightly.records import CELL, FIGURES, Cell
 from simtest.runtime.statistics import CONFIDENCE, mean_interval, share_interval
-from simtest.validation.results_table import BUDGET_COLUMNS, SCHEMA
+from simtest.validation.columns import BUDGET_COLUMNS, SCHEMA
 from simtest.validation.row_kinds import is_false
 from simtest.validation.statistics import PENALTY_DEG, figures, units
 
