@@ -24,7 +24,7 @@ from simtest.geometry import Camera, circle_poses, cone_of_conic, fit_ellipses
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import from_integer
 from simtest.spec import load_experiment
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import Case, expand
 from simtest.validation.columns import Row
 from simtest.validation.execution import PAPER_CHUNK

@@ -308,9 +308,8 @@ def _run_and_report(
 def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, overrides: Mapping[str, Any]) -> "Scene":
     """Return the described scene with values replaced, by key path and by the last name of a key."""
     from simtest.spec import Scene, load_scene
+    from simtest.spec.keys import full_keys, replace_values
     from simtest.spec.scene import scene_from_dict, without_presets
-    from simtest.spec.short_keys import full_keys
-    from simtest.spec.type_change import replace_values
 
     def replaced(values: dict[str, Any]) -> Scene:
         if not isinstance(scene, Scene):
@@ -332,7 +331,7 @@ def _experiment(
 ) -> "Experiment":
     """Return the described experiment with values replaced; those of an `Experiment` are its own already."""
     from simtest.spec import Experiment, load_experiment
-    from simtest.spec.experiment import OWN_KEYS
+    from simtest.spec.recipes import OWN_KEYS
 
     if isinstance(experiment, Experiment):
         if settings or overrides:
@@ -345,7 +344,8 @@ def _experiment(
     # The experiment's own keys come before those of its scenes.
     values |= {name: value for name, value in overrides.items() if name in OWN_KEYS}
     if rest := {name: value for name, value in overrides.items() if name not in OWN_KEYS}:
-        from simtest.spec.short_keys import full_keys, scene_models
+        from simtest.spec.keys import full_keys
+        from simtest.spec.recipes import scene_models
 
         values |= full_keys(scene_models(described), rest, OWN_KEYS)
     return load_experiment(experiment, values)

@@ -20,7 +20,7 @@ from simtest.rendering import backend
 from simtest.rendering.built_scene import make_shape
 from simtest.rendering.truth import trace_hits
 from simtest.runtime.arrays import Array
-from simtest.spec.relief import Relief, ReliefBand
+from simtest.spec.surfaces import Relief, ReliefBand
 from simtest.surfaces import RayHits, Shape, TriangleMesh
 from simtest.surfaces.relief_field import ReliefField, fine_normals, make_relief
 

@@ -19,7 +19,7 @@ from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.dispatch import run
 from simtest.estimators.protocol import Estimate, Estimator
 from simtest.geometry import Camera, CirclePose, Patch
-from simtest.geometry.circle_from_cone import circle_pose as pose_of_cone
+from simtest.geometry.cones import circle_pose as pose_of_cone
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.arrays import Array, Image

@@ -27,7 +27,7 @@ from simtest.rendering import Session
 from simtest.rendering.rays import Sightlines
 from simtest.runtime.arrays import AnyArray, Array, Image, IntArray, Mask
 from simtest.spec import Scene
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.recipes import load_dataset
 
 RECIPES = ("highlights", "highlights_smooth")
 SAMPLES = (200, 100)

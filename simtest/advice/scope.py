@@ -13,9 +13,9 @@ from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array
 from simtest.runtime.resources import shown, suggestion
-from simtest.spec.camera_spec import SceneCamera, load_camera
+from simtest.spec.camera import SceneCamera, load_camera
 from simtest.spec.camera_tables import camera_table
-from simtest.spec.rig import Rig
+from simtest.spec.lights import Rig
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml

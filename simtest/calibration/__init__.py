@@ -1,8 +1,8 @@
 """What is known of a camera beside its geometry, and beside a picture: response, falloff, noise, priors.
 
-`calibration` undoes response and falloff; `frame` is a frame on that way, as detectors and estimators see it; `priors`
-holds what is known of lights, distance, lobe, camera and relief, and what is assumed where nobody told
-(`distributions`).
+`calibration` undoes response and falloff (`photometry`); `frame` is a frame on that way, as detectors and estimators
+see it; `priors` holds what is known of lights, distance, lobe, camera and relief, and what is assumed where nobody
+told.
 """
 
 from typing import TYPE_CHECKING
@@ -11,45 +11,35 @@ from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.calibration.calibration import Calibration, CorrectedFrame
-    from simtest.calibration.distributions import Distribution, LogUniform, Normal, Uniform, exactly
-    from simtest.calibration.frame import Frame
-    from simtest.calibration.noise_estimate import estimate_noise
-    from simtest.calibration.noise_model import NoiseModel
-    from simtest.calibration.priors import LIGHT_AT_CAMERA, NO_PRIORS, CameraPrior, Priors
-    from simtest.calibration.response import Response, srgb_decode, srgb_encode
+    from simtest.calibration.frame import Frame, estimate_noise
+    from simtest.calibration.photometry import AngularProfile, NoiseModel, Response, srgb_decode, srgb_encode
+    from simtest.calibration.priors import (
+        LIGHT_AT_CAMERA,
+        NO_PRIORS,
+        CameraPrior,
+        Distribution,
+        LogUniform,
+        Normal,
+        Priors,
+        Uniform,
+        exactly,
+    )
 
 _HOMES = {
-    "simtest.calibration.calibration": (
-        "Calibration",
-        "CorrectedFrame",
-    ),
-    "simtest.calibration.distributions": (
-        "Distribution",
-        "LogUniform",
-        "Normal",
-        "Uniform",
+    "simtest.calibration.calibration": ("Calibration", "CorrectedFrame"),
+    "simtest.calibration.frame": ("Frame", "estimate_noise"),
+    "simtest.calibration.photometry": ("AngularProfile", "NoiseModel", "Response", "srgb_decode", "srgb_encode"),
+    "simtest.calibration.priors": (
+        "LIGHT_AT_CAMERA", "NO_PRIORS", "CameraPrior", "Distribution", "LogUniform", "Normal", "Priors", "Uniform",
         "exactly",
     ),
-    "simtest.calibration.frame": ("Frame",),
-    "simtest.calibration.noise_estimate": ("estimate_noise",),
-    "simtest.calibration.noise_model": ("NoiseModel",),
-    "simtest.calibration.priors": (
-        "LIGHT_AT_CAMERA",
-        "NO_PRIORS",
-        "CameraPrior",
-        "Priors",
-    ),
-    "simtest.calibration.response": (
-        "Response",
-        "srgb_decode",
-        "srgb_encode",
-    ),
-}
+}  # fmt: skip
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)
 
 __all__ = [
     "LIGHT_AT_CAMERA",
     "NO_PRIORS",
+    "AngularProfile",
     "Calibration",
     "CameraPrior",
     "CorrectedFrame",
@@ -65,4 +55,4 @@ __all__ = [
     "exactly",
     "srgb_decode",
     "srgb_encode",
-]
+]  # fmt: skip

@@ -30,13 +30,12 @@ def show(file: Path, /, *, view_radius: ViewRadius = None, as_json: AsJson = Fal
         A camera file of any known format. FILE#ID names one camera of several.
     """
     from simtest.cli.printing import print_json
-    from simtest.spec.camera_formats import recognise
-    from simtest.spec.camera_formats.files import NAMES
-    from simtest.spec.camera_spec import load_camera
-    from simtest.spec.camera_summary import camera_summary
+    from simtest.spec.camera import load_camera
+    from simtest.spec.camera_formats.files import FORMATS, recognise
+    from simtest.spec.camera_tables import camera_summary
 
     shown = camera_summary(load_camera(file, view_radius))
-    shown = {"file": str(file), "format": NAMES[recognise(file)], **shown}
+    shown = {"file": str(file), "format": FORMATS[recognise(file)].title, **shown}
     if as_json:
         print_json(shown)
     else:
@@ -105,7 +104,7 @@ def convert(
     from simtest.errors import InputError
     from simtest.runtime.locks import exclusive_file
     from simtest.spec.calibration_file import load_calibration, save_calibration
-    from simtest.spec.camera_spec import load_camera, save_camera
+    from simtest.spec.camera import load_camera, save_camera
 
     if photometric is not None and (to or out.suffix.lower().removeprefix(".")) != "toml":
         raise InputError(f"--photometric {photometric}: needs --to toml; no other format holds it")

@@ -48,7 +48,7 @@ def fit(
     from simtest.realism.frame_sets import MOST_GENERATED, open_frames
     from simtest.runtime.limits import check_count
     from simtest.runtime.locks import exclusive_file, exclusive_folder
-    from simtest.spec.dataset_recipe import load_dataset
+    from simtest.spec.recipes import load_dataset
 
     check_out(out)
     check_count(size, "--size", MOST_GENERATED)

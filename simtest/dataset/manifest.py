@@ -15,7 +15,7 @@ from simtest.estimators.process.naming import core_hashes, short_name
 from simtest.runtime import provenance
 from simtest.runtime.files import write_json
 from simtest.runtime.resources import shown
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
 
 NAME = "manifest.json"

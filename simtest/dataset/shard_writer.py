@@ -37,7 +37,7 @@ from simtest.runtime.files import sync_folder
 from simtest.runtime.locks import LOCK, exclusive_folder, waiting_for
 from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.validation.runner import Progress
 
 SHARDS_PER_PROCESS = 8

@@ -32,8 +32,8 @@ from simtest.runtime import provenance
 from simtest.runtime.arrays import AnyArray
 from simtest.runtime.engines import Engine
 from simtest.runtime.locks import LOCK
-from simtest.spec.camera_spec import SceneCamera
-from simtest.spec.relief import Relief
+from simtest.spec.camera import SceneCamera
+from simtest.spec.surfaces import Relief
 from simtest.validation.run_folder import EXPORT, EXPORTING
 from simtest.validation.runner import Progress
 

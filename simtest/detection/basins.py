@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.geometry.pixel_sets import rows_and_columns
+from simtest.geometry.patch import rows_and_columns
 from simtest.runtime.arrays import Array, Image, Index, Mask
 
 _NEIGHBOURS = ((0, 1), (1, -1), (1, 0), (1, 1))

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from simtest.calibration.calibration import brightest_channel, mean_channel
-from simtest.calibration.noise_estimate import median
+from simtest.calibration.frame import median
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection.light_split import BLOCKS, NEIGHBOURHOOD, SplitLight
 from simtest.detection.regions import MARGIN_PX, Region

@@ -14,7 +14,7 @@ from simtest.detection.light_split import SplitLight
 from simtest.detection.spots import Spot
 from simtest.detection.view_mask import View
 from simtest.geometry import Image, Mask, smooth
-from simtest.geometry.pixel_sets import rows_and_columns
+from simtest.geometry.patch import rows_and_columns
 
 SHAPE_PX = 0.7
 """Smoothing of the specular light before the shape of highlights is measured."""

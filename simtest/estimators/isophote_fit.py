@@ -18,9 +18,8 @@ from simtest.geometry import (
     fit_arc,
     fit_ellipses,
 )
-from simtest.geometry.arc_fit import MIN_ARC_RAD, angular_extent
-from simtest.geometry.ellipse_fit import MIN_POINTS
-from simtest.geometry.fitting_planes import FORWARD, fitting_planes
+from simtest.geometry.cones import FORWARD, fitting_planes
+from simtest.geometry.ellipse_fit import MIN_ARC_RAD, MIN_POINTS, angular_extent
 from simtest.runtime.short_repr import short_repr
 
 MAX_ARC_RESIDUAL = 0.1

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.geometry.quaternions import rotation_of
+from simtest.geometry.vectors import rotation_of
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import require_plain
 from simtest.runtime.resources import shown

@@ -22,7 +22,7 @@ from simtest.estimators.process.naming import short_names
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
-from simtest.geometry.gaussian_smoothing import share_of_noise
+from simtest.geometry.patch import share_of_noise
 from simtest.reconstruction.assumptions import assumptions, calibration_of_view
 from simtest.reconstruction.choices import (
     AUTO,

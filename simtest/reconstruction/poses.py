@@ -17,7 +17,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.estimators.two_views import PoseError
-from simtest.geometry.quaternions import rotation_of
+from simtest.geometry.vectors import rotation_of
 from simtest.reconstruction.dataset_poses import dataset_poses
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import require_plain
@@ -266,8 +266,8 @@ def _is_foreign(text: str, is_json: bool) -> bool:
 
 def _from_others(path: Path, text: str, is_json: bool, where: str) -> Read:
     """Read the poses of another program's file, and the settings that it states."""
-    from simtest.spec.camera_formats import read_poses as read_foreign
     from simtest.spec.camera_formats.common import parse_json
+    from simtest.spec.camera_formats.files import read_poses as read_foreign
 
     try:
         found = read_foreign(path)

@@ -27,8 +27,7 @@ from simtest.rendering.tissue_kernels import ReliefKernel
 from simtest.rendering.trace import Progress, Tracer
 from simtest.rendering.truth import CHANNELS, ShapeLabels
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
-from simtest.spec.falloff import CosineProfile
-from simtest.spec.rig import LightSpec, is_at_camera
+from simtest.spec.lights import CosineProfile, LightSpec, is_at_camera
 from simtest.spec.scene import Scene
 from simtest.surfaces import Shape, TriangleMesh
 

@@ -20,8 +20,8 @@ from simtest.rendering.reflectances import bsdf_dict, parameter_updates, parts_a
 from simtest.rendering.tissue_kernels import AlbedoKernel
 from simtest.rendering.truth import ShapeLabels
 from simtest.runtime.arrays import Array
+from simtest.spec.lights import LightSpec, Rig
 from simtest.spec.reflectance import Reflectance
-from simtest.spec.rig import LightSpec, Rig
 from simtest.surfaces import Shape, TriangleMesh
 
 

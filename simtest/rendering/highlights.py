@@ -23,7 +23,7 @@ import numpy as np
 from simtest.rendering.frames import HighlightPoint, Radiance
 from simtest.rendering.misfits import MisfitGrid, crossed, exact_misfit, turned_pixels
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 
 if TYPE_CHECKING:
     from simtest.geometry.camera import Camera

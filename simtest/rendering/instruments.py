@@ -20,8 +20,8 @@ from simtest.rendering.placement_checks import check_instruments
 from simtest.rendering.rays import Hit
 from simtest.rendering.reflectances import facet_density, visible_over_cosine
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
-from simtest.spec.instrument import DEFAULT_DEPTH_SHARE, Instrument
-from simtest.spec.rig import is_at_camera
+from simtest.spec.lights import is_at_camera
+from simtest.spec.surfaces import DEFAULT_DEPTH_SHARE, Instrument
 from simtest.surfaces.instrument import RoundCones, round_cones
 
 if TYPE_CHECKING:

@@ -18,9 +18,17 @@ from simtest.rendering.kernel_values import MitsubaDict, channel_mean, spectrum
 from simtest.rendering.rays import Hit, Lanes
 from simtest.rendering.tissue_kernels import AlbedoKernel
 from simtest.runtime.arrays import Array
-from simtest.spec.falloff import CosineProfile, TableProfile
-from simtest.spec.light_source import CrescentSource, DiscSource, RingSource, Source
-from simtest.spec.rig import LightSpec, Rig, is_at_camera
+from simtest.spec.lights import (
+    CosineProfile,
+    CrescentSource,
+    DiscSource,
+    LightSpec,
+    Rig,
+    RingSource,
+    Source,
+    TableProfile,
+    is_at_camera,
+)
 
 DRAWN = 4
 """Points of each source at each of a pixel's samples."""

@@ -22,10 +22,8 @@ from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.runtime.machine_errors import write_error
 from simtest.spec import Scene
-from simtest.spec.falloff import CosineProfile
-from simtest.spec.light_source import DiscSource
+from simtest.spec.lights import CosineProfile, DiscSource, LightSpec
 from simtest.spec.reflectance import PhongReflectance, TissueReflectance
-from simtest.spec.rig import LightSpec
 from simtest.spec.spec_model import Spec
 from simtest.surfaces import Shape, SurfaceModel, make_surface
 

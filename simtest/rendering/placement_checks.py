@@ -5,7 +5,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Array
-from simtest.spec.rig import LightSpec, Rig
+from simtest.spec.lights import LightSpec, Rig
 from simtest.spec.scene import Scene
 from simtest.surfaces import SurfaceModel
 from simtest.surfaces.deformation import DeformedSurface, stays_in_free_space

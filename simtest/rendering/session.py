@@ -29,10 +29,10 @@ from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel, rest_ma
 from simtest.rendering.trace import Bounces, Progress, Tracer, as_radiance, evaluate, mean_over
 from simtest.rendering.truth import ShapeLabels, as_hits, as_labels
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
-from simtest.spec.motion import Motion
-from simtest.spec.rig import is_at_camera
+from simtest.spec.camera import Motion
+from simtest.spec.lights import is_at_camera
+from simtest.spec.reflectance import Translucency
 from simtest.spec.scene import Scene
-from simtest.spec.translucency import Translucency
 from simtest.surfaces import RayHits, SurfaceModel, SurfacePoints, make_surface
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ import numpy as np
 
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.translucency import Translucency
+from simtest.spec.reflectance import Translucency
 
 LEVELS_PX = tuple(2.0**i for i in range(8))
 """Standard deviations of the blurred levels, px; what is narrower stays sharp, what is wider takes the last."""

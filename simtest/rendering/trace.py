@@ -21,7 +21,7 @@ from simtest.rendering.rays import Hit, HitRefinement, Lanes, Pixels, Rays, Sigh
 from simtest.rendering.tissue_kernels import ReliefKernel
 from simtest.rendering.truth import CHANNELS, ShapeLabels
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.motion import Motion
+from simtest.spec.camera import Motion
 from simtest.spec.scene import Effort
 
 

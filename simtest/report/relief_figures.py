@@ -13,7 +13,7 @@ from simtest.report.curves import bar, scattered, varies
 from simtest.report.run_folder import Run
 from simtest.report.series import axis_title
 from simtest.runtime.arrays import Array
-from simtest.spec.describe import name_key
+from simtest.spec.keys import name_key
 from simtest.validation import relief_laws
 
 KD = "kd_base"

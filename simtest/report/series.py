@@ -11,7 +11,7 @@ from simtest.pages.charts import NOTHING, Axis, Bars, Chart, Mark, Panel, curvat
 from simtest.pages.style import NEUTRAL, estimator_order, number, symbols
 from simtest.report.curves import Ask, Curve, gather, prepared, varies
 from simtest.report.run_folder import Run
-from simtest.spec.describe import describe_key, name_key
+from simtest.spec.keys import describe_key, name_key
 
 # A law is met within 0.3 deg or 3 %, whichever is larger (theory.md section 4).
 TOLERANCE_DEG, TOLERANCE_SHARE = 0.3, 0.03

@@ -10,7 +10,7 @@ from simtest.simulation.sequence_labels import FILES, SequenceLabels
 from simtest.simulation.view_files import FRAMES_PER_SECOND, ViewWriter
 from simtest.simulation.viewpoints import Progress, SampledViews, sample_views, viewpoint_key
 from simtest.spec import Scene
-from simtest.spec.trajectories import COLMAP, TRANSFORMS, TUM, Trajectory, stack, write_trajectory
+from simtest.spec.camera_formats.trajectories import COLMAP, TRANSFORMS, TUM, Trajectory, stack, write_trajectory
 
 FPS = (0.1, 1000.0)
 """Frames a second that a sequence may have."""

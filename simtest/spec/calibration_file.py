@@ -7,8 +7,8 @@ from typing import Any
 from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.runtime.resources import shown
+from simtest.spec.camera import NOT_OF_THE_CAMERA, load_camera
 from simtest.spec.camera_formats.files import FOREIGN_SUFFIXES, recognise
-from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, load_camera
 from simtest.spec.spec_model import validate
 from simtest.spec.toml_files import read_toml
 
@@ -68,7 +68,7 @@ def load_calibration(
 
 def _with_photometry(data: Mapping[str, Any], photometric: Path, path: Path) -> dict[str, Any]:
     """Return the tables of a calibration file with those of a photometric calibration."""
-    from simtest.spec.camera_formats.photometric import read_photometric
+    from simtest.spec.camera_formats.omnidirectional import read_photometric
 
     made = dict(data)
     for name, table in read_photometric(photometric).items():
@@ -111,7 +111,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     # Imported on demand: reading needs neither.
     from simtest.runtime.files import write_atomically
     from simtest.runtime.machine_errors import cannot_write
-    from simtest.spec.calibration_tables import calibration_toml
+    from simtest.spec.calibration_spec import calibration_toml
 
     text = calibration_toml(calibration)
     try:

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from simtest.runtime.arrays import Array, IntArray
-from simtest.spec.surface import CylinderSurface, PlaneSurface, QuadricSurface, SphereSurface
+from simtest.spec.surfaces import CylinderSurface, PlaneSurface, QuadricSurface, SphereSurface
 from simtest.surfaces.model import (
     RayHits,
     Shape,

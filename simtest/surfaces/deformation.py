@@ -16,7 +16,7 @@ import numpy as np
 
 from simtest.geometry.vectors import rotation
 from simtest.runtime.arrays import Array, Mask
-from simtest.spec.deformation import MAX_STRETCH, Breathing, Contractions, Deformation, Dent, Peristalsis
+from simtest.spec.surfaces import MAX_STRETCH, Breathing, Contractions, Deformation, Dent, Peristalsis
 from simtest.surfaces.model import (
     RayHits,
     Shape,
@@ -291,7 +291,7 @@ class DeformationAt:
     Examples
     --------
     >>> import numpy as np
-    >>> from simtest.spec.deformation import Dent
+    >>> from simtest.spec.surfaces import Dent
     >>> dent = Dent(amplitude_mm=2.0, period_s=2.0, direction=(0, 0, 1), radius_mm=5.0)
     >>> pressed = DeformationAt([dent], time_s=1.0)
     >>> pressed.moved(np.zeros((1, 3))).tolist()

@@ -5,16 +5,16 @@ from pathlib import Path
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
-from simtest.spec.deformation import Deformation
-from simtest.spec.surface import (
+from simtest.spec.camera import Moved
+from simtest.spec.surfaces import (
     AnatomySurface,
     CylinderSurface,
+    Deformation,
     PlaneSurface,
     QuadricSurface,
     SphereSurface,
     Surface,
 )
-from simtest.spec.views import Moved
 from simtest.surfaces.analytic import Cylinder, GradedMesh, Plane, Quadric, Sphere
 from simtest.surfaces.mesh_file import MESH_SUFFIXES
 from simtest.surfaces.model import SurfaceModel, TriangleMesh, principal_curvatures

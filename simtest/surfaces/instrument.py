@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtest.runtime.arrays import Array, IntArray
-from simtest.spec.instrument import Instrument
+from simtest.spec.surfaces import Instrument
 
 DEFAULT_OPENING_DEG = 30.0
 

@@ -16,7 +16,7 @@ from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.resources import find
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import MESH_SUFFIXES, Repairs, examine, other_unit, read_mesh
 from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures
 from simtest.surfaces.poses import lumen_pose, nearest_mm, organ_pose

@@ -18,7 +18,7 @@ from simtest.errors import InputError
 from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.seeds import Stage, generator
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.model import SurfaceModel, TriangleMesh
 from simtest.surfaces.triangles import MIN_CLEARANCE_MM, Generator, MeshProbe
 

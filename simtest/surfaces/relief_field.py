@@ -17,7 +17,7 @@ import numpy as np
 from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.kept_arrays import kept
-from simtest.spec.relief import Relief, ReliefBand
+from simtest.spec.surfaces import Relief, ReliefBand
 from simtest.surfaces.model import SurfacePoints, principal
 
 NODES = 96

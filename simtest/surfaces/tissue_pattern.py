@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.kept_arrays import kept
-from simtest.spec.tissue_colour import TissueColour
+from simtest.spec.reflectance import TissueColour
 from simtest.surfaces.model import SurfaceModel
 from simtest.surfaces.vessels import (
     NO_VESSELS,

@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from simtest.runtime.arrays import Array, IntArray, Mask
-from simtest.spec.tissue_colour import Vessels
+from simtest.spec.reflectance import Vessels
 from simtest.surfaces.analytic import QUADRIC_REACH, Cylinder, Plane, Quadric, Sphere
 from simtest.surfaces.model import SurfaceModel, TriangleMesh
 from simtest.surfaces.triangles import area_vectors

@@ -14,9 +14,9 @@ from simtest.runtime.files import Json
 from simtest.runtime.resources import find, shown
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, apply_settings, read_toml, scene_from_dict
-from simtest.spec.paper import PaperSetting, is_paper, paper_from_dict
+from simtest.spec.keys import replace_values
+from simtest.spec.recipes import PaperSetting, is_paper, paper_from_dict
 from simtest.spec.toml_files import toml_value
-from simtest.spec.type_change import replace_values
 from simtest.surfaces.recipe import load_recipe
 
 if TYPE_CHECKING:

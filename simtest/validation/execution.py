@@ -13,7 +13,7 @@ from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.process.naming import forgive_cores
 from simtest.runtime.engines import OnStep
 from simtest.spec import Experiment
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation import gallery_items as gallery
 from simtest.validation.cases import Case
 from simtest.validation.columns import Row, Value, completed, swept_columns, table

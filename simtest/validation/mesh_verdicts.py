@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from simtest.runtime.files import JsonObject
 from simtest.runtime.resources import find
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, read_toml, scene_from_dict
+from simtest.spec.keys import replace_values
 from simtest.spec.toml_files import apply_settings
-from simtest.spec.type_change import replace_values
 
 if TYPE_CHECKING:
     from simtest.surfaces.mesh_check import MeshCheck

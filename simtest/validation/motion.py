@@ -20,7 +20,7 @@ from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import Stage, generator
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import Experiment, Scene
-from simtest.spec.views import Moved, Views
+from simtest.spec.camera import Moved, Views
 from simtest.validation.cases import Case
 from simtest.validation.columns import Row
 

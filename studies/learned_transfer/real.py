@@ -24,7 +24,7 @@ from simtest.reconstruction import Specularity
 from simtest.reconstruction.assumptions import calibration_of_view
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.rig import Rig
+from simtest.spec.lights import Rig
 from studies.detection.real_frames import (
     OutlinedFrame,
 )

@@ -8,7 +8,7 @@ from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import Experiment, scene_from_dict
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import expand
 from simtest.validation.paper.published_pipeline import Pipeline
 from simtest.validation.paper.rows import paper_rows

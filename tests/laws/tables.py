@@ -12,7 +12,7 @@ from simtest.runtime.arrays import Array
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import Examined, verdicts
 from simtest.spec import Experiment
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation import laws
 from simtest.validation.cases import expand
 from simtest.validation.columns import Row, table

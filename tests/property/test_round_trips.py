@@ -11,7 +11,7 @@ from simtest.geometry import ellipse_of_conic
 from simtest.geometry.vectors import angle_deg, bisect, rotation, tangent_basis, tangent_coordinates
 from simtest.runtime.seeds import from_integer
 from simtest.spec import LightSpec
-from simtest.spec.views import Moved, Views
+from simtest.spec.camera import Moved, Views
 from simtest.surfaces.analytic import placement
 from simtest.validation.motion import told_pose
 

@@ -21,9 +21,9 @@ from simtest.runtime.resources import data_root
 from simtest.runtime.seeds import Stage, from_integer, generator, integer
 from simtest.simulation.camera_chain import capture
 from simtest.spec import Experiment, load_dataset, scene_from_dict
-from simtest.spec.rig import Rig
+from simtest.spec.lights import Rig
+from simtest.spec.reflectance import TissueColour
 from simtest.spec.sensor import Sensor
-from simtest.spec.tissue_colour import TissueColour
 from simtest.surfaces import make_surface, poses
 from simtest.surfaces.liver import Body
 from simtest.surfaces.recipe import load_recipe

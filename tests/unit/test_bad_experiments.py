@@ -6,7 +6,7 @@ import pytest
 
 from simtest.estimators import load_estimators
 from simtest.spec import load_experiment, load_scene
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces import make_surface
 from simtest.validation import realisation, runner
 from simtest.validation.cases import expand

@@ -7,8 +7,7 @@ import pytest
 
 from simtest.rendering import backend, truth, tube_kernel
 from simtest.rendering.tube_kernel import TubeKernel
-from simtest.spec.relief import Relief, ReliefBand
-from simtest.spec.surface import AnatomySurface, SphereSurface
+from simtest.spec.surfaces import AnatomySurface, Relief, ReliefBand, SphereSurface
 from simtest.surfaces import RayHits, SurfacePoints, make_surface
 from simtest.surfaces.colon import BuiltColon, Colon
 from simtest.surfaces.model import pack_points

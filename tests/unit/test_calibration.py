@@ -8,13 +8,13 @@ import pytest
 import simtest
 from simtest.calibration import Calibration, NoiseModel, Priors, Response, Uniform
 from simtest.calibration.calibration import MIN_FALLOFF
+from simtest.calibration.photometry import AngularProfile
 from simtest.detection import Region, detect, estimate_noise
 from simtest.detection.detector import Detection
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction.pipeline import reconstruct, run_pipeline
 from simtest.simulation.camera_chain import capture, collect
 from simtest.spec import load_calibration, load_camera, save_calibration

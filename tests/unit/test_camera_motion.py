@@ -14,8 +14,8 @@ from simtest.estimators import load_estimators
 from simtest.rendering import Session
 from simtest.simulation.frame_files import write_frame
 from simtest.spec import Experiment, load_camera, scene_from_dict
-from simtest.spec.dataset_recipe import Dataset
-from simtest.spec.motion import Motion
+from simtest.spec.camera import Motion
+from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
 from simtest.validation.realisation import Realiser

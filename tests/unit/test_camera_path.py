@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces import make_surface
 from simtest.surfaces.model import RayHits, Shape, SurfaceModel, TriangleMesh
 from simtest.surfaces.poses import MIN_CLEARANCE_MM, camera_path

@@ -35,7 +35,7 @@ from simtest.runtime.engines import make_engine
 from simtest.runtime.engines.cluster import cores_per_task
 from simtest.simulation.frame_files import write_frame
 from simtest.spec import load_dataset, load_scene, scene_from_dict
-from simtest.spec.dataset_recipe import Dataset, Distribution, Splits
+from simtest.spec.recipes import Dataset, Distribution, Splits
 from simtest.spec.spec_model import validate
 from tests.marked import marked
 from tests.unit.engine_tasks import breaks, dies_once, fails, meets_a_full_disk, square

@@ -14,7 +14,7 @@ from simtest.estimators import load_estimators
 from simtest.rendering import Session
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import Experiment, load_dataset
-from simtest.spec.dataset_recipe import Dataset, Family
+from simtest.spec.recipes import Dataset, Family
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
 from simtest.validation.realisation import realise

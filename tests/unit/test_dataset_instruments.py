@@ -14,8 +14,7 @@ from simtest.dataset.shard_writer import write_dataset
 from simtest.dataset.verify import check_sample, verify
 from simtest.errors import InputError
 from simtest.runtime.engines import make_engine
-from simtest.spec.dataset_recipe import Dataset
-from simtest.spec.experiment import Experiment
+from simtest.spec.recipes import Dataset, Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand, swept_example
 from simtest.validation.columns import table

@@ -11,7 +11,7 @@ from simtest.geometry.camera import Camera
 from simtest.rendering import Session, trace
 from simtest.rendering.rays import TILE, is_pinhole, untile
 from simtest.spec import scene_from_dict
-from simtest.spec.camera_spec import CameraSpec
+from simtest.spec.camera import CameraSpec
 from tests.marked import marked
 
 pytestmark = pytest.mark.render

@@ -12,8 +12,8 @@ from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.simulation.frame_files import write_frame
 from simtest.simulation.labelled_frame import make_frame
-from simtest.spec.instrument import Instrument
 from simtest.spec.scene import scene_from_dict
+from simtest.spec.surfaces import Instrument
 from simtest.surfaces.instrument import round_cones
 
 F, WIDTH, HEIGHT, DISTANCE = 64.0, 80, 60, 60.0

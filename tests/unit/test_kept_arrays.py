@@ -12,9 +12,8 @@ import pytest
 from simtest.runtime import kept_arrays
 from simtest.runtime.kept_arrays import cache_folder, kept, only_reading
 from simtest.runtime.resources import find
-from simtest.spec.relief import Relief, ReliefBand
-from simtest.spec.surface import PlaneSurface
-from simtest.spec.tissue_colour import TissueColour
+from simtest.spec.reflectance import TissueColour
+from simtest.spec.surfaces import PlaneSurface, Relief, ReliefBand
 from simtest.surfaces import colon, liver, relief_field, tissue_pattern
 from simtest.surfaces.analytic import Plane
 from simtest.surfaces.recipe import load_recipe

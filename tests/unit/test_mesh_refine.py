@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import read_mesh
 from simtest.surfaces.mesh_surface import Refinement, fair, halvings, prepare, refine, shape_operators, vertex_normals
 from simtest.surfaces.model import principal_curvatures

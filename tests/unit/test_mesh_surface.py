@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from simtest.errors import InputError
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import read_mesh
 from simtest.surfaces.mesh_surface import LUMEN_QUOTIENT, MeshSurface, prepare
 from simtest.surfaces.model import RayHits

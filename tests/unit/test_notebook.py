@@ -20,7 +20,8 @@ from simtest.report.run_results import RunResults
 from simtest.runtime.short_repr import LONGEST, short
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.preview import SURFACE_LEVEL, preview
-from simtest.spec.short_keys import full_keys, scene_models
+from simtest.spec.keys import full_keys
+from simtest.spec.recipes import scene_models
 from simtest.validation.cases import expand
 
 SIZE = 160

@@ -9,7 +9,7 @@ from simtest import validate
 from simtest.errors import InputError
 from simtest.runtime.engines import make_engine
 from simtest.spec import Experiment, load_experiment, load_scene
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import expand
 from simtest.validation.columns import SCHEMA
 from simtest.validation.runner import run_experiment

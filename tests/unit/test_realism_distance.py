@@ -18,7 +18,7 @@ from simtest.realism.frame_sets import NamedFrame, open_frames, open_generated, 
 from simtest.realism.frame_statistics import COLUMNS
 from simtest.runtime.kept_arrays import kept
 from simtest.spec import load_scene
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.recipes import load_dataset
 
 SPREAD = 0.3
 """Of the scenes' means, where a scene's own values spread by 1."""

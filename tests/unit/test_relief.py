@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
-from simtest.spec.relief import MAX_HEIGHT_MM, Relief
+from simtest.spec.surfaces import MAX_HEIGHT_MM, Relief
 from simtest.surfaces import forget_meshes
 from simtest.surfaces.relief_field import NODES, HeightJets, fine_normals, make_relief
 from tests.example_counts import examples

@@ -5,7 +5,7 @@ import pytest
 
 from simtest.rendering import Session, trace
 from simtest.spec import scene_from_dict
-from simtest.spec.tissue_colour import PRESETS, TissueColour
+from simtest.spec.reflectance import TISSUE_PRESETS, TissueColour
 from simtest.surfaces import make_surface
 from simtest.surfaces.tissue_pattern import BLUR_PER_DEPTH, _make, blood_absorption, make_pattern, reach
 from simtest.surfaces.vessels import (
@@ -279,7 +279,7 @@ def test_the_net_has_meshes_of_the_told_width():
     assert 0.05 < dark.mean() < 0.5
 
 
-@pytest.mark.parametrize("preset", sorted(PRESETS))
+@pytest.mark.parametrize("preset", sorted(TISSUE_PRESETS))
 def test_albedo_is_a_share(preset):
     tissue = {"preset": preset, "base": [1.0, 1.0, 0.9], "mottling": {"amplitude": 1.0}}
     pattern = make_pattern(surface_of("plane"), scene(tissue=tissue).albedo)
@@ -293,8 +293,8 @@ def test_albedo_is_a_share(preset):
 def test_presets_can_be_overridden_number_by_number():
     tissue = TissueColour.model_validate({"preset": "stomach", "vessels": {"depth_mm": 0.1}})
     assert tissue.vessels.depth_mm == 0.1
-    assert tissue.vessels.largest_mm == PRESETS["stomach"]["vessels"]["largest_mm"]
-    assert tissue.base == PRESETS["stomach"]["base"]
+    assert tissue.vessels.largest_mm == TISSUE_PRESETS["stomach"]["vessels"]["largest_mm"]
+    assert tissue.base == TISSUE_PRESETS["stomach"]["base"]
     assert TissueColour() == TissueColour.model_validate({}) == TissueColour(preset="colon_mucosa")
 
 

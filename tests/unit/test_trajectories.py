@@ -7,10 +7,10 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.geometry.distortion import KannalaBrandt
+from simtest.geometry.lenses import KannalaBrandt
 from simtest.geometry.vectors import rotation
 from simtest.reconstruction.poses import read_poses
-from simtest.spec.trajectories import Trajectory, stack, tum_text, write_trajectory
+from simtest.spec.camera_formats.trajectories import Trajectory, stack, tum_text, write_trajectory
 
 CAMERA = Camera(640, 480, 320.0, 322.0, 318.0, 243.0)
 

@@ -7,9 +7,9 @@ import pytest
 from simtest.errors import InputError
 from simtest.runtime.resources import find
 from simtest.spec import Scene, load_calibration, load_dataset, load_experiment, load_scene, read_toml
+from simtest.spec.keys import replace_values
 from simtest.spec.scene import scene_from_dict
 from simtest.spec.toml_files import apply_settings
-from simtest.spec.type_change import replace_values
 from simtest.validation.cases import expand
 from tests.refusals import refused
 

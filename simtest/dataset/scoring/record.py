@@ -19,7 +19,7 @@ from simtest.runtime.arrays import Image
 from simtest.runtime.files import require_plain, write_json
 from simtest.runtime.resources import shown
 from simtest.spec import Experiment
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import Case, expand
 from simtest.validation.fingerprints import definition

@@ -16,7 +16,7 @@ from simtest.estimators.protocol import Target
 from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.resources import shown
-from simtest.spec.camera_spec import CameraSpec
+from simtest.spec.camera import CameraSpec
 from simtest.spec.spec_model import validate
 from simtest.validation.metrics import MISSED
 

@@ -8,8 +8,8 @@ import polars as pl
 from simtest.errors import FAULTS, Reason
 from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE, KEY, QUANTITIES
 from simtest.nightly.records import CELL, POOLED, SINGLE, NightlyRun, RunRecord, to_explain
-from simtest.validation.faults import fault_sentences, faults_of
 from simtest.validation.columns import BUDGET_COLUMNS
+from simtest.validation.faults import fault_sentences, faults_of
 
 MOST = 8
 """Causes at most; what else was found is counted in one more."""

@@ -17,7 +17,7 @@ from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import Json, make_folder, require_plain, write_json
 from simtest.runtime.provenance import source_hash
 from simtest.runtime.resources import shown
-from simtest.spec.dataset_recipe import Dataset, Splits
+from simtest.spec.recipes import Dataset, Splits
 
 if TYPE_CHECKING:
     from simtest.realism.fitting.frames import DrawnFrame

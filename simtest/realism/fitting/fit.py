@@ -17,7 +17,7 @@ from simtest.realism.frame_statistics import measure
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 from simtest.spec import load_scene
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 
 LEAST_SCENES = 3
 """Of fewer scenes neither a spread nor an interval can be said."""

@@ -15,7 +15,7 @@ from simtest.runtime.seeds import Stage, generator, integer
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.rendered_view import expose_picture
 from simtest.spec import Scene, apply_settings
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.sensor import Sensor
 
 TRIES = 8

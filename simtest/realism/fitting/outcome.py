@@ -15,7 +15,7 @@ from simtest.realism.fitting.summaries import NAMES
 from simtest.runtime.files import Json, write_atomically, write_json
 from simtest.runtime.machine_errors import write_error
 from simtest.runtime.resources import shown
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.toml_files import toml_value
 
 UNITS = {kind: unit for kind, _, unit in KNOWN}

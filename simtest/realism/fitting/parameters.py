@@ -7,7 +7,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
-from simtest.spec.dataset_recipe import Dataset, Distribution, Family
+from simtest.spec.recipes import Dataset, Distribution, Family
 
 KNOWN: tuple[tuple[str, str, str], ...] = (
     ("relief slope", r"surface\.relief\.bands\.\d+\.slope_deg", "deg"),

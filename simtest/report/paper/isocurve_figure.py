@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.measure import find_contours
 
-from simtest.geometry.isocurves import brightest_point, isocurve_radii, on_isophote_branch, specular_isocurve
 from simtest.pages.charts import Axis, Chart, Mark, Panel
 from simtest.pages.palette import NEUTRAL, SERIES
 from simtest.pages.style import symbols
 from simtest.runtime.arrays import Array
+from simtest.validation.paper.isocurves import brightest_point, isocurve_radii, on_isophote_branch, specular_isocurve
 
 KAPPA = 0.55  # the article's value
 OFFSET_LIGHT = (1.2, 0.0, 1.0)  # a light beside the camera, abs(V_Z)

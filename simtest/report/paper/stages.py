@@ -11,7 +11,7 @@ from simtest.pages.style import NEUTRAL, TRUTH, degrees, labelled
 from simtest.report.paper.parameters import PARAMETERS
 from simtest.report.run_folder import GalleryItem, KeptEstimate, Run
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 
 _ISOPHOTE = "#00C2D1"
 _DOT, _CROSS = "●", "✖"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from simtest.calibration.response import srgb_encode
+from simtest.calibration.photometry import srgb_encode
 from simtest.errors import Failure, InputError
 from simtest.pages.palette import estimator_order
 from simtest.reconstruction.pipeline import reconstruct

@@ -13,7 +13,7 @@ from simtest.estimators.circle_pose import CirclePoseEstimator
 from simtest.estimators.photometric import Photometric, photometric_plane
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.seeds import from_integer
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.columns import SCHEMA, Row, Value
 from simtest.validation.metrics import mahalanobis2
 from simtest.validation.paper.published_pipeline import Pipeline

@@ -32,7 +32,7 @@ class MapFormat:
         End of the file name of a normal map, None where the data set has none. Such a map has three channels of 16
         bits, -1 to 1 over the whole range; all three are 0 where there is no normal. It stands beside the depth map.
     normal_axes : str
-        The camera's axes that red, green and blue hold (`simtest.geometry.axes`).
+        The camera's axes that red, green and blue hold (`simtest.geometry.vectors`).
     depths : str
         End of the file name of a depth map.
     cautions : tuple of str

@@ -12,10 +12,10 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.quaternions import quaternion_of
+from simtest.geometry.vectors import quaternion_of
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
-from simtest.spec.camera_formats.writing import file_contents, write_files
+from simtest.spec.camera_formats.files import file_contents, write_files
 
 TUM, TRANSFORMS, COLMAP = "trajectory.txt", "transforms.json", "colmap"
 """Files of a trajectory: TUM's, NeRF's, and the folder of COLMAP's."""
@@ -27,6 +27,8 @@ MM_PER_M = 1000.0
 class Trajectory:
     """Poses of a sequence's frames.
 
+    Raises `InputError` if the numbers of names, poses and times differ.
+
     Parameters
     ----------
     names : sequence of str
@@ -35,11 +37,6 @@ class Trajectory:
         Poses, mm.
     times_s : sequence of float, optional
         When the frames were taken, s; None where they are no sequence in time.
-
-    Raises
-    ------
-    InputError
-        If the numbers of names, poses and times differ.
     """
 
     names: Sequence[str]
@@ -76,28 +73,10 @@ def tum_text(trajectory: Trajectory) -> str:
 
 
 def write_trajectory(trajectory: Trajectory, camera: Camera, folder: Path) -> tuple[list[Path], list[str]]:
-    """Write a trajectory in every format that can hold it.
+    """Write a trajectory of one camera in every format that can hold it, into an existing folder.
 
-    Parameters
-    ----------
-    trajectory : Trajectory
-        The poses.
-    camera : Camera
-        Of all frames.
-    folder : Path
-        An existing folder; it gets `TRANSFORMS`, the folder `COLMAP` and, for frames with times, `TUM`.
-
-    Returns
-    -------
-    files : list of Path
-        What was written.
-    left_out : list of str
-        Why a format was not: it lacks the camera's lens.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
+    It gets `TRANSFORMS`, the folder `COLMAP` and, for frames with times, `TUM`. Returns the files that were written,
+    and why a format was left out: it lacks the camera's lens. Raises `InputError` if a file cannot be written.
     """
     files: list[Path] = []
     left_out: list[str] = []

@@ -1,21 +1,116 @@
-"""The camera of a scene, and camera files."""
+"""The camera of a scene, where it stands and how it moves; camera files."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.errors import InputError
-from simtest.geometry.camera import Camera, ViewMask
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
-from simtest.geometry.field_of_view import FovExtent, focal_of_view
+from simtest.geometry.camera import Camera, FovExtent, ViewMask, focal_of_view
+from simtest.geometry.lenses import LENSES, Distortion
+from simtest.geometry.vectors import rotation
 from simtest.runtime.arrays import Array
-from simtest.spec.motion import Motion
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
-from simtest.spec.views import Moved
+
+Speed = Annotated[float, Field(ge=-1e4, le=1e4)]
+AngularSpeed = Annotated[float, Field(ge=-3600, le=3600)]
+
+
+class Motion(Spec):
+    """Camera and rig move evenly during the exposure; the frame is the mean of the radiance over it.
+
+    All truth (labels, highlights, poses) is that of the middle of the exposure. Camera frame of that moment: x right,
+    y down, z forward.
+    """
+
+    velocity_mm_s: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="of the camera's centre, mm/s")
+    angular_velocity_deg_s: tuple[AngularSpeed, AngularSpeed, AngularSpeed] = Field(
+        (0.0, 0.0, 0.0), description="the camera turns about this axis through its centre, right-handed, deg/s"
+    )
+    exposure_s: float = Field(1 / 60, gt=0, le=10, description="how long the shutter is open, s; 1/60 is a video field")
+    steps: int = Field(
+        16,
+        ge=2,
+        le=1024,
+        description="moments at which the radiance is taken; they share the pixel's samples, at least one each. The "
+        "picture should move by little more than a pixel from one to the next",
+    )
+
+    @property
+    def moves(self) -> bool:
+        """Whether any velocity differs from 0."""
+        return any((*self.velocity_mm_s, *self.angular_velocity_deg_s))
+
+    @property
+    def times_s(self) -> Array:
+        """The moments, shape (steps,), s from the middle of the exposure: the middles of equal parts of it."""
+        return np.asarray(((np.arange(self.steps) + 0.5) / self.steps - 0.5) * self.exposure_s)
+
+    def poses(self) -> Array:
+        """Return the camera's poses, shape (steps, 4, 4), at `times_s`: middle_from_moment, mm.
+
+        The centre moves along a straight line, and the camera turns about a fixed axis.
+        """
+        poses = np.tile(np.eye(4), (self.steps, 1, 1))
+        poses[:, :3, 3] = self.times_s[:, None] * np.array(self.velocity_mm_s)
+        turn = np.radians(self.angular_velocity_deg_s)
+        poses[:, :3, :3] = [rotation(time * turn) for time in self.times_s]
+        return poses
+
+
+Length = Annotated[float, Field(ge=-1e3, le=1e3)]
+Angle = Annotated[float, Field(ge=-360, le=360)]
+
+
+class Moved(Spec):
+    """Camera and rig stand elsewhere than where the surface's own keys put them; in the camera frame of that place."""
+
+    translation_mm: tuple[Length, Length, Length] = Field((0.0, 0.0, 0.0), description="of the camera's centre, mm")
+    rotation_deg: tuple[Angle, Angle, Angle] = Field(
+        (0.0, 0.0, 0.0), description="the camera is turned about this axis through its centre, right-handed, deg"
+    )
+
+    def pose(self) -> Array:
+        """Return unmoved_from_moved, shape (4, 4), mm."""
+        pose = np.eye(4)
+        pose[:3, :3] = rotation(np.radians(self.rotation_deg))
+        pose[:3, 3] = self.translation_mm
+        return pose
+
+
+class Views(Spec):
+    """Further views of the same surface, from a camera moved with its lights: for an experiment on motion.
+
+    The first view is that of the scene. Each further one is moved by `length_mm` across the optical axis.
+    """
+
+    count: int = Field(2, ge=2, le=16, description="number of views, the scene's own included")
+    length_mm: float = Field(1.0, ge=0, le=100, description="of the motion from the first view to each other one, mm")
+    direction_deg: Angle = Field(0.0, description="image direction of the first motion, deg from x to y")
+    turn_deg: Angle = Field(90.0, description="by how much the direction of each next motion is turned on, deg")
+    translation_error: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="standard deviation of the told translation along each axis, share of length_mm",
+    )
+    rotation_error_deg: float = Field(
+        0.0, ge=0, le=45, description="standard deviation of the told rotation about each axis, deg"
+    )
+    errors_told: bool = Field(True, description="whether the method is told these standard deviations, rather than 0")
+
+    def moved(self) -> list[Moved]:
+        """Return where the camera of each further view stands, from the first one."""
+        angles = np.radians(self.direction_deg + self.turn_deg * np.arange(self.count - 1))
+        return [
+            Moved(translation_mm=(float(self.length_mm * np.cos(a)), float(self.length_mm * np.sin(a)), 0.0))
+            for a in angles
+        ]
+
 
 SHORTEST, LONGEST = 0.004, 1000.0
 """Focal lengths over the longer side of the image, for fields of view of 179 and 0.06 deg."""
@@ -36,7 +131,14 @@ NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor", "
 """Tables that a calibration file may hold beside the camera; `simtest.spec.calibration_spec` describes them."""
 
 
-class BrownConradySpec(Spec):
+class _Lens(Spec):
+    def model(self) -> Distortion:
+        """Return the lens as the geometry package uses it."""
+        told = self.model_dump()
+        return LENSES[told.pop("type")](**told)
+
+
+class BrownConradySpec(_Lens):
     """A perspective lens: OpenCV's models of 5 and 8 coefficients, ROS' plumb_bob and rational_polynomial.
 
     With x = X/Z, y = Y/Z, u = x^2 + y^2, x and y are multiplied by
@@ -54,12 +156,8 @@ class BrownConradySpec(Spec):
     k5: Coefficient = Field(0.0, description="radial, of the denominator")
     k6: Coefficient = Field(0.0, description="radial, of the denominator")
 
-    def model(self) -> BrownConrady:
-        """Return the lens as the geometry package uses it."""
-        return BrownConrady(**self.model_dump(exclude={"type"}))
 
-
-class KannalaBrandtSpec(Spec):
+class KannalaBrandtSpec(_Lens):
     """A fisheye: OpenCV's fisheye model, ROS' equidistant.
 
     A direction at theta from the axis is imaged at theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal
@@ -72,12 +170,8 @@ class KannalaBrandtSpec(Spec):
     k3: Coefficient = 0.0
     k4: Coefficient = 0.0
 
-    def model(self) -> KannalaBrandt:
-        """Return the lens as the geometry package uses it."""
-        return KannalaBrandt(**self.model_dump(exclude={"type"}))
 
-
-class ScaramuzzaSpec(Spec):
+class ScaramuzzaSpec(_Lens):
     """An omnidirectional lens: the model of OCamCalib, of MATLAB's fisheye calibration and of C3VD.
 
     The image point (x, y) sees the direction (x, y, 1 + k2 r^2 + k3 r^3 + k4 r^4), r its distance from the centre, and
@@ -92,10 +186,6 @@ class ScaramuzzaSpec(Spec):
     c: float = Field(1.0, gt=0, le=1e3, description="of the matrix ((c, d), (e, 1))")
     d: float = Field(0.0, ge=-1e3, le=1e3, description="of the matrix")
     e: float = Field(0.0, ge=-1e3, le=1e3, description="of the matrix")
-
-    def model(self) -> Scaramuzza:
-        """Return the lens as the geometry package uses it."""
-        return Scaramuzza(**self.model_dump(exclude={"type"}))
 
 
 DistortionSpec = Annotated[BrownConradySpec | KannalaBrandtSpec | ScaramuzzaSpec, Field(discriminator="type")]
@@ -142,11 +232,8 @@ class CameraSpec(Spec):
             raise ValueError(f"skew = {self.skew:g}: must be 0 with fov_deg, which means square pixels")
         if given := sorted({"fx", "fy"} & self.model_fields_set):
             raise ValueError(f"fov_deg and {' and '.join(given)} exclude each other; give one of them")
-        try:
-            lens = None if self.distortion is None else self.distortion.model()
-            focal = focal_of_view(self.fov_deg, (self.width, self.height), self._centre_px, lens, self.fov_of)
-        except InputError as error:
-            raise ValueError(str(error)) from None
+        lens = None if self.distortion is None else self.distortion.model()
+        focal = focal_of_view(self.fov_deg, (self.width, self.height), self._centre_px, lens, self.fov_of)
         # Known from here on; a frozen model has no other way.
         self.__dict__.update(fx=focal, fy=focal)
         return self
@@ -332,6 +419,6 @@ def save_camera(
     True
     """
     # Imported on demand, as in `load_camera`.
-    from simtest.spec.camera_formats.writing import write_camera
+    from simtest.spec.camera_formats.files import write_camera
 
     write_camera(camera, path, format, poses)
