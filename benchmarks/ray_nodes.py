@@ -17,7 +17,7 @@ from typing import Any
 
 from benchmarks.measuring import Figure
 from simtest.dataset.shard_writer import write_dataset
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import load_dataset
 from simtest.spec.recipes import Dataset
 

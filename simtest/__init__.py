@@ -43,19 +43,7 @@ if TYPE_CHECKING:
         save_camera,
     )
 
-_HOMES = {
-    "simtest.api": ("LabelledFrame", "RunResults", "export", "render", "validate"),
-    "simtest.calibration": ("Calibration",),
-    "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
-    "simtest.estimators": ("Estimate",),
-    "simtest.geometry": ("BrownConrady", "Camera", "KannalaBrandt", "Patch", "Scaramuzza", "ViewMask"),
-    "simtest.reconstruction": ("Specularity", "reconstruct"),
-    "simtest.spec": (
-        "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_calibration",
-        "save_camera",
-    ),
-}  # fmt: skip
-_named, _names = lazy_names(__name__, _HOMES)
+_named, _names, _ = lazy_names(__name__)
 
 __all__ = [
     "BackendError",

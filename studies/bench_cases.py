@@ -12,10 +12,11 @@ from typing import Any
 from simtest.bench.suite import HASHES, SUITE, FrozenCase, read_suite
 from simtest.errors import InputError
 from simtest.runtime.files import write_json
-from simtest.runtime.resources import data_root, shown
+from simtest.runtime.resources import data_root
 from simtest.spec import AnatomySurface, Scene, load_scene, scene_from_dict
 from simtest.spec.toml_files import toml_tables, toml_value
 from simtest.surfaces.recipe import load_recipe
+from simtest.validation.rough_truth import shown
 
 Tables = dict[str, Any]
 

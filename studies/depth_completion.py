@@ -78,11 +78,6 @@ def complete(
     -------
     ndarray, shape (H, W)
         The corrected distances, mm; NaN as before.
-
-    Raises
-    ------
-    InputError
-        If shapes do not fit, or a covariance is not positive.
     """
     from scipy.sparse import block_diag
     from scipy.sparse.linalg import splu

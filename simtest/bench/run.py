@@ -42,10 +42,9 @@ from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process.command import INTERPRETERS, parse_core
 from simtest.estimators.process.naming import core_hashes, core_records, has_files, short_name
 from simtest.runtime import provenance
-from simtest.runtime.engines import Engine, make_engine
 from simtest.runtime.files import Json, JsonObject, make_folder, write_json
-from simtest.runtime.model_names import parse_model
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine, make_engine
+from simtest.runtime.resources import parse_model
 from simtest.validation.runner import Progress, run_experiments
 
 PART = "dense"
@@ -78,7 +77,7 @@ def chosen_parts(suite: Suite, wanted: Sequence[str] | None) -> list[str]:
         if suite.part(name).kind != HIGHLIGHTS:
             raise InputError(f"--part {name}: is scored by maps of normals or depths; give --maps in place of --core")
         if list(wanted).count(name) > 1:
-            raise InputError(f"--part {shown(name, 60)}: named twice")
+            raise InputError(f"--part {name}: named twice")
     return [part.name for part in suite.spec.parts if part.name in wanted]
 
 

@@ -15,9 +15,10 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
+from simtest.runtime.boundary import close_names
 from simtest.runtime.files import Json
 from simtest.runtime.provenance import file_hash
-from simtest.runtime.resources import close_names, data_root, shown
+from simtest.runtime.resources import data_root
 from simtest.runtime.seeds import Stage, generator
 from simtest.spec import AnatomySurface, Experiment, Group, read_toml
 from simtest.spec.spec_model import Name, Spec, load
@@ -138,7 +139,7 @@ class Suite:
                 return part
         names = [part.name for part in self.spec.parts]
         meant = "".join(f" (did you mean {close}?)" for close in close_names(name, names))
-        raise InputError(f"--part {shown(name, 60)}: unknown; allowed: {', '.join(names)}{meant}")
+        raise InputError(f"--part {name}: unknown; allowed: {', '.join(names)}{meant}")
 
     def of_part(self, name: str) -> list[FrozenCase]:
         """Return the cases of a part."""
@@ -158,7 +159,7 @@ def digest_of(value: Json) -> str:
 def suite_folder(version: str) -> Path:
     """Return the folder of a shipped suite; raise `InputError` for an unknown version."""
     if version not in SUITES:
-        raise InputError(f"suite {shown(version, 40)!r}: unknown; allowed: {', '.join(SUITES)}")
+        raise InputError(f"suite {version!r}: unknown; allowed: {', '.join(SUITES)}")
     return data_root("scenes") / "bench" / version
 
 
@@ -191,7 +192,7 @@ def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
         pinned = json.loads((folder / HASHES).read_text(encoding="utf-8"))
         told, of_suite = dict(pinned["cases"]), str(pinned["suite"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{shown(folder / HASHES)}: cannot be read as the pinned hashes ({error})") from error
+        raise InputError(f"{folder / HASHES}: cannot be read as the pinned hashes ({error})") from error
     for name, digest in suite.hashes.items():
         if told.get(name) != digest:
             raise InputError(
@@ -199,7 +200,7 @@ def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
                 f"{str(told.get(name))[:12]}; a changed case must be a new version"
             )
     if suite.digest != of_suite or set(told) != set(suite.hashes):
-        raise InputError(f"{shown(folder / SUITE)}: parts, seed or list of cases are not those pinned in {HASHES}")
+        raise InputError(f"{folder / SUITE}: parts, seed or list of cases are not those pinned in {HASHES}")
     return suite
 
 

@@ -36,7 +36,6 @@ from simtest.pages.html import environment
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject, make_folder, require_plain, write_atomically
-from simtest.runtime.resources import shown
 from simtest.spec.spec_model import validate
 
 FIGURES, MEDIAN_DEG = 0.05, 1e-3
@@ -86,22 +85,22 @@ def read_certificate(path: Path) -> Certificate:
     """Read a certificate; raise `InputError` if it is none, was altered, lacks a figure, or is of another format."""
     if path.is_dir():
         path = path / CERTIFICATE
+    require_plain(path, "record_bytes", "a certificate")
     try:
-        told = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+        told = json.loads(path.read_text(encoding="utf-8"))
         # What has no hash is none: numbers that are not finite, and what is nested too deeply.
         digest_of(told)
-    except (OSError, ValueError, RecursionError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise InputError(f"{shown(path)}: cannot be read as a certificate ({why})") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read as a certificate ({error})") from error
     if not isinstance(told, dict) or told.get("kind") != KIND:
-        raise InputError(f"{shown(path)}: is no certificate; its kind must be {KIND!r}")
+        raise InputError(f"{path}: is no certificate; its kind must be {KIND!r}")
     if told.get("format") != FORMAT:
-        raise InputError(f"{shown(path)}: format = {shown(told.get('format'), 20)}; this release reads {FORMAT}")
+        raise InputError(f"{path}: format = {told.get('format')!s:.20}; this release reads {FORMAT}")
     stated, keys = told.pop(OF_CERTIFICATE, None), CertificateForm.model_fields.keys()
     if missing := sorted(keys - told.keys()):
-        raise InputError(f"{shown(path)}: has no key {missing[0]}; a certificate has {', '.join(sorted(keys))}")
+        raise InputError(f"{path}: has no key {missing[0]}; a certificate has {', '.join(sorted(keys))}")
     if not isinstance(stated, str) or stated != digest_of(told):
-        raise InputError(f"{shown(path)}: was altered: its content does not have the hash that it states")
+        raise InputError(f"{path}: was altered: its content does not have the hash that it states")
     validate(CertificateForm, told, str(path))
     return Certificate(path, told)
 
@@ -111,25 +110,21 @@ def check_suite(certificate: Certificate, suite: Suite) -> None:
     told = certificate.content["suite"]
     if told.get("version") != suite.version:
         own = SUITES.get(suite.version, suite.version)
-        raise InputError(
-            f"{shown(certificate.path)}: is of version {shown(told.get('version'), 20)!r}; must be of {own}"
-        )
+        raise InputError(f"{certificate.path}: is of version {told.get('version')!r:.20}; must be of {own}")
     for part in certificate.parts:
         if part not in {each.name for each in suite.spec.parts}:
-            raise InputError(f"{shown(certificate.path)}: part {shown(part, 60)!r} is none of {SUITES[suite.version]}")
+            raise InputError(f"{certificate.path}: part {part!r:.60} is none of {SUITES[suite.version]}")
     stated, frozen = certificate.content["cases"], cases_of(suite, certificate.parts)
     for name in (*stated, *frozen):
         if name not in frozen or stated.get(name) != frozen[name]:
-            raise InputError(
-                f"{shown(certificate.path)}: case {shown(name, 60)} is not that of {SUITES[suite.version]}"
-            )
+            raise InputError(f"{certificate.path}: case {name!s:.60} is not that of {SUITES[suite.version]}")
     if told.get("sha256") != suite.digest:
-        raise InputError(f"{shown(certificate.path)}: its suite's hash is not that of {SUITES[suite.version]}")
+        raise InputError(f"{certificate.path}: its suite's hash is not that of {SUITES[suite.version]}")
     for part, figures in certificate.parts.items():
         layout = {case: scenes for case, (scenes, _) in layout_of(suite, part).items()}
         if {case: len(held) for case, held in figures["scenes"].items()} != layout:
             wanted = ", ".join(f"{count} of {case}" for case, count in layout.items())
-            raise InputError(f"{shown(certificate.path)}: parts.{part}.scenes: must be {wanted}")
+            raise InputError(f"{certificate.path}: parts.{part}.scenes: must be {wanted}")
 
 
 @dataclass(frozen=True)
@@ -269,10 +264,10 @@ def read_entries(folder: Path, suite: Suite) -> Board:
     Raises `InputError` if there are none, or one was altered, is malformed, or is of another version.
     """
     if not folder.is_dir():
-        raise InputError(f"{shown(folder)}: must be a folder that holds certificates")
+        raise InputError(f"{folder}: must be a folder that holds certificates")
     files = sorted(file for file in folder.rglob("*.json") if _is_certificate(file))
     if not files or len(files) > MOST_CERTIFICATES:
-        raise InputError(f"{shown(folder)}: holds {len(files)} certificates; must be 1 to {MOST_CERTIFICATES}")
+        raise InputError(f"{folder}: holds {len(files)} certificates; must be 1 to {MOST_CERTIFICATES}")
     certificates = [read_certificate(file) for file in files]
     for certificate in certificates:
         check_suite(certificate, suite)

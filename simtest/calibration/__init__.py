@@ -25,34 +25,4 @@ if TYPE_CHECKING:
         exactly,
     )
 
-_HOMES = {
-    "simtest.calibration.calibration": ("Calibration", "CorrectedFrame"),
-    "simtest.calibration.frame": ("Frame", "estimate_noise"),
-    "simtest.calibration.photometry": ("AngularProfile", "NoiseModel", "Response", "srgb_decode", "srgb_encode"),
-    "simtest.calibration.priors": (
-        "LIGHT_AT_CAMERA", "NO_PRIORS", "CameraPrior", "Distribution", "LogUniform", "Normal", "Priors", "Uniform",
-        "exactly",
-    ),
-}  # fmt: skip
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
-
-__all__ = [
-    "LIGHT_AT_CAMERA",
-    "NO_PRIORS",
-    "AngularProfile",
-    "Calibration",
-    "CameraPrior",
-    "CorrectedFrame",
-    "Distribution",
-    "Frame",
-    "LogUniform",
-    "NoiseModel",
-    "Normal",
-    "Priors",
-    "Response",
-    "Uniform",
-    "estimate_noise",
-    "exactly",
-    "srgb_decode",
-    "srgb_encode",
-]  # fmt: skip
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -12,8 +12,7 @@ from simtest.calibration.priors import NO_PRIORS, Priors
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_kind, check_number, check_numbers
-from simtest.runtime.arrays import Array, Image, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Image, Mask, short_repr
 
 OPTICAL_AXIS = (0.0, 0.0, 1.0)
 

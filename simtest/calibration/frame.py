@@ -15,8 +15,7 @@ from simtest.calibration.calibration import Calibration, CorrectedFrame
 from simtest.errors import Failure
 from simtest.geometry.camera import Camera
 from simtest.geometry.patch import Patch, share_of_noise, smooth
-from simtest.runtime.arrays import Image, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Image, Mask, short_repr
 
 _KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 """Difference of two Laplacians: blind to any quadratic image (Immerkaer 1996); its norm is 6."""

@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_kind, check_number, check_numbers
-from simtest.runtime.arrays import Array, Image
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Image, short_repr
 
 _LEVELS = 2**16  # values that a picture has at most
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.geometry.checks import check_kind, check_number
-from simtest.runtime.arrays import Array
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, short_repr
 
 LEAST_SHARE = 0.05
 """A Normal that stands for something positive is cut off at this share of its mean."""

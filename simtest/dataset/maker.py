@@ -22,8 +22,7 @@ from simtest.estimators.process.naming import forgive_cores
 from simtest.geometry import ellipse_of_conic, fit_ellipse
 from simtest.reconstruction.found import Specularity
 from simtest.rendering import Frame, Session, backend
-from simtest.runtime.arrays import AnyArray, Image
-from simtest.runtime.kept_arrays import only_reading
+from simtest.runtime.arrays import AnyArray, Image, only_reading
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.rendered_view import (

@@ -102,11 +102,6 @@ class Plan:
     ----------
     dataset : Dataset
         What is wanted.
-
-    Raises
-    ------
-    InputError
-        If a scene would be malformed anywhere in the ranges, or there are too few anatomies.
     """
 
     def __init__(self, dataset: Dataset) -> None:

@@ -20,8 +20,7 @@ from simtest.detection.spots import Spot
 from simtest.errors import Failure
 from simtest.geometry import Array, FittedConic, Image, Mask, fit_ellipses
 from simtest.geometry.level_sets import LevelSet, crossings, level_set_around
-from simtest.runtime.arrays import Index
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Index, short_repr
 
 Box = tuple[int, int, int, int]
 _Fitted = tuple[Array, FittedConic]

@@ -30,7 +30,7 @@ from simtest.estimators.training_range import TrainingRange, inflation, read_usu
 from simtest.estimators.turned_normals import turned_normals
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import data_root, shown
+from simtest.runtime.resources import data_root
 
 FORMAT = "simtest dense_normals, version 2"
 
@@ -92,11 +92,6 @@ class LearnedDense:
     ----------
     model : str or Path, optional
         The file model.onnx. Default: the shipped network.
-
-    Raises
-    ------
-    InputError
-        At the first use, if ONNX Runtime (extra ``onnx``) is missing, or the file is no such network.
     """
 
     model: str | Path | None = None
@@ -114,7 +109,7 @@ class LearnedDense:
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
-        network = shown(self.model or SHIPPED[-1])
+        network = str(self.model or SHIPPED[-1])
         return f"The normal of the base surface at each highlight, by the network {network} of the whole frame."
 
     @cached_property

@@ -27,7 +27,7 @@ from simtest.estimators.training_range import TrainingRange, inflation, read_usu
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import data_root, shown
+from simtest.runtime.resources import data_root
 
 FORMAT = "simtest spot_normals, version 3"
 
@@ -60,12 +60,6 @@ class LearnedSpot:
         The file model.onnx. Default: the shipped network.
     target : {"base", "fine"}
         Which surface's normals are stated.
-
-    Raises
-    ------
-    InputError
-        If the target is neither; at the first use, if ONNX Runtime (extra ``onnx``) is missing, or the file is no such
-        network.
     """
 
     model: str | Path | None = None
@@ -73,10 +67,10 @@ class LearnedSpot:
 
     def __post_init__(self) -> None:
         if self.target not in SURFACES:
-            raise InputError(f"target = {shown(self.target)}: must be base or fine")
+            raise InputError(f"target = {self.target}: must be base or fine")
 
     def with_model(self, model: Path) -> "LearnedSpot":
-        """Return the estimator with another network, which is read (see `simtest.runtime.entry_points`)."""
+        """Return the estimator with another network, which is read (see `simtest.runtime.resources`)."""
         made = replace(self, model=model)
         made.check()
         return made
@@ -84,7 +78,7 @@ class LearnedSpot:
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
-        network = shown(self.model or SHIPPED[-1])
+        network = str(self.model or SHIPPED[-1])
         return f"The normal of the {self.target} surface at each highlight, by the network {network}."
 
     def check(self) -> None:

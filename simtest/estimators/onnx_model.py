@@ -13,7 +13,6 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray
 from simtest.runtime.files import JsonObject, require_plain
-from simtest.runtime.resources import shown
 
 METADATA = "simtest"
 """Key of the metadata, a JSON object, in the file."""
@@ -37,12 +36,6 @@ class OnnxModel:
     ----------
     content : dict
         The metadata; read it inside of `reading`.
-
-    Raises
-    ------
-    InputError
-        If onnxruntime is missing, or the file cannot be read, is too large, is no ONNX model, or has no metadata of
-        this form.
     """
 
     def __init__(self, path: Path, form: str, core: str) -> None:
@@ -61,7 +54,7 @@ class OnnxModel:
             text = self._session.get_modelmeta().custom_metadata_map.get(METADATA, "")
         except Exception as error:  # its exceptions share no base but this
             reason = " ".join(str(error).split())
-            raise InputError(f"{shown(path)}: is no ONNX model ({shown(reason, 100)})") from None
+            raise InputError(f"{path}: is no ONNX model ({reason!s:.100})") from None
         with self.reading():
             self.content: JsonObject = json.loads(text)
             if self.content["format"] != form:
@@ -74,7 +67,7 @@ class OnnxModel:
             yield
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
             raise InputError(
-                f"{shown(self._path)}: is no network for {self._core} ({type(error).__name__}: {shown(error, 80)}); "
+                f"{self._path}: is no network for {self._core} ({type(error).__name__}: {error!s:.80}); "
                 f"its metadata must hold {METADATA!r} of the form {self._form!r}"
             ) from None
 
@@ -87,11 +80,6 @@ class OnnxModel:
             Arrays of float32 by name.
         shapes : mapping
             Names of the wanted outputs with their shapes; None stands for any number.
-
-        Raises
-        ------
-        InputError
-            If the network has other inputs or outputs, or an output holds no floating-point numbers or is not finite.
         """
         try:
             made = [np.asarray(each) for each in self._session.run(list(shapes), dict(inputs))]
@@ -104,7 +92,7 @@ class OnnxModel:
                     raise ValueError(f"{name} holds values that are not finite")
         except Exception as error:  # of ONNX Runtime, as above
             reason = " ".join(str(error).split())
-            raise InputError(f"{shown(self._path)}: cannot be run ({shown(reason, 120)})") from None
+            raise InputError(f"{self._path}: cannot be run ({reason!s:.120})") from None
         return made
 
 
@@ -117,7 +105,7 @@ def _bytes(path: Path) -> bytes:
     try:
         size = require_plain(path).stat().st_size
         if size > LARGEST_MODEL_BYTES:
-            raise InputError(f"{shown(path)}: has {size} bytes; may have {LARGEST_MODEL_BYTES}")
+            raise InputError(f"{path}: has {size} bytes; may have {LARGEST_MODEL_BYTES}")
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None

@@ -14,7 +14,7 @@ from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.cones import PoseRegion
 from simtest.geometry.vectors import deviation_deg
-from simtest.runtime.short_repr import LONGEST, clipped, vector
+from simtest.runtime.arrays import LONGEST, clipped, vector
 
 Target = Literal["fine", "base"]
 

@@ -7,8 +7,7 @@ from simtest.errors import InputError
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
 from simtest.estimators.protocol import AnyEstimator, Estimator, FrameEstimator
-from simtest.runtime.model_names import SUFFIX, parse_model
-from simtest.runtime.resources import shown
+from simtest.runtime.resources import SUFFIX, parse_model
 
 
 def as_estimator(name: str, given: object) -> AnyEstimator:
@@ -18,7 +17,7 @@ def as_estimator(name: str, given: object) -> AnyEstimator:
     if isinstance(given, Estimator | FrameEstimator):
         return given
     raise InputError(
-        f"estimator {name!r}: {shown(repr(given), 80)} has neither estimate(patch, camera, priors) nor "
+        f"estimator {name!r}: {repr(given)!s:.80} has neither estimate(patch, camera, priors) nor "
         "estimate_frame(frame, camera, priors)"
     )
 
@@ -28,7 +27,7 @@ def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[st
 
     A name is as registered, or "package:name" where two packages register it; or it is a core's
     (`simtest.estimators.process.command.parse_core`), which is started, or that of a network of the user's own
-    ("learned_spot:FILE.onnx", `simtest.runtime.model_names`), which is read. Both stand under their short names.
+    ("learned_spot:FILE.onnx", `simtest.runtime.resources`), which is read. Both stand under their short names.
 
     Raises
     ------
@@ -54,13 +53,11 @@ def _plain(name: str) -> tuple[str, object]:
         raise InputError(f"estimator {name!r}: one name each; several are given as {each}")
     if name.endswith(SUFFIX):
         raise InputError(
-            f"estimator {shown(name, 120)!r}: is no estimator's name; a network stands behind what runs it, as in "
-            f"learned_spot:{shown(Path(name), 80)}"
+            f"estimator {name!r}: is no estimator's name; a network stands behind what runs it, as in "
+            f"learned_spot:{Path(name)}"
         )
     if " " in name.strip() or "/" in name:
-        raise InputError(
-            f"estimator {shown(name, 120)!r}: is no estimator's name; a program of yours needs 'command: ' before it"
-        )
+        raise InputError(f"estimator {name!r}: is no estimator's name; a program of yours needs 'command: ' before it")
     return name, _installed(name)
 
 
@@ -81,7 +78,7 @@ def _installed(name: str) -> object:
         if name in ESTIMATORS.names() or not Path(name).is_file():
             raise
         how = f"python {name}" if name.endswith(".py") else f"./{name}"
-        raise InputError(f"{error}; the file {shown(name, 80)} is run by 'command: {how}'") from error
+        raise InputError(f"{error}; the file {name} is run by 'command: {how}'") from error
 
 
 def _core(name: str) -> tuple[str, object]:

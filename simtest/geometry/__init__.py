@@ -31,23 +31,4 @@ if TYPE_CHECKING:
     from simtest.geometry.patch import Patch, smooth
     from simtest.runtime.arrays import Array, Image, Index, Mask
 
-_HOMES = {
-    "simtest.geometry.camera": ("Camera", "ViewMask"),
-    "simtest.geometry.cones": (
-        "CirclePose", "CirclePoses", "circle_pose", "circle_poses", "cone_axes", "cone_of_conic", "cone_rays",
-    ),
-    "simtest.geometry.ellipse_fit": (
-        "FittedArc", "FittedConic", "ellipse_of_conic", "fit_arc", "fit_ellipse", "fit_ellipses",
-    ),
-    "simtest.geometry.lenses": ("BrownConrady", "KannalaBrandt", "Scaramuzza"),
-    "simtest.geometry.patch": ("Patch", "smooth"),
-    "simtest.runtime.arrays": ("Array", "Image", "Index", "Mask"),
-}  # fmt: skip
-
-__all__ = [
-    "Array", "BrownConrady", "Camera", "CirclePose", "CirclePoses", "FittedArc", "FittedConic", "Image", "Index",
-    "KannalaBrandt", "Mask", "Patch", "Scaramuzza", "ViewMask", "circle_pose", "circle_poses", "cone_axes",
-    "cone_of_conic", "cone_rays", "ellipse_of_conic", "fit_arc", "fit_ellipse", "fit_ellipses", "smooth",
-]  # fmt: skip
-
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -11,8 +11,7 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
 from simtest.geometry.lenses import BrownConrady, Distortion, with_radial_error
-from simtest.runtime.arrays import Array, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Mask, short_repr
 
 FOLD_GRID = 33
 """Points along each side of the image at which a lens is checked for a fold."""
@@ -321,8 +320,7 @@ def focal_of_view(
     """Return the focal length, px, of a camera with square pixels that has a given field of view.
 
     The angle, deg, is as `field_of_view` gives it. Size and principal point of the picture are px; the lens, whose
-    field it is, is by default a pinhole. Raises `InputError` if the lens cannot span that angle: a pinhole not 180 deg,
-    others not beyond their fold.
+    field it is, is by default a pinhole.
     """
     wanted, ends = np.radians(fov_deg), _ends(*size, centre, across)
     lengths = np.linalg.norm(ends, axis=1)

@@ -25,10 +25,7 @@ def survival(x: float, freedom: int) -> float:
 
 @lru_cache(maxsize=256)
 def quantile(share: float, freedom: int) -> float:
-    """Return the value that a chi-squared variable stays below with a probability of `share`, inside (0, 1).
-
-    Raises `ValueError` if `share` is not inside (0, 1), or `freedom` is below 1.
-    """
+    """Return the value that a chi-squared variable stays below with a probability of `share`, inside (0, 1)."""
     if not 0 < share < 1 or freedom < 1:
         raise ValueError(f"share = {share}, freedom = {freedom}: must be inside (0, 1), and at least 1")
     if freedom == 2:

@@ -15,8 +15,7 @@ import numpy.typing as npt
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry.level_sets import Crossings, LevelSet, crossings, cut_level_set_around, level_set_around
-from simtest.runtime.arrays import Array, Image, Index, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Image, Index, Mask, short_repr
 
 LEAST_SMOOTHING_PX = 0.5
 """What the parabola through three pixels amounts to, where a frame is not smoothed."""

@@ -104,10 +104,7 @@ def _length(vectors: Array) -> Array:
 
 
 def rotation_of(quaternion: npt.ArrayLike, where: str = "quaternion") -> Array:
-    """Return the rotation, shape (3, 3), of a quaternion w, x, y, z of length 1.
-
-    Raises `InputError` if its length is not 1 within 1 %; the message begins with `where`.
-    """
+    """Return the rotation, shape (3, 3), of a quaternion w, x, y, z of length 1."""
     q = np.asarray(quaternion, dtype=float)
     length = float(np.linalg.norm(q))
     if not abs(length - 1) <= _ROUNDED:

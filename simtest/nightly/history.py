@@ -11,7 +11,6 @@ import polars as pl
 
 from simtest.nightly.records import CELL, FIGURES, NightlyRun, Verdict
 from simtest.runtime.files import require_plain, sync_folder, write_atomically
-from simtest.runtime.resources import shown
 
 HISTORY: dict[str, pl.DataType] = {
     **FIGURES, "run_id": pl.String(), "started": pl.Datetime("us", "UTC"), "commit": pl.String(),
@@ -85,8 +84,8 @@ def read_history(folder: Path, newest: int = NEWEST) -> tuple[pl.DataFrame, list
         if not isinstance(found, str) and found["run_id"][0] in runs:
             found = "a night that another file holds already"
         if isinstance(found, str):
-            warnings.warn(f"{shown(file)}: {found}; skipped", stacklevel=2)
-            skipped.append(f"{shown(file.relative_to(folder))} ({found})")
+            warnings.warn(f"{file}: {found}; skipped", stacklevel=2)
+            skipped.append(f"{file.relative_to(folder)} ({found})")
         else:
             runs[found["run_id"][0]] = found
     # The run's id may be of a clock that went back.

@@ -33,8 +33,7 @@ from simtest.nightly.store import (
 from simtest.rendering import backend
 from simtest.report import write_report
 from simtest.runtime import provenance
-from simtest.runtime.engines import make_engine
-from simtest.runtime.engines.engine import Engine
+from simtest.runtime.processes import Engine, make_engine
 from simtest.spec import Experiment, Profile, experiments_of
 from simtest.validation.cases import Case, expand
 from simtest.validation.fingerprints import definition

@@ -21,11 +21,10 @@ import polars as pl
 from simtest.errors import InputError, SimtestError
 from simtest.nightly.gate.quantities import OLDEST_COLUMNS, OPTIONAL_COLUMNS, RESULT_COLUMNS
 from simtest.nightly.records import CELL, FIGURES, NightlyRun, RunRecord
-from simtest.runtime.files import require_plain, sync_folder, write_atomically, write_json
+from simtest.runtime.boundary import explain
+from simtest.runtime.files import read_json, sync_folder, write_atomically, write_json
 from simtest.runtime.locks import exclusive_file, waiting_for
-from simtest.runtime.machine_errors import cannot_write, disk_problem
 from simtest.runtime.provenance import file_hash
-from simtest.runtime.resources import shown
 from simtest.validation.columns import SCHEMA
 
 
@@ -57,9 +56,7 @@ class Reports:
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except FileExistsError:
-            raise InputError(f"--reports {shown(self.root)}: is a file; must be a folder") from None
-        except OSError as error:
-            raise cannot_write(error, f"--reports {shown(self.root)}", self.root) from error
+            raise InputError(f"--reports {self.root}: is a file; must be a folder") from None
 
 
 def new_run_id(now: datetime) -> str:
@@ -143,10 +140,10 @@ def disk_errors_in_one_line(root: Path, what: str, left: str) -> Iterator[None]:
     except (OSError, pl.exceptions.PolarsError, SimtestError) as error:
         # A full disk under an experiment's scratch folder is told by the name of that; the user gave the reports'.
         cause = error.__cause__ if type(error) is SimtestError else error
-        why = None if cause is None or isinstance(cause, SimtestError) else disk_problem(cause, root)
+        why = None if cause is None or isinstance(cause, SimtestError) else explain(cause)
         if why is None:
             raise
-        raise SimtestError(f"--reports {shown(root)}: {what} ({why}); {left}") from error
+        raise SimtestError(f"--reports {root}: {what} ({why}); {left}") from error
 
 
 def save_run(folder: Path, run: NightlyRun, rows_file: str, smallest: bool = False) -> None:
@@ -175,19 +172,14 @@ def check_columns(path: Path, table: pl.DataFrame, schema: Mapping[str, pl.DataT
     """Raise `InputError`, with file and column, where a table lacks a column or holds one of another type."""
     for name, dtype in schema.items():
         if name not in table.columns:
-            raise InputError(f"{shown(path)}: damaged (no column {name})")
+            raise InputError(f"{path}: damaged (no column {name})")
         if table.schema[name] != dtype:
-            raise InputError(f"{shown(path)}: damaged (column {name} is of type {table.schema[name]}, not {dtype})")
+            raise InputError(f"{path}: damaged (column {name} is of type {table.schema[name]}, not {dtype})")
 
 
 def _record(path: Path) -> tuple[RunRecord, dict[str, str]]:
     """Read a run's record, and the hashes of its tables by file name."""
-    try:
-        data = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{shown(path)}: damaged (not JSON: {error})") from error
+    data = read_json(path, "a run's record")
     try:
         hashes = data.pop("files", None)
         record = RunRecord.model_validate(data)
@@ -195,9 +187,9 @@ def _record(path: Path) -> tuple[RunRecord, dict[str, str]]:
     except (AttributeError, TypeError, KeyError, ValueError):
         sound = False
     if not sound:
-        raise InputError(f"{shown(path)}: damaged (no record of a night, with id, profile and started)")
+        raise InputError(f"{path}: damaged (no record of a night, with id, profile and started)")
     if not isinstance(hashes, dict):
-        raise InputError(f"{shown(path)}: damaged (no hashes under files)")
+        raise InputError(f"{path}: damaged (no hashes under files)")
     return record, hashes
 
 
@@ -206,11 +198,9 @@ def _table(path: Path, hashes: Mapping[str, str]) -> pl.DataFrame:
         same = file_hash(path) == hashes.get(path.name)
         if same:
             return pl.read_parquet(path, memory_map=False)
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
     except pl.exceptions.PolarsError as error:
-        raise InputError(f"{shown(path)}: damaged ({str(error).splitlines()[0]})") from error
-    raise InputError(f"{shown(path)}: damaged, or not of the same night as {RUN_FILE} (another SHA-256)")
+        raise InputError(f"{path}: damaged ({str(error).splitlines()[0]})") from error
+    raise InputError(f"{path}: damaged, or not of the same night as {RUN_FILE} (another SHA-256)")
 
 
 _TYPES = {name: SCHEMA[name] for name in RESULT_COLUMNS if name not in OLDEST_COLUMNS} | OPTIONAL_COLUMNS
@@ -254,7 +244,7 @@ def whole(rows: pl.DataFrame, path: Path) -> pl.DataFrame:
         types = {column: rows.schema.get(column) for column in (held, REFERENCE)}
         if types != {held: pl.UInt32(), REFERENCE: pl.Float64()}:
             told = ", ".join(f"column {column} is of type {kind}" for column, kind in types.items())
-            raise InputError(f"{shown(path)}: damaged ({told}; must be UInt32 and Float64)")
+            raise InputError(f"{path}: damaged ({told}; must be UInt32 and Float64)")
         bits = rows[held].fill_null(0).to_numpy() ^ _bits(rows[REFERENCE])
         restored = pl.Series(name, bits.view(np.float32))
         restored = pl.select(pl.when(rows[held].is_not_null()).then(restored)).to_series()
@@ -293,7 +283,7 @@ def load_baseline(reports: Reports, profile: str) -> NightlyRun | None:
     run = load_run(folder, BASELINE_ROWS)
     if run.record.profile != profile:
         raise InputError(
-            f"{shown(folder / RUN_FILE)}: profile = {shown(run.record.profile)}; the baseline of this night must be "
+            f"{folder / RUN_FILE}: profile = {run.record.profile}; the baseline of this night must be "
             f"of the profile {profile}"
         )
     rows = whole(run.rows, folder / BASELINE_ROWS)
@@ -311,13 +301,13 @@ def log_note(reports: Reports, profile: str) -> str | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        return f"{shown(path)}: cannot be read ({error.strerror})."
+        return f"{path}: cannot be read ({error.strerror})."
     broken = [number for number, line in enumerate(lines, 1) if not _is_entry(line)]
     if not broken:
         return None
     more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
     return (
-        f"{shown(path)}: damaged (line {broken[0]}{more} of {len(lines)} is no entry; cut off?); the rest is kept, "
+        f"{path}: damaged (line {broken[0]}{more} of {len(lines)} is no entry; cut off?); the rest is kept, "
         "the baseline itself is sound."
     )
 
@@ -346,12 +336,12 @@ def _accept(reports: Reports, profile: str, reason: str) -> RunRecord:
     source, target = reports.latest(profile), reports.baseline(profile)
     # Nothing is made where there never was a night.
     if not source.parent.is_dir():
-        raise InputError(f"{shown(source)}: no night of the profile {profile}; run simtest nightly first")
+        raise InputError(f"{source}: no night of the profile {profile}; run simtest nightly first")
     reports.make()
     # Read tonight's run under its lock, so that no other run replaces it meanwhile.
     with exclusive_replacement(source):
         if not source.is_dir():
-            raise InputError(f"{shown(source)}: no night of the profile {profile}; run simtest nightly first")
+            raise InputError(f"{source}: no night of the profile {profile}; run simtest nightly first")
         run = load_run(source, LATEST_ROWS)
     now = datetime.now(UTC)
     record = run.record.model_copy(update={"reason": reason, "accepted": now.isoformat(timespec="seconds")})

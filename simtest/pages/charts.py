@@ -18,8 +18,7 @@ import numpy.typing as npt
 from simtest.pages import pixels
 from simtest.pages.style import NEUTRAL, SHAPES, STROKES, symbols
 from simtest.runtime.arrays import Array, Image
-from simtest.runtime.files import write_atomically
-from simtest.runtime.user_cache import user_cache
+from simtest.runtime.files import user_cache, write_atomically
 
 Spec = dict[str, Any]
 """A Vega-Lite specification, or a part of one."""

@@ -40,11 +40,6 @@ def write_comparison(
     -------
     Path
         The page.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be made.
     """
 
     def tell(step: int) -> None:

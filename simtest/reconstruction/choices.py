@@ -14,9 +14,7 @@ from simtest.detection.peaks import PeakDetector
 from simtest.errors import InputError
 from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.picture_values import is_coloured
-from simtest.runtime.arrays import Image
-from simtest.runtime.resources import shown
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Image, short_repr
 
 AUTO = "auto"
 ENCODINGS = ("srgb", "linear")
@@ -76,7 +74,7 @@ def check_encoding(encoding: str | None, calibration: Calibration) -> None:
     if encoding is None:
         return
     if encoding not in ENCODINGS:
-        raise InputError(f"encoding = {shown(repr(encoding), 80)}: must be one of {', '.join(ENCODINGS)}, or None")
+        raise InputError(f"encoding = {encoding!r:.80}: must be one of {', '.join(ENCODINGS)}, or None")
     if calibration.response is not None:
         raise InputError(f"encoding = {encoding!r}: the calibration states the response; give one of them")
 

@@ -15,13 +15,5 @@ if TYPE_CHECKING:
     from simtest.rendering.session import Session
     from simtest.rendering.trace import Progress
 
-_HOMES = {
-    "simtest.rendering.frames": ("Frame", "HighlightPoint", "Labels", "Radiance", "TruthMaps"),
-    "simtest.rendering.trace": ("Progress",),
-    "simtest.rendering.session": ("Session",),
-}
-
-__all__ = ["Frame", "HighlightPoint", "Labels", "Progress", "Radiance", "Session", "TruthMaps"]
-
 # Who asks for the backend alone needs no renderer.
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -20,9 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import BackendError, InputError
-from simtest.runtime.files import Json, write_json
-from simtest.runtime.resources import shown, suggestion
-from simtest.runtime.user_cache import user_cache
+from simtest.runtime.boundary import suggestion
+from simtest.runtime.files import Json, user_cache, write_json
 
 
 class _Late:
@@ -96,7 +95,7 @@ def requested_variant(variant: str | None = None, coloured: bool = False) -> str
         allowed = (*DEVICES, *VARIANTS)
         meant = suggestion(name, allowed)
         given = "variant" if variant else VARIANT_VARIABLE
-        raise InputError(f"{given} {shown(name, 60)!r}: cannot be used; allowed: {', '.join(allowed)}{meant}")
+        raise InputError(f"{given} {name!r}: cannot be used; allowed: {', '.join(allowed)}{meant}")
     return f"{name}_ad_{'rgb' if coloured else 'mono'}" if name in DEVICES else name
 
 
@@ -235,11 +234,6 @@ def load(variant: str | None = None) -> Any:
     -------
     module
         mitsuba.
-
-    Raises
-    ------
-    BackendError
-        If no libLLVM works, or the variant does not exist; the message says how to mend it.
     """
     name = requested_variant(variant)
     # Library: chosen before Dr.Jit is imported, checked afterwards.

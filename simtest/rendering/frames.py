@@ -6,8 +6,7 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from simtest.runtime.arrays import Array, Image, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Image, Mask, short_repr
 
 
 @dataclass(frozen=True)

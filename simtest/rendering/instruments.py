@@ -232,10 +232,7 @@ ROUNDING = 1e-6
 
 
 def place(session: "Session") -> InstrumentKernel | None:
-    """Return the kernel of a scene's instruments at their places; None without any.
-
-    Raises `InputError` if one holds the camera or a light, ends inside the picture, or has no sightline at its tip.
-    """
+    """Return the kernel of a scene's instruments at their places; None without any."""
     shown = session.scene.shown_instruments
     if not shown:
         return None

@@ -20,7 +20,6 @@ from simtest.rendering.reflectances import bsdf_dict
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
-from simtest.runtime.machine_errors import write_error
 from simtest.spec import Scene
 from simtest.spec.lights import CosineProfile, DiscSource, LightSpec
 from simtest.spec.reflectance import PhongReflectance, TissueReflectance
@@ -57,14 +56,6 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
     """Write a scene for Mitsuba: scene.xml and, for surfaces that are meshes, surface.ply (see `simtest.export`).
 
     The world is the surface's model frame, mm. What belongs to the sensor (noise, exposure) is left out.
-
-    Raises
-    ------
-    InputError
-        If the camera or a light has what Mitsuba cannot express, the surface's file is malformed, or the folder cannot
-        be written.
-    BackendError
-        If the rendering backend cannot be used.
     """
     # Check before anything is written.
     for key, value, why in _inexpressible(scene):
@@ -77,17 +68,14 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
     text = _xml(scene, surface, shape, plugin)
     make_folder(out)
     files = [out / SCENE_FILE]
-    try:
-        if shape.mesh:
-            files.append(out / MESH_FILE)
-            mesh = make_shape(shape, {"type": "diffuse"})
-            # By way of memory, since Mitsuba does not tell which of the system's errors it met.
-            stream = mi.MemoryStream()
-            mesh.write_ply(stream)
-            write_atomically(files[1], lambda part: part.write_bytes(stream.raw_buffer()))
-        write_atomically(files[0], lambda part: part.write_text(text, encoding="utf-8"))
-    except OSError as error:
-        raise write_error(error, out) from error
+    if shape.mesh:
+        files.append(out / MESH_FILE)
+        mesh = make_shape(shape, {"type": "diffuse"})
+        # By way of memory, since Mitsuba does not tell which of the system's errors it met.
+        stream = mi.MemoryStream()
+        mesh.write_ply(stream)
+        write_atomically(files[1], lambda part: part.write_bytes(stream.raw_buffer()))
+    write_atomically(files[0], lambda part: part.write_text(text, encoding="utf-8"))
     return files
 
 

@@ -10,13 +10,7 @@ from simtest.rendering import lighting, reflectances
 
 
 def register() -> None:
-    """Register the plugins for Mitsuba's active variant; call it again after a change of variant, repeats do no harm.
-
-    Raises
-    ------
-    BackendError
-        If no variant is set.
-    """
+    """Register the plugins for Mitsuba's active variant; call it again after a change of variant."""
     import mitsuba
 
     variant = mitsuba.variant()

@@ -70,13 +70,6 @@ class Session:
     ----------
     rebuilds : int
         How many times the Mitsuba scene was built.
-
-    Raises
-    ------
-    BackendError
-        If the rendering backend cannot be used.
-    InputError
-        If the surface's file is malformed, the camera lies on the wrong side, or a light inside a body.
     """
 
     def __init__(self, scene: Scene, variant: str | None = None, labelled: bool = False) -> None:
@@ -104,13 +97,7 @@ class Session:
 
     @_at_its_variant
     def update(self, scene: Scene) -> None:
-        """Move to another scene; update only what changed, and rebuild only another structure.
-
-        Raises
-        ------
-        InputError
-            As for the session itself; it then stays at its scene.
-        """
+        """Move to another scene; update only what changed, and rebuild only another structure."""
         before = self.scene
         # Surface, camera and lights: refused here if they are not sound.
         if scene.placement != self.scene.placement:

@@ -28,11 +28,6 @@ def write_report(run: Path, progress: Progress | None = None) -> Path:
     pathlib.Path
         ``run/index.html``. Beside it, ``run/guide.json`` and ``run/figures/*.png`` are written anew; pictures of an
         earlier report go.
-
-    Raises
-    ------
-    InputError
-        If a file of the run is missing or malformed.
     """
     run = Path(run)
     page, key = run / "index.html", page_key(run)

@@ -17,9 +17,8 @@ from simtest.detection import contrast, half_height_component
 from simtest.detection.regions import Component, component_above
 from simtest.geometry import smooth
 from simtest.rendering import HighlightPoint
-from simtest.runtime.arrays import Array, Image, IntArray, Mask
+from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
 from simtest.runtime.files import Json
-from simtest.runtime.short_repr import short_repr
 
 Pixel = tuple[int, int]
 """Row and column."""

@@ -27,13 +27,7 @@ def sample_into(
     fps: float | None = None,
     labels: bool = False,
 ) -> SampledViews:
-    """Sample views of a scene and write them into an existing folder (see `simtest.sample_views`).
-
-    Raises
-    ------
-    InputError
-        If `fps` is out of range, or as `sample_views` does.
-    """
+    """Sample views of a scene and write them into an existing folder (see `simtest.sample_views`)."""
     if fps is not None and not FPS[0] <= fps <= FPS[1]:
         raise InputError(f"fps = {fps:g}: must be {FPS[0]:g} to {FPS[1]:g} frames a second")
     rate = (fps or FRAMES_PER_SECOND) if sequence else None

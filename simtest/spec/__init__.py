@@ -33,26 +33,4 @@ if TYPE_CHECKING:
     from simtest.spec.surfaces import AnatomySurface
     from simtest.spec.toml_files import apply_settings, parse_settings, read_toml
 
-_HOMES = {
-    "simtest.spec.calibration_file": ("load_calibration", "save_calibration"),
-    "simtest.spec.calibration_spec": ("CalibrationSpec", "calibration_toml"),
-    "simtest.spec.camera": ("CameraSpec", "load_camera", "save_camera"),
-    "simtest.spec.camera_tables": ("camera_table", "camera_toml", "describe_camera"),
-    "simtest.spec.lights": ("LightSpec",),
-    "simtest.spec.recipes": (
-        "Dataset", "Experiment", "Group", "Profile", "Uniform", "experiments_of", "load_dataset",
-        "load_experiment", "load_profile",
-    ),
-    "simtest.spec.scene": ("Scene", "load_scene", "scene_from_dict"),
-    "simtest.spec.surfaces": ("AnatomySurface",),
-    "simtest.spec.toml_files": ("apply_settings", "parse_settings", "read_toml"),
-}  # fmt: skip
-
-__all__ = [
-    "AnatomySurface", "CalibrationSpec", "CameraSpec", "Dataset", "Experiment", "Group", "LightSpec", "Profile",
-    "Scene", "Uniform", "apply_settings", "calibration_toml", "camera_table", "camera_toml", "describe_camera",
-    "experiments_of", "load_calibration", "load_camera", "load_dataset", "load_experiment", "load_profile",
-    "load_scene", "parse_settings", "read_toml", "save_calibration", "save_camera", "scene_from_dict",
-]  # fmt: skip
-
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -13,6 +13,7 @@ from simtest.geometry.camera import Camera, FovExtent, ViewMask, focal_of_view
 from simtest.geometry.lenses import LENSES, Distortion
 from simtest.geometry.vectors import rotation
 from simtest.runtime.arrays import Array
+from simtest.runtime.boundary import plain_errors
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
 
@@ -321,6 +322,7 @@ def _centre(cx: float | None, cy: float | None, middle: tuple[float, float]) -> 
     return middle[0] if cx is None else cx, middle[1] if cy is None else cy
 
 
+@plain_errors
 def load_camera(path: str | Path, view_radius_px: float | None = None) -> Camera:
     """Read a camera file; the half pixel between conventions is added or subtracted here (docs/howto/cameras.md).
 
@@ -387,6 +389,7 @@ def _validated(table: Mapping[str, Any], path: Path, how: str = "") -> Camera:
         raise
 
 
+@plain_errors
 def save_camera(
     camera: Camera, path: str | Path, format: str | None = None, poses: Sequence[tuple[str, Array]] | None = None
 ) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.spec.spec_model import nodes_at
 from simtest.spec.toml_files import apply_settings
 
@@ -98,8 +98,7 @@ def full_keys(models: Sequence[BaseModel], given: Mapping[str, Any], others: Seq
 
     `models` hold the keys that may be meant: a scene, or those of an experiment. Keys that the scene's file states come
     before those that it leaves at their defaults, and keys of tables before those of lists of tables. A mistyped name
-    may mean one of `others`, which the caller takes itself. Raises `InputError` if several keys end in a name, or none
-    does.
+    may mean one of `others`, which the caller takes itself.
     """
     found = [each for model in models for each in _paths(model)]
     stated = dict.fromkeys(path for path, is_stated in found if is_stated)
@@ -117,10 +116,10 @@ def _path_of(name: str, stated: Sequence[str], rest: Sequence[str], others: Sequ
             return (single or ending)[0]
         if ending:
             one = f'settings={{"{ending[0]}": ...}}'
-            raise InputError(f"{shown(name, 60)}: {len(ending)} keys end so: {', '.join(ending)}; name one by {one}")
+            raise InputError(f"{name}: {len(ending)} keys end so: {', '.join(ending)}; name one by {one}")
     known = dict.fromkeys(path.rsplit(".", 1)[-1] for path in (*others, *stated, *rest))
     meant = suggestion(name, known, CLOSE) or "; `simtest schema scene` lists the keys"
-    raise InputError(f"{shown(name, 60)}: no key of this scene or experiment ends so{meant}")
+    raise InputError(f"{name}: no key of this scene or experiment ends so{meant}")
 
 
 def _paths(model: BaseModel, before: str = "", stated: bool = True) -> Iterator[tuple[str, bool]]:

@@ -16,9 +16,9 @@ from pydantic import BaseModel, Field, model_validator
 from simtest.conventions import PAPER_SMOOTHING_PX
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.runtime.arrays import Array
-from simtest.runtime.resources import find, shown, suggestion
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, short_repr
+from simtest.runtime.boundary import plain_errors, suggestion
+from simtest.runtime.resources import find
 from simtest.spec.keys import replace_values, rivals
 from simtest.spec.scene import Scene
 from simtest.spec.spec_model import Name, Share, Spec, load, validate
@@ -166,6 +166,7 @@ OWN_KEYS = ("description", "estimators", "realisations", "seed", "title", "viewp
 """Settings of the experiment itself; all others are keys of its scenes."""
 
 
+@plain_errors
 def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None) -> Experiment:
     """Read an experiment file.
 
@@ -201,7 +202,7 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     if viewpoints is not None:
         groups = tuple(_with_first_viewpoints(group, viewpoints) for group in groups)
         if not any(VIEWPOINT in table for group in groups for table in (*group.sweep, *group.pool)):
-            raise InputError(f"--set viewpoints: no group of {shown(path)} varies {VIEWPOINT}")
+            raise InputError(f"--set viewpoints: no group of {path} varies {VIEWPOINT}")
     if "realisations" in own:
         # In all groups, also in those that have a number of their own.
         groups = tuple(group.model_copy(update={"realisations": None}) for group in groups)
@@ -222,14 +223,13 @@ def check_first_parts(settings: Mapping[str, Any], scene: Iterable[str], own: It
         first = path.partition(".")[0]
         if first not in scene:
             allowed = f"allowed: {', '.join(own)}, and of the scenes {', '.join(scene)}"
-            raise InputError(f"--set {shown(path, 60)}: unknown key; {allowed}{suggestion(first, [*own, *scene])}")
+            raise InputError(f"--set {path}: unknown key; {allowed}{suggestion(first, [*own, *scene])}")
 
 
 def still_varied(varied: Iterable[str], settings: Mapping[str, Any], what: str) -> set[str]:
     """Return which of the key paths that an experiment or a dataset varies stay so beside settings.
 
-    A setting fixes its path, all below it and the keys that it excludes. Raises `InputError` for a part of a value that
-    is varied as a whole.
+    A setting fixes its path, all below it and the keys that it excludes.
     """
     left = dict.fromkeys(varied)
     for path in settings:
@@ -252,7 +252,7 @@ def _is_replaced(key: str, settings: Mapping[str, Any]) -> bool:
 def _with_first_viewpoints(group: Group, count: object) -> Group:
     """Keep the first viewpoints of a group that varies them."""
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise InputError(f"--set viewpoints={shown(str(count), 60)}: must be a whole number from 1 on")
+        raise InputError(f"--set viewpoints={count!s}: must be a whole number from 1 on")
 
     def first(tables: tuple[dict[str, tuple[Any, ...]], ...]) -> tuple[dict[str, tuple[Any, ...]], ...]:
         return tuple(
@@ -443,6 +443,7 @@ class Dataset(Spec):
 _DATASET_KEYS = frozenset(Dataset.model_fields) - {"families", "per_sample", "name"}
 
 
+@plain_errors
 def load_dataset(name: str | Path, settings: Mapping[str, Any] | None = None) -> Dataset:
     """Read a dataset file.
 
@@ -555,10 +556,8 @@ def _experiment(profile: Profile, entry: ProfileEntry) -> Experiment:
     if entry.labels is not None:
         labels = [group.label for group in groups]
         if missing := next((label for label in entry.labels if label not in labels), None):
-            allowed = ", ".join(shown(label) for label in labels if label)
-            raise InputError(
-                f"profile {profile.name}: {experiment.name} has no group {shown(missing)!r}; allowed: {allowed}"
-            )
+            allowed = ", ".join(str(label) for label in labels if label)
+            raise InputError(f"profile {profile.name}: {experiment.name} has no group {missing!r}; allowed: {allowed}")
         groups = tuple(group for group in groups if group.label in entry.labels)
     # the first viewpoints of each
     if entry.pool is not None:

@@ -10,9 +10,10 @@ from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Respons
 from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
-from simtest.runtime.limits import check_limit
-from simtest.runtime.resources import find, shown
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
+from simtest.runtime.boundary import plain_errors
+from simtest.runtime.files import check_limit
+from simtest.runtime.resources import find
 from simtest.spec.camera import SceneCamera, Views
 from simtest.spec.camera_formats.common import read_json
 from simtest.spec.keys import replace_values
@@ -248,6 +249,7 @@ def _differing(table: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, 
     }
 
 
+@plain_errors
 def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> Scene:
     """Read a scene file.
 
@@ -284,5 +286,5 @@ def _tables(path: Path) -> dict[str, Any]:
         return read_toml(path)
     scene = read_json(path, "scene").get("scene")
     if not isinstance(scene, dict):
-        raise InputError(f"{shown(path)}: scene: must be a table, as in a dataset's sample or in frame.json")
+        raise InputError(f"{path}: scene: must be a table, as in a dataset's sample or in frame.json")
     return scene

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import PydanticCustomError
 
 from simtest.errors import InputError
-from simtest.runtime.resources import close_names, shown, suggestion
+from simtest.runtime.boundary import close_names, suggestion
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -85,8 +85,7 @@ def _leaves(value: Any) -> Iterator[Any]:
 def load(model: type[Model], path: Path, settings: Mapping[str, Any] | None = None) -> Model:
     """Read a TOML file as a model that has a `Name`, by default that of the file.
 
-    Values of `settings` replace those of the file, by key path. Raises `InputError` if the file is missing or
-    malformed.
+    Values of `settings` replace those of the file, by key path.
     """
     data = apply_settings(read_toml(path), settings or {}, str(path))
     data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
@@ -113,7 +112,7 @@ def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
         ]  # fmt: skip
         errors = sorted(errors, key=lambda e: _is_missing_by_typo(e, errors))
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise InputError(f"{shown(where)}: {_describe(errors[0], model, data)}{more}") from None
+        raise InputError(f"{where}: {_describe(errors[0], model, data)}{more}") from None
 
 
 def _is_missing_by_typo(error: Any, errors: list[Any]) -> bool:
@@ -128,7 +127,7 @@ def _is_missing_by_typo(error: Any, errors: list[Any]) -> bool:
 def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> str:
     """Return one of pydantic's errors as text: key path, value, and what is allowed."""
     kind, value = error["type"], error.get("input")
-    location = [shown(part, 60) for part in _without_tags(error["loc"], data, kind == "missing")]
+    location = [str(part) or "''" for part in _without_tags(error["loc"], data, kind == "missing")]
     # our own error, which names the field itself
     if kind == "coerced":
         return f"{'.'.join([*location, error['ctx']['field']])} = {_short(error['ctx']['got'])}: {error['msg']}"

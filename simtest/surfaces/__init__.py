@@ -14,19 +14,4 @@ if TYPE_CHECKING:
     from simtest.surfaces.factory import forget_meshes, make_surface
     from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh
 
-_HOMES = {
-    "simtest.surfaces.factory": ("forget_meshes", "make_surface"),
-    "simtest.surfaces.model": ("RayHits", "Shape", "SurfaceModel", "SurfacePoints", "TriangleMesh"),
-}
-
-__all__ = [
-    "RayHits",
-    "Shape",
-    "SurfaceModel",
-    "SurfacePoints",
-    "TriangleMesh",
-    "forget_meshes",
-    "make_surface",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -8,8 +8,7 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import AnyArray, Array, IntArray
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
 from simtest.surfaces.model import RayHits, TriangleMesh, in_rows
 from simtest.surfaces.poses import Generator, lumen_pose
 from simtest.surfaces.recipe import ColonRecipe

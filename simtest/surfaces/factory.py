@@ -42,11 +42,6 @@ def make_surface(
         How it deforms; the camera is not moved with it.
     time_s : float
         The moment of the deformation, s.
-
-    Raises
-    ------
-    InputError
-        If a recipe or mesh file is missing or malformed.
     """
     surface = _make_base(spec)
     if moved is not None:
@@ -131,11 +126,6 @@ def make_mesh(recipe: ColonRecipe | LiverRecipe, edge_mm: float | None = None) -
         Vertices on the surface, mm, exact normals on the camera's side.
     k_min, k_max : ndarray, shape (V,)
         Exact principal curvatures at the vertices, 1/mm.
-
-    Raises
-    ------
-    InputError
-        If the recipe gives no usable surface, or too many triangles.
     """
     from simtest.surfaces import colon, liver
 

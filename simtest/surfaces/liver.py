@@ -21,8 +21,7 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import Array, IntArray, Mask
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import Array, IntArray, Mask, kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows
 from simtest.surfaces.poses import organ_pose

@@ -14,10 +14,7 @@ import numpy as np
 
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.files import write_atomically
-from simtest.runtime.limits import check_file, check_limit, limit
-from simtest.runtime.machine_errors import cannot_write, write_error
-from simtest.runtime.resources import shown
+from simtest.runtime.files import check_limit, limit, require_plain, write_atomically
 from simtest.surfaces.model import TriangleMesh
 from simtest.surfaces.triangles import edge_uses
 from simtest.surfaces.vtk_file import check_indices, read_vtk
@@ -43,7 +40,7 @@ class Element:
 
 def read_header(path: Path) -> tuple[str, list[Element], int]:
     """Return byte order, empty of text, elements and length of a PLY file's header; `InputError` if it is malformed."""
-    where = shown(path)
+    where = str(path)
     with path.open("rb") as file:
         head = file.read(HEADER_BYTES)
     end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
@@ -66,9 +63,9 @@ def read_header(path: Path) -> tuple[str, list[Element], int]:
             case [first, *_]:
                 forms = {"element": "element NAME COUNT", "property": "property TYPE NAME of a known type"}
                 wanted = forms.get(first, "an element, property or comment")
-                raise InputError(f"{where}: header line {shown(line.rstrip(chr(13)), 60)!r}: must be {wanted}")
+                raise InputError(f"{where}: header line {line.rstrip(chr(13))!r:.60}: must be {wanted}")
     if kind not in BYTE_ORDERS:
-        raise InputError(f"{where}: format {shown(kind, 40)}: must be one of {', '.join(BYTE_ORDERS)}")
+        raise InputError(f"{where}: format {kind!s:.40}: must be one of {', '.join(BYTE_ORDERS)}")
     return BYTE_ORDERS[kind], elements, end.end()
 
 
@@ -78,7 +75,7 @@ def check_ply(path: Path, size: int) -> tuple[int, int]:
     Checked before any memory is asked for. Raises `InputError` if the header is malformed, there is no vertex or face
     in it, there are more faces than allowed, or the file ends before the announced ones.
     """
-    where = shown(path)
+    where = str(path)
     order, elements, start = read_header(path)
     found = {element.name: element for element in elements}
     for name in ("vertex", "face"):
@@ -130,7 +127,7 @@ def read_mixed_polygons(path: Path) -> tuple[Array, IntArray] | None:
                 return None
             row = np.dtype([(name, order + kind) for name, (kind,) in element.properties.items()])
             if len(data) < start + element.count * row.itemsize:
-                raise InputError(f"{shown(path)}: ends within its {element.name} elements: it is cut short")
+                raise InputError(f"{path}: ends within its {element.name} elements: it is cut short")
             if element.name == "vertex":
                 rows = np.frombuffer(data, row, element.count, start)
                 vertices = np.column_stack([rows[axis] for axis in "xyz"]).astype(np.float64)
@@ -363,16 +360,11 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
     faces : ndarray of int, shape (F, 3)
     repairs : Repairs
         What was repaired.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or no usable mesh; one line with the file, the value and what is allowed.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise InputError(f"{shown(path)}: unknown suffix {path.suffix!r}; allowed: {', '.join(MESH_SUFFIXES)}")
+        raise InputError(f"{path}: unknown suffix {path.suffix!r}; allowed: {', '.join(MESH_SUFFIXES)}")
     announced = _check_file(path, suffix)
     try:
         with _quiet():
@@ -387,7 +379,7 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
     held = (len(vertices), len(faces))
     if held[0] < announced[0] or held[1] < announced[1]:
         raise InputError(
-            f"{shown(path)}: holds {held[0]} vertices and {held[1]} faces, but its header announces {announced[0]} and "
+            f"{path}: holds {held[0]} vertices and {held[1]} faces, but its header announces {announced[0]} and "
             f"{announced[1]}: it is cut short, or a line is malformed"
         )
     _check_arrays(path, vertices, faces)
@@ -414,20 +406,17 @@ def other_unit(extent: float) -> str:
 
 def _check_file(path: Path, suffix: str) -> tuple[int, int]:
     """Check what can be checked without a reader; return the vertices and faces that the file must hold at least."""
-    size = check_file(path, "mesh_bytes", "a mesh", "decimate the mesh")
+    size = require_plain(path, "mesh_bytes", "a mesh", "decimate the mesh").stat().st_size
     if size == 0:
-        raise InputError(f"{shown(path)}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
-    try:
-        if suffix == ".ply":
-            return check_ply(path, size)
-        with path.open("rb") as file:
-            head = file.read(4096)
-            {".stl": _check_stl, ".obj": _check_obj, ".vtk": _check_vtk}[suffix](path, file, head, size)
-            is_text = suffix == ".obj" or (suffix == ".stl" and size != 84 + 50 * _announced(head))
-            if is_text and size > LARGE_BYTES:
-                _check_large_text(path, file, size, b"endfacet" if suffix == ".stl" else b"\nf")
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+        raise InputError(f"{path}: 0 bytes; a mesh of at least {MIN_FACES} faces is needed")
+    if suffix == ".ply":
+        return check_ply(path, size)
+    with path.open("rb") as file:
+        head = file.read(4096)
+        {".stl": _check_stl, ".obj": _check_obj, ".vtk": _check_vtk}[suffix](path, file, head, size)
+        is_text = suffix == ".obj" or (suffix == ".stl" and size != 84 + 50 * _announced(head))
+        if is_text and size > LARGE_BYTES:
+            _check_large_text(path, file, size, b"endfacet" if suffix == ".stl" else b"\nf")
     return 0, 0
 
 
@@ -442,9 +431,7 @@ def _check_large_text(path: Path, file: BinaryIO, size: int, word: bytes) -> Non
         end = piece[1 - len(word) :]
     check_limit("mesh_faces", count, path, "faces", "decimate the mesh")
     if size > MOST_BYTES_PER_FACE * count:
-        raise InputError(
-            f"{shown(path)}: {count} faces in {size} bytes; must be {MOST_BYTES_PER_FACE} bytes a face at most"
-        )
+        raise InputError(f"{path}: {count} faces in {size} bytes; must be {MOST_BYTES_PER_FACE} bytes a face at most")
 
 
 def _announced(head: bytes) -> int:
@@ -461,35 +448,33 @@ def _check_stl(path: Path, file: BinaryIO, head: bytes, size: int) -> None:
         # A header of a binary file may begin so too.
         file.seek(max(0, size - _END_BYTES))
         if b"endsolid" not in file.read().lower():
-            raise InputError(f"{shown(path)}: has no line endsolid: it is cut short")
+            raise InputError(f"{path}: has no line endsolid: it is cut short")
     elif 84 <= size < 84 + 50 * count and count <= limit("mesh_faces"):
         # Four letters of a text would be more than that.
         held = (size - 84) // 50
-        raise InputError(f"{shown(path)}: holds {held} of the {count} faces that it announces: it is cut short")
+        raise InputError(f"{path}: holds {held} of the {count} faces that it announces: it is cut short")
 
 
 def _check_obj(path: Path, file: BinaryIO, head: bytes, _: int) -> None:
     """Raise `InputError` where a file is no text, or a face names vertex 0, which its reader takes for the last one."""
     # Its reader would make a hundred million words of it before it finds nothing in them.
     if b"\0" in head:
-        raise InputError(f"{shown(path)}: no OBJ file; it is no text")
+        raise InputError(f"{path}: no OBJ file; it is no text")
     file.seek(0)
     # By pieces that end with a line, unless that is longer than any line of a mesh.
     while piece := file.read(2**20) + file.readline(2**20):
         if wrong := _ZERO_INDEX.search(piece):
             line = wrong[0].decode("latin-1").strip()
-            raise InputError(f"{shown(path)}: {shown(line, 60)}: vertex 0; the first vertex of an OBJ file is 1")
+            raise InputError(f"{path}: {line!s:.60}: vertex 0; the first vertex of an OBJ file is 1")
 
 
 def _check_vtk(path: Path, _: BinaryIO, head: bytes, size: int) -> None:
     """Raise `InputError` where a VTK file is none, or announces more points or cells than it has bytes."""
     if not head.startswith((b"# vtk DataFile", b"<?xml", b"<VTKFile")):
-        raise InputError(f"{shown(path)}: no VTK file; its first line must be # vtk DataFile Version ...")
+        raise InputError(f"{path}: no VTK file; its first line must be # vtk DataFile Version ...")
     for name, count in re.findall(rb"^(POINTS|POLYGONS|CELLS|TRIANGLE_STRIPS)\s+(-?\d{1,18})\b", head, re.MULTILINE):
         if not 0 <= int(count) <= size:
-            raise InputError(
-                f"{shown(path)}: {name.decode()} {int(count)}: the file has {size} bytes, too few for them"
-            )
+            raise InputError(f"{path}: {name.decode()} {int(count)}: the file has {size} bytes, too few for them")
 
 
 @contextmanager
@@ -561,12 +546,9 @@ def _told(error: Exception) -> str:
 def check_target(path: Path) -> None:
     """Raise `InputError` if no mesh can be written to a path; called before any work is done."""
     if path.suffix.lower() not in WRITTEN_SUFFIXES:
-        raise InputError(f"--out {shown(path)}: suffix {path.suffix!r}; allowed: {', '.join(WRITTEN_SUFFIXES)}")
-    try:
-        if path.is_dir():
-            raise InputError(f"--out {shown(path)}: is a folder; must be a file")
-    except OSError as error:
-        raise cannot_write(error, f"--out {shown(path)}", path) from error
+        raise InputError(f"--out {path}: suffix {path.suffix!r}; allowed: {', '.join(WRITTEN_SUFFIXES)}")
+    if path.is_dir():
+        raise InputError(f"--out {path}: is a folder; must be a file")
 
 
 def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] | None = None) -> None:
@@ -589,7 +571,4 @@ def write_mesh(path: Path, mesh: TriangleMesh, attributes: Mapping[str, Array] |
         data = built.export(file_type="obj", include_normals=True, digits=8, header=None).encode()
     else:
         data = built.export(file_type="stl")
-    try:
-        write_atomically(path, lambda part: part.write_bytes(data))
-    except OSError as error:
-        raise write_error(error, path) from error
+    write_atomically(path, lambda part: part.write_bytes(data))

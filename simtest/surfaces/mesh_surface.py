@@ -290,10 +290,7 @@ def prepare(path: str | Path, refinement: Refinement | int = 1, kind: str = "aut
     `InputError` if the file is missing or malformed.
     """
     path = Path(path).expanduser().resolve()
-    try:
-        state = path.stat()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    state = path.stat()
     how = Refinement(refinement) if isinstance(refinement, int) else refinement
     return _prepare(str(path), state.st_mtime_ns, state.st_size, how, kind)
 

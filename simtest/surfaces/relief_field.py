@@ -15,8 +15,7 @@ from functools import cached_property, lru_cache, reduce
 import numpy as np
 
 from simtest.geometry.vectors import tangent_basis
-from simtest.runtime.arrays import AnyArray, Array
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.surfaces import Relief, ReliefBand
 from simtest.surfaces.model import SurfacePoints, principal
 

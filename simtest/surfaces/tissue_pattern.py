@@ -18,8 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from simtest.runtime.arrays import AnyArray, Array
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.reflectance import TissueColour
 from simtest.surfaces.model import SurfaceModel
 from simtest.surfaces.vessels import (

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from simtest.conventions import MOTION_COLUMNS, ON_INSTRUMENT
 from simtest.errors import InputError
 from simtest.runtime.files import Json
-from simtest.runtime.resources import find, shown
+from simtest.runtime.resources import find
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, Uniform, apply_settings, read_toml, scene_from_dict
 from simtest.spec.keys import replace_values
@@ -113,13 +113,7 @@ class Case:
         return range(self.part * self.realisations, (self.part + 1) * self.realisations)
 
     def scene(self, experiment: Experiment, realisation: int) -> tuple[Scene, dict[str, float]]:
-        """Make the scene of a realisation; return it with the values drawn for it, by key path.
-
-        Raises
-        ------
-        InputError
-            If a swept or drawn value does not fit the schema.
-        """
+        """Make the scene of a realisation; return it with the values drawn for it, by key path."""
         # Drawn values.
         rng = generator(experiment.seed, experiment.name, self.name, realisation, Stage.SWEEP)
         drawn = {path: float(rng.uniform(d.low, d.high)) for path, d in self.random.items()}
@@ -169,14 +163,7 @@ class Case:
 
 
 def expand(experiment: Experiment) -> list[Case]:
-    """Return an experiment's cases, in the order of its groups.
-
-    Raises
-    ------
-    InputError
-        If a scene is missing or malformed, a swept value or an end of a drawn range does not fit, or two settings
-        share a name: found before anything is rendered.
-    """
+    """Return an experiment's cases, in the order of its groups."""
     check_effort(experiment)
     cases = [case for group in experiment.groups for case in _expand_group(experiment, group)]
     names: set[str] = set()
@@ -184,7 +171,7 @@ def expand(experiment: Experiment) -> list[Case]:
     for case in cases:
         if case.name in names:
             raise InputError(
-                f"experiment {experiment.name}: two settings are called {shown(case.setting)!r}; "
+                f"experiment {experiment.name}: two settings are called {case.setting!r}; "
                 "give the groups different labels, and each value of a sweep once"
             )
         names.add(case.name)
@@ -201,7 +188,7 @@ def check_effort(experiment: Experiment) -> None:
         for kind, tables in (("sweep", group.sweep), ("pool", group.pool)):
             for table in tables:
                 key, values = next(iter(table.items()))
-                _check_most(len(values), "values", f"{where}.{kind}: {shown(key, 60)}")
+                _check_most(len(values), "values", f"{where}.{kind}: {key}")
                 count *= len(values)
         settings += count
         realisations += count * (experiment.realisations if group.realisations is None else group.realisations)

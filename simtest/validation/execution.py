@@ -11,7 +11,7 @@ import polars as pl
 
 from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.process.naming import forgive_cores
-from simtest.runtime.engines import OnStep
+from simtest.runtime.processes import OnStep
 from simtest.spec import Experiment
 from simtest.spec.recipes import PaperSetting
 from simtest.validation import gallery_items as gallery

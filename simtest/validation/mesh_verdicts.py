@@ -39,11 +39,6 @@ def mesh_verdicts(experiment: Experiment) -> list[MeshVerdict]:
     """Judge each mesh file of an experiment once; recipes are fine by construction.
 
     A file has several verdicts only where groups of other lobes or refinements are judged otherwise.
-
-    Raises
-    ------
-    InputError
-        If a scene is malformed, or a mesh cannot be used.
     """
     verdicts: dict[tuple[object, ...], MeshVerdict] = {}
     for scene in (scene for group in experiment.groups for scene in _scenes(group)):

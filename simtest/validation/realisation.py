@@ -9,8 +9,7 @@ from simtest.estimators import AnyEstimator
 from simtest.estimators.protocol import laws_of
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
-from simtest.runtime.arrays import Image, Picture
-from simtest.runtime.kept_arrays import only_reading
+from simtest.runtime.arrays import Image, Picture, only_reading
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment

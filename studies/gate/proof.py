@@ -12,7 +12,7 @@ from benchmarks.measuring import Figure
 from simtest.errors import SimtestError
 from simtest.nightly.gate.contrasts import margin_of
 from simtest.nightly.gate.quantities import QUANTITIES
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import Experiment
 from simtest.validation.runner import run_experiment
 from studies.gate.bank import COLUMNS, experiment, frames_of, load_bank

@@ -6,7 +6,7 @@ import re
 from cyclopts import App
 
 from simtest.cli.commands import APP
-from simtest.cli.listing import HEADINGS, names_of
+from simtest.cli.scenes import HEADINGS, names_of
 from studies.manual.markdown import code, table
 
 OPENING = """# Commands

@@ -71,7 +71,7 @@ ROWS = (
         "blake2b(str(len(text)).encode(),", "seeds validation"),
     row("seed tree without the experiment's name", "seeds", "runtime.seeds:sequence", "(key(experiment), key(case),",
         "(key(case), key(case),", "seeds validation"),
-    row("kept arrays are found under another key", "seeds", "runtime.kept_arrays:kept", "{_code()} {kind} {key}",
+    row("kept arrays are found under another key", "seeds", "runtime.arrays:kept", "{_code()} {kind} {key}",
         "{_code()} {kind}", "kept_arrays"),
     # geometry
     row("pixel centres of the camera at integers", "pixel centre", "geometry.camera:Camera.pixel_centres",

@@ -184,7 +184,7 @@ def test_what_no_file_states_is_refused_and_not_dropped(calibration, field, tmp_
     [
         (CAMERA, "calibration.toml", "calibration is a Camera: must be a simtest.Calibration"),
         (Calibration(CAMERA), "calibration.yaml", "a calibration is TOML"),
-        (Calibration(CAMERA), "none/calibration.toml", "cannot be written"),
+        (Calibration(CAMERA), "none/calibration.toml", "No such file or directory"),
     ],
 )
 def test_refusals_of_writing(calibration, name, said, tmp_path):

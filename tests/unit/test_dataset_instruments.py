@@ -13,7 +13,7 @@ from simtest.dataset.preview import write_preview
 from simtest.dataset.shard_writer import write_dataset
 from simtest.dataset.verify import check_sample, verify
 from simtest.errors import InputError
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec.recipes import Dataset, Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand, swept_example

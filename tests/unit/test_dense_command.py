@@ -181,7 +181,7 @@ def test_a_run_is_not_written_over(run, here, tmp_path):
 
 
 def test_the_command_knows_the_methods():
-    from simtest.cli.dense_score import WORDS
+    from simtest.cli.runs import WORDS
     from simtest.dataset.scoring.dense import METHODS
 
     assert set(WORDS) == set(METHODS)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from simtest.cli.manners import MANNERS
-from simtest.cli.validate import validate
+from simtest.cli.main import MANNERS
+from simtest.cli.runs import validate
 from simtest.errors import InputError
 from simtest.spec import Experiment, Group
 from simtest.surfaces.mesh_check import check_mesh

@@ -17,7 +17,7 @@ from simtest.geometry.vectors import tilt_deg
 from simtest.pages.notebook import normal_html, picture_html, table_html
 from simtest.rendering.frames import Radiance
 from simtest.report.run_results import RunResults
-from simtest.runtime.short_repr import LONGEST, short
+from simtest.runtime.arrays import LONGEST, short
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.preview import SURFACE_LEVEL, preview
 from simtest.spec.keys import full_keys

@@ -7,7 +7,7 @@ import pytest
 
 from simtest import validate
 from simtest.errors import InputError
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import Experiment, load_experiment, load_scene
 from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import expand

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from scipy import stats
 
-from simtest.cli.realism import realism
+from simtest.cli.data import realism
 from simtest.errors import InputError
 from simtest.pages.charts import png
 from simtest.realism.charts import distance_chart, distribution_charts

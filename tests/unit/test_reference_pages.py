@@ -13,7 +13,7 @@ from simtest.estimators.budget import PARTS, STATED
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spot import UNRESOLVED
 from simtest.reconstruction.explanations import FLAGS
-from simtest.runtime.limits import DEFAULTS
+from simtest.runtime.files import DEFAULTS
 from simtest.spec import Scene
 from simtest.validation.columns import SCHEMA
 from simtest.validation.statistics import Figures

@@ -12,15 +12,15 @@ import platformdirs
 import pytest
 
 from simtest.calibration import Calibration
+from simtest.cli.common import named_path
 from simtest.cli.main import _mend_terminal
-from simtest.cli.options import named_path
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction import reconstruct_colour
 from simtest.reconstruction.picture_values import is_coloured
 from simtest.rendering import bitmap
-from simtest.runtime.kept_arrays import cache_folder
-from simtest.runtime.user_cache import user_cache
+from simtest.runtime.arrays import cache_folder
+from simtest.runtime.files import user_cache
 from simtest.spec import load_calibration, load_scene
 from simtest.surfaces.mesh_file import read_mesh
 
@@ -40,15 +40,6 @@ def test_a_terminal_without_the_characters_gets_others(monkeypatch):
     _mend_terminal()
     print("± deg", flush=True)
     assert written.getvalue() == b"? deg\n"
-
-
-@pytest.mark.parametrize(("columns", "left"), [("0", None), ("1", None), ("20", "20"), ("wide", "wide")])
-def test_a_terminal_too_narrow_for_tables_counts_as_one_of_no_stated_width(monkeypatch, columns, left):
-    monkeypatch.setenv("COLUMNS", columns)
-    _mend_terminal()
-    import os
-
-    assert os.environ.get("COLUMNS") == left
 
 
 def test_a_closed_output_is_no_error():

@@ -102,5 +102,5 @@ def test_the_unit_may_be_a_number_of_millimetres(tmp_path):
 def test_a_file_that_cannot_be_written_is_no_lens_that_a_format_lacks(tmp_path):
     (tmp_path / "colmap" / "cameras.txt").mkdir(parents=True)
     held = Trajectory(["0.png"], np.eye(4)[None])
-    with pytest.raises(InputError, match=r"cameras.txt"):
+    with pytest.raises(OSError, match=r"cameras.txt"):
         write_trajectory(held, Camera(64, 48, 50.0, 50.0, 32.0, 24.0), tmp_path)

@@ -29,7 +29,7 @@ from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import run_picture
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import kept
 from simtest.spec import load_scene
 from simtest.spec.camera import SceneCamera
 from simtest.spec.recipes import load_dataset

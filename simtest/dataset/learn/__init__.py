@@ -9,4 +9,5 @@ if TYPE_CHECKING:
 
 __all__ = ["Samples"]
 
-__getattr__, _ = lazy_names(__name__, {"simtest.dataset.learn.samples": ("Samples",)})
+# Crops need no PyTorch.
+__getattr__, *_ = lazy_names(__name__)

@@ -57,11 +57,6 @@ class Samples(IterableDataset[Item]):
     [0, 1], NaN where there is no surface), and ``meta``, the sample's metadata. In a batch ``meta`` is a list.
 
     Ranks and workers divide samples, not shards, so there may be more of them than shards. No process group is needed.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no finished dataset, there is no such split or field, or rank or world is out of range.
     """
 
     def __init__(

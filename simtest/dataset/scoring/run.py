@@ -20,11 +20,9 @@ from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
 from simtest.rendering import backend
 from simtest.runtime import provenance
-from simtest.runtime.engines import Engine, OnStep, make_engine
 from simtest.runtime.files import Json, are_nested
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine, OnStep, make_engine
 from simtest.validation import gallery_items
 from simtest.validation.cases import swept_example
 from simtest.validation.columns import Row, Value
@@ -102,11 +100,6 @@ def score_table(
     -------
     Run
         With results.parquet, summary.json and gallery/; `simtest.report.write_report` makes its page.
-
-    Raises
-    ------
-    InputError
-        If the table is malformed, nothing was exported, or a frame comes out otherwise than it was exported.
     """
     started, clock = datetime.now(UTC), time.monotonic()
     method = table.stem if name is None else name
@@ -117,26 +110,23 @@ def score_table(
     _check_apart(on, out)
     with exclusive_folder(out):
         check_folder(out)
-        try:
-            remove_folder(out / "gallery")
-            (out / "gallery").mkdir(parents=True)
-            results = _results(source, record, answers, out, engine or make_engine(), progress)
-            for doubt in filter(None, [stray_rows(answers, record), *reversed_axes(results), *wide_regions(results)]):
-                warnings.warn(f"{shown(table)}: {doubt}", stacklevel=2)
-            made = _run_record(source, record.fingerprint, (table, on / EXPORT), command, started, clock)
-            described = {each: f"Answers of {table.name}, made elsewhere." for each in answers}
-            write_results(out, made, results, _summary(source, results, described))
-        except OSError as error:
-            raise write_error(error, out) from error
+        remove_folder(out / "gallery")
+        (out / "gallery").mkdir(parents=True)
+        results = _results(source, record, answers, out, engine or make_engine(), progress)
+        for doubt in filter(None, [stray_rows(answers, record), *reversed_axes(results), *wide_regions(results)]):
+            warnings.warn(f"{table}: {doubt}", stacklevel=2)
+        made = _run_record(source, record.fingerprint, (table, on / EXPORT), command, started, clock)
+        described = {each: f"Answers of {table.name}, made elsewhere." for each in answers}
+        write_results(out, made, results, _summary(source, results, described))
     return Run(out, 0, results)
 
 
 def _check_apart(on: Path, out: Path) -> None:
     """Raise `InputError` where the scored run would replace, or lie in, a run whose frames were exported."""
     if are_nested(on, out):
-        raise InputError(f"--out {shown(out)}: must be neither the run that is scored on nor inside or around it")
+        raise InputError(f"--out {out}: must be neither the run that is scored on nor inside or around it")
     if (out / EXPORT).exists():
-        raise InputError(f"--out {shown(out)}: holds a run whose frames were exported; must be another folder")
+        raise InputError(f"--out {out}: holds a run whose frames were exported; must be another folder")
 
 
 def _run_record(
@@ -242,7 +232,7 @@ def score_part(part: ScorePart, on_step: OnStep) -> pl.DataFrame:
     for count, each in enumerate(part.views):
         name = part.names.get(each.number)
         if name is None:
-            raise InputError(f"{shown(part.folder)}: {each.setting} was not exported as a whole; export again")
+            raise InputError(f"{part.folder}: {each.setting} was not exported as a whole; export again")
         check_frame(part.folder, name, part.hashes[each.number], each.image)
         rows += _scored(part, each, part.item if count == 0 else None)
         on_step()

@@ -92,13 +92,7 @@ class FittedRecipe:
 
 
 def summarise_scenes(frames: Sequence[NamedFrame], progress: Progress | None = None) -> Seen:
-    """Return the mean summaries of each scene, the sizes of frames, and why frames were left out.
-
-    Raises
-    ------
-    InputError
-        If there are fewer than three scenes that can be measured.
-    """
+    """Return the mean summaries of each scene, the sizes of frames, and why frames were left out."""
     held: dict[str, list[Array]] = {}
     sizes, left_out = set(), {}
     for number, frame in enumerate(frames):
@@ -154,11 +148,6 @@ def fit(
         See `Progress`.
     repeats : int
         Repeated fits for the intervals.
-
-    Raises
-    ------
-    InputError
-        If there are too few scenes, nothing to fit, or the bank cannot be made.
     """
     parameters = fitted_parameters(dataset)
     seen = summarise_scenes(frames, progress)

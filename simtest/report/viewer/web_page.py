@@ -28,10 +28,7 @@ def write_scene_page(content: Content, path: Path, title: str) -> None:
         highlights=int((content.names == TRUE).sum()), rough=bool((content.names == TRUE_BASE).any()),
         compared=compared_with(content),
     )  # fmt: skip
-    try:
-        write_atomically(path, lambda part: part.write_text(html, encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"--page {path}: cannot be written ({error.strerror})") from error
+    write_atomically(path, lambda part: part.write_text(html, encoding="utf-8"))
 
 
 def errors_deg(content: Content) -> dict[str, list[float]]:

@@ -19,7 +19,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt
 from simtest.geometry.vectors import quaternion_of, rotation_of
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.spec.camera_formats.common import (
     Files,
     Poses,
@@ -109,7 +109,7 @@ def read_colmap(text: str) -> dict[str, Table]:
                 continue
             name = words[0]
             if name in cameras:
-                raise InputError(f"camera {shown(name, 40)} is given twice")
+                raise InputError(f"camera {name} is given twice")
             cameras[name] = _colmap_camera(words)
         if mask is not None:
             cameras[name]["view_mask"], mask = mask, None
@@ -125,7 +125,7 @@ def _colmap_camera(words: Sequence[str]) -> Table:
     if model not in COLMAP_MODELS:
         reason = "simtest lacks this lens" if model in OTHER_MODELS else "unknown camera model"
         allowed = f"{', '.join(COLMAP_MODELS)}{suggestion(model, COLMAP_MODELS)}"
-        raise InputError(f"{shown(model, 40)}: {reason}; must be one of {allowed}")
+        raise InputError(f"{model}: {reason}; must be one of {allowed}")
     width, height = int(number(words[2], "WIDTH", whole=True)), int(number(words[3], "HEIGHT", whole=True))
     # the principal point comes after the focal lengths
     names = list(COLMAP_MODELS[model])
@@ -176,10 +176,7 @@ def _pose(words: Sequence[str], at: str) -> Array:
 
 
 def colmap_files(camera: Camera, path: Path, poses: Poses | None) -> Files:
-    """Return a camera as cameras.txt, and poses, whose lengths must be mm, as images.txt beside an empty points3D.txt.
-
-    Raises `InputError` where COLMAP has no such lens, or the folder holds another model's points.
-    """
+    """Return a camera as cameras.txt, and poses, lengths in mm, as images.txt beside an empty points3D.txt."""
     files = {path: _cameras_text(camera).encode()}
     if poses is not None:
         points = path.with_name("points3D.txt")
@@ -196,7 +193,7 @@ def _check_no_points(path: Path) -> None:
     except OSError:
         return
     if any(line.strip() and not line.startswith(b"#") for line in head.splitlines()):
-        raise InputError(f"{shown(path)}: exists and holds points; poses must go to a folder without them")
+        raise InputError(f"{path}: exists and holds points; poses must go to a folder without them")
 
 
 def _cameras_text(camera: Camera) -> str:
@@ -239,10 +236,7 @@ def _images_text(poses: Poses) -> str:
 
 @of_text(limit="record_bytes")
 def read_transforms(text: str) -> dict[str, Table]:
-    """Read the camera, or those of the frames where they have their own, by file_path.
-
-    Raises `InputError` if the file is malformed, or its camera model is none of simtest's.
-    """
+    """Read the camera, or those of the frames where they have their own, by file_path."""
     data = json_object(text)
     frames = _frames(data)
     if not any(set(frame) & set(INTRINSICS) for frame in frames):
@@ -252,16 +246,13 @@ def read_transforms(text: str) -> dict[str, Table]:
         with within(f"frames[{i}]"):
             name, camera = _name(frame), _nerf_camera(_of_frame(data, frame))
             if cameras.setdefault(name, camera) != camera:
-                raise InputError(f"file_path {shown(name, 60)} has two cameras; must have one")
+                raise InputError(f"file_path {name} has two cameras; must have one")
     return cameras
 
 
 @of_text(limit="record_bytes")
 def transforms_poses(text: str) -> Poses:
-    """Read world_from_camera of the frames, by file_path, with OpenCV's camera axes, in the file's unit of length.
-
-    Raises `InputError` if the file is malformed, or a frame has no pose.
-    """
+    """Read world_from_camera of the frames, by file_path, with OpenCV's camera axes, in the file's unit of length."""
     made: list[tuple[str, Array]] = []
     for i, frame in enumerate(_frames(json_object(text))):
         with within(f"frames[{i}]"):
@@ -274,7 +265,7 @@ def transforms_poses(text: str) -> Poses:
 def _frames(data: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     frames = data.get("frames", [])
     if not isinstance(frames, list) or not all(isinstance(frame, Mapping) for frame in frames):
-        raise InputError(f"frames = {shown(repr(frames), 60)}: must be a list of objects")
+        raise InputError(f"frames = {frames!r:.60}: must be a list of objects")
     return frames
 
 
@@ -288,7 +279,7 @@ def _of_frame(data: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, An
 def _name(frame: Mapping[str, Any]) -> str:
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
-        raise InputError(f"file_path = {shown(repr(name), 60)}: must name a picture")
+        raise InputError(f"file_path = {name!r:.60}: must name a picture")
     return name
 
 
@@ -332,11 +323,11 @@ def _nerf_lens(data: Mapping[str, Any], told: Mapping[str, float]) -> Table | No
     if model is not None and (not isinstance(model, str) or model not in NERF_MODELS):
         hint = suggestion(model, NERF_MODELS) if isinstance(model, str) else ""
         raise InputError(
-            f"camera_model = {shown(repr(model), 40)}: simtest lacks it; must be one of {', '.join(NERF_MODELS)}{hint}"
+            f"camera_model = {model!r:.40}: simtest lacks it; must be one of {', '.join(NERF_MODELS)}{hint}"
         )
     told_fisheye = data.get("is_fisheye", False)
     if told_fisheye not in (False, True, None):
-        raise InputError(f"is_fisheye = {shown(repr(told_fisheye), 40)}: must be true or false")
+        raise InputError(f"is_fisheye = {told_fisheye!r:.40}: must be true or false")
     fisheye = bool(told_fisheye) if model is None else NERF_MODELS[model]
     if told_fisheye is not None and "is_fisheye" in data and bool(told_fisheye) != fisheye:
         raise InputError(f"is_fisheye = {told_fisheye}: does not fit camera_model = {model!r}")
@@ -349,10 +340,7 @@ def _nerf_lens(data: Mapping[str, Any], told: Mapping[str, float]) -> Table | No
 
 
 def transforms_file(camera: Camera, path: Path, poses: Poses | None) -> Files:
-    """Return a camera, and poses of its frames, whose lengths must be mm, as transforms.json.
-
-    Raises `InputError` if the camera has a skew, or a lens that the format lacks.
-    """
+    """Return a camera, and poses of its frames, whose lengths must be mm, as transforms.json."""
     lens, name = camera.distortion, "transforms.json"
     if camera.skew != 0:
         raise InputError(f"camera.skew = {camera.skew:g}: must be 0, since {name} has none; save as TOML instead")

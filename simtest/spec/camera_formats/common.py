@@ -15,7 +15,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.camera import ViewMask
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.spec.toml_files import read_text
 
 Read = TypeVar("Read")
@@ -60,7 +60,7 @@ def of_text(
         @wraps(read)
         def read_file(path: Path) -> Read:
             text = read_text(path, kind, limit)
-            with within(shown(path)):
+            with within(str(path)):
                 return read(text)
 
         return read_file
@@ -80,7 +80,7 @@ def json_object(text: str) -> dict[str, Any]:
     except RecursionError:
         raise InputError("not valid JSON: nested too deeply") from None
     except ValueError as error:
-        raise InputError(f"not valid JSON: {shown(error, 80)}") from error
+        raise InputError(f"not valid JSON: {error!s:.80}") from error
     if not isinstance(data, dict):
         raise InputError(f"holds a {type(data).__name__}; must be an object of keys and values")
     return data
@@ -117,7 +117,7 @@ def xml_root(text: str) -> ElementTree.Element:
     try:
         return parse_xml(text)
     except (ElementTree.ParseError, ValueError, RecursionError) as error:
-        raise InputError(f"not valid XML: {shown(error, 80)}") from error
+        raise InputError(f"not valid XML: {error!s:.80}") from error
 
 
 def number(value: Any, name: str, whole: bool = False) -> float:
@@ -130,7 +130,7 @@ def number(value: Any, name: str, whole: bool = False) -> float:
         found = math.nan
     if not math.isfinite(found) or (whole and found != round(found)):
         kind = "whole" if whole else "finite"
-        raise InputError(f"{name} = {shown(repr(value), 60)}: must be a {kind} number")
+        raise InputError(f"{name} = {value!r:.60}: must be a {kind} number")
     return found
 
 
@@ -138,7 +138,7 @@ def numbers(values: Any, name: str, counts: int | Sequence[int]) -> list[float]:
     """Return a list of finite numbers of an allowed length."""
     allowed = (counts,) if isinstance(counts, int) else tuple(counts)
     if not isinstance(values, list | tuple):
-        raise InputError(f"{name} = {shown(repr(values), 60)}: must be a list of numbers")
+        raise InputError(f"{name} = {values!r:.60}: must be a list of numbers")
     if len(values) not in allowed:
         said = " or ".join(str(count) for count in allowed)
         raise InputError(f"{name}: {len(values)} values; must be {said}")
@@ -157,14 +157,14 @@ def check_alike(names: tuple[str, str], told: float, other: float, unit: str = "
 def rigid(rows: Any, name: str) -> Array:
     """Return a rigid transform, shape (4, 4), of 3 or 4 rows of 4 numbers; the rotation's rounding is taken out."""
     if not isinstance(rows, list) or len(rows) not in (3, 4):
-        raise InputError(f"{name} = {shown(repr(rows), 60)}: must be 4 rows of 4 numbers")
+        raise InputError(f"{name} = {rows!r:.60}: must be 4 rows of 4 numbers")
     T = np.eye(4)
     T[: len(rows)] = [numbers(row, f"{name}[{i}]", 4) for i, row in enumerate(rows)]
     R = T[:3, :3]
     if not np.abs(T).max() <= LARGEST:
         raise InputError(f"{name}: holds {np.abs(T).max():.3g}; must be at most {LARGEST:g}")
     if not np.allclose(R @ R.T, np.eye(3), atol=ROUNDED) or np.linalg.det(R) < 0:
-        raise InputError(f"{name}: must begin with a rotation; R R^T is {shown((R @ R.T).round(3).tolist())}")
+        raise InputError(f"{name}: must begin with a rotation; R R^T is {(R @ R.T).round(3).tolist()}")
     if not np.allclose(T[3], [0, 0, 0, 1]):
         raise InputError(f"{name}: last row is {T[3].tolist()}; must be 0, 0, 0, 1")
     U, _, V = np.linalg.svd(R)
@@ -187,9 +187,7 @@ def chosen(cameras: Mapping[str, Table], wanted: str | None) -> Table:
     listed = ", ".join(list(cameras)[:MOST_SHOWN]) + (", ..." if len(cameras) > MOST_SHOWN else "")
     if wanted is not None:
         if wanted not in cameras:
-            raise InputError(
-                f"no camera {shown(wanted, 40)}; must be one of {listed}{suggestion(wanted, list(cameras))}"
-            )
+            raise InputError(f"no camera {wanted}; must be one of {listed}{suggestion(wanted, list(cameras))}")
         return cameras[wanted]
     tables = list(cameras.values())
     if any(table != tables[0] for table in tables):
@@ -209,7 +207,7 @@ def mask_of_text(text: Any) -> Table:
     except (TypeError, ValueError):
         made = None
     if not isinstance(made, dict):
-        raise InputError(f"view mask {shown(repr(text), 60)}: must be a JSON object")
+        raise InputError(f"view mask {text!r:.60}: must be a JSON object")
     return made
 
 

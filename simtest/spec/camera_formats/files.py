@@ -15,9 +15,8 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
+from simtest.runtime.boundary import suggestion
 from simtest.runtime.files import write_atomically
-from simtest.runtime.machine_errors import cannot_write
-from simtest.runtime.resources import shown, suggestion
 from simtest.spec.camera_formats.common import LARGEST, Files, Poses, Table, chosen, within
 from simtest.spec.camera_tables import camera_toml
 from simtest.spec.toml_files import read_text
@@ -129,8 +128,7 @@ def split_id(path: str | Path) -> tuple[Path, str | None]:
 def recognise(path: str | Path) -> str:
     """Return the name of a camera file's format, by its suffix and by what it holds; what is nothing else is TOML.
 
-    A folder is a COLMAP model where it holds cameras.txt. Raises `InputError` if the file cannot be read, or is one of
-    COLMAP's binary ones.
+    A folder is a COLMAP model where it holds cameras.txt.
     """
     path, _ = split_id(path)
     suffix = path.suffix.lower()
@@ -140,7 +138,7 @@ def recognise(path: str | Path) -> str:
         return "matlab" if suffix == ".mat" else "toml"
     if suffix == ".bin":
         how = "colmap model_converter --output_type TXT writes text files"
-        raise InputError(f"{shown(path)}: binary models are not read; {how}")
+        raise InputError(f"{path}: binary models are not read; {how}")
     text = read_text(path, "camera", "record_bytes")
     head = text[:HEAD]
     if head.lstrip().startswith("<"):
@@ -171,11 +169,10 @@ def _first(syntax: str, text: str, otherwise: str) -> str:
 def read_table(path: str | Path) -> Table:
     """Read a camera of a file of another program as the table of a `CameraSpec`; "FILE#ID" names one of several.
 
-    Raises `InputError` if the file is missing, malformed, holds no camera, a lens that simtest lacks, or several
-    different cameras of which none is named. TOML is read elsewhere.
+    TOML is read elsewhere.
     """
     path, wanted = split_id(path)
-    where, form = shown(path), FORMATS[recognise(path)]
+    where, form = str(path), FORMATS[recognise(path)]
     if form.name == "photometric":
         raise InputError(f"{where}: {form.title} holds no lens; give it as --photometric beside a camera file")
     if not form.cameras:
@@ -202,16 +199,16 @@ def read_poses(path: str | Path) -> Poses:
         path = path / "images.txt" if path.is_dir() else path.with_name("images.txt")
     if not form.poses:
         must = "COLMAP's images.txt, transforms.json or a Kalibr chain"
-        raise InputError(f"{shown(path)}: {form.title} holds no poses; must be {must}")
+        raise InputError(f"{path}: {form.title} holds no poses; must be {must}")
     poses: Poses = form.function(form.poses)(path)
     if not poses:
-        raise InputError(f"{shown(path)}: holds no pose; must hold one for each frame")
+        raise InputError(f"{path}: holds no pose; must hold one for each frame")
     seen: set[str] = set()
     for name, pose in poses:
         if name in seen:
-            raise InputError(f"{shown(path)}: names {shown(name, 60)} twice; must give each frame one pose")
+            raise InputError(f"{path}: names {name} twice; must give each frame one pose")
         if not np.abs(pose).max() <= LARGEST:
-            raise InputError(f"{shown(path)}: {shown(name, 60)}: a position beyond {LARGEST:g}; must be within it")
+            raise InputError(f"{path}: {name}: a position beyond {LARGEST:g}; must be within it")
         seen.add(name)
     return poses
 
@@ -223,8 +220,7 @@ def write_camera(camera: Camera, path: str | Path, format: str | None = None, po
     """Write a camera file, and the poses of a sequence's frames where they are given (see `simtest.save_camera`).
 
     COLMAP's images.txt and an empty points3D.txt are written beside cameras.txt. Poses are world_from_camera, shape (4,
-    4), OpenCV axes, mm: lengths are written as they are, and both formats state mm. Raises `InputError` if format and
-    suffix do not fit, the format cannot hold the camera or poses, or the file cannot be written.
+    4), OpenCV axes, mm: lengths are written as they are, and both formats state mm.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -232,25 +228,22 @@ def write_camera(camera: Camera, path: str | Path, format: str | None = None, po
         raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera")
     name = format or next((name for name in WRITTEN if suffix in FORMATS[name].suffixes), "opencv")
     if name not in WRITTEN:
-        raise InputError(f"format = {shown(name)!r}: must be one of {', '.join(WRITTEN)}{suggestion(name, WRITTEN)}")
+        raise InputError(f"format = {name!r}: must be one of {', '.join(WRITTEN)}{suggestion(name, WRITTEN)}")
     form = FORMATS[name]
     if suffix not in form.suffixes:
-        raise InputError(f"{shown(path)}: {name} needs a file name that ends in {', '.join(form.suffixes)}")
+        raise InputError(f"{path}: {name} needs a file name that ends in {', '.join(form.suffixes)}")
     if name == "colmap" and path.name in ("images.txt", "points3D.txt"):
-        raise InputError(f"{shown(path)}: COLMAP keeps no camera under this name; must be cameras.txt")
+        raise InputError(f"{path}: COLMAP keeps no camera under this name; must be cameras.txt")
     if poses is not None and not form.writes_poses:
         must = ", ".join(name for name in WRITTEN if FORMATS[name].writes_poses)
-        raise InputError(f"{shown(path)}: {name} holds no poses; must be one of {must}")
+        raise InputError(f"{path}: {name} holds no poses; must be one of {must}")
     write_files(file_contents(camera, path, name, poses))
 
 
 def write_files(files: Files) -> None:
     """Write files whole or not at all; raise `InputError` for one that cannot be written."""
     for file, data in files.items():
-        try:
-            write_atomically(file, partial(Path.write_bytes, data=data))
-        except OSError as error:
-            raise cannot_write(error, shown(file), file) from error
+        write_atomically(file, partial(Path.write_bytes, data=data))
 
 
 def file_contents(camera: Camera, path: Path, format: str, poses: Poses | None) -> Files:

@@ -14,7 +14,6 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
-from simtest.runtime.resources import shown
 from simtest.spec.camera_formats.common import Files, Poses, Table, check_alike, mask_of_text, mask_text, number, within
 from simtest.spec.camera_formats.matlab_struct import HOW, read_struct
 from simtest.spec.camera_formats.omnidirectional import scaramuzza_table
@@ -28,11 +27,10 @@ def read_matlab(path: Path) -> dict[str, Table]:
 
     The .mat file holds one struct, under any name, with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
     RadialDistortion and TangentialDistortion; or, of a fisheye, with MappingCoefficients, StretchMatrix,
-    DistortionCenter and ImageSize. Raises `InputError` if the file is missing, malformed, of version 7.3, or holds a
-    cameraParameters object instead of a struct.
+    DistortionCenter and ImageSize.
     """
     fields = read_struct(path)
-    with within(shown(path)):
+    with within(str(path)):
         return {"": _table(fields)}
 
 
@@ -103,7 +101,7 @@ def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...]) 
     value = np.asarray(fields[name])
     if value.dtype.kind not in "iuf" or value.size not in allowed:
         said = " or ".join(str(count) for count in allowed)
-        raise InputError(f"{name} = {shown(repr(fields[name]), 80)}: must be {said} numbers")
+        raise InputError(f"{name} = {fields[name]!r:.80}: must be {said} numbers")
     return value.astype(float).ravel()
 
 
@@ -113,8 +111,7 @@ def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...]) 
 def matlab_file(camera: Camera, path: Path, _: Poses | None) -> Files:
     """Return a camera as a .mat file of version 5 that holds the struct `camera`.
 
-    Its fields are the arguments of MATLAB's cameraParameters, or of fisheyeIntrinsics. Raises `InputError` if MATLAB
-    has no such lens.
+    Its fields are the arguments of MATLAB's cameraParameters, or of fisheyeIntrinsics.
     """
     from scipy.io import savemat
 

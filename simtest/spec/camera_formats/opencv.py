@@ -19,7 +19,6 @@ from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown
 from simtest.spec.camera_formats.common import (
     Files,
     Poses,
@@ -68,12 +67,9 @@ MM = 1000.0
 
 
 def read_opencv(path: Path) -> dict[str, Table]:
-    """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json): its one camera, whose id is empty.
-
-    Raises `InputError` if the file is missing, malformed, or holds a lens that simtest does not know.
-    """
+    """Read a calibration of OpenCV or ROS (.yml, .yaml, .xml, .json): its one camera, whose id is empty."""
     text = read_text(path, "camera")
-    with within(shown(path)):
+    with within(str(path)):
         return {"": _table(_parse(text, path.suffix.lower()))}
 
 
@@ -109,7 +105,7 @@ def _parse(text: str, suffix: str) -> Mapping[str, Any]:
     except RecursionError:
         raise InputError(f"not valid {kind}: nested too deeply") from None
     except (ValueError, ElementTree.ParseError) as error:
-        raise InputError(f"not valid {kind}: {shown(error, 80)}") from error
+        raise InputError(f"not valid {kind}: {error!s:.80}") from error
     if not isinstance(data, Mapping) or not data:
         raise InputError("holds no keys; must be a calibration of OpenCV or ROS")
     return data
@@ -154,7 +150,7 @@ def _numbers(value: Any, name: str, counts: Sequence[int], shape: tuple[int, int
         flat += item if isinstance(item, list) else [item]
     wrong = next((item for item in flat if isinstance(item, bool) or not isinstance(item, int | float)), None)
     if not isinstance(value, list) or wrong is not None:
-        raise InputError(f"{name} = {shown(repr(value), 80)}: must be a matrix or a list of numbers")
+        raise InputError(f"{name} = {value!r:.80}: must be a matrix or a list of numbers")
     if len(flat) not in counts:
         allowed = " or ".join(str(count) for count in counts)
         raise InputError(f"{name}: {len(flat)} values; must be {allowed}")
@@ -174,7 +170,7 @@ def _check_matrix(matrix: Mapping[str, Any], name: str, shape: tuple[int, int] |
             raise InputError(f"{name}: {len(held)} values; must be {sizes[0]} x {sizes[1]}")
     # Integers of 8 bits hold no focal length, and several channels no matrix.
     if (kind := matrix.get("dt")) not in (None, *NUMBER_TYPES):
-        raise InputError(f"{name}: dt = {shown(kind, 40)}: must be one of {', '.join(NUMBER_TYPES)}")
+        raise InputError(f"{name}: dt = {kind}: must be one of {', '.join(NUMBER_TYPES)}")
 
 
 def _size(data: Mapping[str, Any]) -> tuple[Any, Any]:
@@ -185,7 +181,7 @@ def _size(data: Mapping[str, Any]) -> tuple[Any, Any]:
         for names, told in ((WIDTH_NAMES, width), (HEIGHT_NAMES, height)):
             other, value = _one_of(data, names)
             if other is not None and value != told:
-                raise InputError(f"{other} = {shown(repr(value), 40)}: does not fit {name}, which says {told:g}")
+                raise InputError(f"{other} = {value!r:.40}: does not fit {name}, which says {told:g}")
         return width, height
     found = []
     for names in (WIDTH_NAMES, HEIGHT_NAMES):
@@ -245,7 +241,7 @@ def _check_no_other_lens(data: Mapping[str, Any]) -> None:
     key = next((k for k in data if k.lower().startswith("dist") and (k != "distortion_model" or data[k])), None)
     if key is not None:
         raise InputError(
-            f"{key} = {shown(repr(data[key]), 60)}: speaks of a lens whose coefficients are missing; "
+            f"{key} = {data[key]!r:.60}: speaks of a lens whose coefficients are missing; "
             f"allowed names: {', '.join(LENS_NAMES)}"
         )
 
@@ -255,7 +251,7 @@ def _is_fisheye(data: Mapping[str, Any]) -> bool:
     if model in (None, ""):
         return bool(flag)
     if not isinstance(model, str) or model.lower() not in MODELS:
-        raise InputError(f"distortion_model = {shown(repr(model), 60)}: must be one of {', '.join(MODELS)}")
+        raise InputError(f"distortion_model = {model!r:.60}: must be one of {', '.join(MODELS)}")
     fisheye = MODELS[model.lower()]
     if flag is not None and bool(flag) != fisheye:
         raise InputError(f"fisheye_model = {flag!r}: does not fit distortion_model = {model!r}")
@@ -263,10 +259,7 @@ def _is_fisheye(data: Mapping[str, Any]) -> bool:
 
 
 def opencv_file(camera: Camera, path: Path, _: Poses | None) -> Files:
-    """Return a camera as an OpenCV FileStorage; the file's suffix selects YAML, XML or JSON.
-
-    Raises `InputError` if the camera has a skew, which OpenCV ignores.
-    """
+    """Return a camera as an OpenCV FileStorage; the file's suffix selects YAML, XML or JSON."""
     matrix, coefficients = _shifted(camera, "OpenCV")
     kinds = {".xml": cv2.FILE_STORAGE_FORMAT_XML, ".json": cv2.FILE_STORAGE_FORMAT_JSON}
     flags = (
@@ -362,21 +355,21 @@ def _chain(text: str) -> dict[str, Mapping[str, Any]]:
     try:
         data = parse_yaml(text)
     except ValueError as error:
-        raise InputError(f"not valid YAML: {shown(error, 80)}") from error
+        raise InputError(f"not valid YAML: {error!s:.80}") from error
     items = data.items() if isinstance(data, Mapping) else ()
     found = {name: value for name, value in items if KALIBR_CAMERA.fullmatch(name)}
     if not found:
         raise InputError("holds no camera; must have the keys cam0, cam1, ...")
     for name, value in found.items():
         if not isinstance(value, Mapping):
-            raise InputError(f"{name} = {shown(repr(value), 60)}: must be a table of keys")
+            raise InputError(f"{name} = {value!r:.60}: must be a table of keys")
     return dict(sorted(found.items(), key=lambda item: int(item[0][3:])))
 
 
 def _kalibr_camera(data: Mapping[str, Any]) -> Table:
     model = data.get("camera_model")
     if model != "pinhole":
-        raise InputError(f"camera_model = {shown(repr(model), 40)}: simtest lacks it; must be pinhole")
+        raise InputError(f"camera_model = {model!r:.40}: simtest lacks it; must be pinhole")
     fx, fy, cx, cy = numbers(data.get("intrinsics"), "intrinsics", 4)
     width, height = numbers(data.get("resolution"), "resolution", 2)
     table = {
@@ -390,9 +383,7 @@ def _kalibr_lens(data: Mapping[str, Any]) -> Table:
     """Return the key `distortion`, or nothing for a pinhole."""
     name = data.get("distortion_model", "none")
     if name not in LENSES:
-        raise InputError(
-            f"distortion_model = {shown(repr(name), 40)}: simtest lacks it; must be one of {', '.join(LENSES)}"
-        )
+        raise InputError(f"distortion_model = {name!r:.40}: simtest lacks it; must be one of {', '.join(LENSES)}")
     told = [] if name == "none" else numbers(data.get("distortion_coeffs"), "distortion_coeffs", 4)
     if name in ("equidistant", "equi"):
         return {"distortion": {"type": "kannala_brandt", **dict(zip(("k1", "k2", "k3", "k4"), told, strict=True))}}

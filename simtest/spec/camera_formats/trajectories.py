@@ -27,8 +27,6 @@ MM_PER_M = 1000.0
 class Trajectory:
     """Poses of a sequence's frames.
 
-    Raises `InputError` if the numbers of names, poses and times differ.
-
     Parameters
     ----------
     names : sequence of str
@@ -58,10 +56,7 @@ class Trajectory:
 
 
 def tum_text(trajectory: Trajectory) -> str:
-    """Return a trajectory as the text of a TUM file: lines of time, tx ty tz (m), qx qy qz qw; world from camera.
-
-    Raises `InputError` for frames without times.
-    """
+    """Return a trajectory as the text of a TUM file: lines of time, tx ty tz (m), qx qy qz qw; world from camera."""
     if trajectory.times_s is None:
         raise InputError("trajectory: has no times; a TUM file needs one for each frame")
     lines = ["# unit: m", "# world from camera: time tx ty tz qx qy qz qw; x right, y down, z forward"]
@@ -76,7 +71,7 @@ def write_trajectory(trajectory: Trajectory, camera: Camera, folder: Path) -> tu
     """Write a trajectory of one camera in every format that can hold it, into an existing folder.
 
     It gets `TRANSFORMS`, the folder `COLMAP` and, for frames with times, `TUM`. Returns the files that were written,
-    and why a format was left out: it lacks the camera's lens. Raises `InputError` if a file cannot be written.
+    and why a format was left out: it lacks the camera's lens.
     """
     files: list[Path] = []
     left_out: list[str] = []

@@ -54,11 +54,6 @@ def isocurve_radii(kappa_value: npt.ArrayLike, height: npt.ArrayLike) -> tuple[A
 
     r+- = abs(V_Z) sqrt((2-kappa)/kappa +- sqrt(((2-kappa)/kappa)^2 - 1)). The isophote is r-; r+ is the branch
     cos(beta) = -tau; r+ r- = V_Z^2. Computed in the form r- = abs(V_Z) tan(acos(tau)/2), which does not cancel.
-
-    Raises
-    ------
-    InputError
-        If kappa is outside (0, 1) or the height V_Z is 0.
     """
     k, z = np.asarray(kappa_value, dtype=float), np.abs(np.asarray(height, dtype=float))
     if not (np.all(k > 0) and np.all(k < 1)):

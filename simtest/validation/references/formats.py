@@ -7,7 +7,7 @@ the user must state it.
 from dataclasses import dataclass
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import suggestion
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,6 @@ def map_format(name: str) -> MapFormat:
     """Return a format by name; raise `InputError` for one that is not known."""
     if name not in FORMATS:
         raise InputError(
-            f"--reference-format {shown(name)}: unknown; allowed: {', '.join(FORMATS)}{suggestion(name, list(FORMATS))}"
+            f"--reference-format {name}: unknown; allowed: {', '.join(FORMATS)}{suggestion(name, list(FORMATS))}"
         )
     return FORMATS[name]

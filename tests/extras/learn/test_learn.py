@@ -14,7 +14,7 @@ from simtest.dataset.learn import Samples
 from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
 from simtest.geometry.vectors import angle_deg
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import load_dataset
 
 pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]

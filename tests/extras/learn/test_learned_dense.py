@@ -194,7 +194,7 @@ def test_the_pipeline_runs_it_beside_the_others(made):
         assert angle_deg(result.normal[None], maps.normal[row, column].astype(float)[None])[0] < 3
         assert np.all(np.linalg.eigvalsh(result.covariance) > 0)
     assert isinstance(learned.estimate_frame(found.detection.frame, calibration().camera, Priors()), Failure)
-    with pytest.raises(InputError, match=r"other.onnx: cannot be read"):
+    with pytest.raises(InputError, match=r"other.onnx: (no such file|cannot be read)"):
         learned.with_model("other.onnx")
 
 
@@ -376,7 +376,7 @@ def test_what_is_no_model_is_refused_in_one_line(tmp_path):
     (tmp_path / "text.onnx").write_text("no model")
     with pytest.raises(InputError, match=r"text.onnx: is no ONNX model"):
         LearnedDense(tmp_path / "text.onnx").check()
-    with pytest.raises(InputError, match=r"none.onnx: cannot be read \(No such file"):
+    with pytest.raises(InputError, match=r"none.onnx: no such file"):
         LearnedDense(tmp_path / "none.onnx").check()
 
 

@@ -10,7 +10,7 @@ from test_model_cards import HEADING, SHIPPED
 
 from simtest.dataset.shard_writer import write_dataset
 from simtest.estimators.learned_dense import LearnedDense
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import load_dataset
 from studies.networks.__main__ import made_network
 from studies.networks.card import MEASURED, make_card, write_card

@@ -42,7 +42,7 @@ def test_an_own_network_stands_beside_the_shipped_one(own, tmp_path):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("learned_spot:none.onnx", "none.onnx: cannot be read (No such file or directory)"),
+        ("learned_spot:none.onnx", "none.onnx: no such file"),
         ("learned_spot:text.onnx", "text.onnx: is no ONNX model"),
         ("learned_spt:text.onnx", "estimator 'learned_spt': not installed"),
         ("cloud:text.onnx", "estimator 'cloud:text.onnx': cloud runs no network; must stand alone"),

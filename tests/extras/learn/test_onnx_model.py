@@ -129,8 +129,8 @@ def test_files_that_cannot_be_a_network_are_told_in_one_line(line, tmp_path, mon
     (tmp_path / "empty.onnx").write_bytes(b"")
     (tmp_path / "cut.onnx").write_bytes(line[1].read_bytes()[:500])
     (tmp_path / "folder.onnx").mkdir()
-    for name, said in (("empty", "is no ONNX model"), ("cut", "is no ONNX model"), ("folder", "cannot be read"),
-                       ("none", "cannot be read")):  # fmt: skip
+    for name, said in (("empty", "is no ONNX model"), ("cut", "is no ONNX model"), ("folder", "is a folder"),
+                       ("none", "no such file")):  # fmt: skip
         with pytest.raises(InputError, match=rf"{name}.onnx: {said}") as raised:
             OnnxModel(tmp_path / f"{name}.onnx", FORM, "line")
         assert "\n" not in str(raised.value)

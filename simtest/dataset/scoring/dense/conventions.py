@@ -22,7 +22,6 @@ from simtest.errors import InputError
 from simtest.geometry.axes import ALL, NAMED, described, matrix
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
-from simtest.runtime.resources import shown
 
 FRAME = "opencv"
 DEPTH: DepthKind = "z"
@@ -68,11 +67,11 @@ class MapOptions:
     def check(self) -> None:
         """Raise `InputError` for what is not allowed."""
         if self.encoding is not None and self.encoding not in ENCODINGS:
-            raise InputError(f"--encoding {shown(self.encoding)}: unknown; allowed: {', '.join(ENCODINGS)}")
+            raise InputError(f"--encoding {self.encoding}: unknown; allowed: {', '.join(ENCODINGS)}")
         if self.frame is not None:
             parse_axes(self.frame)
         if self.depth is not None and self.depth not in KINDS:
-            raise InputError(f"--depth {shown(self.depth)}: unknown; allowed: {', '.join(KINDS)}")
+            raise InputError(f"--depth {self.depth}: unknown; allowed: {', '.join(KINDS)}")
         if self.unit_mm is not None and not 1e-9 <= self.unit_mm <= 1e6:
             raise InputError(f"--unit-mm {self.unit_mm:g}: must be 1e-9 to 1e6 mm")
 
@@ -209,8 +208,7 @@ def parse_axes(text: str) -> str:
     axes = NAMED.get(text.strip().lower(), text.replace(" ", "").replace("+", "").lower())
     if axes not in ALL:
         raise InputError(
-            f"--frame {shown(text)}: unknown; allowed: {', '.join(NAMED)}, or the axes of the three channels, such as "
-            "x,-y,-z"
+            f"--frame {text}: unknown; allowed: {', '.join(NAMED)}, or the axes of the three channels, such as x,-y,-z"
         )
     return axes
 

@@ -19,7 +19,6 @@ from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.resources import shown
 
 TABLE, SUMMARY, PAGE = "dense.parquet", "dense.json", "index.html"
 SCHEMA = 3
@@ -130,7 +129,7 @@ def score_frames(
     if not is_checked:
         method.check(names)
     if not names:
-        raise InputError(f"{shown(on) if on else 'the run'}: holds no frame")
+        raise InputError(f"{str(on) if on else 'the run'}: holds no frame")
     return score
 
 
@@ -218,7 +217,7 @@ def score_maps(
 def _refuse_run(out: Path) -> None:
     """Raise `InputError` where a folder for figures holds something else that has a page."""
     if out.is_dir() and (out / PAGE).exists() and not (out / SUMMARY).exists():
-        raise InputError(f"--out {shown(out)}: holds another page; must be an empty folder or one of such figures")
+        raise InputError(f"--out {out}: holds another page; must be an empty folder or one of such figures")
 
 
 __all__ = ["DenseScore", "Key", "score_frames", "score_maps", "write_score"]
