@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 TERMINATED = 143
 
+NARROWEST = 20
+"""Columns of a terminal; tables and help cannot be laid out in fewer."""
+
 LATER_S = 0.01
 """After so long a stop that came within an import is tried again."""
 
@@ -240,13 +243,16 @@ def _warn(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def _mend_terminal() -> None:
-    """Let output never fail: characters that a terminal lacks are replaced."""
+    """Let output never fail: characters that a terminal lacks are replaced, and one of no width gets the usual one."""
     import io
 
     for stream in (sys.stdout, sys.stderr):
         # None where it is closed.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+    # Help is laid out without end, in ever more memory, where there is no room for a word.
+    if os.environ.get("COLUMNS", "").isdecimal() and int(os.environ["COLUMNS"]) < NARROWEST:
+        del os.environ["COLUMNS"]
 
 
 def _report(text: str, code: int) -> int:

@@ -17,7 +17,7 @@ def as_estimator(name: str, given: object) -> AnyEstimator:
     if isinstance(given, Estimator | FrameEstimator):
         return given
     raise InputError(
-        f"estimator {name!r}: {repr(given)!s:.80} has neither estimate(patch, camera, priors) nor "
+        f"estimator {name!r}: {given!r:.80} has neither estimate(patch, camera, priors) nor "
         "estimate_frame(frame, camera, priors)"
     )
 

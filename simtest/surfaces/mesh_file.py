@@ -65,7 +65,7 @@ def read_header(path: Path) -> tuple[str, list[Element], int]:
                 wanted = forms.get(first, "an element, property or comment")
                 raise InputError(f"{where}: header line {line.rstrip(chr(13))!r:.60}: must be {wanted}")
     if kind not in BYTE_ORDERS:
-        raise InputError(f"{where}: format {kind!s:.40}: must be one of {', '.join(BYTE_ORDERS)}")
+        raise InputError(f"{where}: format {kind!r:.40}: must be one of {', '.join(BYTE_ORDERS)}")
     return BYTE_ORDERS[kind], elements, end.end()
 
 

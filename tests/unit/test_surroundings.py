@@ -42,6 +42,15 @@ def test_a_terminal_without_the_characters_gets_others(monkeypatch):
     assert written.getvalue() == b"? deg\n"
 
 
+@pytest.mark.parametrize(("columns", "left"), [("0", None), ("1", None), ("20", "20"), ("wide", "wide")])
+def test_a_terminal_too_narrow_for_tables_counts_as_one_of_no_stated_width(monkeypatch, columns, left):
+    monkeypatch.setenv("COLUMNS", columns)
+    _mend_terminal()
+    import os
+
+    assert os.environ.get("COLUMNS") == left
+
+
 def test_a_closed_output_is_no_error():
     command = f"{sys.executable} -m simtest schema scene >&-"
     done = subprocess.run(["/bin/sh", "-c", command], capture_output=True, text=True, timeout=60)
@@ -117,7 +126,7 @@ def test_an_image_that_cannot_be_written_whole_names_the_cause(tmp_path, monkeyp
         def write(self, name):
             raise RuntimeError(f'[FileStream] "{name}": I/O error while writing: {os.strerror(number)}')
 
-    monkeypatch.setattr(bitmap.backend, "load", lambda _: Stream())
+    monkeypatch.setattr(bitmap, "mi", Stream())
     with pytest.raises(OSError, match=os.strerror(number)) as error:
         bitmap.write_exr(path, np.ones((4, 4), np.float32))
     assert (error.value.errno, error.value.filename) == (number, str(path))
