@@ -179,6 +179,7 @@ def validate(
     workers: int = 1,
     engine: "Engine | None" = None,
     export: str | Path | None = None,
+    charts: bool = False,
     **overrides: Any,
 ) -> "RunResults":
     """Run an experiment and write its report.
@@ -203,6 +204,8 @@ def validate(
         What runs the work, in place of `workers` (see `simtest.runtime.processes.make_engine`).
     export : str or Path, optional
         Folder for the frames without their truth, for methods that run elsewhere (docs/howto/score.md).
+    charts : bool
+        Whether the charts of the page are written as PNG files too.
     **overrides
         Values by the last name of a key of the experiment, such as ``realisations=5``, or of its scenes.
 
@@ -240,7 +243,7 @@ def validate(
     frames = None if export is None else Path(export)
     with exclusive_folder(Path(out)):
         try:
-            made = _run_and_report(described, Path(out), command, variant, progress, chosen, frames)
+            made = _run_and_report(described, Path(out), command, variant, progress, chosen, frames, charts)
             made.warn_of_faults()
             return made
         except OSError as error:
@@ -253,7 +256,7 @@ def validate(
 
 def _run_and_report(
     experiment: "Experiment", out: Path, command: str, variant: str | None, progress: "Progress | None",
-    engine: "Engine", export: Path | None,
+    engine: "Engine", export: Path | None, charts: bool,
 ) -> "RunResults":  # fmt: skip
     """Run an experiment, write its page, and export its frames where a folder for them is given."""
     from simtest.report import write_report
@@ -266,7 +269,7 @@ def _run_and_report(
         # Before the work.
         check_export(experiment, out, export)
     run = run_experiment(experiment, out, command, variant, progress, engine)
-    page = write_report(run.folder, progress)
+    page = write_report(run.folder, progress, charts)
     if export is not None:
         export_run(run.folder, experiment, export, engine, progress)
     return RunResults(page)

@@ -66,9 +66,10 @@ def validate(
         Path | None,
         Parameter(help="Folder for the frames without their truth, for methods elsewhere.", converter=named_path),
     ] = None,
+    charts: Annotated[bool, Parameter(negative="", help="Write the page's charts as PNG files too.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run an experiment and write results.parquet, summary.json, figures and index.html; a stopped run goes on.
+    """Run an experiment and write results.parquet, summary.json and index.html; a stopped run goes on.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def validate(
     with progress_bar() as progress:
         folder = out or RUNS / described.name
         chosen = engine.make(needs_gpu(variant))
-        run(described, folder, None, command, variant, progress, engine=chosen, export=export)
+        run(described, folder, None, command, variant, progress, engine=chosen, export=export, charts=charts)
     if as_json:
         exported = {} if export is None else {"export": export / "README.md"}
         print_run(folder, meshes=meshes, **exported)

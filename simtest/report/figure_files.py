@@ -1,4 +1,4 @@
-"""The figures of a page: each described once, drawn into a file by threads, and packed for the page."""
+"""The figures of a page: each described once and packed for the page; threads draw those that are files."""
 
 import hashlib
 import os
@@ -17,11 +17,12 @@ T = TypeVar("T")
 
 @dataclass
 class FigureFiles:
-    """The figures of a page: files in `folder`, drawn and written by `pool`, and those that the page draws."""
+    """The figures of a page: charts that the page draws, and files in `folder`, drawn and written by `pool`."""
 
     folder: Path
     pool: ThreadPoolExecutor
     progress: Progress | None = None
+    chart_files: bool = False  # whether charts are files too: each takes as long as all the rest of a small page
     charts: list[Chart] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 by file name, of what is written
     work: dict[Future[Any], str] = field(default_factory=dict)  # with what it draws
@@ -33,9 +34,10 @@ class FigureFiles:
         return future
 
     def draw(self, name: str, charts: list[Chart]) -> list[Chart]:
-        """Draw charts into one file and into the page; returns them."""
+        """Draw charts into the page, and into one file where that is asked for; returns them."""
         self.tell(f"describing {name}")
-        self.start(name, self._draw_charts, name, charts)
+        if self.chart_files:
+            self.start(name, self._draw_charts, name, charts)
         self.charts += charts
         return charts
 

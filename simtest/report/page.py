@@ -35,8 +35,10 @@ from simtest.report.write import Progress
 _FIRST_CARDS, _MAX_HEAT_MAPS = 9, 18
 
 
-def draw_page(run: Run, folder: Path, progress: Progress | None = None) -> tuple[str, dict[str, str], int]:
-    """Draw the figures of a run into a folder, which must exist.
+def draw_page(
+    run: Run, folder: Path, progress: Progress | None = None, charts: bool = False
+) -> tuple[str, dict[str, str], int]:
+    """Draw the frames of a run, and its charts where asked for, into files of a folder, which must exist.
 
     Returns
     -------
@@ -45,7 +47,7 @@ def draw_page(run: Run, folder: Path, progress: Progress | None = None) -> tuple
         `progress` was told of, with the last one, writing the page, still to do.
     """
     with ThreadPoolExecutor(THREADS) as pool:
-        figures = FigureFiles(folder, pool, progress)
+        figures = FigureFiles(folder, pool, progress, charts)
         # Stages: describe the sections, draw them, fill in the page.
         sections = _sections(run, figures)
         figures.finish()

@@ -460,7 +460,7 @@ def test_the_same_command_goes_on_and_gives_the_same_results(here, monkeypatch, 
 
     monkeypatch.setattr(runner, "run_experiment", spy)
     # The report has its own tests and takes longer than the run.
-    monkeypatch.setattr(simtest.report, "write_report", lambda folder, progress=None: folder / "index.html")
+    monkeypatch.setattr(simtest.report, "write_report", lambda folder, *_: folder / "index.html")
     monkeypatch.setattr("simtest.cli.runs.print_guide", lambda run: None)
     monkeypatch.chdir(experiment.parent)
     # What a killed run was writing is no obstacle.

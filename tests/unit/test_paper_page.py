@@ -262,7 +262,7 @@ def small(tmp_path_factory):
 
 
 def test_the_pages_sections_and_files(small):
-    html = write_report(small.folder).read_text(encoding="utf-8")
+    html = write_report(small.folder, charts=True).read_text(encoding="utf-8")
     wanted = {"statements", "isocurves", "pipeline", "error_vs_paper_sigma", "gallery"}
     assert wanted <= set(re.findall(r'<(?:section|details)[^>]* id="(\w+)"', html))
     assert "error_vs_curvature" not in html

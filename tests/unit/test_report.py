@@ -245,7 +245,7 @@ def png_size(path):
 @pytest.fixture(scope="module")
 def overview(tmp_path_factory):
     path = make_run(tmp_path_factory.mktemp("overview"), items=2)
-    return path, write_report(path)
+    return path, write_report(path, charts=True)
 
 
 def test_overview_page_has_its_sections(overview):
@@ -373,7 +373,7 @@ def test_grid_gives_heat_maps_and_slices(tmp_path):
     curvature, _, offset = line_figures(run)
     np.testing.assert_allclose(curvature.curves[0].x, [0.1, 0.5, 1])
     np.testing.assert_allclose(offset.curves[0].x, [0, 0.05, 0.2])
-    page = read_page(write_report(path))
+    page = read_page(write_report(path, charts=True))
     assert "heatmap" in page.ids()
     assert png_size(path / "figures" / "heatmap.png")[0] > 1000
     assert heat_range(maps)[0] > 0
@@ -382,7 +382,7 @@ def test_grid_gives_heat_maps_and_slices(tmp_path):
 def test_anatomy_gives_surfaces_and_bins(tmp_path):
     path = make_run(tmp_path, "anatomy", realisations=3)
     run = read_run(path)
-    page = read_page(write_report(path))
+    page = read_page(write_report(path, charts=True))
     assert {"surfaces", "coverage", "error_vs_curvature", "fineness"} <= page.ids()
     assert png_size(path / "figures" / "anatomy.png")[0] > 800
     # What triangles alone cost is shown with every run over anatomies, and with no other.
