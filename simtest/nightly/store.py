@@ -140,7 +140,7 @@ def disk_errors_in_one_line(root: Path, what: str, left: str) -> Iterator[None]:
     except (OSError, pl.exceptions.PolarsError, SimtestError) as error:
         # A full disk under an experiment's scratch folder is told by the name of that; the user gave the reports'.
         cause = error.__cause__ if type(error) is SimtestError else error
-        why = None if cause is None or isinstance(cause, SimtestError) else explain(cause)
+        why = None if cause is None or isinstance(cause, SimtestError) else explain(cause, root)
         if why is None:
             raise
         raise SimtestError(f"--reports {root}: {what} ({why}); {left}") from error

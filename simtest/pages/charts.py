@@ -360,12 +360,10 @@ def _head(mark: Mark, x_ends: tuple[float, float], y_ends: tuple[float, float]) 
     return {"shape": path, "size": (14 + 2 * mark.width) ** 2, "width": 0.0, "opacity": 1.0}
 
 
-def _told(mark: Mark, x: Array, y: Array) -> list[str | None]:
-    """Return what is told at each point of a mark."""
+def _told(mark: Mark, x: Array, y: Array) -> list[str]:
+    """Return what is told at each point of a mark; nothing is an empty text, since Vega says null as a word."""
     if not isinstance(mark.hover, str):
-        return list(mark.hover) or [None] * len(x)
-    if not mark.hover:
-        return [None] * len(x)
+        return list(mark.hover) or [""] * len(x)
     texts = zip(x.tolist(), y.tolist(), strict=True)
     return [mark.hover.replace("{x}", f"{at:.3g}").replace("{y}", f"{value:.3g}") for at, value in texts]
 

@@ -66,4 +66,5 @@ def _curve(name: str, runs: pl.DataFrame, colour: str) -> Iterator[Mark]:
     yield Mark(day, value, colour, name, line="solid", width=1.3, symbol=_POINT, size=4, hover=told)
     found = runs["state"].is_in(["regression", "changed"]).fill_null(False).to_numpy()
     if found.any():
-        yield Mark(day[found], value[found], colour, name, listed=False, symbol=_CROSS, size=10)
+        why = [text for text, is_found in zip(told, found, strict=True) if is_found]
+        yield Mark(day[found], value[found], colour, name, listed=False, symbol=_CROSS, size=10, hover=why)
