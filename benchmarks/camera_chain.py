@@ -16,8 +16,7 @@ from simtest.calibration import Response
 from simtest.geometry import Camera, ViewMask, smooth
 from simtest.runtime.arrays import Image
 from simtest.simulation import camera_chain, mosaic, video_processor
-from simtest.spec.sensor import Sensor
-from simtest.spec.sensor_presets import PRESETS
+from simtest.spec.sensor import PRESETS, Sensor
 
 WIDTH, HEIGHT = 640, 480
 ROUNDS = 21

@@ -27,7 +27,7 @@ from simtest.dataset.shard import PART, finish, write_sample
 from simtest.dataset.shard_writer import UNSAVED_SHARE
 from simtest.runtime.arrays import Array
 from simtest.spec import load_dataset
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
 
 FRAMES = 10**7

@@ -15,8 +15,8 @@ from benchmarks.nights import run_of
 from benchmarks.transfers import smooth_scene
 from simtest.calibration import Calibration
 from simtest.geometry import Camera
-from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.verdict import verdict_on
+from simtest.nightly.gate.quantities import setting_figures
+from simtest.nightly.run import verdict_on
 from simtest.reconstruction import detect_in_picture, reconstruct_colour
 from simtest.reconstruction.pipeline import default_estimators
 from simtest.rendering import Session, backend

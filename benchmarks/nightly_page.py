@@ -68,7 +68,7 @@ def _judged(folder: Path) -> JudgedRun:
 
 def _opened(page: Path) -> list[Figure]:
     """Open the page, and use it."""
-    times, processor, used = openings(page, "#trends .main-svg", FILTERED)
+    times, processor, used = openings(page, "#trends svg.marks", FILTERED)
     middle = OPENINGS // 2
     about = f"of {OPENINGS} openings; the page's thread {processor[middle]:.2f} s of processor"
     return [

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.quantities import setting_figures
 from simtest.nightly.history import HISTORY, TREND_COLUMNS, trend_rows
 from simtest.nightly.records import CELL, COMPARISONS, NightlyRun, RunRecord, Verdict
 from simtest.runtime import provenance

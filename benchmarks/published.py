@@ -24,12 +24,12 @@ from simtest.geometry import Camera, circle_poses, cone_of_conic, fit_ellipses
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import from_integer
 from simtest.spec import load_experiment
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import Case, expand
+from simtest.validation.columns import Row
 from simtest.validation.execution import PAPER_CHUNK
 from simtest.validation.paper.published_pipeline import kernel_radius
 from simtest.validation.paper.rows import paper_rows, pipeline_with
-from simtest.validation.results_table import ResultRow
 
 WORKERS = 2
 CONICS, POINTS = 1000, 100
@@ -76,7 +76,7 @@ def figures() -> list[Figure]:
 def _ratio(name: str, setting: PaperSetting, rounds: int = 15) -> Figure:
     """Compare the rows of one chunk of realisations with their floor, in this process."""
     seeds = list(range(PAPER_CHUNK))
-    common = ResultRow(experiment="bench", label="", setting="")
+    common: Row = {"experiment": "bench", "label": "", "setting": ""}
     functions: dict[str, Callable[[], object]] = {
         "rows": lambda: paper_rows(setting, common, range(PAPER_CHUNK), seeds, ("circle_pose",)),
         "floor": lambda: floor(setting, seeds),

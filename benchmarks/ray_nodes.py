@@ -17,9 +17,9 @@ from typing import Any
 
 from benchmarks.measuring import Figure
 from simtest.dataset.shard_writer import write_dataset
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import load_dataset
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 
 ROUNDS = 3
 SETTINGS: dict[str, Any] = {"samples": 64, "samples_per_anatomy": 8, "shard_mb": 11.0}

@@ -23,7 +23,6 @@ Public names are loaded at first use; importing the package loads neither the re
 
 from typing import TYPE_CHECKING, Any
 
-from simtest import _renamed
 from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
@@ -44,19 +43,7 @@ if TYPE_CHECKING:
         save_camera,
     )
 
-_HOMES = {
-    "simtest.api": ("LabelledFrame", "RunResults", "export", "render", "validate"),
-    "simtest.calibration": ("Calibration",),
-    "simtest.errors": ("BackendError", "Failure", "InputError", "Reason", "SimtestError"),
-    "simtest.estimators": ("Estimate",),
-    "simtest.geometry": ("BrownConrady", "Camera", "KannalaBrandt", "Patch", "Scaramuzza", "ViewMask"),
-    "simtest.reconstruction": ("Specularity", "reconstruct"),
-    "simtest.spec": (
-        "Experiment", "Scene", "load_calibration", "load_camera", "load_experiment", "load_scene", "save_calibration",
-        "save_camera",
-    ),
-}  # fmt: skip
-_named, _names = lazy_names(__name__, _HOMES)
+_named, _names, _ = lazy_names(__name__)
 
 __all__ = [
     "BackendError",
@@ -88,8 +75,6 @@ __all__ = [
     "save_camera",
     "validate",
 ]
-
-_renamed.install()
 
 
 def __getattr__(name: str) -> Any:

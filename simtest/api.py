@@ -11,26 +11,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
+from simtest.runtime.boundary import plain, plain_errors
+from simtest.runtime.files import check_count
 from simtest.runtime.lazy_names import lazy_names
-from simtest.runtime.limits import check_count
 
 if TYPE_CHECKING:
     from simtest.reconstruction import reconstruct
     from simtest.reconstruction.description import PictureRecord
     from simtest.reconstruction.picture import Options
     from simtest.report.run_results import RunResults
-    from simtest.runtime.engines import Engine
+    from simtest.runtime.processes import Engine
     from simtest.simulation.labelled_frame import LabelledFrame
     from simtest.simulation.viewpoints import SampledViews
     from simtest.spec import Experiment, Scene
     from simtest.validation.runner import Progress
 
-_HOMES = {
-    "simtest.simulation.labelled_frame": ("LabelledFrame",),
-    "simtest.reconstruction": ("reconstruct",),
-    "simtest.report.run_results": ("RunResults",),
-}
-__getattr__, _ = lazy_names(__name__, _HOMES)
+__getattr__, *_ = lazy_names(__name__)
 
 __all__ = [
     "Extras",
@@ -44,10 +40,13 @@ __all__ = [
     "validate",
 ]
 
+MOST_VIEWS = 1000
+
 TRIES = 10
 """Viewpoints that are tried for each view wanted."""
 
 
+@plain_errors
 def render(
     scene: "Scene | str | Path",
     settings: Mapping[str, Any] | None = None,
@@ -94,6 +93,7 @@ def render(
     return make_frame(_scene(scene, settings, overrides), variant, progress)
 
 
+@plain_errors
 def export(
     scene: "Scene | str | Path",
     out: str | Path,
@@ -137,6 +137,7 @@ def export(
         return export_scene(_scene(scene, settings, overrides), Path(out), variant)
 
 
+@plain_errors
 def sample_views(
     scene: "Scene | str | Path",
     out: str | Path,
@@ -148,47 +149,17 @@ def sample_views(
     fps: float | None = None,
     labels: bool = False,
 ) -> "SampledViews":
-    """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path.
+    """Pick viewpoints of an anatomy that show isolated highlights, or follow its camera path (docs/howto/sequences.md).
 
-    At most ten viewpoints are tried for each view wanted: 0, 1, 2, ..., or, where ``surface.view`` is not auto, evenly
-    spread over the camera path. The folder gets views.json, with the poses and what was left out, a picture of each
-    view, sheet.png, which shows all of them, the poses in the files of other programs (transforms.json, colmap/), and
-    film.avi and trajectory.txt of a sequence.
-
-    Parameters
-    ----------
-    scene, settings, variant
-        As of `render`; the scene is one of an anatomy.
-    out : str or Path
-        Folder, made if need be.
-    count : int
-        Views wanted, 1 to 1000.
-    progress : callable, optional
-        Called with views found, views wanted, and what was tried.
-    along : tuple of float, optional
-        First and last share of the camera path: a sequence of views evenly spaced between them, none left out.
-    fps : float, optional
-        Frames a second of the sequence, 0.1 to 1000; default 25.
-    labels : bool
-        Whether to write the sequence's optical flow (flow_NNNN.npz, flow_sheet.png) and covisibility.npy.
-
-    Returns
-    -------
-    SampledViews
-
-    Raises
-    ------
-    InputError
-        If the scene is malformed or no anatomy's, `count` or `fps` is out of range, or `fps` or `labels` is given
-        without `along`.
-    BackendError
-        If the rendering backend cannot be used.
+    At most ten viewpoints are tried for each view wanted. `along` are the first and last share of the camera path: a
+    sequence of `count` views evenly spaced between them, at `fps` frames a second (default 25), with optical flow and
+    co-visibility where `labels`. The folder gets views.json, pictures, sheet.png, and the poses for other programs.
     """
     from simtest.runtime.locks import exclusive_folder
     from simtest.simulation.view_folder import sample_into
     from simtest.simulation.viewpoints import along_path, candidates
 
-    check_count("views", count, "count")
+    check_count(count, "count", MOST_VIEWS)
     described = _scene(scene, settings, {})
     viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     if along is None and (fps is not None or labels):
@@ -197,6 +168,7 @@ def sample_views(
         return sample_into(Path(out), described, count, viewpoints, variant, progress, along is not None, fps, labels)
 
 
+@plain_errors
 def validate(
     experiment: "Experiment | str | Path",
     out: str | Path,
@@ -207,6 +179,7 @@ def validate(
     workers: int = 1,
     engine: "Engine | None" = None,
     export: str | Path | None = None,
+    charts: bool = False,
     **overrides: Any,
 ) -> "RunResults":
     """Run an experiment and write its report.
@@ -228,9 +201,11 @@ def validate(
     workers : int
         Processes of this machine that work at once, >= 1.
     engine : Engine, optional
-        What runs the work, in place of `workers` (see `simtest.runtime.engines.make_engine`).
+        What runs the work, in place of `workers` (see `simtest.runtime.processes.make_engine`).
     export : str or Path, optional
         Folder for the frames without their truth, for methods that run elsewhere (docs/howto/score.md).
+    charts : bool
+        Whether the charts of the page are written as PNG files too.
     **overrides
         Values by the last name of a key of the experiment, such as ``realisations=5``, or of its scenes.
 
@@ -260,23 +235,20 @@ def validate(
     ('index.html', ['cone_axis'])
     """
     from simtest.estimators.process.naming import close_cores
-    from simtest.runtime.engines import make_engine
     from simtest.runtime.locks import exclusive_folder
-    from simtest.runtime.machine_errors import disk_problem, write_error
+    from simtest.runtime.processes import make_engine
 
     described = _experiment(experiment, settings, overrides)
     chosen = engine or make_engine(workers=workers)
     frames = None if export is None else Path(export)
     with exclusive_folder(Path(out)):
         try:
-            made = _run_and_report(described, Path(out), command, variant, progress, chosen, frames)
+            made = _run_and_report(described, Path(out), command, variant, progress, chosen, frames, charts)
             made.warn_of_faults()
             return made
         except OSError as error:
-            if disk_problem(error) is None:
-                raise
             kept = "what is finished is kept, and the same command goes on from there"
-            raise write_error(error, out, kept) from error
+            raise plain(error, kept, Path(out)) from error
         finally:
             # The page's worst cases are estimated again.
             close_cores()
@@ -284,7 +256,7 @@ def validate(
 
 def _run_and_report(
     experiment: "Experiment", out: Path, command: str, variant: str | None, progress: "Progress | None",
-    engine: "Engine", export: Path | None,
+    engine: "Engine", export: Path | None, charts: bool,
 ) -> "RunResults":  # fmt: skip
     """Run an experiment, write its page, and export its frames where a folder for them is given."""
     from simtest.report import write_report
@@ -297,7 +269,7 @@ def _run_and_report(
         # Before the work.
         check_export(experiment, out, export)
     run = run_experiment(experiment, out, command, variant, progress, engine)
-    page = write_report(run.folder, progress)
+    page = write_report(run.folder, progress, charts)
     if export is not None:
         export_run(run.folder, experiment, export, engine, progress)
     return RunResults(page)
@@ -306,9 +278,8 @@ def _run_and_report(
 def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, overrides: Mapping[str, Any]) -> "Scene":
     """Return the described scene with values replaced, by key path and by the last name of a key."""
     from simtest.spec import Scene, load_scene
+    from simtest.spec.keys import full_keys, replace_values
     from simtest.spec.scene import scene_from_dict, without_presets
-    from simtest.spec.short_keys import full_keys
-    from simtest.spec.type_change import replace_values
 
     def replaced(values: dict[str, Any]) -> Scene:
         if not isinstance(scene, Scene):
@@ -330,7 +301,7 @@ def _experiment(
 ) -> "Experiment":
     """Return the described experiment with values replaced; those of an `Experiment` are its own already."""
     from simtest.spec import Experiment, load_experiment
-    from simtest.spec.experiment import OWN_KEYS
+    from simtest.spec.recipes import OWN_KEYS
 
     if isinstance(experiment, Experiment):
         if settings or overrides:
@@ -343,7 +314,8 @@ def _experiment(
     # The experiment's own keys come before those of its scenes.
     values |= {name: value for name, value in overrides.items() if name in OWN_KEYS}
     if rest := {name: value for name, value in overrides.items() if name not in OWN_KEYS}:
-        from simtest.spec.short_keys import full_keys, scene_models
+        from simtest.spec.keys import full_keys
+        from simtest.spec.recipes import scene_models
 
         values |= full_keys(scene_models(described), rest, OWN_KEYS)
     return load_experiment(experiment, values)
@@ -369,34 +341,11 @@ class Extras:
     """Data set whose map the reference is."""
 
 
+@plain_errors
 def reconstruct_picture(
     image: Path, out: Path, options: "Options", extras: Extras | None = None
 ) -> tuple["PictureRecord", list[Path]]:
-    """Reconstruct the normals of a picture and write them.
-
-    Parameters
-    ----------
-    image : Path
-        The picture.
-    out : Path
-        Folder, made if need be.
-    options : Options
-        Camera, detector and estimators.
-    extras : Extras, optional
-        Reference surface and depths.
-
-    Returns
-    -------
-    record : PictureRecord
-        The specularities found, with their normals.
-    files : list of Path
-        normals.json, normals.csv, normals.ply, overlay.png, and the others.
-
-    Raises
-    ------
-    InputError
-        If the input is malformed or the folder cannot be written.
-    """
+    """Reconstruct the normals of a picture and write them; return what was found, and the files."""
     from simtest.runtime.locks import exclusive_folder
 
     with exclusive_folder(out):

@@ -5,8 +5,21 @@ key, the value got and the values allowed. Ill-posed data (no closed isophote, a
 of an experiment: it is returned as a `Failure`, counted and reported.
 """
 
+import re
 from dataclasses import dataclass
 from enum import StrEnum
+
+LONGEST = 900
+"""Characters of a message; of a longer one, as of a long word, the middle is left out."""
+
+
+def one_line(text: object) -> str:
+    """Return a text as one line of printable characters, since it may quote what a user or a file gave."""
+    line = re.sub(r"\S{300,}", lambda word: f"{word[0][:120]}...{word[0][-60:]}", str(text))
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    half = LONGEST // 2 - 3
+    return line if len(line) <= LONGEST else f"{line[:half]} ... {line[-half:]}"
 
 
 class SimtestError(Exception):
@@ -21,6 +34,9 @@ class SimtestError(Exception):
     ...     print(type(error).__name__)
     InputError
     """
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class InputError(SimtestError, ValueError):

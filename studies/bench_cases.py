@@ -5,15 +5,18 @@ written again: a folder that holds hashes is refused.
 """
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from simtest.bench.suite import HASHES, SUITE, read_suite, resolved_tables
+from simtest.bench.suite import HASHES, SUITE, FrozenCase, read_suite
 from simtest.errors import InputError
 from simtest.runtime.files import write_json
 from simtest.runtime.resources import data_root
-from simtest.spec import load_scene
+from simtest.spec import AnatomySurface, Scene, load_scene, scene_from_dict
 from simtest.spec.toml_files import toml_tables, toml_value
+from simtest.surfaces.recipe import load_recipe
+from simtest.validation.rough_truth import shown
 
 Tables = dict[str, Any]
 
@@ -173,6 +176,50 @@ def dense() -> list[Tables]:
     chosen = {"smooth": ("cylinder", "saddle"), "tissue": ("colon", "gallbladder"), "hard": ("stomach",)}
     made = [case for case in (*smooth(), *tissue(), *hard()) if case["name"] in chosen[case["part"]]]
     return [case | how | {"name": f"{case['part']}_{case['name']}"} for case in made]
+
+
+def resolved_tables(scene: Scene) -> dict[str, Any]:
+    """Return a scene's tables with every default written out, and every preset and recipe replaced by its numbers.
+
+    Keys without a value are left out: TOML has none.
+    """
+    tables: dict[str, Any] = scene.model_dump(mode="json", exclude_none=True)
+    if scene.rig.preset is not None:
+        lights = [light.model_dump(mode="json", exclude_none=True) for light in scene.rig.lights]
+        lights = [
+            {key: value for key, value in light.items() if key not in ("offset_mm", "azimuth_deg")} for light in lights
+        ]
+        tables["rig"] = {"lights": lights, "seed": scene.rig.seed, "emission_known": scene.rig.emission_known}
+    tables["sensor"].pop("preset", None)
+    tables["reflectance"].get("albedo", {}).pop("preset", None)
+    if isinstance(scene.surface, AnatomySurface) and (file := scene.surface.file()).suffix == ".toml":
+        recipe = load_recipe(file, scene.surface.recipe_values)
+        # The type says which file it is read with, and the seed is the surface's own.
+        tables["surface"]["recipe"] = recipe.model_dump(mode="json", exclude_none=True, exclude={"type", "seed"})
+        tables["surface"]["seed"] = recipe.seed
+    return tables
+
+
+def unfrozen_keys(case: FrozenCase) -> list[str]:
+    """Return the key paths whose values the frozen file does not state: defaults that were added after the freeze.
+
+    Raises `InputError` if the file's scene resolves to another one than it states.
+    """
+    now = _flat(resolved_tables(scene_from_dict(case.scene, str(case.file))))
+    frozen = _flat(case.scene)
+    for path, value in frozen.items():
+        if now.get(path) != value:
+            raise InputError(f"{shown(case.file)}: {path} = {value!r} is read as {now.get(path)!r}")
+    return sorted(now.keys() - frozen.keys())
+
+
+def _flat(value: Any, above: str = "") -> dict[str, Any]:
+    """Return the leaves of nested tables and lists by key path; empty tables and lists are leaves."""
+    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    flat: dict[str, Any] = {}
+    for key, item in items:
+        flat |= _flat(item, f"{above}.{key}" if above else str(key))
+    return flat or ({above: value} if above else {})
 
 
 def freeze(version: str) -> Path:

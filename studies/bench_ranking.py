@@ -10,7 +10,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from simtest.bench.ranking import ALPHA, CAP_DEG, Ranking, SceneSums, rank
+from simtest.bench.scores import CAP_DEG
+from simtest.bench.table import ALPHA, Ranking, SceneSums, rank
 from simtest.runtime.arrays import Array
 
 SCENES = (60, 60, 60, 60)
@@ -44,7 +45,7 @@ def rankings(factors: Sequence[float], tables: int, margin: bool = True, alpha: 
     """Return the tables of as many draws; without the margin where that is asked for."""
     if margin:
         return [rank([cores(seed, factors)], alpha) for seed in range(tables)]
-    with patch("simtest.bench.ranking.margin", lambda first, second: np.zeros(())):
+    with patch("simtest.bench.table.margin", lambda first, second: np.zeros(())):
         return [rank([cores(seed, factors)], alpha) for seed in range(tables)]
 
 

@@ -17,10 +17,10 @@ import numpy as np
 
 from simtest.geometry.vectors import angle_deg
 from simtest.rendering import backend
-from simtest.rendering.exact_points import trace_hits
-from simtest.rendering.shapes import make_shape
+from simtest.rendering.built_scene import make_shape
+from simtest.rendering.truth import trace_hits
 from simtest.runtime.arrays import Array
-from simtest.spec.relief import Relief, ReliefBand
+from simtest.spec.surfaces import Relief, ReliefBand
 from simtest.surfaces import RayHits, Shape, TriangleMesh
 from simtest.surfaces.relief_field import ReliefField, fine_normals, make_relief
 
@@ -113,13 +113,13 @@ class TracedPatch:
         self.mi, self.patch = mi, patch
         self.mesh, self.feet = patch.mesh()
         self.shape = Shape("mesh", False, np.eye(4), self.mesh, "displaced")
-        made = make_shape(mi, self.shape, {"type": "diffuse"})
+        made = make_shape(self.shape, {"type": "diffuse"})
         self.scene = mi.load_dict({"type": "scene", "surface": made}, optimize=False)
 
     def trace(self, origins: Array, direction: Array) -> RayHits:
         """Trace parallel rays."""
         directions = np.broadcast_to(direction, origins.shape)
-        return trace_hits(self.mi, self.scene, self.shape, origins, directions, None)[0]
+        return trace_hits(self.scene, self.shape, origins, directions, None)[0]
 
     def judge(self, view_deg: float) -> tuple[Array, float, float]:
         """View the patch's middle under an angle to the base's normal.

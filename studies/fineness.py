@@ -21,9 +21,8 @@ from simtest.errors import Failure
 from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry import Camera, Patch
 from simtest.surfaces.colon import build
-from simtest.surfaces.fineness import half_width, phong_concentration
+from simtest.surfaces.mesh_surface import half_width, phong_concentration, vertex_normals
 from simtest.surfaces.recipe import ColonRecipe
-from simtest.surfaces.subdivision import vertex_normals
 
 matplotlib.use("Agg")
 

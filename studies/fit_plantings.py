@@ -25,7 +25,7 @@ from simtest.realism.frame_statistics import measure
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import write_json
 from simtest.runtime.seeds import from_integer
-from simtest.spec.dataset_recipe import Dataset, SeedRange, Splits, load_dataset
+from simtest.spec.recipes import Dataset, SeedRange, Splits, load_dataset
 
 RECIPE = Path(__file__).with_suffix(".toml")
 FRAMES, MARGIN, WIDTH = 30, 0.15, 0.15

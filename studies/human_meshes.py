@@ -19,7 +19,7 @@ from simtest.detection.colour import ColourDetector
 from simtest.errors import Failure, SimtestError
 from simtest.estimators import Estimate
 from simtest.geometry import chi_squared
-from simtest.geometry.isophotes import encloses
+from simtest.geometry.patch import encloses
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, Specularity, run_pipeline
 from simtest.rendering import Session

@@ -27,7 +27,7 @@ from simtest.rendering import Session
 from simtest.rendering.rays import Sightlines
 from simtest.runtime.arrays import AnyArray, Array, Image, IntArray, Mask
 from simtest.spec import Scene
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.recipes import load_dataset
 
 RECIPES = ("highlights", "highlights_smooth")
 SAMPLES = (200, 100)
@@ -117,7 +117,7 @@ def peak_of(session: Session, point_px: Array) -> float:
     close = replace(
         camera, fx=camera.fx * DIVISION, fy=camera.fy * DIVISION, cx=x, cy=y, width=size, height=size, view_mask=None
     )
-    sightlines = Sightlines(session.mi, close, session.surface.model_from_camera)
+    sightlines = Sightlines(close, session.surface.model_from_camera)
     parts, _ = session._tracer(sightlines).centres(None, True, None)
     # Of an instrument in front, too.
     channels = len(parts) // (2 if session.scene.instruments else 1) // 2

@@ -18,8 +18,7 @@ import polars as pl
 from scipy import stats
 
 from simtest.dataset.scoring.dense.tally import joined_figures
-from simtest.nightly.gate.contrasts import paired, unpaired
-from simtest.nightly.gate.pairing_units import paired_sums, sums
+from simtest.nightly.gate.contrasts import paired, unit_sums, unpaired
 from simtest.nightly.gate.quantities import Quantity
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.statistics import Interval, mean_interval, median_interval, share_interval
@@ -156,9 +155,9 @@ def _nightly(drawn: Array, own: IntArray) -> Iterator[tuple[str, Array, Array]]:
     keys = {"cell": np.repeat(np.arange(draws), count), "quantity": "mean_deg", "realisation": np.tile(own, draws)}
     quantity, (errors, equal, other) = Quantity("deg", 0.02, 0.002), drawn.swapaxes(0, 1).reshape(3, -1)
     for name, values in (("nightly equal pair", equal), ("nightly other pair", other)):
-        found = paired(paired_sums(pl.DataFrame({**keys, "baseline": errors, "tonight": values})), quantity)
+        found = paired(unit_sums(pl.DataFrame({**keys, "baseline": errors, "tonight": values})), quantity)
         yield name, found.low, found.high
-    before, after = (sums(pl.DataFrame({**keys, "value": values})) for values in (errors, equal))
+    before, after = (unit_sums(pl.DataFrame({**keys, "value": values})) for values in (errors, equal))
     found = unpaired(before, after, quantity)
     yield "nightly unpaired", found.low, found.high
 

@@ -104,7 +104,7 @@ TARGETS = {
     ),
     "nightly": Target(
         ("nightly", "--profile", "p.toml", "--workers", "2", "--reports"), _night_files,
-        ("work/2*", "**/.*.part*", ".p.lock", "nightly/.p.old"),
+        ("work/*", "**/.*.part*", ".p.lock", "nightly/.p.old"),
     ),
 }  # fmt: skip
 

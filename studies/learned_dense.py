@@ -18,8 +18,6 @@ from pathlib import Path
 import numpy as np
 
 from simtest.cli.progress import progress_bar
-from simtest.dataset.learn.dense_frames import FIELDS_READ, truth_at
-from simtest.dataset.learn.spots import sample_frame
 from simtest.dataset.reader import read_samples, sample_positions
 from simtest.dataset.sample import Sample
 from simtest.errors import Failure
@@ -32,6 +30,7 @@ from simtest.geometry.vectors import angle_deg, tangent_basis, tangent_coordinat
 from simtest.reconstruction.pipeline import run_pipeline
 from simtest.runtime.arrays import Array
 from simtest.runtime.statistics import CONFIDENCE, NORMAL_QUANTILE
+from studies.networks.examples import DENSE_FIELDS, sample_frame, truth_at
 from studies.resampling import drawn_groups, interval_of_mean
 
 STEP = 4
@@ -69,7 +68,7 @@ def main() -> None:
     taken: Counter[tuple[int, int]] = Counter()
     total = len(sample_positions(options.data, options.split))
     with progress_bar("comparing") as progress:
-        for number, sample in enumerate(read_samples(options.data, options.split, FIELDS_READ)):
+        for number, sample in enumerate(read_samples(options.data, options.split, DENSE_FIELDS)):
             anatomy = (sample.meta["anatomy"]["family"], sample.meta["anatomy"]["number"])
             taken[anatomy] += 1
             if taken[anatomy] <= options.most:

@@ -12,14 +12,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from simtest.dataset.learn.dense_frames import FIELDS_READ
-from simtest.dataset.learn.spots import sample_frame
 from simtest.dataset.reader import read_samples
 from simtest.dataset.sample import Sample
 from simtest.errors import Failure
 from simtest.estimators.learned_dense import LearnedDense
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.arrays import Array, Picture
+from studies.networks.examples import DENSE_FIELDS, sample_frame
 
 SIZE = (256, 192)
 HEAD_PX, GAP_PX, QUALITY = 24, 4, 85
@@ -35,7 +34,7 @@ def main() -> None:
     data, model, out = sys.argv[1:4]
     wanted = [int(index) for index in sys.argv[4:]]
     rows, families = [_heads()], set()
-    for sample in read_samples(data, "test", FIELDS_READ):
+    for sample in read_samples(data, "test", DENSE_FIELDS):
         family = sample.meta["anatomy"]["family"]
         if sample.index in wanted or (not wanted and family not in families):
             rows.append(_joined(list(_panels(sample, LearnedDense(model)))))

@@ -1,7 +1,7 @@
 """Compare a network of the task `spot_normals` with `bisector` and `cloud` on anatomies that it has not seen.
 
 simtest dataset highlights --out data/highlights
-simtest train spot_normals data/highlights --out models/spots
+python -m studies.networks learned_spot data/highlights models/spots/model.onnx
 python -m studies.learned_spots data/highlights models/spots/model.onnx
 
 A third argument limits the frames of each anatomy: the anatomies are the independent units. A fourth names the split,
@@ -18,7 +18,6 @@ import numpy as np
 
 from simtest.cli.progress import progress_bar
 from simtest.dataset.fields import INSTRUMENT
-from simtest.dataset.learn.spots import FIELDS_READ, NEAR_PX, only_glints, sample_frame
 from simtest.dataset.reader import read_samples, sample_positions
 from simtest.dataset.sample import Sample
 from simtest.errors import Failure
@@ -30,6 +29,7 @@ from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import run_pipeline
 from simtest.runtime.arrays import Array
 from simtest.runtime.statistics import CONFIDENCE, NORMAL_QUANTILE
+from studies.networks.examples import NEAR_PX, SPOT_FIELDS, only_glints, sample_frame
 from studies.resampling import interval_of_mean
 
 CHI2_95 = chi_squared.quantile(CONFIDENCE, 2)
@@ -74,7 +74,7 @@ def main() -> None:
     taken: Counter[tuple[int, int]] = Counter()
     total = len(sample_positions(folder, split))
     with progress_bar("comparing") as progress:
-        for number, sample in enumerate(read_samples(folder, split, FIELDS_READ)):
+        for number, sample in enumerate(read_samples(folder, split, SPOT_FIELDS)):
             anatomy = (sample.meta["anatomy"]["family"], sample.meta["anatomy"]["number"])
             taken[anatomy] += 1
             if taken[anatomy] <= most:

@@ -19,7 +19,7 @@ def picture(browser: Browser, page: Path, out: Path, section: str | None, **cont
     """Take one picture: of what is seen first, or of a section."""
     tab = browser.new_context(**context).new_page()  # type: ignore[arg-type]
     tab.goto(page.resolve().as_uri())
-    tab.wait_for_selector("#trends .main-svg")
+    tab.wait_for_selector("#trends svg.marks")
     if section:
         tab.locator(section).scroll_into_view_if_needed()
         tab.wait_for_timeout(500)

@@ -4,7 +4,7 @@
 
 Each frame of a colon or a liver, smooth or of tissue, gets three coarse maps of distance: the truth with a smooth error
 of 5 % (`planted`), the same after blurring, as networks blur folds (`blurred`), and shading alone (`shading`). Normals
-correct each map (`simtest.reconstruction.completion`), which is told the same error of 5 % every time. The error is
+correct each map (`studies.depth_completion`), which is told the same error of 5 % every time. The error is
 the angle between the map's normals and those of the base surface; the gain is the mean angle before minus that after,
 over all pixels and over those within 10 px of a normal, in the coarse map's pixels.
 """
@@ -24,7 +24,6 @@ from simtest.errors import Failure
 from simtest.estimators.protocol import Target
 from simtest.estimators.shading_maps import shading_maps
 from simtest.geometry import Camera
-from simtest.reconstruction.completion import CoarseError, complete
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.reconstruction.ranking import best_of
 from simtest.rendering import Session
@@ -32,6 +31,7 @@ from simtest.runtime.arrays import Array, Mask
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import Scene, load_scene
 from simtest.validation.depth_maps import depth_normals
+from studies.depth_completion import CoarseError, complete
 from studies.resampling import interval_of_mean
 
 EVERY = 6

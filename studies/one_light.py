@@ -38,7 +38,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.rendered_view import RenderedView
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.recipes import load_dataset
 from simtest.validation.cloud_rows import match_cloud
 from simtest.validation.metrics import mahalanobis2
 from studies.twins import SCOPES, _rendered, told

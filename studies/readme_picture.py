@@ -8,19 +8,19 @@ along the normal. The frame stands on the left, its highlights enlarged on the r
 """
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.linalg import norm
+from PIL import Image, ImageDraw
 
 import simtest
 from simtest.errors import Failure
 from simtest.geometry.vectors import angle_deg, tangent_basis
-from simtest.pages.pixels import GAMMA, Canvas, Pixels, legend
-from simtest.pages.sheet import Sheet
+from simtest.pages.pixels import GAMMA, Canvas, Pixels, font, legend
 from simtest.pages.style import TRUTH, colours
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import write_atomically
@@ -88,34 +88,34 @@ def draw(frame: simtest.LabelledFrame, spots: list[Spot]) -> Pixels:
     whole = Canvas(linear, None, HEIGHT)
     for spot in spots:
         draw_spot(whole, spot, frame.camera, 2)
-    sheet = Sheet(whole.pixels)
+    numbers = []
     rows = -(-len(spots) // COLUMNS)
     side = HEIGHT // rows
     crops = []
     for number, spot in enumerate(spots, start=1):
         x, y = spot.bp_px
         half = CROP_PX / 2
-        _text(sheet, (x * whole.scale + 42, y * whole.scale + 12), str(number), 22)
+        numbers.append(((x * whole.scale + 42, y * whole.scale + 12), str(number), 22))
         crop = Canvas(linear, (x - half, x + half, y - half, y + half), side)
         draw_spot(crop, spot, frame.camera, 3)
-        label = Sheet(crop.pixels)
-        _text(label, (10, 8), str(number), 22)
-        for line, name in enumerate(ESTIMATORS):
-            _text(label, (10, side - 44 + 20 * line), f"{name}: off by {spot.error_deg(name):.2f} deg", 16)
-        crops.append(crop.pixels)
+        errors = [f"{name}: off by {spot.error_deg(name):.2f} deg" for name in ESTIMATORS]
+        lines = [((10, side - 44 + 20 * line), text, 16) for line, text in enumerate(errors)]
+        crops.append(_labelled(crop.pixels, [((10, 8), str(number), 22), *lines]))
     crops += [np.full_like(crops[0], 255)] * (rows * COLUMNS - len(crops))
     right = np.vstack([np.hstack(crops[COLUMNS * i : COLUMNS * (i + 1)]) for i in range(rows)])
-    picture = np.hstack([whole.pixels, np.full((HEIGHT, 6, 3), 255, np.uint8), right])
+    picture = np.hstack([_labelled(whole.pixels, numbers), np.full((HEIGHT, 6, 3), 255, np.uint8), right])
     palette = colours(ESTIMATORS)
     entries = [(TRUTH, TRUE), *((palette[name], name) for name in ESTIMATORS)]
     return np.vstack([picture, legend(picture.shape[1], entries)])
 
 
-def _text(sheet: Sheet, corner: tuple[float, float], text: str, size: int) -> None:
-    """Write white on a dark edge, from the upper left corner."""
-    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        sheet.text((corner[0] + dx, corner[1] + dy), text, size, "#101010", across=0.0, down=0.0)
-    sheet.text(corner, text, size, "#ffffff", across=0.0, down=0.0)
+def _labelled(picture: Pixels, labels: Sequence[tuple[tuple[float, float], str, int]]) -> Pixels:
+    """Write texts of a size in white with a dark edge, each from its upper left corner."""
+    image = Image.fromarray(picture)
+    pen = ImageDraw.Draw(image)
+    for corner, text, size in labels:
+        pen.text(corner, text, fill="#ffffff", font=font(size), stroke_width=1, stroke_fill="#101010")
+    return np.asarray(image)
 
 
 def main() -> None:

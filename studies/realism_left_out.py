@@ -26,7 +26,7 @@ from simtest.realism.fitting.parameters import fitted_parameters, one_family
 from simtest.realism.frame_sets import open_frames
 from simtest.realism.frame_statistics import COLUMNS, STATISTICS, Measured, measure
 from simtest.runtime.files import write_json
-from simtest.spec.dataset_recipe import Dataset, Splits, load_dataset
+from simtest.spec.recipes import Dataset, Splits, load_dataset
 
 REAL = ("fig5_a.bmp", "fig7_a.bmp", "hyperkvasir_0qkwl.jpg", "hyperkvasir_0qx73.jpg", "hyperkvasir_0rx1i.jpg")
 RECIPE = Path(__file__).with_suffix(".toml")

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from simtest.reconstruction.pipeline import reconstruct
-from simtest.rendering import Session, glints
+from simtest.rendering import Session, highlights
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import key
 from simtest.simulation.rendered_view import RenderedView, render_view
@@ -108,7 +108,7 @@ class Glints:
 
 def glints_of(session: Session) -> Glints:
     """Find the glints of a frame of the first light."""
-    pixels = glints.search(session, 0)
+    pixels = highlights.search_glints(session, 0)
     points = session.cast(pixels)[0]
     cosine = np.clip(np.sum(points.normal * points.normal_base, axis=1), -1, 1)
     pose = session.surface.model_from_camera
@@ -186,7 +186,7 @@ def count(case: Case, wanted: int, least_frames: int = 12) -> tuple[float, float
     """Return the mean number of glints, its standard error, the law's, and the number of frames."""
     numbers: list[int] = []
     for session in frames(case):
-        numbers.append(len(glints.search(session, 0)))
+        numbers.append(len(highlights.search_glints(session, 0)))
         if sum(numbers) >= wanted and len(numbers) >= least_frames:
             break
     expected = laws.glint_count(case.slope, case.wavelength_mm, case.distance_mm, case.gains)
@@ -247,7 +247,7 @@ def centroid_errors(case: Case, wanted: int) -> tuple[Array, Array]:
     errors: list[float] = []
     numbers: list[int] = []
     for session in frames(case):
-        pixels = glints.search(session, 0)
+        pixels = highlights.search_glints(session, 0)
         if len(pixels):
             mean = session.camera.unproject(pixels).mean(axis=0)
             # The base faces the camera, which lies on the surface's axis.
@@ -366,8 +366,8 @@ def exhaustive(session: Session) -> Array:
         may = ((corners.min(axis=0) <= 0) & (corners.max(axis=0) >= 0)).all(axis=0)
     own, below, right = np.nonzero(may)
     seeds = blocks[own] + np.stack([right, below], axis=1) / FINER
-    found = glints._newton(session, seeds, session.scene.rig.true_mm()[0])
-    return glints.distinct(found[session.camera.contains(found)], glints.SAME_PX)
+    found = highlights._glint_zeros(session, seeds, session.scene.rig.true_mm()[0])
+    return highlights.distinct(found[session.camera.contains(found)], highlights.SAME_GLINT_PX)
 
 
 def search(name: str, seed: int, slope_deg: float, wavelength_mm: float) -> tuple[int, int, float]:
@@ -375,11 +375,11 @@ def search(name: str, seed: int, slope_deg: float, wavelength_mm: float) -> tupl
     relief = {"bands": [{"slope_deg": slope_deg, "wavelength_mm": wavelength_mm}], "seed": seed}
     camera = {"width": 320, "height": 240, "fx": 300.0, "fy": 300.0, "cx": 160.0, "cy": 120.0}
     session = Session(scene_from_dict({"surface": {**SEARCHED[name], "relief": relief}, "camera": camera}))
-    found, whole = glints.search(session, 0), exhaustive(session)
+    found, whole = highlights.search_glints(session, 0), exhaustive(session)
     if not len(found):
         return len(whole), 0, 0.0
     near = cKDTree(found).query(whole)[0] < SAME_PX if len(whole) else np.empty(0)
-    misfit = glints.exact_misfit(session, found, session.scene.rig.true_mm()[0]).length.max()
+    misfit = highlights.exact_misfit(session, found, session.scene.rig.true_mm()[0]).length.max()
     return len(whole), int(np.sum(near)), float(misfit)
 
 
@@ -400,7 +400,7 @@ def print_search(scale: float) -> None:
 # Shipped tissues -------------------------------------------------------------------------------------------------
 
 TISSUES = ("tissue_colon", "tissue_stomach", "tissue_liver", "tissue_gallbladder")
-TWICE = {"GRID_WAVE": 2 * glints.GRID_WAVE, "MAX_DIVISION": 2 * glints.MAX_DIVISION}
+TWICE = {"GRID_WAVE": 2 * highlights.GRID_WAVE, "MAX_DIVISION": 2 * highlights.MAX_DIVISION}
 """The grid twice as fine, against which the search is compared."""
 
 
@@ -446,7 +446,7 @@ def print_tissues(scale: float) -> None:
             views = {"surface.relief.seed": i} if name == "tissue_gallbladder" else {"surface.viewpoint": i}
             scene = load_scene(name, views)
             coarse = seen(scene)
-            with patch.multiple(glints, **TWICE):
+            with patch.multiple(highlights, **TWICE):
                 fine = seen(scene)
             gap, back = (cKDTree(a.places).query(b.places)[0] > SAME_PX for a, b in ((coarse, fine), (fine, coarse)))
             own, other = ({tuple(h.bp_px.round(1)) for h in a.view.highlights if h.isolated} for a in (coarse, fine))

@@ -16,7 +16,7 @@ from simtest.geometry import Camera
 from simtest.rendering import backend
 from simtest.rendering.subsurface import once_scattered, spread, transfer
 from simtest.runtime.arrays import Array
-from simtest.spec.translucency import Translucency
+from simtest.spec.reflectance import Translucency
 
 CHANNELS = ("red", "green", "blue")
 HALF_WIDTH_MM = 15.0

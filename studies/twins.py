@@ -43,7 +43,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image, IntArray
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.rendered_view import RenderedView, render_view
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.recipes import load_dataset
 
 SEED = 7720
 """Of the frames; nothing was tuned on them. Tuning frames: seeds 7703, 5501 and 7719."""

@@ -16,7 +16,7 @@ from benchmarks.measuring import print_markdown
 from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.dataset.plan import Plan
 from simtest.reconstruction.pipeline import run_picture
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.recipes import load_dataset
 from studies.twins import SCOPES, _rendered, told
 
 SEED = 9203

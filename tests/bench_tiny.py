@@ -4,12 +4,12 @@ import copy
 from pathlib import Path
 from typing import Any
 
-from simtest.bench.certificate import write_certificate
-from simtest.bench.run import BenchRun
-from simtest.bench.suite import HASHES, SUITE, Suite, load_suite, read_suite, resolved_tables
+from simtest.bench.run import BenchRun, write_certificate
+from simtest.bench.suite import HASHES, SUITE, Suite, load_suite, read_suite
 from simtest.runtime.files import write_json
 from simtest.spec import load_scene
 from simtest.spec.toml_files import toml_tables
+from studies.bench_cases import resolved_tables
 
 SUITE_TEXT = """
 name = "tiny"

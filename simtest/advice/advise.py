@@ -13,9 +13,9 @@ from simtest.advice.break_points import BreakPoint, SpotSize, break_points, spot
 from simtest.advice.figures import Found, read_results
 from simtest.advice.plan import Question, main_experiment, surroundings, write_experiment
 from simtest.errors import InputError
-from simtest.pages.sheet import Pixels
-from simtest.runtime.engines import make_engine
+from simtest.pages.pixels import Pixels
 from simtest.runtime.files import make_folder, write_atomically
+from simtest.runtime.processes import make_engine
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import Experiment, load_scene
@@ -94,13 +94,6 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
         Called with steps done, steps in all, and what is done.
     workers : int
         Processes that render at once.
-
-    Raises
-    ------
-    InputError
-        If something does not fit, or no surface can be rendered so.
-    BackendError
-        If the rendering backend cannot be used.
     """
     engine = make_engine(workers=workers)
     make_folder(out)

@@ -66,11 +66,6 @@ def in_free_space(
         Ends of what is drawn, by key path.
     seed : int
         Of the advice.
-
-    Raises
-    ------
-    InputError
-        If no wall at a distance leaves room.
     """
     forms = [key for key in values if key.startswith(SURFACE) and not key.startswith("surface.relief")]
     made = {key: list(column) for key, column in values.items()}

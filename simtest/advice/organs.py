@@ -12,7 +12,7 @@ from typing import Any
 
 from simtest.advice.scope import Interval, ReliefPrior, ends
 from simtest.runtime.resources import find
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.recipes import load_dataset
 from simtest.spec.toml_files import read_toml
 
 MOST_TILT_DEG = 35.0

@@ -9,9 +9,8 @@ import numpy as np
 from simtest.advice.advise import Advised
 from simtest.advice.figures import WIDE, Choice, MethodAnswers
 from simtest.advice.plan import DISTANCES, MOST_ASKED
-from simtest.pages import chart_png, chart_web, pixels
-from simtest.pages.axes import Axis
-from simtest.pages.chart import Chart, Mark, Panel
+from simtest.pages import pixels
+from simtest.pages.charts import Axis, Chart, Mark, Panel, embedded, png
 from simtest.pages.html import environment
 from simtest.pages.palette import SERIES
 from simtest.pages.style import number, symbols
@@ -41,7 +40,7 @@ def write_advice(found: Advised, out: Path, command: str = "") -> Path:
     """
     make_folder(out / "figures")
     chart = distance_chart(found)
-    content = pixels.png(chart_png.draw([chart])[0])
+    content = png([chart])
     write_atomically(out / "figures" / "distance.png", lambda part: part.write_bytes(content))
     made_by = provenance.environment()
     html = environment().get_template("advice.html.j2").render(
@@ -51,7 +50,7 @@ def write_advice(found: Advised, out: Path, command: str = "") -> Path:
         interval=interval, surfaces=_SURFACES,
         parts=list(dict.fromkeys(name for each in found.found.methods for name in each.budget_deg)),
         provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"], "python": made_by["python"]},
-        figures=chart_web.packed({chart.key: chart_web.figure(chart)}), plotly=chart_web.packed_plotly(),
+        **embedded([chart]),
     )  # fmt: skip
     write_json(out / RESULT, {**found.to_json(), "run": {"command": command, **made_by}})
     write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))

@@ -14,8 +14,8 @@ from simtest.advice.organs import ORGANS, Organ, Surroundings, is_smooth, wall
 from simtest.advice.scope import Interval, Scope
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
+from simtest.runtime.boundary import suggestion
 from simtest.runtime.files import write_atomically
-from simtest.runtime.resources import shown, suggestion
 from simtest.spec import Experiment, load_experiment, load_scene
 from simtest.spec.toml_files import toml_value
 
@@ -62,11 +62,6 @@ class Question:
         Frames; default as many as `BUDGET_S` allows.
     seed : int
         Of everything that is drawn.
-
-    Raises
-    ------
-    InputError
-        If the organ is unknown, or a number out of range.
     """
 
     scope: Scope
@@ -79,7 +74,7 @@ class Question:
     def __post_init__(self) -> None:
         if self.organ not in ORGANS:
             known = ", ".join(ORGANS)
-            raise InputError(f"--organ {shown(self.organ)}: unknown; organs: {known}{suggestion(self.organ, ORGANS)}")
+            raise InputError(f"--organ {self.organ}: unknown; organs: {known}{suggestion(self.organ, ORGANS)}")
         near, far = self.distances_mm
         for value in (near, far):
             check_number("--distances", value, above=0)

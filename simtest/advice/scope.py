@@ -12,10 +12,10 @@ from pydantic import Field, model_validator
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown, suggestion
-from simtest.spec.camera_spec import SceneCamera, load_camera
+from simtest.runtime.boundary import suggestion
+from simtest.spec.camera import SceneCamera, load_camera
 from simtest.spec.camera_tables import camera_table
-from simtest.spec.rig import Rig
+from simtest.spec.lights import Rig
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
@@ -140,11 +140,6 @@ def read_scope(name: str, camera: Path | None = None) -> Scope:
         In ``[rig]``, ``lights_mm`` may give the positions alone, as in a calibration file.
     camera : Path, optional
         Camera file that replaces the scope's camera.
-
-    Raises
-    ------
-    InputError
-        If there is no such scope, or something does not fit.
     """
     scope = _named(name)
     if camera is None:
@@ -158,7 +153,7 @@ def _named(name: str) -> Scope:
     path = Path(name).expanduser()
     if not path.is_file():
         known = ", ".join(SCOPES)
-        raise InputError(f"{shown(name)}: no such file or preset; presets: {known}{suggestion(name, SCOPES)}")
+        raise InputError(f"{name}: no such file or preset; presets: {known}{suggestion(name, SCOPES)}")
     data = read_toml(path)
     rig = data.get("rig")
     if isinstance(rig, Mapping) and "lights_mm" in rig:
@@ -174,5 +169,5 @@ def _listed(lights_mm: Any, where: str) -> Table:
     """Return the rig of lights at some positions, of which each has its share of the power."""
     sound = isinstance(lights_mm, Sequence) and 1 <= len(lights_mm) <= 32
     if not sound or not all(isinstance(light, Sequence) and len(light) == 3 for light in lights_mm):
-        raise InputError(f"{where} = {shown(lights_mm, 80)}: must be 1 to 32 positions x, y, z, mm")
+        raise InputError(f"{where} = {lights_mm!s:.80}: must be 1 to 32 positions x, y, z, mm")
     return {"lights": [{"position_mm": list(light), "power": 1 / len(lights_mm)} for light in lights_mm]}

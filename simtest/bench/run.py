@@ -1,48 +1,69 @@
-"""Runs the benchmark: each part by the ordinary runner, then the figures and the certificate."""
+"""Runs the benchmark: each part by the ordinary runner, or maps on the dense part; then the certificate."""
 
+import json
 import math
-from collections.abc import Sequence
+import os
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from simtest.bench.certificate import FORMAT, KIND, cases_of, environment, suite_record, write_certificate
-from simtest.bench.cores import check_core, core_record
-from simtest.bench.draws import experiment_of
-from simtest.bench.ranking import CAP_DEG
-from simtest.bench.scores import score_part
-from simtest.bench.suite import Suite, layout_of
+from simtest.bench.scores import (
+    CAP_DEG,
+    CERTIFICATE,
+    FORMAT,
+    KIND,
+    OF_CERTIFICATE,
+    UNSTATED,
+    PartScore,
+    ZoneScore,
+    score_part,
+)
+from simtest.bench.suite import (
+    HIGHLIGHTS,
+    Layout,
+    Suite,
+    cases_of,
+    digest_of,
+    experiment_of,
+    layout_of,
+    parts_of_overall,
+)
+from simtest.dataset.export import check_exportable, export_run
+from simtest.dataset.scoring.dense.conventions import MapOptions
+from simtest.dataset.scoring.dense.map_files import find_maps
+from simtest.dataset.scoring.dense.score import DenseScore, score_maps
+from simtest.dataset.scoring.dense.scorer import ANGLE, NORMAL, depth_source
+from simtest.dataset.scoring.record import read_record
 from simtest.errors import InputError
-from simtest.runtime.engines import Engine
-from simtest.runtime.files import JsonObject, make_folder
-from simtest.runtime.resources import shown
+from simtest.estimators import load_estimators
+from simtest.estimators.installed import ESTIMATORS
+from simtest.estimators.process.command import INTERPRETERS, parse_core
+from simtest.estimators.process.naming import core_hashes, core_records, has_files, short_name
+from simtest.runtime import provenance
+from simtest.runtime.files import Json, JsonObject, make_folder, write_json
+from simtest.runtime.processes import Engine, make_engine
+from simtest.runtime.resources import parse_model
 from simtest.validation.runner import Progress, run_experiments
 
-if TYPE_CHECKING:
-    from simtest.dataset.scoring.dense.conventions import MapOptions
+PART = "dense"
+RUN, FRAMES, SCORES = "run", "frames", "scores"
+"""Folders: of the part's run, of its frames without truth, and of the figures of maps."""
 
-HIGHLIGHTS = "highlights"
+STATED = ("encoding", "frame", "depth", "unit_mm")
+"""Options that say how maps are read, in the order of `MapOptions`."""
+
+OF_RUN = "brightest_point"
+"""The quickest estimator: the run is there for its frames."""
 
 
 @dataclass(frozen=True)
 class BenchRun:
-    """A finished run of the benchmark.
-
-    Parameters
-    ----------
-    certificate : Path
-        Its file.
-    content : dict
-        As in the file, without its hash.
-    """
+    """A finished run of the benchmark."""
 
     certificate: Path
-    content: JsonObject
-
-
-def parts_of_overall(suite: Suite) -> list[str]:
-    """Return the parts whose scores make the headline: those whose unit is the highlight."""
-    return [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
+    content: JsonObject  # as in the file, without its hash
 
 
 def chosen_parts(suite: Suite, wanted: Sequence[str] | None) -> list[str]:
@@ -56,7 +77,7 @@ def chosen_parts(suite: Suite, wanted: Sequence[str] | None) -> list[str]:
         if suite.part(name).kind != HIGHLIGHTS:
             raise InputError(f"--part {name}: is scored by maps of normals or depths; give --maps in place of --core")
         if list(wanted).count(name) > 1:
-            raise InputError(f"--part {shown(name, 60)}: named twice")
+            raise InputError(f"--part {name}: named twice")
     return [part.name for part in suite.spec.parts if part.name in wanted]
 
 
@@ -69,27 +90,14 @@ def run_bench(
     progress: Progress | None = None,
     variant: str | None = None,
 ) -> BenchRun:
-    """Run a core on a suite and write its certificate; a stopped run goes on.
+    """Run a core, an installed estimator or a command, on a suite and write its certificate; a stopped run goes on.
 
-    Parameters
-    ----------
-    suite : Suite
-        What to run.
-    core : str
-        An installed estimator, or a command.
-    folder : Path
-        Gets a run's folder for each part, and certificate.json.
-    parts : sequence of str, optional
-        Default all that are scored by highlights.
-    engine, progress, variant
-        See `simtest.validate`. The figures do not depend on the engine.
-
-    Raises
-    ------
-    InputError
-        If a part or the core is unknown, or the folder holds something else.
+    `folder` gets a run's folder for each part, by default all that are scored by highlights, and certificate.json. The
+    figures do not depend on the engine. Raises `InputError` if a part or the core is unknown, or the folder holds
+    something else.
     """
-    check_core(core)
+    if not core.strip():
+        raise InputError('--core: is empty; must be an installed estimator, or a command as in "command: ./core"')
     chosen = chosen_parts(suite, parts)
     told = core_record(core)
     make_folder(folder)
@@ -106,30 +114,166 @@ def run_maps(
     suite: Suite,
     maps: str | Path,
     folder: Path,
-    options: "MapOptions | None" = None,
+    options: MapOptions | None = None,
     engine: Engine | None = None,
     progress: Progress | None = None,
 ) -> BenchRun:
     """Score a method's maps on the dense part and write its certificate; see `run_bench`.
 
-    `maps` is a folder of maps, each called as its frame (`simtest.bench.maps.export_frames`), or "shading".
+    `maps` is a folder of maps, each called as its frame (`export_frames`), or "shading".
     """
-    from simtest.bench.maps import PART, maps_record, score_dense
-
     make_folder(folder)
-    score, figures = score_dense(suite, maps, folder / PART, options, engine, progress)
+    own = folder / PART
+    export_frames(suite, own, engine, progress)
+
+    def tell(done: int, total: int, what: str) -> None:
+        if progress:
+            progress(done, total, f"scoring {what}")
+
+    score = score_maps(maps, own / RUN, own / SCORES, options, "", tell)
+    numbers = {use.frame: use.realisation for use in read_record(own / RUN).uses}
+    stated = {key: getattr(options or MapOptions(), key) for key in STATED}
+    figures = dense_figures(score, layout_of(suite, PART), numbers) | {"stated": stated}
     return _certified(suite, folder, maps_record(maps, score), {PART: figures})
 
 
+def export_frames(suite: Suite, folder: Path, engine: Engine | None = None, progress: Progress | None = None) -> Path:
+    """Write the frames of the dense part without their truth; return their folder.
+
+    Raises `InputError` if the folder holds something else.
+    """
+    experiment = experiment_of(suite, PART, OF_RUN)
+    check_exportable(experiment)
+    chosen = engine or make_engine()
+    (run,) = run_experiments([(experiment, folder / RUN)], "", None, progress, chosen)
+    export_run(run.folder, experiment, folder / FRAMES, chosen, progress)
+    return folder / FRAMES
+
+
+def dense_figures(score: DenseScore, layout: Layout, numbers: Mapping[str, int]) -> JsonObject:
+    """Return a part's figures of the angles at all scored pixels, in the form of other parts, and those by zone.
+
+    They are of normal maps where there are any, else of depth maps after an affine alignment. The score counts 90 deg
+    for a pixel without a value.
+    """
+    sources = sorted({key[0] for key, _ in score.scorer.cells()})
+    if not sources:
+        raise InputError(f"maps {score.name}: hold neither normals nor depths")
+    source = NORMAL if NORMAL in sources else depth_source("affine")
+    zones = {
+        label: _zone(score, source, label) for label in ("all", "highlight", "ring_1", "ring_2", "ring_4", "elsewhere")
+    }
+    every, rows = zones["all"], [_plain(row) for row in score.scorer.rows if row["group"] == "zone"]
+    refused = {"no_value": every.n_unanswered} if every.n_unanswered else {}
+    return PartScore(
+        n=every.n, answered=every.n - every.n_unanswered, missed=0, false=0, refused=refused,
+        median_deg=every.median_deg, median_interval=every.median_interval, mean_deg=every.mean_deg,
+        p95_deg=every.p95_deg, score_deg=every.penalised_deg, score_interval=every.penalised_interval,
+        scenes=_scene_sums(score, source, layout, numbers), uncertainty=UNSTATED, results=digest_of(rows),
+        source=source, zones=zones,
+        conventions=[line for line in score.lines if line.startswith(("normals:", "depths:"))],
+    ).to_json()  # fmt: skip
+
+
+def _scene_sums(
+    score: DenseScore, source: str, layout: Layout, numbers: Mapping[str, int]
+) -> dict[str, list[tuple[int, float]]]:
+    """Return by case, for each scene, its number of pixels and the sum of their errors as the score takes them.
+
+    `numbers` are the frames' realisations by name. A frame without a surface has no row, and equal ones have one name.
+    """
+    sums = {case: [(0, 0.0)] * scenes for case, (scenes, _) in layout.items()}
+    for row in score.scorer.rows:
+        if (row["source"], row["quantity"], row["surface"], row["group"], row["label"]) == (
+            source, ANGLE, "fine", "zone", "all",
+        ):  # fmt: skip
+            case = row["setting"]
+            scene = numbers[row["frame"]] // layout[case][1]
+            n, total = sums[case][scene]
+            sums[case][scene] = n + row["n"], total + row["n"] * row["mean_penalised"]
+    return sums
+
+
+def _zone(score: DenseScore, source: str, label: str) -> ZoneScore:
+    found = score.cell(source, "fine", label)
+    intervals = found["ci95"]
+    return ZoneScore(
+        n=found["n"], n_unanswered=found["n_unanswered"], mean_deg=found["mean"], median_deg=found["median"],
+        median_interval=intervals.get("median"), p95_deg=found["p95"], penalised_deg=found["mean_penalised"],
+        penalised_interval=intervals.get("mean_penalised"),
+    )  # fmt: skip
+
+
+def _plain(row: JsonObject) -> Json:
+    """Return a row as it is hashed: numbers as they are, what is not finite as null."""
+    return {key: None if isinstance(value, float) and value != value else value for key, value in row.items()}
+
+
+def maps_record(maps: str | Path, score: DenseScore) -> JsonObject:
+    """Return what a certificate tells of maps: the method's name, and the hash of the maps by their place and name."""
+    if not Path(maps).exists():
+        return {"name": score.name, "kind": "baseline", "version": f"simtest {provenance.version()}", "sha256": None}
+    files = sorted((one.path.relative_to(maps).as_posix(), one.path) for one in find_maps(Path(maps)))
+    hashes: Json = [[name, provenance.file_hash(path)] for name, path in files]
+    return {"name": score.name, "kind": "maps", "version": None, "sha256": digest_of(hashes)}
+
+
+def core_record(text: str) -> JsonObject:
+    """Return what a certificate tells of a core, without paths; raise `InputError` if it is unknown or cannot start.
+
+    `sha256` is of the core's own files and of the words of its command. An interpreter or another program of the
+    machine, such as docker, is no part of it, since it differs from machine to machine: it stands under `program`.
+    Modules that a script loads are seen only where the command or the TOML file (`core.files`) names them.
+    """
+    (name,) = load_estimators([text])
+    if not has_files(text):
+        ((_, package),) = ESTIMATORS.distributions([text]).items()
+        return {"name": name, "kind": "installed", "version": package, "sha256": None}
+    if parse_model(text):
+        ((_, package),) = ESTIMATORS.distributions([text]).items()
+        (digest,) = core_hashes([text])[text].values()
+        return {"name": name, "kind": "network", "version": package, "sha256": digest}
+    (record,) = core_records([text]).values()
+    ((_, hashes),) = core_hashes([text]).items()
+    (program, digest), *files = hashes.items()
+    own = files if _is_shared(Path(program)) else [(program, digest), *files]
+    # Files by name, without folders: the same core lies elsewhere on another machine.
+    named: Json = sorted([Path(file).name, of_file] for file, of_file in own)
+    version = record.get("version")
+    return {
+        "name": short_name(text), "kind": "command", "version": None if version is None else str(version),
+        "sha256": digest_of({"files": named, "words": _words(parse_core(text).arguments[1:])}),
+        "program": {"name": Path(program).name, "sha256": digest},
+    }  # fmt: skip
+
+
+def _words(arguments: Sequence[str]) -> list[str]:
+    """Return the words of a command as they are on every machine: paths without their folders."""
+    words = []
+    for word in arguments:
+        option, equals, value = word.rpartition("=") if word.startswith("-") else ("", "", word)
+        words.append(f"{option}{equals}{Path(value).name if value.startswith('/') else value}")
+    return words
+
+
+def _is_shared(program: Path) -> bool:
+    """Return whether a program belongs to the machine, not to the core: an interpreter, or one that is on PATH."""
+    found = shutil.which(program.name)
+    return bool(INTERPRETERS.match(program.name)) or (found is not None and os.path.abspath(found) == str(program))
+
+
 def _certified(suite: Suite, folder: Path, core: JsonObject, scores: dict[str, JsonObject]) -> BenchRun:
-    """Write the certificate of a run's figures by part."""
+    """Write the certificate of a run's figures by part, and what of the machine these may depend on."""
+    environment: dict[str, Any] = dict(provenance.environment())
+    # The kernel says nothing of the figures, and its text may name the host.
+    del environment["system"]
     content: JsonObject = {
         "kind": KIND,
         "format": FORMAT,
-        "suite": suite_record(suite),
+        "suite": {"name": suite.spec.name, "version": suite.version, "sha256": suite.digest},
         "cases": cases_of(suite, scores),
         "core": core,
-        "environment": environment(),
+        "environment": environment | {"source_sha256": provenance.source_hash()},
         "parts": scores,
         "overall": overall_of(suite, scores),
     }
@@ -153,3 +297,11 @@ def overall_of(suite: Suite, parts: "dict[str, JsonObject]") -> JsonObject:
     below, above = (math.hypot(*(span[i] - value for span, value in zip(spans, values, strict=True))) for i in (0, 1))
     interval = [max(mean - below / len(spans), 0.0), min(mean + above / len(spans), CAP_DEG)]
     return {"complete": True, "score_deg": mean, "score_interval": interval}
+
+
+def write_certificate(folder: Path, content: JsonObject) -> Path:
+    """Write a certificate into a run's folder, with the hash of its content."""
+    path = folder / CERTIFICATE
+    plain = json.loads(json.dumps(content, allow_nan=False))
+    write_json(path, {**plain, OF_CERTIFICATE: digest_of(plain)})
+    return path

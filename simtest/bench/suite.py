@@ -1,4 +1,4 @@
-"""A suite of the benchmark: frozen cases by part, and the hashes that pin them.
+"""A suite of the benchmark: frozen cases by part, the hashes that pin them, and the scenes that are drawn of them.
 
 A case is a scene with every default written out (scenes/bench/v1/PART/NAME.toml), and the values that are drawn for
 each of its scenes (suite.toml). No later release changes it: a changed case is a new version of the suite.
@@ -6,7 +6,8 @@ each of its scenes (suite.toml). No later release changes it: a changed case is 
 
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,18 +15,24 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from simtest.errors import InputError
+from simtest.runtime.boundary import close_names
 from simtest.runtime.files import Json
 from simtest.runtime.provenance import file_hash
-from simtest.runtime.resources import close_names, data_root, shown
-from simtest.spec import AnatomySurface, Scene, read_toml, scene_from_dict
+from simtest.runtime.resources import data_root
+from simtest.runtime.seeds import Stage, generator
+from simtest.spec import AnatomySurface, Experiment, Group, read_toml
 from simtest.spec.spec_model import Name, Spec, load
-from simtest.surfaces.recipe import load_recipe
 
 FORMAT = 1
 """Of the cases' files; it enters their hashes."""
 
 SUITES = {"v1": "simtest-bench v1"}
 HASHES, SUITE = "hashes.json", "suite.toml"
+
+HIGHLIGHTS = "highlights"
+
+DIGITS = 6
+"""Of a drawn value: mathematical libraries differ in the last ones."""
 
 PartKind = Literal["highlights", "maps"]
 
@@ -98,24 +105,12 @@ class SuiteSpec(Spec):
 
 @dataclass(frozen=True)
 class FrozenCase:
-    """A case with its scene's tables and its hash.
+    """A case with its scene's tables and its hash."""
 
-    Parameters
-    ----------
-    spec : CaseSpec
-        Its entry in suite.toml.
-    file : Path
-        The scene's file.
-    scene : dict
-        The scene's tables.
-    digest : str
-        SHA-256 of what defines the case.
-    """
-
-    spec: CaseSpec
-    file: Path
-    scene: dict[str, Any]
-    digest: str
+    spec: CaseSpec  # its entry in suite.toml
+    file: Path  # of the scene
+    scene: dict[str, Any]  # its tables
+    digest: str  # SHA-256 of what defines the case
 
     @property
     def name(self) -> str:
@@ -144,7 +139,7 @@ class Suite:
                 return part
         names = [part.name for part in self.spec.parts]
         meant = "".join(f" (did you mean {close}?)" for close in close_names(name, names))
-        raise InputError(f"--part {shown(name, 60)}: unknown; allowed: {', '.join(names)}{meant}")
+        raise InputError(f"--part {name}: unknown; allowed: {', '.join(names)}{meant}")
 
     def of_part(self, name: str) -> list[FrozenCase]:
         """Return the cases of a part."""
@@ -164,7 +159,7 @@ def digest_of(value: Json) -> str:
 def suite_folder(version: str) -> Path:
     """Return the folder of a shipped suite; raise `InputError` for an unknown version."""
     if version not in SUITES:
-        raise InputError(f"suite {shown(version, 40)!r}: unknown; allowed: {', '.join(SUITES)}")
+        raise InputError(f"suite {version!r}: unknown; allowed: {', '.join(SUITES)}")
     return data_root("scenes") / "bench" / version
 
 
@@ -189,10 +184,7 @@ def read_suite(folder: Path) -> Suite:
 def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
     """Read a shipped suite and check it against its pinned hashes.
 
-    Raises
-    ------
-    InputError
-        If the version is unknown, a file is malformed, or a case is not the frozen one.
+    Raises `InputError` if the version is unknown, a file is malformed, or a case is not the frozen one.
     """
     folder = folder or suite_folder(version)
     suite = read_suite(folder)
@@ -200,7 +192,7 @@ def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
         pinned = json.loads((folder / HASHES).read_text(encoding="utf-8"))
         told, of_suite = dict(pinned["cases"]), str(pinned["suite"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{shown(folder / HASHES)}: cannot be read as the pinned hashes ({error})") from error
+        raise InputError(f"{folder / HASHES}: cannot be read as the pinned hashes ({error})") from error
     for name, digest in suite.hashes.items():
         if told.get(name) != digest:
             raise InputError(
@@ -208,8 +200,18 @@ def load_suite(version: str = "v1", folder: Path | None = None) -> Suite:
                 f"{str(told.get(name))[:12]}; a changed case must be a new version"
             )
     if suite.digest != of_suite or set(told) != set(suite.hashes):
-        raise InputError(f"{shown(folder / SUITE)}: parts, seed or list of cases are not those pinned in {HASHES}")
+        raise InputError(f"{folder / SUITE}: parts, seed or list of cases are not those pinned in {HASHES}")
     return suite
+
+
+def cases_of(suite: Suite, parts: Iterable[str]) -> dict[str, str]:
+    """Return the hashes of the cases of some parts, by part and name."""
+    return {case.name: case.digest for part in parts for case in suite.of_part(part)}
+
+
+def parts_of_overall(suite: Suite) -> list[str]:
+    """Return the parts whose scores make the headline: those whose unit is the highlight."""
+    return [part.name for part in suite.spec.parts if part.kind == HIGHLIGHTS]
 
 
 def layout_of(suite: Suite, part: str) -> Layout:
@@ -233,45 +235,51 @@ def _meshes(scene: Mapping[str, Any]) -> dict[str, str]:
     return {} if file.suffix == ".toml" else {file.name: file_hash(file)}
 
 
-def resolved_tables(scene: Scene) -> dict[str, Any]:
-    """Return a scene's tables with every default written out, and every preset and recipe replaced by its numbers.
+def experiment_of(suite: Suite, part: str, core: str) -> Experiment:
+    """Return a part as an experiment of one estimator.
 
-    Keys without a value are left out: TOML has none.
+    Each drawn scene is a pooled value of its case, so that a case is one setting of the results.
     """
-    tables: dict[str, Any] = scene.model_dump(mode="json", exclude_none=True)
-    if scene.rig.preset is not None:
-        lights = [light.model_dump(mode="json", exclude_none=True) for light in scene.rig.lights]
-        lights = [
-            {key: value for key, value in light.items() if key not in ("offset_mm", "azimuth_deg")} for light in lights
-        ]
-        tables["rig"] = {"lights": lights, "seed": scene.rig.seed, "emission_known": scene.rig.emission_known}
-    tables["sensor"].pop("preset", None)
-    tables["reflectance"].get("albedo", {}).pop("preset", None)
-    if isinstance(scene.surface, AnatomySurface) and (file := scene.surface.file()).suffix == ".toml":
-        recipe = load_recipe(file, scene.surface.recipe_values)
-        # The type says which file it is read with, and the seed is the surface's own.
-        tables["surface"]["recipe"] = recipe.model_dump(mode="json", exclude_none=True, exclude={"type", "seed"})
-        tables["surface"]["seed"] = recipe.seed
-    return tables
+    text = f"{suite.spec.name} {suite.version} | {part} | {suite.spec.seed}"
+    seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+    name = f"{suite.spec.name}-{suite.version}-{part}"
+    groups = []
+    for case in suite.of_part(part):
+        pool = pooled(seed, name, case.spec)
+        groups.append(
+            Group(
+                scene=str(Path(case.file).resolve()),
+                label=case.spec.name,
+                pool=(pool,) if pool else (),
+                realisations=case.spec.realisations,
+                isolated=case.spec.isolated,
+            )
+        )
+    about = suite.part(part)
+    return Experiment(
+        name=name, title=f"{suite.spec.title}: {about.title}", description=about.description, seed=seed,
+        estimators=(core,), groups=tuple(groups),
+    )  # fmt: skip
 
 
-def unfrozen_keys(case: FrozenCase) -> list[str]:
-    """Return the key paths whose values the frozen file does not state: defaults that were added after the freeze.
-
-    Raises `InputError` if the file's scene resolves to another one than it states.
-    """
-    now = _flat(resolved_tables(scene_from_dict(case.scene, str(case.file))))
-    frozen = _flat(case.scene)
-    for path, value in frozen.items():
-        if now.get(path) != value:
-            raise InputError(f"{shown(case.file)}: {path} = {value!r} is read as {now.get(path)!r}")
-    return sorted(now.keys() - frozen.keys())
+def pooled(seed: int, experiment: str, case: CaseSpec) -> dict[str, tuple[float | int, ...]]:
+    """Return the drawn values of a case's scenes by key path; each hangs on its key and its number alone."""
+    made = {}
+    for key, draw in sorted(case.draw.items()):
+        numbers = [n if draw.blocks is None else n * draw.blocks // case.draws for n in range(case.draws)]
+        made[key] = tuple(_drawn(seed, experiment, f"{case.name} | {key}", n, draw) for n in numbers)
+    return made
 
 
-def _flat(value: Any, above: str = "") -> dict[str, Any]:
-    """Return the leaves of nested tables and lists by key path; empty tables and lists are leaves."""
-    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
-    flat: dict[str, Any] = {}
-    for key, item in items:
-        flat |= _flat(item, f"{above}.{key}" if above else str(key))
-    return flat or ({above: value} if above else {})
+def _drawn(seed: int, experiment: str, name: str, number: int, draw: Draw) -> float | int:
+    rng = generator(seed, experiment, name, number, Stage.SWEEP)
+    low, high = draw.low or 0.0, draw.high
+    if draw.kind == "normal":
+        value = low + high * float(rng.standard_normal())
+    elif draw.kind == "log_uniform":
+        value = math.exp(float(rng.uniform(math.log(low), math.log(high))))
+    elif draw.kind == "integer":
+        return int(rng.integers(int(low), int(high), endpoint=True))
+    else:
+        value = float(rng.uniform(low, high))
+    return float(f"{value:.{DIGITS}g}")

@@ -7,15 +7,12 @@ from functools import cached_property, reduce
 
 import numpy as np
 
-from simtest.calibration.noise_model import NoiseModel
+from simtest.calibration.photometry import AngularProfile, NoiseModel, Response
 from simtest.calibration.priors import NO_PRIORS, Priors
-from simtest.calibration.response import Response
 from simtest.errors import InputError
-from simtest.geometry import Array, Image, Mask
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_kind, check_number, check_numbers
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Image, Mask, short_repr
 
 OPTICAL_AXIS = (0.0, 0.0, 1.0)
 

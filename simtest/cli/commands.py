@@ -1,6 +1,8 @@
 """The application and its sub-commands, which are imported when they are called: `simtest --help` answers at once."""
 
-from cyclopts import App
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
 
 APP = App(
     name="simtest",
@@ -35,20 +37,51 @@ COMMANDS = {
     "nightly": "Run the fixed experiments, compare with the baseline, write the page.",
     "bench": "Run the frozen benchmark, make a table of its certificates.",
     "dataset": "Make a labelled dataset for learning, check it, look at it.",
-    "train": "Train a network on a dataset.",
     "camera": "Show what a camera file means, or convert it to another program's format.",
     "mesh": "Check a mesh of yours, or make a colon or liver from its recipe.",
     "completion": "Print or install the completion of commands, options and names for a shell.",
 }
-_MODULES = {"list": "listing"}
-"""Where a command's name is not its module's; `list` would hide Python's own."""
+GONE = {"train": "train in PyTorch on simtest.dataset.learn.Samples (examples/11_train_a_network.py)"}
+"""Commands that are gone, and what takes their place."""
+
+_HOMES = {
+    "scenes": ("doctor", "export", "list", "mesh", "render", "schema", "view", "views"),
+    "pictures": ("calibrate", "camera", "reconstruct", "twin"),
+    "runs": ("bench", "core", "nightly", "score", "validate"),
+    "data": ("advise", "dataset", "fit", "realism"),
+    "commands": ("completion",),
+}
+"""Modules of the commands. The function of `list` is `listing`, since it would hide Python's own."""
 
 for _name, _help in COMMANDS.items():
-    _module = _MODULES.get(_name, _name)
-    APP.command(f"simtest.cli.{_module}:{_module}", name=_name, help=_help)
+    _module = next(module for module, names in _HOMES.items() if _name in names)
+    APP.command(f"simtest.cli.{_module}:{'listing' if _name == 'list' else _name}", name=_name, help=_help)
 
 
 def _version() -> str:
     from simtest.runtime.provenance import version
 
     return version()
+
+
+def completion(
+    shell: Literal["bash", "zsh", "fish"],
+    /,
+    *,
+    install: Annotated[
+        bool, Parameter(negative="", help="Write it where the shell finds it, instead of printing it.")
+    ] = False,
+) -> None:
+    """Print the script that completes commands, options and shipped names, or install it for your shell.
+
+    Without --install: `simtest completion bash > FILE`, and a line `source FILE` in ~/.bashrc.
+
+    Parameters
+    ----------
+    shell : str
+        Whose script.
+    """
+    if install:
+        print(APP.install_completion(shell=shell))
+    else:
+        print(APP.generate_completion(prog_name="simtest", shell=shell))

@@ -1,21 +1,112 @@
 """The `simtest` command: runs the application, and reports errors in one line.
 
-It loads nothing before signals are answered, so that a stop in the first moments is a silent one.
+It loads little before signals are answered.
 """
 
+import os
+import signal
 import sys
-from typing import TYPE_CHECKING
-
-from simtest.cli.stopping import INTERRUPTED, TERMINATED, Termination
+import threading
+from collections.abc import Iterable, Sequence
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cyclopts import MissingArgumentError
 
+INTERRUPTED = 130
+TERMINATED = 143
+
 NARROWEST = 20
 """Columns of a terminal; tables and help cannot be laid out in fewer."""
 
-LONGEST = 900
-"""Characters of a line; a longer one is cut."""
+LATER_S = 0.01
+"""After so long a stop that came within an import is tried again."""
+
+
+class Termination:
+    """Answers SIGTERM as Ctrl-C is answered, and remembers that it came.
+
+    Within an import both wait for its end: an exception there can be swallowed, or break a library for good.
+    """
+
+    def __init__(self) -> None:
+        self.came = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> "Termination":
+        """Answer the signals from now on; in a thread, which gets none, nothing is done."""
+        if threading.current_thread() is threading.main_thread():
+            numbers = [signal.SIGTERM, signal.SIGALRM]
+            # Ignored by nohup, and in the background of a script: then it stays so.
+            if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+                numbers.append(signal.SIGINT)
+            self._before = {number: signal.signal(number, self._stop) for number in numbers}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the signals to whoever answered them before."""
+        for number, before in self._before.items():
+            signal.signal(number, before)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        self.came = self.came or number == signal.SIGTERM
+        if _importing(frame):
+            signal.setitimer(signal.ITIMER_REAL, LATER_S)
+            return
+        # A progress bar, which answers Ctrl-C itself, waits for the end of its step.
+        answer = signal.getsignal(signal.SIGINT)
+        if callable(answer) and answer != self._stop:
+            answer(number, frame)
+        else:
+            raise KeyboardInterrupt
+
+
+def _importing(frame: FrameType | None) -> bool:
+    """Return whether a module is being imported."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+FLAGS = ("--quiet", "--verbose", "--traceback")
+"""What every command takes; `simtest --help` names them."""
+
+
+class Manners:
+    """How much is said; of this process."""
+
+    quiet = False
+    """Neither progress nor warnings: results and errors alone."""
+
+    verbose = False
+    """Every step of the work and every row of a table."""
+
+
+MANNERS = Manners()
+
+
+def take_flags(words: Sequence[str]) -> tuple[list[str], bool]:
+    """Set `MANNERS` by the flags of a command line; return its other words, and whether it has ``--traceback``."""
+    # Behind -- nothing is a flag.
+    end = list(words).index("--") if "--" in words else len(words)
+    flags = set(words[:end]).intersection(FLAGS)
+    MANNERS.quiet, MANNERS.verbose = "--quiet" in flags, "--verbose" in flags
+    return [word for i, word in enumerate(words) if i >= end or word not in FLAGS], "--traceback" in flags
+
+
+def meant_flag(word: str, options: Iterable[str]) -> str | None:
+    """Return the message for an unknown word that is a mistyped flag or one with a value, unless an option is meant."""
+    from simtest.runtime.boundary import close_names
+
+    name = word.partition("=")[0]
+    if name in FLAGS:
+        return f"{name}: takes no value"
+    close = close_names(name, [*options, *FLAGS])
+    return f'Unknown option: "{word:.60}". Did you mean "{close[0]}"?' if set(close) & set(FLAGS) else None
+
 
 BAD_USE = 2
 
@@ -31,36 +122,41 @@ def main() -> None:
     the output that has gone is no error.
     """
     with Termination() as stop:
-        _mend_terminal()
-        sys.exit(_run(stop))
+        try:
+            _mend_terminal()
+            code = _run()
+        except KeyboardInterrupt as stopped:
+            goes_on = sys.argv[1:2] and sys.argv[1] in GOING_ON
+            kept = (
+                f"what is finished is kept, and the same command {'goes on from there' if goes_on else 'begins anew'}"
+            )
+            _report(f"{'terminated' if stop.came else 'stopped'}; {str(stopped) or kept}", 0)
+            code = TERMINATED if stop.came else INTERRUPTED
+    sys.exit(code)
 
 
-def _run(stop: Termination) -> int:  # noqa: C901 - a branch for each way in which a command may end
+def _run() -> int:
     """Run the command and return its exit code."""
-    from simtest.cli.manners import MANNERS, meant_flag, take_flags
-
     sys.argv[1:], wants_traceback = take_flags(sys.argv[1:])
     failed = BAD_USE if sys.argv[1:2] == ["nightly"] else 1
     _answer_warnings(MANNERS.quiet, wants_traceback)
 
     from cyclopts import CycloptsError, MissingArgumentError, UnknownOptionError
 
-    from simtest.cli.commands import APP
-    from simtest.cli.options import gather_settings
-    from simtest.errors import InputError, SimtestError
+    from simtest.cli.commands import APP, GONE
+    from simtest.cli.common import gather_settings
+    from simtest.errors import InputError
 
     words = gather_settings(sys.argv[1:])
-
     if wants_traceback:
-        with stop.working():
-            return _code(APP(words, result_action="return_value"))
+        return _code(APP(words, result_action="return_value"))
     try:
-        with stop.working():
-            _require_folder()
-            if MANNERS.quiet and MANNERS.verbose:
-                raise InputError("--quiet and --verbose exclude each other; give one of them")
-            # A command's result is its exit code.
-            code = _code(APP(words, exit_on_error=False, print_error=False, result_action="return_value"))
+        if words and words[0] in GONE:
+            raise InputError(f"{words[0]}: is gone; {GONE[words[0]]}")
+        if MANNERS.quiet and MANNERS.verbose:
+            raise InputError("--quiet and --verbose exclude each other; give one of them")
+        # A command's result is its exit code.
+        code = _code(APP(words, exit_on_error=False, print_error=False, result_action="return_value"))
         # Output may wait in a buffer whose reader has gone, or whose disk is full.
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -72,15 +168,8 @@ def _run(stop: Termination) -> int:  # noqa: C901 - a branch for each way in whi
         return _report(meant_flag(word, known) or str(error), BAD_USE)
     except MissingArgumentError as error:
         return _report(_missing(error), BAD_USE)
-    except (CycloptsError, InputError) as error:
+    except CycloptsError as error:
         return _report(str(error), BAD_USE)
-    except SimtestError as error:
-        return _report(str(error), failed)
-    except KeyboardInterrupt as stopped:
-        goes_on = sys.argv[1:2] and sys.argv[1] in GOING_ON
-        kept = "what is finished is kept, and the same command " + ("goes on from there" if goes_on else "begins anew")
-        how = "terminated" if stop.came else "stopped"
-        return _report(f"{how}; {str(stopped) or kept}", TERMINATED if stop.came else INTERRUPTED)
     except BrokenPipeError:
         _discard_output()
         return 0
@@ -90,7 +179,7 @@ def _run(stop: Termination) -> int:  # noqa: C901 - a branch for each way in whi
             return 0
         raise
     except Exception as error:
-        return _report(_problem(error), failed)
+        return _told(error, failed)
 
 
 def _missing(error: "MissingArgumentError") -> str:
@@ -103,33 +192,23 @@ def _missing(error: "MissingArgumentError") -> str:
     return f"{error.keyword or argument.name}: {lacks}{f' ({what})' if what else ''}; {command} --help describes it"
 
 
-def _problem(error: Exception) -> str:
-    """Return an error that no command foresaw as text: of the output, of the machine, or of the program."""
-    from simtest.runtime.machine_errors import machine_problem
+def _told(error: Exception, failed: int) -> int:
+    """Report an error of the input, of the output, of a file, of the machine, or of the program; return the code."""
+    from simtest.errors import InputError, SimtestError
+    from simtest.runtime.boundary import plain
 
+    told = plain(error)
     # Only the output's stream has neither a name nor a reason of its own to fail.
-    what = machine_problem(error) or _damaged_bytecode(error)
-    if what is not None and isinstance(error, OSError) and error.filename is None and _output_fails():
-        return f"the output cannot be written ({what})"
-    return what or f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
-
-
-def _damaged_bytecode(error: Exception) -> str | None:
-    """Return which compiled file of Python is cut short, as a full disk leaves it; None for any other error."""
-    if not isinstance(error, EOFError | ValueError) or "marshal data" not in str(error):
-        return None
-    import traceback
-
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        if path := frame.f_locals.get("bytecode_path"):
-            return f"{path}: a compiled file of Python that is cut short, perhaps by a full disk; delete it"
-    return None
+    if isinstance(error, OSError) and error.filename is None and _output_fails():
+        return _report(f"the output cannot be written ({told})", failed)
+    if isinstance(told, SimtestError):
+        return _report(str(told), BAD_USE if isinstance(told, InputError) else failed)
+    internal = f"internal error, please report it ({type(error).__name__}: {error}); --traceback shows where"
+    return _report(internal, failed)
 
 
 def _output_fails() -> bool:
     """Return whether what is printed cannot be written; then it is given up, or Python would say so at its end."""
-    import os
-
     try:
         # What failed once is lost from the buffers, so flushing them again tells nothing.
         os.write(sys.stdout.fileno(), b"\n")
@@ -140,26 +219,11 @@ def _output_fails() -> bool:
 
 
 def _discard_output() -> None:
-    import os
-
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _code(result: object) -> int:
     return result if isinstance(result, int) else 0
-
-
-def _require_folder() -> None:
-    """Raise `InputError` where the working folder was deleted: libraries and child processes end without one."""
-    import os
-
-    from simtest.errors import InputError
-
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        if not {"--help", "-h", "--version"} & set(sys.argv):
-            raise InputError("the working folder was deleted; change to another one") from None
 
 
 def _answer_warnings(quiet: bool, plain: bool) -> None:
@@ -173,28 +237,27 @@ def _answer_warnings(quiet: bool, plain: bool) -> None:
 
 
 def _warn(message: Warning | str, *_: object, **__: object) -> None:
-    from simtest.runtime.resources import shown
+    from simtest.errors import one_line
 
-    print(f"simtest: warning: {shown(message, LONGEST)}", file=sys.stderr)
+    print(f"simtest: warning: {one_line(message)}", file=sys.stderr)
 
 
 def _mend_terminal() -> None:
     """Let output never fail: characters that a terminal lacks are replaced, and one of no width gets the usual one."""
     import io
-    import os
 
     for stream in (sys.stdout, sys.stderr):
         # None where it is closed.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+    # Help is laid out without end, in ever more memory, where there is no room for a word.
     if os.environ.get("COLUMNS", "").isdecimal() and int(os.environ["COLUMNS"]) < NARROWEST:
         del os.environ["COLUMNS"]
 
 
 def _report(text: str, code: int) -> int:
     """Print an error as one line and return the exit code."""
-    from simtest.runtime.resources import shown
+    from simtest.errors import one_line
 
-    line = " ".join(text.split())
-    print(f"simtest: {shown(line, LONGEST)}", file=sys.stderr)
+    print(f"simtest: {one_line(' '.join(text.split()))}", file=sys.stderr)
     return code

@@ -5,15 +5,61 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from datetime import timedelta
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
-from simtest.cli.manners import MANNERS
-from simtest.cli.remaining import Remaining
+from simtest.cli.main import MANNERS
 from simtest.pages import WRITTEN
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+
+LEAST_STEPS = 4
+"""Measured steps before which there is no estimate."""
+
+LEAST_S = 2.0
+"""Measured time before which there is none."""
+
+AGREEMENT = 1.5
+"""An estimate is stable where the paces of all measured steps and of their later half differ by at most this factor."""
+
+
+@dataclass
+class Remaining:
+    """An estimate of the time that is left of a stretch of work, from the times at which its steps ended.
+
+    The first step is not measured: it compiles the renderer's kernels, and takes as long as dozens of others.
+    """
+
+    _first: int | None = None  # steps that were done at the first call
+    _ends: list[tuple[int, float]] = field(default_factory=list)  # steps done, and when, from the end of the first on
+
+    def seconds(self, done: int, total: int, now: float) -> float | None:
+        """Take note that `done` of `total` steps are done at a time, s, and return the time left, s.
+
+        It is None while it is not known.
+        """
+        if self._first is None or done < self._first or (self._ends and done < self._ends[-1][0]):
+            # A new stretch of work.
+            self._first, self._ends = done, []
+            return None
+        if done > self._first and (not self._ends or done > self._ends[-1][0]):
+            self._ends.append((done, now))
+        pace = self._pace()
+        return None if pace is None else pace * (total - done)
+
+    def _pace(self) -> float | None:
+        """Return the time of a step, s, as measured over the later half of the steps; None while it is not stable."""
+        if not self._ends:
+            return None
+        (start, began), (end, ended) = self._ends[0], self._ends[-1]
+        if end - start < LEAST_STEPS or ended - began < LEAST_S:
+            return None
+        middle, passed = next(entry for entry in reversed(self._ends) if 2 * entry[0] <= start + end)
+        overall, recent = (ended - began) / (end - start), (ended - passed) / (end - middle)
+        return recent if overall <= AGREEMENT * recent and recent <= AGREEMENT * overall else None
+
 
 LINE_EVERY_S = 10.0
 """Of a log; work that takes less leaves no line."""
@@ -44,16 +90,6 @@ def stop_between_steps() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, before)
 
 
-class Display(Protocol):
-    """What shows the steps of some work."""
-
-    def show(self, done: int, total: int, what: str) -> None:
-        """Show how many steps are done, and the present one."""
-
-    def close(self) -> None:
-        """End the display."""
-
-
 @contextmanager
 def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[int, int, str], None]]:
     """Show a bar, or lines, while the body runs, and yield the callable that moves it: (done, total, what).
@@ -62,17 +98,19 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
     nothing follows it. A single step shows no bar. What comes after all steps of a bar, such as the steps of a page,
     has a bar of its own below.
     """
-    display: Display | None = None
+    display: _Lines | _Bar | None = None
     with stop_between_steps() as check:
 
         def move(done: int, total: int, what: str) -> None:
             nonlocal display
             check()
+            if MANNERS.quiet:
+                return
             if display is None:
                 if done == total:
                     return
                 # Not before the first step: bad input is reported in one line, and nothing to do takes no time.
-                display = _display()
+                display = _Lines() if MANNERS.verbose or not at_terminal() else _Bar()
             display.show(done, total, afterwards if done == total and what != WRITTEN else what)
 
         try:
@@ -85,20 +123,6 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
 def at_terminal() -> bool:
     """Return whether a person sees the error stream."""
     return sys.stderr is not None and sys.stderr.isatty()
-
-
-def _display() -> Display:
-    if MANNERS.quiet:
-        return _Nothing()
-    return _Lines() if MANNERS.verbose or not at_terminal() else _Bar()
-
-
-class _Nothing:
-    def show(self, done: int, total: int, what: str) -> None:
-        """Show nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
 
 
 class _Lines:

@@ -18,4 +18,4 @@ if TYPE_CHECKING:
 __all__ = ["FIELDS", "calibration_of", "read"]
 
 # Scenes take a tenth of a second to import, and who reads arrays needs none.
-__getattr__, _ = lazy_names(__name__, {"simtest.dataset.sample_calibration": ("calibration_of",)})
+__getattr__, *_ = lazy_names(__name__)

@@ -12,7 +12,7 @@ from simtest.dataset.manifest import Manifest
 from simtest.dataset.plan import Plan
 from simtest.pages.markdown import escaped, paragraphs, yaml_string
 from simtest.runtime.files import write_atomically
-from simtest.spec.dataset_recipe import Distribution
+from simtest.spec.recipes import Distribution
 
 CARD = "README.md"
 

@@ -31,11 +31,9 @@ from simtest.errors import InputError
 from simtest.reconstruction.picture_values import scale_picture
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image
-from simtest.runtime.engines import Engine, OnStep
 from simtest.runtime.files import are_nested, write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_folder
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine, OnStep
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.frame_files import encoded_png
 from simtest.spec import Experiment, calibration_toml, camera_table
@@ -127,12 +125,6 @@ def export_run(
     -------
     Path
         README.md of the export.
-
-    Raises
-    ------
-    InputError
-        If the experiment renders no frames, a calibration cannot be written as a file, or the folder holds something
-        else.
     """
     source = source_of_run(folder, experiment, expand(experiment))
     return _export(source, experiment.model_dump(mode="json"), out, engine, progress, "--export")
@@ -151,13 +143,10 @@ def _export(
     _check_apart(source.folder, out, option)
     with exclusive_folder(out, option):
         _check_folder(out, option)
-        try:
-            made = _write_frames(source, out, engine, progress)
-            _write_tables(out, made)
-            _write_record(source, experiment, made)
-            _set_one_time(out)
-        except OSError as error:
-            raise write_error(error, out) from error
+        made = _write_frames(source, out, engine, progress)
+        _write_tables(out, made)
+        _write_record(source, experiment, made)
+        _set_one_time(out)
     return out / README
 
 
@@ -282,22 +271,19 @@ def _write_record(source: Source, experiment: dict[str, Any], made: Sequence[Exp
 def _check_apart(folder: Path, out: Path, option: str) -> None:
     """Raise `InputError` where an export would lie in the folder of its run or dataset, or hold that folder."""
     if are_nested(folder, out):
-        raise InputError(f"{option} {shown(out)}: must be neither {shown(folder)} nor inside or around it")
+        raise InputError(f"{option} {out}: must be neither {folder} nor inside or around it")
 
 
 def _check_folder(out: Path, option: str) -> None:
     """Raise `InputError` if a folder holds something that is no part of an export."""
-    try:
-        held = {path.name for path in out.iterdir()} - {LOCK}
-    except OSError as error:
-        raise InputError(f"{option} {shown(out)}: cannot be used ({error.strerror})") from error
+    held = {path.name for path in out.iterdir()} - {LOCK}
     strangers = sorted(held - {FRAMES, PREVIEWS, CAMERAS, README, *TABLES})
     # Folders of those names alone may be anyone's, and an export removes what it does not list.
     if not strangers and held and "frames.csv" not in held and {FRAMES, PREVIEWS, CAMERAS} - held:
         strangers = sorted(held)
     if strangers:
-        what = f"holds {shown(strangers[0])}, which is no part of an export"
-        raise InputError(f"{option} {shown(out)}: {what}; must be empty or hold an export")
+        what = f"holds {strangers[0]}, which is no part of an export"
+        raise InputError(f"{option} {out}: {what}; must be empty or hold an export")
 
 
 # In a worker --------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from simtest.dataset.metadata import EstimateMeta, SampleMeta
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.shard import PART, samples
 from simtest.runtime.files import write_atomically
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 
 SAMPLES, HIGHLIGHTS, ESTIMATES = "index.parquet", "highlights.parquet", "estimates.parquet"
 TABLES = (SAMPLES, HIGHLIGHTS, ESTIMATES)

@@ -22,8 +22,7 @@ from simtest.estimators.process.naming import forgive_cores
 from simtest.geometry import ellipse_of_conic, fit_ellipse
 from simtest.reconstruction.found import Specularity
 from simtest.rendering import Frame, Session, backend
-from simtest.runtime.arrays import AnyArray, Image
-from simtest.runtime.kept_arrays import only_reading
+from simtest.runtime.arrays import AnyArray, Image, only_reading
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.rendered_view import (
@@ -38,8 +37,8 @@ from simtest.simulation.true_highlights import TrueHighlight, lobe_region
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
 from simtest.validation.cloud_rows import of_clouds
+from simtest.validation.columns import Row
 from simtest.validation.realisation import answer, score
-from simtest.validation.results_table import ResultRow
 
 UNPLACED = 100
 """Draws that cannot be rendered, beyond the tries, before a sample is given up."""
@@ -186,14 +185,16 @@ class Maker:
     def score(
         self, index: int, session: Session, seen: RenderedView, answers: Sequence[Specularity],
         estimators: Mapping[str, AnyEstimator],
-    ) -> list[ResultRow]:  # fmt: skip
+    ) -> list[Row]:  # fmt: skip
         """Score the answers to a sample, at whose scene the session is; true_id is the index in the list of all."""
         scene = session.scene
-        common = ResultRow(experiment=self.plan.dataset.name, label=scene.surface.label, realisation=index,
-                           setting=self.plan.split(index), seed=scene.sensor.seed)  # fmt: skip
+        common: Row = {"experiment": self.plan.dataset.name, "label": scene.surface.label, "realisation": index,
+                       "setting": self.plan.split(index), "seed": scene.sensor.seed}  # fmt: skip
         made, clouds = score(session, seen, answers, estimators, common), of_clouds(estimators)
         return [
-            row if row.true_id is None or row.estimator in clouds else replace(row, true_id=made.counted[row.true_id])
+            row | {"true_id": made.counted[number]}
+            if isinstance(number := row.get("true_id"), int) and row["estimator"] not in clouds
+            else row
             for row in made.rows
         ]
 
@@ -261,9 +262,9 @@ def _highlight(truth: TrueHighlight) -> HighlightMeta:
     return cast(HighlightMeta, truth.to_json())
 
 
-def _estimate(row: ResultRow) -> EstimateMeta:
+def _estimate(row: Row) -> EstimateMeta:
     """Return a row of results as it is kept: columns without a value are left out."""
-    return {key: plain for key, value in row.to_row().items() if (plain := _plain(value)) is not None}
+    return {key: plain for key, value in row.items() if (plain := _plain(value)) is not None}
 
 
 def _detection(specularity: Specularity) -> DetectionMeta:

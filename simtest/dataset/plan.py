@@ -16,8 +16,8 @@ from simtest.runtime.arrays import IntArray
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import AnatomySurface, Scene, apply_settings, read_toml, scene_from_dict
-from simtest.spec.dataset_recipe import Dataset, Distribution, Family
-from simtest.spec.type_change import replace_values
+from simtest.spec.keys import replace_values
+from simtest.spec.recipes import Dataset, Distribution, Family
 from simtest.surfaces.recipe import load_recipe
 
 ANATOMY_KEYS = ("surface.seed", "surface.path", "surface.recipe")
@@ -102,11 +102,6 @@ class Plan:
     ----------
     dataset : Dataset
         What is wanted.
-
-    Raises
-    ------
-    InputError
-        If a scene would be malformed anywhere in the ranges, or there are too few anatomies.
     """
 
     def __init__(self, dataset: Dataset) -> None:

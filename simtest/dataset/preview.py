@@ -21,7 +21,6 @@ from simtest.pages import palette
 from simtest.pages.pixels import jpeg_address
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.files import write_atomically
-from simtest.runtime.machine_errors import cannot_write
 
 WIDTH = 240
 """Width of a thumbnail, px."""
@@ -69,10 +68,7 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
         histograms=list(_histograms(index, highlights)),
         cards=[_card(sample) for sample in sorted(shown, key=lambda sample: sample.index)],
     )
-    try:
-        write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
-    except OSError as error:
-        raise cannot_write(error, f"--out {page}", page) from error
+    write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
     return page
 
 

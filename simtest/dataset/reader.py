@@ -14,7 +14,6 @@ from simtest.dataset.shard import BrokenShardError, StoredSample, read_member, s
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import shown
 
 Record = dict[str, Any]
 """A sample as `read` yields it: array by field name, and ``meta``, a `SampleMeta`."""
@@ -74,17 +73,17 @@ def open_manifest(folder: Path) -> Manifest:
     try:
         return read_manifest(folder)
     except ManifestError as error:
-        raise InputError(f"{shown(folder)}: no dataset to read ({error})") from None
+        raise InputError(f"{folder}: no dataset to read ({error})") from None
 
 
 def shard_names(folder: Path, split: str | None = None) -> list[str]:
     """Return the names of a finished dataset's shards, of one split or of all."""
     manifest = open_manifest(folder)
     if not manifest.tables:
-        raise InputError(f"{shown(folder)}: the dataset is not finished; give its simtest dataset command again")
+        raise InputError(f"{folder}: the dataset is not finished; give its simtest dataset command again")
     splits = sorted({name.rpartition("-")[0] for name in manifest.shards})
     if split is not None and split not in splits:
-        raise InputError(f"split = {shown(split)}: unknown; allowed: {', '.join(splits)}")
+        raise InputError(f"split = {split}: unknown; allowed: {', '.join(splits)}")
     return [name for name in sorted(manifest.shards) if split in (None, name.rpartition("-")[0])]
 
 
@@ -142,7 +141,7 @@ def _known_fields(fields: Sequence[str] | None) -> list[str]:
     wanted = list(BY_NAME) if fields is None else list(fields)
     for name in wanted:
         if name not in BY_NAME:
-            raise InputError(f"field {shown(name)}: unknown; allowed: {', '.join(BY_NAME)}")
+            raise InputError(f"field {name}: unknown; allowed: {', '.join(BY_NAME)}")
     return wanted
 
 
@@ -151,8 +150,6 @@ def _one_line_errors(path: Path) -> Iterator[None]:
     """Turn what goes wrong with a shard into an error of one line."""
     try:
         yield
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (BrokenShardError, ValueError) as error:
         if isinstance(error, InputError):
             raise

@@ -8,7 +8,6 @@ from simtest.dataset.sample import sample_key
 from simtest.dataset.shard import BrokenShardError, read_member, samples
 from simtest.errors import InputError
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.machine_errors import write_error
 
 
 def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:
@@ -24,12 +23,9 @@ def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = 
     files = []
     with exclusive_folder(out):
         made = Maker(plan, variant or manifest.origin["variant"]).make(index)
-        try:
-            for suffix, data in made.encode().items():
-                files.append(out / f"{made.key}.{suffix}")
-                files[-1].write_bytes(data)
-        except OSError as error:
-            raise write_error(error, out) from error
+        for suffix, data in made.encode().items():
+            files.append(out / f"{made.key}.{suffix}")
+            files[-1].write_bytes(data)
     return files
 
 

@@ -32,12 +32,11 @@ from simtest.dataset.shard import PART, finish, whole_samples, write_sample
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.process.naming import absolute_names
-from simtest.runtime.engines import Engine, OnStep
+from simtest.runtime.boundary import plain
 from simtest.runtime.files import sync_folder
 from simtest.runtime.locks import LOCK, exclusive_folder, waiting_for
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
-from simtest.spec.dataset_recipe import Dataset
+from simtest.runtime.processes import Engine, OnStep
+from simtest.spec.recipes import Dataset
 from simtest.validation.runner import Progress
 
 SHARDS_PER_PROCESS = 8
@@ -77,11 +76,6 @@ def write_dataset(
     progress : callable, optional
         Called with samples done, samples in all, and what is being done.
 
-    Raises
-    ------
-    InputError
-        If the dataset cannot be made as described, or the folder holds something else or cannot be written.
-
     Warns
     -----
     UserWarning
@@ -92,7 +86,7 @@ def write_dataset(
         warnings.warn(plan.made_small, stacklevel=2)
     # Refused before anything is written; who reads the dataset needs neither packages nor cores.
     load_estimators(dataset.estimators)
-    with _one_line_errors(folder), exclusive_folder(folder):
+    with _telling_what_stays(folder), exclusive_folder(folder):
         manifest = _open(folder, plan, colour_variant(variant))
         _complete(plan, manifest, folder, engine, progress)
         isolated = pl.read_parquet(folder / SAMPLES, columns=["n_isolated"])["n_isolated"]
@@ -162,7 +156,7 @@ def _write_shards(
 def remake(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, progress: Progress | None) -> None:
     """Make named files of a dataset anew: shards, tables or card."""
     plan = manifest.plan()
-    with _one_line_errors(folder), exclusive_folder(folder, "DATASET"):
+    with _telling_what_stays(folder), exclusive_folder(folder, "DATASET"):
         for name in broken:
             (folder / name).unlink(missing_ok=True)
             manifest.shards.pop(name, None)
@@ -172,13 +166,12 @@ def remake(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, 
 
 
 @contextmanager
-def _one_line_errors(folder: Path) -> Iterator[None]:
-    """Turn errors of the operating system into an error of one line (`write_error`)."""
+def _telling_what_stays(folder: Path) -> Iterator[None]:
+    """Say in an error of the disk what stays of the work."""
     try:
         yield
     except OSError as error:
-        kept = "what is written stays valid, and the same command goes on from there"
-        raise write_error(error, folder, kept) from error
+        raise plain(error, "what is written stays valid, and the same command goes on from there", folder) from error
 
 
 def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
@@ -189,13 +182,9 @@ def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
         there = read_manifest(folder)
     except ManifestError as error:
         if (folder / NAME).exists():
-            raise InputError(
-                f"--out {shown(folder)}: {error}; must be another folder, or simtest dataset verify"
-            ) from None
+            raise InputError(f"--out {folder}: {error}; must be another folder, or simtest dataset verify") from None
         if other := next((path.name for path in folder.iterdir() if not path.name.endswith((PART, LOCK))), None):
-            raise InputError(
-                f"--out {shown(folder)}: holds {shown(other)} and no dataset; must be empty or not exist"
-            ) from None
+            raise InputError(f"--out {folder}: holds {other} and no dataset; must be empty or not exist") from None
         wanted.save(folder)
         return wanted
     check_same(folder, there, wanted)
@@ -218,7 +207,7 @@ def write_shard(task: ShardTask, on_step: OnStep) -> FileEntry:
     """Write a shard, or finish one that was begun; call `on_step` after each sample."""
     folder, maker = Path(task.folder), maker_of(task.dataset, task.variant)
     shard = maker.plan.shards[task.number]
-    with _one_line_errors(folder):
+    with _telling_what_stays(folder):
         entry = _write_shard(folder, maker, shard, on_step)
         # Here, not at the end: one process would take hours for the tables of millions of samples.
         write_shard_tables(maker.plan, folder, shard)

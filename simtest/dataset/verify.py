@@ -30,10 +30,10 @@ from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
 from simtest.runtime.arrays import AnyArray
-from simtest.runtime.engines import Engine
 from simtest.runtime.locks import LOCK
-from simtest.spec.camera_spec import SceneCamera
-from simtest.spec.relief import Relief
+from simtest.runtime.processes import Engine
+from simtest.spec.camera import SceneCamera
+from simtest.spec.surfaces import Relief
 from simtest.validation.run_folder import EXPORT, EXPORTING
 from simtest.validation.runner import Progress
 
@@ -132,11 +132,6 @@ def repair_files(folder: Path, faults: list[Fault], engine: Engine, progress: Pr
 
     `faults` are those of `verify`; `engine` runs the tasks; `progress` is called with samples done, samples in all, and
     what is being done.
-
-    Raises
-    ------
-    InputError
-        If the manifest itself is broken: without it nobody knows which dataset this is.
     """
     if any(fault.file == NAME for fault in faults):
         raise InputError(f"{folder / NAME}: is broken; remove it with the other files, and give the dataset's command")

@@ -15,13 +15,6 @@ if TYPE_CHECKING:
     from simtest.detection.regions import Component, Region, contrast, detect, half_height_component
     from simtest.detection.shape import PeakShape, flat_pixels, peak_shape
 
-_HOMES = {
-    "simtest.calibration": ("estimate_noise",),
-    "simtest.detection.detector": ("Detection", "Detector", "load_detector"),
-    "simtest.detection.regions": ("Component", "Region", "contrast", "detect", "half_height_component"),
-    "simtest.detection.shape": ("PeakShape", "flat_pixels", "peak_shape"),
-}
-
 __all__ = [
     "Component",
     "Detection",
@@ -37,4 +30,4 @@ __all__ = [
     "peak_shape",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, _ = lazy_names(__name__)

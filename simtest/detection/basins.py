@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.geometry.pixel_sets import rows_and_columns
+from simtest.geometry.patch import rows_and_columns
 from simtest.runtime.arrays import Array, Image, Index, Mask
 
 _NEIGHBOURS = ((0, 1), (1, -1), (1, 0), (1, 1))
@@ -83,31 +83,6 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     labels[rows, columns] = mine[basin] + 1
     pairs, low = _highest_of_pairs(mine[first], mine[second], saddle, order, len(kept))
     return Basins(rows[tops[kept]], columns[tops[kept]], labels, pairs, np.stack([rows[low], columns[low]], axis=1))
-
-
-def given_basins(values: Image, labels: Index) -> Basins:
-    """Return the basins of a frame whose pixels are shared out already.
-
-    Parameters
-    ----------
-    values : ndarray, shape (H, W)
-        What is climbed: specular light.
-    labels : ndarray of int, shape (H, W)
-        Number of the basin that a pixel belongs to, from 1; 0 where none. The summit of each is its highest pixel.
-    """
-    rows, columns, _, order, ends = _pixels_of(values, labels != 0)
-    # From the highest pixel down the first one of each basin is its summit.
-    down = np.argsort(-order)
-    _, first = np.unique(labels[rows, columns][down], return_index=True)
-    tops = down[np.sort(first)]
-    rank = np.zeros(int(labels.max(initial=0)) + 1, dtype=np.int64)
-    rank[labels[rows[tops], columns[tops]]] = np.arange(len(tops))
-    mine = rank[labels[rows, columns]]
-    made = np.zeros(labels.shape, dtype=np.int64)
-    made[rows, columns] = mine + 1
-    first, second, low = _saddles(mine, order, np.arange(len(rows)), ends, len(tops))
-    pairs, saddles = np.stack([first, second], axis=1), np.stack([rows[low], columns[low]], axis=1)
-    return Basins(rows[tops], columns[tops], made, pairs, saddles)
 
 
 def _pixels_of(values: Image, mask: Mask) -> tuple[Index, Index, Array, Index, list[Index]]:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from simtest.calibration.calibration import brightest_channel, mean_channel
-from simtest.calibration.noise_estimate import median
+from simtest.calibration.frame import median
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection.light_split import BLOCKS, NEIGHBOURHOOD, SplitLight
 from simtest.detection.regions import MARGIN_PX, Region
@@ -20,8 +20,7 @@ from simtest.detection.spots import Spot
 from simtest.errors import Failure
 from simtest.geometry import Array, FittedConic, Image, Mask, fit_ellipses
 from simtest.geometry.level_sets import LevelSet, crossings, level_set_around
-from simtest.runtime.arrays import Index
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Index, short_repr
 
 Box = tuple[int, int, int, int]
 _Fitted = tuple[Array, FittedConic]

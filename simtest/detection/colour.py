@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
-from simtest.calibration.noise_estimate import MAD_TO_SIGMA, median
+from simtest.calibration.frame import MAD_TO_SIGMA, median
 from simtest.detection.detector import Detection
 from simtest.detection.judging import ColourDetection, detection_of, judge_spots, plateaus, tissue_spots
 from simtest.detection.light_split import SplitLight, fill, split_light

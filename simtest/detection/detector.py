@@ -14,9 +14,8 @@ from simtest.detection.regions import Region
 from simtest.detection.view_mask import WHOLE, View
 from simtest.errors import Failure, InputError
 from simtest.geometry import Camera
-from simtest.runtime.entry_points import EntryPointGroup
-from simtest.runtime.resources import shown
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
+from simtest.runtime.resources import EntryPointGroup
 
 DETECTORS = EntryPointGroup("simtest.detectors", "detector")
 
@@ -119,4 +118,4 @@ def _integers(what: str, given: object, names: str) -> tuple[int, ...]:
     if isinstance(given, Sequence | np.ndarray) and len(given) == count:
         with contextlib.suppress(TypeError):
             return tuple(operator.index(each) for each in given)
-    raise InputError(f"{what} {shown(given, 80)}: must be {count} integers {names}")
+    raise InputError(f"{what} {given}: must be {count} integers {names}")

@@ -1,4 +1,4 @@
-"""What detectors by colour share: spots of the tissue become judged highlights, and these a detection."""
+"""Spots of the tissue become judged highlights, and these a detection."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ from simtest.detection.light_split import SplitLight
 from simtest.detection.spots import Spot
 from simtest.detection.view_mask import View
 from simtest.geometry import Image, Mask, smooth
-from simtest.geometry.pixel_sets import rows_and_columns
+from simtest.geometry.patch import rows_and_columns
 
 SHAPE_PX = 0.7
 """Smoothing of the specular light before the shape of highlights is measured."""
@@ -52,15 +52,10 @@ class ColourDetection:
         return [highlight for highlight in self.highlights if highlight.is_isolated]
 
 
-def tissue_spots(
-    spots: list[Spot], shape: tuple[int, ...], shining: list[Spot] | None = None
-) -> tuple[list[Spot], Mask, Mask]:
-    """Return the spots that lie on no text or instrument, the pixels of all, and those of text and instruments.
-
-    `shining` are all spots of light on tissue or not, by which text and instruments are known; default `spots`.
-    """
+def tissue_spots(spots: list[Spot], shape: tuple[int, ...]) -> tuple[list[Spot], Mask, Mask]:
+    """Return the spots that lie on no text or instrument, the pixels of all, and those of text and instruments."""
     bright = _pixels(spots, shape)
-    foreign = find_foreign(bright if shining is None else bright | _pixels(shining, shape))
+    foreign = find_foreign(bright)
     if foreign.any():
         spots = [spot for spot in spots if not foreign[spot.crop][spot.mask].mean() > ON_FOREIGN]
     return spots, bright, foreign

@@ -9,7 +9,7 @@ from simtest.detection.shape import flat_pixels, peak_shape
 from simtest.detection.view_mask import view_of
 from simtest.errors import Failure
 from simtest.geometry import Camera, Mask
-from simtest.geometry.gaussian_smoothing import share_of_noise
+from simtest.geometry.patch import share_of_noise
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration.noise_estimate import median
+from simtest.calibration.frame import median
 from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, HIGHLIGHT_ISOVALUE
-from simtest.geometry import pixel_sets
+from simtest.geometry.patch import connected, dilated
 from simtest.runtime.arrays import Array, Image, Mask
 
 EXPANSION = 2.0
@@ -115,7 +115,7 @@ def _local_maxima(image: Image, threshold: npt.NDArray[np.floating]) -> list[tup
     rows, columns = np.nonzero(maxima)
     if len(rows) > MAX_PEAKS:
         # One pixel for each plateau: clipped ones must not crowd out the other peaks.
-        labels = pixel_sets.connected(maxima, diagonally=True)
+        labels = connected(maxima, diagonally=True)
         first = np.sort(np.unique(labels[rows, columns], return_index=True)[1])
         rows, columns = rows[first], columns[first]
     order = np.argsort(-image[rows, columns], kind="stable")[:MAX_PEAKS]
@@ -145,14 +145,14 @@ def component_above(
         y0, y1 = max(row - half, 0), min(row + half + 1, rows)
         x0, x1 = max(column - half, 0), min(column + half + 1, columns)
         window = image[y0:y1, x0:x1]
-        labels = pixel_sets.connected(window >= level)
+        labels = connected(window >= level)
         mask = labels == labels[row - y0, column - x0]
         if float(window[mask].max()) > most:
             return None
         edges = ((mask[0], y0 == 0), (mask[-1], y1 == rows), (mask[:, 0], x0 == 0), (mask[:, -1], x1 == columns))
         touched = [at_border for line, at_border in edges if line.any()]
         if all(touched):
-            cut = seen is not None and bool((pixel_sets.dilated(mask) & ~seen[y0:y1, x0:x1]).any())
+            cut = seen is not None and bool((dilated(mask) & ~seen[y0:y1, x0:x1]).any())
             return Component(mask, x0, y0, closed=not touched and not cut)
         half *= 2
 

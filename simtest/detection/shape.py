@@ -17,7 +17,7 @@ from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL, HIGHLIGHT_ISOVALUE, 
 from simtest.detection.regions import Region
 from simtest.errors import Failure
 from simtest.geometry import FittedConic, Mask, Patch, fit_ellipse, smooth
-from simtest.geometry.gaussian_smoothing import share_of_noise
+from simtest.geometry.patch import share_of_noise
 
 RESIDUAL_ISOVALUE = 0.7
 """The isophote that is compared with an ellipse: lower ones reach farther out, where curvature changes, and higher

@@ -7,7 +7,7 @@ import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.detection.basins import Basins, find_basins
-from simtest.geometry.pixel_sets import rows_and_columns
+from simtest.geometry.patch import rows_and_columns
 from simtest.runtime.arrays import Array, Image, Index, Mask
 
 SADDLE = 0.8

@@ -10,7 +10,7 @@ from simtest.calibration.calibration import brightest_channel
 from simtest.calibration.frame import Frame
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, ViewMask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
 
 WORKING_PX = 480
 """Longer side of the picture in which the border is searched."""

@@ -22,19 +22,6 @@ if TYPE_CHECKING:
     )
     from simtest.estimators.registry import load_estimators
 
-_HOMES = {
-    "simtest.estimators.isophote_fit": ("FittedIsophote",),
-    "simtest.estimators.protocol": (
-        "AnyEstimator",
-        "BatchEstimator",
-        "Estimate",
-        "EstimatedCurvature",
-        "Estimator",
-        "FrameEstimator",
-    ),
-    "simtest.estimators.registry": ("load_estimators",),
-}
-
 __all__ = [
     "AnyEstimator",
     "BatchEstimator",
@@ -46,4 +33,4 @@ __all__ = [
     "load_estimators",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, _ = lazy_names(__name__)

@@ -16,7 +16,7 @@ from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, Law
 from simtest.geometry import Array, Camera, Patch
-from simtest.geometry.gaussian_smoothing import slope_divisor_px2
+from simtest.geometry.patch import slope_divisor_px2
 
 PIXEL_PX2 = 0.005
 """Variance of the parabola's apex, px^2: the peak of three pixels is not the lobe's."""

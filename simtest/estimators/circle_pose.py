@@ -14,7 +14,7 @@ from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.estimators.pose_uncertainty import pose_region
 from simtest.estimators.protocol import Estimate, Law
 from simtest.geometry import Array, Camera, CirclePoses, Mask, Patch, circle_poses
-from simtest.geometry.gaussian_smoothing import slope_divisor_px2
+from simtest.geometry.patch import slope_divisor_px2
 
 POOLED_ISOVALUES = (0.1, 0.2, 0.3)
 """Low ones: the distance of the circles' projected centres grows with the square of the isophote's size."""

@@ -33,9 +33,9 @@ def clipped_pixels(patch: Patch) -> Mask | None:
 
 
 def plateau_area_px(patch: Patch, isovalue: float) -> int:
-    """Return how many pixels inside an isophote are clipped."""
+    """Return how many pixels inside an isophote are clipped; where the region cuts it, inside it and the cut."""
     clipped = clipped_pixels(patch)
-    return 0 if clipped is None else int(np.count_nonzero(clipped & patch.inside(isovalue)))
+    return 0 if clipped is None else int(np.count_nonzero(clipped & patch.inside(isovalue, cut=True)))
 
 
 def hidden_peak_moments(area_px: int, moments: Array, px2: Array, residual: float) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from simtest.calibration import Distribution, Uniform
 from simtest.geometry import Array, chi_squared
 from simtest.geometry.vectors import basis_across
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
 
 BASE_KD = Uniform(-0.5, 1.0)
 """Distance times curvature of the base along both principal directions, where nobody told: a lumen's wall from inside

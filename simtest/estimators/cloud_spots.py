@@ -11,7 +11,7 @@ import numpy as np
 from simtest.calibration import Frame
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.geometry import Array, Image, Mask, smooth
-from simtest.geometry.gaussian_smoothing import share_of_noise
+from simtest.geometry.patch import share_of_noise
 
 SMOOTHING_PX = 0.7
 """Gaussian smoothing before maxima are looked for: that of a lens, so that one spot of noise is no maximum."""

@@ -5,9 +5,9 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from simtest.estimators.training_range import rounded
 from simtest.geometry import Array
 from simtest.runtime.files import JsonObject
-from simtest.runtime.training_range import rounded
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import inspect
 import sys
 from collections.abc import Sequence
 
-from simtest.runtime.entry_points import OWN
+from simtest.runtime.resources import OWN
 
 DESCRIPTIONS: dict[str, str] = {
     "cone_axis": "The axis of the cone from the camera through the highlight's isophotes, averaged over several.",

@@ -213,7 +213,7 @@ def _place(error: Exception) -> str:
 
     What was raised before the estimator's first line, such as a wrong number of arguments, has no place.
     """
-    # The first entry is the call in this file. Between it and a plain function stands a wrapper of this package.
+    # The first entry is the call in this file.
     steps = traceback.extract_tb(error.__traceback__)[1:]
     foreign = [step.filename for step in steps if not Path(step.filename).is_relative_to(_PACKAGE)]
     file = foreign[0] if foreign else steps[0].filename if steps else None

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from simtest.calibration.noise_estimate import COLOURED
+from simtest.calibration.frame import COLOURED
 from simtest.estimators.lobe_fit import LobeFit, Model, fit_lobe
 from simtest.estimators.lobe_models import ColocatedQuadric
 from simtest.geometry import Array, Mask, chi_squared

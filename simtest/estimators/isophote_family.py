@@ -24,8 +24,8 @@ from simtest.estimators.peak_value import PeakValue, fit_peak_value
 from simtest.estimators.propagation import gram
 from simtest.estimators.ripples import excess
 from simtest.geometry import Array, Camera, CirclePose, Mask, Patch, cone_axes
-from simtest.geometry.gaussian_smoothing import share_of_noise
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
+from simtest.geometry.patch import share_of_noise
 from simtest.geometry.vectors import basis_across
 
 DRIFT_CHI2, SUSPECT_CHI2 = 13.82, 3.22

@@ -18,10 +18,9 @@ from simtest.geometry import (
     fit_arc,
     fit_ellipses,
 )
-from simtest.geometry.arc_fit import MIN_ARC_RAD, angular_extent
-from simtest.geometry.ellipse_fit import MIN_POINTS
-from simtest.geometry.fitting_planes import FORWARD, fitting_planes
-from simtest.runtime.short_repr import short_repr
+from simtest.geometry.cones import FORWARD, fitting_planes
+from simtest.geometry.ellipse_fit import MIN_ARC_RAD, MIN_POINTS, angular_extent
+from simtest.runtime.arrays import short_repr
 
 MAX_ARC_RESIDUAL = 0.1
 """An arc that misses its ellipse by more, RMS over the radius, noise included, is no part of one."""

@@ -22,15 +22,15 @@ from simtest.estimators.dense_inputs import (
     camera_values,
     dense_inputs,
 )
+from simtest.estimators.onnx_model import OnnxModel
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.reflection_check import reflection_distances
 from simtest.estimators.spot_inputs import LOG_RANGE
+from simtest.estimators.training_range import TrainingRange, inflation, read_usual
 from simtest.estimators.turned_normals import turned_normals
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.runtime.arrays import Image
-from simtest.runtime.onnx_model import OnnxModel
-from simtest.runtime.resources import data_root, shown
-from simtest.runtime.training_range import TrainingRange, inflation, read_usual
+from simtest.runtime.resources import data_root
 
 FORMAT = "simtest dense_normals, version 2"
 
@@ -78,13 +78,13 @@ class DenseMaps:
 
 @dataclass(frozen=True)
 class LearnedDense:
-    """A network of the task ``dense_normals`` (`simtest train`) as an estimator.
+    """A network that states normals all over a frame (`studies.networks.dense`) as an estimator.
 
     It sees the whole frame on a coarse grid, the sightlines and the lights. It states the base's normal and the
     distance everywhere (`maps`); as an estimator it answers for each detection. It refuses with ``no_estimate`` what
     lies outside the range that it was taught: another lens or other lights, a frame without colour, of an unusual
     aspect or too small, and frames whose features lie far from those of the train split. Short of that, what it states
-    grows less certain with the features' distance (`simtest.runtime.training_range.inflation`). At highlights it is
+    grows less certain with the features' distance (`simtest.estimators.training_range.inflation`). At highlights it is
     checked against the law of reflection (`simtest.estimators.reflection_check`): a frame, and a highlight alone, where
     its normals contradict that law is refused.
 
@@ -92,11 +92,6 @@ class LearnedDense:
     ----------
     model : str or Path, optional
         The file model.onnx. Default: the shipped network.
-
-    Raises
-    ------
-    InputError
-        At the first use, if ONNX Runtime (extra ``onnx``) is missing, or the file is no such network.
     """
 
     model: str | Path | None = None
@@ -114,7 +109,7 @@ class LearnedDense:
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
-        network = shown(self.model or SHIPPED[-1])
+        network = str(self.model or SHIPPED[-1])
         return f"The normal of the base surface at each highlight, by the network {network} of the whole frame."
 
     @cached_property

@@ -10,6 +10,7 @@ import numpy as np
 from simtest.calibration import Frame, Priors
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.covariance_scale import CovarianceScale
+from simtest.estimators.onnx_model import OnnxModel
 from simtest.estimators.protocol import Estimate, Target
 from simtest.estimators.spot_inputs import (
     EXTRAS,
@@ -22,12 +23,11 @@ from simtest.estimators.spot_inputs import (
     rays_of,
     spot_inputs,
 )
+from simtest.estimators.training_range import TrainingRange, inflation, read_usual
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
-from simtest.runtime.onnx_model import OnnxModel
-from simtest.runtime.resources import data_root, shown
-from simtest.runtime.training_range import TrainingRange, inflation, read_usual
+from simtest.runtime.resources import data_root
 
 FORMAT = "simtest spot_normals, version 3"
 
@@ -48,7 +48,7 @@ def log_deviation(outputs: Array) -> Array:
 
 @dataclass(frozen=True)
 class LearnedSpot:
-    """A network of the task ``spot_normals`` (`simtest train`) as an estimator.
+    """A network that states the normal at one highlight (`studies.networks.spots`) as an estimator.
 
     It sees three crops around each highlight and the lights' positions, and answers for each detection on its own. It
     refuses with ``no_estimate`` what lies outside the range that it was taught: another focal length, a lens with
@@ -60,12 +60,6 @@ class LearnedSpot:
         The file model.onnx. Default: the shipped network.
     target : {"base", "fine"}
         Which surface's normals are stated.
-
-    Raises
-    ------
-    InputError
-        If the target is neither; at the first use, if ONNX Runtime (extra ``onnx``) is missing, or the file is no such
-        network.
     """
 
     model: str | Path | None = None
@@ -73,10 +67,10 @@ class LearnedSpot:
 
     def __post_init__(self) -> None:
         if self.target not in SURFACES:
-            raise InputError(f"target = {shown(self.target)}: must be base or fine")
+            raise InputError(f"target = {self.target}: must be base or fine")
 
     def with_model(self, model: Path) -> "LearnedSpot":
-        """Return the estimator with another network, which is read (see `simtest.runtime.entry_points`)."""
+        """Return the estimator with another network, which is read (see `simtest.runtime.resources`)."""
         made = replace(self, model=model)
         made.check()
         return made
@@ -84,7 +78,7 @@ class LearnedSpot:
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
-        network = shown(self.model or SHIPPED[-1])
+        network = str(self.model or SHIPPED[-1])
         return f"The normal of the {self.target} surface at each highlight, by the network {network}."
 
     def check(self) -> None:

@@ -8,7 +8,7 @@ from simtest.errors import Failure
 from simtest.estimators.isophote_family import IsophoteFamily
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.geometry import Array, Camera, Patch
-from simtest.geometry.pose_region import PoseRegion
+from simtest.geometry.cones import PoseRegion
 
 STEP = 1e-5
 """Step of the differences between conic and ellipse, as a share of the largest of their parameters."""

@@ -19,7 +19,7 @@ from simtest.estimators.light_table import light_table
 from simtest.estimators.near_misses import near_miss_parts
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, chi_squared
-from simtest.geometry.distortion import undistort_with_errors
+from simtest.geometry.lenses import undistort_with_errors
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
 
 NEAR_SHARE = 0.05

@@ -12,9 +12,9 @@ from simtest.estimators.budget import STATED, Budget, bounded, total
 from simtest.estimators.cloud_shape import CloudShape
 from simtest.estimators.isophote_fit import FittedIsophote
 from simtest.geometry import Array, Camera, Patch
-from simtest.geometry.pose_region import PoseRegion
+from simtest.geometry.cones import PoseRegion
 from simtest.geometry.vectors import deviation_deg
-from simtest.runtime.short_repr import LONGEST, clipped, vector
+from simtest.runtime.arrays import LONGEST, clipped, vector
 
 Target = Literal["fine", "base"]
 

@@ -1,50 +1,25 @@
 """Estimators by name: those of packages (entry-point group ``simtest.estimators``), and those of the user's own."""
 
-import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from simtest.calibration import Priors
-from simtest.errors import Failure, InputError
+from simtest.errors import InputError
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
-from simtest.estimators.protocol import AnyEstimator, Estimate, Estimator, FrameEstimator
-from simtest.geometry import Camera, Patch
-from simtest.runtime.model_names import SUFFIX, parse_model
-from simtest.runtime.resources import shown
-
-
-@dataclass(frozen=True)
-class PlainCallable:
-    """A function of patch and camera, the old form of an estimator, which this release still accepts."""
-
-    function: Callable[[Patch, Camera], Estimate | Failure]
-
-    def estimate(self, patch: Patch, camera: Camera, _priors: Priors, /) -> Estimate | Failure:
-        """Call the function."""
-        return self.function(patch, camera)
+from simtest.estimators.protocol import AnyEstimator, Estimator, FrameEstimator
+from simtest.runtime.resources import SUFFIX, parse_model
 
 
 def as_estimator(name: str, given: object) -> AnyEstimator:
-    """Return an object as an estimator; a plain callable is wrapped, with a DeprecationWarning.
-
-    Raises
-    ------
-    InputError
-        If it is neither an estimator nor callable, or a class where an instance is meant.
-    """
+    """Return an object as an estimator; raise `InputError` if it is none, or a class where an instance is meant."""
     if isinstance(given, type):
         raise InputError(f"estimator {name!r}: {given.__qualname__} is a class; must be an instance of it")
     if isinstance(given, Estimator | FrameEstimator):
         return given
-    if not callable(given):
-        raise InputError(f"estimator {name!r}: {given!r} is not callable and has neither estimate nor estimate_frame")
-    warnings.warn(
-        f"estimator {name!r} is a plain callable, which 0.3.0 refuses: give it a method "
-        "estimate(patch, camera, priors)", DeprecationWarning, stacklevel=3,
-    )  # fmt: skip
-    return PlainCallable(given)
+    raise InputError(
+        f"estimator {name!r}: {given!r:.80} has neither estimate(patch, camera, priors) nor "
+        "estimate_frame(frame, camera, priors)"
+    )
 
 
 def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[str, AnyEstimator]:
@@ -52,7 +27,7 @@ def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[st
 
     A name is as registered, or "package:name" where two packages register it; or it is a core's
     (`simtest.estimators.process.command.parse_core`), which is started, or that of a network of the user's own
-    ("learned_spot:FILE.onnx", `simtest.runtime.model_names`), which is read. Both stand under their short names.
+    ("learned_spot:FILE.onnx", `simtest.runtime.resources`), which is read. Both stand under their short names.
 
     Raises
     ------
@@ -78,13 +53,11 @@ def _plain(name: str) -> tuple[str, object]:
         raise InputError(f"estimator {name!r}: one name each; several are given as {each}")
     if name.endswith(SUFFIX):
         raise InputError(
-            f"estimator {shown(name, 120)!r}: is no estimator's name; a network stands behind what runs it, as in "
-            f"learned_spot:{shown(Path(name), 80)}"
+            f"estimator {name!r}: is no estimator's name; a network stands behind what runs it, as in "
+            f"learned_spot:{Path(name)}"
         )
     if " " in name.strip() or "/" in name:
-        raise InputError(
-            f"estimator {shown(name, 120)!r}: is no estimator's name; a program of yours needs 'command: ' before it"
-        )
+        raise InputError(f"estimator {name!r}: is no estimator's name; a program of yours needs 'command: ' before it")
     return name, _installed(name)
 
 
@@ -105,7 +78,7 @@ def _installed(name: str) -> object:
         if name in ESTIMATORS.names() or not Path(name).is_file():
             raise
         how = f"python {name}" if name.endswith(".py") else f"./{name}"
-        raise InputError(f"{error}; the file {shown(name, 80)} is run by 'command: {how}'") from error
+        raise InputError(f"{error}; the file {name} is run by 'command: {how}'") from error
 
 
 def _core(name: str) -> tuple[str, object]:

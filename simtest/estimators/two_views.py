@@ -192,11 +192,6 @@ def rank_by_motion(
         Relative standard deviation of the first picture's abs(1 + d k), > 0.
     pose_error : PoseError
         Of the motion.
-
-    Raises
-    ------
-    InputError
-        If the motion is not rigid.
     """
     T = rigid(second_from_first, "second_from_first")
     return rank_by_motions(first, [MovedView([second], T, pose_error)], priors, gain_sd)

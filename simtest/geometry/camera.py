@@ -1,7 +1,8 @@
-"""The camera: pixels to unit sightlines and back, pixel centres at integer + 0.5."""
+"""The camera: pixels to unit sightlines and back, pixel centres at integer + 0.5; and its field of view."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -9,18 +10,27 @@ import numpy.typing as npt
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
-from simtest.geometry.distortion import BrownConrady, Distortion, with_radial_error
-from simtest.runtime.arrays import Array, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.geometry.lenses import BrownConrady, Distortion, with_radial_error
+from simtest.runtime.arrays import Array, Mask, short_repr
 
 FOLD_GRID = 33
 """Points along each side of the image at which a lens is checked for a fold."""
 
+FOLD_CIRCLE = 256
+"""The same around a view mask."""
+
 FOV_DEG = (0.05, 179.0)
 """Fields of view that a pinhole may have."""
 
-FOLD_CIRCLE = 256
-"""The same around a view mask."""
+FovExtent = Literal["width", "height", "diagonal"]
+
+FOV_EXTENTS: tuple[FovExtent, ...] = get_args(FovExtent)
+
+_LONGEST_FOCAL = 1e7
+"""Focal length up to which one is sought, over the picture's diagonal."""
+
+_FOV_STEPS = 200
+"""Of the bisection; 120 reach the last digit."""
 
 
 @dataclass(frozen=True)
@@ -149,13 +159,6 @@ class Camera:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        self._check_numbers()
-        if self.view_mask is not None and not self.view_mask.contains(self.pixel_centres()).any():
-            raise InputError(f"camera.view_mask = {self.view_mask}: must cover a pixel of the image")
-        if self.distortion is not None:
-            self._check_fold(self.distortion)
-
-    def _check_numbers(self) -> None:
         for name in ("width", "height"):
             check_integer(f"camera.{name}", getattr(self, name), 1)
         for name in ("fx", "fy", "cx", "cy", "skew"):
@@ -163,6 +166,10 @@ class Camera:
         for name in ("fx", "fy"):
             if getattr(self, name) <= 0:
                 raise InputError(f"camera.{name} = {getattr(self, name)!r}: must be > 0, else K is singular")
+        if self.view_mask is not None and not self.view_mask.contains(self.pixel_centres()).any():
+            raise InputError(f"camera.view_mask = {self.view_mask}: must cover a pixel of the image")
+        if self.distortion is not None:
+            self._check_fold(self.distortion)
 
     def _check_fold(self, distortion: Distortion) -> None:
         """Raise `InputError` where a pixel that should be seen has no sightline on the lens's first branch."""
@@ -291,3 +298,67 @@ class Camera:
         points = np.asarray(points_px, dtype=float)
         inside = ((points >= 0) & (points <= [self.width, self.height])).all(axis=-1)
         return np.asarray(inside if self.view_mask is None else inside & self.view_mask.contains(points))
+
+
+def field_of_view(camera: Camera, across: FovExtent = "width") -> float:
+    """Return the angle, deg, that a camera's picture spans across its width, height or diagonal.
+
+    It is the sum of the angles from the optical axis at the two ends: of the line through the principal point, or of
+    the diagonal from the upper left corner. NaN where the lens images nothing at an end.
+    """
+    ends = _ends(camera.width, camera.height, (camera.cx, camera.cy), across)
+    return float(np.degrees(_angles(camera.unproject(ends + np.array([camera.cx, camera.cy])))))
+
+
+def focal_of_view(
+    fov_deg: float,
+    size: tuple[int, int],
+    centre: tuple[float, float],
+    lens: Distortion | None = None,
+    across: FovExtent = "width",
+) -> float:
+    """Return the focal length, px, of a camera with square pixels that has a given field of view.
+
+    The angle, deg, is as `field_of_view` gives it. Size and principal point of the picture are px; the lens, whose
+    field it is, is by default a pinhole.
+    """
+    wanted, ends = np.radians(fov_deg), _ends(*size, centre, across)
+    lengths = np.linalg.norm(ends, axis=1)
+    if lens is None and lengths[0] == lengths[1] and 0 < wanted < np.pi:
+        return float(lengths[0] / np.tan(wanted / 2))
+
+    def spans(focal: float) -> float:
+        """Return the angle at a focal length; inf where the lens folds over before an end of the picture."""
+        m = ends / focal
+        angle = _angles(np.column_stack([m, [1.0, 1.0]]) if lens is None else lens.undistort(m))
+        return float(angle) if np.isfinite(angle) else np.inf
+
+    # The angle falls as the focal length grows.
+    low, high = np.log(lengths.max() * 1e-6), np.log(lengths.max() * _LONGEST_FOCAL)
+    for _ in range(_FOV_STEPS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if spans(float(np.exp(middle))) > wanted else (low, middle)
+    focal = float(np.exp(high))
+    if not abs(spans(focal) - wanted) <= 1e-9 * wanted:
+        most = np.degrees(np.pi if lens is None else 2 * lens.limit_angle)
+        raise InputError(
+            f"fov_deg = {fov_deg:g}: this lens cannot span that angle across the {across}; must be below {most:.4g} "
+            "deg, where it ends or folds over"
+        )
+    return focal
+
+
+def _ends(width: int, height: int, centre: tuple[float, float], across: FovExtent) -> Array:
+    """Return the two ends of an extent, shape (2, 2), px from the principal point."""
+    cx, cy = centre
+    ends = {
+        "width": [[-cx, 0.0], [width - cx, 0.0]],
+        "height": [[0.0, -cy], [0.0, height - cy]],
+        "diagonal": [[-cx, -cy], [width - cx, height - cy]],
+    }
+    return np.array(ends[across])
+
+
+def _angles(rays: Array) -> Array:
+    """Return the sum of the angles between two rays, shape (2, 3), and the optical axis, rad."""
+    return np.asarray(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]).sum())

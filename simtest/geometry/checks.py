@@ -5,7 +5,6 @@ from numbers import Integral, Real
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
 
 
 def check_number(name: str, value: Any, least: float | None = None, above: float | None = None) -> None:
@@ -15,7 +14,7 @@ def check_number(name: str, value: Any, least: float | None = None, above: float
     if not fits:
         bound = "" if least is None else f" >= {least:g}"
         bound += "" if above is None else f" > {above:g}"
-        raise InputError(f"{name} = {shown(repr(value), 80)}: must be a finite number{bound}")
+        raise InputError(f"{name} = {value!r:.80}: must be a finite number{bound}")
 
 
 def check_integer(name: str, value: Any, least: int, most: int | None = None) -> None:
@@ -23,7 +22,7 @@ def check_integer(name: str, value: Any, least: int, most: int | None = None) ->
     fits = isinstance(value, Integral) and not isinstance(value, bool)
     if not (fits and value >= least and (most is None or value <= most)):
         bound = f">= {least}" if most is None else f"from {least} to {most}"
-        raise InputError(f"{name} = {shown(repr(value), 80)}: must be an integer {bound}")
+        raise InputError(f"{name} = {value!r:.80}: must be an integer {bound}")
 
 
 def check_numbers(name: str, values: Any) -> None:
@@ -33,7 +32,7 @@ def check_numbers(name: str, values: Any) -> None:
     except TypeError:
         fits = False
     if not fits:
-        raise InputError(f"{name} = {shown(repr(values), 80)}: must be a sequence of finite numbers")
+        raise InputError(f"{name} = {values!r:.80}: must be a sequence of finite numbers")
 
 
 def check_kind(name: str, value: Any, kind: type) -> None:

@@ -9,18 +9,9 @@ from functools import lru_cache
 
 
 def survival(x: float, freedom: int) -> float:
-    """Return the probability that a chi-squared variable exceeds x > 0, by its finite sums [AS, 26.4.4, 26.4.5].
+    """Return the probability that a chi-squared variable exceeds x > 0, by its finite sums.
 
-    Parameters
-    ----------
-    x : float
-        Value, > 0.
-    freedom : int
-        Degrees of freedom, >= 1.
-
-    Notes
-    -----
-    [AS] M. Abramowitz, I. A. Stegun, "Handbook of Mathematical Functions", 1964.
+    Abramowitz and Stegun, "Handbook of Mathematical Functions", 1964, 26.4.4 and 26.4.5.
     """
     half = x / 2
     # Q(a + 1) = Q(a) + half^a exp(-half) / Gamma(a + 1), from a = 1/2 or from a = 1 up to freedom/2.
@@ -34,13 +25,7 @@ def survival(x: float, freedom: int) -> float:
 
 @lru_cache(maxsize=256)
 def quantile(share: float, freedom: int) -> float:
-    """Return the value that a chi-squared variable stays below with a probability of `share`, inside (0, 1).
-
-    Raises
-    ------
-    ValueError
-        If `share` is not inside (0, 1), or `freedom` is below 1.
-    """
+    """Return the value that a chi-squared variable stays below with a probability of `share`, inside (0, 1)."""
     if not 0 < share < 1 or freedom < 1:
         raise ValueError(f"share = {share}, freedom = {freedom}: must be inside (0, 1), and at least 1")
     if freedom == 2:

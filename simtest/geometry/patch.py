@@ -1,20 +1,48 @@
-"""A region of interest of a smoothed frame around one peak, and the isophotes in it."""
+"""A region of interest of a smoothed frame around one peak, and the isophotes in it.
 
+Connected sets of pixels and their closing are OpenCV's: scipy.ndimage takes longer to load than a picture to
+reconstruct.
+"""
+
+import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.errors import Failure, InputError, Reason
-from simtest.geometry import pixel_sets
-from simtest.geometry.isophotes import IsophoteTracer
-from simtest.geometry.level_sets import Crossings, LevelSet
-from simtest.runtime.arrays import Array, Image, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.geometry.level_sets import Crossings, LevelSet, crossings, cut_level_set_around, level_set_around
+from simtest.runtime.arrays import Array, Image, Index, Mask, short_repr
+
+LEAST_SMOOTHING_PX = 0.5
+"""What the parabola through three pixels amounts to, where a frame is not smoothed."""
+
+_SQUARE = np.ones((3, 3), np.uint8)
+
+CUT_SIGMAS = 1.5
+"""Nearer than this to a cut, over the smoothing's standard deviation, an isophote is left out: smoothing moves it, at
+the cut by 0.8 of that deviation, at this distance by 0.06."""
 
 MIN_PLATEAU_PX = 12
 """Fewer clipped pixels leave a smoothed peak round; more leave it flat, and its highest pixel an accident."""
+
+
+@dataclass(frozen=True, eq=False)
+class _LevelSets:
+    """The level sets around a peak that were found, and the values, view, peak and smoothing that they are of."""
+
+    of: tuple[object, ...]
+    closed: dict[float, LevelSet | Failure] = field(default_factory=dict)
+    cut: dict[float, LevelSet] = field(default_factory=dict)
+    crossings: dict[tuple[LevelSet, ...], Crossings] = field(default_factory=dict)
+
+    def are_of(self, of: tuple[object, ...]) -> bool:
+        """Return whether they are of the same arrays, not copies, with the same peak and smoothing."""
+        pairs = zip(self.of, of, strict=True)
+        return all(one is other or (isinstance(one, int | float | tuple) and one == other) for one, other in pairs)
 
 
 @dataclass(frozen=True)
@@ -47,8 +75,8 @@ class Patch:
         Peaks of the frame's other specularities, px; None: not known, empty: there are none.
     others_value : tuple of float
         Smoothed intensities of those, 0 where one has no patch; empty: not known.
-    tracer : IsophoteTracer, optional
-        Made from the fields above, unless it is one that was.
+    found : optional
+        The level sets found so far: those of the patch that this one is a copy of, where it has the same.
     kept : dict
         What estimators have fitted to this patch, by a name, each with the camera; a copy starts without.
 
@@ -74,16 +102,16 @@ class Patch:
     smoothing_px: float = 0.0
     others_px: tuple[tuple[float, float], ...] | None = None
     others_value: tuple[float, ...] = ()
-    tracer: IsophoteTracer | None = field(default=None, compare=False, repr=False)
+    found: _LevelSets | None = field(default=None, compare=False, repr=False)
     kept: dict[Hashable, tuple[object, object]] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         # A copy with other neighbours or noise keeps its level sets; one with other values or another peak does not.
-        fresh = IsophoteTracer(self.values, self.peak_pixel, self.peak_value, self.seen, self.smoothing_px)
-        if self.tracer is None or not self.tracer.finds_the_same_as(fresh):
-            object.__setattr__(self, "tracer", fresh)
+        of = (self.values, self.seen, self.peak_pixel, self.peak_value, self.smoothing_px)
+        if self.found is None or not self.found.are_of(of):
+            object.__setattr__(self, "found", _LevelSets(of))
 
     @classmethod
     def cut(
@@ -185,11 +213,11 @@ class Patch:
 
     def crossings_of(self, isovalues: Sequence[float]) -> list[Array | Failure]:
         """Return the points of several isophotes (see `crossings`), at little more than the cost of one."""
-        found = [self._isophotes.closed(t) for t in isovalues]
+        found = [self._closed(t) for t in isovalues]
         closed = [each for each in found if not isinstance(each, Failure)]
         if not closed:
             return [each for each in found if isinstance(each, Failure)]
-        traced = self._isophotes.crossings(closed)
+        traced = self._crossings(closed)
         points = iter(traced.each(traced.points + self._first_centre))
         return [each if isinstance(each, Failure) else next(points) for each in found]
 
@@ -198,29 +226,55 @@ class Patch:
 
         Points nearer to the cut than 1.5 times the smoothing's width are left out.
         """
-        return self._isophotes.crossings([self._isophotes.cut(isovalue)]).points + self._first_centre
+        return self._crossings([self._cut(isovalue)]).points + self._first_centre
 
     def traced(self, isovalues: Sequence[float], cut: Sequence[bool]) -> Crossings:
         """Return the points of `crossings`, or of `arc` where `cut` is true, and how they move with the values.
 
         The isophotes must have been found; pixels and points are those of the region.
         """
-        tracer = self._isophotes
-        found = [tracer.cut(t) if arc else tracer.closed(t) for t, arc in zip(isovalues, cut, strict=True)]
-        return tracer.crossings([each for each in found if isinstance(each, LevelSet)])
+        found = [self._cut(t) if arc else self._closed(t) for t, arc in zip(isovalues, cut, strict=True)]
+        return self._crossings([each for each in found if isinstance(each, LevelSet)])
 
     def isophote(self, isovalue: float) -> Array | Failure:
         """Return the points of `crossings` as a closed polygon, shape (N + 1, 2), the first repeated at the end.
 
         Where the border meets itself, at a pixel whose value is the level, a point is passed more than once.
         """
-        found = self._isophotes.closed(isovalue)
+        found = self._closed(isovalue)
         return found if isinstance(found, Failure) else found.polygon() + PIXEL_CENTRE + self.origin_px
 
     @property
-    def _isophotes(self) -> IsophoteTracer:
-        assert self.tracer is not None
-        return self.tracer
+    def _level_sets(self) -> _LevelSets:
+        assert self.found is not None
+        return self.found
+
+    def _closed(self, isovalue: float) -> LevelSet | Failure:
+        """Return the region above t times the peak; a Failure where its border does not close."""
+        found = self._level_sets.closed
+        if isovalue not in found:
+            level = _checked(isovalue) * self.peak_value
+            found[isovalue] = level_set_around(self.values, self.peak_pixel, level, self.seen) or Failure(
+                Reason.NO_CLOSED_ISOPHOTE, f"none around the peak at t = {isovalue:g}"
+            )
+        return found[isovalue]
+
+    def _cut(self, isovalue: float) -> LevelSet:
+        """Return the same region where the border or the view may cut it, its border open there."""
+        found = self._level_sets.cut
+        if isovalue not in found:
+            margin = max(int(np.ceil(CUT_SIGMAS * self.smoothing_px)), 1)
+            level = _checked(isovalue) * self.peak_value
+            found[isovalue] = cut_level_set_around(self.values, self.peak_pixel, level, margin, self.seen)
+        return found[isovalue]
+
+    def _crossings(self, sets: list[LevelSet]) -> Crossings:
+        """Return where the borders of level sets cross the lines between pixel centres."""
+        # Usually the points are used first, then how they move.
+        found, key = self._level_sets.crossings, tuple(sets)
+        if key not in found:
+            found[key] = crossings(sets)
+        return found[key]
 
     @property
     def _first_centre(self) -> Array:
@@ -232,10 +286,10 @@ class Patch:
 
         Where it does not close: all seen pixels, or with `cut` those that it encloses together with the cut.
         """
-        found = self._isophotes.closed(isovalue)
+        found = self._closed(isovalue)
         if isinstance(found, Failure):
             if cut:
-                return np.asarray(self._isophotes.cut(isovalue).inside[1:-1, 1:-1])
+                return np.asarray(self._cut(isovalue).inside[1:-1, 1:-1])
             return np.ones(self.values.shape, dtype=bool) if self.seen is None else self.seen
         mask = np.zeros(self.values.shape, dtype=bool)
         height, width = found.inside.shape
@@ -245,7 +299,7 @@ class Patch:
 
     def area_px(self, isovalue: float) -> int | None:
         """Return how many pixels an isophote encloses; None where it does not close."""
-        found = self._isophotes.closed(isovalue)
+        found = self._closed(isovalue)
         return None if isinstance(found, Failure) else int(np.count_nonzero(found.inside))
 
     @property
@@ -263,6 +317,20 @@ class Patch:
         return float(np.mean(self.saturated[inside])) if inside.any() else 0.0
 
 
+def _checked(isovalue: float) -> float:
+    if not 0 < isovalue < 1:
+        raise InputError(f"isovalue t = {isovalue!r}: must be inside (0, 1)")
+    return isovalue
+
+
+def encloses(points: Array, point: Array) -> bool:
+    """Return whether a closed polygon, shape (N, 2), encloses a point, shape (2,), by the even-odd rule."""
+    x, y = (points - point).T
+    crosses = (y[:-1] > 0) != (y[1:] > 0)
+    x0, y0, x1, y1 = x[:-1][crosses], y[:-1][crosses], x[1:][crosses], y[1:][crosses]
+    return bool(np.count_nonzero(x0 - y0 * (x1 - x0) / (y1 - y0) > 0) % 2)
+
+
 def _plateau(shown: Image | Array, clipped: Mask, row: int, column: int) -> Mask | None:
     """Return the connected clipped pixels around a peak's pixel, small holes closed; None where they are few.
 
@@ -270,11 +338,11 @@ def _plateau(shown: Image | Array, clipped: Mask, row: int, column: int) -> Mask
     """
     if np.count_nonzero(clipped) < MIN_PLATEAU_PX:
         return None
-    high = pixel_sets.connected(shown >= HIGHLIGHT_ISOVALUE * shown[row, column])
-    whole = pixel_sets.closed(clipped & (high == high[row, column]))
+    high = connected(shown >= HIGHLIGHT_ISOVALUE * shown[row, column])
+    whole = closed(clipped & (high == high[row, column]))
     if not whole[row, column]:
         return None
-    labels = pixel_sets.connected(whole, diagonally=True)
+    labels = connected(whole, diagonally=True)
     plateau = np.asarray(labels == labels[row, column])
     return plateau if np.count_nonzero(plateau) >= MIN_PLATEAU_PX and (plateau & clipped).any() else None
 
@@ -289,3 +357,75 @@ def _parabolic_peak(values: Image | Array, row: int, column: int) -> Array:
             if bend < 0:
                 position[axis] += min(max(0.5 * (before - after) / bend, -0.5), 0.5)
     return np.array(position)
+
+
+def smooth(frame: npt.ArrayLike, sigma_px: float, seen: Mask | None = None) -> Image:
+    """Smooth a frame, shape (H, W) or (H, W, C), with a Gaussian of a standard deviation in px; 0 leaves it as it is.
+
+    With `seen`, shape (H, W), the pixels inside a camera's view mask, each smoothed value is the weighted mean of those
+    alone, so that the dark outside does not lower the values at the mask's border; pixels outside become 0.
+    """
+    image = np.ascontiguousarray(frame, dtype=np.float32)
+    if seen is None:
+        return _blurred(image, sigma_px)
+    inside = seen if image.ndim == 2 else seen[:, :, None]
+    weights = _blurred(seen.astype(np.float32), sigma_px).reshape(inside.shape)
+    blurred = _blurred(np.where(inside, image, np.float32(0)), sigma_px)
+    return np.asarray(np.divide(blurred, weights, where=inside, out=np.zeros_like(image)))
+
+
+def share_of_noise(sigma_px: float) -> float:
+    """Return the share of white noise that smoothing leaves: 1 / (2 sqrt(pi) s) for a wide Gaussian."""
+    return 1 / math.sqrt(1 + 4 * math.pi * sigma_px**2)
+
+
+def slope_divisor_px2(sigma_px: npt.ArrayLike) -> Array:
+    """Return what divides the standard deviation of white noise for that of the smoothed noise's slope an axis, px^2.
+
+    The slope has the variance sigma^2 / (8 pi s^4).
+    """
+    return np.asarray(np.sqrt(8 * np.pi) * np.maximum(sigma_px, LEAST_SMOOTHING_PX) ** 2)
+
+
+def _blurred(image: Image, sigma_px: float) -> Image:
+    if sigma_px <= 0:
+        return image
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT))
+
+
+def connected(mask: Mask, diagonally: bool = False) -> npt.NDArray[np.int32]:
+    """Return the number of each pixel's connected set, shape (H, W), 0 outside the mask, of shape (H, W).
+
+    Pixels are neighbours along the axes, and with `diagonally` at corners too.
+    """
+    _, labels = cv2.connectedComponents(_bytes(mask), connectivity=8 if diagonally else 4)
+    return np.asarray(labels, dtype=np.int32)
+
+
+def dilated(mask: Mask) -> Mask:
+    """Return a mask, shape (H, W), with the eight neighbours of its pixels."""
+    return np.asarray(cv2.dilate(_bytes(mask), _SQUARE), dtype=bool)
+
+
+def closed(mask: Mask) -> Mask:
+    """Return a mask, shape (H, W), with its narrow gaps closed: the union with its closing by a square of 3 pixels.
+
+    Nothing is set outside the picture, so the closing adds nothing along its border.
+    """
+    grown = cv2.dilate(_bytes(mask), _SQUARE)
+    shrunk = cv2.erode(grown, _SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=(0,))
+    return np.asarray(mask | shrunk.astype(bool))
+
+
+def rows_and_columns(mask: Mask) -> tuple[Index, Index]:
+    """Return rows and columns of a mask's pixels, of shape (H, W), row by row, as `np.nonzero` does.
+
+    Ten times as fast where few pixels are set.
+    """
+    indices = np.flatnonzero(mask)
+    rows = indices // mask.shape[1]
+    return rows, indices - rows * mask.shape[1]
+
+
+def _bytes(mask: Mask) -> npt.NDArray[np.uint8]:
+    return np.ascontiguousarray(mask).view(np.uint8)

@@ -1,7 +1,6 @@
 """`inverse_rendering`: a quadric patch fitted by differentiating the renderer, as a reference for the others.
 
-No other estimator may import it. `estimator` fits a `rendered_quadric`, whose radiance and derivatives come from
-`patch_renderer`.
+No other estimator may import it. `estimator` fits a quadric, whose radiance and derivatives come from `patch`.
 """
 
 from simtest.inverse.estimator import InverseRendering, inverse_rendering

@@ -21,8 +21,7 @@ from simtest.estimators.prior_parts import add_common_parts, light_offset_part, 
 from simtest.estimators.protocol import Estimate, EstimatedCurvature, Law
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
-from simtest.inverse.patch_renderer import PatchRenderer
-from simtest.inverse.rendered_quadric import RenderedQuadric
+from simtest.inverse.patch import PatchRenderer, RenderedQuadric
 
 STEP = 1e-5
 """Step of the differences of the normal, rad, and as a share of the distance."""

@@ -2,9 +2,9 @@
 
 `run` calls the three stages, each of which hands one record of `records` to the next:
 
-    run = measure_run(...)      # measure: experiments -> NightlyRun
-    judged = judge(run, ...)    # judge: gate/ against the baseline, history -> JudgedRun
-    draw(judged, ...)           # draw: reports, page/, outputs/ (JSON, Markdown)
+    run = measure_run(...)      # experiments -> NightlyRun
+    judged = judge(run, ...)    # gate/ against the baseline, history -> JudgedRun
+    draw(judged, ...)           # reports, page/, `outputs` (JSON, Markdown)
 
-`storage` writes a run, `baseline` accepts one, `history` keeps the figures of all, `layout` names the folders.
+`store` names the folders, writes a run and accepts a baseline, `history` keeps the figures of all.
 """

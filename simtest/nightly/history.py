@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import polars as pl
 
 from simtest.nightly.records import CELL, FIGURES, NightlyRun, Verdict
 from simtest.runtime.files import require_plain, sync_folder, write_atomically
-from simtest.runtime.resources import shown
 
 HISTORY: dict[str, pl.DataType] = {
     **FIGURES, "run_id": pl.String(), "started": pl.Datetime("us", "UTC"), "commit": pl.String(),
@@ -40,20 +38,16 @@ MAX_NAMED = 5
 def history_rows(run: NightlyRun, verdict: Verdict) -> pl.DataFrame:
     """Return a run's figures with the columns `HISTORY`."""
     record = run.record
+    versions = hashlib.sha256(json.dumps(record.versions, sort_keys=True).encode()).hexdigest()[:12]
     # The whole digest would be most of the file.
     digest = pl.col("digest").str.slice(0, DIGEST_DIGITS)
     return run.figures.select(*FIGURES).with_columns(
         digest, run_id=pl.lit(record.id), started=pl.lit(record.start, HISTORY["started"]),
         commit=pl.lit(record.commit, pl.String), profile=pl.lit(record.profile), state=pl.lit(verdict.state),
         bit_equal=pl.lit(verdict.bit_equal, pl.Boolean), processor=pl.lit(record.processor, pl.String),
-        versions=pl.lit(versions_hash(record.versions)), duration_s=pl.lit(record.duration_s, pl.Float64),
+        versions=pl.lit(versions), duration_s=pl.lit(record.duration_s, pl.Float64),
         source_hash=pl.lit(record.source_hash, pl.String),
     )  # fmt: skip
-
-
-def versions_hash(versions: Mapping[str, str]) -> str:
-    """Return a short hash of packages' versions."""
-    return hashlib.sha256(json.dumps(dict(versions), sort_keys=True).encode()).hexdigest()[:12]
 
 
 def append(folder: Path, rows: pl.DataFrame, scratch: Path) -> Path:
@@ -78,21 +72,10 @@ def trend_rows(rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def read_history(folder: Path, newest: int = NEWEST) -> tuple[pl.DataFrame, list[str]]:
-    """Read what the page shows of a profile's history; damaged and foreign files are skipped, with a warning each.
+    """Read what the page shows of the `newest` runs of a profile's history, and notes of what was skipped.
 
-    Parameters
-    ----------
-    folder : Path
-        The profile's history; may be missing.
-    newest : int
-        Files that are read, the last ones by name, which begins with the run's start.
-
-    Returns
-    -------
-    rows : polars.DataFrame
-        `TREND_COLUMNS` of the quantities `TRENDS`, run after run in the order of their start.
-    notes : list of str
-        What was skipped, for the page.
+    The rows are `TREND_COLUMNS` of the quantities `TRENDS`, run after run in the order of their start. Files are chosen
+    by name, which begins with the run's start; damaged and foreign ones are skipped, with a warning each.
     """
     runs: dict[str, pl.DataFrame] = {}
     skipped = []
@@ -101,22 +84,19 @@ def read_history(folder: Path, newest: int = NEWEST) -> tuple[pl.DataFrame, list
         if not isinstance(found, str) and found["run_id"][0] in runs:
             found = "a night that another file holds already"
         if isinstance(found, str):
-            warnings.warn(f"{shown(file)}: {found}; skipped", stacklevel=2)
-            skipped.append(f"{shown(file.relative_to(folder))} ({found})")
+            warnings.warn(f"{file}: {found}; skipped", stacklevel=2)
+            skipped.append(f"{file.relative_to(folder)} ({found})")
         else:
             runs[found["run_id"][0]] = found
     # The run's id may be of a clock that went back.
     ordered = sorted(runs.values(), key=lambda run: (run["started"][0], run["run_id"][0]))
     none = pl.DataFrame(schema=HISTORY).select(*TREND_COLUMNS)
-    return pl.concat([none, *map(trend_rows, ordered)]), _skipped_note(skipped)
-
-
-def _skipped_note(skipped: list[str]) -> list[str]:
+    rows = pl.concat([none, *map(trend_rows, ordered)])
     if not skipped:
-        return []
+        return rows, []
     more = f" and {len(skipped) - MAX_NAMED} more" if len(skipped) > MAX_NAMED else ""
-    files = f"file{'s' * (len(skipped) > 1)}"
-    return [f"History: {len(skipped)} {files} skipped: {'; '.join(skipped[:MAX_NAMED])}{more}."]
+    files = f"{len(skipped)} file{'s' * (len(skipped) > 1)}"
+    return rows, [f"History: {files} skipped: {'; '.join(skipped[:MAX_NAMED])}{more}."]
 
 
 def _read(file: Path) -> pl.DataFrame | str:

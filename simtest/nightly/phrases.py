@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 
 import polars as pl
 
-from simtest.nightly.records import RunRecord, Verdict
+from simtest.nightly.records import Verdict
 from simtest.pages.style import degrees, labelled, number
 
 STATES = {
@@ -36,12 +36,7 @@ _ACCEPT = "simtest nightly accept --reason TEXT"
 
 def cell_name(row: Mapping[str, str | None]) -> str:
     """Return the name of a cell: setting and estimator; the setting begins with its label."""
-    return joined(row["setting"] or row["label"] or row["surface"], row["estimator"])
-
-
-def joined(*names: str | None) -> str:
-    """Join the names that are not empty."""
-    return ", ".join(name for name in names if name)
+    return ", ".join(filter(None, (row["setting"] or row["label"] or row["surface"], row["estimator"])))
 
 
 def short_commit(commit: str | None) -> str:
@@ -125,14 +120,11 @@ def verdict_lines(verdict: Verdict) -> list[tuple[str, str]]:
         True: "yes: all rows are identical to the baseline's, byte by byte",
         False: "no: some rows differ from the baseline's",
     }[verdict.bit_equal]
-    return [("Bit-equal", equal), ("Baseline", _baseline(verdict.baseline))]
-
-
-def _baseline(record: RunRecord | None) -> str:
-    if record is None:
-        return f"none; `{_ACCEPT}` makes this run the baseline"
-    text = f"{when(record.started)}, commit {short_commit(record.commit)}"
-    return f"{text}: {record.reason}" if record.reason else text
+    text, record = f"none; `{_ACCEPT}` makes this run the baseline", verdict.baseline
+    if record is not None:
+        text = f"{when(record.started)}, commit {short_commit(record.commit)}"
+        text += f": {record.reason}" if record.reason else ""
+    return [("Bit-equal", equal), ("Baseline", text)]
 
 
 def counts(verdict: Verdict) -> list[tuple[str, int, str]]:

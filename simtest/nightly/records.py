@@ -1,6 +1,5 @@
 """The records that the nightly's stages hand on: `NightlyRun` (measure), `Verdict` (judge), `JudgedRun` (draw)."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -27,6 +26,9 @@ CELL = Cell._fields
 POOLED = "all"
 """Stands for label, surface and setting of a comparison over all settings of an experiment, and for the experiment too
 of one over all experiments."""
+
+SINGLE = "single"
+"""Method of comparisons of results one by one."""
 
 _CELL_TYPES: dict[str, pl.DataType] = dict.fromkeys(CELL, pl.String())
 
@@ -64,29 +66,6 @@ it; gone: tonight has nothing to say of the quantity."""
 def to_explain() -> pl.Expr:
     """Return which comparisons are no regression, and yet must be explained: errors that fell, and what changed."""
     return pl.col("outcome").is_in(["changed", "better"])
-
-
-class Figure(NamedTuple):
-    """A number that a run measured: a row of `FIGURES`, whose columns the fields are."""
-
-    cell: Cell
-    quantity: str
-    unit: str
-    value: float | None
-    low: float | None = None
-    high: float | None = None
-    n: int | None = None
-    digest: str | None = None
-
-    def to_row(self) -> tuple[Any, ...]:
-        """Return the values of the columns `FIGURES`."""
-        return (*self.cell, *self[1:])
-
-
-def figure_table(figures: Iterable[Figure]) -> pl.DataFrame:
-    """Return figures as a table with the columns `FIGURES`; NaN becomes null."""
-    table = pl.DataFrame([figure.to_row() for figure in figures], schema=FIGURES, orient="row")
-    return table.with_columns(pl.col("value", "low", "high").fill_nan(None))
 
 
 class RunRecord(BaseModel):
@@ -135,7 +114,7 @@ class NightlyRun:
     """What one run of a profile measured."""
 
     record: RunRecord  # when, where and of what it was made
-    rows: pl.DataFrame  # results of all experiments, the columns of `simtest.validation.results_table.SCHEMA`
+    rows: pl.DataFrame  # results of all experiments, the columns of `simtest.validation.columns.SCHEMA`
     figures: pl.DataFrame  # columns `FIGURES`
 
 
@@ -179,12 +158,6 @@ class JudgedRun:
     verdict: Verdict
     history: pl.DataFrame  # columns `simtest.nightly.history.HISTORY`, the run's own rows among them
     reports: tuple[str, ...] = ()  # experiments with findings whose own page lies in reports/NAME, the worst first
-
-    def with_outcome(self, outcome: str) -> pl.DataFrame:
-        """Return the comparisons of an outcome, the surest first."""
-        return self.verdict.comparisons.filter(pl.col("outcome") == outcome).sort(
-            "p_holm", "experiment", "label", "setting", "estimator", "quantity", nulls_last=True, maintain_order=True
-        )
 
     def by_experiment(self) -> pl.DataFrame:
         """Count by experiment: `rows` (true highlights), those `answered`, the other `KINDS` of rows, and `OUTCOMES`.

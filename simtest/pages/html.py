@@ -25,7 +25,6 @@ TEMPLATES = [
             "nightly/page",
             "bench",
             "dataset/scoring/dense",
-            "dataset/learn",
         )
     ),
 ]

@@ -1,19 +1,24 @@
 """Draws on enlarged frames with OpenCV, writes pictures, and embeds them in pages."""
 
 import base64
+import importlib.util
 import io
 from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.pages.sheet import Pixels, Sheet, text_width
 from simtest.pages.style import rgb
 from simtest.runtime.arrays import Array
 
-__all__ = ["Canvas", "Pixels", "Window", "data_address", "displayed", "jpeg_address", "legend", "png"]
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont
 
+Pixels = npt.NDArray[np.uint8]
 Window = tuple[float, float, float, float]
 GAMMA = 2.2  # frames are linear; they are shown with this display gamma. Isophotes are those of the linear frame
 AVIF_QUALITY, AVIF_SPEED = 42, 10
@@ -97,18 +102,38 @@ def _dashes(points: Array) -> list[npt.NDArray[np.int32]]:
 
 def legend(width: int, entries: Sequence[tuple[str, str]]) -> Pixels:
     """Return a white strip, px wide, with (colour, text) entries in as many lines as they need."""
+    from PIL import Image, ImageDraw
+
     x, line, drawn = 8, 0, []
     for colour, text in entries:
-        wide = 22 + round(text_width(text, _FONT_PX)) + 14
+        wide = 22 + round(font(_FONT_PX).getlength(text)) + 14
         if x > 8 and x + wide > width:
             x, line = 8, line + 1
         drawn.append((x, 6 + _LINE_PX * line, colour, text))
         x += wide
-    strip = Sheet.white(width, 12 + _LINE_PX * (line + 1))
+    strip = Image.new("RGB", (width, 12 + _LINE_PX * (line + 1)), "white")
+    pen = ImageDraw.Draw(strip)
     for x, y, colour, text in drawn:
-        strip.box(x, y + 3, x + 14, y + 14, colour)
-        strip.text((x + 20, y), text, _FONT_PX, "#1b1f24", across=0.0, down=0.0)
-    return strip.pixels
+        pen.rectangle((x, y + 3, x + 13, y + 13), fill=colour)
+        pen.text((x + 20, y), text, fill="#1b1f24", font=font(_FONT_PX))
+    return np.asarray(strip)
+
+
+def fonts() -> Path:
+    """Return the folder of the fonts of all pictures, DejaVu, which matplotlib brings; found without importing that."""
+    found = importlib.util.find_spec("matplotlib")
+    assert found is not None
+    assert found.origin is not None
+    return Path(found.origin).parent / "mpl-data" / "fonts" / "ttf"
+
+
+@cache
+def font(size: float, bold: bool = False) -> "FreeTypeFont":
+    """Return DejaVu Sans in a size, px."""
+    from PIL import ImageFont
+
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(fonts() / name, size, layout_engine=ImageFont.Layout.BASIC)
 
 
 def png(picture: Pixels) -> bytes:

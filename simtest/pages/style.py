@@ -1,7 +1,7 @@
 """Symbols and number formats of all pages and figures; their colours are those of `palette`."""
 
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +20,9 @@ __all__ = [
     "ESTIMATOR_COLOURS",
     "LIGHT",
     "NEUTRAL",
+    "SHAPES",
+    "STROKES",
     "TRUTH",
-    "Symbol",
     "colours",
     "degrees",
     "estimator_order",
@@ -33,29 +34,32 @@ __all__ = [
 ]
 
 
-class Symbol(NamedTuple):
-    """One marker, by its letter in files (matplotlib's), its name in plotly and as a character."""
+SHAPES: Mapping[str, str] = {
+    "●": "circle",
+    "■": "square",
+    "▲": "triangle-up",
+    "◆": "M0,-1.3L1.3,0L0,1.3L-1.3,0Z",
+    "▼": "triangle-down",
+    "✚": "cross",
+    "✖": "M-1,-.5L-.5,-1L0,-.5L.5,-1L1,-.5L.5,0L1,.5L.5,1L0,.5L-.5,1L-1,.5L-.5,0Z",
+    "★": "M0,-1L.23,-.31L.95,-.31L.37,.12L.59,.81L0,.38L-.59,.81L-.37,.12L-.95,-.31L-.23,-.31Z",
+    "+": "M-1,0H1M0,-1V1",
+    "×": "M-1,-1L1,1M-1,1L1,-1",
+    "–": "M-1,0H1",
+    "|": "M0,-1V1",
+    "▮": "M0,-1V1",
+}
+"""Vega's name of each symbol, which is a character, or its path."""
 
-    letter: str
-    plotly: str
-    text: str
+STROKES = ("+", "×", "–", "|", "▮")
+"""Symbols without an area."""
+
+_IN_TURN = tuple(SHAPES)[:8]
 
 
-_SYMBOLS = (
-    Symbol("o", "circle", "●"),
-    Symbol("s", "square", "■"),
-    Symbol("^", "triangle-up", "▲"),
-    Symbol("D", "diamond", "◆"),
-    Symbol("v", "triangle-down", "▼"),
-    Symbol("P", "cross", "✚"),
-    Symbol("X", "x", "✖"),
-    Symbol("*", "star", "★"),
-)
-
-
-def symbols(labels: Iterable[str]) -> dict[str, Symbol]:
-    """Return the marker of each label, by order of appearance."""
-    return {label: _SYMBOLS[i % len(_SYMBOLS)] for i, label in enumerate(dict.fromkeys(labels))}
+def symbols(labels: Iterable[str]) -> dict[str, str]:
+    """Return the symbol of each label, by order of appearance."""
+    return {label: _IN_TURN[i % len(_IN_TURN)] for i, label in enumerate(dict.fromkeys(labels))}
 
 
 ROUNDING = 1e-12

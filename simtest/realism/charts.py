@@ -4,10 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from simtest.pages.axes import Axis, finite, log_range
-from simtest.pages.chart import NOTHING, Chart, Line, Mark, Panel
+from simtest.pages.charts import NOTHING, Axis, Chart, Line, Mark, Panel, finite, log_range
 from simtest.pages.palette import NEUTRAL, SERIES
-from simtest.pages.style import Symbol, number, symbols
+from simtest.pages.style import number, symbols
 from simtest.realism.comparison import Comparison, Quartiles, SetOfFrames, statistic_of
 from simtest.realism.distance import NEAR, VERDICTS, StatisticDistance, distance_text, mean_distribution
 from simtest.realism.frame_statistics import COLUMNS
@@ -22,7 +21,7 @@ VERDICT_SYMBOLS = symbols(VERDICTS)
 LEAST_DISTANCE, MOST_DISTANCE = 0.1, 100.0
 """Distances beyond are drawn here; the table holds the numbers."""
 
-_DOT = Symbol(".", "circle", "●")
+_DOT = "●"
 _POINTS, _STEPS = 120, 240
 _BOX = 0.3  # half the height of a box, whose row is 1 high
 

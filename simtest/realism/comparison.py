@@ -117,13 +117,7 @@ class Comparison:
 def compare(
     real: Sequence[NamedFrame], generated: Sequence[NamedFrame], progress: Progress | None = None, seed: int = 0
 ) -> Comparison:
-    """Measure both sets and compare them; frames that cannot be measured are left out with their reason.
-
-    Raises
-    ------
-    InputError
-        If a side has no frame that can be measured.
-    """
+    """Measure both sets and compare them; frames that cannot be measured are left out with their reason."""
     total, done = len(real) + len(generated) + 1, 0
     left_out: list[LeftOut] = []
     sides = []

@@ -78,13 +78,7 @@ def by_scene(frames: Sequence[tuple[str, Measured]]) -> dict[str, Measured]:
 
 
 def distances(real: Scenes, generated: Scenes, seed: int = 0) -> list[StatisticDistance]:
-    """Compare two sets of frames by every statistic.
-
-    Raises
-    ------
-    InputError
-        If a side has no scene.
-    """
+    """Compare two sets of frames by every statistic."""
     for name, scenes in (("real", real), ("generated", generated)):
         if not scenes:
             raise InputError(f"realism: no {name} frames; at least one is needed")

@@ -11,16 +11,16 @@ import numpy as np
 from simtest.dataset.reader import read_samples, shard_names
 from simtest.errors import InputError
 from simtest.reconstruction.image_io import Source, is_sequence, open_source, read_picture
-from simtest.runtime.arrays import AnyArray, Image
-from simtest.runtime.kept_arrays import only_reading
-from simtest.runtime.limits import check_count, check_file
-from simtest.runtime.resources import shown
+from simtest.runtime.arrays import AnyArray, Image, only_reading
+from simtest.runtime.files import check_count, require_plain
 from simtest.spec.scene import Scene, load_scene
 
 if TYPE_CHECKING:
     from simtest.rendering import Session
 
 Item = TypeVar("Item")
+
+MOST_GENERATED = 10_000
 
 FILM_FRAMES = 20
 """Frames of one film that are measured, evenly spread: neighbours are nearly the same picture."""
@@ -42,16 +42,11 @@ def open_frames(paths: Sequence[Path]) -> list[NamedFrame]:
     """Open picture files, each a scene; films, each a scene; and folders of pictures, each picture a scene.
 
     Pictures of one film lie in a folder whose name ends in ``.film``: it is one scene.
-
-    Raises
-    ------
-    InputError
-        If a path is missing or holds no frame.
     """
     frames: list[NamedFrame] = []
     for path in paths:
         if not is_sequence(path):
-            check_file(path, "picture_bytes", "a picture, a film or a folder of pictures")
+            require_plain(path, "picture_bytes", "a picture, a film or a folder of pictures")
             frames.append(NamedFrame(str(path), path.name, partial(read_picture, path)))
             continue
         source = open_source(path)
@@ -83,7 +78,7 @@ class _Film:
             if frame.index == index:
                 return frame.read()
         path, count = self.source.path, self.source.count
-        raise InputError(f"{shown(path)}: ends after {self.held} of the {count} frames that it announces")
+        raise InputError(f"{path}: ends after {self.held} of the {count} frames that it announces")
 
 
 def _as_values(picture: AnyArray) -> Image:
@@ -104,20 +99,15 @@ def open_generated(against: str, count: int, surfaces: Sequence[str] = ()) -> li
     folder's pictures `count` are taken, evenly spread. `surfaces` names those that are taken of a dataset, by default
     all. A scene is rendered `count` times, from another viewpoint and with another seed of relief, pattern and noise
     each time; each frame counts as a scene.
-
-    Raises
-    ------
-    InputError
-        If there is nothing to open, `count` is below 1, or surfaces are named where they cannot be told apart.
     """
-    check_count("generated_frames", count, "--count")
+    check_count(count, "--count", MOST_GENERATED)
     if not against.strip():
         raise InputError("--against is empty; must be a dataset's folder, a folder of pictures, or a scene")
     path = Path(against)
     if path.is_dir() and (path / "manifest.json").is_file():
         return _dataset(path, count, surfaces)
     if surfaces:
-        raise InputError(f"--surface {shown(surfaces[0])}: only of a dataset, and {shown(against)} is none")
+        raise InputError(f"--surface {surfaces[0]}: only of a dataset, and {against} is none")
     if path.exists() and path.suffix != ".toml":
         return list(_spread(open_frames([path]), count))
     return rendered_frames(load_scene(against), count)
@@ -141,7 +131,7 @@ def _dataset(path: Path, count: int, surfaces: Sequence[str]) -> list[NamedFrame
     held = index["surface"].unique(maintain_order=True).to_list()
     for name in surfaces:
         if name not in held:
-            raise InputError(f"--surface {shown(name)}: {shown(path)} has none; it has {', '.join(held)}")
+            raise InputError(f"--surface {name}: {path} has none; it has {', '.join(held)}")
     if surfaces:
         index = index.filter(pl.col("surface").is_in(list(surfaces)))
     # The first sample of each anatomy, then the second of each, ...: neighbours show one anatomy.
@@ -155,7 +145,7 @@ def _dataset(path: Path, count: int, surfaces: Sequence[str]) -> list[NamedFrame
 def _sample(path: Path, shard: str, index: int) -> Image:
     for sample in read_samples(path, fields=["image"], shards=[shard], indices={index}):
         return _as_values(sample.images["image"])
-    raise InputError(f"{shown(path / shard)}: has no sample {index}; simtest dataset verify --repair mends it")
+    raise InputError(f"{path / shard}: has no sample {index}; simtest dataset verify --repair mends it")
 
 
 def varied(scene: Scene, number: int) -> Scene:

@@ -100,11 +100,6 @@ def measure(picture: Image) -> Measured:
     ----------
     picture : ndarray of float32, shape (H, W, 3)
         sRGB values in [0, 1].
-
-    Raises
-    ------
-    InputError
-        If the picture has no colours or is smaller than 64 px.
     """
     if not is_coloured(picture):
         raise InputError(f"frame of shape {picture.shape} has no colours: realism takes colour frames, (H, W, 3)")

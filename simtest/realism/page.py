@@ -1,9 +1,9 @@
 """Writes a comparison: realism.json, figures as PNG, and one HTML file that needs nothing else."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from simtest.pages import WRITTEN, chart_png, chart_web, pixels
+from simtest.pages import WRITTEN, pixels
+from simtest.pages.charts import Chart, embedded, png
 from simtest.pages.html import environment
 from simtest.realism import charts
 from simtest.realism.comparison import Comparison, Progress, SetOfFrames, plain
@@ -12,9 +12,6 @@ from simtest.realism.frame_statistics import STATISTICS
 from simtest.realism.strip import draw_strip
 from simtest.runtime import provenance
 from simtest.runtime.files import make_folder, write_atomically, write_json
-
-if TYPE_CHECKING:
-    from simtest.pages.chart import Chart
 
 PAGE, RESULT = "index.html", "realism.json"
 
@@ -43,11 +40,6 @@ def write_comparison(
     -------
     Path
         The page.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be made.
     """
 
     def tell(step: int) -> None:
@@ -57,12 +49,13 @@ def write_comparison(
     make_folder(out / "figures")
     tell(0)
     rows = [("real", found.real.pictures), ("generated", found.generated.pictures)]
-    _write_png(out / "figures" / "strip.png", draw_strip([row for row in rows if row[1]], STRIP_HEIGHT_PX))
+    strip = draw_strip([row for row in rows if row[1]], STRIP_HEIGHT_PX)
+    _write_png(out / "figures" / "strip.png", pixels.png(strip))
     tell(1)
     distance, columns = charts.distance_chart(found), charts.distribution_charts(found)
-    _write_charts(out / "figures" / "distances.png", [distance])
+    _write_png(out / "figures" / "distances.png", png([distance]))
     tell(2)
-    _write_charts(out / "figures" / "distributions.png", columns)
+    _write_png(out / "figures" / "distributions.png", png(columns))
     tell(3)
     html = _render(found, against, command, distance, columns)
     # These come last, so that a stopped command leaves the earlier ones.
@@ -74,23 +67,17 @@ def write_comparison(
     return out / PAGE
 
 
-def _write_charts(path: Path, drawn: "list[Chart]") -> None:
-    _write_png(path, chart_png.draw(drawn)[0])
-
-
-def _write_png(path: Path, picture: pixels.Pixels) -> None:
-    content = pixels.png(picture)
+def _write_png(path: Path, content: bytes) -> None:
     write_atomically(path, lambda part: part.write_bytes(content))
 
 
-def _render(found: Comparison, against: str, command: str, distance: "Chart", columns: "list[Chart]") -> str:
+def _render(found: Comparison, against: str, command: str, distance: Chart, columns: list[Chart]) -> str:
     """Fill in the page's template."""
     made_by = provenance.environment()
     groups, at = [], 0
     for statistic in STATISTICS:
         groups.append((statistic, columns[at : at + len(statistic.columns)]))
         at += len(statistic.columns)
-    figures = {chart.key: chart_web.figure(chart) for chart in (distance, *columns)}
     sides = (("real", found.real), ("generated", found.generated))
     return environment().get_template("realism.html.j2").render(
         found=found, title=Path(against).stem or against, command=command, distance=distance, groups=groups,
@@ -98,11 +85,11 @@ def _render(found: Comparison, against: str, command: str, distance: "Chart", co
         strips=[(name, [(title, pixels.data_address(picture)) for title, picture in held.pictures])
                 for name, held in sides],
         colours={"real": charts.REAL, "generated": charts.GENERATED},
-        verdicts={word: (symbol.text, charts.VERDICT_COLOURS[word]) for word, symbol in charts.VERDICT_SYMBOLS.items()},
+        verdicts={word: (symbol, charts.VERDICT_COLOURS[word]) for word, symbol in charts.VERDICT_SYMBOLS.items()},
         text=distance_text, finite=plain, near=NEAR, least=LEAST_SCENES,
         provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"],
                     "python": made_by["python"]},
-        figures=chart_web.packed(figures), plotly=chart_web.packed_plotly(),
+        **embedded([distance, *columns]),
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from simtest.pages.sheet import Pixels, Sheet, text_width
+from simtest.pages.pixels import Pixels, font
 from simtest.runtime.arrays import Picture
 
 GAP_PX, TITLE_PX, CAPTION_PX = 8, 26, 16
@@ -25,21 +25,25 @@ def draw_strip(rows: Sequence[tuple[str, Named]], height: int) -> Pixels:
     height : int
         Of each picture, px; all are brought to it.
     """
+    from PIL import Image, ImageDraw
+
     fitted = [(title, [(name, _fitted(picture, height)) for name, picture in held]) for title, held in rows]
     widths = [sum(picture.shape[1] + GAP_PX for _, picture in held) for _, held in fitted]
-    titles = [round(text_width(title, 0.7 * TITLE_PX)) + GAP_PX for title, _ in rows]
+    large, small = font(0.7 * TITLE_PX, bold=True), font(0.75 * CAPTION_PX)
+    titles = [round(large.getlength(title)) + GAP_PX for title, _ in rows]
     line = TITLE_PX + height + CAPTION_PX + 2 * GAP_PX
-    sheet = Sheet.white(max([*widths, *titles], default=0) + GAP_PX, line * len(rows) + GAP_PX)
+    size = max([*widths, *titles], default=0) + GAP_PX, line * len(rows) + GAP_PX
+    sheet = Image.new("RGB", size, "white")
+    pen = ImageDraw.Draw(sheet)
     for number, (title, held) in enumerate(fitted):
         x, y = GAP_PX, GAP_PX + number * line
-        sheet.text((x, y), title, 0.7 * TITLE_PX, _INK, across=0.0, down=0.0, bold=True)
+        pen.text((x, y), title, fill=_INK, font=large)
         y += TITLE_PX
         for name, picture in held:
-            sheet.pixels[y : y + height, x : x + picture.shape[1]] = picture
-            caption = _shortened(name, picture.shape[1])
-            sheet.text((x, y + height + 2), caption, 0.75 * CAPTION_PX, _SOFT, across=0.0, down=0.0)
+            sheet.paste(Image.fromarray(picture), (x, y))
+            pen.text((x, y + height + 2), _shortened(name, picture.shape[1]), fill=_SOFT, font=small)
             x += picture.shape[1] + GAP_PX
-    return sheet.pixels
+    return np.asarray(sheet)
 
 
 def _fitted(picture: Picture, height: int) -> Picture:
@@ -52,6 +56,6 @@ def _fitted(picture: Picture, height: int) -> Picture:
 def _shortened(name: str, width: int) -> str:
     """Return a name that fits below its picture, px."""
     text = name
-    while len(text) > 4 and text_width(text, 0.75 * CAPTION_PX) > width:
+    while len(text) > 4 and font(0.75 * CAPTION_PX).getlength(text) > width:
         text = text[: -2 if text == name else -3].rstrip(".…") + "…"
     return text

@@ -19,24 +19,4 @@ if TYPE_CHECKING:
         reconstruct_colour,
     )
 
-_HOMES = {
-    "simtest.reconstruction.picture_detection": ("detect_in_picture",),
-    "simtest.reconstruction.pipeline": (
-        "DEFAULT_ESTIMATORS",
-        "Specularities",
-        "Specularity",
-        "reconstruct",
-        "reconstruct_colour",
-    ),
-}
-
-__all__ = [
-    "DEFAULT_ESTIMATORS",
-    "Specularities",
-    "Specularity",
-    "detect_in_picture",
-    "reconstruct",
-    "reconstruct_colour",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -10,14 +10,11 @@ from simtest.calibration import Calibration, Priors, Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.detection.colour import ColourDetector
 from simtest.detection.detector import Detector, load_detector
-from simtest.detection.learned_detector import LearnedDetector
 from simtest.detection.peaks import PeakDetector
 from simtest.errors import InputError
 from simtest.reconstruction.assumptions import Assumption
 from simtest.reconstruction.picture_values import is_coloured
-from simtest.runtime.arrays import Image
-from simtest.runtime.resources import shown
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Image, short_repr
 
 AUTO = "auto"
 ENCODINGS = ("srgb", "linear")
@@ -77,7 +74,7 @@ def check_encoding(encoding: str | None, calibration: Calibration) -> None:
     if encoding is None:
         return
     if encoding not in ENCODINGS:
-        raise InputError(f"encoding = {shown(repr(encoding), 80)}: must be one of {', '.join(ENCODINGS)}, or None")
+        raise InputError(f"encoding = {encoding!r:.80}: must be one of {', '.join(ENCODINGS)}, or None")
     if calibration.response is not None:
         raise InputError(f"encoding = {encoding!r}: the calibration states the response; give one of them")
 
@@ -111,17 +108,16 @@ def choose_detector(
     if isinstance(found, ColourDetector) and (picture.ndim != 3 or picture.shape[2] != 3):
         raise InputError(f"detector {name}: the picture is grey; must be peaks")
     # A detector that is given, or another package's, decides by itself what it takes.
-    if isinstance(told, str) and isinstance(found, ColourDetector | PeakDetector | LearnedDetector):
-        # The same object where it fits, which keeps a network that was read.
-        found = found if found.isolated == isolated else replace(found, isolated=isolated)
+    if isinstance(told, str) and isinstance(found, ColourDetector | PeakDetector):
+        found = replace(found, isolated=isolated)
     return name, found
 
 
 def choose_smoothing(told: float | None, finder: Detector) -> float:
-    """Return the smoothing, px: the given one, or else 1 px by colour or a network, and 2 px by other detectors."""
+    """Return the smoothing, px: the given one, or else 1 px by colour and 2 px by other detectors."""
     if told is not None:
         return told
-    return SMOOTHING_BY_COLOUR_PX if isinstance(finder, ColourDetector | LearnedDetector) else DEFAULT_SMOOTHING_PX
+    return SMOOTHING_BY_COLOUR_PX if isinstance(finder, ColourDetector) else DEFAULT_SMOOTHING_PX
 
 
 def untold(calibration: Calibration, **told: object) -> tuple[str, ...]:

@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.geometry.quaternions import rotation_of
+from simtest.geometry.vectors import rotation_of
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import shown
 
 POSITION, ROTATION = "SavedPosition_", "SavedRotationQuaternion_"
 """Begins of the names of SimCol3D's files."""
@@ -27,13 +26,7 @@ DOWN = np.diag([1.0, -1.0, 1.0])
 
 
 def dataset_poses(path: Path, text: str, where: str) -> list[Array] | None:
-    """Return the poses of a data set's file, world_from_camera, shape (4, 4), mm; None where it is none of them.
-
-    Raises
-    ------
-    InputError
-        If a line is malformed, or SimCol3D's other file is missing or of another length.
-    """
+    """Return the poses of a data set's file, world_from_camera, shape (4, 4), mm; None where it is none of them."""
     if path.name.startswith(POSITION):
         return _simcol3d(path, text, where)
     first = next((line for line in text.splitlines() if line.strip()), "")
@@ -53,15 +46,15 @@ def _simcol3d(path: Path, text: str, where: str) -> list[Array]:
     other = path.with_name(ROTATION + path.name.removeprefix(POSITION))
     try:
         turned = require_plain(other, "record_bytes").read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        raise InputError(f"{where}: needs {shown(other.name)} beside it, which cannot be read") from None
-    at, of = _numbers(text, 3, None, where), _numbers(turned, 4, None, f"--poses {shown(other)}")
+    except (OSError, ValueError):
+        raise InputError(f"{where}: needs {other.name} beside it, which cannot be read") from None
+    at, of = _numbers(text, 3, None, where), _numbers(turned, 4, None, f"--poses {other}")
     if len(at) != len(of):
-        raise InputError(f"{where}: {len(at)} positions, but {shown(other.name)} has {len(of)} rotations")
+        raise InputError(f"{where}: {len(at)} positions, but {other.name} has {len(of)} rotations")
     poses = []
     for number, (position, (x, y, z, w)) in enumerate(zip(at, of, strict=True)):
         T = np.eye(4)
-        T[:3, :3] = DOWN @ rotation_of((w, x, y, z), f"--poses {shown(other)}: pose {number}") @ DOWN
+        T[:3, :3] = DOWN @ rotation_of((w, x, y, z), f"--poses {other}: pose {number}") @ DOWN
         T[:3, 3] = DOWN @ position * MM_PER_CM
         poses.append(T)
     return poses
@@ -78,6 +71,6 @@ def _numbers(text: str, count: int, separator: str | None, where: str) -> list[l
         except ValueError:
             row = []
         if len(row) != count or not np.isfinite(row).all():
-            raise InputError(f"{where}: line {number}: {shown(line.strip(), 60)}; must be {count} numbers")
+            raise InputError(f"{where}: line {number}: {line.strip()!s:.60}; must be {count} numbers")
         rows.append(row)
     return rows

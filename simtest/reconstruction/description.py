@@ -20,9 +20,8 @@ from simtest.reconstruction.motion_record import MotionRecord
 from simtest.reconstruction.pipeline import Reconstruction, Specularity
 from simtest.reconstruction.ranking import StatedErrors, best_of, stated_errors
 from simtest.runtime import provenance
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, short_repr
 from simtest.runtime.files import JsonObject
-from simtest.runtime.short_repr import short_repr
 from simtest.spec import describe_camera
 
 Points = list[list[float]]

@@ -8,7 +8,7 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import Patch
 from simtest.reconstruction.choices import Choices
-from simtest.runtime.short_repr import LONGEST, clipped, short_repr, vector
+from simtest.runtime.arrays import LONGEST, clipped, short_repr, vector
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,10 @@
 """Reading pictures, folders of pictures and videos: values in [0, 1], or an error of one line that says why not."""
 
+import contextlib
+import os
 import re
+import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,9 +19,8 @@ from PIL import Image as PillowImage
 from simtest.errors import InputError
 from simtest.reconstruction.picture_values import scale_picture
 from simtest.runtime.arrays import Image
-from simtest.runtime.limits import check_file, check_limit, check_picture_size
-from simtest.runtime.quiet import quiet_libraries
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import plain_errors
+from simtest.runtime.files import check_limit, check_picture_size, require_plain
 
 PATIENCE_MS = 5000
 """After so long FFmpeg gives up opening a film, or reading a frame."""
@@ -34,6 +37,8 @@ TURNED = {"JPEG": "as they are stored", "MPO": "as they are stored", "TIFF": "as
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv")
 
+_ERROR_STREAM = threading.RLock()
+
 
 def read_picture(path: Path) -> Image:
     """Read a picture of 8 or 16 bits as values in [0, 1], as they are encoded; shape (H, W) or (H, W, 3), RGB.
@@ -48,38 +53,29 @@ def read_picture(path: Path) -> Image:
         and (clear := float((picture[..., 3] < picture[..., 3].max()).mean()))
     ):
         warnings.warn(
-            f"{shown(path)}: its alpha channel is ignored, by which {clear:.2g} of the pixels are transparent",
+            f"{path}: its alpha channel is ignored, by which {clear:.2g} of the pixels are transparent",
             stacklevel=3,
         )
-    scaled = scale_picture(picture, shown(path))
+    scaled = scale_picture(picture, str(path))
     if scaled is None:
-        raise InputError(f"{shown(path)}: pixels are {picture.dtype}; must be 8 or 16 bits")
+        raise InputError(f"{path}: pixels are {picture.dtype}; must be 8 or 16 bits")
     # OpenCV's order of channels is BGR.
     return scaled if scaled.ndim == 2 else np.ascontiguousarray(scaled[:, :, ::-1])
 
 
+@plain_errors
 def read_raw(path: Path, wanted: str) -> npt.NDArray[np.generic]:
-    """Read the pixels of a picture file as they are, in OpenCV's order of channels; of several pages the first.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, no plain file, no picture, or beyond a limit (`simtest.runtime.limits`): checked before
-        it is decoded.
-    """
-    check_file(path, "picture_bytes", wanted)
+    """Read the pixels of a picture file as they are, in OpenCV's order of channels; of several pages the first."""
+    require_plain(path, "picture_bytes", wanted)
     _check_header(path)
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+    data = np.fromfile(path, dtype=np.uint8)
     try:
         with quiet_libraries():
             picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     except cv2.error as error:
-        raise InputError(f"{shown(path)}: cannot be decoded ({str(error).splitlines()[0][:120]})") from error
+        raise InputError(f"{path}: cannot be decoded ({str(error).splitlines()[0][:120]})") from error
     if picture is None:
-        raise InputError(f"{shown(path)}: no picture ({data.size} bytes); must be PNG, JPEG, BMP or TIFF")
+        raise InputError(f"{path}: no picture ({data.size} bytes); must be PNG, JPEG, BMP or TIFF")
     check_picture_size(path, picture.shape[1], picture.shape[0])
     return np.asarray(picture)
 
@@ -110,12 +106,12 @@ def _check_header(path: Path) -> None:
     if turned != 1:
         how = TURNED.get(str(header.format), "")
         warnings.warn(
-            f"{shown(path)}: its orientation tag is {turned}: pixels are taken {how}, and the calibration must be of "
+            f"{path}: its orientation tag is {turned}: pixels are taken {how}, and the calibration must be of "
             "such pictures",
             stacklevel=4,
         )
     if animated:
-        warnings.warn(f"{shown(path)}: holds several pictures; the first is used", stacklevel=4)
+        warnings.warn(f"{path}: holds several pictures; the first is used", stacklevel=4)
 
 
 def _tiff_size(path: Path) -> tuple[int, int, int]:
@@ -184,7 +180,7 @@ def _video_frames(path: Path) -> Iterator[SequenceFrame]:
         with quiet_libraries():
             done, frame = capture.retrieve()
         if not done or frame is None:
-            raise InputError(f"{shown(path)}: a frame cannot be decoded")
+            raise InputError(f"{path}: a frame cannot be decoded")
         values = frame.astype(np.float32) / np.float32(255)
         return values if values.ndim == 2 else np.ascontiguousarray(values[:, :, ::-1])
 
@@ -213,32 +209,26 @@ def _grabbed(capture: cv2.VideoCapture) -> bool:
 
 def is_sequence(path: Path) -> bool:
     """Return whether a path is a folder, or a video by its suffix."""
-    try:
-        return path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+    return path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def open_source(path: Path) -> Source:
     """Open a folder or a video; raise `InputError` if there is none, or it holds no frame."""
     if path.is_dir():
-        try:
-            files = [file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES and file.is_file()]
-        except OSError as error:
-            raise InputError(f"{shown(path)}: cannot be read ({error.strerror})") from error
+        files = [file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES and file.is_file()]
         if not files:
-            raise InputError(f"{shown(path)}: holds no pictures ({', '.join(PICTURE_SUFFIXES)})")
+            raise InputError(f"{path}: holds no pictures ({', '.join(PICTURE_SUFFIXES)})")
         return Source(path, len(files), tuple(sorted(files, key=_natural)))
-    size = check_file(path, "film_bytes", "a film, a picture or a folder of pictures")
+    size = require_plain(path, None, "a film, a picture or a folder of pictures").stat().st_size
     # FFmpeg takes whatever it can make sense of, playlists of other files among it.
     with path.open("rb") as file:
         head = file.read(16)
         if not _is_film(head):
-            raise InputError(f"{shown(path)}: no video that can be read ({size} bytes, of no known container)")
+            raise InputError(f"{path}: no video that can be read ({size} bytes, of no known container)")
     capture = _capture(path)
     # OpenCV opens some files that hold no frame, so the first is fetched.
     if not capture.isOpened() or not _grabbed(capture):
-        raise InputError(f"{shown(path)}: no video that can be read ({size} bytes)")
+        raise InputError(f"{path}: no video that can be read ({size} bytes)")
     keys = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT)
     width, height, count = (int(capture.get(key)) for key in keys)
     capture.release()
@@ -261,3 +251,26 @@ def _is_film(head: bytes) -> bool:
 def _natural(path: Path) -> list[tuple[int, int, str]]:
     """Return the key that sorts frame10 behind frame9."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", path.name) if part]
+
+
+@contextlib.contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Send nowhere what is written to the process's error stream meanwhile; for single calls of a library.
+
+    libpng, libtiff and FFmpeg write to the descriptor itself, which no setting of OpenCV prevents.
+    """
+    with _ERROR_STREAM:
+        try:
+            sys.stderr.flush()
+            kept = os.dup(2)
+        except (OSError, ValueError, AttributeError):
+            # There is no error stream.
+            yield
+            return
+        try:
+            with open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)

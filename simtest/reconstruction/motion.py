@@ -17,7 +17,6 @@ from simtest.reconstruction.description import SpecularityRecord
 from simtest.reconstruction.motion_record import MotionRecord
 from simtest.reconstruction.tracking import TrackedFrame
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown
 
 MOST_VIEWS = 6
 """Other frames that judge a highlight: evenly spaced ones of all that may."""
@@ -43,7 +42,7 @@ _BENDS = {1: "convex", -1: "concave", 0: "undecided"}
 
 def check_priors(priors: Priors, camera: Path) -> None:
     """Raise `InputError` where a calibration lacks what the method needs."""
-    where = f"--camera {shown(camera)}: --poses needs"
+    where = f"--camera {camera}: --poses needs"
     if priors.distance_mm is None:
         raise InputError(
             f"{where} the working distance; give rig.distance_mm with distance_sd_mm, or distance_range_mm"

@@ -18,7 +18,6 @@ from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.result_page import write_picture_page
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.files import make_folder, write_atomically, write_json
-from simtest.runtime.machine_errors import write_error
 
 MANY = 10
 """Above this many specularities normals.json is written on one line, since most of it is outlines."""
@@ -45,15 +44,12 @@ def write_outputs(
     arrays = constraints_arrays(record)
     points = normals_ply(spots, camera, depths)
     make_folder(out)
-    try:
-        write_json(out / "normals.json", record, compact=len(spots) > MANY)
-        write_atomically(out / "normals.csv", lambda part: write_csv(part, COLUMNS, normals_rows(spots)))
-        write_atomically(out / "normals.ply", lambda part: part.write_text(points, encoding="ascii"))
-        write_atomically(out / "overlay.png", lambda part: cv2.imwrite(str(part), draw_overlay(picture, spots)))
-        write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
-        write_atomically(out / "index.html", lambda part: write_picture_page(part, record, picture))
-    except OSError as error:
-        raise write_error(error, out) from error
+    write_json(out / "normals.json", record, compact=len(spots) > MANY)
+    write_atomically(out / "normals.csv", lambda part: write_csv(part, COLUMNS, normals_rows(spots)))
+    write_atomically(out / "normals.ply", lambda part: part.write_text(points, encoding="ascii"))
+    write_atomically(out / "overlay.png", lambda part: cv2.imwrite(str(part), draw_overlay(picture, spots)))
+    write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
+    write_atomically(out / "index.html", lambda part: write_picture_page(part, record, picture))
     return [out / name for name in FILES]
 
 

@@ -16,7 +16,6 @@ from simtest.reconstruction.description import PictureRecord, describe
 from simtest.reconstruction.picture_values import check_size
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import shown
 
 TARGETS = ("fine", "base")
 
@@ -57,12 +56,6 @@ class Options:
         What the field of view spans; "view": the round view in the picture, whose centre is then the principal point.
     poses : Path, optional
         Of the camera over the frames of a sequence: tells convex from concave (`simtest.reconstruction.motion`).
-
-    Raises
-    ------
-    InputError
-        If the camera is given twice or not at all, the target is none of these, or no detector of that name is
-        registered.
     """
 
     camera: Path | None = None
@@ -96,7 +89,7 @@ def parse_roi(text: str) -> tuple[int, int, int, int]:
     try:
         x, y, width, height = (int(part) for part in text.split(","))
     except ValueError:
-        raise InputError(f"--roi {shown(text, 60)}: must be x,y,w,h, four integers in px") from None
+        raise InputError(f"--roi {text!s:.60}: must be x,y,w,h, four integers in px") from None
     return x, y, width, height
 
 
@@ -144,7 +137,7 @@ def reconstruct_values(
     try:
         check_size(picture, calibration.camera)
     except InputError as error:
-        raise InputError(f"{shown(name)}: {error}") from error
+        raise InputError(f"{name}: {error}") from error
     # linear light, detect, estimate
     made, choices = run_picture(
         picture, calibration, options.encoding, options.detector, options.estimators, options.roi, options.smoothing_px,

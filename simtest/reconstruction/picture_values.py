@@ -9,7 +9,6 @@ import numpy.typing as npt
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import shown
 
 LARGEST = {"uint8": 2**8 - 1, "uint16": 2**16 - 1}
 """The value that light of full scale has, by the type of the values."""
@@ -117,7 +116,7 @@ def check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
     try:
         x, y, width, height = (operator.index(value) for value in roi)
     except (TypeError, ValueError):
-        raise InputError(f"roi = {shown(repr(roi), 80)}: must be x, y, width, height: four integers, px") from None
+        raise InputError(f"roi = {roi!r:.80}: must be x, y, width, height: four integers, px") from None
     return x, y, width, height
 
 

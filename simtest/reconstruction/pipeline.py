@@ -22,7 +22,7 @@ from simtest.estimators.process.naming import short_names
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
-from simtest.geometry.gaussian_smoothing import share_of_noise
+from simtest.geometry.patch import share_of_noise
 from simtest.reconstruction.assumptions import assumptions, calibration_of_view
 from simtest.reconstruction.choices import (
     AUTO,
@@ -37,7 +37,7 @@ from simtest.reconstruction.choices import (
 from simtest.reconstruction.found import Reconstruction, Specularities, Specularity
 from simtest.reconstruction.picture_values import check_frame, check_roi, check_size, image_size
 from simtest.runtime.arrays import Array, Image, Mask
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import plain_errors
 
 DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
 MAX_SMOOTHING_PX = 50
@@ -51,6 +51,7 @@ SMALL_RADIUS = 3.0
 estimates have the flag ``small``."""
 
 
+@plain_errors
 def reconstruct(
     frame: npt.ArrayLike,
     camera: Camera | Calibration | float,
@@ -428,5 +429,5 @@ def _calibration(camera: object) -> Calibration:
 
 def _check_names(names: Sequence[str]) -> Sequence[str]:
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-        raise InputError(f"estimators = {shown(repr(names), 80)}: must be a list of names")
+        raise InputError(f"estimators = {names!r:.80}: must be a list of names")
     return names

@@ -17,11 +17,11 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.estimators.two_views import PoseError
-from simtest.geometry.quaternions import rotation_of
+from simtest.geometry.vectors import rotation_of
 from simtest.reconstruction.dataset_poses import dataset_poses
 from simtest.runtime.arrays import Array
+from simtest.runtime.boundary import close_names
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import close_names, shown
 
 UNITS_MM = {"mm": 1.0, "m": 1000.0}
 
@@ -75,25 +75,20 @@ class Poses:
         ----------
         names, indices : sequence
             Names of the frames' files, and their numbers in the sequence, which count where the poses have no names.
-
-        Raises
-        ------
-        InputError
-            If no frame is named in the file, or there are fewer poses than frames.
         """
         if self.names:
             table = {name: pose for name, pose in zip(self.names, self.world_from_camera, strict=True)}
             found = [table.get(name) for name in names]
             if all(pose is None for pose in found):
                 raise InputError(
-                    f"--poses {shown(self.path)}: names {shown(self.names[0], 60)}; must name frames of the folder, "
-                    f"such as {shown(names[0], 60)}"
+                    f"--poses {self.path}: names {self.names[0]!s:.60}; must name frames of the folder, "
+                    f"such as {names[0]!s:.60}"
                 )
             return found
         count = len(self.world_from_camera)
         if max(indices) >= count:
             raise InputError(
-                f"--poses {shown(self.path)}: {count} poses; must be one for each of the {max(indices) + 1} frames"
+                f"--poses {self.path}: {count} poses; must be one for each of the {max(indices) + 1} frames"
             )
         return [self.world_from_camera[index] for index in indices]
 
@@ -102,7 +97,7 @@ class Poses:
 
         Poses without names must be as many as the files, and a name must be that of one file.
         """
-        where, count = f"--poses {shown(self.path)}", len(self.world_from_camera)
+        where, count = f"--poses {self.path}", len(self.world_from_camera)
         check_names(where, self.names, names)
         found = self.of_frames(names, range(len(names)))
         if not self.names and count != len(names):
@@ -116,14 +111,14 @@ class Poses:
 
         Names must number the frames from 0 or 1 without a gap. There must be one for each of at least `least` frames.
         """
-        where, count, poses = f"--poses {shown(self.path)}", len(self.world_from_camera), self
+        where, count, poses = f"--poses {self.path}", len(self.world_from_camera), self
         if self.names:
             numbers = [int((re.findall(r"\d+", Path(name).stem) or ["-1"])[-1]) for name in self.names]
             order = np.argsort(numbers)
             first = numbers[order[0]]
             if first not in (0, 1) or sorted(numbers) != list(range(first, first + count)):
                 raise InputError(
-                    f"{where}: names {shown(self.names[0], 60)}; of a film the names must number its frames from 0 or "
+                    f"{where}: names {self.names[0]!s:.60}; of a film the names must number its frames from 0 or "
                     "1 without a gap; or give the folder of the pictures in its place"
                 )
             poses = replace(self, world_from_camera=self.world_from_camera[order], names=())
@@ -137,16 +132,14 @@ def check_names(where: str, keys: Iterable[str], files: Sequence[str]) -> None:
     counts = Counter(Path(name).name for name in files)
     for key in keys:
         if counts[key] > 1:
-            raise InputError(f"{where}: {shown(key, 60)} names {counts[key]} pictures; must be given other file names")
+            raise InputError(f"{where}: {key} names {counts[key]} pictures; must be given other file names")
 
 
 def read_poses(path: Path) -> Poses:
     """Read a file of poses; raise `InputError`, one line, where it is malformed."""
-    where = f"--poses {shown(path)}"
+    where = f"--poses {path}"
     try:
-        text = require_plain(path, "record_bytes").read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{where}: cannot be read ({error.strerror})") from error
+        text = require_plain(path, "record_bytes", "a file of poses").read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{where}: no text (byte {error.start}); must be JSON or a TUM trajectory") from error
     is_json = path.suffix.lower() == ".json"
@@ -162,7 +155,7 @@ def read_poses(path: Path) -> Poses:
         raise InputError(f"{where}: holds no pose; must hold one for each frame")
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])
-        raise InputError(f"{where}: names {shown(twice, 60)} twice; must give each frame one pose")
+        raise InputError(f"{where}: names {twice} twice; must give each frame one pose")
     if foreign and "unit" not in settings:
         how = 'a key "unit": "mm"' if is_json else "a line # unit: mm"
         raise InputError(f"{where}: its unit of length is arbitrary; state it by {how}, or the millimetres of one unit")
@@ -197,8 +190,7 @@ def _unit_mm(unit: object, where: str) -> float:
         number = np.nan
     if not 0 < number < np.inf:
         raise InputError(
-            f"{where}: unit = {shown(str(unit), 40)}; must be one of {', '.join(UNITS_MM)}, or the millimetres of one "
-            "unit"
+            f"{where}: unit = {unit!s}; must be one of {', '.join(UNITS_MM)}, or the millimetres of one unit"
         )
     return number
 
@@ -213,7 +205,7 @@ def _share(settings: dict[str, Any], key: str, most: float, where: str) -> float
     except (TypeError, ValueError, OverflowError):
         number = np.nan
     if not 0 <= number <= most:
-        raise InputError(f"{where}: {key} = {shown(str(value), 40)}; must be a number in [0, {most:g}]")
+        raise InputError(f"{where}: {key} = {value!s:.40}; must be a number in [0, {most:g}]")
     return number
 
 
@@ -244,7 +236,7 @@ def _from_json(text: str, where: str) -> Read:
                 )
             named = next((entry[key] for key in NAMES if entry.get(key) is not None), None)
             if named is not None and not isinstance(named, str):
-                raise InputError(f"{at}: names its frame {shown(str(named), 40)}; must be the name of a file")
+                raise InputError(f"{at}: names its frame {named!s}; must be the name of a file")
             names += [] if named is None else [Path(named).name]
         poses.append(_matrix(matrix, at))
     if names and len(names) < len(poses):
@@ -266,8 +258,8 @@ def _is_foreign(text: str, is_json: bool) -> bool:
 
 def _from_others(path: Path, text: str, is_json: bool, where: str) -> Read:
     """Read the poses of another program's file, and the settings that it states."""
-    from simtest.spec.camera_formats import read_poses as read_foreign
     from simtest.spec.camera_formats.common import parse_json
+    from simtest.spec.camera_formats.files import read_poses as read_foreign
 
     try:
         found = read_foreign(path)
@@ -298,7 +290,7 @@ def _setting(line: str, at: str) -> dict[str, Any]:
 def _check_setting(key: str, where: str) -> None:
     """Raise `InputError` for a key that is nearly a setting: what it says would be passed over."""
     if key not in SETTINGS and (meant := close_names(key.lower(), SETTINGS)):
-        raise InputError(f"{where}: {shown(key, 40)}: unknown; did you mean {meant[0]}?")
+        raise InputError(f"{where}: {key}: unknown; did you mean {meant[0]}?")
 
 
 def _matrix(value: object, at: str) -> Array:
@@ -313,7 +305,7 @@ def _matrix(value: object, at: str) -> Array:
     except (TypeError, ValueError, OverflowError):
         T = np.empty(0)
     if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError(f"{at}: {shown(str(value), 40)}; must be a 4 x 4 matrix of numbers")
+        raise InputError(f"{at}: {value!s:.40}; must be a 4 x 4 matrix of numbers")
     R = T[:3, :3]
     off = max(float(np.abs(R @ R.T - np.eye(3)).max()), float(np.abs(T[3] - [0, 0, 0, 1]).max()))
     if off > ROUNDED or np.linalg.det(R) < 0:
@@ -341,7 +333,7 @@ def _from_tum(text: str, where: str) -> Read:
         except ValueError:
             values = []
         if len(values) != 8 or not np.isfinite(values).all():
-            raise InputError(f"{at}: {shown(line.strip(), 60)}; must be 8 numbers: time tx ty tz qx qy qz qw")
+            raise InputError(f"{at}: {line.strip()!s:.60}; must be 8 numbers: time tx ty tz qx qy qz qw")
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = rotation_of(np.roll(values[4:], 1), at), values[1:4]
         poses.append(T)

@@ -34,11 +34,10 @@ from simtest.reconstruction.pipeline import default_estimators
 from simtest.reconstruction.poses import Poses, read_poses
 from simtest.reconstruction.result_page import write_sequence_page
 from simtest.reconstruction.tracking import Track, TrackedFrame, Tracker, tracks_of
-from simtest.runtime.files import JsonObject, make_folder, require_plain, write_atomically, write_json
+from simtest.runtime.boundary import plain_errors
+from simtest.runtime.files import JsonObject, make_folder, read_json, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.machine_errors import write_error
 from simtest.runtime.provenance import environment
-from simtest.runtime.resources import shown
 
 Progress = Callable[[int, int, str], None]
 
@@ -63,6 +62,7 @@ class SequenceResult:
     motion: str | None = None
 
 
+@plain_errors
 def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Progress | None = None) -> SequenceResult:
     """Reconstruct the frames of a folder or a video.
 
@@ -78,11 +78,6 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
     progress : callable, optional
         Called with frames done, frames in all, and the frame's name; what it raises stops the run, and what is done
         is kept.
-
-    Raises
-    ------
-    InputError
-        If the source or the camera is malformed, no frame can be read, or `out` holds a run of other settings.
     """
     source = open_source(path)
     poses = None
@@ -101,7 +96,7 @@ def _checked_poses(path: Path, source: Source, options: Options) -> tuple[Poses,
     from simtest.spec.calibration_file import load_calibration
 
     if options.camera is None:
-        raise InputError(f"--poses {shown(path)}: needs a calibration; give --camera in place of --fov")
+        raise InputError(f"--poses {path}: needs a calibration; give --camera in place of --fov")
     poses, calibration = read_poses(path), load_calibration(options.camera)
     check_priors(calibration.priors, options.camera)
     if source.is_video:
@@ -131,18 +126,18 @@ def _reconstruct(
         run.take(frame)
     # A run that read nothing is an error; one that ended early keeps what it has.
     if not run.frames:
-        raise InputError(f"{shown(path)}: no frame could be read ({run.first_error or 'it has none'})")
+        raise InputError(f"{path}: no frame could be read ({run.first_error or 'it has none'})")
     # The count of a whole film may be off by one.
     if source.is_video and (run.taken < source.count - 1 or source.is_cut):
         how = "its file is cut short; " if source.is_cut else ""
         warnings.warn(
-            f"{shown(path)}: {how}ends after {run.taken} of {source.count} frames; what was read is kept", stacklevel=2
+            f"{path}: {how}ends after {run.taken} of {source.count} frames; what was read is kept", stacklevel=2
         )
     if poses is not None:
         # The count of a film is not known before it is read.
         if source.is_video and not source.is_cut and len(poses.world_from_camera) > run.taken:
             warnings.warn(
-                f"--poses {shown(poses.path)}: {len(poses.world_from_camera)} poses for {run.taken} frames; the first "
+                f"--poses {poses.path}: {len(poses.world_from_camera)} poses for {run.taken} frames; the first "
                 "ones are taken in their order",
                 stacklevel=2,
             )
@@ -235,7 +230,7 @@ class _Run:
         self.is_flipped = fits_flipped_axes(self.frames, told, poses.error, priors)
         for frame in self.frames:
             path = self.folder / f"{frame.index:06d}.json"
-            data = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+            data = read_json(path)
             for entry, spot in zip(data["specularities"], frame.specularities, strict=True):
                 entry["motion"] = spot.motion
             write_json(path, data, compact=True)
@@ -256,7 +251,7 @@ def _slim(spot: SpecularityRecord, needed: Sequence[str]) -> SpecularityRecord:
 
 def _read(path: Path) -> TrackedFrame:
     """Read the file of a frame."""
-    return TrackedFrame.from_json(json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8")))
+    return TrackedFrame.from_json(read_json(path))
 
 
 def _read_done(path: Path, name: str) -> TrackedFrame | None:
@@ -324,14 +319,13 @@ def _check_settings(path: Path, settings: JsonObject) -> None:
     if not path.is_file():
         return
     try:
-        before = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+        before = read_json(path)
     except (OSError, ValueError):
         before = None
     if before != settings:
         keys = [key for key in settings if not isinstance(before, dict) or before.get(key) != settings[key]]
         raise InputError(
-            f"--out {shown(path.parent)}: holds a run with another {', '.join(keys) or 'set of settings'}; "
-            "give another folder"
+            f"--out {path.parent}: holds a run with another {', '.join(keys) or 'set of settings'}; give another folder"
         )
 
 
@@ -347,10 +341,7 @@ def _write(out: Path, frames: list[TrackedFrame], tracks: list[Track]) -> list[P
         )
         for row in normals_rows([whole])
     )
-    try:
-        write_atomically(files[0], lambda part: write_csv(part, columns, table))
-        write_json(files[1], tracks, compact=True)
-        write_atomically(files[2], lambda part: write_sequence_page(part, frames, tracks))
-    except OSError as error:
-        raise write_error(error, out) from error
+    write_atomically(files[0], lambda part: write_csv(part, columns, table))
+    write_json(files[1], tracks, compact=True)
+    write_atomically(files[2], lambda part: write_sequence_page(part, frames, tracks))
     return files

@@ -1,9 +1,9 @@
 """The only package that imports Mitsuba.
 
-`backend` chooses libLLVM and variant. `session` holds the scene, which `shapes`, `materials`, `phong`, `tissue` and
-`emission` describe to Mitsuba; `rays`, `integrate`, `direct` and `indirect` trace its radiance. Ground truth comes from
-`shape_labels` (the rendered shape), `exact_points` (the smooth surface) and `highlights` (the points where the normal
-bisects light and camera). `frames` defines the records; `mitsuba_export` writes a scene for Mitsuba.
+`backend` chooses libLLVM and variant. `session` holds the scene: a `built_scene` of surface, `reflectances` and
+`lighting`, with `tissue_kernels` and `instruments`. `rays`, `trace` and `adaptive` render its radiance. `truth` is of
+the rendered shape and of the smooth surface (a colon's by `tube_kernel`); `highlights` are the points where the normal
+bisects light and camera, `misfits` how far it is from that. `frames` defines the records.
 """
 
 from typing import TYPE_CHECKING
@@ -12,16 +12,8 @@ from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.rendering.frames import Frame, HighlightPoint, Labels, Radiance, TruthMaps
-    from simtest.rendering.integrate import Progress
     from simtest.rendering.session import Session
-
-_HOMES = {
-    "simtest.rendering.frames": ("Frame", "HighlightPoint", "Labels", "Radiance", "TruthMaps"),
-    "simtest.rendering.integrate": ("Progress",),
-    "simtest.rendering.session": ("Session",),
-}
-
-__all__ = ["Frame", "HighlightPoint", "Labels", "Progress", "Radiance", "Session", "TruthMaps"]
+    from simtest.rendering.trace import Progress
 
 # Who asks for the backend alone needs no renderer.
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -6,6 +6,7 @@ child process before the real one uses it. Nothing is set when this module is im
 
 import contextlib
 import gc
+import importlib
 import importlib.metadata
 import json
 import os
@@ -19,9 +20,24 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import BackendError, InputError
-from simtest.runtime.files import Json, write_json
-from simtest.runtime.resources import shown, suggestion
-from simtest.runtime.user_cache import user_cache
+from simtest.runtime.boundary import suggestion
+from simtest.runtime.files import Json, user_cache, write_json
+
+
+class _Late:
+    """A module that is imported when an attribute of it is first asked for: `load` chooses its library before."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        # Looked up each time: what a variant is made of changes with it.
+        return getattr(sys.modules.get(self._name) or importlib.import_module(self._name), name)
+
+
+dr: Any = _Late("drjit")
+mi: Any = _Late("mitsuba")
+"""With the variant that `load` has set last, or the session that is at work."""
 
 LLVM, CUDA = DEVICES = ("llvm", "cuda")
 """What kernels are compiled for: the processor, or an NVIDIA GPU. Nothing outside this module names a variant."""
@@ -59,21 +75,11 @@ MENDING = (
 
 @dataclass(frozen=True)
 class Candidate:
-    """A libLLVM that might be used.
+    """A libLLVM that might be used."""
 
-    Parameters
-    ----------
-    origin : str
-        Where it was found.
-    path : str
-        The file.
-    verdict : str
-        "ok", or why it cannot be used; empty while untried.
-    """
-
-    origin: str
-    path: str
-    verdict: str = ""
+    origin: str  # Where it was found
+    path: str  # The file
+    verdict: str = ""  # "ok", or why it cannot be used; empty while untried
 
 
 def requested_variant(variant: str | None = None, coloured: bool = False) -> str:
@@ -89,7 +95,7 @@ def requested_variant(variant: str | None = None, coloured: bool = False) -> str
         allowed = (*DEVICES, *VARIANTS)
         meant = suggestion(name, allowed)
         given = "variant" if variant else VARIANT_VARIABLE
-        raise InputError(f"{given} {shown(name, 60)!r}: cannot be used; allowed: {', '.join(allowed)}{meant}")
+        raise InputError(f"{given} {name!r}: cannot be used; allowed: {', '.join(allowed)}{meant}")
     return f"{name}_ad_{'rgb' if coloured else 'mono'}" if name in DEVICES else name
 
 
@@ -228,11 +234,6 @@ def load(variant: str | None = None) -> Any:
     -------
     module
         mitsuba.
-
-    Raises
-    ------
-    BackendError
-        If no libLLVM works, or the variant does not exist; the message says how to mend it.
     """
     name = requested_variant(variant)
     # Library: chosen before Dr.Jit is imported, checked afterwards.
@@ -337,27 +338,13 @@ def no_library_message(tried: list[Candidate]) -> str:
 
 @dataclass(frozen=True)
 class BackendReport:
-    """State of the backend, as `simtest doctor` reports it.
+    """State of the backend, as `simtest doctor` reports it."""
 
-    Parameters
-    ----------
-    variant : str
-        Mitsuba variant.
-    library : str or None
-        The libLLVM that would be used.
-    candidates : list of Candidate
-        Libraries that were tried, with verdicts.
-    versions : dict
-        Version by package.
-    problem : str or None
-        Why it cannot render, one line.
-    """
-
-    variant: str
-    library: str | None
-    candidates: list[Candidate]
-    versions: dict[str, str]
-    problem: str | None
+    variant: str  # Mitsuba variant
+    library: str | None  # The libLLVM that would be used
+    candidates: list[Candidate]  # Libraries that were tried, with verdicts
+    versions: dict[str, str]  # Version by package
+    problem: str | None  # Why it cannot render, one line
 
     @property
     def can_render(self) -> bool:
@@ -370,12 +357,54 @@ class BackendReport:
 
 
 def library_report(variant: str | None = None) -> BackendReport:
-    """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered.
-
-    Raises `InputError` for a name that is no variant's.
-    """
+    """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered."""
     versions = {package: importlib.metadata.version(package) for package in ("mitsuba", "drjit")}
     name = requested_variant(variant)
     chosen, tried = choose_library() if needs_llvm(name) else (None, [])
     problem = no_library_message(tried) if needs_llvm(name) and chosen is None else None
     return BackendReport(name, chosen.path if chosen else None, tried, versions, problem)
+
+
+RENDER_TIMEOUT_S = 180
+
+
+def examine(variant: str | None = None) -> BackendReport:
+    """Examine the rendering backend (see `simtest.rendering.backend.requested_variant`); this process loads nothing."""
+    report = library_report(variant)
+    return replace(report, problem=_try_rendering(report.variant)) if report.can_render else report
+
+
+def _try_rendering(variant: str) -> str | None:
+    """Render a plane in a child process; return the problem, or None."""
+    # A child: a bad libLLVM may end the process.
+    # -P: no file of the current folder may stand in for a package.
+    command = [sys.executable, "-P", "-m", "simtest.rendering.backend", variant]
+    try:
+        child = subprocess.run(command, capture_output=True, text=True, timeout=RENDER_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return f"rendering a small scene took more than {RENDER_TIMEOUT_S} s"
+    if child.returncode == 0:
+        return None
+    if child.returncode < 0:
+        return f"rendering a small scene ended the process (signal {-child.returncode}). To mend it: {MENDING}"
+    lines = [line for line in (child.stdout + child.stderr).splitlines() if line.strip()]
+    return lines[-1] if lines else f"rendering a small scene ended with exit code {child.returncode}"
+
+
+def _main() -> int:
+    from simtest.errors import SimtestError
+    from simtest.rendering.session import Session
+    from simtest.spec import scene_from_dict
+
+    scene = scene_from_dict({"surface": {"type": "plane"}, "camera": {"width": 17, "height": 17, "fx": 17, "fy": 17}})
+    try:
+        peak = float(Session(scene, sys.argv[1]).radiance().total.max())
+    except SimtestError as error:
+        print(json.dumps(str(error))[1:-1])
+        return 1
+    # At 10 mm the peak of a Phong plane of scale 1 is 1/100.
+    return 0 if abs(peak - 0.01) < 1e-3 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(_main())

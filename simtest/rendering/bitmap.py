@@ -11,9 +11,9 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.rendering import backend
+from simtest.rendering.backend import mi
 from simtest.runtime.arrays import Image
-from simtest.runtime.limits import check_picture_size
-from simtest.runtime.resources import shown
+from simtest.runtime.files import check_picture_size
 
 HEADER_BYTES = 65536
 """In which the size of an image must stand."""
@@ -21,7 +21,7 @@ HEADER_BYTES = 65536
 
 def write_exr(path: Path, image: Image, variant: str | None = None) -> None:
     """Write linear values, shape (H, W) or (H, W, 3), as a float32 OpenEXR file; the path ends in .exr."""
-    mi = backend.load(variant)
+    backend.load(variant)
     bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
     try:
         with _two_threads():
@@ -49,21 +49,15 @@ def _two_threads() -> Iterator[None]:
 
 
 def read_bitmap(path: Path, variant: str | None = None) -> Image:
-    """Read an OpenEXR file as float32, shape (H, W) or (H, W, C).
-
-    Raises
-    ------
-    InputError
-        If the file is not an image, or of more pixels than allowed.
-    """
+    """Read an OpenEXR file as float32, shape (H, W) or (H, W, C)."""
     _check_size(path)
-    mi = backend.load(variant)
+    backend.load(variant)
     try:
         with _two_threads():
             bitmap = mi.Bitmap(str(path))
     except Exception as error:
         # Mitsuba hands on whatever OpenEXR runs into.
-        raise InputError(f"{shown(path)}: cannot be read ({shown(_last_line(error), 120)})") from None
+        raise InputError(f"{path}: cannot be read ({_last_line(error)!s:.120})") from None
     # Converted here: Mitsuba converts no image of one channel that is called Z, as depth is.
     return np.array(np.array(bitmap), dtype=np.float32)
 
@@ -79,9 +73,9 @@ def _check_size(path: Path) -> None:
     key = b"dataWindow\0box2i\0\x10\0\0\0"
     start = head.find(key) + len(key)
     if start < len(key) or len(head) < start + 16:
-        raise InputError(f"{shown(path)}: no OpenEXR image; its header has no data window")
+        raise InputError(f"{path}: no OpenEXR image; its header has no data window")
     left, top, right, bottom = struct.unpack("<4i", head[start : start + 16])
     width, height = right - left + 1, bottom - top + 1
     if width < 1 or height < 1:
-        raise InputError(f"{shown(path)}: {width} x {height} px; must be 1 px or more along each side")
+        raise InputError(f"{path}: {width} x {height} px; must be 1 px or more along each side")
     check_picture_size(path, width, height)

@@ -11,49 +11,65 @@ from typing import Any
 
 import numpy as np
 
-from simtest.rendering import emission
-from simtest.rendering.albedo import AlbedoKernel
-from simtest.rendering.direct import DirectLight
-from simtest.rendering.materials import bsdf_dict, parameter_updates, parts_alone
-from simtest.rendering.mesh_edges import MeshEdges
-from simtest.rendering.shape_labels import ShapeLabels
-from simtest.rendering.shapes import flat, make_shape
+from simtest.rendering import lighting
+from simtest.rendering.adaptive import MeshEdges
+from simtest.rendering.backend import mi
+from simtest.rendering.kernel_values import MitsubaDict
+from simtest.rendering.lighting import DirectLight
+from simtest.rendering.reflectances import bsdf_dict, parameter_updates, parts_alone
+from simtest.rendering.tissue_kernels import AlbedoKernel
+from simtest.rendering.truth import ShapeLabels
 from simtest.runtime.arrays import Array
+from simtest.spec.lights import LightSpec, Rig
 from simtest.spec.reflectance import Reflectance
-from simtest.spec.rig import LightSpec, Rig
 from simtest.surfaces import Shape, TriangleMesh
+
+
+def make_shape(shape: Shape, bsdf: MitsubaDict) -> Any:
+    """Make a shape for `mi.load_dict`: a description of an analytic shape, or a mesh with the given vertex normals."""
+    if shape.mesh is not None:
+        return _make_mesh(shape.mesh, bsdf)
+    plugin = {"plane": "rectangle", "sphere": "sphere", "cylinder": "cylinder"}[shape.kind]
+    transform = mi.ScalarTransform4f(shape.to_model.tolist())
+    return {"type": plugin, "to_world": transform, "flip_normals": shape.flip, "bsdf": bsdf}
+
+
+def _make_mesh(mesh: TriangleMesh, bsdf: MitsubaDict) -> Any:
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = mi.load_dict(bsdf)
+    made = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, props=properties)
+    parameters = mi.traverse(made)
+    parameters["vertex_positions"] = flat(mesh.vertices, np.float32)
+    parameters["faces"] = flat(mesh.faces, np.uint32)
+    parameters.update()
+    # Mitsuba recomputes the normals from the triangles when positions change, so the exact ones are set afterwards.
+    parameters["vertex_normals"] = flat(mesh.normals, np.float32)
+    parameters.update()
+    return made
+
+
+def flat(values: Any, dtype: Any) -> Any:
+    """Flatten an array row by row into 32-bit numbers, as Mitsuba stores buffers."""
+    return np.ascontiguousarray(values, dtype=dtype).ravel()
 
 
 @dataclass
 class BuiltScene:
-    """A built Mitsuba scene.
+    """A built Mitsuba scene."""
 
-    Parameters
-    ----------
-    key : tuple
-        Its structure.
-    scene, parameters
-        The Mitsuba scene with surface and lights, and its parameters.
-    base, base_parameters
-        The BSDF's base alone and its parameters; None where the BSDF evaluates its parts separately.
-    labels : ShapeLabels, optional
-        What traces the labels of its shape; made when first needed.
-    edges : MeshEdges, optional
-        Edges of its mesh; made when first needed.
-    mesh : TriangleMesh, optional
-        The mesh as it was written last.
-    """
-
-    key: tuple[Any, ...]
+    key: tuple[Any, ...]  # Its structure
+    # scene, parameters: The Mitsuba scene with surface and lights, and its parameters
     scene: Any
     parameters: Any
+    # base, base_parameters: The BSDF's base alone and its parameters; None where the BSDF evaluates its parts
+    # separately
     base: Any
     base_parameters: Any
-    labels: ShapeLabels | None = None
-    edges: MeshEdges | None = None
-    mesh: TriangleMesh | None = None
+    labels: ShapeLabels | None = None  # What traces the labels of its shape; made when first needed
+    edges: MeshEdges | None = None  # Edges of its mesh; made when first needed
+    mesh: TriangleMesh | None = None  # The mesh as it was written last
 
-    def write(self, mi: Any, shape: Shape, reflectance: Reflectance) -> None:
+    def write(self, shape: Shape, reflectance: Reflectance) -> None:
         """Write pose and material of the surface."""
         # Shape.
         if shape.mesh is None:
@@ -61,7 +77,7 @@ class BuiltScene:
         elif not _same(shape.mesh, self.mesh):
             self._deform(shape.mesh)
         # Material: the whole and its base alone.
-        for name, value in parameter_updates(mi, reflectance).items():
+        for name, value in parameter_updates(reflectance).items():
             self._set(f"bsdf.{name}", value)
             if self.base is not None:
                 self.base_parameters[name] = value
@@ -77,23 +93,20 @@ class BuiltScene:
         self.parameters.update()
         self.mesh, self.labels, self.edges = mesh, None, None
 
-    def place_lights(self, mi: Any, rig: Rig, model_from_camera: Array) -> DirectLight:
-        """Write the lights of a rig at a pose of the camera, shape (4, 4), and all that was set before.
-
-        Returns the lights' own kernel.
-        """
+    def place_lights(self, rig: Rig, model_from_camera: Array) -> DirectLight:
+        """Write the lights of a rig at a pose of the camera, and all set before; return their own kernel."""
         lights, rotation = rig.lights, model_from_camera[:3, :3]
         positions = rig.true_mm() @ rotation.T + model_from_camera[:3, 3]
         axes = np.array([light.axis for light in lights]) @ rotation.T
         poses = [
-            emission.LightPose(position, axis, light.across @ rotation.T)
+            lighting.LightPose(position, axis, light.across @ rotation.T)
             for light, position, axis in zip(lights, positions, axes, strict=True)
         ]
         for i, light in enumerate(lights):
-            for name, value in emission.emitter_values(mi, light, poses[i]).items():
+            for name, value in lighting.emitter_values(light, poses[i]).items():
                 self._set(f"light_{i}.{name}", value)
         self.parameters.update()
-        return DirectLight(mi, rig, poses)
+        return DirectLight(rig, poses)
 
     def let_bounces_find(self, albedo: AlbedoKernel) -> None:
         """Let bounced light find the albedo of tissue by its own points."""
@@ -109,11 +122,11 @@ class BuiltScene:
 
 
 def build(
-    mi: Any, key: tuple[Any, ...], shape: Shape, reflectance: Reflectance, lights: Sequence[LightSpec], plugin: str
+    key: tuple[Any, ...], shape: Shape, reflectance: Reflectance, lights: Sequence[LightSpec], plugin: str
 ) -> BuiltScene:
     """Build the Mitsuba scene of a structure; `plugin` is the name of the Phong BSDF."""
-    surface = make_shape(mi, shape, bsdf_dict(reflectance, plugin, diffuse_only=False))
-    emitters = {f"light_{i}": emission.emitter_dict(emission.kind_of(light)) for i, light in enumerate(lights)}
+    surface = make_shape(shape, bsdf_dict(reflectance, plugin, diffuse_only=False))
+    emitters = {f"light_{i}": lighting.emitter_dict(lighting.kind_of(light)) for i, light in enumerate(lights)}
     # Without optimize=False Mitsuba merges equal objects: two lights of one power, or a light and a texture,
     # would share a parameter, and an update of one would change both.
     scene = mi.load_dict({"type": "scene", "surface": surface, **emitters}, optimize=False)

@@ -1,12 +1,12 @@
 """Records that a session returns: radiance, labels, ground-truth maps and highlight points."""
 
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from simtest.runtime.arrays import Array, Image, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Image, Mask, short_repr
 
 
 @dataclass(frozen=True)
@@ -42,62 +42,76 @@ class Radiance:
         return self.total if self.channels == 1 else self.total.mean(axis=2, dtype=np.float32)
 
 
-@dataclass(frozen=True)
-class Labels:
-    """What was rendered at each pixel's centre, single precision, camera frame; NaN where there is no surface.
+Real = TypeVar("Real", np.float32, np.float64)
 
-    Of a mesh these are the hit triangle's, with normals and shape operators interpolated between its corners;
-    `TruthMaps` holds the exact values of the smooth surface.
+
+@dataclass(frozen=True)
+class Maps(Generic[Real]):
+    """What is at each pixel's centre, camera frame; NaN where there is no surface.
+
+    `Labels` are that of the rendered shape, in single precision: of a mesh the hit triangle's, with normals and shape
+    operators interpolated between its corners. `TruthMaps` are exact, of the smooth surface. Where an instrument is
+    seen, depth, position and normals are its own, also those of the base, curvatures and directions are NaN, and there
+    is no pool.
 
     Parameters
     ----------
-    depth : ndarray of float32, shape (H, W)
+    depth : ndarray, shape (H, W)
         Distance along the ray, mm.
-    position : ndarray of float32, shape (H, W, 3)
-        mm.
-    normal, geometric_normal : ndarray of float32, shape (H, W, 3)
-        Unit normals: that of the shading off the lobe, as it is (on a relief the fine one), and that of the triangle,
-        facing the camera.
-    k_min, k_max : ndarray of float32, shape (H, W)
-        Principal curvatures of the fine surface, 1/mm, convex towards the camera positive; NaN also where a mesh's
-        could not be fitted.
-    normal_base : ndarray of float32, shape (H, W, 3)
-        Unit normal of the base, without the relief; `normal` itself on a smooth surface.
-    k_min_base, k_max_base : ndarray of float32, shape (H, W)
-        Principal curvatures of the base, 1/mm; `k_min` and `k_max` themselves on a smooth surface.
-    pool : ndarray of bool, shape (H, W)
-        Where the liquid film fills a valley.
-    instance : ndarray of int32, shape (H, W)
-        Number of the surface, from 0; -1 where there is none. An instrument's is 1 + its index in the scene's list:
-        there depth, position and normals are its own, and curvatures NaN.
-    face : ndarray of int32, shape (H, W)
-        Triangle of a mesh, 0 for other shapes; -1 where there is none.
+    position, normal : ndarray, shape (H, W, 3)
+        Point, mm, and unit normal of the fine surface; without a relief it faces the camera, but for labels.
+    shading_normal, geometric_normal : ndarray, shape (H, W, 3)
+        Normals that the renderer used: interpolated, for light off the lobe (on a relief the fine one; the base below
+        the lobe is shaded by that of the smoothed relief), and of the triangle, facing the camera.
+    k_min, k_max : ndarray, shape (H, W)
+        Principal curvatures, 1/mm, convex towards the camera positive; of labels NaN also where a mesh's could not be
+        fitted.
+    normal_base : ndarray, shape (H, W, 3)
+        Unit normal of the base, without the relief; `normal` where there is no relief.
+    k_min_base, k_max_base : ndarray, shape (H, W)
+        Principal curvatures of the base, 1/mm; `k_min` and `k_max` where there is no relief.
+    pool, mask : ndarray of bool, shape (H, W)
+        Where the liquid film fills a valley, and where there is a surface.
+    instrument : ndarray of uint8, shape (H, W)
+        1 + the index of the instrument that is seen, 0 where none is.
+    direction_min, direction_max : ndarray, shape (H, W, 3), or None
+        Unit principal directions, of truth.
+    face : ndarray of int32, shape (H, W), or None
+        Of labels: triangle of a mesh, 0 for other shapes; -1 where there is none.
     """
 
-    depth: Image
-    position: Image
-    normal: Image
-    geometric_normal: Image
-    k_min: Image
-    k_max: Image
-    normal_base: Image
-    k_min_base: Image
-    k_max_base: Image
+    depth: npt.NDArray[Real]
+    position: npt.NDArray[Real]
+    normal: npt.NDArray[Real]
+    shading_normal: npt.NDArray[Real]
+    geometric_normal: npt.NDArray[Real]
+    k_min: npt.NDArray[Real]
+    k_max: npt.NDArray[Real]
+    normal_base: npt.NDArray[Real]
+    k_min_base: npt.NDArray[Real]
+    k_max_base: npt.NDArray[Real]
     pool: Mask
-    instance: npt.NDArray[np.int32]
-    face: npt.NDArray[np.int32]
+    mask: Mask
+    instrument: npt.NDArray[np.uint8]
+    direction_min: npt.NDArray[Real] | None = None
+    direction_max: npt.NDArray[Real] | None = None
+    face: npt.NDArray[np.int32] | None = None
 
     __repr__ = short_repr
 
     @property
-    def mask(self) -> Mask:
-        """Where there is a surface, shape (H, W)."""
-        return self.instance >= 0
+    def instance(self) -> npt.NDArray[np.int32]:
+        """0 for the surface, 1 + its index for an instrument, -1 where there is neither, shape (H, W)."""
+        return np.where(self.mask, self.instrument.astype(np.int32), np.int32(-1))
 
     @property
-    def instrument(self) -> npt.NDArray[np.uint8]:
-        """1 + the index of the instrument that is seen, 0 where none is, shape (H, W)."""
-        return np.maximum(self.instance, 0).astype(np.uint8)
+    def larger_curvature(self) -> npt.NDArray[Real]:
+        """Principal curvature of larger size, 1/mm, shape (H, W)."""
+        return np.where(np.abs(self.k_max) >= np.abs(self.k_min), self.k_max, self.k_min)
+
+
+Labels = Maps[np.float32]
+TruthMaps = Maps[np.float64]
 
 
 @dataclass(frozen=True)
@@ -119,79 +133,17 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class TruthMaps:
-    """Ground truth at each pixel's centre, camera frame; NaN where there is no surface.
-
-    Parameters
-    ----------
-    depth : ndarray, shape (H, W)
-        Distance along the ray, mm.
-    position, normal : ndarray, shape (H, W, 3)
-        Point of the smooth surface, mm, and unit normal of the fine surface; without a relief it faces the camera.
-    shading_normal, geometric_normal : ndarray, shape (H, W, 3)
-        Normals that the renderer used: interpolated, for light off the lobe (on a relief the fine one; the base below
-        the lobe is shaded by that of the smoothed relief), and of the triangle.
-    k_min, k_max : ndarray, shape (H, W)
-        Principal curvatures, 1/mm, convex towards the camera positive.
-    direction_min, direction_max : ndarray, shape (H, W, 3)
-        Unit principal directions.
-    normal_base : ndarray, shape (H, W, 3)
-        Unit normal of the base, without the relief, facing the camera; `normal` where there is no relief.
-    k_min_base, k_max_base : ndarray, shape (H, W)
-        Principal curvatures of the base, 1/mm.
-    pool : ndarray of bool, shape (H, W)
-        Where the liquid film fills a valley.
-    mask : ndarray of bool, shape (H, W)
-        Where there is a surface.
-    instrument : ndarray of uint8, shape (H, W)
-        1 + the index of the instrument that is seen, 0 where none is. Where one is, depth, position and normals are its
-        own, also those of the base, curvatures and directions are NaN, and there is no pool.
-    """
-
-    depth: Array
-    position: Array
-    normal: Array
-    shading_normal: Array
-    geometric_normal: Array
-    k_min: Array
-    k_max: Array
-    direction_min: Array
-    direction_max: Array
-    normal_base: Array
-    k_min_base: Array
-    k_max_base: Array
-    pool: Mask
-    mask: Mask
-    instrument: npt.NDArray[np.uint8]
-
-    __repr__ = short_repr
-
-    @property
-    def larger_curvature(self) -> Array:
-        """Principal curvature of larger size, 1/mm, shape (H, W)."""
-        return np.where(np.abs(self.k_max) >= np.abs(self.k_min), self.k_max, self.k_min)
-
-
-@dataclass(frozen=True)
 class MisfitMaps:
     """Normal minus bisector across the sightline (see `exact_misfit`) of the rendered shape, a map for each light.
 
     The maps reach beyond the frame, so that a zero next to its border lies between pixels too.
-
-    Parameters
-    ----------
-    distance : ndarray of float32, shape (h, w)
-        Distance along the ray, mm; NaN where there is no surface.
-    fine, base : ndarray of float32, shape (L, 2, h, w)
-        Of the fine normal and of the base's; one array where there is no relief.
-    margin : int
-        Cells beyond the frame on each side.
     """
 
-    distance: Image
+    distance: Image  # (h, w): distance along the ray, mm; NaN where there is no surface
+    # fine, base: (L, 2, h, w): of the fine normal and of the base's; one array where there is no relief
     fine: Image
     base: Image
-    margin: int
+    margin: int  # Cells beyond the frame on each side
 
     __repr__ = short_repr
 

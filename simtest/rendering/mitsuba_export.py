@@ -12,19 +12,17 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.rendering import backend, phong, tissue
-from simtest.rendering.materials import bsdf_dict
-from simtest.rendering.mitsuba_values import MitsubaDict
-from simtest.rendering.shapes import make_shape
+from simtest.rendering import backend, reflectances
+from simtest.rendering.backend import mi
+from simtest.rendering.built_scene import make_shape
+from simtest.rendering.kernel_values import MitsubaDict
+from simtest.rendering.reflectances import bsdf_dict
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
-from simtest.runtime.machine_errors import write_error
 from simtest.spec import Scene
-from simtest.spec.falloff import CosineProfile
-from simtest.spec.light_source import DiscSource
+from simtest.spec.lights import CosineProfile, DiscSource, LightSpec
 from simtest.spec.reflectance import PhongReflectance, TissueReflectance
-from simtest.spec.rig import LightSpec
 from simtest.spec.spec_model import Spec
 from simtest.surfaces import Shape, SurfaceModel, make_surface
 
@@ -58,37 +56,26 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
     """Write a scene for Mitsuba: scene.xml and, for surfaces that are meshes, surface.ply (see `simtest.export`).
 
     The world is the surface's model frame, mm. What belongs to the sensor (noise, exposure) is left out.
-
-    Raises
-    ------
-    InputError
-        If the camera or a light has what Mitsuba cannot express, the surface's file is malformed, or the folder cannot
-        be written.
-    BackendError
-        If the rendering backend cannot be used.
     """
     # Check before anything is written.
     for key, value, why in _inexpressible(scene):
         raise InputError(f"scene {scene.name}: {key} = {value!r}: cannot be exported; {why}")
-    mi = backend.load(variant)
-    plugin = phong.register(mi, str(mi.variant()))
-    tissue.register(mi, str(mi.variant()))
+    backend.load(variant)
+    plugin = reflectances.register_phong(str(mi.variant()))
+    reflectances.register_tissue(str(mi.variant()))
     surface = make_surface(scene.surface, None, scene.camera.moved, scene.deformation, scene.time_s)
     shape = _cut_to_view(surface.shape(), surface, scene.camera.model())
-    text = _xml(mi, scene, surface, shape, plugin)
+    text = _xml(scene, surface, shape, plugin)
     make_folder(out)
     files = [out / SCENE_FILE]
-    try:
-        if shape.mesh:
-            files.append(out / MESH_FILE)
-            mesh = make_shape(mi, shape, {"type": "diffuse"})
-            # By way of memory, since Mitsuba does not tell which of the system's errors it met.
-            stream = mi.MemoryStream()
-            mesh.write_ply(stream)
-            write_atomically(files[1], lambda part: part.write_bytes(stream.raw_buffer()))
-        write_atomically(files[0], lambda part: part.write_text(text, encoding="utf-8"))
-    except OSError as error:
-        raise write_error(error, out) from error
+    if shape.mesh:
+        files.append(out / MESH_FILE)
+        mesh = make_shape(shape, {"type": "diffuse"})
+        # By way of memory, since Mitsuba does not tell which of the system's errors it met.
+        stream = mi.MemoryStream()
+        mesh.write_ply(stream)
+        write_atomically(files[1], lambda part: part.write_bytes(stream.raw_buffer()))
+    write_atomically(files[0], lambda part: part.write_text(text, encoding="utf-8"))
     return files
 
 
@@ -244,7 +231,7 @@ def _disc_pose(light: LightSpec, position_mm: Array, surface: SurfaceModel) -> A
     return np.asarray(surface.model_from_camera @ local)
 
 
-def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str) -> str:
+def _xml(scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str) -> str:
     # Describe.
     bsdf = bsdf_dict(scene.reflectance, plugin, diffuse_only=False)
     effort = scene.render
@@ -252,13 +239,13 @@ def _xml(mi: Any, scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str
         "type": "scene",
         "integrator": {"type": "path", "max_depth": effort.path_depth, "rr_depth": effort.path_depth},
         "sensor": _sensor(scene, surface, shape),
-        "surface": {"type": "ply", "filename": MESH_FILE, "bsdf": bsdf} if shape.mesh else make_shape(mi, shape, bsdf),
+        "surface": {"type": "ply", "filename": MESH_FILE, "bsdf": bsdf} if shape.mesh else make_shape(shape, bsdf),
         **_lights(scene, surface),
     }
     # Let Mitsuba write its XML.
     state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), described)
     for node in state.nodes:
-        if node.props.plugin_name() in (plugin, tissue.PLUGIN):
+        if node.props.plugin_name() in (plugin, reflectances.TISSUE):
             # Mitsuba does not know the kind of a plugin written in Python.
             node.type = mi.ObjectType.BSDF
     written = mi.parser.write_string(state, add_section_headers=True)
@@ -294,7 +281,7 @@ def _head(scene: Scene) -> str:
         "Without the sensor: no noise, no exposure, linear radiance.",
     ]
     if isinstance(scene.reflectance, PhongReflectance | TissueReflectance):
-        name = phong.PLUGIN if isinstance(scene.reflectance, PhongReflectance) else tissue.PLUGIN
+        name = reflectances.PHONG if isinstance(scene.reflectance, PhongReflectance) else reflectances.TISSUE
         lines += [
             f'The reflectance "{name}" is a plugin of simtest. After mitsuba.set_variant and before loading:',
             "    from simtest.rendering.plugins import register; register()",

@@ -5,10 +5,10 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Array
-from simtest.spec.rig import LightSpec, Rig
+from simtest.spec.lights import LightSpec, Rig
 from simtest.spec.scene import Scene
 from simtest.surfaces import SurfaceModel
-from simtest.surfaces.deformed import DeformedSurface, stays_in_free_space
+from simtest.surfaces.deformation import DeformedSurface, stays_in_free_space
 from simtest.surfaces.instrument import RoundCones
 
 RIM_COPIES = (1.0, 0.75, 0.5, 0.25)
@@ -126,10 +126,7 @@ def _check_rims(scene: Scene, surface: SurfaceModel, positions: Array) -> None:
 
 
 def _rim_points(light: LightSpec, position: Array) -> Array:
-    """Return points of a source of finite size, shape (N, 3), camera frame, mm: its rim, and smaller copies of it.
-
-    A fold may rise through a disc.
-    """
+    """Return the rim of a source, shape (N, 3), and smaller copies of it: a fold may rise through a disc."""
     assert light.source is not None
     rim = light.source.rim() - light.source.centroid_mm
     return np.asarray(np.concatenate([share * rim for share in RIM_COPIES]) @ light.across + position)

@@ -6,22 +6,16 @@ One line before `mi.load_file` or `mi.load_dict`, after `mi.set_variant`::
 """
 
 from simtest.errors import BackendError
-from simtest.rendering import emission, phong, tissue
+from simtest.rendering import lighting, reflectances
 
 
 def register() -> None:
-    """Register the plugins for Mitsuba's active variant; call it again after a change of variant, repeats do no harm.
-
-    Raises
-    ------
-    BackendError
-        If no variant is set.
-    """
+    """Register the plugins for Mitsuba's active variant; call it again after a change of variant."""
     import mitsuba
 
     variant = mitsuba.variant()
     if variant is None:
         raise BackendError("no Mitsuba variant is set; call mitsuba.set_variant before register")
-    phong.register(mitsuba, variant)
-    tissue.register(mitsuba, variant)
-    emission.register(mitsuba, variant)
+    reflectances.register_phong(variant)
+    reflectances.register_tissue(variant)
+    lighting.register_light(variant)

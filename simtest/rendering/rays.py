@@ -1,4 +1,4 @@
-"""Rays through pixels: the positions of the samples, the order in which pixels are traced, and their sightlines.
+"""Rays through pixels, and the surface points that they hit.
 
 The kernel computes the sightlines of a pinhole itself; those of any other camera come from its `unproject`.
 """
@@ -11,8 +11,11 @@ import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.geometry.camera import Camera, ViewMask
-from simtest.rendering.kernel_arrays import to_kernel
+from simtest.rendering.backend import dr, mi
+from simtest.rendering.kernel_values import to_kernel
+from simtest.rendering.tissue_kernels import KernelJets, ReliefKernel, turned
 from simtest.runtime.arrays import Array, Mask
+from simtest.surfaces import Shape
 
 Pixels = npt.NDArray[np.uint32]
 
@@ -35,69 +38,33 @@ def is_pinhole(camera: Camera) -> bool:
 
 @dataclass(frozen=True)
 class Lanes:
-    """The pixels that one launch of a kernel works on.
+    """The pixels that one launch of a kernel works on."""
 
-    Parameters
-    ----------
-    column, row : mitsuba.UInt32
-        The pixels; beyond the frame where it is no multiple of the tile.
-    shift_x, shift_y : mitsuba.UInt32
-        Random shifts of the pixels' sample points, shares of 2^32.
-    """
-
+    # column, row: The pixels; beyond the frame where it is no multiple of the tile
     column: Any
     row: Any
+    # shift_x, shift_y: Random shifts of the pixels' sample points, shares of 2^32
     shift_x: Any
     shift_y: Any
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays of one launch.
+    """Rays of one launch."""
 
-    Parameters
-    ----------
-    traced : mitsuba.Ray3f
-        Model frame, mm; unit directions.
-    origin, direction : mitsuba.Vector3d
-        The same in double precision.
-    sightline : mitsuba.Vector3f
-        The directions in the camera frame.
-    active : mitsuba.Bool
-        False where the camera has no sightline or the pixel lies outside its round field of view.
-    """
-
-    traced: Any
+    traced: Any  # Model frame, mm; unit directions
+    # origin, direction: The same in double precision
     origin: Any
     direction: Any
-    sightline: Any
-    active: Any
+    sightline: Any  # The directions in the camera frame
+    active: Any  # False where the camera has no sightline or the pixel lies outside its round field of view
 
 
 class Sightlines:
-    """The rays of a camera at its pose.
+    """The rays of a camera at its pose, model_from_camera, shape (4, 4), mm."""
 
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    camera : Camera
-        The camera.
-    model_from_camera : ndarray, shape (4, 4)
-        Its pose, mm.
-
-    Attributes
-    ----------
-    pose : ndarray, shape (4, 4)
-        The given one.
-    camera_from_model : mitsuba.Matrix3f
-        The rotation alone.
-    """
-
-    def __init__(self, mi: Any, camera: Camera, model_from_camera: Array) -> None:
-        import drjit as dr
-
-        self.mi, self.camera = mi, camera
+    def __init__(self, camera: Camera, model_from_camera: Array) -> None:
+        self.camera = camera
         self.in_kernel = is_pinhole(camera)
         self.pose = model_from_camera
         # Opaque, so that another camera or pose compiles no new kernel.
@@ -108,7 +75,7 @@ class Sightlines:
         self._numbers = {name: mi.Float64(value) for name, value in numbers.items()}
         mask = camera.view_mask
         # In double precision, to decide as `Camera.seen` does.
-        self._mask = None if mask is None else _mask_numbers(mi, mask)
+        self._mask = None if mask is None else _mask_numbers(mask)
         self._width, self._tiles = mi.UInt32(camera.width), mi.UInt32(-(-camera.width // TILE))
         dr.make_opaque(self._origin, self._rotation, self.camera_from_model, self._numbers)
         dr.make_opaque(self._mask, self._width, self._tiles)
@@ -119,13 +86,7 @@ class Sightlines:
         return -(-self.camera.height // TILE) * TILE, -(-self.camera.width // TILE) * TILE
 
     def lanes(self, first: int, count: int, tiled: bool, seed: int) -> Lanes:
-        """Return `count` pixels from `first` on: in tiles, which trace faster, or in rows, which need no sorting.
-
-        The sample points depend on seed and pixel alone.
-        """
-        import drjit as dr
-
-        mi = self.mi
+        """Return `count` pixels from `first` on, in tiles or rows; samples depend on seed and pixel alone."""
         start, salt = mi.UInt32(first), mi.UInt32(seed)
         dr.make_opaque(start, salt)
         index = dr.arange(mi.UInt32, count) + start
@@ -142,9 +103,6 @@ class Sightlines:
 
     def lanes_of(self, pixels: Pixels, seed: int) -> Lanes:
         """Return the lanes of pixels by their numbers, row after row; their sample points are those of `lanes`."""
-        import drjit as dr
-
-        mi = self.mi
         index, salt = to_kernel(mi.UInt32, pixels, np.uint32), mi.UInt32(seed)
         dr.make_opaque(salt)
         row = index // self._width
@@ -152,7 +110,6 @@ class Sightlines:
 
     def sample(self, lanes: Lanes, number: Any) -> tuple[Any, Any]:
         """Return the position, px, of a pixel's sample by its number: uniform, and evenly spread over the numbers."""
-        mi = self.mi
         x, y = lanes.shift_x + number * mi.UInt32(_STEP_X), lanes.shift_y + number * mi.UInt32(_STEP_Y)
         # Single precision holds 24 bits.
         share = 2.0**-24
@@ -160,13 +117,10 @@ class Sightlines:
 
     def centre(self, lanes: Lanes) -> tuple[Any, Any]:
         """Return the centres of the pixels, px."""
-        return self.mi.Float(lanes.column) + PIXEL_CENTRE, self.mi.Float(lanes.row) + PIXEL_CENTRE
+        return mi.Float(lanes.column) + PIXEL_CENTRE, mi.Float(lanes.row) + PIXEL_CENTRE
 
     def rays(self, x: Any, y: Any) -> Rays:
         """Return the rays through pixel positions x and y, mitsuba.Float, px."""
-        import drjit as dr
-
-        mi = self.mi
         active = mi.Bool(True)
         # Sightlines, camera frame.
         if self.in_kernel:
@@ -190,10 +144,7 @@ class Sightlines:
         return Rays(traced, self._origin, direction, mi.Vector3f(sightline), active)
 
     def in_model(self, points_px: Array) -> tuple[Array, Array]:
-        """Return origins and unit directions, model frame, float64, of pixel positions, two arrays of shape (N, 3).
-
-        Positions outside the field of view have rays too; NaN where the camera has no sightline.
-        """
+        """Return origins and unit directions, model frame, of pixel positions; NaN where there is no sightline."""
         directions = self.camera.unproject(points_px) @ self.pose[:3, :3].T
         return np.broadcast_to(self.pose[:3, 3], directions.shape), directions
 
@@ -215,7 +166,7 @@ def in_tiles(chosen: Mask) -> Pixels:
     return (row * width + column).astype(np.uint32)
 
 
-def _mask_numbers(mi: Any, mask: ViewMask) -> list[Any]:
+def _mask_numbers(mask: ViewMask) -> list[Any]:
     """Return a view mask's centre and limits for the kernel: the circle's square, or those of sides and cuts."""
     limits = [mask.radius**2]
     if mask.corner is not None:
@@ -226,8 +177,6 @@ def _mask_numbers(mi: Any, mask: ViewMask) -> list[Any]:
 
 def _is_seen(numbers: list[Any], column: Any, row: Any) -> Any:
     """Return which pixels lie inside a view mask (see `_mask_numbers`), with the terms of `ViewMask.contains`."""
-    import drjit as dr
-
     cx, cy, *limits = numbers
     x, y = column - cx, row - cy
     if len(limits) == 1:
@@ -242,3 +191,87 @@ def untile(values: Any, size: tuple[int, int]) -> Any:
     lead = values.shape[:-1]
     cells = values.reshape(*lead, height // TILE, width // TILE, TILE, TILE)
     return np.swapaxes(cells, -3, -2).reshape(*lead, height, width)
+
+
+@dataclass(frozen=True)
+class Hit:
+    """Surface points, mitsuba.SurfaceInteraction3f, with three normals; without a relief they are one object."""
+
+    base: Any  # Of the smooth surface
+    fine: Any  # Of the relief: what light off the lobe sees
+    diffuse: Any  # Of the smoothed relief: what light sees that has travelled below the surface
+    jets: KernelJets | None = None  # Of the relief
+
+
+def make_hit(si: Any, relief: ReliefKernel | None, bent: bool = False) -> Hit:
+    """Make a hit of the base's surface points; with the relief's second derivatives if `bent`."""
+    if relief is None:
+        return Hit(si, si, si)
+    jets = relief.jets_at(si, bent)
+    return Hit(si, turned(si, jets.gradient), turned(si, jets.diffused), jets)
+
+
+def tangents_and_turns(si: Any) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    """Return two perpendicular tangents of surface points, and the change of the shape's normal along each."""
+    first, along = dr.normalize(si.dp_du), si.dn_du / dr.norm(si.dp_du)
+    share = dr.dot(first, si.dp_dv)
+    across = si.dp_dv - share * first
+    return (first, dr.normalize(across)), (along, (si.dn_dv - share * along) / dr.norm(across))
+
+
+_ROUND = {"sphere": (1.0, 1.0, 1.0), "cylinder": (1.0, 1.0, 0.0)}
+"""Weights of the squared coordinates, whose sum is 1 on Mitsuba's unit shape."""
+
+SAME_HIT = 1e-2
+"""A solution farther than this from Mitsuba's hit, relative to the distance, is another point: Mitsuba's is kept."""
+
+
+class HitRefinement:
+    """Solves the hits on one shape again in double precision; hits on a mesh are left as they are.
+
+    Mitsuba's rays are single precision. At a silhouette the hit moves by the ray's rounding over the cosine of view,
+    and the cosine of the light is small there too: together a relative error of the radiance of 1e-4 and more, although
+    the light is direct and the surface has a formula. So the hit is solved again from the camera's own ray.
+    """
+
+    def __init__(self, shape: Shape) -> None:
+        self.shape = shape
+        if shape.mesh is None:
+            local_from_model = np.linalg.inv(shape.to_model)
+            # Opaque, so that a moved or larger shape compiles no new kernel.
+            self._turn = mi.Matrix3d(local_from_model[:3, :3].tolist())
+            self._shift = mi.Vector3d(local_from_model[:3, 3].tolist())
+            self._normals = mi.Matrix3d(local_from_model[:3, :3].T.tolist())
+            dr.make_opaque(self._turn, self._shift, self._normals)
+
+    def apply(self, origin: Any, direction: Any, si: Any) -> None:
+        """Replace position, normals and local view direction of what Mitsuba found on rays, mitsuba.Vector3d, unit."""
+        if self.shape.mesh is not None:
+            return
+        # Solve on the unit shape.
+        o, d = self._turn @ origin + self._shift, self._turn @ direction
+        if self.shape.kind == "plane":
+            t = -o.z / d.z
+            gradient = mi.Vector3d(0, 0, 1)
+        else:
+            weights = mi.Vector3d(*_ROUND[self.shape.kind])
+            t = self._root(weights, o, d, mi.Float64(si.t))
+            gradient = weights * (o + t * d)
+        # Normals transform by the inverse transpose.
+        normal = dr.normalize(self._normals @ gradient) * (-1.0 if self.shape.flip else 1.0)
+        # Replace Mitsuba's values where the solution is the same hit.
+        found = si.is_valid() & dr.isfinite(t) & (dr.abs(mi.Float(t) - si.t) < SAME_HIT * si.t)
+        position = origin + t * direction
+        si.p = dr.select(found, mi.Point3f(position), si.p)
+        si.n = dr.select(found, mi.Normal3f(normal), si.n)
+        si.sh_frame = mi.Frame3f(dr.select(found, mi.Normal3f(normal), si.sh_frame.n))
+        si.wi = si.to_local(-mi.Vector3f(direction))
+
+    def _root(self, weights: Any, o: Any, d: Any, near: Any) -> Any:
+        """Solve |o + t d|^2 = 1, in the weighted norm, for the t nearest to a distance; NaN where there is none."""
+        a, b, c = (dr.sum(weights * p * q) for p, q in ((d, d), (o, d), (o, o)))
+        c -= 1
+        # Without cancellation: one root is q/a, the other c/q.
+        q = -(b + dr.copysign(dr.sqrt(b * b - a * c), b))
+        first, second = q / a, c / q
+        return dr.select(dr.abs(first - near) < dr.abs(second - near), first, second)

@@ -5,42 +5,56 @@ structure is new, and write the values that may differ. Then it renders radiance
 the ground truth.
 """
 
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.rendering import adaptive, backend, emission, phong, tissue
-from simtest.rendering.albedo import AlbedoKernel
+from simtest.rendering import adaptive, backend, highlights, lighting, reflectances, truth
+from simtest.rendering.adaptive import MeshEdges
+from simtest.rendering.backend import mi
 from simtest.rendering.built_scene import BuiltScene, build
-from simtest.rendering.camera_motion import mean_over
-from simtest.rendering.direct import Material
 from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance, TruthMaps
-from simtest.rendering.hit_refinement import Refinement
-from simtest.rendering.indirect import Bounces
-from simtest.rendering.instrument_kernel import InstrumentKernel
-from simtest.rendering.instruments import Cover, cover_of, place
-from simtest.rendering.integrate import Progress, Tracer, as_radiance
-from simtest.rendering.materials import compiled_form
-from simtest.rendering.mesh_edges import MeshEdges
+from simtest.rendering.instruments import Cover, InstrumentKernel, cover_of, place, shade
+from simtest.rendering.kernel_values import to_kernel
+from simtest.rendering.lighting import Material
+from simtest.rendering.misfits import MisfitGrid, trace_grid, trace_misfits, trace_tiles
 from simtest.rendering.placement_checks import check_camera, check_lights, check_motion
-from simtest.rendering.rays import Sightlines
-from simtest.rendering.relief_kernel import ReliefKernel
-from simtest.rendering.rest_map import rest_map
-from simtest.rendering.session_truth import SessionTruth
-from simtest.rendering.shape_labels import ShapeLabels, as_labels
-from simtest.runtime.arrays import Array, Image
-from simtest.spec.motion import Motion
+from simtest.rendering.rays import HitRefinement, Sightlines
+from simtest.rendering.reflectances import compiled_form
+from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel, rest_map
+from simtest.rendering.trace import Bounces, Progress, Tracer, as_radiance, evaluate, mean_over
+from simtest.rendering.truth import ShapeLabels, as_hits, as_labels
+from simtest.runtime.arrays import Array, Image, IntArray, Mask
+from simtest.spec.camera import Motion
+from simtest.spec.lights import is_at_camera
+from simtest.spec.reflectance import Translucency
 from simtest.spec.scene import Scene
-from simtest.spec.translucency import Translucency
-from simtest.surfaces import SurfaceModel, make_surface
+from simtest.surfaces import RayHits, SurfaceModel, SurfacePoints, make_surface
 
 if TYPE_CHECKING:
     from simtest.surfaces.tissue_pattern import TissuePattern
 
 
-class Session(SessionTruth):
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _at_its_variant(method: Callable[Concatenate["Session", P], T]) -> Callable[Concatenate["Session", P], T]:
+    """Let a method run with Mitsuba set to the session's variant, which another session may have changed."""
+
+    @functools.wraps(method)
+    def entered(self: "Session", *args: P.args, **kwargs: P.kwargs) -> T:
+        self.mi  # noqa: B018 - sets the variant
+        return method(self, *args, **kwargs)
+
+    return entered
+
+
+class Session:
     """Renders scenes of the same structure without rebuilding.
 
     Parameters
@@ -56,21 +70,14 @@ class Session(SessionTruth):
     ----------
     rebuilds : int
         How many times the Mitsuba scene was built.
-
-    Raises
-    ------
-    BackendError
-        If the rendering backend cannot be used.
-    InputError
-        If the surface's file is malformed, the camera lies on the wrong side, or a light inside a body.
     """
 
     def __init__(self, scene: Scene, variant: str | None = None, labelled: bool = False) -> None:
-        self._mitsuba = backend.load(backend.requested_variant(variant, coloured=scene.is_coloured))
-        self.variant = str(self._mitsuba.variant())
-        self.plugin = phong.register(self.mi, self.variant)
-        tissue.register(self.mi, self.variant)
-        emission.register(self.mi, self.variant)
+        loaded = backend.load(backend.requested_variant(variant, coloured=scene.is_coloured))
+        self.variant = str(loaded.variant())
+        self.plugin = reflectances.register_phong(self.variant)
+        reflectances.register_tissue(self.variant)
+        lighting.register_light(self.variant)
         self.rebuilds = 0
         self._instruments: InstrumentKernel | None = None
         self._cover: Cover | None = None
@@ -84,18 +91,13 @@ class Session(SessionTruth):
     @property
     def mi(self) -> Any:
         """The mitsuba module, set to this session's variant, which another session may have changed."""
-        if self._mitsuba.variant() != self.variant:
-            self._mitsuba.set_variant(self.variant)
-        return self._mitsuba
+        if mi.variant() != self.variant:
+            mi.set_variant(self.variant)
+        return mi
 
+    @_at_its_variant
     def update(self, scene: Scene) -> None:
-        """Move to another scene; update only what changed, and rebuild only another structure.
-
-        Raises
-        ------
-        InputError
-            As for the session itself; it then stays at its scene.
-        """
+        """Move to another scene; update only what changed, and rebuild only another structure."""
         before = self.scene
         # Surface, camera and lights: refused here if they are not sound.
         if scene.placement != self.scene.placement:
@@ -138,8 +140,8 @@ class Session(SessionTruth):
         check_motion(scene, surface)
         self._shape = surface.shape()
         # Relief and colour are looked up where the tissue is at rest.
-        self._rest = rest_map(self.mi, surface)
-        self._relief = None if surface.relief is None else ReliefKernel(self.mi, surface.relief, self._rest)
+        self._rest = rest_map(surface)
+        self._relief = None if surface.relief is None else ReliefKernel(surface.relief, self._rest)
         self.surface: SurfaceModel = surface
         self._set_tissue(scene)
         self.scene = scene
@@ -155,7 +157,7 @@ class Session(SessionTruth):
 
     def _set_camera(self, scene: Scene) -> None:
         self._camera_spec, self.camera = scene.camera.still, scene.camera.model()
-        self.sightlines = Sightlines(self.mi, self.camera, self.surface.model_from_camera)
+        self.sightlines = Sightlines(self.camera, self.surface.model_from_camera)
         self._forget()
 
     def _forget(self) -> None:
@@ -173,29 +175,30 @@ class Session(SessionTruth):
         """Return everything of the scene that is compiled into the kernels."""
         material = compiled_form(self.scene.reflectance)
         relief = None if self._relief is None else self._relief.key
-        lights = tuple(emission.kind_of(light) for light in self.scene.rig.lights)
+        lights = tuple(lighting.kind_of(light) for light in self.scene.rig.lights)
         return self._shape.key, relief, material, self._pattern is not None, lights
 
     def _build(self, key: tuple[Any, ...]) -> BuiltScene:
         self.rebuilds += 1
-        return build(self.mi, key, self._shape, self.scene.reflectance, self.scene.rig.lights, self.plugin)
+        return build(key, self._shape, self.scene.reflectance, self.scene.rig.lights, self.plugin)
 
     def _write_values(self) -> None:
         """Write the values that may differ between scenes of one structure into the Mitsuba scene."""
-        self._built.write(self.mi, self._shape, self.scene.reflectance)
+        self._built.write(self._shape, self.scene.reflectance)
         self._place_lights(self.surface.model_from_camera)
         # The pattern of the tissue, unless it is there.
         if self._albedo is None or self._albedo.pattern is not self._pattern:
-            self._albedo = AlbedoKernel(self.mi, self._pattern) if self._pattern else None
+            self._albedo = AlbedoKernel(self._pattern) if self._pattern else None
         if self._albedo is not None:
             self._albedo.rest = self._rest
             self._built.let_bounces_find(self._albedo)
 
     def _place_lights(self, model_from_camera: Array) -> None:
-        self._light = self._built.place_lights(self.mi, self.scene.rig, model_from_camera)
+        self._light = self._built.place_lights(self.scene.rig, model_from_camera)
 
     # Radiance ----------------------------------------------------------------------------------------------------
 
+    @_at_its_variant
     def radiance(self, progress: Progress | None = None) -> Radiance:
         """Render the frame; `progress` is called after each launch, and what it raises stops the frame only.
 
@@ -204,6 +207,7 @@ class Session(SessionTruth):
         """
         return self._render(None, progress)[0]
 
+    @_at_its_variant
     def frame(self, progress: Progress | None = None) -> Frame:
         """Render the frame with the labels of the rendered shape, in one pass where it has one sample a pixel.
 
@@ -211,13 +215,11 @@ class Session(SessionTruth):
         """
         radiance = self.labelled_radiance(progress)
         labels, cover = as_labels(self._labels), self.cover()
-        return Frame(radiance, labels if cover is None else cover.labels(labels))
+        return Frame(radiance, labels if cover is None else cover.over(labels))
 
+    @_at_its_variant
     def labelled_radiance(self, progress: Progress | None = None) -> Radiance:
-        """Render the radiance of `frame`, and trace its labels.
-
-        The labels are kept while surface and camera stay: a frame of more samples takes them over.
-        """
+        """Render the radiance of `frame`, and trace its labels, or keep them while surface and camera stay."""
         kept = self._labels if self.scene.render.samples_per_pixel > 1 else []
         radiance, channels = self._render(None if kept else self._shape_labels(), progress)
         self._centre = self._labels = kept or channels
@@ -226,7 +228,7 @@ class Session(SessionTruth):
     def _shape_labels(self) -> ShapeLabels:
         if self._built.labels is None:
             operators = self.surface.vertex_shape_operators()
-            self._built.labels = ShapeLabels(self.mi, self._built.scene.shapes()[0], operators)
+            self._built.labels = ShapeLabels(self._built.scene.shapes()[0], operators)
         return self._built.labels
 
     def _render(self, labels: ShapeLabels | None, progress: Progress | None) -> tuple[Radiance, list[Any]]:
@@ -234,7 +236,7 @@ class Session(SessionTruth):
         # Direct light is traced here; a path depth above 2 adds bounces.
         bounces = None
         if effort.path_depth > 2:
-            bounces = Bounces(self.mi, self._built.scene, effort.path_depth, effort.seed)
+            bounces = Bounces(self._built.scene, effort.path_depth, effort.seed)
         if (motion := self.scene.camera.moving) is not None:
             parts = self._mean_over(motion, bounces, progress)
             channels = tracer.centres(None, False, labels)[1] if labels else []
@@ -265,7 +267,7 @@ class Session(SessionTruth):
         def at(middle_from_moment: Array) -> Tracer:
             pose = middle @ middle_from_moment
             self._place_lights(pose)
-            return self._tracer(Sightlines(self.mi, self.camera, pose))
+            return self._tracer(Sightlines(self.camera, pose))
 
         try:
             return mean_over(motion, self.scene.render, at, bounces, progress)
@@ -275,8 +277,8 @@ class Session(SessionTruth):
     def _adaptive(self, tracer: Tracer) -> adaptive.Adaptive:
         built, mesh = self._built, self._shape.mesh
         if built.edges is None and mesh is not None:
-            built.edges = MeshEdges(self.mi, built.scene, mesh)
-        labels = ShapeLabels(self.mi, built.scene.shapes()[0], None, curved=False)
+            built.edges = MeshEdges(built.scene, mesh)
+        labels = ShapeLabels(built.scene.shapes()[0], None, curved=False)
         return adaptive.Adaptive(tracer, self.scene, labels, self._shape, built.edges)
 
     def _translucent(self, radiance: Radiance, channels: list[Image], spec: Translucency) -> Radiance:
@@ -295,19 +297,181 @@ class Session(SessionTruth):
         """Return what traces the scene, by default from the camera's own pose."""
         built, sightlines = self._built, sightlines or self.sightlines
         material = Material(built.scene.shapes()[0].bsdf(), built.base, self._albedo)
-        refinement = Refinement(self.mi, self._shape)
+        refinement = HitRefinement(self._shape)
         kernel = self._instruments
-        return Tracer(self.mi, built.scene, sightlines, self._light, material, refinement, self._relief, kernel)
+        return Tracer(built.scene, sightlines, self._light, material, refinement, self._relief, kernel)
 
     def _centre_hits(self) -> list[Image]:
         """Return the labels of the last frame, or else trace them without curvatures, which the truth does not need."""
         if not self._centre:
-            labels = ShapeLabels(self.mi, self._built.scene.shapes()[0], None, curved=False)
+            labels = ShapeLabels(self._built.scene.shapes()[0], None, curved=False)
             self._centre = self._tracer().centres(None, False, labels)[1]
         return self._centre
 
+    @_at_its_variant
     def cover(self) -> Cover | None:
         """Return what instruments cover of the frame; None in a scene without instruments."""
         if self._cover is None and self._instruments is not None:
             self._cover = cover_of(self, self._instruments, self._centre_hits()[0])
         return self._cover
+
+    # Truth -------------------------------------------------------------------------------------------------------
+
+    def to_model(self, points: Array) -> Array:
+        """Transform points, shape (N, 3), from the camera frame to the model frame, mm."""
+        pose = self.surface.model_from_camera
+        return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
+
+    @_at_its_variant
+    def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
+        """Cast rays through pixel positions, shape (N, 2), onto the exact surface.
+
+        Returns the exact points and the shading and geometric normals of the rendered shape, shape (N, 3), without its
+        relief; in the camera frame, NaN where the ray misses.
+        """
+        return self._cast(*self.sightlines.in_model(points_px), None)
+
+    def _cast(
+        self, origins: Array, directions: Array, relief: ReliefKernel | None
+    ) -> tuple[SurfacePoints, Array, Array]:
+        """Cast rays of the model frame (see `cast`); with a `relief` the shading normals follow it."""
+        hits, shading, geometric = truth.trace_hits(self._built.scene, self._shape, origins, directions, relief)
+        rotation = self.surface.model_from_camera[:3, :3]
+        return truth.solve(self.surface, origins, directions, hits), shading @ rotation, geometric @ rotation
+
+    @_at_its_variant
+    def exact_points(self, points_px: Array, fine: bool = True) -> SurfacePoints:
+        """Return the exact points at pixel positions, shape (N, 2), camera frame, of the fine surface or the base."""
+        rays = self.sightlines.in_model(points_px)
+        return truth.solve(self.surface, *rays, self.exact_hits(*rays), fine)
+
+    @_at_its_variant
+    def exact_hits(self, origins: Array, directions: Array) -> RayHits:
+        """Return the hits from which exact points start, of rays of the model frame, shape (N, 3)."""
+        return truth.trace_starts(self._built.scene, origins, directions)
+
+    @_at_its_variant
+    def misfit_grid(self, stride: int) -> MisfitGrid:
+        """Return the misfits of all lights, without the relief, at the centres of every `stride`-th pixel."""
+        lights = self.to_model(self.scene.rig.true_mm())
+        return trace_grid(self._built.scene, self.sightlines, lights, stride)
+
+    @_at_its_variant
+    def misfits(self) -> MisfitMaps:
+        """Return the misfits of all lights at the centres of pixels; they are kept while surface, camera, rig stay."""
+        if self._misfits is None:
+            self._misfits = trace_misfits(self._tracer(), self.scene.rig.true_mm())
+        return self._misfits
+
+    @_at_its_variant
+    def tile_misfits(self, light: int, division: int, corners: IntArray, size: int) -> Image:
+        """Return the fine misfit of one light in tiles of divided pixels (see `trace_tiles`)."""
+        return trace_tiles(self._tracer(), self.scene.rig.true_mm()[light], division, corners, size)
+
+    @_at_its_variant
+    def truth(self, stride: int = 1) -> TruthMaps:
+        """Return the truth at the centre of every `stride`-th pixel along both axes; of all pixels it is kept."""
+        if stride == 1 and self._truth is None:
+            self._truth = self._cast_maps(1)
+        maps = self._truth if stride == 1 else None
+        maps, cover = maps or self._cast_maps(stride), self.cover()
+        return maps if cover is None else cover.every(stride).over(maps)
+
+    def _cast_maps(self, stride: int) -> TruthMaps:
+        centres = self.camera.pixel_centres()[::stride, ::stride]
+        pixels = centres.reshape(-1, 2)
+        if stride == 1:
+            # Hits like those of a frame's labels: the truth must not depend on whether a frame was rendered before.
+            hits, shading, geometric = as_hits(self._centre_hits())
+            points = truth.solve_frame(self.surface, *self.sightlines.in_view(pixels), hits)
+        else:
+            points, shading, geometric = self._cast(*self.sightlines.in_view(pixels), self._relief)
+        return truth.truth_maps(points, shading, geometric, centres.shape[:2])
+
+    @_at_its_variant
+    def depths(self) -> Array:
+        """Return the distances of `truth`, shape (H, W), mm, without instruments, at a fraction of its cost."""
+        if self._truth is not None:
+            return self._truth.depth
+        rays = self.sightlines.in_view(self.camera.pixel_centres().reshape(-1, 2))
+        distance = truth.frame_distances(self.surface, *rays, as_hits(self._centre_hits())[0])
+        return distance.reshape(self.camera.height, self.camera.width)
+
+    @_at_its_variant
+    def exact_distances(self, origins: Array, directions: Array) -> Array:
+        """Return how far along rays of the model frame, shape (N, 3), the exact surface lies, mm; NaN: it does not."""
+        return self.surface.distances(origins, directions, self.exact_hits(origins, directions))
+
+    @_at_its_variant
+    def blocked(self, origins: Array, directions: Array, reach: Array) -> Mask:
+        """Return which rays, shape (N, 3), model frame, meet the rendered shape before `reach`, shape (N,), mm."""
+        return truth.trace_blocked(self._built.scene, origins, directions, reach)
+
+    @_at_its_variant
+    def lit(self, positions: Array, light: int) -> Any:
+        """Return which points, shape (N, 3), camera frame, mm, a light emits towards and reaches unblocked."""
+        source = self.scene.rig.true_mm()[light]
+        towards = positions - source
+        distance = np.linalg.norm(towards, axis=1)
+        directions = towards / distance[:, None]
+        emitted = self.scene.rig.lights[light].factor(directions) > 0
+        # A light at the camera reaches all that is seen.
+        if is_at_camera(source):
+            return emitted
+        # Shadow rays from the light.
+        pose = self.surface.model_from_camera
+        origins = np.broadcast_to(self.to_model(source[None]), positions.shape)
+        hits = self.exact_hits(origins, directions @ pose[:3, :3].T)
+        # A blocker stands clearly in front of the point; the point's own triangle does not count.
+        return emitted & (hits.distance > distance * (1 - 1e-3))
+
+    @_at_its_variant
+    def lobe_at(self, points: Sequence[HighlightPoint]) -> Array:
+        """Compute the direct light off the lobe at highlight points, shape (N,), mean of the channels.
+
+        The normal is the exact one: the rendered triangles' misses the peak of a lobe that is narrower than a pixel. It
+        is 0 where a highlight is the pixels' mean alone: over a relief that no part of the frame resolves, or over the
+        camera's motion.
+        """
+        if not points or self.is_unresolved or self.scene.camera.moving is not None:
+            return np.zeros(len(points))
+        tracer, rotation = self._tracer(), self.surface.model_from_camera[:3, :3]
+        pixels, normals = np.array([point.bp_px for point in points]), np.array([point.normal for point in points])
+        rays, _, hit = tracer.hit(*(to_kernel(mi.Float, axis, np.float32) for axis in pixels.T))
+        fine = mi.SurfaceInteraction3f(hit.fine)
+        fine.sh_frame = mi.Frame3f(mi.Normal3f((normals @ rotation.T).T.astype(np.float32)))
+        fine.wi = fine.to_local(-rays.traced.d)
+        drawer = tracer.light.drawer(None)
+        draw = None if drawer is None else drawer.at(0)
+        lobe, _ = tracer.light.radiance(tracer.scene, tracer.material, replace(hit, fine=fine), draw)
+        return np.mean(evaluate([*lobe], len(points)), axis=0, dtype=float)
+
+    @_at_its_variant
+    def highlights(self, radiance: Radiance | None = None) -> list[HighlightPoint]:
+        """Find the highlight points of every light in view, the brightest first, with the frame's radiance.
+
+        On a surface with relief these are its glints (theory.md 7.1). Where no part of the frame resolves the relief it
+        acts as roughness, and the highlight points are the base's. Without a `radiance` theirs is 0, and they stand in
+        no order.
+        """
+        return self._found(self.is_unresolved, radiance)
+
+    @property
+    @_at_its_variant
+    def is_unresolved(self) -> bool:
+        """Whether the surface has a relief that no part of the frame resolves, so that it acts as roughness."""
+        return self.surface.relief is not None and not highlights.is_resolved(self)
+
+    @_at_its_variant
+    def base_highlights(self, radiance: Radiance | None = None) -> list[HighlightPoint]:
+        """Find the highlight points of the base, without the relief: the centres of the clouds of glints."""
+        return self._found(True, radiance)
+
+    def _found(self, base: bool, radiance: Radiance | None) -> list[HighlightPoint]:
+        """Return the highlight points of the base or of the fine surface, searched for once."""
+        if base not in self._highlights:
+            self._highlights[base] = highlights.search(self, base)
+        found = self._highlights[base]
+        if self._instruments is not None:
+            found = shade(self, self._instruments, found)
+        return list(found) if radiance is None else highlights.lit_by(radiance, found)

@@ -17,7 +17,7 @@ import numpy as np
 
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.translucency import Translucency
+from simtest.spec.reflectance import Translucency
 
 LEVELS_PX = tuple(2.0**i for i in range(8))
 """Standard deviations of the blurred levels, px; what is narrower stays sharp, what is wider takes the last."""
@@ -50,16 +50,8 @@ GRID_PX = 16
 def transfer(wave: Array, scattering: float, absorption: float, index: float) -> Array:
     """Return the diffuse reflectance of a half-space at spatial frequencies over that under uniform light.
 
+    `wave` is in rad/mm, reduced scattering and absorption in 1/mm; `index` is that of refraction over that outside.
     Light that is scattered once returns where it entered, with light and camera side by side; the rest diffuses.
-
-    Parameters
-    ----------
-    wave : ndarray
-        Wave numbers, rad/mm.
-    scattering, absorption : float
-        Reduced scattering and absorption coefficient, 1/mm.
-    index : float
-        Refractive index over that outside; 1: no internal reflection.
     """
     share = once_scattered(scattering, absorption, index)
     diffused = reflectance(wave, scattering, absorption, index) / reflectance(0.0, scattering, absorption, index)
@@ -88,20 +80,10 @@ def once_scattered(scattering: float, absorption: float, index: float) -> float:
 
 
 def spread(image: Image, depth: Array | Image, normal: Array | Image, camera: Camera, spec: Translucency) -> Image:
-    """Return diffuse radiance after its spread below the surface.
+    """Return diffuse radiance, shape (H, W) or (H, W, 3), after its spread below the surface, before the lens.
 
-    Parameters
-    ----------
-    image : ndarray of float32, shape (H, W) or (H, W, 3)
-        `Radiance.diffuse`, before the lens; one channel spreads as the mean of three.
-    depth : ndarray, shape (H, W)
-        Distance along the rays, mm; NaN where there is no surface: nothing spreads from or to there.
-    normal : ndarray, shape (H, W, 3)
-        Unit normals of the base, camera frame.
-    camera : Camera
-        The camera.
-    spec : Translucency
-        Optical properties of the tissue.
+    One channel spreads as the mean of three. Nothing spreads from or to where `depth`, the distance along the rays,
+    shape (H, W), mm, is NaN. `normal`, shape (H, W, 3), is the base's unit normal in the camera frame.
     """
     mask = np.isfinite(depth)
     if not mask.any():
@@ -158,11 +140,8 @@ def pixels_per_mm(depth: Array | Image, normal: Array | Image, camera: Camera) -
 def _fitted(spec: Translucency, channels: int, first: int, last: int) -> Array:
     """Fit Gaussians of the levels' widths to the transfer function.
 
-    Returns
-    -------
-    ndarray of float32, shape (scales, 1 + levels, channels)
-        Weights of the sharp image and of each level, of sum 1, at the scales 2^(i / `SCALES_PER_OCTAVE`) px/mm, i from
-        `first` to `last`.
+    Returns the weights of the sharp image and of each level, of sum 1, shape (scales, 1 + levels, channels), at the
+    scales 2^(i / `SCALES_PER_OCTAVE`) px/mm, i from `first` to `last`.
     """
     from scipy.optimize import nnls
 

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from simtest.rendering.kernel_arrays import to_kernel, vectors_from_kernel, vectors_to_kernel
+from simtest.rendering.backend import dr, mi
+from simtest.rendering.kernel_values import to_kernel, vectors_from_kernel, vectors_to_kernel
 from simtest.runtime.arrays import Array
 from simtest.surfaces import RayHits
 from simtest.surfaces.tube import MAX_SHIFT_MM, NEWTON_STEPS, NEWTON_TOLERANCE_MM, TubeChart
@@ -62,37 +63,24 @@ class _Frame:
 class _Table:
     """Rows of numbers that a kernel gathers."""
 
-    def __init__(self, mi: Any, rows: Array) -> None:
-        self.mi, self.columns = mi, rows.shape[1]
+    def __init__(self, rows: Array) -> None:
+        self.columns = rows.shape[1]
         self._values = mi.Float64(np.ascontiguousarray(rows, dtype=np.float64).ravel())
 
     def row(self, index: Any, active: Any = True) -> list[Any]:
         """Return the numbers of rows, mitsuba.UInt32."""
-        import drjit as dr
-
         first = index * self.columns
-        return [dr.gather(self.mi.Float64, self._values, first + i, active) for i in range(self.columns)]
+        return [dr.gather(mi.Float64, self._values, first + i, active) for i in range(self.columns)]
 
 
 class TubeKernel:
-    """Solves rays against a tube.
+    """Solves rays against a tube."""
 
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    chart : TubeChart
-        The tube, and its parameters at the corners of the rendered triangles.
-    """
-
-    def __init__(self, mi: Any, chart: TubeChart) -> None:
-        import drjit as dr
-
+    def __init__(self, chart: TubeChart) -> None:
         numbers = chart.tube.numbers()
-        self.mi = mi
-        self._folds, self._panels = _Table(mi, numbers.folds), _Table(mi, numbers.panels)
-        self._waves = _Table(mi, numbers.waves) if len(numbers.waves) else None
-        self._corners = _Table(mi, chart.corners.reshape(-1, 2))
+        self._folds, self._panels = _Table(numbers.folds), _Table(numbers.panels)
+        self._waves = _Table(numbers.waves) if len(numbers.waves) else None
+        self._corners = _Table(chart.corners.reshape(-1, 2))
         constants = {**numbers.constants, "last_knot": len(numbers.panels) - 1}
         self._n = {name: mi.Float64(value) for name, value in constants.items()}
         self._counts = {"folds": mi.UInt32(len(numbers.folds)), "waves": mi.UInt32(len(numbers.waves))}
@@ -100,10 +88,7 @@ class TubeKernel:
         dr.make_opaque(list(self._n.values()), list(self._counts.values()))
 
     def solve(self, origins: Array, directions: Array, hits: RayHits, model_from_camera: Array) -> dict[str, Array]:
-        """Compute the exact points, camera frame, on rays of the model frame, shape (N, 3) (see `exact_points.solve`).
-
-        Returns the fields of `SurfacePoints` that are not the base's own.
-        """
+        """Compute the exact points of `truth.solve` by field, but for those that are the base's own."""
         if not len(origins):
             # Dr.Jit ends the process on a kernel without rays.
             return {name: np.empty((0, *shape), dtype=kind) for name, (shape, kind) in _FIELDS.items()}
@@ -114,16 +99,11 @@ class TubeKernel:
         """Compute the distances of `solve` alone, shape (N,), mm; NaN where a ray has no point."""
         if not len(origins):
             return np.empty(0)
-        import drjit as dr
-
         t, _, _, found = self._solved(origins, directions, hits)[2:]
         return np.array(dr.select(found & dr.isfinite(t), t, dr.nan))
 
     def _solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Any, ...]:
         """Return rays as lanes of a kernel, and their solutions: distance, u, v and which are found."""
-        import drjit as dr
-
-        mi = self.mi
         origin, direction = (
             vectors_to_kernel(mi.Vector3d, mi.Float64, rays, np.float64) for rays in (origins, directions)
         )
@@ -141,9 +121,6 @@ class TubeKernel:
 
     def _newton(self, origin: Any, direction: Any, start: Any, u: Any, v: Any, valid: Any) -> tuple[Any, ...]:
         """Solve P(u, v) = origin + t direction (see `Tube.solve`); return t, u, v and which are found."""
-        import drjit as dr
-
-        mi = self.mi
 
         def body(t: Any, u: Any, v: Any, active: Any, found: Any, step: Any) -> tuple[Any, ...]:
             frame, r = self._frame(u, v), self._radius(u, v, second=False)
@@ -180,9 +157,6 @@ class TubeKernel:
         self, origin: Any, direction: Any, t: Any, u: Any, v: Any, found: Any, model_from_camera: Array
     ) -> dict[str, Array]:
         """Evaluate normals and curvatures at solutions, and turn all to the camera frame (see `pack_points`)."""
-        import drjit as dr
-
-        mi = self.mi
         frame, r = self._frame(u, v), self._radius(u, v, second=True)
         bend, cosine, sine = frame.bend, frame.cosine, frame.sine
         A = 1 - bend * r.f * cosine
@@ -203,7 +177,7 @@ class TubeKernel:
         sign = dr.select(dr.dot(normal, direction) > 0, mi.Float64(-1), mi.Float64(1))
         normal = normal * sign
         # Eigenvalues and eigenvectors of S in a tangent basis, S = sum of II_ij d_i d_j^T
-        tangent, other = _tangent_basis(mi, normal)
+        tangent, other = _tangent_basis(normal)
         a, b, c = (
             sign * (L * (f1 * f2) + M * (f1 * s2 + s1 * f2) + N * (s1 * s2))
             for (f1, s1), (f2, s2) in _pairs([(dr.dot(first, w), dr.dot(second, w)) for w in (tangent, other)])
@@ -223,7 +197,7 @@ class TubeKernel:
             "direction_min": rotation @ (turned_cosine * other - turned_sine * tangent),
             "direction_max": rotation @ (turned_cosine * tangent + turned_sine * other),
         }
-        return _arrays(mi, values, found)
+        return _arrays(values, found)
 
     @staticmethod
     def _in_model(frame: _Frame, local: Any) -> Any:
@@ -231,9 +205,7 @@ class TubeKernel:
 
     def _frame(self, u: Any, v: Any) -> _Frame:
         """Compute C(u) and the basis (see `Tube.heading`, `Tube.centreline` and `Tube.frame`)."""
-        import drjit as dr
-
-        mi, n = self.mi, self._n
+        n = self._n
         swaying, turning = dr.sincos(n["omega"] * u + n["phase"])
         psi = n["rate"] * u + n["sway"] * swaying
         bend = n["rate"] + n["sway"] * n["omega"] * turning
@@ -253,9 +225,7 @@ class TubeKernel:
 
     def _radius(self, u: Any, v: Any, second: bool) -> _Radius:
         """Compute r and its derivatives (see `Tube.radius`)."""
-        import drjit as dr
-
-        mi, n = self.mi, self._n
+        n = self._n
         # taeniae
         sine, cosine = dr.sincos(3 * (v - n["taenia_phase"]))
         zero = mi.Float64(0)
@@ -291,10 +261,8 @@ class TubeKernel:
         return _Radius(*sums, *([] if second else [zero] * 3))
 
     def _summed(self, term: Any, count: Any, sums: list[Any]) -> list[Any]:
-        import drjit as dr
-
         names = ("i", *(f"sum_{i}" for i in range(len(sums))))
-        state = (self.mi.UInt32(0), *(self.mi.Float64(part) for part in sums))
+        state = (mi.UInt32(0), *(mi.Float64(part) for part in sums))
         return list(dr.while_loop(state, lambda i, *_: i < count, term, labels=names)[1:])
 
 
@@ -304,10 +272,8 @@ def _pairs(rows: list[tuple[Any, Any]]) -> tuple[tuple[Any, Any], ...]:
     return (tangent, tangent), (tangent, other), (other, other)
 
 
-def _tangent_basis(mi: Any, normal: Any) -> tuple[Any, Any]:
+def _tangent_basis(normal: Any) -> tuple[Any, Any]:
     """Return the basis of `simtest.geometry.vectors.tangent_basis`."""
-    import drjit as dr
-
     sign = dr.select(normal.z >= 0, mi.Float64(1), mi.Float64(-1))
     a = -1 / (sign + normal.z)
     b = normal.x * normal.y * a
@@ -315,10 +281,8 @@ def _tangent_basis(mi: Any, normal: Any) -> tuple[Any, Any]:
     return first, mi.Vector3d(b, sign + dr.square(normal.y) * a, -normal.y)
 
 
-def _arrays(mi: Any, values: dict[str, Any], found: Any) -> dict[str, Array]:
+def _arrays(values: dict[str, Any], found: Any) -> dict[str, Array]:
     """Return lanes as arrays of double precision, NaN where there is no point."""
-    import drjit as dr
-
     kept = {name: dr.select(found, value, dr.nan) for name, value in values.items()}
     dr.eval(kept, found)
     arrays: dict[str, Array] = {"valid": np.array(found), "pool": np.zeros(len(found), dtype=bool)}

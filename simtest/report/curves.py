@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
-from simtest.pages.axes import Axis
+from simtest.pages.charts import Axis
 from simtest.pages.style import estimator_order
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array

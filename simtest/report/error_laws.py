@@ -12,7 +12,7 @@ from simtest.report.run_folder import Run
 from simtest.report.series import TOLERANCE_DEG, TOLERANCE_SHARE
 from simtest.runtime.arrays import Array
 from simtest.runtime.statistics import deviation_of_mean, summed
-from simtest.spec.experiment import LawName
+from simtest.spec.recipes import LawName
 from simtest.validation import laws
 from simtest.validation.statistics import units
 

@@ -1,4 +1,4 @@
-"""The figures of a page: each described once, drawn into a file by threads, and packed for the page."""
+"""The figures of a page: each described once and packed for the page; threads draw those that are files."""
 
 import hashlib
 import os
@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from simtest.pages import chart_png, chart_web, pixels
-from simtest.pages.chart import Chart
+from simtest.pages.charts import Chart, png
 from simtest.report.write import Progress
 
 THREADS = 2
@@ -18,12 +17,13 @@ T = TypeVar("T")
 
 @dataclass
 class FigureFiles:
-    """The figures of a page: files in `folder`, drawn and written by `pool`, and plotly's JSON by key."""
+    """The figures of a page: charts that the page draws, and files in `folder`, drawn and written by `pool`."""
 
     folder: Path
     pool: ThreadPoolExecutor
     progress: Progress | None = None
-    json: dict[str, chart_web.PlotlyJson] = field(default_factory=dict)
+    chart_files: bool = False  # whether charts are files too: each takes as long as all the rest of a small page
+    charts: list[Chart] = field(default_factory=list)
     hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 by file name, of what is written
     work: dict[Future[Any], str] = field(default_factory=dict)  # with what it draws
 
@@ -34,14 +34,15 @@ class FigureFiles:
         return future
 
     def draw(self, name: str, charts: list[Chart]) -> list[Chart]:
-        """Draw charts into one file and into the page; returns them."""
+        """Draw charts into the page, and into one file where that is asked for; returns them."""
         self.tell(f"describing {name}")
-        self.start(name, self._draw_charts, name, charts)
-        self.json |= {chart.key: chart_web.figure(chart) for chart in charts}
+        if self.chart_files:
+            self.start(name, self._draw_charts, name, charts)
+        self.charts += charts
         return charts
 
     def _draw_charts(self, name: str, charts: list[Chart]) -> None:
-        self.write(name, pixels.png(chart_png.draw(charts)[0]))
+        self.write(name, png(charts))
 
     def write(self, name: str, content: bytes) -> None:
         """Write a PNG file; a reader never meets half of one."""
@@ -73,7 +74,3 @@ class FigureFiles:
         for old in (*self.folder.glob("*.png"), *self.folder.glob(".*.part")):
             if old.name not in self.hashes:
                 old.unlink()
-
-    def packed(self) -> str:
-        """Return plotly's JSON of all charts, packed."""
-        return chart_web.packed(self.json)

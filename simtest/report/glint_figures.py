@@ -7,10 +7,9 @@ from itertools import cycle
 import numpy as np
 import polars as pl
 
-from simtest.pages.axes import Axis, finite, log_range
-from simtest.pages.chart import Bars, Chart, Mark, Panel
+from simtest.pages.charts import Axis, Bars, Chart, Mark, Panel, finite, log_range
 from simtest.pages.palette import NEUTRAL, SERIES
-from simtest.pages.style import Symbol, number, symbols
+from simtest.pages.style import number, symbols
 from simtest.report.relief_figures import (
     KD,
     LEVEL,
@@ -32,7 +31,7 @@ LEAST_RADIUS_PX = 2.0
 """Below this radius a visible highlight is measured in too few pixels to judge the law."""
 
 _BLUE, _ORANGE = SERIES[:2]
-_GLINTS, _VISIBLE = Symbol("o", "circle", "●"), Symbol("^", "triangle-up", "▲")
+_GLINTS, _VISIBLE = "●", "▲"
 _COLUMNS = {
     "cloud", "pool", "radius_px", "radius_law_px", "cloud_glints", "cloud_glints_law", "cloud_visible",
     "cloud_error_deg", "cloud_error_law_deg", "cloud_kd_min", "cloud_kd_max", "cloud_cov_11", "cloud_cov_22",

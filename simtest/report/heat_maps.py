@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 import polars as pl
 
-from simtest.pages.axes import Axis, finite
-from simtest.pages.chart import NOTHING, Chart, Mark, Panel
-from simtest.pages.style import Symbol, estimator_order, hexadecimal, number
+from simtest.pages.charts import NOTHING, Axis, Chart, Mark, Panel, finite
+from simtest.pages.style import estimator_order, hexadecimal, number
 from simtest.report.curves import prepared, scattered, varies
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
@@ -23,7 +22,7 @@ _WIDTHS, _LEAST_WIDTH = (0.1, 0.03, 0.01, 0.003), 2e-3
 """Width of a column or row as a share of its values, the widest that melts no more settings than the narrowest; and the
 least width."""
 
-_SWATCH = Symbol("s", "square", "■")
+_SWATCH = "■"
 
 
 @dataclass(frozen=True)

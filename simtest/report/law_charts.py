@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from simtest.pages.axes import Axis, log_range
-from simtest.pages.chart import Chart, Mark, Panel
+from simtest.pages.charts import Axis, Chart, Mark, Panel, log_range
 from simtest.pages.palette import FURTHER, NEUTRAL, SERIES
 from simtest.pages.style import symbols
 from simtest.report.error_laws import SLOPE, LawResult

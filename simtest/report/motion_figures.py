@@ -6,8 +6,7 @@ import numpy as np
 import polars as pl
 
 from simtest.estimators.two_views import WRONG_SHARE
-from simtest.pages.axes import Axis
-from simtest.pages.chart import Chart, Mark, Panel
+from simtest.pages.charts import Axis, Chart, Mark, Panel
 from simtest.pages.palette import SERIES
 from simtest.pages.style import number, symbols
 from simtest.report.relief_figures import ReliefFigure

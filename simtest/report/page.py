@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from simtest.estimators.descriptions import DESCRIPTIONS
-from simtest.pages import chart_web, style
+from simtest.pages import style
+from simtest.pages.charts import embedded, packed
 from simtest.pages.html import environment
 from simtest.report import sentences
 from simtest.report.coverage import coverage, is_anatomical
@@ -23,19 +24,21 @@ from simtest.report.pairs import pairs
 from simtest.report.paper.paper_section import paper_section
 from simtest.report.relief_figures import relief_figures
 from simtest.report.run_folder import GalleryItem, Run
+from simtest.report.scene3d import framed, kept_scene
 from simtest.report.series import line_chart, line_figures
 from simtest.report.summary_table import HEADINGS, table_rows
 from simtest.report.surface_errors import surface_chart, surface_errors
 from simtest.report.triangle_cost import fineness_charts, read_study
-from simtest.report.view3d import view_3d, view_json
 from simtest.report.visible_figures import visible_figures
 from simtest.report.write import Progress
 
 _FIRST_CARDS, _MAX_HEAT_MAPS = 9, 18
 
 
-def draw_page(run: Run, folder: Path, progress: Progress | None = None) -> tuple[str, dict[str, str], int]:
-    """Draw the figures of a run into a folder, which must exist.
+def draw_page(
+    run: Run, folder: Path, progress: Progress | None = None, charts: bool = False
+) -> tuple[str, dict[str, str], int]:
+    """Draw the frames of a run, and its charts where asked for, into files of a folder, which must exist.
 
     Returns
     -------
@@ -44,7 +47,7 @@ def draw_page(run: Run, folder: Path, progress: Progress | None = None) -> tuple
         `progress` was told of, with the last one, writing the page, still to do.
     """
     with ThreadPoolExecutor(THREADS) as pool:
-        figures = FigureFiles(folder, pool, progress)
+        figures = FigureFiles(folder, pool, progress, charts)
         # Stages: describe the sections, draw them, fill in the page.
         sections = _sections(run, figures)
         figures.finish()
@@ -78,9 +81,8 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
     boxes = figures.draw("anatomy", [surface_chart(surfaces, colours)]) if surfaces and surfaces.boxes else []
     study = read_study() if is_anatomical(run) else None
     fineness = figures.draw("fineness", fineness_charts(study)) if study else []
-    view = view_3d(run, colours)
-    if view is not None:
-        figures.json[view.key] = view_json(view)
+    view = kept_scene(run)
+    frame, parts = framed(view.content, "curvature") if view else ("", [])
 
     headline = sentences.headline(run, curves)
     headline += ([paper.headline] if paper else []) + ([sentence(results)] if laws else [])
@@ -90,7 +92,8 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
         "lines": [(curve, chart, sentences.measured(curve)) for curve, chart in lines], "relief": relief,
         "heat": [(chart, sentences.heat_line(item)) for chart, item in zip(heat, maps, strict=True)],
         "surfaces": surfaces, "boxes": boxes, "coverage": coverage(run), "study": study, "fineness": fineness,
-        "pairs": pairs(run), "cards": cards, "view": view, "summary": table_rows(run),
+        "pairs": pairs(run), "cards": cards, "view": view, "frame": packed(frame), "parts": parts,
+        "summary": table_rows(run),
         "colours": {name: colours[name] for name in style.estimator_order(colours)},
     }  # fmt: skip
 
@@ -125,6 +128,6 @@ def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
             "first": _FIRST_CARDS, "isophotes": isophote_keys(run.gallery), "truth_colour": style.TRUTH,
             "columns": HEADINGS, **_guide(guide_json(run)),
             "length_units": " or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",
-            "figures": figures.packed(), "plotly": chart_web.packed_plotly() if figures.json else None,
+            **embedded(figures.charts),
         }
     )  # fmt: skip

@@ -7,14 +7,13 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from simtest.pages.axes import Axis, log_range
-from simtest.pages.chart import NOTHING, Bars, Chart, Mark, Panel
-from simtest.pages.style import NEUTRAL, Symbol, degrees, estimator_order, number
+from simtest.pages.charts import NOTHING, Axis, Bars, Chart, Mark, Panel, log_range
+from simtest.pages.style import NEUTRAL, degrees, estimator_order, number
 from simtest.report.curves import bar, scattered, varies
 from simtest.report.run_folder import Run
 from simtest.report.series import axis_title
 from simtest.runtime.arrays import Array
-from simtest.spec.describe import name_key
+from simtest.spec.keys import name_key
 from simtest.validation import relief_laws
 
 KD = "kd_base"
@@ -33,7 +32,7 @@ _NAMES = {KD: "the base's curvature", LEVEL: "the film's level"}
 _SEED = "surface.relief.seed"
 _LAW_OVER_SLOPE = float(relief_laws.relief_error(1.0))
 _AGAINST = {"error_base_deg": "base", "error_fine_deg": "fine surface"}
-_SYMBOLS = {"error_base_deg": Symbol("o", "circle", "●"), "error_fine_deg": Symbol("^", "triangle-up", "▲")}
+_SYMBOLS = {"error_base_deg": "●", "error_fine_deg": "▲"}
 
 
 @dataclass(frozen=True)
@@ -172,7 +171,7 @@ def _curve(rows: pl.DataFrame, error: str, name: str, colour: str) -> Mark:
 
 
 def mean_mark(
-    groups: list[tuple[float, pl.DataFrame]], value: str, colour: str, name: str, symbol: Symbol, about: str = "",
+    groups: list[tuple[float, pl.DataFrame]], value: str, colour: str, name: str, symbol: str, about: str = "",
     told: Callable[[float], str] = number,
 ) -> Mark:  # fmt: skip
     """Describe the means of a column of rows by x, with their intervals over frames; rows without a value are none."""

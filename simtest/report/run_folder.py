@@ -16,8 +16,8 @@ from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.pages.style import degrees
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.camera_spec import CameraSpec
-from simtest.spec.paper import PaperSetting
+from simtest.spec.camera import CameraSpec
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.faults import fault_sentence
 from simtest.validation.guide import Guide, guide_of
 

@@ -64,15 +64,6 @@ class RunResults:
             for sentence in fault_sentences(faults):
                 warnings.warn(sentence, RuntimeWarning, stacklevel=3)
 
-    def __getattr__(self, name: str) -> Any:
-        """Return what a `Path` of the page has by a public name: `simtest.validate` returned one in 0.1."""
-        # A notebook asks for many names that start with an underscore; a copy asks before there is a page.
-        if name.startswith("_") or "page" not in vars(self) or not hasattr(Path, name):
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        how = f"RunResults.{name} is deprecated and goes in 0.3.0; use .page.{name}"
-        warnings.warn(how, DeprecationWarning, stacklevel=2)
-        return getattr(self.page, name)
-
     def __fspath__(self) -> str:
         return str(self.page)
 

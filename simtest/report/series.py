@@ -7,18 +7,17 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from simtest.pages.axes import Axis, curvature_axis, log_range
-from simtest.pages.chart import NOTHING, Bars, Chart, Mark, Panel, label_keys
-from simtest.pages.style import NEUTRAL, Symbol, estimator_order, number, symbols
+from simtest.pages.charts import NOTHING, Axis, Bars, Chart, Mark, Panel, curvature_axis, label_keys, log_range
+from simtest.pages.style import NEUTRAL, estimator_order, number, symbols
 from simtest.report.curves import Ask, Curve, gather, prepared, varies
 from simtest.report.run_folder import Run
-from simtest.spec.describe import describe_key, name_key
+from simtest.spec.keys import describe_key, name_key
 
 # A law is met within 0.3 deg or 3 %, whichever is larger (theory.md section 4).
 TOLERANCE_DEG, TOLERANCE_SHARE = 0.3, 0.03
 MOST_TITLE = 70  # characters of a description that fit under an axis
 _ERROR_TITLE = "angular error (deg)"
-_DASH = Symbol("_", "line-ew-open", "–")
+_DASH = "–"
 LEAST_LAW = 0.01  # a law below this (deg, or axis ratio) predicts nothing that noise would leave visible
 
 
@@ -175,7 +174,7 @@ def _has_law(curve: Curve, axis: Axis) -> bool:
 def _law_mark(data: LineFigure, curve: Curve, colours: Mapping[str, str]) -> Mark:
     return Mark(
         curve.law_x, curve.law_y, NEUTRAL if data.shared_law else colours[curve.estimator], curve.estimator,
-        listed=False, line="dash" if curve.joined else "", width=1.5, symbol=None if curve.joined else _DASH, size=9,
+        listed=False, line="dash" if curve.joined else "", width=1.5, symbol="" if curve.joined else _DASH, size=9,
         hover=f"law, {curve.label}\n{{x}}: {{y}}",
     )  # fmt: skip
 
@@ -190,7 +189,7 @@ def _join_mark(curve: Curve, colours: Mapping[str, str]) -> Mark:
     return Mark(x, y, colours[curve.estimator], curve.estimator, listed=False, line="solid", width=0.7)
 
 
-def _points_mark(data: LineFigure, curve: Curve, colours: Mapping[str, str], symbol: Symbol) -> Mark:
+def _points_mark(data: LineFigure, curve: Curve, colours: Mapping[str, str], symbol: str) -> Mark:
     columns = (curve.names, curve.x, curve.y, curve.low, curve.high, curve.law_at, curve.counts)
     hover = [
         f"{curve.estimator}, {curve.label}\n{name}\nx = {number(x)}, mean {number(y)}{data.unit} "

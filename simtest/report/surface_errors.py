@@ -6,9 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from simtest.pages.axes import Axis, log_range
-from simtest.pages.chart import Chart, Mark, Panel
-from simtest.pages.style import Symbol, degrees, estimator_order
+from simtest.pages.charts import Axis, Chart, Mark, Panel, log_range
+from simtest.pages.style import degrees, estimator_order
 from simtest.report.coverage import is_anatomical
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
@@ -17,7 +16,7 @@ from simtest.validation.situations import CO_LOCATED
 
 _LEAST_DEG = 1e-6  # errors of exactly zero still show on a logarithmic axis
 STRIP_POINTS = 120  # points drawn beside a box: evenly spaced order statistics where there are more values
-_DOT = Symbol(".", "circle", "●")
+_DOT = "●"
 
 
 class Box(NamedTuple):

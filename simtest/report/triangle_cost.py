@@ -6,8 +6,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from simtest.conventions import EDGES_PER_HALF_WIDTH
-from simtest.pages.axes import Axis, log_range
-from simtest.pages.chart import Chart, Mark, Panel, label_keys
+from simtest.pages.charts import Axis, Chart, Mark, Panel, label_keys, log_range
 from simtest.pages.palette import NEUTRAL, SERIES
 from simtest.pages.style import symbols
 

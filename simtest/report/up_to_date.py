@@ -13,8 +13,9 @@ GUIDE = "guide.json"
 
 _OPEN, _CLOSE = "<!-- made of ", " -->\n"
 _PACKAGE = Path(__file__).resolve().parents[1]
-_TEMPLATES = ("*.j2", "*.json", "*.zz")
-_DRAWING = ("pillow", "jinja2", "matplotlib")  # whose versions change a page, beside those that change results
+_TEMPLATES = ("*.j2", "*.json")
+# Whose versions change a page, beside those that change results.
+_DRAWING = ("pillow", "jinja2", "matplotlib", "trimesh", "vl-convert-python")
 
 
 def page_key(run: Path) -> str:
@@ -27,22 +28,27 @@ def page_key(run: Path) -> str:
     return _hash({"files": content, "code": _code(), "versions": versions() | package_versions(_DRAWING)})
 
 
-def signed(html: str, key: str, figures: Mapping[str, str], guide: str) -> str:
-    """Return a page with its note: the key, and the SHA-256 of the page, its figures by file name, and `GUIDE`."""
+def signed(html: str, key: str, charts: bool, figures: Mapping[str, str], guide: str) -> str:
+    """Return a page with its note: key, whether charts are files, SHA-256 of page, files of figures, and `GUIDE`."""
     digest = hashlib.sha256(html.encode()).hexdigest()
-    content = {"key": key, "page": digest, "guide": guide, "figures": dict(sorted(figures.items()))}
+    content = {"key": key, "charts": charts, "page": digest, "guide": guide, "figures": dict(sorted(figures.items()))}
     note = json.dumps(content, separators=(",", ":"))
     return f"{html}{_OPEN}{note}{_CLOSE}"
 
 
-def is_up_to_date(run: Path, key: str) -> bool:
-    """Return whether a run's page was made of what `key` stands for, and it and all its figures are still as made."""
+def is_up_to_date(run: Path, key: str, charts: bool = False) -> bool:
+    """Return whether a run's page was made of what `key` stands for, and it and all its figures are still as made.
+
+    With `charts` only where they are files too.
+    """
     try:
         html, found, end = (run / "index.html").read_text(encoding="utf-8").rpartition(_OPEN)
         if not found or not end.endswith(_CLOSE):
             return False
         note = json.loads(end.removesuffix(_CLOSE))
         if note["key"] != key or note["page"] != hashlib.sha256(html.encode()).hexdigest():
+            return False
+        if charts and not note["charts"]:
             return False
         if file_hash(run / GUIDE) != note["guide"]:
             return False

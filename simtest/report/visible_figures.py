@@ -6,16 +6,15 @@ import numpy as np
 import polars as pl
 
 from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, ON_INSTRUMENT
-from simtest.pages.axes import Axis
-from simtest.pages.chart import Chart, Mark, Panel
+from simtest.pages.charts import Axis, Chart, Mark, Panel
 from simtest.pages.palette import NEUTRAL, SERIES
-from simtest.pages.style import Symbol, number
+from simtest.pages.style import number
 from simtest.report.relief_figures import ReliefFigure
 from simtest.report.run_folder import Run
 from simtest.validation.row_kinds import row_kind
 
 _NEEDED = {"visible_id", "visible_snr", "frame_visible"}
-_FOUND, _FALSE = Symbol("o", "circle", "●"), Symbol("x", "x", "✕")
+_FOUND, _FALSE = "●", "✖"
 _FRAME = ["setting", "realisation"]
 
 

@@ -12,8 +12,8 @@ Progress = Callable[[int, int, str], None]
 """Called with steps done, steps in all, and what is done."""
 
 
-def write_report(run: Path, progress: Progress | None = None) -> Path:
-    """Write the figures and the page of a run; what is up to date stays as it is.
+def write_report(run: Path, progress: Progress | None = None, charts: bool = False) -> Path:
+    """Write the page of a run and the pictures of its frames; what is up to date stays as it is.
 
     Parameters
     ----------
@@ -22,21 +22,18 @@ def write_report(run: Path, progress: Progress | None = None) -> Path:
     progress : callable, optional
         Called with steps done, steps in all (a figure or frame each, and the page), and what is done; what it raises
         stops the report, and the page stays the earlier one.
+    charts : bool
+        Whether the charts, which the page draws, are written as PNG files too.
 
     Returns
     -------
     pathlib.Path
         ``run/index.html``. Beside it, ``run/guide.json`` and ``run/figures/*.png`` are written anew; pictures of an
         earlier report go.
-
-    Raises
-    ------
-    InputError
-        If a file of the run is missing or malformed.
     """
     run = Path(run)
     page, key = run / "index.html", page_key(run)
-    if is_up_to_date(run, key):
+    if is_up_to_date(run, key, charts):
         return page
     # Imported here: a page that is up to date needs none of what draws it.
     from simtest.report.page import draw_page, guide_json
@@ -47,10 +44,10 @@ def write_report(run: Path, progress: Progress | None = None) -> Path:
     data = read_run(run)
     folder = run / "figures"
     folder.mkdir(exist_ok=True)
-    html, figures, steps = draw_page(data, folder, progress)
+    html, figures, steps = draw_page(data, folder, progress, charts)
     write_json(run / GUIDE, guide_json(data))
     # The page comes last, so that a stopped report leaves the earlier one.
-    note = signed(html, key, figures, file_hash(run / GUIDE))
+    note = signed(html, key, charts, figures, file_hash(run / GUIDE))
     write_atomically(page, lambda part: part.write_text(note, encoding="utf-8"))
     if progress:
         progress(steps, steps, WRITTEN)

@@ -1,6 +1,7 @@
 """What every package stands on.
 
-`files` writes atomically, `resources` finds shipped data, `seeds` holds the seed tree, `provenance` records versions
-and hashes, `measuring` takes times and memory, `arrays` names the array types, `engines` runs tasks in parallel,
-`lazy_names` loads a package's names at first use.
+`files` writes atomically and refuses what is too large, `locks` keeps a folder to one run, `resources` finds shipped
+data and registered objects, `boundary` says what is wrong, `arrays` names the array types and keeps arrays, `processes`
+runs tasks in parallel, `seeds` holds the seed tree, `provenance` records versions and hashes, `statistics` makes
+intervals, `lazy_names` loads a package's names at first use.
 """

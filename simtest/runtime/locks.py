@@ -18,9 +18,7 @@ from pathlib import Path
 from typing import IO
 
 from simtest.errors import InputError
-from simtest.runtime.files import make_folder, refuse_file
-from simtest.runtime.machine_errors import cannot_write
-from simtest.runtime.resources import shown
+from simtest.runtime.files import make_folder
 
 LOCK = ".lock"
 """Name of the lock file in a folder, and end of the name of one beside a file."""
@@ -33,26 +31,17 @@ _WITHOUT_LOCKS = {errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOLCK, errno.EO
 def exclusive_folder(folder: Path, option: str = "--out") -> Iterator[None]:
     """Keep a folder for results to this run; it is made if need be, and removed again if it stays empty.
 
-    Parameters
-    ----------
-    folder : Path
-        The folder.
-    option : str
-        How the user names it, for messages.
-
-    Raises
-    ------
-    InputError
-        If another run is at work in the folder: the message names its process. If the folder cannot be made.
+    Raises `InputError` if another run is at work in the folder: the message names its process. `option` is how the user
+    names the folder.
     """
-    made = _missing(folder, option)
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     make_folder(folder, option)
     try:
-        with _exclusive(folder / LOCK, f"{option} {shown(folder)}"):
+        with _exclusive(folder / LOCK, folder, option):
             yield
     finally:
         # What was refused leaves nothing behind.
-        for path in made:
+        for path in missing:
             with contextlib.suppress(OSError):
                 path.rmdir()
 
@@ -63,42 +52,34 @@ def exclusive_file(path: Path, option: str = "--out") -> Iterator[None]:
 
     Raises `InputError` as `exclusive_folder` does.
     """
-    what = f"{option} {shown(path)}"
     if path.name in ("", ".."):
-        raise InputError(f"{what}: is a folder; must be a file")
-    try:
-        if not path.parent.is_dir():
-            raise InputError(f"{what}: no such folder {shown(path.parent)}")
-    except OSError as error:
-        raise cannot_write(error, what, path) from error
-    with _exclusive(path.with_name(f".{path.name[:200]}{LOCK}"), what):
+        raise InputError(f"{option} {path}: is a folder; must be a file")
+    if not path.parent.is_dir():
+        raise InputError(f"{option} {path}: no such folder {path.parent}")
+    with _exclusive(path.with_name(f".{path.name[:200]}{LOCK}"), path, option):
         yield
 
 
 @contextlib.contextmanager
-def _exclusive(lock: Path, what: str) -> Iterator[None]:
+def _exclusive(lock: Path, path: Path, option: str) -> Iterator[None]:
+    """Hold a lock of a path meanwhile; where nothing can be locked, or written at all, nobody is refused."""
     try:
         file = _open(lock)
     except OSError as error:
-        # Where nothing can be written nobody writes; a finished run can still be looked at.
-        _require_without_locks(error, what, lock)
+        _require_without_locks(error, path)
         yield
         return
-    except KeyboardInterrupt:
-        # Just made, perhaps; what nobody holds may go.
-        if not is_held(lock):
-            with contextlib.suppress(OSError):
-                lock.unlink(missing_ok=True)
-        raise
     with file:
         try:
-            taken = _taken(lock, file)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            taken = is_same(lock, file)
+        except BlockingIOError:
+            taken = False
         except OSError as error:
-            # A file system without locks refuses nobody.
-            _require_without_locks(error, what, lock)
+            _require_without_locks(error, path)
             taken = True
         if not taken:
-            raise InputError(f"{what}: is in use by {_holder(lock)}; wait until it ends, or name another")
+            raise InputError(f"{option} {path}: is in use by {_holder(lock)}; wait until it ends, or name another")
         try:
             with contextlib.suppress(OSError):
                 file.truncate(0)
@@ -112,10 +93,10 @@ def _exclusive(lock: Path, what: str) -> Iterator[None]:
                 lock.unlink(missing_ok=True)
 
 
-def _require_without_locks(error: OSError, what: str, lock: Path) -> None:
-    """Raise what tells the user, unless an error says that nothing can be locked, or written, at this place."""
+def _require_without_locks(error: OSError, path: Path) -> None:
+    """Raise an error under the name that the user gave, unless it says that nothing can be locked at this place."""
     if error.errno not in _WITHOUT_LOCKS:
-        raise cannot_write(error, what, lock.parent) from error
+        raise OSError(error.errno or errno.EINVAL, error.strerror or str(error), str(path)) from error
 
 
 def _open(lock: Path) -> IO[bytes]:
@@ -139,18 +120,6 @@ def _open(lock: Path) -> IO[bytes]:
     except PermissionError as error:
         told = f"{lock.name} is another user's and cannot be read; remove it where no run is at work"
         raise OSError(errno.EBUSY, told) from error
-
-
-def _taken(lock: Path, file: IO[bytes]) -> bool:
-    """Lock an open file without waiting; return whether that worked and it still is the file of its name.
-
-    Raises `OSError` where the file system knows no locks.
-    """
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return is_same(lock, file)
 
 
 def is_same(path: Path, file: IO[bytes]) -> bool:
@@ -205,24 +174,8 @@ def _holder(lock: Path) -> str:
     try:
         with lock.open("rb") as file:
             told = json.loads(file.read(_MOST_BYTES))
-        own = "" if told["machine"] == socket.gethostname() else f" on {shown(told['machine'], 60)}"
-        return (
-            f"process {int(told['process'])}{own} ({shown(told['command'], 120)}, since {shown(told['started'], 40)})"
-        )
+        own = "" if told["machine"] == socket.gethostname() else f" on {told['machine']!s:.60}"
+        return f"process {int(told['process'])}{own} ({told['command']!s:.120}, since {told['started']!s:.40})"
     except (OSError, ValueError, KeyError, TypeError):
         # Just taken, or just given back.
         return "another process"
-
-
-def _missing(folder: Path, option: str) -> list[Path]:
-    """Return the folders that must be made for a folder to be there, the innermost first."""
-    refuse_file(folder, option)
-    missing = []
-    for path in (folder, *folder.parents):
-        try:
-            if path.exists():
-                break
-        except OSError:
-            break
-        missing.append(path)
-    return missing

@@ -8,7 +8,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Picture
-from simtest.spec.processing import Coding, H264Coding, JpegCoding
+from simtest.spec.sensor import Coding, H264Coding, JpegCoding
 
 _SAMPLING = {
     "4:4:4": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,

@@ -14,8 +14,7 @@ import numpy.typing as npt
 from simtest.geometry import Camera
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Mask
-from simtest.surfaces.deformation import DeformationAt
-from simtest.surfaces.deformed import DeformedSurface
+from simtest.surfaces.deformation import DeformationAt, DeformedSurface
 
 NONE, SEEN, OUT, HIDDEN, INSTRUMENT = range(5)
 """State of a pixel: its ray meets no surface; the other frame sees its point too; the point lies outside the other

@@ -11,10 +11,8 @@ import numpy.typing as npt
 from simtest.calibration import Calibration, Response
 from simtest.rendering.bitmap import write_exr
 from simtest.runtime import provenance
-from simtest.runtime.array_files import write_arrays
-from simtest.runtime.arrays import Image
+from simtest.runtime.arrays import Image, write_arrays
 from simtest.runtime.files import Json, make_folder, write_atomically, write_json
-from simtest.runtime.machine_errors import write_error
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.labelled_frame import LabelledFrame
@@ -79,16 +77,13 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     files = [out / name for name in FILES]
     calibration = calibration_toml(picture_calibration(frame.calibration, frame.scene.sensor), _note(frame.scene))
     make_folder(out)
-    try:
-        write_atomically(files[0], lambda part: part.write_bytes(encoded_png(frame.image, frame.scene.sensor)))
-        write_atomically(files[1], lambda part: write_exr(part, frame.radiance.total, frame.variant))
-        write_atomically(files[2], lambda part: write_arrays(part, _truth(frame)))
-        write_json(files[3], _description(frame))
-        write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
-        write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
-        write_atomically(files[6], lambda part: part.write_bytes(_preview_jpeg(frame)))
-    except OSError as error:
-        raise write_error(error, out) from error
+    write_atomically(files[0], lambda part: part.write_bytes(encoded_png(frame.image, frame.scene.sensor)))
+    write_atomically(files[1], lambda part: write_exr(part, frame.radiance.total, frame.variant))
+    write_atomically(files[2], lambda part: write_arrays(part, _truth(frame)))
+    write_json(files[3], _description(frame))
+    write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
+    write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
+    write_atomically(files[6], lambda part: part.write_bytes(_preview_jpeg(frame)))
     return files
 
 
@@ -147,6 +142,8 @@ def encoded_png(image: Image, sensor: Sensor) -> bytes:
 
 def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
     truth, radiance = frame.truth, frame.radiance
+    assert truth.direction_min is not None
+    assert truth.direction_max is not None
     of_instruments = {"instrument": truth.instrument} if frame.scene.shown_instruments else {}
     return {
         "depth_mm": truth.depth.astype(np.float32),

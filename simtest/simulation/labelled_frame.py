@@ -7,8 +7,7 @@ from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
-from simtest.runtime.arrays import Array, Image
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Image, short_repr
 from simtest.simulation.coding import check_codec
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import TrueHighlight
@@ -87,15 +86,7 @@ class LabelledFrame:
 
 
 def make_frame(scene: Scene, variant: str | None = None, progress: Progress | None = None) -> LabelledFrame:
-    """Render a labelled frame (see `simtest.render`).
-
-    Raises
-    ------
-    InputError
-        If no pixel sees the surface, or a package for the coding is missing.
-    BackendError
-        If the rendering backend cannot be used.
-    """
+    """Render a labelled frame (see `simtest.render`)."""
     check_codec(scene.sensor.coding)
     session = Session(scene, variant, labelled=True)
     # The frame's labels are not used, but the truth starts from their hits.

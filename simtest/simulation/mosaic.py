@@ -5,7 +5,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.runtime.arrays import Image
-from simtest.spec.processing import Mosaic
+from simtest.spec.sensor import Mosaic
 
 _CHANNEL = {"r": 0, "g": 1, "b": 2}
 

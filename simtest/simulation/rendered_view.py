@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from simtest.calibration import Calibration
 from simtest.geometry import Camera
-from simtest.rendering import HighlightPoint, Radiance, Session, glints
+from simtest.rendering import HighlightPoint, Radiance, Session
+from simtest.rendering.highlights import radii_px
 from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
 from simtest.simulation import clouds as glint_clouds
@@ -220,7 +221,7 @@ def _placed(
     session: Session, radiance: Radiance, highlights: list[TrueHighlight]
 ) -> tuple[list[TrueHighlight], Sequence[HighlightPoint]]:
     """Return highlights with their radii and the numbers of their clouds, and the clouds' centres."""
-    radii = glints.radii_px(session, highlights, session.scene.reflectance.half_width)
+    radii = radii_px(session, highlights, session.scene.reflectance.half_width)
     if session.surface.relief is None:
         own = [replace(h, radius_px=float(radii[i]), cloud=i) for i, h in enumerate(highlights)]
         return own, own

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.rendering import Session
-from simtest.runtime.array_files import write_arrays
-from simtest.runtime.arrays import Array, Picture
+from simtest.runtime.arrays import Array, Picture, write_arrays
 from simtest.runtime.files import write_atomically
 from simtest.simulation.flow import SeenSurface, flow_between, hides, moved_between
 from simtest.simulation.flow_picture import flow_picture

@@ -1,7 +1,6 @@
 """Which of a surface's highlight points are isolated, visible highlights (theory.md section 6)."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,9 +17,8 @@ from simtest.detection import contrast, half_height_component
 from simtest.detection.regions import Component, component_above
 from simtest.geometry import smooth
 from simtest.rendering import HighlightPoint
-from simtest.runtime.arrays import Array, Image, IntArray, Mask
+from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
 from simtest.runtime.files import Json
-from simtest.runtime.short_repr import short_repr
 
 Pixel = tuple[int, int]
 """Row and column."""
@@ -55,12 +53,6 @@ class TrueHighlight(HighlightPoint):
     def isolated(self) -> bool:
         """Whether it is a true isolated highlight."""
         return not self.why_not
-
-    @property
-    def highlight(self) -> "TrueHighlight":
-        """Itself: deprecated, from when the verdict stood around the highlight."""
-        warnings.warn("TrueHighlight.highlight goes in 0.3.0: use the highlight itself", DeprecationWarning, 2)
-        return self
 
     def to_json(self) -> dict[str, Json]:
         """Return position, normal and curvature of the fine surface and of the base, and verdict."""

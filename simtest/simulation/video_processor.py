@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from simtest.runtime.arrays import Array, Image, Mask
-from simtest.spec.processing import Caption, ColourProcessing, Overlay, Scaling, Sharpening
+from simtest.spec.sensor import Caption, ColourProcessing, Overlay, Scaling, Sharpening
 
 LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 """Weights of red, green and blue in the luma of encoded pictures (ITU-R BT.601)."""

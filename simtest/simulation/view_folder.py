@@ -10,7 +10,7 @@ from simtest.simulation.sequence_labels import FILES, SequenceLabels
 from simtest.simulation.view_files import FRAMES_PER_SECOND, ViewWriter
 from simtest.simulation.viewpoints import Progress, SampledViews, sample_views, viewpoint_key
 from simtest.spec import Scene
-from simtest.spec.trajectories import COLMAP, TRANSFORMS, TUM, Trajectory, stack, write_trajectory
+from simtest.spec.camera_formats.trajectories import COLMAP, TRANSFORMS, TUM, Trajectory, stack, write_trajectory
 
 FPS = (0.1, 1000.0)
 """Frames a second that a sequence may have."""
@@ -27,13 +27,7 @@ def sample_into(
     fps: float | None = None,
     labels: bool = False,
 ) -> SampledViews:
-    """Sample views of a scene and write them into an existing folder (see `simtest.sample_views`).
-
-    Raises
-    ------
-    InputError
-        If `fps` is out of range, or as `sample_views` does.
-    """
+    """Sample views of a scene and write them into an existing folder (see `simtest.sample_views`)."""
     if fps is not None and not FPS[0] <= fps <= FPS[1]:
         raise InputError(f"fps = {fps:g}: must be {FPS[0]:g} to {FPS[1]:g} frames a second")
     rate = (fps or FRAMES_PER_SECOND) if sequence else None

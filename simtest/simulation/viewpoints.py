@@ -190,13 +190,7 @@ def candidates(scene: Scene, count: int) -> list[int | float]:
 
 
 def along_path(scene: Scene, count: int, first: float, last: float) -> list[int | float]:
-    """Return viewpoints evenly spaced along the camera path, in order.
-
-    Raises
-    ------
-    InputError
-        If the scene's views are not on the path, or a share is out of range.
-    """
+    """Return viewpoints evenly spaced along the camera path, in order."""
     if viewpoint_key(scene) == "surface.viewpoint":
         raise InputError("surface.view = auto: views along the path need another; allowed: path, off_axis, wall")
     if not (0 <= first <= 1 and 0 <= last <= 1):

@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.conventions import PIXEL_CENTRE
-from simtest.runtime.arrays import Array, Image, IntArray, Mask
+from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
 from simtest.runtime.files import Json
-from simtest.runtime.short_repr import short_repr
 from simtest.simulation.true_highlights import TrueHighlight
 
 SADDLE = 0.8

@@ -6,13 +6,14 @@ from typing import Any
 
 from simtest.calibration import Calibration
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
+from simtest.runtime.boundary import plain_errors
+from simtest.spec.camera import NOT_OF_THE_CAMERA, load_camera
 from simtest.spec.camera_formats.files import FOREIGN_SUFFIXES, recognise
-from simtest.spec.camera_spec import NOT_OF_THE_CAMERA, load_camera
 from simtest.spec.spec_model import validate
 from simtest.spec.toml_files import read_toml
 
 
+@plain_errors
 def load_calibration(
     path: str | Path, photometric: str | Path | None = None, view_radius_px: float | None = None
 ) -> Calibration:
@@ -68,17 +69,18 @@ def load_calibration(
 
 def _with_photometry(data: Mapping[str, Any], photometric: Path, path: Path) -> dict[str, Any]:
     """Return the tables of a calibration file with those of a photometric calibration."""
-    from simtest.spec.camera_formats.photometric import read_photometric
+    from simtest.spec.camera_formats.omnidirectional import read_photometric
 
     made = dict(data)
     for name, table in read_photometric(photometric).items():
         told = data.get(name, {}) if name == "rig" else {}
         if (name in data and name != "rig") or (isinstance(told, Mapping) and set(told) & set(table)):
-            raise InputError(f"{shown(path)}: {name}: {shown(photometric)} states it too; leave it out in one of them")
+            raise InputError(f"{path}: {name}: {photometric} states it too; leave it out in one of them")
         made[name] = {**told, **table}
     return made
 
 
+@plain_errors
 def save_calibration(calibration: Calibration, path: str | Path) -> None:
     """Write a calibration file that `load_calibration` reads back as the same calibration.
 
@@ -107,14 +109,10 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     if not isinstance(calibration, Calibration):
         raise InputError(f"calibration is a {type(calibration).__name__}: must be a simtest.Calibration")
     if path.suffix.lower() in FOREIGN_SUFFIXES:
-        raise InputError(f"{shown(path)}: a calibration is TOML, not {path.suffix}; name it .toml")
+        raise InputError(f"{path}: a calibration is TOML, not {path.suffix}; name it .toml")
     # Imported on demand: reading needs neither.
     from simtest.runtime.files import write_atomically
-    from simtest.runtime.machine_errors import cannot_write
-    from simtest.spec.calibration_tables import calibration_toml
+    from simtest.spec.calibration_spec import calibration_toml
 
     text = calibration_toml(calibration)
-    try:
-        write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
-    except OSError as error:
-        raise cannot_write(error, shown(path), path) from error
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

@@ -1,8 +1,9 @@
-"""The tables of a calibration file: a camera with its response, vignetting, emission and noise."""
+"""The tables of a calibration file: a camera with its response, falloff, noise and priors; and the way back."""
 
 import math
-from dataclasses import replace
-from typing import Annotated, Self
+from collections.abc import Iterator
+from dataclasses import astuple, fields, is_dataclass, replace
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
@@ -18,6 +19,7 @@ from simtest.calibration import (
     exactly,
 )
 from simtest.calibration.calibration import OPTICAL_AXIS
+from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import (
     UNTOLD_FALLOFF_POWER,
     UNTOLD_OFFSET_MM,
@@ -25,11 +27,14 @@ from simtest.calibration.priors import (
     Matrix,
     check_light_covariances,
 )
+from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.spec.camera_spec import CameraSpec
-from simtest.spec.falloff import CosineProfile, Profile, TableProfile
+from simtest.spec.camera import CameraSpec
+from simtest.spec.camera_tables import camera_table
+from simtest.spec.lights import CosineProfile, Profile, TableProfile
 from simtest.spec.sensor import Bits, FullWell, ReadNoise, ResponseSpec, check_electrons
-from simtest.spec.spec_model import Millimetres, Spec
+from simtest.spec.spec_model import Millimetres, Spec, validate
+from simtest.spec.toml_files import toml_tables
 
 Bound = Annotated[float, Field(ge=0, le=1e6)]
 Interval = tuple[Bound, Bound]
@@ -258,3 +263,157 @@ def _distribution(interval: Interval | None, unit: float = 1.0) -> Distribution 
         return None
     low, high = interval
     return exactly(low * unit) if low == high else Uniform(low * unit, high * unit)
+
+
+Tables = dict[str, dict[str, Any]]
+
+HEADER = "# What is known of a camera, its light and its tissue; pixel centres at integer + 0.5, camera frame.\n"
+
+CLOSE = 1e-14
+"""Relative rounding of an angle between radians and degrees."""
+
+
+def calibration_toml(calibration: Calibration, note: str = "") -> str:
+    """Return a calibration as the text of a calibration file, after a line of comment.
+
+    Raises
+    ------
+    InputError
+        If it holds what a calibration file cannot state, such as a log-uniform distance.
+    """
+    tables = calibration_tables(calibration)
+    _check_read_back(calibration, tables)
+    return f"{HEADER}{note and f'# {note}{chr(10)}'}\n{toml_tables(tables)}"
+
+
+def calibration_tables(calibration: Calibration) -> Tables:
+    """Return a calibration as the tables that `CalibrationSpec` reads; what it does not know is left out."""
+    priors, noise = calibration.priors, calibration.noise
+    tables: Tables = {"camera": dict(camera_table(calibration.camera))}
+    if calibration.response is not None:
+        tables["response"] = _response(calibration.response)
+    # That no falloff is left in the frame a file says by giving both, even where they are uniform.
+    for name in ("vignetting", "emission"):
+        if not (profile := getattr(calibration, name)).is_uniform or priors.falloff_power is None:
+            tables[name] = _profile(profile)
+    if calibration.emission_axis != OPTICAL_AXIS and "emission" in tables:
+        tables["emission"]["direction"] = list(calibration.emission_axis)
+    is_known = {"vignetting", "emission"} <= set(tables)
+    # Defaults and what is not known are left out; an empty table says nothing.
+    further: Tables = {
+        "sensor": {
+            "noise_sigma": noise.sigma or None, "full_well": noise.full_well, "read_noise": noise.read_noise or None,
+            "bits": noise.bits, "saturation_level": calibration.saturation_level,
+        },
+        "rig": _rig(priors),
+        "surface": _surface(priors),
+        "uncertainty": _uncertainty(priors, is_known and calibration.is_emission_undone),
+    }  # fmt: skip
+    for name, table in further.items():
+        if stated := {key: value for key, value in table.items() if value is not None}:
+            tables[name] = stated
+    return tables
+
+
+def _response(response: Response) -> dict[str, Any]:
+    keys = {"gamma": ("gamma",), "table": ("light", "value")}.get(response.kind, ())
+    return {"type": response.kind, **{key: getattr(response, key) for key in keys}}
+
+
+def _profile(profile: AngularProfile) -> dict[str, Any]:
+    if not profile.angles:
+        return {"type": "cosine", "power": profile.power}
+    return {"type": "table", "angle_deg": [degrees_of(angle) for angle in profile.angles], "value": profile.values}
+
+
+def _rig(priors: Priors) -> dict[str, Any]:
+    rig: dict[str, Any] = {
+        "lights_mm": priors.lights_mm or None,
+        "lights_covariance_mm2": priors.lights_covariance_mm2 or None,
+    }
+    if isinstance(priors.distance_mm, Normal):
+        rig |= {"distance_mm": priors.distance_mm.mean, "distance_sd_mm": priors.distance_mm.sd or None}
+    else:
+        rig["distance_range_mm"] = _interval(priors.distance_mm)
+    if priors.light_offset_mm != UNTOLD_OFFSET_MM:
+        rig["light_offset_mm"] = _interval(priors.light_offset_mm)
+    return rig
+
+
+def _surface(priors: Priors) -> dict[str, Any]:
+    lobe, slope = priors.lobe_curvature, priors.relief_slope
+    told = None if slope == UNTOLD_SLOPE_RAD else _interval(slope)
+    return {
+        "lobe_curvature": lobe.mean if isinstance(lobe, Normal) else None,
+        "relief_slope_deg": None if told is None else [degrees_of(end) for end in told],
+    }
+
+
+def _uncertainty(priors: Priors, states_falloff: bool) -> dict[str, Any]:
+    power = priors.falloff_power
+    return {
+        **{name: deviation or None for name, deviation in priors.camera.deviations.items()},
+        "falloff_power": _interval(power) if states_falloff or power != UNTOLD_FALLOFF_POWER else None,
+    }
+
+
+def _interval(distribution: Distribution | None) -> tuple[float, float] | None:
+    """Return the ends of a uniform distribution, equal ones of an exact value; None of others, which no file states."""
+    if isinstance(distribution, Uniform):
+        return distribution.low, distribution.high
+    exact = isinstance(distribution, Normal) and distribution.sd == 0
+    return (distribution.mean, distribution.mean) if exact and isinstance(distribution, Normal) else None
+
+
+def degrees_of(angle: float) -> float:
+    """Return an angle, rad, as the shortest number of degrees that reads back as the same radians.
+
+    Where no number does, since degrees lie less densely there, it is the nearest one.
+    """
+    rough = math.degrees(angle)
+    near = [rough]
+    for towards in (-math.inf, math.inf):
+        stepped = rough
+        for _ in range(4):
+            stepped = math.nextafter(stepped, towards)
+            near.append(stepped)
+    candidates = (*(round(rough, digits) for digits in range(15)), *near)
+    return next((degrees for degrees in candidates if math.radians(degrees) == angle), rough)
+
+
+def _check_read_back(calibration: Calibration, tables: Tables) -> None:
+    """Raise `InputError` where a file would not state the whole of a calibration."""
+    read = validate(CalibrationSpec, {**tables, "camera": {}}, "calibration").calibration(calibration.camera)
+    names = ["response", "vignetting", "emission", "noise", "saturation_level"]
+    names += [] if calibration.emission.is_uniform else ["emission_axis"]
+    parts = [(name, getattr(calibration, name), getattr(read, name)) for name in names]
+    parts += [
+        (each.name, getattr(calibration.priors, each.name), getattr(read.priors, each.name)) for each in fields(Priors)
+    ]
+    for name, one, other in parts:
+        if not _alike(one, other):
+            raise InputError(f"calibration {name} = {one!r}: a calibration file cannot state it")
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Return whether values are the same, numbers up to the rounding of angles in degrees."""
+    if isinstance(one, NoiseModel) and one.bits is None:
+        # Of a frame without steps between its values the response makes no difference to the noise.
+        other = replace(other, response=one.response)
+    # Also what nobody gave, which is given once a file states it.
+    of_a_kind = is_dataclass(one) and (isinstance(one, type(other)) or isinstance(other, type(one)))
+    if one == other or not of_a_kind:
+        return bool(one == other)
+    ones, others = (list(_numbers(astuple(each))) for each in (one, other))
+    return len(ones) == len(others) and all(
+        a == b or (isinstance(a, float) and isinstance(b, float) and math.isclose(a, b, rel_tol=CLOSE))
+        for a, b in zip(ones, others, strict=True)
+    )
+
+
+def _numbers(value: Any) -> Iterator[Any]:
+    if isinstance(value, tuple):
+        for each in value:
+            yield from _numbers(each)
+    else:
+        yield value

@@ -7,26 +7,22 @@ from typing import Any
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.calibration import Calibration, NoiseModel, Normal, Priors, Response, exactly
+from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
-from simtest.geometry.angular_profile import AngularProfile
-from simtest.runtime.limits import check_limit
-from simtest.runtime.resources import find, shown
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import short_repr
+from simtest.runtime.boundary import plain_errors
+from simtest.runtime.files import check_limit
+from simtest.runtime.resources import find
+from simtest.spec.camera import SceneCamera, Views
 from simtest.spec.camera_formats.common import read_json
-from simtest.spec.camera_spec import SceneCamera
-from simtest.spec.deformation import MOST_DEFORMATIONS, Deformation
-from simtest.spec.instrument import Instrument
-from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueReflectance
-from simtest.spec.rig import Rig
+from simtest.spec.keys import replace_values
+from simtest.spec.lights import Rig
+from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueColour, TissueReflectance, Translucency
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import Millimetres, Spec, validate
-from simtest.spec.surface import Surface
-from simtest.spec.tissue_colour import TissueColour
+from simtest.spec.surfaces import MOST_DEFORMATIONS, Deformation, Instrument, Surface
 from simtest.spec.toml_files import read_toml, source_name
-from simtest.spec.translucency import Translucency
-from simtest.spec.type_change import replace_values
-from simtest.spec.views import Views
 
 MOST_INSTRUMENTS = 8
 """More than a patient has ports for."""
@@ -154,14 +150,9 @@ class Scene(Spec):
     def _as_ever(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out what says nothing: a scene without instruments is written as it was before there were any."""
         dumped: dict[str, Any] = dump(self)
-        if not self.instruments:
-            dumped.pop("instruments", None)
-        if not self.deformation:
-            dumped.pop("deformation", None)
-        if not self.time_s:
-            dumped.pop("time_s", None)
-        if self.views is None:
-            dumped.pop("views", None)
+        for name in ("instruments", "deformation", "time_s", "views"):
+            if not getattr(self, name):
+                dumped.pop(name, None)
         if self.camera.moved is None:
             dumped.get("camera", {}).pop("moved", None)
         return dumped
@@ -258,6 +249,7 @@ def _differing(table: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, 
     }
 
 
+@plain_errors
 def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> Scene:
     """Read a scene file.
 
@@ -294,5 +286,5 @@ def _tables(path: Path) -> dict[str, Any]:
         return read_toml(path)
     scene = read_json(path, "scene").get("scene")
     if not isinstance(scene, dict):
-        raise InputError(f"{shown(path)}: scene: must be a table, as in a dataset's sample or in frame.json")
+        raise InputError(f"{path}: scene: must be a table, as in a dataset's sample or in frame.json")
     return scene

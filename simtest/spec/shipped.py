@@ -12,20 +12,13 @@ FOLDERS = {
     "scenes": "",
     "experiments": "experiments",
     "datasets": "datasets",
-    "trainings": "learning",
     "profiles": "profiles",
 }
 """Kinds of shipped files, and their folders below scenes/."""
 
 
 def shipped_files(kind: str) -> dict[str, str]:
-    """Return the shipped files of a kind: name, and title and first sentence, or else that of the file's comment.
-
-    Parameters
-    ----------
-    kind : str
-        One of `FOLDERS`.
-    """
+    """Return the shipped files of one of `FOLDERS`: name, and title and first sentence, or that of its comment."""
     folder = data_root("scenes") / FOLDERS[kind]
     return {path.stem: _about(path) for path in sorted(folder.glob("*.toml"))}
 
@@ -45,7 +38,7 @@ def _sentence(text: str) -> str:
 
 def rig_presets() -> dict[str, str]:
     """Return the names of ``rig.preset``, with their lights."""
-    from simtest.spec.rig import PRESETS
+    from simtest.spec.lights import PRESETS
 
     return {name: _lights(ring.count, ring.radius_mm) for name, ring in PRESETS.items()}
 
@@ -57,7 +50,7 @@ def _lights(count: int, radius_mm: float) -> str:
 
 def sensor_presets() -> dict[str, str]:
     """Return the names of ``sensor.preset``, with what their frames went through."""
-    from simtest.spec.sensor_presets import PRESETS
+    from simtest.spec.sensor import PRESETS
 
     return {name: _chain(keys) for name, keys in PRESETS.items()}
 

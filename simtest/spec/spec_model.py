@@ -1,7 +1,7 @@
 """Base of all specification models: strict validation, ranges they share, and errors of one line."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import NoneType
@@ -11,8 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import PydanticCustomError
 
 from simtest.errors import InputError
-from simtest.runtime.resources import close_names, shown, suggestion
-from simtest.spec.json_schema import nodes_at
+from simtest.runtime.boundary import close_names, suggestion
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -21,8 +20,11 @@ Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[A-Za-z0-9_-
 """Of an experiment, dataset or profile: fit for a file name."""
 
 Share = Annotated[float, Field(ge=0, le=1)]
+
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+
 Millimetres = Annotated[float, Field(ge=1e-3, le=1e6)]
+
 Curvature = Annotated[float, Field(ge=-10, le=10)]
 
 
@@ -83,8 +85,7 @@ def _leaves(value: Any) -> Iterator[Any]:
 def load(model: type[Model], path: Path, settings: Mapping[str, Any] | None = None) -> Model:
     """Read a TOML file as a model that has a `Name`, by default that of the file.
 
-    Values of `settings` replace those of the file, by key path. Raises `InputError` if the file is missing or
-    malformed.
+    Values of `settings` replace those of the file, by key path.
     """
     data = apply_settings(read_toml(path), settings or {}, str(path))
     data.setdefault("name", re.sub("[^A-Za-z0-9_-]+", "-", path.stem)[:80])
@@ -111,7 +112,7 @@ def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
         ]  # fmt: skip
         errors = sorted(errors, key=lambda e: _is_missing_by_typo(e, errors))
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise InputError(f"{shown(where)}: {_describe(errors[0], model, data)}{more}") from None
+        raise InputError(f"{where}: {_describe(errors[0], model, data)}{more}") from None
 
 
 def _is_missing_by_typo(error: Any, errors: list[Any]) -> bool:
@@ -126,7 +127,7 @@ def _is_missing_by_typo(error: Any, errors: list[Any]) -> bool:
 def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> str:
     """Return one of pydantic's errors as text: key path, value, and what is allowed."""
     kind, value = error["type"], error.get("input")
-    location = [shown(part, 60) for part in _without_tags(error["loc"], data, kind == "missing")]
+    location = [str(part) or "''" for part in _without_tags(error["loc"], data, kind == "missing")]
     # our own error, which names the field itself
     if kind == "coerced":
         return f"{'.'.join([*location, error['ctx']['field']])} = {_short(error['ctx']['got'])}: {error['msg']}"
@@ -210,3 +211,43 @@ def _short(value: Any) -> str:
         # Python refuses to write integers of more than 4300 digits.
         text = "a number of too many digits"
     return text if len(text) <= 80 else text[:77] + "..."
+
+
+def nodes_at(schema: Mapping[str, Any], path: Sequence[str | int]) -> Iterator[Mapping[str, Any]]:
+    """Yield the nodes of a JSON schema at a path of keys and indices, through references, unions, lists and maps.
+
+    An index is a number or text. The type of a tagged union may stand in between; without it the nodes of all its
+    members are yielded.
+    """
+    yield from _walk(schema, schema, list(path))
+
+
+def _walk(node: Mapping[str, Any], schema: Mapping[str, Any], path: list[str | int]) -> Iterator[Mapping[str, Any]]:
+    # The same path goes on inside unions and references ...
+    for way in ("oneOf", "anyOf", "allOf"):
+        for option in node.get(way, ()):
+            yield from _walk(option, schema, path)
+    if reference := node.get("$ref"):
+        yield from _walk(_definition(reference, schema), schema, path)
+    if not path:
+        yield node
+        return
+    # ... and one part of it is used up by an index, a key, or the type of a tagged union.
+    part, rest = path[0], path[1:]
+    if isinstance(part, int) or part.isdigit():
+        for items in (node.get("items"), *node.get("prefixItems", ())):
+            if isinstance(items, Mapping):
+                yield from _walk(items, schema, rest)
+        return
+    members = node.get("discriminator", {}).get("mapping", {})
+    if isinstance(values := node.get("additionalProperties"), Mapping):
+        yield from _walk(values, schema, rest)
+    elif child := node.get("properties", {}).get(part):
+        yield from _walk(child, schema, rest)
+    elif part in members:
+        yield from _walk(_definition(members[part], schema), schema, rest)
+
+
+def _definition(reference: str, schema: Mapping[str, Any]) -> Mapping[str, Any]:
+    found: Mapping[str, Any] = schema["$defs"][reference.rsplit("/", 1)[-1]]
+    return found

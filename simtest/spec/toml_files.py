@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.limits import check_file
-from simtest.runtime.resources import shown
+from simtest.runtime.files import require_plain
 
 MAX_DEPTH = 32
 """Tables and lists within each other, and parts of a key path; the deepest key of a scene has 6."""
@@ -21,23 +20,19 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return _loads(read_text(path, "TOML"))
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{shown(path)}: not valid TOML: {error}") from error
+        raise InputError(f"{path}: not valid TOML: {error}") from error
 
 
 def read_text(path: Path, kind: str, limit: str = "text_bytes") -> str:
     """Read a text file of moderate size; `kind` is what it should be, for messages, such as "TOML".
 
     `limit` names the limit of its size.
-
-    Raises `InputError` if it is missing, no plain file, too large or not UTF-8.
     """
-    name = shown(path)
-    check_file(path, limit, f"a {kind} file")
+    name = str(path)
+    require_plain(path, limit, f"a {kind} file")
     try:
         # Editors on Windows begin a file with a mark of its encoding.
         return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{name}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{name}: not a text file in UTF-8 (byte {error.start})") from error
 
@@ -75,7 +70,7 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
     for setting in settings:
         path, equals, value = setting.partition("=")
         if not equals or not path.strip():
-            raise InputError(f"--set {shown(setting)}: must be key=value, for example surface.distance_mm=12")
+            raise InputError(f"--set {setting}: must be key=value, for example surface.distance_mm=12")
         try:
             table = _loads(f"value = {value}")
         except tomllib.TOMLDecodeError:
@@ -93,12 +88,12 @@ def apply_settings(data: Mapping[str, Any], settings: Mapping[str, Any], where: 
     InputError
         If a path leads through something that is no table or beyond the end of a list; `where` names the file.
     """
-    where = shown(where)
+    where = str(where)
     result = copy.deepcopy(dict(data))
     for path, value in settings.items():
         parts = path.split(".")
         if len(parts) > MAX_DEPTH:
-            raise InputError(f"{where}: {shown(path, 60)}: {len(parts)} parts; a key path has {MAX_DEPTH} at most")
+            raise InputError(f"{where}: {path}: {len(parts)} parts; a key path has {MAX_DEPTH} at most")
         last, parents = parts[-1], parts[:-1]
         node: Any = result
         # Down to the table or list that holds the value ...
@@ -111,7 +106,7 @@ def apply_settings(data: Mapping[str, Any], settings: Mapping[str, Any], where: 
         elif isinstance(node, dict):
             node[last] = value
         else:
-            raise InputError(f"{where}: {shown(path)}: {shown('.'.join(parents))} is a plain value, not a table")
+            raise InputError(f"{where}: {path}: {'.'.join(parents)} is a plain value, not a table")
     return result
 
 
@@ -119,14 +114,14 @@ def _step(node: Any, part: str, following: str, path: str, where: str) -> Any:
     """Descend one part of a key path; create what is missing, a list if the following part is its first index."""
     if isinstance(node, dict):
         if part not in node and following.isdecimal() and following != "0":
-            raise InputError(f"{where}: {shown(path)}: index {shown(following)} is not allowed; the first item is 0")
+            raise InputError(f"{where}: {path}: index {following} is not allowed; the first item is 0")
         return node.setdefault(part, [{}] if following == "0" else {})
     if isinstance(node, list):
         if part.isdecimal() and len(part) < 10 and int(part) < len(node):
             return node[int(part)]
         held = f"items 0 to {len(node) - 1}" if node else "no items"
-        raise InputError(f"{where}: {shown(path)}: index {shown(part)} is not allowed; the list has {held}")
-    raise InputError(f"{where}: {shown(path)}: {shown(part)} is below a plain value, not a table")
+        raise InputError(f"{where}: {path}: index {part} is not allowed; the list has {held}")
+    raise InputError(f"{where}: {path}: {part} is below a plain value, not a table")
 
 
 def source_name(path: Path, settings: Mapping[str, Any] | None) -> str:

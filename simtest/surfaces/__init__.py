@@ -1,9 +1,9 @@
 """Surfaces with exact position, normal and curvature.
 
 `model` is what every surface offers, `factory` makes one from its description. `analytic` holds plane, sphere, cylinder
-and quadric; `colon` (with `tube`, `stalk`, `jets`) and `liver` are generated from a `recipe`; `mesh_surface` is a
-user's mesh, read by `mesh_file`, repaired by `repair`, refined by `subdivision`, judged by `mesh_check`. `poses` and
-`centreline` place cameras.
+and quadric; `colon` (with `tube`, `stalk`) and `liver` are generated from a `recipe`; `mesh_surface` is a user's mesh,
+read and repaired by `mesh_file`, judged by `mesh_check`. `poses` places cameras. `relief_field`, `tissue_pattern` (with
+`vessels`) and `deformation` act on any surface, and `instrument` is what stands before it.
 """
 
 from typing import TYPE_CHECKING
@@ -14,19 +14,4 @@ if TYPE_CHECKING:
     from simtest.surfaces.factory import forget_meshes, make_surface
     from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh
 
-_HOMES = {
-    "simtest.surfaces.factory": ("forget_meshes", "make_surface"),
-    "simtest.surfaces.model": ("RayHits", "Shape", "SurfaceModel", "SurfacePoints", "TriangleMesh"),
-}
-
-__all__ = [
-    "RayHits",
-    "Shape",
-    "SurfaceModel",
-    "SurfacePoints",
-    "TriangleMesh",
-    "forget_meshes",
-    "make_surface",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -8,14 +8,19 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import AnyArray, Array, IntArray
-from simtest.runtime.kept_arrays import kept
-from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
-from simtest.surfaces.cutting import halve, off_between, rough_edges
-from simtest.surfaces.mesh_geometry import area_vectors, face_edges
-from simtest.surfaces.model import RayHits, TriangleMesh
+from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
+from simtest.surfaces.model import RayHits, TriangleMesh, in_rows
 from simtest.surfaces.poses import Generator, lumen_pose
 from simtest.surfaces.recipe import ColonRecipe
+from simtest.surfaces.triangles import (
+    BuiltMesh,
+    MeshedSurface,
+    area_vectors,
+    face_edges,
+    halve,
+    off_between,
+    rough_edges,
+)
 from simtest.surfaces.tube import Tube, TubeChart
 
 TRIANGLES = 200_000
@@ -40,18 +45,10 @@ MAX_TRIANGLES = 5_000_000
 
 @dataclass(frozen=True)
 class BuiltColon(BuiltMesh):
-    """A recipe's surface and mesh.
+    """A recipe's surface and mesh."""
 
-    Parameters
-    ----------
-    tube : Tube
-        The surface.
-    corners : ndarray, shape (F, 3, 2)
-        (u, v) of each triangle's corners.
-    """
-
-    tube: Tube
-    corners: Array
+    tube: Tube  # The surface
+    corners: Array  # (F, 3, 2): (u, v) of each triangle's corners
 
     @property
     def shape_operators(self) -> Array:
@@ -71,16 +68,11 @@ class BuiltColon(BuiltMesh):
         return np.where(free, 1.0, -1.0) * self.probe.distance(points)
 
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return the exact points of the smooth surface (see `BuiltMesh.at_hits`).
-
-        Newton's method on P(u, v) = origin + t direction, to 1e-10 mm, from (u, v) of the mesh's hit. A ray that
-        grazes the mesh but misses the smooth surface has no point.
-        """
+        """Return exact points by Newton's method from (u, v) of the hits; a ray that only grazes the mesh has none."""
         u, v = np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
         distance, u, v = self.tube.solve(origins, directions, hits.distance, u, v)
-        normals, operators = np.full((len(u), 3), np.nan), np.full((len(u), 3, 3), np.nan)
-        good = np.isfinite(distance)
-        normals[good], operators[good] = self.tube.normal_and_shape_operator(u[good], v[good])
+        good = np.flatnonzero(np.isfinite(distance))
+        normals, operators = in_rows(len(u), good, *self.tube.normal_and_shape_operator(u[good], v[good]))
         return distance, normals, operators
 
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
@@ -93,16 +85,8 @@ class BuiltColon(BuiltMesh):
 def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
     """Make the surface and the mesh of a recipe, with normals into the lumen.
 
-    Parameters
-    ----------
-    recipe : ColonRecipe
-    edge_mm : float, optional
-        Side of the mesh's cells on the bare tube, mm; default about `TRIANGLES` triangles.
-
-    Raises
-    ------
-    InputError
-        If the folds close the lumen, the tube bends into itself, or there would be too many triangles.
+    `edge_mm` is the side of the mesh's cells on the bare tube; default about `TRIANGLES` triangles. Raises `InputError`
+    if the folds close the lumen, the tube bends into itself, or there would be too many triangles.
     """
     tube, key = Tube(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = {**kept("colon", key, lambda: _mesh(tube, edge_mm))}
@@ -199,10 +183,7 @@ def _facing(positions: Array, normals: Array, faces: IntArray) -> Array:
 
 
 class Colon(MeshedSurface):
-    """A generated colon with a camera inside, at the pose numbered by `viewpoint`; a shell.
-
-    Raises `InputError` if the recipe gives no usable tube.
-    """
+    """A generated colon with a camera inside, at the pose numbered by `viewpoint`; a shell."""
 
     solid = False
 

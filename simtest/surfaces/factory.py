@@ -5,17 +5,17 @@ from pathlib import Path
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
-from simtest.spec.deformation import Deformation
-from simtest.spec.surface import (
+from simtest.spec.camera import Moved
+from simtest.spec.surfaces import (
     AnatomySurface,
     CylinderSurface,
+    Deformation,
     PlaneSurface,
     QuadricSurface,
     SphereSurface,
     Surface,
 )
-from simtest.spec.views import Moved
-from simtest.surfaces.analytic import Cylinder, Plane, Quadric, Sphere
+from simtest.surfaces.analytic import Cylinder, GradedMesh, Plane, Quadric, Sphere
 from simtest.surfaces.mesh_file import MESH_SUFFIXES
 from simtest.surfaces.model import SurfaceModel, TriangleMesh, principal_curvatures
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
@@ -42,11 +42,6 @@ def make_surface(
         How it deforms; the camera is not moved with it.
     time_s : float
         The moment of the deformation, s.
-
-    Raises
-    ------
-    InputError
-        If a recipe or mesh file is missing or malformed.
     """
     surface = _make_base(spec)
     if moved is not None:
@@ -58,12 +53,9 @@ def make_surface(
         surface.relief = make_relief(spec.relief, film_level)
     if deformation:
         # Imported here, as the relief above.
-        from simtest.surfaces.deformation import DeformationAt
-        from simtest.surfaces.deformed import DeformedSurface
+        from simtest.surfaces.deformation import DeformationAt, DeformedSurface
 
         if isinstance(surface, Plane | Sphere | Cylinder):
-            from simtest.surfaces.graded_mesh import GradedMesh
-
             surface = GradedMesh(surface)
         return DeformedSurface(surface, DeformationAt(deformation, time_s))
     return surface
@@ -83,7 +75,7 @@ def _make_base(spec: Surface) -> SurfaceModel:
             surface = _make_anatomy(spec)
             if spec.view != "auto":
                 # Imported here, as the mesh libraries below.
-                from simtest.surfaces.centreline import path_pose
+                from simtest.surfaces.poses import path_pose
 
                 surface.model_from_camera = path_pose(spec, surface)
             return surface
@@ -91,10 +83,9 @@ def _make_base(spec: Surface) -> SurfaceModel:
 
 def forget_meshes() -> None:
     """Free the meshes that are cached for further scenes of the last few anatomies."""
-    from simtest.surfaces import centreline, colon, liver, relief_field, tissue_pattern, vessels
-    from simtest.surfaces import mesh_surface as mesh
+    from simtest.surfaces import colon, liver, mesh_surface, poses, relief_field, tissue_pattern, vessels
 
-    meshes = (centreline._camera_path, colon.build, liver.build, mesh._prepare)
+    meshes = (poses._camera_path, colon.build, liver.build, mesh_surface._prepare)
     reliefs, patterns = (relief_field._make_field, relief_field._unscaled), (tissue_pattern._make, tissue_pattern._bare)
     for cached in (*meshes, *reliefs, *patterns, vessels.grow_vessels):
         cached.cache_clear()
@@ -135,11 +126,6 @@ def make_mesh(recipe: ColonRecipe | LiverRecipe, edge_mm: float | None = None) -
         Vertices on the surface, mm, exact normals on the camera's side.
     k_min, k_max : ndarray, shape (V,)
         Exact principal curvatures at the vertices, 1/mm.
-
-    Raises
-    ------
-    InputError
-        If the recipe gives no usable surface, or too many triangles.
     """
     from simtest.surfaces import colon, liver
 

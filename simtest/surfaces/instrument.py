@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtest.runtime.arrays import Array, IntArray
-from simtest.spec.instrument import Instrument
+from simtest.spec.surfaces import Instrument
 
 DEFAULT_OPENING_DEG = 30.0
 
@@ -23,22 +23,13 @@ KNEE_SHARE, BOW = 0.45, 0.08
 
 @dataclass(frozen=True)
 class RoundCones:
-    """Hulls of two balls each.
+    """Hulls of two balls each."""
 
-    Parameters
-    ----------
-    starts, ends : ndarray, shape (K, 3)
-        Centres of the balls, mm.
-    radii : ndarray, shape (K, 2)
-        mm; they differ by less than the centres are apart.
-    owners : ndarray of int, shape (K,)
-        Index of the instrument that each belongs to.
-    """
-
+    # starts, ends: (K, 3): centres of the balls, mm
     starts: Array
     ends: Array
-    radii: Array
-    owners: IntArray
+    radii: Array  # (K, 2): mm; they differ by less than the centres are apart
+    owners: IntArray  # (K,): index of the instrument that each belongs to
 
     @property
     def lengths(self) -> Array:

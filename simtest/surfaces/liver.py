@@ -13,6 +13,7 @@ All are lengths in mm; F < 0 in the tissue.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import blake2b
@@ -20,16 +21,58 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import Array, IntArray, Mask, kept
 from simtest.runtime.seeds import Stage, generator
-from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
-from simtest.surfaces.cutting import halve, rough_edges
-from simtest.surfaces.level_grid import in_blocks, level_grid
-from simtest.surfaces.mesh_geometry import face_edges
-from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator
+from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows
 from simtest.surfaces.poses import organ_pose
 from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
+from simtest.surfaces.triangles import BuiltMesh, MeshedSurface, face_edges, halve, rough_edges
+
+SIDE = 4
+"""Cells along the side of a block of the grid."""
+
+POINTS = 8192
+"""Points that are evaluated together: their temporaries stay in the processor's cache."""
+
+ROUNDING = 1e-9
+"""Relative margin of the bound, for rounding."""
+
+
+def level_grid(values: Callable[[Array], Array], slopes: Callable[[Array, float], Array], axes: list[Array]) -> Array:
+    """Return F at the nodes of a grid, exact at the corners of every cell that its zero passes.
+
+    `values` is F at points, shape (N, 3), mm, `slopes` bounds its gradient within a radius, mm, of points. `axes` are
+    the nodes' coordinates along x, y and z, mm, evenly spaced. In a block of half diagonal r about c, F has no zero if
+    abs(F(c)) > L r, with L a bound on its slope there: such a block gets the value F(c), whose sign is right. The other
+    nodes get F itself, so marching cubes find the same triangles as on the whole grid.
+    """
+    width = SIDE * float(axes[0][1] - axes[0][0])
+    middles = [axis[0] + (np.arange(-(-len(axis) // SIDE)) + 0.5) * width for axis in axes]
+    centres = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 3)
+    radius = width * math.sqrt(3) / 2
+    f = in_blocks(values, centres)
+    may_cross = np.abs(f) <= in_blocks(lambda some: slopes(some, radius), centres) * radius * (1 + ROUNDING)
+    blocks = [len(middle) for middle in middles]
+    grid: Array = f.reshape(blocks)
+    near: Mask = may_cross.reshape(blocks)
+    for axis, nodes in enumerate(axes):
+        # From blocks to nodes; some of the last blocks lie beyond the grid.
+        inside = range(len(nodes))
+        grid, near = np.repeat(grid, SIDE, axis).take(inside, axis), np.repeat(near, SIDE, axis).take(inside, axis)
+    # The corners of all cells of the blocks that are left: a block's own nodes, and the next ones along each axis.
+    for axis in range(3):
+        rolled = np.moveaxis(near, axis, 0)
+        rolled[1:] |= rolled[:-1].copy()
+    left = np.nonzero(near)
+    grid[left] = in_blocks(values, np.stack([axis[i] for axis, i in zip(axes, left, strict=True)], axis=1))
+    return grid
+
+
+def in_blocks(function: Callable[[Array], Array], points: Array) -> Array:
+    """Return a function of points, shape (N, 3), computed for some of them at a time."""
+    parts = [function(points[start : start + POINTS]) for start in range(0, max(len(points), 1), POINTS)]
+    return np.concatenate(parts) if len(parts) > 1 else parts[0]
+
 
 GRID_MM = 1.15
 """Spacing of the marching cubes: about 150,000 triangles at the default sizes."""
@@ -173,10 +216,7 @@ class Body:
         return rest @ self._normal - (rest * rest).sum(axis=1) / (2 * radius), self._normal - rest / radius
 
     def solve(self, origins: Array, directions: Array, distance: Array) -> Array:
-        """Solve F(origin + t direction) = 0 by Newton's method; return t, mm, shape (N,), NaN if there is no solution.
-
-        The rays are of shape (N, 3), in mm, with unit directions; `distance`, shape (N,), is a start close by.
-        """
+        """Solve F(origin + t direction) = 0 by Newton's method from a `distance` close by; NaN without solution."""
         t, found = distance.copy(), np.zeros(len(distance), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
         for _ in range(NEWTON_STEPS):
@@ -223,16 +263,11 @@ class BuiltLiver(BuiltMesh):
         return np.where(self.body.values(points) > 0, 1.0, -1.0) * self.probe.distance(points)
 
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return the exact points of the smooth surface (see `BuiltMesh.at_hits`).
-
-        Newton's method on F along the ray, to 1e-10 mm, from the mesh's hit. A ray that grazes the mesh but misses
-        the smooth surface has no point.
-        """
+        """Return exact points by Newton's method on F along the rays; a ray that only grazes the mesh has none."""
         distance = self.body.solve(origins, directions, hits.distance)
-        normals, operators = np.full((len(distance), 3), np.nan), np.full((len(distance), 3, 3), np.nan)
-        good = np.isfinite(distance)
+        good = np.flatnonzero(np.isfinite(distance))
         at = self.body.evaluate(origins[good] + distance[good, None] * directions[good])
-        normals[good], operators[good] = implicit_shape_operator(at.gradient, at.hessian)
+        normals, operators = in_rows(len(distance), good, *implicit_shape_operator(at.gradient, at.hessian))
         return distance, normals, operators
 
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
@@ -244,17 +279,9 @@ class BuiltLiver(BuiltMesh):
 def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
     """Make the level set and the mesh of a recipe; normals outward.
 
-    Parameters
-    ----------
-    recipe : LiverRecipe
-    edge_mm : float, optional
-        Spacing of the marching cubes and about the length of the edges, mm; default `GRID_MM`, with shorter edges
-        where normals between the vertices would be wrong by more than `MAX_NORMAL_ERROR_DEG`.
-
-    Raises
-    ------
-    InputError
-        If the recipe gives no body, or one too large for the grid.
+    `edge_mm` is the spacing of the marching cubes and about the length of the edges; default `GRID_MM`, with shorter
+    edges where normals between the vertices would be wrong by more than `MAX_NORMAL_ERROR_DEG`. Raises `InputError` if
+    the recipe gives no body, or one too large for the grid.
     """
     body, key = Body(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = kept("liver", key, lambda: vars(_mesh(body, edge_mm)))
@@ -327,10 +354,7 @@ def _project(body: Body, points: Array, steps: int) -> Array:
 
 
 class Liver(MeshedSurface):
-    """A generated liver with a camera outside, at the pose numbered by `viewpoint`.
-
-    Raises `InputError` if the recipe gives no body.
-    """
+    """A generated liver with a camera outside, at the pose numbered by `viewpoint`."""
 
     def __init__(self, recipe: LiverRecipe, viewpoint: int) -> None:
         self._build = build(recipe)

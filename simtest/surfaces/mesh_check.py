@@ -9,14 +9,11 @@ import numpy as np
 
 from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.runtime.arrays import Array, IntArray
-from simtest.surfaces.fineness import needed_edge
-from simtest.surfaces.mesh_file import other_unit, read_mesh
-from simtest.surfaces.mesh_geometry import area_quantile, edge_lengths, edge_uses, vertex_areas
-from simtest.surfaces.mesh_surface import is_lumen
+from simtest.surfaces.mesh_file import MAX_CROSSING_FACES, Condition, Repairs, examine, other_unit, read_mesh
+from simtest.surfaces.mesh_surface import is_lumen, needed_edge, shape_operators
 from simtest.surfaces.model import principal_curvatures
 from simtest.surfaces.poses import nearest_mm
-from simtest.surfaces.repair import MAX_CROSSING_FACES, Condition, Repairs, examine
-from simtest.surfaces.subdivision import shape_operators
+from simtest.surfaces.triangles import area_quantile, edge_lengths, edge_uses, vertex_areas
 
 TUBE_RIMS = 2
 """A mesh with as many wide rims may be a tube that is cut open at both ends; ..."""
@@ -32,56 +29,28 @@ MAX_CURVATURE_FACES = 2_000_000
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Result of `check_mesh`.
-
-    Parameters
-    ----------
-    file : str
-    vertices, faces : int
-        After the repairs.
-    extents_mm : tuple of float
-        Along x, y, z.
-    lumen : bool
-        Whether the camera belongs inside.
-    repairs : Repairs
-    condition : Condition
-    edge_median_mm, edge_p95_mm : float
-        Quantiles of the edges' lengths.
-    distance_mm, concentration : float
-        Of the highlights in question.
-    curvature_median_per_mm, curvature_p95_per_mm : float or None
-        Quantiles of the larger absolute principal curvature, by area; None if the mesh is too large.
-    needed_edge_mm : float or None
-        Edge length with which all but 5 % of the surface is fine enough.
-    fine_share : float or None
-        Share of the surface that is fine enough as it is.
-    other_unit : str
-        Guess at another unit than mm, or empty.
-    rims : int
-        Wide rims: rows of open edges.
-    guessed : bool
-        Whether the side is a guess by the shape.
-    """
+class MeshCheck:
+    """Result of `check_mesh`; numbers of vertices, faces and edges are those after the repairs."""
 
     file: str
     vertices: int
     faces: int
-    extents_mm: tuple[float, float, float]
-    lumen: bool
+    extents_mm: tuple[float, float, float]  # Along x, y, z
+    lumen: bool  # Whether the camera belongs inside
     repairs: Repairs
     condition: Condition
     edge_median_mm: float
     edge_p95_mm: float
-    distance_mm: float
+    distance_mm: float  # Of the highlights in question, as the next
     concentration: float
+    # Quantiles of the larger absolute principal curvature, by area; None if the mesh is too large, as the next two
     curvature_median_per_mm: float | None
     curvature_p95_per_mm: float | None
-    needed_edge_mm: float | None
-    fine_share: float | None
-    other_unit: str
-    rims: int = 0
-    guessed: bool = False
+    needed_edge_mm: float | None  # With which all but 5 % of the surface is fine enough
+    fine_share: float | None  # Share of the surface that is fine enough as it is
+    other_unit: str  # Guess at another unit than mm, or empty
+    rims: int = 0  # Wide rows of open edges
+    guessed: bool = False  # Whether the side is a guess by the shape
 
     @property
     def fine(self) -> bool:
@@ -95,10 +64,7 @@ class Verdict:
 
     @property
     def doubt(self) -> str:
-        """Why the mesh may be the inside of a tube though it is taken for an organ by its shape; empty where not.
-
-        A tube that is cut open at both ends has two rims or more. A stated kind is not doubted.
-        """
+        """Why what its shape makes an organ may be a tube, cut open at two rims or more; empty where not."""
         if self.lumen or not self.guessed or self.rims < TUBE_RIMS:
             return ""
         return f"open at {self.rims} rims, as a tube is: if it is seen from inside, its kind is lumen"
@@ -132,66 +98,47 @@ class Verdict:
 
     def lines(self) -> Iterator[str]:
         """Yield the verdict in words, with numbers."""
+        return (f"{label:<12}{text}" for label, text in self._rows())
+
+    def _rows(self) -> Iterator[tuple[str, str]]:
         found, size = self.condition, " x ".join(f"{extent:.4g}" for extent in self.extents_mm)
-        yield f"file        {self.file}"
-        yield f"size        {self.vertices} vertices, {self.faces} faces, {size} mm"
-        yield f"taken for   {self.side}"
+        yield "file", self.file
+        yield "size", f"{self.vertices} vertices, {self.faces} faces, {size} mm"
+        yield "taken for", self.side
         if self.doubt:
-            yield f"doubt       {self.doubt}"
-        yield f"pieces      {found.pieces}"
+            yield "doubt", self.doubt
+        yield "pieces", f"{found.pieces}"
         if found.watertight:
-            yield "surface     watertight"
+            yield "surface", "watertight"
         elif found.open_edges:
-            yield f"surface     open: {found.open_edges} edges at its rims"
+            yield "surface", f"open: {found.open_edges} edges at its rims"
         if found.crossing_faces is None:
-            yield f"crossings   not looked for above {MAX_CROSSING_FACES} faces"
+            yield "crossings", f"not looked for above {MAX_CROSSING_FACES} faces"
         elif not found.crossing_faces:
-            yield "crossings   none"
-        for sentence in self.repairs.sentences(self.lumen):
-            yield f"repaired    {sentence}"
-        yield "normals     computed from the triangles; those of a file are not used"
-        yield f"edges       median {self.edge_median_mm:.3g} mm, 95th percentile {self.edge_p95_mm:.3g} mm"
-        for problem in self.problems:
-            yield f"problem     {problem}"
-        yield from self._fineness()
-
-    def _fineness(self) -> Iterator[str]:
+            yield "crossings", "none"
+        yield from (("repaired", sentence) for sentence in self.repairs.sentences(self.lumen))
+        yield "normals", "computed from the triangles; those of a file are not used"
+        yield "edges", f"median {self.edge_median_mm:.3g} mm, 95th percentile {self.edge_p95_mm:.3g} mm"
+        yield from (("problem", problem) for problem in self.problems)
         if self.needed_edge_mm is None or self.fine_share is None:
-            yield f"highlights  not looked at above {MAX_CURVATURE_FACES} faces: decimate the mesh"
+            yield "highlights", f"not looked at above {MAX_CURVATURE_FACES} faces: decimate the mesh"
             return
-        yield (
-            f"curvature   median {self.curvature_median_per_mm:.3g}, 95th percentile {self.curvature_p95_per_mm:.3g} "
-            "1/mm"
-        )
-        lobe = f"n = {self.concentration / 4:.3g} at {self.distance_mm:g} mm"
-        yield (
-            f"highlights  of {lobe}: {100 * self.fine_share:.1f} % of the surface has {EDGES_PER_HALF_WIDTH:g} edges "
-            "in a half-width"
-        )
+        median, p95 = self.curvature_median_per_mm, self.curvature_p95_per_mm
+        yield "curvature", f"median {median:.3g}, 95th percentile {p95:.3g} 1/mm"
+        lobe = f"of n = {self.concentration / 4:.3g} at {self.distance_mm:g} mm"
+        per_width = f"{EDGES_PER_HALF_WIDTH:g} edges in a half-width"
+        yield "highlights", f"{lobe}: {100 * self.fine_share:.1f} % of the surface has {per_width}"
         if self.fine:
-            yield "verdict     fine enough" + ("; but see the problems above" if self.problems else "")
+            yield "verdict", "fine enough" + ("; but see the problems above" if self.problems else "")
         else:
-            yield f"verdict     too coarse: edges of {self.needed_edge_mm:.2g} mm are needed (surface.edge_mm)"
+            yield "verdict", f"too coarse: edges of {self.needed_edge_mm:.2g} mm are needed (surface.edge_mm)"
 
 
-def check_mesh(path: str | Path, distance_mm: float | None, concentration: float, kind: str = "auto") -> Verdict:
-    """Judge a mesh file.
+def check_mesh(path: str | Path, distance_mm: float | None, concentration: float, kind: str = "auto") -> MeshCheck:
+    """Judge a mesh file for highlights of a lobe of c = `concentration`, seen from a distance, mm.
 
-    Parameters
-    ----------
-    path : str or Path
-        PLY, OBJ, STL or VTK; lengths in mm.
-    distance_mm : float or None
-        Distance of camera and light from the surface, mm; None: that of the nearest viewpoints on the camera's side.
-    concentration : float
-        c of the lobe (`simtest.surfaces.fineness`).
-    kind : {"auto", "lumen", "organ"}
-        Which side the camera is on.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or no usable mesh.
+    With no distance it is that of the nearest viewpoints on the camera's side, which `kind` ("auto", "lumen", "organ")
+    tells. Raises `InputError` if the file is missing or no usable mesh.
     """
     # size, unit and side, after the repairs
     vertices, faces, repairs = read_mesh(path)
@@ -208,7 +155,7 @@ def check_mesh(path: str | Path, distance_mm: float | None, concentration: float
         share = _fine_share(wanted, vertices, faces)
         larger = np.maximum(np.abs(k_min), np.abs(k_max))
         median, p95 = (area_quantile(larger, vertices, faces, level) for level in (0.5, 0.95))
-    return Verdict(
+    return MeshCheck(
         file=str(path),
         vertices=len(vertices),
         faces=len(faces),

@@ -1,33 +1,172 @@
 """A user's mesh as a surface: smoothed by Loop subdivision, with normals and curvatures estimated at its vertices."""
 
+import math
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, overload
 
+import igl
 import numpy as np
 
+from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.resources import find
-from simtest.spec.surface import AnatomySurface
-from simtest.surfaces.built_mesh import BuiltMesh, MeshedSurface
-from simtest.surfaces.fineness import DEFAULT_EXPONENT, needed_edge, phong_concentration
-from simtest.surfaces.mesh_file import MESH_SUFFIXES, other_unit, read_mesh
-from simtest.surfaces.mesh_geometry import area_quantile, edge_lengths, isoperimetric_quotient
+from simtest.spec.surfaces import AnatomySurface
+from simtest.surfaces.mesh_file import MESH_SUFFIXES, Repairs, examine, other_unit, read_mesh
 from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures
 from simtest.surfaces.poses import lumen_pose, nearest_mm, organ_pose
-from simtest.surfaces.repair import examine
-from simtest.surfaces.subdivision import (
-    allowed_smoothing,
-    allowed_subdivisions,
-    halvings,
-    refine,
-    shape_operators,
-    vertex_normals,
-)  # fmt: skip
+from simtest.surfaces.triangles import (
+    BuiltMesh,
+    MeshedSurface,
+    area_quantile,
+    edge_lengths,
+    edge_uses,
+    isoperimetric_quotient,
+)
+
+DEFAULT_EXPONENT = 200.0
+"""Phong exponent of the shipped anatomy scene."""
+
+ISOVALUE = 0.5
+"""Level at which half-widths are taken: the middle of the default isovalues."""
+
+LEAST_STRETCH = 0.25
+"""Below this |1 + d k| there is no isolated highlight (docs/concepts/theory.md, section 6)."""
+
+
+def phong_concentration(exponent: float) -> float:
+    """Return c = -(log f)''(0) of Phong's lobe as a function of the angle between normal and view: 4 n."""
+    return 4.0 * exponent
+
+
+def ggx_concentration(alpha: float) -> float:
+    """Return c = -(log f)''(0) of the GGX lobe under a light at the camera.
+
+    The half vector is the view direction, so that f ~ (alpha^2 + (1 - alpha^2) sin^2)^-2, c = 4 (1/alpha^2 - 1);
+    masking and Fresnel reflection add a term of order 1.
+    """
+    return 4.0 * (1.0 / alpha**2 - 1.0)
+
+
+@overload
+def half_width(distance_mm: float, concentration: float, curvature: float) -> float: ...
+@overload
+def half_width(distance_mm: float, concentration: float, curvature: Array) -> Array: ...
+def half_width(distance_mm: float, concentration: float, curvature: float | Array) -> float | Array:
+    """Return the half-width at `ISOVALUE`, mm, of a highlight of a lobe of c: d sqrt(-2 ln t / c) / |1 + d k|."""
+    angle = math.sqrt(-2.0 * math.log(ISOVALUE) / concentration)
+    return distance_mm * angle / np.maximum(np.abs(1.0 + distance_mm * curvature), LEAST_STRETCH)
+
+
+def needed_edge(distance_mm: float, concentration: float, k_min: Array, k_max: Array) -> Array:
+    """Return the edge length that a surface needs at each of its points, mm, shape (N,); see `half_width`."""
+    narrow = np.minimum(half_width(distance_mm, concentration, k_min), half_width(distance_mm, concentration, k_max))
+    return np.asarray(narrow / EDGES_PER_HALF_WIDTH)
+
+
+def concentration(exponent: float | None, alpha: float | None) -> float:
+    """Return c of a lobe by exponent or roughness, else of `DEFAULT_EXPONENT`; `InputError` if out of range."""
+    if exponent is not None and alpha is not None:
+        raise InputError("--exponent and --roughness: only one of them may be given")
+    if alpha is not None:
+        if not 0 < alpha < 1:
+            raise InputError(f"--roughness {alpha:g}: must be between 0 and 1")
+        return ggx_concentration(alpha)
+    exponent = DEFAULT_EXPONENT if exponent is None else exponent
+    if not 0 < exponent <= 1e5:
+        raise InputError(f"--exponent {exponent:g}: must be greater than 0 and at most 100000")
+    return phong_concentration(exponent)
+
+
+MAX_SUBDIVIDED_FACES = 1_600_000
+
+CURVATURE_RINGS = 2
+"""Rings of neighbours to which the quadric is fitted for the curvature.
+
+Few, so that the curvature agrees with the normals that make the highlights: compared with the change of the vertex
+normals along the edges of a colon from CT, subdivided once, 2 rings give 0.85 of the curvature, 5 give 0.55.
+"""
+
+MAX_SMOOTHED_FACES = 400_000
+"""Meshes of up to this many faces are smoothed: 7 s and 1 GB at the limit."""
+
+
+def fair(vertices: Array, faces: IntArray, wavelength_mm: float) -> Array:
+    """Smooth a manifold: a wave of this length keeps half of its height, a longer one nearly all, a shorter one little.
+
+    Minimises sum m |x - x0|^2 + s sum |L x|^2 / m, with L the cotangent Laplacian, m the Voronoi areas and s =
+    (wavelength / 2 pi)^4, which damps a wave of wave number q by 1 / (1 + s q^4). At a rim the Laplacian is left out,
+    so that an open mesh does not shrink.
+    """
+    from scipy.sparse import diags
+    from scipy.sparse.linalg import splu
+
+    # Laplacian, areas, and 0 at the vertices of a rim
+    laplacian = igl.cotmatrix(vertices, faces)
+    mass = np.asarray(igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_VORONOI).diagonal())
+    edges, uses = edge_uses(faces)
+    inner = np.ones(len(vertices))
+    inner[edges[uses == 1].ravel()] = 0.0
+    strength = (wavelength_mm / (2 * math.pi)) ** 4
+    system = (diags(mass) + strength * (laplacian.T @ diags(inner / mass) @ laplacian)).tocsc()
+    # Symmetric and positive definite. Thin triangles make it so stiff that conjugate gradients take thousands of steps.
+    options = {"SymmetricMode": True}
+    solver = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    # About the centroid, so that rounding is relative to the size, not to the distance from the origin.
+    middle = vertices.mean(axis=0)
+    return np.ascontiguousarray(solver.solve(mass[:, None] * (vertices - middle)) + middle)
+
+
+def halvings(vertices: Array, faces: IntArray, edge_mm: float) -> int:
+    """Return how often edges must be halved for 95 % of them to be at most `edge_mm` long."""
+    length = float(np.quantile(edge_lengths(vertices, faces), 0.95))
+    # With a small tolerance, so that the mesh's own edge length needs no halving.
+    return max(0, math.ceil(math.log2(length / edge_mm) - 1e-6))
+
+
+def subdivisions_within_limit(faces: int, wanted: int) -> int:
+    """Return how often a mesh of so many faces may be subdivided, at most `wanted` times."""
+    allowed = wanted
+    # Each subdivision makes four faces of one.
+    while allowed and faces * 4**allowed > MAX_SUBDIVIDED_FACES:
+        allowed -= 1
+    return allowed
+
+
+def refine(vertices: Array, faces: IntArray, times: int, smoothing_mm: float) -> tuple[Array, IntArray]:
+    """Subdivide by Loop's scheme, `times` times, and smooth fairly unless `smoothing_mm` (see `fair`) is 0.
+
+    The smoothing comes after the first subdivision, where it also evens out what Loop's scheme leaves around vertices
+    of other than six neighbours; before it if there would be more than `MAX_SMOOTHED_FACES`.
+    """
+    if smoothing_mm:
+        if times and 4 * len(faces) <= MAX_SMOOTHED_FACES:
+            vertices, faces = igl.loop(vertices, faces, 1)
+            times -= 1
+        vertices = fair(vertices, faces, smoothing_mm)
+    return igl.loop(vertices, faces, times) if times else (vertices, faces)
+
+
+def vertex_normals(vertices: Array, faces: IntArray) -> Array:
+    """Return unit vertex normals, shape (V, 3): the faces' normals weighted by their angles at the vertex."""
+    normals = igl.per_vertex_normals(vertices, faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
+    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def shape_operators(vertices: Array, faces: IntArray) -> Array:
+    """Return S at the vertices for outward normals, 1/mm, (V, 3, 3), by a quadric fitted to the neighbours."""
+    fitted: Any = igl.principal_curvature(vertices, faces, CURVATURE_RINGS, True)
+    first, second, k1, k2 = fitted[:4]
+    # S = k1 d1 d1^T + k2 d2 d2^T
+    operators = k1[:, None, None] * first[:, :, None] * first[:, None, :]
+    operators += k2[:, None, None] * second[:, :, None] * second[:, None, :]
+    return np.asarray(operators)
+
 
 LUMEN_QUOTIENT = 0.1
 """Below this isoperimetric quotient a mesh is taken for a lumen.
@@ -55,23 +194,12 @@ MAX_CROSSING_FACES = 250_000
 
 @dataclass(frozen=True)
 class PreparedMesh(BuiltMesh):
-    """A mesh ready for rendering and for the truth.
+    """A mesh ready for rendering and for the truth."""
 
-    Parameters
-    ----------
-    operators : ndarray, shape (V, 3, 3)
-        S at the vertices, 1/mm, for the mesh's normals; NaN where the fit failed.
-    lumen : bool
-        Whether the camera belongs inside.
-    subdivisions : int
-        How often the mesh was subdivided.
-    shortest_mm : float
-        Shortest wavelength that the mesh holds itself, mm: two of the file's median edges, or what smoothing left.
-    """
-
-    operators: Array
-    lumen: bool
-    subdivisions: int
+    operators: Array  # (V, 3, 3): S at the vertices, 1/mm, for the mesh's normals; NaN where the fit failed
+    lumen: bool  # Whether the camera belongs inside
+    subdivisions: int  # How often the mesh was subdivided
+    # Shortest wavelength that the mesh holds itself, mm: two of the file's median edges, or what smoothing left
     shortest_mm: float
 
     @property
@@ -156,28 +284,13 @@ class Refinement:
 def prepare(path: str | Path, refinement: Refinement | int = 1, kind: str = "auto") -> PreparedMesh:
     """Read a mesh and prepare it; the last few are cached until their file changes.
 
-    Repairs are warned of, and so are self-intersections, around which the truth is meaningless.
-
-    Parameters
-    ----------
-    path : str or Path
-        A mesh file (see `read_mesh`).
-    refinement : Refinement or int
-        How to refine it; a number is that of Loop subdivisions. Fewer are made, with a warning, if the faces would
-        exceed `MAX_SUBDIVIDED_FACES`.
-    kind : {"auto", "lumen", "organ"}
-        "auto": a lumen if the isoperimetric quotient is below `LUMEN_QUOTIENT`.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed.
+    A number in place of a `Refinement` is that of Loop subdivisions; fewer are made, with a warning, if the faces would
+    exceed `MAX_SUBDIVIDED_FACES`. Of `kind` "auto" it is a lumen if the isoperimetric quotient is below
+    `LUMEN_QUOTIENT`. Repairs are warned of, and self-intersections, around which the truth is meaningless. Raises
+    `InputError` if the file is missing or malformed.
     """
     path = Path(path).expanduser().resolve()
-    try:
-        state = path.stat()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    state = path.stat()
     how = Refinement(refinement) if isinstance(refinement, int) else refinement
     return _prepare(str(path), state.st_mtime_ns, state.st_size, how, kind)
 
@@ -185,12 +298,12 @@ def prepare(path: str | Path, refinement: Refinement | int = 1, kind: str = "aut
 @lru_cache(maxsize=4)
 def _prepare(path: str, mtime_ns: int, size: int, how: Refinement, kind: str) -> PreparedMesh:
     vertices, faces, repairs = read_mesh(path)
-    # what is wrong with the file
     lumen = is_lumen(vertices, faces, kind)
-    _warn(path, vertices, faces, list(repairs.sentences(lumen)))
     # smooth and fine
-    times, smoothing = _plan(path, vertices, faces, how, lumen)
-    shortest = max(smoothing, SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces))))
+    times, smoothing, reasons = _plan(vertices, faces, how, lumen)
+    for problem in (*_doubts(vertices, faces, repairs, lumen), *reasons):
+        warnings.warn(f"{path}: {problem}", stacklevel=3)
+    shortest = max(smoothing, _own_wave(vertices, faces))
     vertices, faces = refine(vertices, faces, times, smoothing)
     normals, operators = vertex_normals(vertices, faces), shape_operators(vertices, faces)
     if lumen:
@@ -205,38 +318,56 @@ def is_lumen(vertices: Array, faces: IntArray, kind: str) -> bool:
     return kind == "lumen" or (kind == "auto" and isoperimetric_quotient(vertices, faces) < LUMEN_QUOTIENT)
 
 
-def _warn(path: str, vertices: Array, faces: IntArray, repairs: list[str]) -> None:
-    """Warn of what was repaired, of a doubtful unit, and of self-intersections."""
-    if repairs:
-        warnings.warn(f"{path}: {'; '.join(repairs)}", stacklevel=4)
+def _doubts(vertices: Array, faces: IntArray, repairs: Repairs, lumen: bool) -> Iterator[str]:
+    """Yield what was repaired, a doubtful unit, and self-intersections."""
+    if sentences := list(repairs.sentences(lumen)):
+        yield "; ".join(sentences)
     if unit := other_unit(float(np.ptp(vertices, axis=0).max())):
-        warnings.warn(f"{path}: lengths are taken as mm; by its extent the file may be in {unit}", stacklevel=4)
+        yield f"lengths are taken as mm; by its extent the file may be in {unit}"
     if len(faces) <= MAX_CROSSING_FACES and (crossing := examine(vertices, faces).crossing_faces):
-        warnings.warn(
-            f"{path}: {crossing} faces cut through others; normals and curvatures around them mean nothing",
-            stacklevel=4,
-        )
+        yield f"{crossing} faces cut through others; normals and curvatures around them mean nothing"
 
 
-def _plan(path: str, vertices: Array, faces: IntArray, how: Refinement, lumen: bool) -> tuple[int, float]:
-    """Return how often to subdivide, and the wavelength to smooth, mm."""
-    smoothing, wanted = how.smoothing_mm or 0.0, how.subdivisions
+def _plan(vertices: Array, faces: IntArray, how: Refinement, lumen: bool) -> tuple[int, float, list[str]]:
+    """Return how often to subdivide, the wavelength to smooth, mm, and why either is less than asked for."""
+    branching, reasons = int((edge_uses(faces)[1] > 2).sum()), []
     # smoothing, by default of what is the mesh's own
+    smoothing = how.smoothing_mm or 0.0
     if how.edge_mm is not None and how.smoothing_mm is None:
-        smoothing = SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
-    smoothing = allowed_smoothing(path, faces, smoothing)
+        smoothing = _own_wave(vertices, faces)
+    problem = ""
+    if len(faces) > MAX_SMOOTHED_FACES:
+        problem = f"{len(faces)} faces, at most {MAX_SMOOTHED_FACES} can be smoothed"
+    elif branching:
+        problem = f"{branching} edges belong to more than two faces, smoothing needs a manifold"
+    if smoothing and problem:
+        reasons, smoothing = [f"{problem}; using smoothing_mm = 0"], 0.0
     # subdivisions, as many as the edge length needs
+    wanted = how.subdivisions
     if how.edge_mm is not None:
         edge = automatic_edge(vertices, faces, lumen, smoothing) if how.edge_mm == "auto" else how.edge_mm
         wanted = halvings(vertices, faces, edge)
-    return allowed_subdivisions(path, faces, wanted), smoothing
+    times = subdivisions_within_limit(len(faces), wanted)
+    if times < wanted:
+        # One subdivision more of a quarter of the limit's faces ends finer than what this mesh allows.
+        fewer = MAX_SUBDIVIDED_FACES // 4 ** (times + 1)
+        reasons.append(
+            f"{wanted} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {times}"
+            f". Decimated to {fewer} faces it would take {times + 1} and end finer"
+        )
+    if times and branching:
+        reasons.append(f"{branching} edges belong to more than two faces; Loop subdivision needs a manifold, using 0")
+        times = 0
+    return times, smoothing, reasons
+
+
+def _own_wave(vertices: Array, faces: IntArray) -> float:
+    """Return the shortest wave, mm, that a file of these edges can hold."""
+    return SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
 
 
 def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: float) -> float:
-    """Return the edge length, mm, that highlights of `AUTO_CONCENTRATION` need as near as a camera comes.
-
-    The faces are outward. Curvatures are taken after smoothing by `smoothing_mm`.
-    """
+    """Return the edge length, mm, that `AUTO_CONCENTRATION` needs on outward faces as near as a camera comes."""
     vertices, faces = refine(vertices, faces, 0, smoothing_mm)
     # The nearest camera sees the narrowest highlights.
     distance = nearest_mm(lumen)
@@ -246,11 +377,7 @@ def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: 
 
 
 class MeshSurface(MeshedSurface):
-    """A user's mesh with a camera inside its lumen or outside the organ.
-
-    Raises `InputError` if the file is missing or malformed, no camera can be placed, or the relief has waves as long as
-    the mesh's own.
-    """
+    """A user's mesh with a camera inside its lumen or outside the organ."""
 
     faceted = True
 

@@ -38,6 +38,18 @@ class RayHits:
         second, third = self.barycentric.T
         return np.stack([1 - second - third, second, third], axis=1)
 
+    def rows(self, chosen: IntArray | slice) -> "RayHits":
+        """Return the hits of some of the rays."""
+        return RayHits(self.distance[chosen], self.face[chosen], self.barycentric[chosen])
+
+
+def in_rows(count: int, chosen: IntArray, *arrays: Array) -> list[Array]:
+    """Return arrays of so many rows, NaN but in those chosen, from what is there."""
+    whole = [np.full((count, *values.shape[1:]), np.nan) for values in arrays]
+    for values, some in zip(whole, arrays, strict=True):
+        values[chosen] = some
+    return whole
+
 
 @dataclass(frozen=True)
 class SurfacePoints:
@@ -220,35 +232,20 @@ def pack_points(
 ) -> SurfacePoints:
     """Make `SurfacePoints` from distances, normals and shape operators, turned to face the rays' origins.
 
-    Parameters
-    ----------
-    origins, directions : ndarray, shape (N, 3)
-        Rays; unit directions.
-    distance : ndarray, shape (N,)
-        mm; NaN or inf if there is no point.
-    normal : ndarray, shape (N, 3)
-        Unit normals of either sign.
-    shape_operator : ndarray, shape (N, 3, 3)
-        S with dN = S dP for the given sign of N: symmetric, S N = 0.
-
-    Returns
-    -------
-    SurfacePoints
-        k_min, k_max are the eigenvalues of S in the tangent plane (theory.md section 0).
+    Distances are in mm, NaN or inf if there is no point; normals, shape (N, 3), are unit and of either sign; S, shape
+    (N, 3, 3), has dN = S dP for the given sign of N, is symmetric, and S N = 0. Its eigenvalues in the tangent plane
+    are k_min and k_max (theory.md section 0).
     """
     # Facing the origin; S changes its sign with the normal.
     sign = np.where(np.einsum("ij,ij->i", normal, directions) > 0, -1.0, 1.0)
     normal = normal * sign[:, None]
     S = shape_operator * sign[:, None, None]
-    # Eigenvalues and eigenvectors of the 2 x 2 matrix (a b; b c) of S in a tangent basis.
-    tangent, other = tangent_basis(normal)
+    tangents = tangent_basis(normal)
+    tangent, other = tangents
     a = np.einsum("ni,nij,nj->n", tangent, S, tangent)
     b = np.einsum("ni,nij,nj->n", tangent, S, other)
     c = np.einsum("ni,nij,nj->n", other, S, other)
-    mean, half = (a + c) / 2, np.hypot((a - c) / 2, b)
-    angle = 0.5 * np.arctan2(b, (a - c) / 2)  # direction of the larger eigenvalue
-    direction_max = np.cos(angle)[:, None] * tangent + np.sin(angle)[:, None] * other
-    direction_min = np.cos(angle)[:, None] * other - np.sin(angle)[:, None] * tangent
+    mean, half, direction_min, direction_max = principal(a, b, c, tangents)
     valid = np.isfinite(distance) & np.isfinite(normal).all(axis=1) & np.isfinite(mean)
 
     # Whatever is not finite in one field is NaN in all.
@@ -271,6 +268,14 @@ def pack_points(
         pool=np.zeros(len(valid), dtype=bool),
         valid=valid,
     )
+
+
+def principal(a: Array, b: Array, c: Array, tangents: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
+    """Return mean and half difference of the eigenvalues of (a b; b c) in a tangent basis, and their directions."""
+    mean, half = (a + c) / 2, np.hypot((a - c) / 2, b)
+    angle = 0.5 * np.arctan2(b, (a - c) / 2)  # direction of the larger eigenvalue
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return mean, half, cosine * tangents[1] - sine * tangents[0], cosine * tangents[0] + sine * tangents[1]
 
 
 def shape_operator(points: SurfacePoints) -> Array:

@@ -1,24 +1,26 @@
-"""Camera poses by number: inside a lumen or outside an organ, never in tissue.
+"""Camera poses by number, and along a path through a lumen; never in tissue.
 
 The same label and number give the same pose. The surface is passed as callables, so that generated anatomies and a
-user's mesh share the two pose functions.
+user's mesh share the two pose functions. For a path the inside of the lumen is sampled on a grid; it joins the two
+cells that are farthest apart, by the route that keeps farthest from the wall, and is then smoothed.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
 
 import igl
 import numpy as np
+from scipy import ndimage, sparse
 
 from simtest.errors import InputError
 from simtest.geometry.vectors import tangent_basis
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.seeds import Stage, generator
-from simtest.surfaces.mesh_geometry import area_vectors
-from simtest.surfaces.model import TriangleMesh
-
-MIN_CLEARANCE_MM = 5.0
-"""A camera in a lumen keeps this distance from the wall if the lumen is wide enough."""
+from simtest.spec.surfaces import AnatomySurface
+from simtest.surfaces.model import SurfaceModel, TriangleMesh
+from simtest.surfaces.triangles import MIN_CLEARANCE_MM, Generator, MeshProbe
 
 CLEARANCE_SHARE = 0.6
 """In a narrower lumen: share of the largest clearance found."""
@@ -36,7 +38,6 @@ ORGAN_TILT_DEG = 25.0
 _DIRECTIONS = 64
 _TARGETS = 64
 
-Generator = np.random.Generator
 Clearance = Callable[[Array], Array]
 Cast = Callable[[Array, Array], Array]
 
@@ -46,106 +47,16 @@ def nearest_mm(lumen: bool) -> float:
     return (AXIS_RANGE_MM if lumen else ORGAN_RANGE_MM)[0]
 
 
-class MeshProbe:
-    """Distances to a triangle mesh and rays against it, for the choice of a pose.
-
-    Parameters
-    ----------
-    mesh : TriangleMesh
-        Its normals face the space of the camera.
-    """
-
-    def __init__(self, mesh: TriangleMesh) -> None:
-        self._mesh = mesh
-        self._vertices = np.ascontiguousarray(mesh.vertices)
-        self._faces = np.ascontiguousarray(mesh.faces)
-        self._tree = igl.AABB()
-        self._tree.init(self._vertices, self._faces)
-
-    def clearance(self, points: Array) -> Array:
-        """Return the signed distance of points, shape (N, 3), to the mesh, mm; positive on the camera's side.
-
-        The sign is that of the interpolated vertex normal at the closest point, so an open mesh works too.
-        """
-        squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points))
-        # The normal at the closest point, interpolated in its triangle
-        corners = self._mesh.vertices[self._mesh.faces[face]]
-        weights = _barycentric(closest, corners)
-        normal = np.einsum("nc,nci->ni", weights, self._mesh.normals[self._mesh.faces[face]])
-        side = np.einsum("ni,ni->n", points - closest, normal)
-        return np.where(side >= 0, 1.0, -1.0) * np.sqrt(squared)
-
-    def distance(self, points: Array) -> Array:
-        """Return the unsigned distance of points, shape (N, 3), to the mesh, mm."""
-        squared, _, _ = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points))
-        return np.sqrt(squared)
-
-    def cast(self, origins: Array, directions: Array) -> Array:
-        """Return the distance along unit rays, shape (N, 3), to the first wall, mm; inf if there is none."""
-        face, distance, _ = self._tree.intersect_ray_first(
-            self._vertices, self._faces, np.ascontiguousarray(origins), np.ascontiguousarray(directions)
-        )
-        return np.where(face >= 0, distance, np.inf)
-
-    def targets(self, rng: Generator, count: int) -> tuple[Array, Array]:
-        """Draw points of the mesh, even by area, with unit normals of their faces; two arrays of shape (count, 3)."""
-        corners = self._mesh.vertices[self._mesh.faces]
-        cross = area_vectors(self._mesh.vertices, self._mesh.faces)
-        # A face is drawn in proportion to its area, then a point in it by the square-root rule.
-        cumulative = np.cumsum(np.linalg.norm(cross, axis=1))
-        face = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right").clip(max=len(cross) - 1)
-        a, b = np.sqrt(rng.random(count)), rng.random(count)
-        weights = np.stack([1 - a, a * (1 - b), a * b], axis=1)
-        points = np.einsum("nc,nci->ni", weights, corners[face])
-        return points, cross[face] / np.linalg.norm(cross[face], axis=1, keepdims=True)
-
-    def sites(self, rng: Generator) -> Array:
-        """Draw points well inside a lumen, shape (N, 3): between a random point of the wall and the wall opposite."""
-        points, normals = self.targets(rng, 16)
-        width = self.cast(points + 1e-3 * normals, normals)
-        # The middle of a chord is the safest, other shares add variety; an open end has no chord.
-        width = np.where(np.isfinite(width), width, 2 * MIN_CLEARANCE_MM)
-        shares = np.array([0.25, 0.4, 0.5, 0.6, 0.75])
-        sites = points[:, None] + (shares[None, :, None] * width[:, None, None]) * normals[:, None]
-        return sites.reshape(-1, 3)
-
-
-def _barycentric(points: Array, corners: Array) -> Array:
-    """Return barycentric weights, shape (N, 3), of points in triangles with corners of shape (N, 3, 3)."""
-    a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
-    aa, ab, bb = (np.einsum("ni,ni->n", *pair) for pair in ((a, a), (a, b), (b, b)))
-    pa, pb = np.einsum("ni,ni->n", p, a), np.einsum("ni,ni->n", p, b)
-    determinant = np.maximum(aa * bb - ab * ab, np.finfo(float).tiny)
-    second, third = (bb * pa - ab * pb) / determinant, (aa * pb - ab * pa) / determinant
-    return np.stack([1 - second - third, second, third], axis=1)
-
-
 def lumen_pose(
     label: str, viewpoint: int, sites: Callable[[Generator], Array], clearance: Clearance, cast: Cast
 ) -> Array:
-    """Return model_from_camera, shape (4, 4), of a camera inside a lumen.
+    """Return model_from_camera, shape (4, 4), of a camera inside a lumen, at the pose of a label and number.
 
     The site keeps `MIN_CLEARANCE_MM` or, in a narrow lumen, `CLEARANCE_SHARE` of the largest clearance found. The
-    direction is random among those whose axis meets the wall within `AXIS_RANGE_MM`; if there are none, the one
-    whose axis meets it closest to that range.
-
-    Parameters
-    ----------
-    label : str
-        Name of the surface; a branch of the seed tree.
-    viewpoint : int
-        Number of the pose, >= 0.
-    sites : callable
-        Draws candidates, shape (N, 3), mm.
-    clearance : callable
-        Signed distance of points to the wall, mm; positive in the lumen.
-    cast : callable
-        Distance from origins along directions to the wall, mm; inf if there is none.
-
-    Raises
-    ------
-    InputError
-        If no candidate lies in the lumen.
+    direction is random among those whose axis meets the wall within `AXIS_RANGE_MM`; if there are none, the one whose
+    axis meets it closest to that range. `sites` draws candidates, shape (N, 3); `clearance` is their signed distance to
+    the wall, positive in the lumen; `cast` the distance along rays to the wall, inf if there is none; all in mm. Raises
+    `InputError` if no candidate lies in the lumen.
     """
     rng = generator(0, "viewpoint", label, viewpoint, Stage.VIEWPOINT)
     # site
@@ -175,23 +86,8 @@ def organ_pose(
     """Return model_from_camera, shape (4, 4), of a camera outside an organ, looking at a random point of it.
 
     The distance is random in `ORGAN_RANGE_MM`, the sightline within `ORGAN_TILT_DEG` of the normal and free of
-    obstacles.
-
-    Parameters
-    ----------
-    label, viewpoint
-        See `lumen_pose`.
-    targets : callable
-        Draws surface points and outward unit normals, two arrays of shape (count, 3).
-    clearance : callable
-        Signed distance of points to the surface, mm; positive outside.
-    cast : callable
-        Distance from origins along directions to the surface, mm; inf if there is none.
-
-    Raises
-    ------
-    InputError
-        If no drawn point can be seen from such a position.
+    obstacles. `targets` draws surface points and outward unit normals; for the rest see `lumen_pose`. Raises
+    `InputError` if no drawn point can be seen from such a position.
     """
     rng = generator(0, "viewpoint", label, viewpoint, Stage.VIEWPOINT)
     # candidates
@@ -226,3 +122,238 @@ def _pose(site: Array, forward: Array, rng: Generator) -> Array:
     pose[:3, 2] = forward
     pose[:3, 3] = site
     return pose
+
+
+MAX_CELLS = 1_500_000
+"""Cells of the grid over the mesh's bounding box, at most."""
+
+MIN_PITCH_MM = 1.0
+STEP_MM = 1.0
+"""Distance between the path's points."""
+
+SMOOTHING_MM = 6.0
+"""Standard deviation of the Gaussian along the path that removes the steps of the grid."""
+
+MIN_LENGTH_MM = 20.0
+WALL_MM = 1.0
+"""The path is cut where it comes closer to the wall, and its longest piece is kept."""
+
+_NEIGHBOURS = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) > (0, 0, 0)]
+"""Half of a cell's 26: each pair of cells is joined once."""
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """A smooth curve inside a lumen, with a frame that turns no more than the curve does."""
+
+    points: Array  # (N, 3): model frame, mm, evenly spaced
+    # tangents, sides: (N, 3): unit vectors along the path and across it
+    tangents: Array
+    sides: Array
+    length: float  # mm
+
+    def at(self, position: float) -> tuple[Array, Array, Array]:
+        """Return point, mm, unit tangent and side at a position of 0 to `length`, mm; straight on beyond the ends."""
+        # interpolated between the two nearest points
+        inside = min(max(position, 0.0), self.length)
+        index = inside / self.length * (len(self.points) - 1)
+        low = min(int(index), len(self.points) - 2)
+        share = index - low
+        point, tangent, side = (
+            (1 - share) * rows[low] + share * rows[low + 1] for rows in (self.points, self.tangents, self.sides)
+        )
+        # orthonormal again
+        tangent /= np.linalg.norm(tangent)
+        side -= (side @ tangent) * tangent
+        return point + (position - inside) * tangent, tangent, side / np.linalg.norm(side)
+
+
+class _Keyed:
+    """A mesh that a cache can find by its key."""
+
+    def __init__(self, key: str, mesh: TriangleMesh) -> None:
+        self.key, self.mesh = key, mesh
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Keyed) and other.key == self.key
+
+
+def camera_path(surface: SurfaceModel) -> CameraPath:
+    """Find the camera path through the mesh of a lumen, closed or open at its ends; the last few are cached."""
+    shape = surface.shape()
+    assert shape.mesh is not None
+    return _camera_path(_Keyed(shape.key, shape.mesh))
+
+
+@lru_cache(maxsize=4)
+def _camera_path(keyed: _Keyed) -> CameraPath:
+    mesh = keyed.mesh
+    # grid
+    probe = MeshProbe(mesh)
+    pitch = max(MIN_PITCH_MM, float(np.prod(np.ptp(mesh.vertices, axis=0)) / MAX_CELLS) ** (1 / 3))
+    cells, corner = _inside_cells(mesh, pitch)
+    centres = corner + pitch * cells
+    if not len(centres):
+        raise InputError("surface.view: the mesh has no inside for a camera path; view = auto places single cameras")
+    # route and smooth path
+    room = probe.distance(centres)
+    rough = centres[_roomiest_route(cells, room)]
+    path = _resampled(rough, pitch)
+    path = _without_ends(path, probe.distance(path))
+    length = STEP_MM * (len(path) - 1)
+    if length < MIN_LENGTH_MM:
+        raise InputError(
+            f"surface.view: a camera path of {max(length, 0):.3g} mm fits into the mesh; at least {MIN_LENGTH_MM:g} mm "
+            "are needed; view = auto places single cameras"
+        )
+    tangents = np.gradient(path, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    return CameraPath(path, tangents, _sides(tangents), length)
+
+
+def _inside_cells(mesh: TriangleMesh, pitch: float) -> tuple[IntArray, Array]:
+    """Return the grid's cells inside the mesh's largest cavity, shape (N, 3), and the centre of cell (0, 0, 0), mm."""
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    counts = np.maximum(np.ceil((high - low) / pitch).astype(int), 1)
+    corner = low + pitch / 2
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1)
+    # The winding number identifies the inside of an open tube too: it is 1/2 where a cap would close the end.
+    winding = igl.fast_winding_number(
+        np.ascontiguousarray(mesh.vertices),
+        np.ascontiguousarray(mesh.faces),
+        np.ascontiguousarray(corner + pitch * grid.reshape(-1, 3)),
+    )
+    inside = np.abs(np.asarray(winding)).reshape(counts) > 0.5
+    labels, count = ndimage.label(inside, np.ones((3, 3, 3)))
+    if count > 1:
+        # The largest cavity; label 0 is the outside.
+        inside = labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
+    return np.argwhere(inside), corner
+
+
+def _roomiest_route(cells: IntArray, room: Array) -> IntArray:
+    """Return the cells' numbers along the roomiest route between the two cells farthest apart."""
+    # Graph of the cells: each is joined to its 26 neighbours. A border of empty cells saves the check of the ends.
+    size = cells.max(axis=0) + 3
+    number = np.full(size, -1, dtype=np.int64)
+    number[tuple((cells + 1).T)] = np.arange(len(cells))
+    first, second, length = [], [], []
+    for step in _NEIGHBOURS:
+        other = number[tuple((cells + 1 + step).T)]
+        here = np.flatnonzero(other >= 0)
+        first.append(here)
+        second.append(other[here])
+        length.append(np.full(len(here), math.sqrt(sum(s * s for s in step))))
+    i, j, steps = np.concatenate(first), np.concatenate(second), np.concatenate(length)
+
+    def graph(weights: Array) -> sparse.csr_matrix:
+        return sparse.csr_matrix((weights, (i, j)), shape=(len(cells), len(cells)))
+
+    def farthest(start: int) -> int:
+        distance = sparse.csgraph.dijkstra(graph(steps), directed=False, indices=start)
+        return int(np.argmax(np.where(np.isfinite(distance), distance, -1.0)))
+
+    # Farthest from the roomiest cell is one end, farthest from that one the other.
+    start = farthest(int(np.argmax(room)))
+    end = farthest(start)
+    # Cubed, so that a detour through the middle is cheaper than a short cut along the wall.
+    cost = steps / np.maximum((room[i] + room[j]) / 2, 1e-3) ** 3
+    _, before = sparse.csgraph.dijkstra(graph(cost), directed=False, indices=start, return_predecessors=True)
+    route = [end]
+    while route[-1] != start and before[route[-1]] >= 0:
+        route.append(int(before[route[-1]]))
+    return np.array(route[::-1])
+
+
+def _resampled(rough: Array, pitch: float) -> Array:
+    """Smooth a row of points and space it evenly by `STEP_MM`."""
+    for width in (pitch, SMOOTHING_MM):
+        rough = np.asarray(ndimage.gaussian_filter1d(_evenly(rough), width / STEP_MM, axis=0, mode="nearest"))
+    return _evenly(rough)
+
+
+def _evenly(points: Array) -> Array:
+    position = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    even = np.arange(0.0, position[-1], STEP_MM)
+    return np.stack([np.interp(even, position, column) for column in points.T], axis=1)
+
+
+def _without_ends(path: Array, room: Array) -> Array:
+    """Keep the longest piece clear of the wall, without its ends.
+
+    The two cells farthest apart lie in corners, into which the path turns within about its own width.
+    """
+    # the longest piece
+    kept = _longest_run(room >= WALL_MM)
+    path, room = path[kept], room[kept]
+    usual = float(np.median(room)) if len(room) else 0.0
+    # without its narrow ends, and at least the usual room from either end
+    wide = np.flatnonzero(room >= min(MIN_CLEARANCE_MM, CLEARANCE_SHARE * usual))
+    if not len(wide):
+        return path[:0]
+    cut = math.ceil(usual / STEP_MM)
+    return path[max(wide[0], cut) : min(wide[-1] + 1, len(path) - cut)]
+
+
+def _longest_run(flags: Mask) -> slice:
+    """Return the longest run of true values."""
+    labels, count = ndimage.label(flags)
+    if not count:
+        return slice(0, 0)
+    return ndimage.find_objects(labels)[int(np.argmax(np.bincount(labels)[1:]))][0]
+
+
+def _sides(tangents: Array) -> Array:
+    """Transport a side vector along the path, turning it no more than the tangents turn."""
+    sides = np.empty_like(tangents)
+    sides[0] = tangent_basis(tangents[:1])[0][0]
+    for n in range(1, len(tangents)):
+        side = sides[n - 1] - (sides[n - 1] @ tangents[n]) * tangents[n]
+        sides[n] = side / np.linalg.norm(side)
+    return sides
+
+
+def path_pose(spec: AnatomySurface, surface: SurfaceModel) -> Array:
+    """Return model_from_camera, shape (4, 4), of a camera on or beside the camera path.
+
+    With `view` path it is on the path and looks at the point `look_ahead_mm` ahead; with off_axis it does so from
+    beside the path, by `off_axis_share` of the room up to `MIN_CLEARANCE_MM` before the wall; with wall it is on the
+    path and looks across it. `around_deg` is the direction across. The pose changes smoothly with it and with
+    `path_share`.
+
+    Raises `InputError` if the surface is an organ, or its mesh has no room for a path.
+    """
+    if surface.solid:
+        raise InputError(f"surface.view = {spec.view}: {spec.label} is an organ; a path needs a lumen; allowed: auto")
+    path = camera_path(surface)
+    position = spec.path_share * path.length
+    site, tangent, side = path.at(position)
+    other = np.cross(tangent, side)
+    angle = math.radians(spec.around_deg)
+    across = math.cos(angle) * side + math.sin(angle) * other
+    # site and target
+    target = path.at(position + spec.look_ahead_mm)[0]
+    if spec.view == "wall":
+        target = site + across
+    elif spec.view == "off_axis":
+        site = site + spec.off_axis_share * _room(surface, site, across) * across
+    forward = (target - site) / np.linalg.norm(target - site)
+    # The picture's x axis: the path's side, or its direction for a view across it.
+    right = tangent if spec.view == "wall" else side
+    right = right - (right @ forward) * forward
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = site
+    return pose
+
+
+def _room(surface: SurfaceModel, site: Array, across: Array) -> float:
+    """Return how far, mm, a camera may move from a site along a direction and keep its clearance."""
+    steps = np.arange(0.0, 100.0, 0.25)
+    least = min(MIN_CLEARANCE_MM, float(surface.clearance(site[None])[0]))
+    blocked = surface.clearance(site + steps[:, None] * across) < least - 1e-9
+    return float(steps[max(int(np.argmax(blocked)) - 1, 0)]) if blocked.any() else float(steps[-1])

@@ -128,11 +128,7 @@ class LiverRecipe(Spec):
 
 
 def load_recipe(path: str | Path, settings: Mapping[str, Any] | None = None) -> ColonRecipe | LiverRecipe:
-    """Read a TOML file with the keys of `ColonRecipe` or `LiverRecipe`, which its ``type`` selects.
-
-    `settings` replace values of the file, by key path or as nested tables. Raises `InputError` if the file is missing
-    or malformed.
-    """
+    """Read a recipe, whose ``type`` is colon or liver; `settings` by key path or as tables replace its values."""
     path, values = Path(path), dict(_flat(settings or {}))
     return recipe_from_dict(apply_settings(read_toml(path), values, str(path)), source_name(path, values))
 
@@ -160,11 +156,7 @@ def recipe_from_dict(data: Mapping[str, Any], where: str) -> ColonRecipe | Liver
 def load_anatomy(
     kind: str, recipe: str | Path | None = None, seed: int | None = None, settings: Mapping[str, Any] | None = None
 ) -> ColonRecipe | LiverRecipe:
-    """Read a recipe of one kind, colon or liver; by default the shipped one.
-
-    `seed` and `settings`, values by key path, replace those of the file. Raises `InputError` if the file is missing,
-    malformed, or of the other kind.
-    """
+    """Read a recipe of one kind, by default the shipped one; `seed` and `settings` replace its values."""
     path = find(recipe if recipe is not None else kind, "meshes")
     described = load_recipe(path, {**(settings or {}), **({} if seed is None else {"seed": seed})})
     if described.type != kind:

@@ -15,10 +15,9 @@ from functools import cached_property, lru_cache, reduce
 import numpy as np
 
 from simtest.geometry.vectors import tangent_basis
-from simtest.runtime.arrays import AnyArray, Array
-from simtest.runtime.kept_arrays import kept
-from simtest.spec.relief import Relief, ReliefBand
-from simtest.surfaces.model import SurfacePoints
+from simtest.runtime.arrays import AnyArray, Array, kept
+from simtest.spec.surfaces import Relief, ReliefBand
+from simtest.surfaces.model import SurfacePoints, principal
 
 NODES = 96
 """Nodes of the lattice along each side; the field repeats after as many."""
@@ -53,40 +52,20 @@ MENISCUS = 0.1
 
 @dataclass(frozen=True)
 class HeightJets:
-    """Height of the relief with its first two derivatives in space.
+    """Height of the relief with its first two derivatives in space."""
 
-    Parameters
-    ----------
-    height : ndarray, shape (N,)
-        mm, towards the camera.
-    gradient : ndarray, shape (N, 3)
-        Model frame.
-    hessian : ndarray, shape (N, 3, 3)
-        1/mm.
-    """
-
-    height: Array
-    gradient: Array
-    hessian: Array
+    height: Array  # (N,): mm, towards the camera
+    gradient: Array  # (N, 3): model frame
+    hessian: Array  # (N, 3, 3): 1/mm
 
 
 @dataclass(frozen=True)
 class BandField:
-    """One band: a periodic cubic B-spline.
+    """One band: a periodic cubic B-spline."""
 
-    Parameters
-    ----------
-    lattice_from_model : ndarray, shape (3, 3)
-        Lattice cells over mm.
-    coefficients : ndarray, shape (NODES, NODES, NODES)
-        Of the B-splines, mm.
-    diffused : ndarray, shape (NODES, NODES, NODES)
-        Those of the field that diffuse light sees.
-    """
-
-    lattice_from_model: Array
-    coefficients: Array
-    diffused: Array
+    lattice_from_model: Array  # (3, 3): lattice cells over mm
+    coefficients: Array  # (NODES, NODES, NODES): of the B-splines, mm
+    diffused: Array  # (NODES, NODES, NODES): those of the field that diffuse light sees
 
     @cached_property
     def is_seen_diffusely(self) -> bool:
@@ -128,24 +107,12 @@ def _spline_weights(t: Array) -> Array:
 
 @dataclass(frozen=True)
 class ReliefField:
-    """The relief of one surface.
+    """The relief of one surface."""
 
-    Parameters
-    ----------
-    bands : tuple of BandField
-        Their heights add up.
-    deviation : float
-        Standard deviation of the height, mm.
-    finest_wave : float
-        Least wavelength of the bands that hold a share of the slope above `FELT`, mm.
-    level : float or None
-        Height up to which a film fills the valleys, mm; None: it follows the relief.
-    """
-
-    bands: tuple[BandField, ...]
-    deviation: float
-    finest_wave: float
-    level: float | None = None
+    bands: tuple[BandField, ...]  # Their heights add up
+    deviation: float  # Standard deviation of the height, mm
+    finest_wave: float  # Least wavelength of the bands that hold a share of the slope above `FELT`, mm
+    level: float | None = None  # Height up to which a film fills the valleys, mm; None: it follows the relief
 
     @property
     def meniscus(self) -> float:
@@ -212,10 +179,7 @@ def fine_normals(normal: Array, gradient: Array) -> Array:
 
 
 def normal_derivative(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array]:
-    """Return fine normals, shape (N, 3), and their derivative along the base's tangents, shape (N, 3, 3).
-
-    `N` and `S` are the base's normals and shape operators; see `ReliefField.apply`.
-    """
+    """Return fine normals and their derivative along the base's tangents (see `ReliefField.apply`)."""
     G, H = jets.gradient, jets.hessian
     along = np.sum(N * G, axis=1)
     m = N - G + N * along[:, None]
@@ -234,13 +198,9 @@ def fine_curvatures(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array,
     tangents = tangent_basis(normal)
     below = [f - N * np.sum(N * f, axis=1, keepdims=True) for f in tangents]
     form = [[np.einsum("ni,nij,nj->n", f, derivative, t) for t in below] for f in tangents]
-    a, b, c = form[0][0], (form[0][1] + form[1][0]) / 2, form[1][1]
-    mean, half = (a + c) / 2, np.hypot((a - c) / 2, b)
-    angle = 0.5 * np.arctan2(b, (a - c) / 2)
-    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    direction_max = cosine * tangents[0] + sine * tangents[1]
-    direction_min = cosine * tangents[1] - sine * tangents[0]
-    return normal, np.stack([mean - half, mean + half], axis=1), (direction_min, direction_max)
+    mixed = (form[0][1] + form[1][0]) / 2
+    mean, half, *directions = principal(form[0][0], mixed, form[1][1], tangents)
+    return normal, np.stack([mean - half, mean + half], axis=1), (directions[0], directions[1])
 
 
 def _outer(weight: Array, vector: Array) -> Array:
@@ -260,15 +220,7 @@ def _add(parts: list[HeightJets]) -> HeightJets:
 
 
 def make_relief(spec: Relief, level: float | None = None) -> ReliefField:
-    """Make the relief of a description.
-
-    Parameters
-    ----------
-    spec : Relief
-        Its bands and seed.
-    level : float, optional
-        Height up to which a film fills the valleys, in standard deviations of the height about its mean.
-    """
+    """Make the relief of a description; a film fills its valleys up to `level` deviations of the height."""
     field = _make_field(spec)
     return field if level is None else replace(field, level=level * field.deviation)
 
@@ -307,20 +259,11 @@ def _drawn(spec: Relief) -> ReliefField:
 
 @dataclass(frozen=True)
 class _Unscaled:
-    """A band before its slope and wavelength are set.
+    """A band before its slope and wavelength are set."""
 
-    Parameters
-    ----------
-    turn : ndarray, shape (3, 3)
-        Of the lattice.
-    coefficients : ndarray, shape (NODES, NODES, NODES)
-        Of the B-splines.
-    slope, wave : float
-        What `_plane_statistics` measures.
-    """
-
-    turn: Array
-    coefficients: Array
+    turn: Array  # (3, 3): of the lattice
+    coefficients: Array  # (NODES, NODES, NODES): of the B-splines
+    # slope, wave: What `_plane_statistics` measures
     slope: float
     wave: float
 

@@ -8,6 +8,7 @@ chord through a vessel (Beer and Lambert), mu_c the absorption of its blood, and
 of the light that comes back from below the vessel's depth.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,14 +18,64 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from simtest.runtime.arrays import AnyArray, Array
-from simtest.runtime.kept_arrays import kept
-from simtest.spec.tissue_colour import TissueColour
-from simtest.surfaces.haemoglobin import TISSUE_SATURATION, blood_absorption, reach
+from simtest.runtime.arrays import AnyArray, Array, kept
+from simtest.spec.reflectance import TissueColour
 from simtest.surfaces.model import SurfaceModel
-from simtest.surfaces.segment_table import NO_VESSELS, SegmentTable, make_table
-from simtest.surfaces.surface_samples import Patch, surface_patch
-from simtest.surfaces.vessels import grow_vessels, segments
+from simtest.surfaces.vessels import (
+    NO_VESSELS,
+    PatternPatch,
+    SegmentTable,
+    grow_vessels,
+    make_table,
+    segments,
+    surface_patch,
+)
+
+EXTINCTION = (
+    # Red, 600 to 650 nm: wavelength, nm; HbO2 and Hb, 1/(cm mol/l)
+    ((600, 3200.0, 14677.2), (610, 1506.0, 9443.6), (620, 942.0, 6509.6), (630, 610.0, 5148.8), (640, 442.0, 4345.2),
+     (650, 368.0, 3750.12)),
+    # Green, 510 to 570 nm
+    ((510, 20035.2, 25773.6), (520, 24202.4, 31589.6), (530, 39956.8, 39036.4), (540, 53236.0, 46592.0),
+     (550, 43016.0, 53412.0), (560, 32613.2, 53788.0), (570, 44496.0, 45072.0)),
+    # Blue, 450 to 490 nm
+    ((450, 62816.0, 103292.0), (460, 44480.0, 23388.8), (470, 33209.2, 16156.4), (480, 26629.2, 14550.0),
+     (490, 23684.4, 16684.0)),
+)  # fmt: skip
+"""Molar extinction in the bands of the three channels."""
+
+HAEMOGLOBIN_G_PER_L = 150.0
+GRAM_PER_MOL = 64500.0
+
+SOFT_TISSUE = (1.89, 1.3)
+"""Reduced scattering a (lambda / 500 nm)^-b of soft tissue: a, 1/mm, and b."""
+
+TISSUE_SATURATION = 0.7
+"""Share of oxygenated haemoglobin in the ground: 0.72 in normal colon mucosa (Friedland et al. 2003), 0.67 (Wang et al.
+2009); see docs/concepts/tissue.md."""
+
+
+def blood_absorption(saturation: float) -> Array:
+    """Return the absorption coefficient of whole blood, 1/mm, shape (3,), red, green and blue.
+
+    mu_a = ln(10) (S e_HbO2 + (1 - S) e_Hb) c with the molar concentration c of haemoglobin, averaged over each band.
+    """
+    means = np.array([np.mean(np.array(band)[:, 1:], axis=0) for band in EXTINCTION])
+    molar = means @ [saturation, 1 - saturation]
+    return np.asarray(math.log(10) * molar * HAEMOGLOBIN_G_PER_L / GRAM_PER_MOL / 10)
+
+
+def reach(blood: float) -> Array:
+    """Return the length, mm, shape (3,), over which the light that comes back from below falls to 1/e.
+
+    Half of the penetration depth 1 / sqrt(3 mu_a (mu_a + mu_s')) of diffuse light, since it goes down and up again.
+    `blood` is the share of the tissue's volume that is blood.
+    """
+    wavelength = np.array([np.mean([row[0] for row in band]) for band in EXTINCTION])
+    scattering = SOFT_TISSUE[0] * (wavelength / 500) ** -SOFT_TISSUE[1]
+    absorption = blood * blood_absorption(TISSUE_SATURATION)
+    return np.asarray(0.5 / np.sqrt(3 * absorption * (absorption + scattering)))
+
 
 NODES = 64
 """Nodes of a lattice along each side, a power of two; its field repeats after as many."""
@@ -53,18 +104,10 @@ _PLAIN, _LATTICES = ("base", "mottled", "netted", "absorption", "share"), ("mott
 
 @dataclass(frozen=True)
 class Lattice:
-    """A periodic field in space, linear between the nodes of a turned lattice.
+    """A periodic field in space, linear between the nodes of a turned lattice."""
 
-    Parameters
-    ----------
-    lattice_from_model : ndarray, shape (3, 3)
-        Nodes over mm.
-    values : ndarray, shape (NODES, NODES, NODES)
-        At the nodes.
-    """
-
-    lattice_from_model: Array
-    values: Array
+    lattice_from_model: Array  # (3, 3): nodes over mm
+    values: Array  # (NODES, NODES, NODES): at the nodes
 
     def at(self, points: Array) -> Array:
         """Return the field at points, shape (N, 3), model frame, mm."""
@@ -83,36 +126,20 @@ class Lattice:
 
 @dataclass(frozen=True)
 class TissuePattern:
-    """The albedo of one surface's tissue.
+    """The albedo of one surface's tissue."""
 
-    Parameters
-    ----------
-    base : ndarray, shape (3,)
-        Albedo of the ground, linear RGB.
-    mottling, capillaries : Lattice
-    mottled, netted : ndarray, shape (3,)
-        Absorbances a_c and b_c for a unit of them.
-    absorption : ndarray, shape (2, 3)
-        Of the blood of arteries and veins, 1/mm.
-    share : ndarray, shape (3,)
-        s_c.
-    vessels : SegmentTable
-    """
-
-    base: Array
+    base: Array  # (3,): albedo of the ground, linear RGB
     mottling: Lattice
     capillaries: Lattice
+    # mottled, netted: (3,): absorbances a_c and b_c for a unit of them
     mottled: Array
     netted: Array
-    absorption: Array
-    share: Array
+    absorption: Array  # (2, 3): of the blood of arteries and veins, 1/mm
+    share: Array  # (3,): s_c
     vessels: SegmentTable
 
     def albedo(self, points: Array) -> Array:
-        """Return the albedo at points of the surface, shape (N, 3), model frame, mm; linear RGB, shape (N, 3).
-
-        The slow reference of `simtest.rendering.albedo`.
-        """
+        """Return the albedo at points of the surface, model frame, mm, linear RGB; the kernel's slow reference."""
         field, net = self.mottling.at(points), self.capillaries.at(points)
         value = self.base * np.exp(-field[:, None] * self.mottled - net[:, None] * self.netted)
         chords = self.vessels.chords(points)
@@ -136,7 +163,7 @@ def _bare(spec: TissueColour) -> TissuePattern:
 
 
 @lru_cache(maxsize=4)
-def _make(patch: Patch, spec: TissueColour) -> TissuePattern:
+def _make(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
     return _unpacked(kept("tissue", f"{patch.key} {spec.model_dump_json()}", lambda: _packed(_grown(patch, spec))))
 
 
@@ -159,7 +186,7 @@ def _unpacked(arrays: Mapping[str, AnyArray]) -> TissuePattern:
     return TissuePattern(mottling=mottling, capillaries=capillaries, vessels=vessels, **plain)
 
 
-def _grown(patch: Patch, spec: TissueColour) -> TissuePattern:
+def _grown(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
     """Make the pattern of a patch."""
     grow = np.random.SeedSequence(spec.seed).spawn(3)[2]
     forest = grow_vessels(patch, spec.vessels, int(grow.generate_state(1)[0]))

@@ -22,10 +22,8 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import Stage, generator
-from simtest.surfaces.components import Components, chosen, components, solve3
-from simtest.surfaces.jets import Jet
 from simtest.surfaces.recipe import ColonRecipe
-from simtest.surfaces.stalk import Stalk
+from simtest.surfaces.stalk import Jet, Stalk
 
 NEWTON_STEPS = 12
 NEWTON_TOLERANCE_MM = 1e-10
@@ -54,23 +52,13 @@ class _Fold:
 
 @dataclass(frozen=True)
 class TubeNumbers:
-    """A tube without pedunculated polyps as numbers, for a kernel.
+    """A tube without pedunculated polyps as numbers, for a kernel."""
 
-    Parameters
-    ----------
-    constants : dict
-        Scalars of the module's formulas.
-    folds : ndarray, shape (K, 7)
-        along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see `_Fold`).
-    waves : ndarray, shape (W, 3)
-        q, m and phase of the relief's waves.
-    panels : ndarray, shape (knots, 2 + 2 * powers)
-        x and z of each knot, then of the polynomial's coefficients about it, the lowest first.
-    """
-
-    constants: dict[str, float]
+    constants: dict[str, float]  # Scalars of the module's formulas
+    # (K, 7): along, sine and cosine of the centre, depth, 1 / width^2, slant and kappa of each fold (see `_Fold`)
     folds: Array
-    waves: Array
+    waves: Array  # (W, 3): q, m and phase of the relief's waves
+    # (knots, 2 + 2 * powers): x and z of each knot, then of the polynomial's coefficients about it, the lowest first
     panels: Array
 
 
@@ -183,10 +171,7 @@ class Tube:
         return np.stack([x, np.zeros_like(x), z], axis=1)
 
     def centreline(self, u: Array) -> Array:
-        """Return C(u), mm, shape (N, 3), from the nearest knot, exact to rounding.
-
-        Around each knot polynomials stand for the quadrature; beyond the tube's ends the quadrature itself is used.
-        """
+        """Return C(u), mm, by polynomials about the nearest knot; by the quadrature itself beyond the tube's ends."""
         spacing = self._knots[1] - self._knots[0]
         knot = np.clip(np.rint(u / spacing), 0, len(self._knots) - 1).astype(np.int64)
         points = self._knot_points[knot]
@@ -325,21 +310,6 @@ class Tube:
         moved = self._with_stalks(Jet(position, first, second, none, none, none))
         return moved.f, moved.u, moved.v
 
-    def _tangent_components(self, u: Array, v: Array) -> tuple[Components, Components, Components]:
-        """Return the components of `tangents`: P, P_u and P_v by x, y and z."""
-        if self._stalks:
-            position, first, second = self.tangents(u, v)
-            return components(position), components(first), components(second)
-        r, (psi, bend, _) = self.radius(u, v, second=False), self.heading(u)
-        s, c, sv, cv = np.sin(psi), np.cos(psi), np.sin(v), np.cos(v)
-        centre, rho = self.centreline(u), (cv * c, sv, -cv * s)
-        along, tau = 1 - bend * r.f * cv, (-sv * c, cv, sv * s)
-        return (
-            (centre[:, 0] + r.f * rho[0], r.f * rho[1], centre[:, 2] + r.f * rho[2]),
-            (along * s + r.u * rho[0], r.u * rho[1], along * c + r.u * rho[2]),
-            (r.v * rho[0] + r.f * tau[0], r.v * rho[1] + r.f * tau[1], r.v * rho[2] + r.f * tau[2]),
-        )
-
     def jet(self, u: Array, v: Array) -> Jet:
         """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
         r = self.radius(u, v)
@@ -397,21 +367,20 @@ class Tube:
     def solve(
         self, origins: Array, directions: Array, distance: Array, u: Array, v: Array
     ) -> tuple[Array, Array, Array]:
-        """Solve P(u, v) = origin + t direction by Newton's method; return t, u and v, t NaN if there is no solution.
-
-        The rays are of shape (N, 3), in mm, with unit directions; `distance`, `u` and `v`, shape (N,), are a start
-        close by.
-        """
+        """Solve P(u, v) = origin + t direction by Newton's method from a start close by; return t, NaN: none, u, v."""
         u, v, t = u.copy(), v.copy(), distance.copy()
         found = np.zeros(len(u), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
-        source, towards = components(origins[active]), components(directions[active])
         for _ in range(NEWTON_STEPS):
-            p, pu, pv = self._tangent_components(u[active], v[active])
-            x, y, z = (a - b - t[active] * c for a, b, c in zip(p, source, towards, strict=True))
-            # The linear system P_u du + P_v dv - direction dt = -miss, for -du, -dv and dt
-            du, dv, dt = solve3(pu, pv, towards, (x, y, z))
-            done = x * x + y * y + z * z < NEWTON_TOLERANCE_MM**2
+            p, pu, pv = self.tangents(u[active], v[active])
+            towards = directions[active]
+            miss = p - origins[active] - t[active, None] * towards
+            # The linear system P_u du + P_v dv - direction dt = -miss by Cramer's rule, for -du, -dv and dt
+            minor = np.cross(pv, towards)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                inverse = 1.0 / _dot(pu, minor)
+                du, dv, dt = (_dot(miss, m) * inverse for m in (minor, np.cross(towards, pu), np.cross(pu, pv)))
+            done = _dot(miss, miss) < NEWTON_TOLERANCE_MM**2
             found[active[done]] = True
             # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
             scale = np.minimum(1.0, MAX_SHIFT_MM / np.maximum(np.abs(dt), np.finfo(float).tiny))
@@ -420,12 +389,17 @@ class Tube:
             v[active] -= scale * dv
             t[active] += scale * dt
             # A ray that leaves the neighbourhood of its hit is given up; the others go on.
-            kept = np.flatnonzero(~done & (np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM))
-            active, source, towards = active[kept], chosen(source, kept), chosen(towards, kept)
+            active = active[~done & (np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM)]
             if not active.size:
                 break
         inside = (u >= -1.0) & (u <= self.recipe.length_mm + 1.0)
         return np.where(found & inside, t, np.nan), u, v
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Return the dot products of vectors, shape (N,), added in order."""
+    product = a * b
+    return np.asarray(product[:, 0] + product[:, 1] + product[:, 2])
 
 
 def _powers(chebyshev: Array) -> Array:

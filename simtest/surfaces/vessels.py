@@ -12,17 +12,343 @@ Arteries and veins are two forests, grown apart. Each grows in stages:
 """
 
 import math
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from simtest.runtime.arrays import Array, IntArray, Mask
-from simtest.spec.tissue_colour import Vessels
-from simtest.surfaces.surface_samples import Patch, spread_points, thinned
+from simtest.spec.reflectance import Vessels
+from simtest.surfaces.analytic import QUADRIC_REACH, Cylinder, Plane, Quadric, Sphere
+from simtest.surfaces.model import SurfaceModel, TriangleMesh
+from simtest.surfaces.triangles import area_vectors
+
+PRIMES = (73856093, 19349663, 83492791)
+"""Factors of the hash of a cell's three numbers (Teschner et al. 2003)."""
+
+LOAD = 0.5
+"""Entries of lists over slots, at most: then few cells share a slot."""
+
+SEGMENTS = 2**15
+"""Segments that are sorted together: they bound the memory."""
+
+MARGIN_MM = 0.02
+"""Rounding of a point in single precision, and how far a mesh lies beside its smooth surface."""
+
+CELL_PER_WIDTH = 3.0
+"""Side of a cell over the median half-width of what is seen of a vessel."""
+
+STEPS = 4
+"""Points of a segment whose distance to a cell is taken."""
+
+ENDLESS = 1e9
+"""mm: farther than any point of a surface."""
+
+SLACK = 0.5
+"""How far a surface may leave the tangent plane of a vessel within its reach, over that reach."""
+
+
+@dataclass(frozen=True)
+class SegmentTable:
+    """Segments by the cell in which they are seen."""
+
+    cell_mm: float  # Side of a cell
+    # (slots + 1,): where each slot's list starts in `rows`; the number of slots is a power of two
+    first: npt.NDArray[np.uint32]
+    # (R, 8): segments of the lists: start (3), half-width that is seen, end minus start (3), peak of the chord, mm;
+    # the last is negative for a vein
+    rows: npt.NDArray[np.float32]
+    # (3,): along each axis of the model, how far from its origin the segments reach; beyond, they are mirrored over
+    # and over. `ENDLESS` where they are not
+    half_mm: Array = field(default_factory=lambda: np.full(3, ENDLESS))
+
+    @property
+    def mask(self) -> int:
+        """What of a hash is the slot."""
+        return len(self.first) - 2
+
+    def mirrored(self, points: Array) -> Array:
+        """Return the points among the segments that stand for points, shape (N, 3), mm."""
+        number = np.round(points / (2 * self.half_mm))
+        return np.asarray((points - 2 * number * self.half_mm) * np.where(number % 2, -1.0, 1.0))
+
+    def slots(self, points: Array) -> IntArray:
+        """Return the slots of points, shape (N, 3), mm."""
+        return _hash(np.floor(points / self.cell_mm).astype(np.int64)) & self.mask
+
+    def chords(self, points: Array) -> Array:
+        """Return the longest chords, mm, through arteries and veins below points, mm; shape (N, 2)."""
+        points = self.mirrored(points)
+        slot = self.slots(points)
+        first, last = self.first[slot], self.first[slot + 1]
+        found = np.zeros((len(points), 2))
+        active = np.flatnonzero(last > first)
+        row = first.astype(np.int64)
+        while len(active):
+            chord, vein = _chord(points[active], self.rows[row[active]].astype(np.float64))
+            found[active, vein] = np.maximum(found[active, vein], chord)
+            row[active] += 1
+            active = active[row[active] < last[active]]
+        return found
+
+
+NO_VESSELS = SegmentTable(1.0, np.zeros(3, dtype=np.uint32), np.zeros((1, 8), dtype=np.float32))
+"""The table of a surface without vessels."""
+
+
+def _chord(points: Array, rows: Array) -> tuple[Array, IntArray]:
+    """Return the chord through one segment below each point, and 1 for a vein."""
+    start, width, along, peak = rows[:, :3], rows[:, 3], rows[:, 4:7], rows[:, 7]
+    gap = points - start
+    t = np.clip(np.sum(gap * along, axis=1) / np.sum(along**2, axis=1), 0, 1)
+    squared = np.sum((gap - t[:, None] * along) ** 2, axis=1)
+    inside = np.maximum(1 - squared / width**2, 0)
+    return np.abs(peak) * inside * np.sqrt(inside), (peak < 0).astype(np.int64)
+
+
+def seen_profile(radius: Array, blur_mm: float) -> tuple[Array, Array]:
+    """Return half-width R and peak, mm, of the chord L(x) = peak (1 - x^2/R^2)^(3/2) that is seen of a vessel.
+
+    The chord through a cylinder is 2 sqrt(r^2 - x^2): area pi r^2, variance r^2/4. Scattering above it adds the blur's
+    variance and leaves the area; this profile has both, is 0 from R on, and has no crease.
+    """
+    variance = radius**2 / 4 + blur_mm**2
+    width = np.sqrt(6 * variance)
+    return width, 8 * radius**2 / (3 * width)
+
+
+def make_table(segments: "VesselSegments", blur_mm: float, half_mm: Array) -> SegmentTable:
+    """Sort segments into the cells in which they are seen, through a depth that blurs by a deviation, mm."""
+    width, peak = seen_profile(segments.radius, blur_mm)
+    if not len(width):
+        return NO_VESSELS
+    cell_mm = CELL_PER_WIDTH * float(np.median(width))
+    owner, cell = _cells(segments, width, cell_mm)
+    slots = 1 << max(1, math.ceil(math.log2(len(owner) / LOAD)))
+    slot = _hash(cell) & (slots - 1)
+    first = np.zeros(slots + 1, dtype=np.uint32)
+    first[1:] = np.cumsum(np.bincount(slot, minlength=slots))
+    rows = np.column_stack([segments.start, width, segments.end - segments.start, np.where(segments.vein, -peak, peak)])
+    sorted_rows = rows.astype(np.float32)[owner[np.argsort(slot, kind="stable")]]
+    return SegmentTable(cell_mm, first, sorted_rows, half_mm)
+
+
+def _cells(segments: "VesselSegments", width: Array, cell_mm: float) -> tuple[IntArray, IntArray]:
+    """Return pairs of a segment and a cell, shapes (P,) and (P, 3), in which it is seen on the surface."""
+    parts = [
+        _cells_of(segments, width, cell_mm, slice(start, start + SEGMENTS)) for start in range(0, len(width), SEGMENTS)
+    ]
+    owner, cell = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return owner, cell
+
+
+def _cells_of(segments: "VesselSegments", width: Array, cell_mm: float, some: slice) -> tuple[IntArray, IntArray]:
+    """Return the pairs of some segments. Lengths are in cells, in single precision: `MARGIN_MM` covers its rounding."""
+    start, end = segments.start[some] / cell_mm, segments.end[some] / cell_mm
+    reach = ((width[some] + MARGIN_MM) / cell_mm)[:, None]
+    low = np.floor(np.minimum(start, end) - reach).astype(np.int32)
+    size = np.floor(np.maximum(start, end) + reach).astype(np.int32) - low + 1
+    count = size.prod(axis=1)
+    owner = np.repeat(np.arange(len(count), dtype=np.int32), count)
+    index = np.arange(len(owner), dtype=np.int32) - np.repeat((np.cumsum(count) - count).astype(np.int32), count)
+    # Number of the cell in the segment's box: along z, y and x.
+    rest, z = np.divmod(index, size[owner, 2])
+    x, y = np.divmod(rest, size[owner, 1])
+    steps = (x, y, z)
+    near = (low + 0.5 - start).astype(np.float32)
+    along, normal = (end - start).astype(np.float32), segments.normal[some].astype(np.float32)
+    gap = [near[owner, axis] + steps[axis] for axis in range(3)]
+    # Only cells that the surface can pass through, which leaves its tangent plane by less than the slack.
+    slack = SLACK * (reach[:, 0] + np.linalg.norm(along, axis=1)) + np.abs(normal).sum(axis=1) / 2
+    height = sum(gap[axis] * normal[owner, axis] for axis in range(3))
+    kept = np.flatnonzero(np.abs(height) < slack.astype(np.float32)[owner])
+    owner, gaps = owner[kept], np.stack([part[kept] for part in gap], axis=1)
+    # Only cells that the vessel reaches: the distance from the cell to a few points of the segment, and half of the way
+    # between these.
+    nearest = np.full(len(owner), np.inf, dtype=np.float32)
+    for i in range(STEPS):
+        outside = np.maximum(np.abs(gaps - ((i + 0.5) / STEPS) * along[owner]) - 0.5, 0)
+        np.minimum(nearest, np.einsum("ni,ni->n", outside, outside), out=nearest)
+    reached = nearest < ((reach[:, 0] + np.linalg.norm(along, axis=1) / (2 * STEPS)) ** 2)[owner]
+    owner, kept = owner[reached], kept[reached]
+    cell = low[owner] + np.stack([step[kept] for step in steps], axis=1)
+    return owner.astype(np.int64) + some.start, cell.astype(np.int64)
+
+
+def _hash(cell: IntArray) -> IntArray:
+    """Return a number below 2^32 for each cell, shape (N, 3)."""
+    parts = [(cell[:, axis] * prime) & 0xFFFFFFFF for axis, prime in enumerate(PRIMES)]
+    return parts[0] ^ parts[1] ^ parts[2]
+
+
+WINDOW = 1.5
+"""Half-size of the part of a plane or cylinder that is sampled, over the anchor's distance."""
+
+CANDIDATES = 3.0
+"""Points drawn before thinning, per square of the least distance."""
+
+MAX_POINTS = 200_000
+"""They bound time and memory; a larger surface gets a wider spacing."""
+
+Draw = Callable[[np.random.Generator, int], tuple[Array, Array]]
+"""Draws so many points and unit normals, shape (N, 3), uniformly by area."""
+
+
+@dataclass(frozen=True)
+class PatternPatch:
+    """The part of a surface that carries a pattern, model frame."""
+
+    key: str  # Identity: patches of one key are equal
+    area: float  # mm^2
+    draw: Draw = field(compare=False, repr=False)  # See `Draw`
+    # Half-size along each axis, beyond which the pattern is mirrored; `ENDLESS` where the patch is the whole surface
+    half_mm: tuple[float, float, float] = (ENDLESS, ENDLESS, ENDLESS)
+
+
+def surface_patch(surface: SurfaceModel) -> PatternPatch:
+    """Return what to sample of a surface: a window around the anchor of one without end, all of another."""
+    if isinstance(surface, Plane):
+        return _plane(WINDOW * surface.distance)
+    if isinstance(surface, Sphere):
+        return _sphere(surface)
+    if isinstance(surface, Cylinder):
+        return _cylinder(surface)
+    if isinstance(surface, Quadric):
+        return _quadric(surface)
+    shape = surface.shape()
+    assert shape.mesh is not None
+    return _mesh(shape.mesh, shape.key)
+
+
+def _plane(half: float) -> PatternPatch:
+    def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+        points = np.zeros((count, 3))
+        points[:, :2] = rng.uniform(-half, half, (count, 2))
+        return points, np.tile([0.0, 0.0, 1.0], (count, 1))
+
+    return PatternPatch(f"plane {half!r}", 4 * half**2, draw, (half, half, ENDLESS))
+
+
+def _sphere(surface: Sphere) -> PatternPatch:
+    radius, side = surface.radius, -1.0 if surface.inside else 1.0
+
+    def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+        # Archimedes: the height above the far side is uniform over the area.
+        z, angle = rng.uniform(-1.0, 1.0, count), rng.uniform(-np.pi, np.pi, count)
+        across = np.sqrt(1 - z**2)
+        # The anchor is at +z of the centre seen from outside, and at -z from inside.
+        out = np.stack([across * np.cos(angle), across * np.sin(angle), side * z], axis=1)
+        return surface.centre + radius * out, side * out
+
+    return PatternPatch(f"sphere {radius!r} {surface.inside}", 4 * math.pi * radius**2, draw)
+
+
+def _cylinder(surface: Cylinder) -> PatternPatch:
+    radius, side = surface.radius, -1.0 if surface.inside else 1.0
+    half = WINDOW * max(surface.distance, 2 * radius if surface.inside else 0.0)
+
+    def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+        angle, along = rng.uniform(-np.pi, np.pi, count), rng.uniform(-half, half, count)
+        out = np.stack([np.sin(angle), np.zeros(count), side * np.cos(angle)], axis=1)
+        return surface.centre + radius * out + along[:, None] * [0.0, 1.0, 0.0], side * out
+
+    key = f"cylinder {radius!r} {half!r} {surface.inside}"
+    return PatternPatch(key, 4 * math.pi * half * radius, draw, (ENDLESS, half, ENDLESS))
+
+
+def _quadric(surface: Quadric) -> PatternPatch:
+    half, (k1, k2, _) = QUADRIC_REACH * surface.distance, surface.curvatures
+    steepest = math.hypot(1.0, k1 * half, k2 * half)
+
+    def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+        rows: list[Array] = []
+        found = 0
+        # Rejection: the density over the plane below is the slope's secant.
+        while found < count:
+            x, y = rng.uniform(-half, half, (2, 2 * count))
+            secant = np.sqrt(1 + (k1 * x) ** 2 + (k2 * y) ** 2)
+            kept = rng.uniform(0, steepest, 2 * count) < secant
+            rows.append(np.stack([x[kept], y[kept]], axis=1))
+            found += int(kept.sum())
+        x, y = np.concatenate(rows)[:count].T
+        normal = np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1)
+        points = np.stack([x, y, -(k1 * x**2 + k2 * y**2) / 2], axis=1)
+        return points, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    # The area by a midpoint rule.
+    side = (np.arange(200) + 0.5) / 100 * half - half
+    secant = np.sqrt(1 + (k1 * side[:, None]) ** 2 + (k2 * side[None, :]) ** 2)
+    return PatternPatch(f"quadric {k1!r} {k2!r} {half!r}", float(secant.mean()) * 4 * half**2, draw)
+
+
+def _mesh(mesh: TriangleMesh, key: str) -> PatternPatch:
+    areas = np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=1) / 2
+    total = np.cumsum(areas)
+
+    def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+        face = np.minimum(np.searchsorted(total, rng.uniform(0, total[-1], count)), len(total) - 1)
+        # Uniform in a triangle: fold the square.
+        first, second = rng.uniform(0, 1, (2, count))
+        beyond = first + second > 1
+        first, second = np.where(beyond, 1 - first, first), np.where(beyond, 1 - second, second)
+        weights = np.stack([1 - first - second, first, second], axis=1)
+        corners = mesh.faces[face]
+        points = np.einsum("nc,nci->ni", weights, mesh.vertices[corners])
+        normals = np.einsum("nc,nci->ni", weights, mesh.normals[corners])
+        return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+    return PatternPatch(f"mesh {key}", float(total[-1]), draw)
+
+
+def spread_points(patch: PatternPatch, distance_mm: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Draw points no two of which are nearer than a distance, about as dense as that allows.
+
+    Returns points, mm, and unit normals, shape (N, 3). The distance is wider, with a warning, where there would be more
+    than `MAX_POINTS`.
+    """
+    # Random dart throwing reaches about 0.7 points per square of the distance.
+    least = math.sqrt(0.7 * patch.area / MAX_POINTS)
+    if distance_mm < least:
+        warnings.warn(
+            f"reflectance.albedo.vessels.spacing_mm: a surface of {patch.area:.0f} mm^2 would need more than "
+            f"{MAX_POINTS} points; the vessels stand {least / distance_mm:.2g} times as far apart",
+            stacklevel=2,
+        )
+        distance_mm = least
+    count = max(16, math.ceil(CANDIDATES * patch.area / distance_mm**2))
+    points, normals = patch.draw(rng, count)
+    kept = thinned(points, distance_mm)
+    return points[kept], normals[kept]
+
+
+def thinned(points: Array, distance: float) -> Mask:
+    """Return which points, shape (N, 3), to keep so that no two are nearer than a distance; earlier points win."""
+    pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
+    first, second = pairs.min(axis=1), pairs.max(axis=1)
+    kept, undecided = np.zeros(len(points), dtype=bool), np.ones(len(points), dtype=bool)
+    while len(first):
+        # A point without an earlier undecided neighbour stays; its neighbours go.
+        beaten = np.zeros(len(points), dtype=bool)
+        beaten[second] = True
+        stays = undecided & ~beaten
+        kept |= stays
+        undecided &= ~stays
+        undecided[_partners(first, second, stays)] = False
+        live = undecided[first] & undecided[second]
+        first, second = first[live], second[live]
+    return kept | undecided
+
+
+def _partners(first: IntArray, second: IntArray, chosen: Mask) -> IntArray:
+    """Return the later partners of chosen points."""
+    return second[chosen[first]]
+
 
 NODES_PER_SPACING = 2.5
 """Nodes along the distance between neighbouring ends: a twig has a few nodes."""
@@ -51,51 +377,30 @@ SYSTEMS = 2
 
 @dataclass(frozen=True)
 class Forest:
-    """Trees of vessels. Node i is joined to its parent by a vessel of radius `radius[i]`; a root is joined to nothing.
+    """Trees of vessels. A vessel of radius `radius[i]` joins node i to its parent; a root is joined to nothing."""
 
-    Parameters
-    ----------
-    position, normal : ndarray, shape (N, 3)
-        Of the nodes, on the surface, mm, and the surface's unit normals.
-    parent : ndarray of int, shape (N,)
-        The node towards the trunk; -1 for a root.
-    radius : ndarray, shape (N,)
-        mm; that of a root is its trunk's.
-    vein : ndarray of bool, shape (N,)
-        Whether the node belongs to a vein.
-    """
-
+    # position, normal: (N, 3): of the nodes, on the surface, mm, and the surface's unit normals
     position: Array
     normal: Array
-    parent: IntArray
-    radius: Array
-    vein: Mask
+    parent: IntArray  # (N,): the node towards the trunk; -1 for a root
+    radius: Array  # (N,): mm; that of a root is its trunk's
+    vein: Mask  # (N,): whether the node belongs to a vein
 
 
 @dataclass(frozen=True)
-class Segments:
-    """Straight pieces of vessels.
+class VesselSegments:
+    """Straight pieces of vessels."""
 
-    Parameters
-    ----------
-    start, end : ndarray, shape (S, 3)
-        mm.
-    normal : ndarray, shape (S, 3)
-        Of the surface, unit, at the start.
-    radius : ndarray, shape (S,)
-        mm.
-    vein : ndarray of bool, shape (S,)
-    """
-
+    # start, end: (S, 3): mm
     start: Array
     end: Array
-    normal: Array
-    radius: Array
-    vein: Mask
+    normal: Array  # (S, 3): of the surface, unit, at the start
+    radius: Array  # (S,): mm
+    vein: Mask  # (S,)
 
 
 @lru_cache(maxsize=4)
-def grow_vessels(patch: Patch, spec: Vessels, seed: int) -> Forest:
+def grow_vessels(patch: PatternPatch, spec: Vessels, seed: int) -> Forest:
     """Grow the vessels of a surface; the last few are cached."""
     branches = np.random.SeedSequence(seed).spawn(SYSTEMS)
     parts = [_grow(patch, spec, np.random.Generator(np.random.SFC64(branch))) for branch in branches]
@@ -106,7 +411,7 @@ def grow_vessels(patch: Patch, spec: Vessels, seed: int) -> Forest:
     return Forest(position, normal, np.where(parent >= 0, parent + first[system], -1), radius, system == 1)
 
 
-def _grow(patch: Patch, spec: Vessels, rng: np.random.Generator) -> tuple[Array, Array, IntArray, Array]:
+def _grow(patch: PatternPatch, spec: Vessels, rng: np.random.Generator) -> tuple[Array, Array, IntArray, Array]:
     """Grow one system; return positions, normals, parents and radii."""
     # The systems share the surface: the ends of one are farther apart than those of both.
     spacing = spec.spacing_mm * math.sqrt(SYSTEMS)
@@ -240,7 +545,7 @@ def _shape_operators(points: Array, normals: Array) -> Array:
     return np.asarray((S + S.transpose(0, 2, 1)) / 2)
 
 
-def segments(forest: Forest) -> Segments:
+def segments(forest: Forest) -> VesselSegments:
     """Cut the curves through the nodes, which are smooth along each path, into straight segments."""
     parent, position, normal = forest.parent, forest.position, forest.normal
     joined = np.flatnonzero(parent >= 0)
@@ -266,7 +571,7 @@ def segments(forest: Forest) -> Segments:
     )
     normals = (1 - t[:-1]) * normal[above] + t[:-1] * normal[joined]
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    return Segments(
+    return VesselSegments(
         curve[:-1].reshape(-1, 3),
         curve[1:].reshape(-1, 3),
         normals.reshape(-1, 3),

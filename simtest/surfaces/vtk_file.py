@@ -1,16 +1,12 @@
-"""VTK files, read in a process of its own: VTK takes the whole process with it where a file lies about its sizes.
+"""VTK files, read in a process of its own: VTK takes the whole process with it where a file lies about its sizes."""
 
-python -m simtest.surfaces.vtk_file MESH.vtk OUT.npz
-"""
-
-import sys
 from pathlib import Path
 
 import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.reader_process import limit_memory, read_apart, serve
+from simtest.runtime.processes import call_apart
 
 MEMORY_BYTES, MEMORY_PER_BYTE = 4e9, 40
 """What VTK may take, in all and for each byte of the file.
@@ -19,28 +15,16 @@ A point takes at least 6 bytes of a file, and a few arrays of 24 bytes in memory
 
 
 def read_vtk(path: Path) -> tuple[Array, IntArray]:
-    """Read a PolyData or an UnstructuredGrid as triangles.
+    """Read a PolyData or an UnstructuredGrid as triangles: vertices, in the file's unit, and faces.
 
     Returns
     -------
     vertices : ndarray, shape (V, 3)
         In the file's unit.
     faces : ndarray of int, shape (F, 3)
-
-    Raises
-    ------
-    InputError
-        If the file is no such mesh, or VTK breaks down over it.
-    SimtestError
-        If memory, or the disk of temporary files, does not hold it.
     """
-    breakdown = "damaged: VTK breaks down over its points or cells"
-    return read_apart(path, "simtest.surfaces.vtk_file", _load, "VTK", breakdown)
-
-
-def _load(made: Path) -> tuple[Array, IntArray]:
-    with np.load(made, allow_pickle=False) as arrays:
-        return arrays["vertices"], arrays["faces"]
+    memory = MEMORY_BYTES + MEMORY_PER_BYTE * path.stat().st_size
+    return call_apart(_triangles, path, memory, "VTK mesh", "damaged: VTK breaks down over its points or cells")
 
 
 def _triangles(path: str) -> tuple[Array, IntArray]:
@@ -71,18 +55,3 @@ def check_indices(indices: IntArray, count: int, where: str = "") -> None:
     if len(indices) and not (indices.min() >= 0 and indices.max() < count):
         wrong = indices.max() if indices.max() >= count else indices.min()
         raise InputError(f"{where}a face names vertex {wrong}; allowed: 0 to {count - 1}")
-
-
-def _store(mesh: tuple[Array, IntArray], out: str) -> None:
-    with open(out, "wb") as file:
-        np.savez(file, vertices=mesh[0], faces=mesh[1])
-
-
-def main() -> int:
-    """Read a file and store its arrays; print why that cannot be."""
-    return serve(_triangles, _store, "VTK mesh", "its triangles")
-
-
-if __name__ == "__main__":
-    limit_memory(MEMORY_BYTES + MEMORY_PER_BYTE * Path(sys.argv[1]).stat().st_size)
-    sys.exit(main())

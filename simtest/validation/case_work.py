@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import polars as pl
 
 from simtest.estimators.process.naming import absolute_names
-from simtest.runtime.engines import Engine
 from simtest.runtime.files import write_atomically
+from simtest.runtime.processes import Engine
 from simtest.validation.cases import Case, swept_example
 from simtest.validation.execution import Part, forget, gallery_cases, make_rows, parts_of
 from simtest.validation.jobs import Job

@@ -14,9 +14,9 @@ from simtest.reconstruction.pipeline import Specularity
 from simtest.rendering import HighlightPoint, Session
 from simtest.simulation import clouds as regions
 from simtest.simulation.rendered_view import RenderedView
-from simtest.validation.metrics import MISSED, estimate_row, mahalanobis2, scene_row
-from simtest.validation.results_table import ResultRow
-from simtest.validation.rough_truth import Cloud, filled_with_cloud
+from simtest.validation.columns import Row
+from simtest.validation.metrics import MISSED, estimate_columns, mahalanobis2, scene_columns
+from simtest.validation.rough_truth import Cloud, cloud_columns
 
 LEAST_VISIBLE = 15
 """A cloud that is wholly in view and has so many visible highlights is missed where no estimate is of it."""
@@ -79,45 +79,42 @@ def match_cloud(session: Session, view: RenderedView, estimate: Estimate) -> lis
 
 
 def cloud_rows(
-    session: Session, view: RenderedView, common: ResultRow, found: Mapping[str, Sequence[tuple[int, Estimate]]],
+    session: Session, view: RenderedView, common: Row, found: Mapping[str, Sequence[tuple[int, Estimate]]],
     failures: Mapping[str, Failure], whole: Mapping[int, Cloud],
-) -> list[ResultRow]:  # fmt: skip
+) -> list[Row]:  # fmt: skip
     """Make the rows of cloud estimators: of each estimate, and of each whole cloud that none is of.
 
     `found` and `failures` are those of `apart`, `whole` the clouds that are wholly in view. The column ``true_id`` is
     the index of the base's highlight point, as ``cloud``; the errors are against the base's normal there.
     """
     made = []
-    common = common.having(target="base")
     for name, estimates in found.items():
         taken: set[int] = set()
         for i, estimate in estimates:
             numbers = match_cloud(session, view, estimate)
             taken.update(numbers)
             row = _row(session, common, view, whole, numbers[0] if numbers else None)
-            row = estimate_row(row.having(estimator=name, specularity=i), estimate)
-            made.append(_with_errors(session, row, estimate, [view.clouds[n] for n in numbers]) if numbers else row)
+            row |= estimate_columns(estimate) | {"estimator": name, "specularity": i}
+            made.append(row | _errors(session, estimate, [view.clouds[n] for n in numbers]) if numbers else row)
         status = MISSED if name not in failures else str(failures[name].reason)
         detail = None if name not in failures else failures[name].detail
         for number, cloud in whole.items():
             if number not in taken and cloud.visible >= LEAST_VISIBLE and view.clouds[number].lit:
                 row = _row(session, common, view, whole, number)
-                made.append(row.having(estimator=name, status=status, flags=detail))
+                made.append(row | {"estimator": name, "status": status, "flags": detail})
     return made
 
 
-def _row(
-    session: Session, common: ResultRow, view: RenderedView, whole: Mapping[int, Cloud], number: int | None
-) -> ResultRow:
+def _row(session: Session, common: Row, view: RenderedView, whole: Mapping[int, Cloud], number: int | None) -> Row:
     """Return the row of a cloud before its estimate: scene, and the base's highlight point by number, if any."""
     centre = None if number is None else view.clouds[number]
-    row = scene_row(session.scene, common, centre).having(true_id=number, cloud=number, target="base")
+    row = common | scene_columns(session.scene, centre) | {"true_id": number, "cloud": number, "target": "base"}
     own = None if number is None else whole.get(number)
-    return row if own is None else filled_with_cloud(row, own)
+    return row if own is None else row | cloud_columns(own)
 
 
-def _with_errors(session: Session, row: ResultRow, estimate: Estimate, centres: Sequence[HighlightPoint]) -> ResultRow:
-    """Fill in the errors against the base's normal at its highlight point, and where the estimate looks.
+def _errors(session: Session, estimate: Estimate, centres: Sequence[HighlightPoint]) -> Row:
+    """Compute the errors against the base's normal at its highlight point, and where the estimate looks.
 
     Lights that are not told apart make one cloud: the truth is the mean of the normals at their points.
     """
@@ -126,14 +123,14 @@ def _with_errors(session: Session, row: ResultRow, estimate: Estimate, centres: 
     errors = angle_deg(estimate.candidates, truth)
     look = session.exact_points(estimate.look_px[None], fine=False)
     at_look = float(angle_deg(estimate.normal, look.normal_base[0])) if look.valid[0] else None
-    return row.having(
-        truth_x=float(truth[0]),
-        truth_y=float(truth[1]),
-        truth_z=float(truth[2]),
-        error_deg=float(errors[0]),
-        error_base_deg=float(errors[0]),
-        error_oracle_deg=float(errors.min()),
-        error_look_deg=at_look,
-        rank_correct=int(errors.argmin()),
-        mahalanobis2=mahalanobis2(estimate, truth),
-    )
+    return {
+        "truth_x": float(truth[0]),
+        "truth_y": float(truth[1]),
+        "truth_z": float(truth[2]),
+        "error_deg": float(errors[0]),
+        "error_base_deg": float(errors[0]),
+        "error_oracle_deg": float(errors.min()),
+        "error_look_deg": at_look,
+        "rank_correct": int(errors.argmin()),
+        "mahalanobis2": mahalanobis2(estimate, truth),
+    }

@@ -118,11 +118,6 @@ def check_core(text: str) -> CoreReport:
     ----------
     text : str
         A command, with or without ``command:`` before it, or a core's TOML file.
-
-    Raises
-    ------
-    InputError
-        If the program or the file cannot be used, or the core is called as an installed estimator is.
     """
     # A command may end with the name of a TOML file too, which is an argument of it.
     is_named = text.startswith(PREFIX) or (is_core(text) and (len(text.split()) == 1 or Path(text).exists()))

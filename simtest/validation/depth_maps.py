@@ -14,8 +14,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction.image_io import read_raw
 from simtest.runtime.arrays import Array, Mask
-from simtest.runtime.limits import check_file, check_limit
-from simtest.runtime.resources import shown
+from simtest.runtime.files import check_limit, require_plain
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 
@@ -55,11 +54,6 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
     -------
     ndarray, shape (H, W)
         mm; NaN where the file holds none (0, negative or not finite).
-
-    Raises
-    ------
-    InputError
-        If the file is missing or of another kind, its channels differ, or an integer map has no scale.
     """
     if scale_mm is not None and not 1e-9 <= scale_mm <= FARTHEST_MM:
         raise InputError(f"--depth-scale {scale_mm:g}: must be 1e-9 to {FARTHEST_MM:g} mm")
@@ -68,16 +62,16 @@ def read_depth(path: Path, scale_mm: float | None = None) -> Array:
     if values.ndim == 3:
         colours = values[:, :, :3]
         if (colours != colours[:, :, :1]).any():
-            raise InputError(f"{shown(path)}: channels differ; a depth map has one, or equal ones")
+            raise InputError(f"{path}: channels differ; a depth map has one, or equal ones")
         values = values[:, :, 0]
     if values.ndim != 2 or not values.size:
-        raise InputError(f"{shown(path)}: has shape {values.shape}; must be (H, W)")
+        raise InputError(f"{path}: has shape {values.shape}; must be (H, W)")
     if values.dtype.kind in "iu" and scale_mm is None:
-        raise InputError(f"{shown(path)}: holds integers; --depth-scale must say how many mm one step is")
+        raise InputError(f"{path}: holds integers; --depth-scale must say how many mm one step is")
     depth = values.astype(float) * (1.0 if scale_mm is None else scale_mm)
     depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
     if np.isnan(depth).all():
-        raise InputError(f"{shown(path)}: holds no positive depth")
+        raise InputError(f"{path}: holds no positive depth")
     _check_range(float(np.nanmin(depth)), float(np.nanmax(depth)), path)
     return depth
 
@@ -89,7 +83,7 @@ def read_values(path: Path, wanted: str = "a depth map") -> npt.NDArray[np.gener
     """
     suffix = path.suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
-        raise InputError(f"{shown(path)}: unknown suffix {suffix or '(none)'}; allowed: {', '.join(DEPTH_SUFFIXES)}")
+        raise InputError(f"{path}: unknown suffix {suffix or '(none)'}; allowed: {', '.join(DEPTH_SUFFIXES)}")
     if suffix == ".npy":
         return _read_npy(path, wanted)
     return _read_exr(path, wanted) if suffix == ".exr" else np.asarray(read_raw(path, wanted))
@@ -98,12 +92,12 @@ def read_values(path: Path, wanted: str = "a depth map") -> npt.NDArray[np.gener
 def _check_range(low: float, high: float, where: object) -> None:
     if not (low >= NEAREST_MM and high <= FARTHEST_MM):
         raise InputError(
-            f"{shown(where)}: depths from {low:.3g} to {high:.3g} mm; must be {NEAREST_MM:g} to {FARTHEST_MM:g} mm"
+            f"{where}: depths from {low:.3g} to {high:.3g} mm; must be {NEAREST_MM:g} to {FARTHEST_MM:g} mm"
         )
 
 
 def _read_npy(path: Path, wanted: str) -> npt.NDArray[np.generic]:
-    check_file(path, "picture_bytes", wanted)
+    require_plain(path, "picture_bytes", wanted)
     try:
         values = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:
@@ -111,14 +105,14 @@ def _read_npy(path: Path, wanted: str) -> npt.NDArray[np.generic]:
         told = " ".join(str(error).split())[:120] or type(error).__name__
         if "pickle" in told or "Python objects" in told:
             told = "it holds Python objects, which are never loaded"
-        raise InputError(f"{shown(path)}: no NPY file, or a damaged one ({told})") from None
+        raise InputError(f"{path}: no NPY file, or a damaged one ({told})") from None
     if not isinstance(values, np.ndarray):
         values.close()
-        raise InputError(f"{shown(path)}: holds several arrays, as NPZ files do; must be one, NPY")
+        raise InputError(f"{path}: holds several arrays, as NPZ files do; must be one, NPY")
     if values.ndim not in (2, 3) or not values.size:
-        raise InputError(f"{shown(path)}: has shape {values.shape}; must be (H, W) or (H, W, C)")
+        raise InputError(f"{path}: has shape {values.shape}; must be (H, W) or (H, W, C)")
     if values.dtype.kind not in "iuf":
-        raise InputError(f"{shown(path)}: {values.dtype} of shape {values.shape}; must be numbers")
+        raise InputError(f"{path}: {values.dtype} of shape {values.shape}; must be numbers")
     check_limit("picture_pixels", values.size, path, "values")
     return np.array(values)
 
@@ -127,7 +121,7 @@ def _read_exr(path: Path, wanted: str) -> npt.NDArray[np.generic]:
     # Imported here: the renderer's library reads EXR, and is slow to load.
     from simtest.rendering.bitmap import read_bitmap
 
-    check_file(path, "picture_bytes", wanted)
+    require_plain(path, "picture_bytes", wanted)
     return read_bitmap(path)
 
 
@@ -235,13 +229,13 @@ def depths_at(
         depth = float(option)
     except ValueError:
         if not Path(option).suffix:
-            raise InputError(f"--depth {shown(option)}: must be a number of mm, or a depth map") from None
+            raise InputError(f"--depth {option}: must be a number of mm, or a depth map") from None
         values = read_depth(Path(option), scale_mm)
         if values.shape != (size[1], size[0]):
             raise InputError(
-                f"--depth {shown(option)}: is {values.shape[1]} x {values.shape[0]} px; must be {size[0]} x {size[1]}"
+                f"--depth {option}: is {values.shape[1]} x {values.shape[0]} px; must be {size[0]} x {size[1]}"
             ) from None
         return [float(interpolate(values, np.array([p]))[0]) if p is not None else math.nan for p in points_px]
     if not NEAREST_MM <= depth <= FARTHEST_MM:
-        raise InputError(f"--depth {shown(option)}: must be {NEAREST_MM:g} to {FARTHEST_MM:g} mm, or a depth map")
+        raise InputError(f"--depth {option}: must be {NEAREST_MM:g} to {FARTHEST_MM:g} mm, or a depth map")
     return [depth] * len(points_px)

@@ -11,16 +11,16 @@ import polars as pl
 
 from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.process.naming import forgive_cores
-from simtest.runtime.engines import OnStep
+from simtest.runtime.processes import OnStep
 from simtest.spec import Experiment
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation import gallery_items as gallery
 from simtest.validation.cases import Case
+from simtest.validation.columns import Row, Value, completed, swept_columns, table
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.gallery_item import save_realisation
 from simtest.validation.paper.rows import paper_rows, pipeline_with
 from simtest.validation.realisation import Realiser
-from simtest.validation.results_table import ResultRow, Value, completed, table
 
 PAPER_CHUNK = 125
 """Realisations of the published protocol that a part makes: a second's work."""
@@ -103,10 +103,10 @@ def make_rows(part: Part, tell: OnStep) -> pl.DataFrame:
     return table(_rendered(part, tell), part.swept)
 
 
-def _rendered(part: Part, tell: OnStep) -> list[ResultRow]:
+def _rendered(part: Part, tell: OnStep) -> list[Row]:
     experiment, case, realiser = part.experiment, part.case, realiser_of(part.variant)
     estimators = _estimators(tuple(experiment.estimators))
-    rows: list[ResultRow] = []
+    rows: list[Row] = []
     for number in part.numbers:
         made = realiser.make(experiment, case, number, estimators)
         rows += made.rows
@@ -125,5 +125,5 @@ def _published(part: Part) -> pl.DataFrame:
     bound = cramer_rao_bound(setting) if setting.eps == 0 else None
     bound_deg = None if bound is None else float(np.degrees(bound))
     swept = {**case.paper_columns(), **case.swept, "bound_deg": bound_deg}
-    common = ResultRow(experiment=experiment.name, label=case.label, setting=case.setting, swept=swept)
+    common: Row = {"experiment": experiment.name, "label": case.label, "setting": case.setting, **swept_columns(swept)}
     return paper_rows(setting, common, part.numbers, seeds, experiment.estimators)

@@ -9,7 +9,7 @@ from simtest.estimators.process.naming import core_hashes
 from simtest.runtime import provenance
 from simtest.runtime.files import Json
 from simtest.spec import Experiment
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.validation.cases import Case
 
 

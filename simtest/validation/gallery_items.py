@@ -10,7 +10,6 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 import numpy.typing as npt
 
-from simtest.conventions import ON_INSTRUMENT
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.estimators.protocol import drawable
@@ -19,10 +18,10 @@ from simtest.geometry.vectors import angle_deg
 from simtest.rendering import Session
 from simtest.runtime.files import Json, write_atomically
 from simtest.spec import Experiment, camera_table
-from simtest.validation.cases import Case
+from simtest.validation.cases import Case, swept_example
+from simtest.validation.columns import table
 from simtest.validation.matching import peak_px
 from simtest.validation.realisation import Realisation
-from simtest.validation.results_table import table
 from simtest.validation.row_kinds import row_kind
 
 Vector = list[float]
@@ -167,7 +166,7 @@ def save(path: Path, session: Session, experiment: Experiment, case: Case, made:
     """Write the gallery item of a realisation, at whose scene the session must be."""
     camera, scene = session.camera, made.view.scene
     # Errors and counts are those of the results: a cloud's truth is the base's, and none of the highlights here.
-    held = table(made.rows, {ON_INSTRUMENT: False})
+    held = table(made.rows, swept_example([case]))
     rows = {
         (row["specularity"], row["estimator"]): (row["kind"], row["error_deg"], row["error_oracle_deg"])
         for row in held.with_columns(kind=row_kind(held)).iter_rows(named=True)

@@ -41,13 +41,7 @@ class Job:
 
 
 def make_jobs(wanted: Sequence[tuple[Experiment, Path]], variant: str | None) -> list[Job]:
-    """Expand experiments, each paired with its folder, and choose the variant of each.
-
-    Raises
-    ------
-    InputError
-        If an experiment does not fit the schema, or the variant is none.
-    """
+    """Expand experiments, each paired with its folder, and choose the variant of each."""
     jobs = []
     for experiment, folder in wanted:
         cases = expand(experiment)

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 from simtest.runtime.files import JsonObject
 from simtest.runtime.resources import find
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, read_toml, scene_from_dict
+from simtest.spec.keys import replace_values
 from simtest.spec.toml_files import apply_settings
-from simtest.spec.type_change import replace_values
 
 if TYPE_CHECKING:
-    from simtest.surfaces.mesh_check import Verdict
+    from simtest.surfaces.mesh_check import MeshCheck
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,6 @@ def mesh_verdicts(experiment: Experiment) -> list[MeshVerdict]:
     """Judge each mesh file of an experiment once; recipes are fine by construction.
 
     A file has several verdicts only where groups of other lobes or refinements are judged otherwise.
-
-    Raises
-    ------
-    InputError
-        If a scene is malformed, or a mesh cannot be used.
     """
     verdicts: dict[tuple[object, ...], MeshVerdict] = {}
     for scene in (scene for group in experiment.groups for scene in _scenes(group)):
@@ -72,8 +67,8 @@ def _scenes(group: Group) -> Iterator[Scene]:
 
 def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
     # Loaded where there is a mesh: most experiments have none.
-    from simtest.surfaces.fineness import concentration
     from simtest.surfaces.mesh_check import check_mesh
+    from simtest.surfaces.mesh_surface import concentration
 
     lobe = concentration(None, None) if curvature is None else curvature
     found = check_mesh(surface.file(), None, lobe, surface.kind)
@@ -97,9 +92,9 @@ def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
     return MeshVerdict(str(surface.path), fine and not found.problems and not doubt, text)
 
 
-def _refined_edge(found: "Verdict", target_mm: float) -> float:
+def _refined_edge(found: "MeshCheck", target_mm: float) -> float:
     """Return the length, mm, that 95 % of the edges do not exceed once the mesh is refined as far as it may be."""
-    from simtest.surfaces.subdivision import subdivisions_within_limit
+    from simtest.surfaces.mesh_surface import subdivisions_within_limit
 
     wanted = max(0, math.ceil(math.log2(found.edge_p95_mm / target_mm) - 1e-6))
     return float(found.edge_p95_mm / 2 ** subdivisions_within_limit(found.faces, wanted))

@@ -18,8 +18,8 @@ from simtest.runtime.arrays import Array
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec.scene import Scene
 from simtest.validation import laws
+from simtest.validation.columns import Row
 from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, base_law_deg, law_deg, look_law_deg
-from simtest.validation.results_table import ResultRow
 from simtest.validation.rough_truth import RoughTruth
 
 MISSED = "missed"
@@ -27,7 +27,7 @@ MISSED = "missed"
 
 def rows(
     session: Session,
-    common: ResultRow,
+    common: Row,
     specularities: Sequence[Specularity],
     truths: Sequence[TrueHighlight],
     matched: Mapping[int, int],
@@ -35,14 +35,14 @@ def rows(
     unfound: str = MISSED,
     rough: RoughTruth | None = None,
     on_instrument: Sequence[bool] | None = None,
-) -> list[ResultRow]:
+) -> list[Row]:
     """Make the rows of one realisation: of each detection, and of each truth that no detection found.
 
     Parameters
     ----------
     session : Session
         At the scene; casts exact rays.
-    common : ResultRow
+    common : dict
         What all rows share: experiment, setting, realisation, seed, swept parameters.
     specularities, truths : sequence
         Detections with their estimates, and the highlights that count as true.
@@ -64,94 +64,92 @@ def rows(
     for i, specularity in enumerate(specularities):
         true_id = matched.get(i)
         truth = None if true_id is None else truths[true_id]
-        row = scene_row(scene, common, truth).having(specularity=i, true_id=true_id)
-        row = rough.filled(row, i, truth)
+        row = common | scene_columns(scene, truth) | {"specularity": i, "true_id": true_id}
+        row |= rough.columns(i, true_id, truth)
         if on_instrument is not None:
-            row = row.having(swept={**row.swept, ON_INSTRUMENT: on_instrument[i]})
+            row[ON_INSTRUMENT] = on_instrument[i]
         if not isinstance(patch := specularity.patch, Failure):
             bp_x, bp_y = patch.peak_px.tolist()
-            row = row.having(bp_x_px=bp_x, bp_y_px=bp_y, saturated_share=patch.saturated_share(HIGHLIGHT_ISOVALUE))
+            row |= {"bp_x_px": bp_x, "bp_y_px": bp_y, "saturated_share": patch.saturated_share(HIGHLIGHT_ISOVALUE)}
         for name, result in specularity.estimates.items():
             if isinstance(result, Failure):
-                made.append(row.having(estimator=name, status=str(result.reason), flags=result.detail))
+                made.append(row | {"estimator": name, "status": str(result.reason), "flags": result.detail})
                 continue
-            answered = estimate_row(row.having(estimator=name), result)
-            made.append(
-                answered
-                if truth is None
-                else _error_row(answered, scene, estimators[name], patch, result, truth, look_normals.get((i, name)))
-            )
+            answered = row | {"estimator": name} | estimate_columns(result)
+            if truth is not None:
+                look_normal = look_normals.get((i, name))
+                answered |= _error_columns(scene, estimators[name], patch, result, truth, look_normal)
+            made.append(answered)
     # Truths without a row of some estimator: no detection found them, or one of a frame estimator alone.
-    held = {(row.true_id, row.estimator) for row in made}
+    held = {(row["true_id"], row["estimator"]) for row in made}
     for j, truth in enumerate(truths):
         if missing := [name for name in estimators if (j, name) not in held]:
-            row = scene_row(scene, common, truth).having(true_id=j, status=unfound)
-            row = rough.filled(row, None, truth)
-            made += [row.having(estimator=name) for name in missing]
+            row = common | scene_columns(scene, truth) | {"true_id": j, "status": unfound}
+            row |= rough.columns(None, j, truth)
+            made += [row | {"estimator": name} for name in missing]
     return made
 
 
-def scene_row(scene: Scene, common: ResultRow, truth: HighlightPoint | None) -> ResultRow:
-    """Fill in the scene and, unless the detection is false, the true highlight or the centre of the true cloud."""
-    # Scene.
-    row = common.having(
+def scene_columns(scene: Scene, truth: HighlightPoint | None) -> Row:
+    """Describe the scene and, unless the detection is false, the true highlight or the centre of the true cloud."""
+    row: Row = {
         # What was not answered would have been of the fine surface.
-        target="fine",
-        surface=scene.surface.label,
-        reflectance=scene.reflectance.type,
-        noise_sigma=scene.sensor.noise_sigma,
-        path_depth=scene.render.path_depth,
-        n_lights=len(scene.rig.lights),
-    )
+        "target": "fine",
+        "surface": scene.surface.label,
+        "reflectance": scene.reflectance.type,
+        "noise_sigma": scene.sensor.noise_sigma,
+        "path_depth": scene.render.path_depth,
+        "n_lights": len(scene.rig.lights),
+    }
     if truth is None:
         return row
     # The light that made the highlight, at its true position.
     light = scene.rig.true_mm()[truth.light]
     truth_x, truth_y, truth_z = truth.normal.tolist()
-    return row.having(
-        distance_mm=truth.distance,
-        kd_min=truth.kd_min,
-        kd_max=truth.kd_max,
-        kd_min_base=truth.kd_min_base,
-        kd_max_base=truth.kd_max_base,
-        eps_over_d=float(np.linalg.norm(light)) / truth.distance,
-        peak_snr=truth.peak_snr if isinstance(truth, TrueHighlight) and np.isfinite(truth.peak_snr) else None,
-        axis_ratio_law=float(laws.axis_ratio(truth.kd_min, truth.kd_max)),
-        bp_true_x_px=float(truth.bp_px[0]),
-        bp_true_y_px=float(truth.bp_px[1]),
-        truth_x=truth_x,
-        truth_y=truth_y,
-        truth_z=truth_z,
-    )
+    return row | {
+        "distance_mm": truth.distance,
+        "kd_min": truth.kd_min,
+        "kd_max": truth.kd_max,
+        "kd_min_base": truth.kd_min_base,
+        "kd_max_base": truth.kd_max_base,
+        "eps_over_d": float(np.linalg.norm(light)) / truth.distance,
+        "peak_snr": truth.peak_snr if isinstance(truth, TrueHighlight) and np.isfinite(truth.peak_snr) else None,
+        "axis_ratio_law": float(laws.axis_ratio(truth.kd_min, truth.kd_max)),
+        "bp_true_x_px": float(truth.bp_px[0]),
+        "bp_true_y_px": float(truth.bp_px[1]),
+        "truth_x": truth_x,
+        "truth_y": truth_y,
+        "truth_z": truth_z,
+    }
 
 
-def estimate_row(row: ResultRow, estimate: Estimate) -> ResultRow:
-    """Fill in an estimate."""
+def estimate_columns(estimate: Estimate) -> Row:
+    """Describe an estimate."""
     isovalues = [isophote.isovalue for isophote in estimate.isophotes]
     normal_x, normal_y, normal_z = estimate.normal.tolist()
     covariance = estimate.covariance
     gains = None if estimate.curvature is None else estimate.curvature.gains
-    return row.having(
-        status="ok",
-        flags=",".join(estimate.flags),
-        n_candidates=len(estimate.candidates),
-        choice_margin=estimate.choice_margin,
-        look_x_px=float(estimate.look_px[0]),
-        look_y_px=float(estimate.look_px[1]),
-        isovalue=isovalues[0] if len(isovalues) == 1 else None,
-        isovalues=",".join(f"{t:g}" for t in isovalues) or None,
-        axis_ratio=estimate.axis_ratio,
-        normal_x=normal_x,
-        normal_y=normal_y,
-        normal_z=normal_z,
-        cov_11=None if covariance is None else covariance[0, 0],
-        cov_12=None if covariance is None else covariance[0, 1],
-        cov_22=None if covariance is None else covariance[1, 1],
-        target=estimate.target,
-        budget={f"budget_{name}_deg": float(np.degrees(sd)) for name, sd in deviations(estimate.budget or {}).items()},
-        gain_1=None if gains is None else float(gains[0]),
-        gain_2=None if gains is None else float(gains[1]),
-    )
+    return {
+        "status": "ok",
+        "flags": ",".join(estimate.flags),
+        "n_candidates": len(estimate.candidates),
+        "choice_margin": estimate.choice_margin,
+        "look_x_px": float(estimate.look_px[0]),
+        "look_y_px": float(estimate.look_px[1]),
+        "isovalue": isovalues[0] if len(isovalues) == 1 else None,
+        "isovalues": ",".join(f"{t:g}" for t in isovalues) or None,
+        "axis_ratio": estimate.axis_ratio,
+        "normal_x": normal_x,
+        "normal_y": normal_y,
+        "normal_z": normal_z,
+        "cov_11": None if covariance is None else covariance[0, 0],
+        "cov_12": None if covariance is None else covariance[0, 1],
+        "cov_22": None if covariance is None else covariance[1, 1],
+        "target": estimate.target,
+        **{f"budget_{name}_deg": float(np.degrees(sd)) for name, sd in deviations(estimate.budget or {}).items()},
+        "gain_1": None if gains is None else float(gains[0]),
+        "gain_2": None if gains is None else float(gains[1]),
+    }
 
 
 def _look_normals(
@@ -173,16 +171,15 @@ def _look_normals(
     return {key: found.normal[n] for n, key in enumerate(looks) if found.valid[n]}
 
 
-def _error_row(
-    row: ResultRow,
+def _error_columns(
     scene: Scene,
     declared: Collection[Law],
     patch: Patch | Failure,
     estimate: Estimate,
     truth: TrueHighlight,
     look_normal: Array | None,
-) -> ResultRow:
-    """Fill in an estimate's errors, and what the laws predict for them.
+) -> Row:
+    """Compute an estimate's errors, and what the laws predict for them.
 
     `look_normal` is the true normal where the estimate looks, None where there is no surface.
     """
@@ -192,22 +189,22 @@ def _error_row(
     error_look_deg = None if look_normal is None else float(angle_deg(estimate.normal, look_normal))
     curvature = curvature_errors(estimate, truth)
     smoothing_px = 0.0 if isinstance(patch, Failure) else patch.smoothing_px
-    return row.having(
-        axis_ratio_seen_law=axis_ratio_seen(scene, declared, estimate, truth, smoothing_px),
-        error_deg=float(to_truth[0]),
-        error_fine_deg=float(angle_deg(estimate.normal, truth.normal)),
-        error_base_deg=float(angle_deg(estimate.normal, truth.normal_base)),
-        error_oracle_deg=float(to_truth.min()),
-        error_look_deg=error_look_deg,
-        error_law_deg=law_deg(scene, declared, estimate, truth),
-        error_look_law_deg=look_law_deg(scene, declared, estimate, truth),
-        error_base_law_deg=base_law_deg(scene),
-        rank_correct=int(to_truth.argmin()),
-        mahalanobis2=mahalanobis2(estimate, stated),
-        gain_error=curvature.gain_error,
-        gain_oracle_error=curvature.gain_oracle_error,
-        direction_error_deg=curvature.direction_error_deg,
-    )
+    return {
+        "axis_ratio_seen_law": axis_ratio_seen(scene, declared, estimate, truth, smoothing_px),
+        "error_deg": float(to_truth[0]),
+        "error_fine_deg": float(angle_deg(estimate.normal, truth.normal)),
+        "error_base_deg": float(angle_deg(estimate.normal, truth.normal_base)),
+        "error_oracle_deg": float(to_truth.min()),
+        "error_look_deg": error_look_deg,
+        "error_law_deg": law_deg(scene, declared, estimate, truth),
+        "error_look_law_deg": look_law_deg(scene, declared, estimate, truth),
+        "error_base_law_deg": base_law_deg(scene),
+        "rank_correct": int(to_truth.argmin()),
+        "mahalanobis2": mahalanobis2(estimate, stated),
+        "gain_error": curvature.gain_error,
+        "gain_oracle_error": curvature.gain_oracle_error,
+        "direction_error_deg": curvature.direction_error_deg,
+    }
 
 
 class CurvatureErrors(NamedTuple):

@@ -20,9 +20,9 @@ from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import Stage, generator
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import Experiment, Scene
-from simtest.spec.views import Moved, Views
+from simtest.spec.camera import Moved, Views
 from simtest.validation.cases import Case
-from simtest.validation.results_table import ResultRow
+from simtest.validation.columns import Row
 
 
 @dataclass(frozen=True)
@@ -57,27 +57,27 @@ class MotionResult:
     specularities: list[Specularity]
     ranked: dict[int, RankedHypotheses]
 
-    def filled(self, row: ResultRow, scene: Scene, truths: Sequence[HighlightPoint]) -> ResultRow:
-        """Fill `MOTION_COLUMNS` of a row; those that are not known stay null.
+    def columns(self, row: Row, scene: Scene, truths: Sequence[HighlightPoint]) -> Row:
+        """Return `MOTION_COLUMNS` of a row; those that are not known are left out.
 
         `motion_sign_i` is the told sign of 1 + d k along the estimated principal direction i, 0 where it is not told,
         and `motion_gain_i` the true 1 + d k along that direction (Euler's formula).
         """
         assert scene.views is not None
-        truth = None if row.true_id is None else truths[row.true_id]
-        ranked = None if row.specularity is None else self.ranked.get(row.specularity)
-        values: dict[str, float] = {}
+        number, true_id = row.get("specularity"), row.get("true_id")
+        truth = truths[true_id] if isinstance(true_id, int) else None
+        values: Row = {}
         if truth is not None:
             values["motion_over_d"] = scene.views.length_mm / truth.distance
-        if ranked is not None and row.specularity is not None:
+        if isinstance(number, int) and (ranked := self.ranked.get(number)) is not None:
             for i, (sign, margin) in enumerate(zip(ranked.told_signs, ranked.sign_margins.tolist(), strict=True), 1):
                 values |= {f"motion_sign_{i}": float(sign), f"motion_margin_{i}": margin}
             values |= {"motion_distance2": float(ranked.distance2[0]), "motion_fits": float(ranked.fits)}
-            first = first_estimate(self.specularities[row.specularity].estimates)
+            first = first_estimate(self.specularities[number].estimates)
             if truth is not None and isinstance(first, Estimate) and first.curvature is not None:
                 gains = true_gains(first.curvature.directions, truth).tolist()
                 values |= {f"motion_gain_{i}": gain for i, gain in enumerate(gains, 1)}
-        return replace(row, swept={**row.swept, **values})
+        return values
 
 
 def with_motion(

@@ -9,11 +9,10 @@ from simtest.estimators import Estimate
 from simtest.estimators.protocol import Law
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array
-from simtest.spec.falloff import CosineProfile
+from simtest.spec.lights import CosineProfile, is_at_camera
 from simtest.spec.reflectance import PhongReflectance, TissueReflectance
-from simtest.spec.relief import Relief
-from simtest.spec.rig import is_at_camera
 from simtest.spec.scene import Scene
+from simtest.spec.surfaces import Relief
 from simtest.validation import laws, relief_laws
 
 EQUAL_KD = 1e-3

@@ -9,17 +9,16 @@ from simtest.estimators import AnyEstimator
 from simtest.estimators.protocol import laws_of
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
-from simtest.runtime.arrays import Image, Picture
-from simtest.runtime.kept_arrays import only_reading
+from simtest.runtime.arrays import Image, Picture, only_reading
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment
 from simtest.validation.cases import Case
 from simtest.validation.cloud_rows import apart, cloud_rows, of_clouds
+from simtest.validation.columns import Row, Value, swept_columns
 from simtest.validation.matching import match, on_instruments
 from simtest.validation.metrics import MISSED, rows
 from simtest.validation.motion import MOTION, FurtherView, MotionResult, further_views, with_motion
-from simtest.validation.results_table import ResultRow, Value
 from simtest.validation.rough_truth import rough_truth
 
 
@@ -33,7 +32,7 @@ class Realisation:
         Of the realisation.
     view : RenderedView
         The rendered scene.
-    rows : list of ResultRow
+    rows : list of dict
         Of the results' table.
     frame : ndarray of float32, shape (H, W) or (H, W, 3)
         The sensor's frame, as encoded.
@@ -47,7 +46,7 @@ class Realisation:
 
     number: int
     view: RenderedView
-    rows: list[ResultRow]
+    rows: list[Row]
     frame: Image
     specularities: list[Specularity]
     truths: list[TrueHighlight]
@@ -60,7 +59,7 @@ class Scored:
 
     Parameters
     ----------
-    rows : list of ResultRow
+    rows : list of dict
         Of the results' table; ``true_id`` is an index in `truths`, of a cloud's row one in the view's `clouds`.
     truths : list of TrueHighlight
         Those that count.
@@ -70,7 +69,7 @@ class Scored:
         Index of the truth by index of the detection.
     """
 
-    rows: list[ResultRow]
+    rows: list[Row]
     truths: list[TrueHighlight]
     counted: list[int]
     matched: dict[int, int]
@@ -87,7 +86,7 @@ def answer(
 
 def score(
     session: Session, view: RenderedView, answers: Sequence[Specularity], estimators: Mapping[str, AnyEstimator],
-    common: ResultRow, isolated: bool = True, motion: MotionResult | None = None,
+    common: Row, isolated: bool = True, motion: MotionResult | None = None,
 ) -> Scored:  # fmt: skip
     """Score answers to a view, at whose scene the session must be: whatever made them, and wherever they are kept.
 
@@ -99,7 +98,7 @@ def score(
         Detections with estimates, those of `motion` where it is given.
     estimators : mapping
         What was asked, by name.
-    common : ResultRow
+    common : dict
         What all rows share.
     isolated : bool
         Whether isolated highlights alone were detected, and count.
@@ -126,7 +125,9 @@ def score(
     declared |= {} if motion is None else {MOTION: ()}
     made = rows(session, common, singles, truths, matched, declared, unfound, rough, metal)
     if motion is not None:
-        made = [motion.filled(row, view.scene, truths) if row.estimator == MOTION else row for row in made]
+        moved = [row for row in made if row["estimator"] == MOTION]
+        for row in moved:
+            row |= motion.columns(row, view.scene, truths)
     if cloud_names:
         made += cloud_rows(session, view, common, of_base, refused, {} if rough is None else rough.clouds)
     return Scored(made, truths, counted, matched)
@@ -181,14 +182,14 @@ def realise(
     specularities = answer(view, frame, estimators, case.isolated)
     motion = with_motion(experiment, case, number, view, further, specularities) if further else None
     specularities = specularities if motion is None else motion.specularities
-    common = ResultRow(
-        experiment=experiment.name,
-        label=case.label,
-        realisation=number,
-        setting=case.setting,
-        seed=seed,
-        laws=",".join(case.laws) or None,
-        swept={**case.swept, **drawn},
-    )
+    common: Row = {
+        "experiment": experiment.name,
+        "label": case.label,
+        "realisation": number,
+        "setting": case.setting,
+        "seed": seed,
+        "laws": ",".join(case.laws) or None,
+        **swept_columns({**case.swept, **drawn}),
+    }
     made = score(session, view, specularities, estimators, common, case.isolated, motion)
     return Realisation(number, view, made.rows, frame, specularities, made.truths, made.matched)

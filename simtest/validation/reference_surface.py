@@ -21,7 +21,6 @@ from simtest.reconstruction.description import (
     SpecularityRecord,
 )
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.resources import shown
 from simtest.spec.toml_files import read_toml
 from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,
@@ -118,17 +117,12 @@ def load_reference(
     """Read a reference: a mesh with its pose, or a map in the camera frame; None where no file is named.
 
     `map_format` names the data set whose map it is (`simtest.validation.references`); None: a plain depth map.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or malformed, a mesh has no pose, a pose no mesh, or sizes differ.
     """
     if path is None:
         if pose is not None:
             raise InputError("--camera-from-model: needs --reference, the mesh that it places")
         if map_format is not None:
-            raise InputError(f"--reference-format {shown(map_format)}: needs --reference, the map of that format")
+            raise InputError(f"--reference-format {map_format}: needs --reference, the map of that format")
         return None
     if path.suffix.lower() in DEPTH_SUFFIXES:
         if pose is not None:
@@ -142,9 +136,9 @@ def load_reference(
         normals = depth_normals(points)
         return DepthReference(normals, str(path), depth_problems(points[..., 2], normals, camera))
     if map_format is not None:
-        raise InputError(f"--reference-format {shown(map_format)}: is for maps; --reference {shown(path)} is a mesh")
+        raise InputError(f"--reference-format {map_format}: is for maps; --reference {path} is a mesh")
     if pose is None:
-        raise InputError(f"--reference {shown(path)}: needs --camera-from-model, the pose of the mesh")
+        raise InputError(f"--reference {path}: needs --camera-from-model, the pose of the mesh")
     from simtest.surfaces.mesh_surface import prepare
 
     camera_from_model = read_pose(pose)
@@ -159,14 +153,9 @@ def read_pose(path: Path) -> Array:
     ----------
     path : Path
         TOML with ``matrix``, 4 x 4 or 3 x 4, or with ``rotation``, 3 x 3, and ``translation_mm``.
-
-    Raises
-    ------
-    InputError
-        If a key is missing or malformed, or the 3 x 3 part is no rotation.
     """
     data = read_toml(path)
-    where = shown(path)
+    where = str(path)
     allowed = {"matrix", "rotation", "translation_mm"}
     if unknown := sorted(set(data) - allowed):
         raise InputError(f"{where}: {unknown[0]}: unknown key; allowed: {', '.join(sorted(allowed))}")
@@ -210,7 +199,7 @@ def _numbers(data: Mapping[str, Any], key: str, shapes: Sequence[tuple[int, ...]
         values = np.empty(0)
     if values.shape not in shapes or not np.isfinite(values).all():
         wanted = " or ".join(" x ".join(str(n) for n in shape) for shape in shapes)
-        raise InputError(f"{where}: {key} = {shown(str(data[key]), 60)}: must be {wanted} finite numbers")
+        raise InputError(f"{where}: {key} = {data[key]!s}: must be {wanted} finite numbers")
     return values
 
 

@@ -14,8 +14,8 @@ from simtest.simulation import clouds as regions
 from simtest.simulation.rendered_view import RenderedView
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.simulation.visible_highlights import VisibleHighlight
+from simtest.validation.columns import Row
 from simtest.validation.predicted import centroid_law_deg, glint_count_law
-from simtest.validation.results_table import ResultRow
 
 MISSED_PX = 3.0
 """A missed glint belongs to the visible highlight whose peak is so near."""
@@ -93,27 +93,26 @@ class RoughTruth:
         """Visible highlights above the noise, of the surface: what shines on an instrument is no missing answer."""
         return len(shown([spot for spot in self.visible if spot.instrument is None]))
 
-    def filled(self, row: ResultRow, specularity: int | None, truth: TrueHighlight | None) -> ResultRow:
-        """Fill the columns of a detection's row, or of that of a truth which no detection found."""
+    def columns(self, specularity: int | None, true_id: int | None, truth: TrueHighlight | None) -> Row:
+        """Return the columns of a detection's row, or of that of a truth which no detection found."""
         number = None if specularity is None else self.seen.get(specularity)
         if number is None and specularity is None and truth is not None:
             # The spot in which the missed glint shines.
             near = np.hypot(*(self._peaks_px - truth.bp_px).T)
             number = int(np.argmin(near)) if len(near) and near.min() < MISSED_PX else None
         snr = None if number is None else self.visible[number].peak_snr
-        row = row.having(visible_id=number, visible_snr=snr if snr is not None and np.isfinite(snr) else None)
+        row: Row = {"visible_id": number, "visible_snr": snr if snr is not None and np.isfinite(snr) else None}
         if self.is_rough:
-            row = row.having(frame_visible=self._shown)
-        if truth is not None:
-            row = row.having(cloud=truth.cloud)
-        elif number is not None:
-            row = row.having(cloud=self.visible[number].cloud)
+            row["frame_visible"] = self._shown
+        owner = truth if truth is not None else None if number is None else self.visible[number]
+        cloud = None if owner is None else owner.cloud
+        row["cloud"] = cloud
         if truth is not None and self.is_rough:
             law = truth.radius_px if np.isfinite(truth.radius_px) else None
-            alone = None if row.true_id is None else self.alone_px.get(row.true_id)
-            row = row.having(pool=truth.pool, radius_px=alone, radius_law_px=law)
-        cloud = None if row.cloud is None else self.clouds.get(row.cloud)
-        return row if cloud is None else filled_with_cloud(row, cloud)
+            alone = None if true_id is None else self.alone_px.get(true_id)
+            row |= {"pool": truth.pool, "radius_px": alone, "radius_law_px": law}
+        whole = None if cloud is None else self.clouds.get(cloud)
+        return row if whole is None else row | cloud_columns(whole)
 
 
 def shown(visible: Sequence[VisibleHighlight]) -> list[VisibleHighlight]:
@@ -121,21 +120,21 @@ def shown(visible: Sequence[VisibleHighlight]) -> list[VisibleHighlight]:
     return [spot for spot in visible if spot.peak_snr >= HIGHLIGHT_CONTRAST_SIGMA]
 
 
-def filled_with_cloud(row: ResultRow, cloud: Cloud) -> ResultRow:
-    """Fill the columns of a cloud that is wholly in view."""
+def cloud_columns(cloud: Cloud) -> Row:
+    """Return the columns of a cloud that is wholly in view."""
     covariance = cloud.covariance
-    return row.having(
-        cloud_glints=cloud.glints,
-        cloud_glints_law=cloud.glints_law,
-        cloud_visible=cloud.visible,
-        cloud_error_deg=cloud.error_deg,
-        cloud_error_law_deg=cloud.error_law_deg,
-        cloud_kd_min=cloud.kd_min,
-        cloud_kd_max=cloud.kd_max,
-        cloud_cov_11=None if covariance is None else float(covariance[0, 0]),
-        cloud_cov_12=None if covariance is None else float(covariance[0, 1]),
-        cloud_cov_22=None if covariance is None else float(covariance[1, 1]),
-    )
+    return {
+        "cloud_glints": cloud.glints,
+        "cloud_glints_law": cloud.glints_law,
+        "cloud_visible": cloud.visible,
+        "cloud_error_deg": cloud.error_deg,
+        "cloud_error_law_deg": cloud.error_law_deg,
+        "cloud_kd_min": cloud.kd_min,
+        "cloud_kd_max": cloud.kd_max,
+        "cloud_cov_11": None if covariance is None else float(covariance[0, 0]),
+        "cloud_cov_12": None if covariance is None else float(covariance[0, 1]),
+        "cloud_cov_22": None if covariance is None else float(covariance[1, 1]),
+    }
 
 
 def rough_truth(session: Session, view: RenderedView, counted: Sequence[int], seen: Mapping[int, int]) -> RoughTruth:

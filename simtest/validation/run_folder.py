@@ -1,16 +1,13 @@
 """The folder of a run: what it holds while the run goes on and afterwards, and what else it may be refused for."""
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
 from simtest.runtime import provenance
-from simtest.runtime.files import require_plain, write_json
+from simtest.runtime.files import read_json, write_json
 from simtest.runtime.locks import LOCK
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
 
 RESULTS = "results.parquet"
 MOST_DIGEST_BYTES = 1000
@@ -33,7 +30,7 @@ def record_in(folder: Path) -> dict[str, Any] | None:
         if (folder / PARTS).is_dir():
             # Beside the parts of a stopped run anything may be incomplete.
             return None
-        record = json.loads(require_plain(folder / "summary.json", "record_bytes").read_text(encoding="utf-8"))["run"]
+        record = read_json(folder / "summary.json")["run"]
         return dict(record) if "fingerprint" in record else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
@@ -54,16 +51,13 @@ def prepare(folder: Path, digest: str) -> None:
     """Make the run's folder; keep the finished cases of the same run, stopped, and drop those of another."""
     parts = folder / PARTS
     record = parts / "fingerprint.json"
-    try:
-        if not (record.is_file() and record.stat().st_size < MOST_DIGEST_BYTES and _told_digest(record) == digest):
-            # Results of an earlier run stay until the new ones replace them.
-            remove_folder(parts)
-            remove_folder(folder / "gallery")
-        parts.mkdir(parents=True, exist_ok=True)
-        (folder / "gallery").mkdir(exist_ok=True)
-        write_json(record, digest)
-    except OSError as error:
-        raise write_error(error, folder) from error
+    if not (record.is_file() and record.stat().st_size < MOST_DIGEST_BYTES and _told_digest(record) == digest):
+        # Results of an earlier run stay until the new ones replace them.
+        remove_folder(parts)
+        remove_folder(folder / "gallery")
+    parts.mkdir(parents=True, exist_ok=True)
+    (folder / "gallery").mkdir(exist_ok=True)
+    write_json(record, digest)
 
 
 def _told_digest(record: Path) -> str:
@@ -72,17 +66,14 @@ def _told_digest(record: Path) -> str:
 
 def check_folder(folder: Path) -> None:
     """Raise `InputError` if a folder holds something other than a run; remove what a killed run was writing."""
-    try:
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"--out {shown(folder)}: is a file; must be a folder")
-        # Leftovers of a killed run.
-        held = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
-        for name in [name for name in held if re.fullmatch(r"\.(results|summary|guide|index)\.\d+\.part\.\w+", name)]:
-            held.pop(name).unlink()
-        for left in (*folder.glob(f"{PARTS}/.*.part.*"), *folder.glob("gallery/.*.part.*")):
-            left.unlink()
-    except OSError as error:
-        raise InputError(f"--out {shown(folder)}: cannot be used ({error.strerror})") from error
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {folder}: is a file; must be a folder")
+    # Leftovers of a killed run.
+    held = {path.name: path for path in folder.iterdir()} if folder.is_dir() else {}
+    for name in [name for name in held if re.fullmatch(r"\.(results|summary|guide|index)\.\d+\.part\.\w+", name)]:
+        held.pop(name).unlink()
+    for left in (*folder.glob(f"{PARTS}/.*.part.*"), *folder.glob("gallery/.*.part.*")):
+        left.unlink()
     # What is no part of a run.
     held.pop(LOCK, None)
     own = {"results.parquet", "summary.json", "gallery", "figures", "guide.json", "index.html"}
@@ -92,10 +83,8 @@ def check_folder(folder: Path) -> None:
     if not strangers and not held.keys() & {"results.parquet", PARTS}:
         strangers = sorted(held)
     if strangers:
-        stranger = shown(strangers[0])
-        raise InputError(
-            f"--out {shown(folder)}: holds {stranger}, which is no part of a run; must be empty or hold a run"
-        )
+        stranger = str(strangers[0])
+        raise InputError(f"--out {folder}: holds {stranger}, which is no part of a run; must be empty or hold a run")
 
 
 def remove_folder(folder: Path) -> None:

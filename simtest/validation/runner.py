@@ -13,9 +13,8 @@ from simtest.estimators.process import is_core
 from simtest.estimators.process.naming import close_cores, core_records
 from simtest.rendering import backend
 from simtest.runtime import provenance
-from simtest.runtime.engines import Engine, make_engine
 from simtest.runtime.files import Json
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine, make_engine
 from simtest.spec import Experiment
 from simtest.validation.fingerprints import input_hashes
 from simtest.validation.jobs import Job, make_jobs
@@ -126,13 +125,6 @@ def run_experiment(
         returned as it is.
     command, variant, progress, engine
         See `simtest.validate`; by default this process does the work. The rows do not depend on the engine.
-
-    Raises
-    ------
-    InputError
-        If the experiment does not fit the schema, an estimator is unknown or the folder holds something else.
-    BackendError
-        If the rendering backend cannot be used.
     """
     return run_experiments([(experiment, folder)], command, variant, progress, engine)[0]
 
@@ -198,7 +190,7 @@ def _warn_of_kept(finished: Sequence[Job]) -> None:
     kept = [job.folder for job in finished if any(map(is_core, job.experiment.estimators))]
     if kept:
         warnings.warn(
-            f"{shown(kept[0])}: is kept, since the core's command and files are the same; other files that it reads "
+            f"{kept[0]}: is kept, since the core's command and files are the same; other files that it reads "
             "are not compared (core.files of its TOML file names them)", stacklevel=4,
         )  # fmt: skip
 

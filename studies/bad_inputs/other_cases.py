@@ -109,7 +109,7 @@ def _mesh_options() -> Iterator[Case]:
         {"m.ply": files.ply()},
     )
     for out in ("m.xyz", "m", "m.vtk", ".", "nowhere/m.ply", "", "n" * 300 + ".ply", "/proc/m.ply"):
-        yield Case(f"mesh colon: --out {out[:20]}", ("mesh", "colon", "--out", out), says="--out")
+        yield Case(f"mesh colon: --out {out[:20]}", ("mesh", "colon", "--out", out), says=out[:20] or "--out")
     yield Case("mesh colon: curvature of .obj", ("mesh", "colon", "--curvature", "--out", "m.obj"))
     for seed in ("-1", "x", "1.5", "9" * 40):
         yield Case(f"mesh liver: --seed {seed[:20]}", ("mesh", "liver", "--seed", seed, "--out", "m.ply"))

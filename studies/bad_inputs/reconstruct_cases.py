@@ -358,7 +358,8 @@ def _options() -> Iterator[Case]:
             yield _case(f"{option} {value[:20] or '(nothing)'}", option, value)
     yield _case("estimator twice", "--estimator", "cone_axis", "--estimator", "cone_axis")
     for name, out, made in OUTS:
-        yield _case(f"--out, {name}", "--out", out.replace("__", "."), says="--out", **made)
+        named = out.replace("__", ".")
+        yield _case(f"--out, {name}", "--out", named, says=named[:20], **made)
     yield _case("unknown option", "--speed", "3")
     yield _case("an option without a value", "--roi")
 

@@ -68,8 +68,7 @@ def preload() -> None:
     import simtest.cli.main
     import simtest.reconstruction.pipeline
     import simtest.spec.calibration_spec
-    import simtest.spec.dataset_recipe
-    import simtest.spec.experiment
+    import simtest.spec.recipes
     import simtest.surfaces.recipe  # noqa: F401
 
     # Its threads do not survive a fork.

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from simtest.calibration import Calibration
+from simtest.calibration.photometry import AngularProfile
 from simtest.dataset import read
 from simtest.dataset.shard_writer import write_dataset
 from simtest.estimators.protocol import Target
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction import Specularities, reconstruct
 from simtest.rendering import Frame, HighlightPoint, Session, TruthMaps
 from simtest.runtime.arrays import Array, Image
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.spec import Scene, load_dataset
 from simtest.spec.scene import scene_from_dict

@@ -21,7 +21,7 @@ from simtest.simulation.flow import HIDDEN, OUT, SEEN
 from simtest.simulation.frame_files import write_frame
 from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import load_calibration
-from simtest.spec.experiment import Experiment, Group
+from simtest.spec.recipes import Experiment, Group
 from studies.corners import formulas
 from studies.corners.case import STORED, Case, Faults, NotAskedError
 from studies.corners.scenes import EMISSION_POWER, VIGNETTING_POWER

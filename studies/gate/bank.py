@@ -4,10 +4,10 @@ from pathlib import Path
 
 import polars as pl
 
-from simtest.runtime.engines import make_engine
 from simtest.runtime.files import write_atomically
+from simtest.runtime.processes import make_engine
 from simtest.spec import Experiment, load_experiment
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 from simtest.validation.runner import run_experiment
 from studies.kept import of_this_code
 

@@ -13,10 +13,10 @@ import numpy as np
 import polars as pl
 
 from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.quantities import setting_figures
 from simtest.nightly.records import NightlyRun, RunRecord, Verdict
-from simtest.nightly.storage import LATEST_ROWS, load_run
-from simtest.validation.results_table import SCHEMA
+from simtest.nightly.store import LATEST_ROWS, load_run
+from simtest.validation.columns import SCHEMA
 
 OK = (pl.col("status") == "ok") & pl.col("true_id").is_not_null()
 OF_ANSWERS = (

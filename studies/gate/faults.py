@@ -5,7 +5,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from simtest.geometry import ellipse_fit, gaussian_smoothing
+from simtest.geometry import ellipse_fit, patch
 from simtest.simulation.rendered_view import RenderedView
 from studies.mutants.planting import Mutation, planted
 from studies.mutants.rows import BY_NAME
@@ -60,7 +60,7 @@ HARMLESS: dict[str, tuple[Mutation, ...]] = {
         Mutation(ellipse_fit._points, "xy = np.asarray(points, dtype=float)", "xy = np.asarray(points, float)[::-1]"),
     ),
     "smoothing in double precision": (
-        Mutation(gaussian_smoothing._blurred, _BLUR, _BLUR_TWICE),
+        Mutation(patch._blurred, _BLUR, _BLUR_TWICE),
     ),
     "light off by 1e-7 of itself": (
         Mutation(

@@ -11,9 +11,8 @@ import polars as pl
 from benchmarks.measuring import Figure
 from simtest.errors import SimtestError
 from simtest.nightly.gate.contrasts import margin_of
-from simtest.nightly.gate.limits import Limits
-from simtest.nightly.gate.quantities import quantities
-from simtest.runtime.engines import make_engine
+from simtest.nightly.gate.quantities import QUANTITIES
+from simtest.runtime.processes import make_engine
 from simtest.spec import Experiment
 from simtest.validation.runner import run_experiment
 from studies.gate.bank import COLUMNS, experiment, frames_of, load_bank
@@ -165,7 +164,7 @@ def rises(bank: pl.DataFrame, nights: int = DETECTION_NIGHTS) -> list[tuple[Rate
         after = Source(raised(bank, estimator, RISE), source.unit, source.setting)
         own = bank.filter(pl.col("estimator") == estimator).group_by("experiment", "setting")
         means = own.agg(pl.col("error_deg").mean())["error_deg"].drop_nulls().to_numpy()
-        margins = RISE * means / margin_of(quantities(Limits())["mean_deg"], means)
+        margins = RISE * means / margin_of(QUANTITIES["mean_deg"], means)
         about = f"{(margins > 1).sum()} of {len(means)} settings, by {margins.max():.2g} margins at most"
         made.append(
             (

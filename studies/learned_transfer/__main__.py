@@ -1,34 +1,31 @@
 """Compare networks taught on smooth surfaces with those taught on tissue: on other rendered frames, and on real ones.
 
     python -m studies.learned_transfer --kept FOLDER [--scenes 12] [--spots SMOOTH TISSUE] [--dense SMOOTH TISSUE]
-        [--detectors [SMOOTH] TISSUE] [--hard] [--real] [--overlays FOLDER] [--sheet FILE]
+        [--hard] [--real] [--overlays FOLDER] [--sheet FILE]
 
 SMOOTH and TISSUE are the files model.onnx of one task, trained on `highlights_smooth` and on `highlights`
-(`simtest train`). The folder of `--kept` holds the frames of the corpus `hard`, rendered at the first run, and the
-answers on them: a run that was ended goes on where it stopped. Without `--hard` and `--real`
+(`python -m studies.networks`). The folder of `--kept` holds the frames of the corpus `hard`, rendered at the first run,
+and the answers on them: a run that was ended goes on where it stopped. Without `--hard` and `--real`
 both parts are run. Tasks without files are left out. `--overlays` writes a PNG of each real frame and method, `--sheet`
 one contact sheet of all.
 """
 
 import argparse
 import sys
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
 
-from simtest.detection.detector import Detector
 from simtest.estimators import AnyEstimator
 from simtest.runtime.files import make_folder
 from studies.detection.real_frames import outlined_frames
-from studies.detection.tissue import Counts
 from studies.kept import of_this_code
 from studies.learned_transfer import real, sheet, tables
 from studies.learned_transfer.answers import OK, Answer
 from studies.learned_transfer.frames import FIRST, GUIDES, ONE_LIGHT, ROWS, hard_frames
 from studies.learned_transfer.kept import Kept
-from studies.learned_transfer.networks import CLASSICAL, COLOUR, SMOOTH, TAUGHT, TISSUE, detectors, estimators, named
+from studies.learned_transfer.networks import CLASSICAL, SMOOTH, TAUGHT, TISSUE, estimators, named
 
 TASKS = ("learned_spot", "learned_dense")
 
@@ -44,37 +41,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m studies.learned_transfer", description="Smooth against tissue.")
     parser.add_argument("--kept", type=Path, required=True, help="folder of the rendered frames")
     parser.add_argument("--scenes", type=int, default=12)
-    for task in ("spots", "dense", "detectors"):
+    for task in ("spots", "dense"):
         parser.add_argument(f"--{task}", type=Path, nargs="+", metavar="FILE")
     parser.add_argument("--hard", action="store_true", help="the corpus hard alone")
     parser.add_argument("--real", action="store_true", help="the real frames alone")
     parser.add_argument("--overlays", type=Path)
     parser.add_argument("--sheet", type=Path)
     given = parser.parse_args(arguments)
-    if any(len(files or ()) > len(TAUGHT) for files in (given.spots, given.dense, given.detectors)):
+    if any(len(files or ()) > len(TAUGHT) for files in (given.spots, given.dense)):
         parser.error("a task has two networks at most: SMOOTH TISSUE, or TISSUE alone")
-    normals, finders = estimators(given.spots, given.dense), detectors(given.detectors)
+    normals = estimators(given.spots, given.dense)
     both = given.hard == given.real
     if given.hard or both:
-        for line in _hard(range(FIRST, FIRST + given.scenes), of_this_code(given.kept), normals, finders):
+        for line in _hard(range(FIRST, FIRST + given.scenes), of_this_code(given.kept), normals):
             print(line, flush=True)
     if given.real or both:
-        for line in _real(normals, finders, given.overlays, given.sheet):
+        for line in _real(normals, given.overlays, given.sheet):
             print(line, flush=True)
     return 0
 
 
-def _hard(
-    scenes: Sequence[int], kept: Path, normals: Mapping[str, AnyEstimator], finders: Mapping[str, Detector]
-) -> Iterator[str]:
+def _hard(scenes: Sequence[int], kept: Path, normals: Mapping[str, AnyEstimator]) -> Iterator[str]:
     """Yield the tables of the corpus `hard`."""
     made: list[Answer] = []
-    counts: dict[str, dict[str, list[dict[int, Counts]]]] = {name: defaultdict(list) for name in finders}
     answered = Kept(kept)
     for frame in hard_frames(scenes, ROWS, kept):
         made += answered.normals(frame, normals)
-        for name, finder in finders.items():
-            counts[name][frame.row.name].append(answered.detection(frame, name, finder))
         print(f"scene {frame.scene}, {frame.row.name}", file=sys.stderr, flush=True)
     yield from ("", "## Corpus hard: normals", "")
     yield from tables.summary(made, GROUPS, list(normals))
@@ -83,24 +75,13 @@ def _hard(
     compared += [(named(task, TISSUE), CLASSICAL[0]) for task in TASKS if named(task, TISSUE) in normals]
     yield from ("", "## Corpus hard: paired differences", "")
     yield from tables.pairs(made, GROUPS, compared)
-    yield from ("", "## Corpus hard: detection", "")
-    yield from tables.detection(counts, GROUPS)
 
 
-def _real(
-    normals: Mapping[str, AnyEstimator], finders: Mapping[str, Detector], overlays: Path | None, file: Path | None
-) -> Iterator[str]:
+def _real(normals: Mapping[str, AnyEstimator], overlays: Path | None, file: Path | None) -> Iterator[str]:
     """Yield the tables of the real frames, and write their pictures."""
     frames = list(outlined_frames())
     learned = [name for name in normals if name not in CLASSICAL]
     pictures: dict[str, dict[str, sheet.Picture]] = {frame.name: {} for frame in frames}
-    yield from ("", "## Real frames: detection", "")
-    yield from tables.head(real.DETECTION_HEADS)
-    for frame in frames:
-        found = {name: real.found_by(frame.picture, finder) for name, finder in finders.items()}
-        for name, detection in found.items():
-            yield real.detection_line(frame, name, detection, found[COLOUR])
-            pictures[frame.name][name] = sheet.outlined(frame.picture, detection.highlights, 2)
     yield from ("", "## Real frames: normals", "")
     yield from tables.head(real.NORMALS_HEADS)
     agreed: list[real.Agreement] = []

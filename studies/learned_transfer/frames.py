@@ -20,12 +20,11 @@ import numpy as np
 
 from simtest.calibration import Calibration, Frame, Normal
 from simtest.errors import InputError, SimtestError
-from simtest.runtime.arrays import AnyArray, Array, Image, Mask
+from simtest.runtime.arrays import AnyArray, Array, Image
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.runtime.seeds import key as hashed
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.rendered_view import RenderedView
-from studies.detection.tissue_frames import TissueFrame
 from studies.hard.cases import scene_of
 from studies.hard.measure import Frames
 from studies.hard.rows import PICTURE, Row, lit_from, moving, plain, vessels, wide, with_relief
@@ -93,14 +92,8 @@ class HardFrame:
         The base's true unit normal at each pixel, camera frame; NaN off the surface.
     depth : ndarray of float32, shape (H, W)
         Distance along the ray, mm; NaN off the surface.
-    regions : ndarray of uint16, shape (H, W)
-        1 + the number of the visible highlight whose pixel it is, 0 elsewhere.
     peaks : ndarray, shape (N, 2)
         Peaks of the visible highlights, px.
-    radii, clearness : ndarray, shape (N,)
-        Their radii at half height, px; peak over noise.
-    whole : ndarray of bool, shape (N,)
-        Whether they are clear of the border.
     fine : ndarray, shape (N, 3)
         The fine surface's true normal at the only glint of each; NaN where it holds none or several.
     """
@@ -110,11 +103,7 @@ class HardFrame:
     picture: AnyArray
     normal_base: AnyArray
     depth: AnyArray
-    regions: AnyArray
     peaks: Array
-    radii: Array
-    clearness: Array
-    whole: Mask
     fine: Array
 
     @property
@@ -137,14 +126,6 @@ class HardFrame:
     def frame(self) -> Frame:
         """Return the picture as estimators see it."""
         return Frame(self.encoded, self.calibration, SMOOTHING_PX)
-
-    def as_tissue(self) -> TissueFrame:
-        """Return what `studies.detection.tissue` scores."""
-        regions = self.regions.astype(np.int32)
-        name = f"{self.kind} {self.scene}"
-        return TissueFrame(
-            name, self.picture, self.peaks, self.radii, self.clearness, self.whole, np.zeros(len(self.peaks)), regions
-        )
 
 
 def hard_frames(scenes: Sequence[int], rows: Sequence[Row], folder: Path) -> Iterator[HardFrame]:
@@ -169,7 +150,7 @@ def hard_frames(scenes: Sequence[int], rows: Sequence[Row], folder: Path) -> Ite
                 yield HardFrame(number, row, **{name: kept[name] for name in ARRAYS})
 
 
-ARRAYS = ("picture", "normal_base", "depth", "regions", "peaks", "radii", "clearness", "whole", "fine")
+ARRAYS = ("picture", "normal_base", "depth", "peaks", "fine")
 
 
 def _rendered(renderer: Frames, row: Row) -> dict[str, AnyArray]:
@@ -193,11 +174,7 @@ def _rendered(renderer: Frames, row: Row) -> dict[str, AnyArray]:
         "picture": picture,
         "normal_base": truth.normal_base.astype(np.float16),
         "depth": truth.depth.astype(np.float32),
-        "regions": view.spots.regions.astype(np.uint16),
         "peaks": np.array([spot.peak_px for spot in spots], dtype=float).reshape(-1, 2),
-        "radii": np.array([spot.radius_px for spot in spots], dtype=float),
-        "clearness": np.array([spot.peak_snr for spot in spots], dtype=float),
-        "whole": np.array([spot.whole for spot in spots], dtype=bool),
         "fine": np.array([_fine(view, spot.glints) for spot in spots], dtype=float).reshape(-1, 3),
     }
 

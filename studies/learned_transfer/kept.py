@@ -10,10 +10,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-from simtest.detection.detector import Detector, run_detector
 from simtest.estimators import AnyEstimator
 from simtest.runtime.files import make_folder, write_atomically
-from studies.detection.tissue import Counts, score_frame
 from studies.learned_transfer.answers import Answer, answers
 from studies.learned_transfer.frames import HardFrame
 
@@ -47,29 +45,11 @@ class Kept:
             found += [Answer(**{**row, "estimator": name}) for row in rows]
         return found
 
-    def detection(self, frame: HardFrame, name: str, detector: Detector) -> dict[int, Counts]:
-        """Return the counts of a detector on a frame, by radius class."""
-        file = self._file(frame, name, detector)
-        if not file.exists():
-            counts: dict[int, Counts] = _Counts()
-            score_frame(frame.as_tissue(), run_detector(detector, frame.frame()).highlights, counts)
-            _write(file, [{"size": key, **asdict(each)} for key, each in counts.items()])
-        rows = json.loads(file.read_text(encoding="utf-8"))
-        return {row.pop("size"): Counts(**row) for row in rows}
-
     def _file(self, frame: HardFrame, name: str, method: object) -> Path:
         model = getattr(method, "model", None)
         key = hashlib.sha256(Path(model).read_bytes()).hexdigest()[:16] if model else ""
         label = "_".join(part for part in (name.split(",")[0], key) if part)
         return self._folder / label / f"{frame.scene}_{frame.row.name.replace(' ', '_')}.json"
-
-
-class _Counts(dict[int, Counts]):
-    """Counts that begin at 0."""
-
-    def __missing__(self, key: int) -> Counts:
-        self[key] = Counts()
-        return self[key]
 
 
 def _write(file: Path, rows: Rows) -> None:

@@ -3,15 +3,13 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from simtest.detection.colour import ColourDetector
-from simtest.detection.detector import Detector
 from simtest.estimators import AnyEstimator, load_estimators
 
 SMOOTH, TISSUE = "smooth", "tissue"
 TAUGHT = (SMOOTH, TISSUE)
 """What the two networks of a task were taught."""
 
-CLASSICAL, COLOUR = ("bisector", "cloud"), "colour"
+CLASSICAL = ("bisector", "cloud")
 
 Files = Sequence[Path]
 """Files of a task's network taught on smooth surfaces, and on tissue; one file is that of tissue."""
@@ -39,14 +37,3 @@ def estimators(spots: Files | None, dense: Files | None) -> Mapping[str, AnyEsti
 
         made |= {named("learned_dense", name): LearnedDense(file) for name, file in _taught(dense).items()}
     return {**made, **load_estimators(list(CLASSICAL))}
-
-
-def detectors(files: Files | None) -> Mapping[str, Detector]:
-    """Return the networks that find highlights, and the classical detector beside them."""
-    made: dict[str, Detector] = {}
-    if files:
-        from simtest.detection.learned_detector import LearnedDetector
-
-        taught = _taught(files).items()
-        made |= {named("learned_detector", name): LearnedDetector(file, isolated=False) for name, file in taught}
-    return {**made, COLOUR: ColourDetector(isolated=False)}

@@ -1,7 +1,7 @@
-"""Networks on real frames: what is marked where nothing shines, and how far normals agree with the classical ones.
+"""Networks on real frames: what is answered where nothing shines, and how far normals agree with the classical ones.
 
-Nobody knows the true normals of these frames, nor their cameras. Detectors see the frames as they are. For normals the
-picture is reduced to 480 px across, the size that the networks were taught, and taken in two ways:
+Nobody knows the true normals of these frames, nor their cameras. The picture is reduced to 480 px across, the size that
+the networks were taught, and taken in two ways:
 
 - as `simtest reconstruct FRAME --fov 80` does: a field of view of 80 deg across it, lights not told;
 - with a rig told: the same, and two light guides 4 mm beside the camera (eight in the laparoscope), tissue 30 mm away,
@@ -16,9 +16,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from simtest.calibration import Calibration, Frame, Normal, Response
-from simtest.detection.blobs import Highlight
-from simtest.detection.detector import Detection, Detector, run_detector
+from simtest.calibration import Calibration, Normal
 from simtest.errors import Failure
 from simtest.estimators import AnyEstimator, Estimate
 from simtest.geometry.vectors import basis_across, tangent_coordinates
@@ -26,16 +24,13 @@ from simtest.reconstruction import Specularity
 from simtest.reconstruction.assumptions import calibration_of_view
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.rig import Rig
+from simtest.spec.lights import Rig
 from studies.detection.real_frames import (
-    FrameScore,
     OutlinedFrame,
-    inside_outlines,
-    score_highlights,
 )
 from studies.hard.table import CHI2_95
 from studies.learned_transfer.answers import OK, why
-from studies.learned_transfer.frames import DISTANCE_MM, DISTANCE_SD, SMOOTHING_PX
+from studies.learned_transfer.frames import DISTANCE_MM, DISTANCE_SD
 
 FOV_DEG, ACROSS_PX = 80.0, 480
 
@@ -100,50 +95,9 @@ def ways(frame: OutlinedFrame) -> Iterator[tuple[str, Image, Calibration]]:
     yield TOLD, small, told(small, frame.name)
 
 
-def frame_of(picture: Image) -> Frame:
-    """Return a picture as a detector sees it."""
-    calibration = replace(untold(picture), response=Response("srgb"), saturation_level=1.0)
-    return Frame(picture, calibration, SMOOTHING_PX)
-
-
-def found_by(picture: Image, detector: Detector) -> Detection:
-    """Return what a detector finds in a picture."""
-    return run_detector(detector, frame_of(picture))
-
-
-def detection_score(frame: OutlinedFrame, detection: Detection) -> FrameScore:
-    """Score a detection; the pixels that it marks are those inside its outlines, for all detectors alike."""
-    return score_highlights(frame, detection.highlights, inside_outlines(detection.highlights, frame.specular.shape))
-
-
-def shared(one: Sequence[Highlight], other: Sequence[Highlight], shape: tuple[int, ...]) -> float:
-    """Return the share of highlights whose peak lies inside an outline of another detector; NaN without any."""
-    inside = inside_outlines(other, shape)
-    peaks = [highlight.region.peak for highlight in one]
-    return float(np.mean([inside[y, x] for x, y in peaks])) if peaks else math.nan
-
-
-DETECTION_HEADS = (
-    "frame", "detector", "covered", "answered", "IoU", "highlights", "of them in colour's", "of colour's in them",
-    "on instrument, text, vessel, border", "refused",
-)  # fmt: skip
-
-
 NORMALS_HEADS = (
     "frame", "way", "estimator", "detections", "answered", "refused", "answers on instrument, text, vessel, border",
 )  # fmt: skip
-
-
-def detection_line(frame: OutlinedFrame, name: str, detection: Detection, colour: Detection) -> str:
-    """Return a detector's line of the table, beside the classical detector."""
-    made = detection_score(frame, detection)
-    marks = ", ".join(str(made.marks.get(kind, 0)) for kind in FORBIDDEN)
-    refusal = getattr(detection, "refusal", None)
-    shares = " | ".join(f"{share:.3f}" for share in (made.covered, made.answered, made.iou))
-    own, other, shape = detection.highlights, colour.highlights, frame.specular.shape
-    both = f"{shared(own, other, shape):.2f} | {shared(other, own, shape):.2f}"
-    why_not = refusal.detail if refusal else "no"
-    return f"| {frame.name} | {name} | {shares} | {made.count} | {both} | {marks} | {why_not} |"
 
 
 def specularities(

@@ -1,4 +1,4 @@
-"""Pictures of real frames for the eye: outlines of what detectors find, and normals as needles with their deviation."""
+"""Pictures of real frames for the eye: normals as needles with their deviation."""
 
 import math
 from collections.abc import Sequence
@@ -7,13 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from simtest.detection.blobs import Highlight
 from simtest.estimators import Estimate
 from simtest.reconstruction import Specularity
 from simtest.runtime.arrays import Image, Picture
-
-FOUND, OTHER = (60, 255, 60), (40, 120, 255)
-"""Colours, BGR, of highlights that may carry one normal and of the other kinds."""
 
 NEEDLE, REGION = (255, 220, 0), (255, 255, 255)
 
@@ -21,21 +17,6 @@ NEEDLE_SHARE = 0.10
 """Length of a needle across the view, as a share of the picture's width."""
 
 TILE_PX, QUALITY, LEAST_QUALITY, LARGEST_BYTES = 300, 80, 30, 300_000
-FRACTION_BITS = 4
-
-
-def outlined(picture: Image, highlights: Sequence[Highlight], scale: int = 1) -> Picture:
-    """Draw the outlines of highlights: green where one may carry a normal, orange otherwise."""
-    canvas = _canvas(picture, scale)
-    for highlight in highlights:
-        colour = FOUND if highlight.is_isolated else OTHER
-        points = highlight.outline
-        if len(points) < 3:
-            column, row = highlight.region.peak
-            points = np.array([[column, row], [column + 1, row], [column + 1, row + 1], [column, row + 1]], dtype=float)
-        fixed = np.rint((points * scale - 0.5) * 2**FRACTION_BITS).astype(np.int32)
-        cv2.polylines(canvas, [fixed.reshape(-1, 1, 2)], True, colour, 1, cv2.LINE_AA, FRACTION_BITS)
-    return canvas
 
 
 def needles(picture: Image, found: Sequence[Specularity], name: str, scale: int = 1) -> Picture:

@@ -8,7 +8,6 @@ import numpy as np
 
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
-from studies.detection.tissue import CLASSES, Counts
 from studies.learned_transfer.answers import OK, Answer
 from studies.learned_transfer.real import Agreement
 from studies.resampling import interval_of_mean
@@ -97,22 +96,6 @@ def pairs(
             yield _line(
                 group, f"{first} - {second}", made.pairs, made.scenes, f"{made.difference:+.2f}", interval, medians
             )
-
-
-def detection(
-    counts: Mapping[str, Mapping[str, Sequence[Mapping[int, Counts]]]], rows: Mapping[str, Sequence[str]]
-) -> Iterator[str]:
-    """Yield the table of F1 by radius class; `counts` by detector and row: of each frame, by class."""
-    yield from head(("rows", "detector", *(f"from {low:g} px: F1 (found + missed, false)" for low in CLASSES)))
-    for group, members in rows.items():
-        for name, by_row in counts.items():
-            cells = []
-            for key in range(len(CLASSES)):
-                own = [frame[key] for row in members for frame in by_row.get(row, ()) if key in frame]
-                hits, missed, false = (sum(getattr(c, part) for c in own) for part in ("hits", "missed", "false"))
-                total = 2 * hits + missed + false
-                cells.append(f"{2 * hits / total:.3f} ({hits} + {missed}, {false})" if total else NONE)
-            yield _line(group, name, *cells)
 
 
 def agreement(agreed: Sequence[Agreement], frames: Sequence[str]) -> Iterator[str]:

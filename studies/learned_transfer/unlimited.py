@@ -12,14 +12,14 @@ from pathlib import Path
 
 import onnx
 
-from simtest.runtime.onnx_model import METADATA
+from simtest.estimators.onnx_model import METADATA
 
 LIMIT = 1e12
 """Above the squared Mahalanobis distance of any features."""
 
 
 def unlimited(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a copy of a network of `simtest train` without the limit of its features."""
+    """Return a copy of a network without the limit of its features."""
     made = onnx.ModelProto()
     made.CopyFrom(model)
     own = {prop.key: prop.value for prop in made.metadata_props}

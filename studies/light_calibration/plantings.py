@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from simtest.calibration import Calibration, Response
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt
+from simtest.geometry.lenses import BrownConrady, KannalaBrandt
 from simtest.spec.calibration_file import save_calibration
 from studies.light_calibration.pictures import Floats, Look, picture_of_ball
 

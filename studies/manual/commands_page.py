@@ -6,7 +6,7 @@ import re
 from cyclopts import App
 
 from simtest.cli.commands import APP
-from simtest.cli.listing import HEADINGS, names_of
+from simtest.cli.scenes import HEADINGS, names_of
 from studies.manual.markdown import code, table
 
 OPENING = """# Commands
@@ -18,7 +18,7 @@ up).
 Exit codes: 0 done; 1 could not render, a full disk, or a command's own verdict; 2 bad input; 130 Ctrl-C; 143 SIGTERM.
 For `nightly`, 1 is a regression or an unexplained change, and whatever else went wrong is 2.
 
-[What is shipped](shipped.md) lists the names that commands take: scenes, experiments, datasets, trainings, profiles,
+[What is shipped](shipped.md) lists the names that commands take: scenes, experiments, datasets, profiles,
 estimators, detectors and presets.
 
 ```{toctree}

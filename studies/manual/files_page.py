@@ -10,8 +10,7 @@ from simtest.dataset.fields import FIELDS as SAMPLE_FIELDS
 from simtest.dataset.index import HighlightRow, SampleRow
 from simtest.reconstruction.output_files import COLUMNS
 from simtest.simulation.frame_files import FIELDS, FILES, INSTRUMENT_FIELDS
-from simtest.validation.column_meanings import MEANINGS
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import COLUMNS as RESULTS
 from simtest.validation.runner import RunRecord
 from simtest.validation.statistics import Figures
 from studies.manual.markdown import code, table
@@ -132,11 +131,11 @@ def files_page() -> str:
 def _columns() -> Iterable[tuple[str, str, str]]:
     """Return the columns of results, those of one vector or matrix in a row."""
     rows: list[tuple[list[str], str, str]] = []
-    for name, kind in SCHEMA.items():
-        if not MEANINGS[name]:
+    for name, column in RESULTS.items():
+        if not column.meaning:
             rows[-1][0].append(name)
         else:
-            rows.append(([name], str(kind).lower(), MEANINGS[name]))
+            rows.append(([name], str(column.dtype).lower(), column.meaning))
     return [(code(", ".join(names)), kind, line) for names, kind, line in rows]
 
 

@@ -22,7 +22,7 @@ from studies.manual.blocks import ROOT, Block, blocks_of, manual_pages
 from studies.manual.outputs import Shown, difference, with_outputs
 
 SLOW = ("simtest nightly", "simtest validate", "simtest fit", "simtest realism", "simtest dataset endoscopy",
-        "simtest dataset learning", "simtest dataset smooth", "-m studies.", "-m benchmarks")  # fmt: skip
+        "simtest dataset smooth", "-m studies.", "-m benchmarks")  # fmt: skip
 """What takes minutes, as it stands in a command: left out of a quick run."""
 
 NEVER = ("make ", "pip install", "docker ", "apptainer ", "crontab", "systemctl", "git clone", "-m venv", "activate")

@@ -18,7 +18,7 @@ from typing import Any
 from cyclopts import CycloptsError
 
 from simtest.cli.commands import APP
-from simtest.cli.manners import FLAGS
+from simtest.cli.main import FLAGS
 from simtest.dataset.plan import Plan
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
@@ -93,13 +93,13 @@ def _simtest_fault(arguments: list[str], runs: bool) -> str | None:
         return " ".join(str(error).split())
     given = bound.arguments
     try:
-        _check_names(function.__module__.rpartition(".")[2], function.__name__, given, bound.args, runs)
+        _check_names(arguments[0], function.__name__, given, bound.args, runs)
     except InputError as error:
         return str(error)
     return None
 
 
-def _check_names(module: str, function: str, given: dict[str, Any], positional: tuple[Any, ...], runs: bool) -> None:
+def _check_names(command: str, function: str, given: dict[str, Any], positional: tuple[Any, ...], runs: bool) -> None:
     """Raise InputError where a command names a scene, an experiment, a recipe, a profile or an estimator amiss."""
     settings = parse_settings(given.get("settings") or [])
     # A mesh of the reader's is not there to be read, nor checked with the other settings.
@@ -113,10 +113,10 @@ def _check_names(module: str, function: str, given: dict[str, Any], positional: 
         ("validate", "validate"): lambda name, values: expand(load_experiment(name, values)),
         ("dataset", "make"): lambda name, values: Plan(load_dataset(name, values)),
     }
-    loader = loaders.get((module, function))
+    loader = loaders.get((command, function))
     if loader and positional and not _is_file(positional[0]):
         loader(positional[0], {} if absent else settings)
-    if module == "nightly" and given.get("profile") and not _is_file(given["profile"]):
+    if command == "nightly" and given.get("profile") and not _is_file(given["profile"]):
         load_profile(given["profile"])
     if runs and (names := given.get("estimators") or given.get("estimator")):
         load_estimators(names)

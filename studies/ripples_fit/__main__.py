@@ -19,7 +19,7 @@ import numpy as np
 
 import simtest.estimators.brightest_point as of_peak
 from simtest.calibration import Calibration
-from simtest.calibration.noise_model import NoiseModel
+from simtest.calibration.photometry import NoiseModel
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.detection.colour import ColourDetector
 from simtest.estimators.bends import MEAN_BENDS, PEAK_BENDS

@@ -14,7 +14,7 @@ NEEDS = {
     "docs": ("docs", ("sphinx",)),
     "exchange": ("test-extras", ("datasets", "webdataset", "ray", "pycolmap")),
     "git": ("git", ("git",)),
-    "learn": ("learn", ("torch", "safetensors", "onnx", "onnxruntime")),
+    "learn": ("learn", ("torch", "onnx", "onnxruntime")),
     "video": ("video", ("av",)),
     "viewer": ("libEGL", ("EGL",)),
 }

@@ -18,8 +18,7 @@ from simtest.estimators.prior_parts import light_offset_part
 from simtest.geometry import Camera
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.arrays import Array
-from simtest.validation.metrics import estimate_row
-from simtest.validation.results_table import ResultRow
+from simtest.validation.metrics import estimate_columns
 from tests.laws import by_hand
 from tests.laws.law import Law, law
 
@@ -74,7 +73,7 @@ def budgets() -> list[Law]:
         gap = float(np.abs(estimate.covariance - added).max() / np.trace(added))
     about = "parts of the budget, added by hand, over their trace"
     # The columns of results: the root of each part's trace, deg
-    stated = estimate_row(ResultRow(), estimate).budget if parts and isinstance(estimate, Estimate) else {}
+    stated = estimate_columns(estimate) if parts and isinstance(estimate, Estimate) else {}
     roots = {f"budget_{name}_deg": math.degrees(math.sqrt(np.trace(part))) for name, part in _parts(estimate).items()}
     apart = max((abs(stated.get(name, math.nan) / root - 1) for name, root in roots.items()), default=math.nan)
     return [

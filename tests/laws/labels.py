@@ -17,7 +17,7 @@ from simtest.runtime.arrays import AnyArray, Array
 from simtest.simulation.frame_files import encoded_png, write_frame
 from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import scene_from_dict
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.sensor import Sensor
 from tests.laws import by_hand
 from tests.laws.law import Law, law

@@ -2,7 +2,7 @@
 
 import math
 
-from simtest.validation import error_ladder as ladder
+from studies import error_ladder as ladder
 from tests.laws.law import Law, law
 
 PROTOTYPE_NOISE_DEG, PROTOTYPE_CURVED_DEG = 0.008, 59.9

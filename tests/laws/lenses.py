@@ -11,7 +11,7 @@ from simtest.geometry.vectors import bisect
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.spec import load_camera, scene_from_dict
-from simtest.spec.rig import Rig
+from simtest.spec.lights import Rig
 from tests.laws.law import Law, law
 
 FX, FY, CX, CY, SKEW = 310.0, 300.0, 163.3, 117.8, 7.0

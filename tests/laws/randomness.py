@@ -8,11 +8,10 @@ from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import Experiment, scene_from_dict
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import expand
 from simtest.validation.paper.published_pipeline import Pipeline
 from simtest.validation.paper.rows import paper_rows
-from simtest.validation.results_table import ResultRow
 from tests.laws.law import Law, law
 
 SLANT_OFF_DEG = 0.05
@@ -64,7 +63,7 @@ def protocol_noise() -> list[Law]:
 def published() -> list[Law]:
     """Reconstruct the published protocol's plane without noise, at its default slant."""
     setting = PaperSetting(sigma=0.0, smoothing_px=0.0)
-    rows = paper_rows(setting, ResultRow(), range(1), [0], ("circle_pose",))
+    rows = paper_rows(setting, {}, range(1), [0], ("circle_pose",))
     off = rows["error_deg"].fill_null(np.nan).item()
     about = "circle_pose at a slant of 58 deg, without noise; unsmoothed; interpolation leaves 0.01 deg"
     return [law("published", "circle_pose_off", "deg", off, SLANT_OFF_DEG, about=about)]

@@ -112,7 +112,7 @@ def plane_errors(session: Session) -> list[Law]:
     point = by_hand.highlight_of_plane(normal, DISTANCE_MM, np.array(LIGHT_MM))
     half = float(by_hand.angle_deg(-point, np.array(LIGHT_MM) - point)) / 2
     # As the rows of results state it, so that the metric is checked too.
-    stated = [row.error_deg for row in offset.rows if row.estimator == "cone_axis" and row.status == "ok"]
+    stated = [row["error_deg"] for row in offset.rows if row["estimator"] == "cone_axis" and row["status"] == "ok"]
     ratio = stated[0] / half if len(stated) == 1 and stated[0] is not None else np.nan
     about = f"half the angle between light and camera, {half:.4f} deg; falloff moves the peak by 1 % of it"
     return [*laws, law("light_offset", "error_over_law", "x", float(ratio), 1.03, 0.97, about=about)]

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from simtest.calibration import Calibration, NoiseModel, Response, estimate_noise
+from simtest.calibration.photometry import AngularProfile
 from simtest.geometry import Camera, smooth
-from simtest.geometry.angular_profile import AngularProfile
-from simtest.geometry.gaussian_smoothing import share_of_noise
+from simtest.geometry.patch import share_of_noise
 from simtest.runtime.arrays import Array, Image
 from simtest.simulation.camera_chain import capture, collect, to_uint8
 from simtest.spec.sensor import Sensor

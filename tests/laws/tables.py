@@ -12,14 +12,14 @@ from simtest.runtime.arrays import Array
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import Examined, verdicts
 from simtest.spec import Experiment
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation import laws
 from simtest.validation.cases import expand
+from simtest.validation.columns import Row, table
 from simtest.validation.matching import match
-from simtest.validation.metrics import curvature_errors, mahalanobis2, rows, scene_row
+from simtest.validation.metrics import curvature_errors, mahalanobis2, rows, scene_columns
 from simtest.validation.paper.rows import paper_rows
 from simtest.validation.realisation import Realisation, realise
-from simtest.validation.results_table import ResultRow, table
 from simtest.validation.statistics import figures
 from tests.laws import by_hand
 from tests.laws.law import Law, law
@@ -35,11 +35,11 @@ def statistics() -> list[Law]:
     """Compare the figures of thirteen rows with numbers worked out apart from this package."""
     count = len(ERRORS)
     made = [
-        ResultRow(status="ok", realisation=i, true_id=0, error_deg=e, error_oracle_deg=e / 2, error_base_deg=2 * e,
+        dict(status="ok", realisation=i, true_id=0, error_deg=e, error_oracle_deg=e / 2, error_base_deg=2 * e,
                   mahalanobis2=m)
         for i, (e, m) in enumerate(zip(ERRORS, (0.1, 0.5, 1.0, 1.4, 2.0, 3.0, 4.0, 5.5, 5.9, 6.1), strict=True))
     ]  # fmt: skip
-    made += [ResultRow(status="missed", true_id=1), ResultRow(status="no_peak", true_id=2), ResultRow(status="ok")]
+    made += [dict(status="missed", true_id=1), dict(status="no_peak", true_id=2), dict(status="ok")]
     found = figures(table(made, {}))
     # Student's 97.5 % point of 9 degrees of freedom is 2.262157, chi-squared's 95 % point of 2 is 5.991465.
     wanted = {
@@ -70,8 +70,8 @@ def counts(session: Session) -> list[Law]:
     made = _realised(session, 0.0)
     own = [made.specularities[i] for i in made.matched]
     aside = [truth.bp_px + np.array([40.0, 0.0]) for truth in made.truths]
-    missed = rows(session, ResultRow(), [], made.truths, {}, {"cone_axis": (), "curved": ()})
-    states = [row.status for row in missed]
+    missed = rows(session, {}, [], made.truths, {}, {"cone_axis": (), "curved": ()})
+    states = [row["status"] for row in missed]
     return [
         law("counts", "matched", "", len(made.matched), 1, 1, about="the one highlight of a plane"),
         law("counts", "matched_aside", "", len(match(own, aside)), 0, about="to a point 40 px away"),
@@ -82,8 +82,8 @@ def counts(session: Session) -> list[Law]:
 def columns(session: Session) -> list[Law]:
     """Compare the columns of a plane's rows under a light aside with the plane's own geometry."""
     made = _realised(session, SIGMA)
-    wanted = [row for row in made.rows if row.estimator == "cone_axis" and row.status == "ok"]
-    row = wanted[0] if len(wanted) == 1 else ResultRow()
+    wanted = [row for row in made.rows if row["estimator"] == "cone_axis" and row["status"] == "ok"]
+    (row,) = wanted
     normal = by_hand.anchor_normal(TILT_DEG, AZIMUTH_DEG)
     light = np.array(LIGHT_MM)
     point = by_hand.highlight_of_plane(normal, DISTANCE_MM, light)
@@ -92,19 +92,21 @@ def columns(session: Session) -> list[Law]:
     pixel = c["fx"] * point[0] / point[2] + c["cx"], c["fy"] * point[1] / point[2] + c["cy"]
     half = float(by_hand.angle_deg(-point, light - point)) / 2
     stated = _vector(row, "normal")
-    look = np.array([(_value(row.look_x_px) - c["cx"]) / c["fx"], (_value(row.look_y_px) - c["cy"]) / c["fy"], 1.0])
+    look = np.array(
+        [(_value(row["look_x_px"]) - c["cx"]) / c["fx"], (_value(row["look_y_px"]) - c["cy"]) / c["fy"], 1.0]
+    )
     error = float(by_hand.angle_deg(stated, normal))
     off = {
-        "distance_off": (row.distance_mm, far, 1e-4), "eps_over_d_off": (row.eps_over_d, 1.0 / far, 1e-6),
-        "kd_min_off": (row.kd_min, 0.0, 1e-9), "kd_max_off": (row.kd_max, 0.0, 1e-9),
-        "axis_ratio_law_off": (row.axis_ratio_law, 1.0, 1e-9), "bp_x_off": (row.bp_true_x_px, pixel[0], 1e-3),
-        "bp_y_off": (row.bp_true_y_px, pixel[1], 1e-3), "peak_x_off": (row.bp_x_px, pixel[0], 1.0),
-        "peak_y_off": (row.bp_y_px, pixel[1], 1.0), "noise_sigma_off": (row.noise_sigma, SIGMA, 0),
-        "n_lights_off": (row.n_lights, 1, 0),
+        "distance_off": (row["distance_mm"], far, 1e-4), "eps_over_d_off": (row["eps_over_d"], 1.0 / far, 1e-6),
+        "kd_min_off": (row["kd_min"], 0.0, 1e-9), "kd_max_off": (row["kd_max"], 0.0, 1e-9),
+        "axis_ratio_law_off": (row["axis_ratio_law"], 1.0, 1e-9), "bp_x_off": (row["bp_true_x_px"], pixel[0], 1e-3),
+        "bp_y_off": (row["bp_true_y_px"], pixel[1], 1e-3), "peak_x_off": (row["bp_x_px"], pixel[0], 1.0),
+        "peak_y_off": (row["bp_y_px"], pixel[1], 1.0), "noise_sigma_off": (row["noise_sigma"], SIGMA, 0),
+        "n_lights_off": (row["n_lights"], 1, 0),
         "truth_off": (float(by_hand.angle_deg(_vector(row, "truth"), normal)), 0, 1e-6),
-        "error_law_off": (row.error_law_deg, half, 1e-4), "error_off": (row.error_deg, error, 1e-6),
-        "error_look_off": (row.error_look_deg, error, 1e-6), "error_fine_off": (row.error_fine_deg, error, 1e-6),
-        "error_base_off": (row.error_base_deg, error, 1e-6),
+        "error_law_off": (row["error_law_deg"], half, 1e-4), "error_off": (row["error_deg"], error, 1e-6),
+        "error_look_off": (row["error_look_deg"], error, 1e-6), "error_fine_off": (row["error_fine_deg"], error, 1e-6),
+        "error_base_off": (row["error_base_deg"], error, 1e-6),
         "look_off_deg": (float(by_hand.angle_deg(look, -stated)), 0, 1e-6),
     }  # fmt: skip
     about = "cone_axis on a plane under a light 1 mm aside, its geometry by hand"
@@ -113,11 +115,15 @@ def columns(session: Session) -> list[Law]:
         for name, (value, right, close) in off.items()
     ]
     # The peak stands on black, a little lower for its smoothing.
-    snr = _value(row.peak_snr) * SIGMA
+    snr = _value(row["peak_snr"]) * SIGMA
     figures_.append(law("columns", "peak_snr", "x", snr, 1.02, 0.85, about="peak over the noise; smoothing lowers it"))
     # Of a bent surface: curvatures in their order, and the ratio of 1 + d k
-    bent = scene_row(made.view.scene, ResultRow(), replace(made.truths[0], kd_min=-0.3, kd_max=0.8))
-    gap = abs(_value(bent.kd_min) + 0.3) + abs(_value(bent.kd_max) - 0.8) + abs(_value(bent.axis_ratio_law) - 0.7 / 1.8)
+    bent = scene_columns(made.view.scene, replace(made.truths[0], kd_min=-0.3, kd_max=0.8))
+    gap = (
+        abs(_value(bent["kd_min"]) + 0.3)
+        + abs(_value(bent["kd_max"]) - 0.8)
+        + abs(_value(bent["axis_ratio_law"]) - 0.7 / 1.8)
+    )
     figures_.append(law("columns", "bent_off", "", gap, 1e-12, n=3, about="k d of -0.3 and 0.8, as they were put in"))
     return [*figures_, *_candidates(made), *_of_protocol(), *_curvature_errors(made), _distance(made)]
 
@@ -187,8 +193,10 @@ def _candidates(made: Realisation) -> list[Law]:
     both = replace(own, normal=other, candidates=np.array([other, truth.normal]), budget=None, covariance=None)
     specularity = replace(made.specularities[next(iter(made.matched))], estimates={"both": both})
     session = _Still(made)
-    (row, *_) = rows(session, ResultRow(), [specularity], [truth], {0: 0}, {"both": ()})  # type: ignore[arg-type]
-    gap = max(abs(_value(row.error_deg) - 5.0), abs(_value(row.error_oracle_deg)), abs(_value(row.rank_correct) - 1))
+    (row, *_) = rows(session, {}, [specularity], [truth], {0: 0}, {"both": ()})  # type: ignore[arg-type]
+    gap = max(
+        abs(_value(row["error_deg"]) - 5.0), abs(_value(row["error_oracle_deg"])), abs(_value(row["rank_correct"]) - 1)
+    )
     about = "the second of two candidates is the truth, the first 5 deg off"
     return [law("columns", "oracle_off", "deg", gap, 1e-6, about=about)]
 
@@ -209,7 +217,7 @@ class _Still:
 
 def _of_protocol() -> list[Law]:
     """Compare the published protocol's errors with the angles between its columns."""
-    made = paper_rows(PaperSetting(size=200, sigma=0.02, isovalue=0.5), ResultRow(), range(2), [3, 4], ("circle_pose",))
+    made = paper_rows(PaperSetting(size=200, sigma=0.02, isovalue=0.5), {}, range(2), [3, 4], ("circle_pose",))
     stated = made.select("normal_x", "normal_y", "normal_z").to_numpy()
     slanted = np.array([0.0, math.sin(58 / 180 * math.pi), -math.cos(58 / 180 * math.pi)])
     gap = np.abs(by_hand.angle_deg(stated, slanted) - made["error_deg"].to_numpy()).max()
@@ -259,8 +267,8 @@ def _realised(session: Session, sigma: float) -> Realisation:
     return realise(session, experiment, case, 0, render_view(session, scene), {}, load_estimators(names))
 
 
-def _vector(row: ResultRow, name: str) -> Array:
-    return np.array([_value(getattr(row, f"{name}_{axis}")) for axis in "xyz"])
+def _vector(row: Row, name: str) -> Array:
+    return np.array([_value(row[f"{name}_{axis}"]) for axis in "xyz"])
 
 
 def _value(value: float | None) -> float:

@@ -6,7 +6,7 @@ import pytest
 
 from simtest.conventions import MOTION, MOTION_COLUMNS
 from simtest.estimators.two_views import RankedHypotheses
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import Experiment, load_experiment
 from simtest.validation.runner import run_experiments
 from studies.gate.faults import Mutation, planted

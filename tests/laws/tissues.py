@@ -10,8 +10,8 @@ from simtest.rendering import Session
 from simtest.rendering.subsurface import spread, transfer
 from simtest.runtime.arrays import Array, Mask
 from simtest.spec import scene_from_dict
-from simtest.spec.relief import Relief
-from simtest.spec.translucency import Translucency
+from simtest.spec.reflectance import Translucency
+from simtest.spec.surfaces import Relief
 from simtest.surfaces.relief_field import make_relief
 from simtest.validation.relief_laws import cloud_covariance, glint_count, relief_error
 from tests.laws import by_hand

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from simtest.errors import Failure
 from simtest.geometry import Camera, circle_poses, cone_of_conic, fit_ellipse, fit_ellipses
-from simtest.geometry.circle_from_cone import circle_pose
+from simtest.geometry.cones import circle_pose
 
 CAMERA = Camera(406, 406, 406.0, 420.0, 203.0, 190.0, 1.5)
 

@@ -22,15 +22,15 @@ from simtest.calibration import (
     Uniform,
     exactly,
 )  # fmt: skip
+from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
 from simtest.estimators.process.requests import priors_message
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, ViewMask
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction.assumptions import calibration_of_view
 from simtest.simulation.frame_files import picture_calibration
 from simtest.spec import load_scene, scene_from_dict
-from simtest.spec.calibration_tables import degrees_of
+from simtest.spec.calibration_spec import degrees_of
 
 SCENES = sorted(
     p.stem for p in (Path(__file__).resolve().parents[2] / "scenes").glob("*.toml") if p.stem != "published"
@@ -184,7 +184,7 @@ def test_what_no_file_states_is_refused_and_not_dropped(calibration, field, tmp_
     [
         (CAMERA, "calibration.toml", "calibration is a Camera: must be a simtest.Calibration"),
         (Calibration(CAMERA), "calibration.yaml", "a calibration is TOML"),
-        (Calibration(CAMERA), "none/calibration.toml", "cannot be written"),
+        (Calibration(CAMERA), "none/calibration.toml", "No such file or directory"),
     ],
 )
 def test_refusals_of_writing(calibration, name, said, tmp_path):

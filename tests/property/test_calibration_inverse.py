@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.calibration import Calibration, NoiseModel, Response
+from simtest.calibration.photometry import AngularProfile
 from simtest.geometry import Camera
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.simulation.camera_chain import capture, collect
 from simtest.spec.sensor import Sensor
 

@@ -10,18 +10,13 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.contrasts import paired, unpaired
-from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.gate.holm import holm
-from simtest.nightly.gate.limits import Limits
-from simtest.nightly.gate.pairing_units import paired_sums, sums
-from simtest.nightly.gate.pooling import pooled
-from simtest.nightly.gate.quantities import quantities
+from simtest.nightly.gate.contrasts import holm, paired, pooled, unit_sums, unpaired
+from simtest.nightly.gate.quantities import QUANTITIES, setting_figures
 from simtest.nightly.records import OUTCOMES, NightlyRun, RunRecord
 from simtest.runtime.statistics import mean_interval
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 
-ERROR = quantities(Limits())["mean_deg"]
+ERROR = QUANTITIES["mean_deg"]
 probabilities = st.lists(st.floats(0, 1), min_size=1, max_size=6)
 
 
@@ -59,7 +54,7 @@ def test_one_row_a_unit_is_student_s_test(x, data):
     y = data.draw(st.lists(st.floats(0.05, 50), min_size=len(x), max_size=len(x)))
     x, y = np.array(x), np.array(y)
     assume(min(np.std(y - 1.02 * x), np.std(y - x), np.std(x), np.std(y)) > 1e-3)
-    found = paired(paired_sums(pairs_of(x, y)), ERROR)
+    found = paired(unit_sums(pairs_of(x, y)), ERROR)
     # Both margins must be exceeded: the larger p-value counts.
     expected = max(
         stats.ttest_1samp(y - 1.02 * x, 0, alternative="greater").pvalue,
@@ -72,7 +67,8 @@ def test_one_row_a_unit_is_student_s_test(x, data):
     assert found.low[0] < interval.low + 1e-6
     assert found.high[0] > interval.high - 1e-6
     one, two = (
-        sums(pl.DataFrame({"cell": 0, "quantity": "q", "realisation": np.arange(len(v)), "value": v})) for v in (x, y)
+        unit_sums(pl.DataFrame({"cell": 0, "quantity": "q", "realisation": np.arange(len(v)), "value": v}))
+        for v in (x, y)
     )
     welch = max(
         stats.ttest_ind(y, 1.02 * x, equal_var=False, alternative="greater").pvalue,
@@ -86,11 +82,11 @@ def test_rows_of_one_unit_count_as_one():
     rng = np.random.default_rng(0)
     x = rng.uniform(0.5, 1.5, 12)
     y = x * rng.uniform(0.9, 1.3, 12)
-    single, table = paired(paired_sums(pairs_of(x, y)), ERROR), pairs_of(x, y)
-    copied = paired(paired_sums(pl.concat([table] * 10)), ERROR)
+    single, table = paired(unit_sums(pairs_of(x, y)), ERROR), pairs_of(x, y)
+    copied = paired(unit_sums(pl.concat([table] * 10)), ERROR)
     np.testing.assert_allclose(copied.worse, single.worse, rtol=1e-9)
     apart = table.with_columns(realisation=pl.col("realisation") + 100)
-    assert paired(paired_sums(pl.concat([table, apart])), ERROR).worse < single.worse
+    assert paired(unit_sums(pl.concat([table, apart])), ERROR).worse < single.worse
 
 
 numbers = st.one_of(st.none(), st.floats(0, 90), st.sampled_from([0.0, float("nan"), float("inf")]))
@@ -147,7 +143,9 @@ def pooled_p(units, factor):
     nights = [np.exp(1.2 * rng.standard_normal(shape)), factor * np.exp(1.2 * rng.standard_normal(shape))]
     cell, realisation = (axis.ravel() for axis in np.indices(shape))
     tables = [
-        sums(pl.DataFrame({"cell": cell, "quantity": "q", "realisation": realisation, "value": v.ravel()})).sort("cell")
+        unit_sums(pl.DataFrame({"cell": cell, "quantity": "q", "realisation": realisation, "value": v.ravel()})).sort(
+            "cell"
+        )
         for v in nights
     ]
     found = unpaired(*tables, ERROR)
@@ -165,7 +163,7 @@ def test_cells_together_keep_their_level_under_heavy_tails(units):
 
 def test_few_cells_of_few_units_say_nothing_together():
     x = pairs_of(np.ones(2), np.array([2.0, 3.0]))
-    table = paired_sums(pl.concat([x, x.with_columns(pl.lit(1, x["cell"].dtype).alias("cell"))])).sort("cell")
+    table = unit_sums(pl.concat([x, x.with_columns(pl.lit(1, x["cell"].dtype).alias("cell"))])).sort("cell")
     found = pooled(paired(table, ERROR), ERROR)
     assert np.isnan(found.worse).all()
     np.testing.assert_allclose(found.difference, [2 * 1.5 / 3.5], rtol=1e-12, atol=1e-300)

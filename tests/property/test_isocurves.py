@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from simtest.errors import InputError
-from simtest.geometry import isocurves
+from simtest.validation.paper import isocurves
 from tests import isocurve_formulas as formulas
 
 place = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(1, 100)).map(np.array)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from simtest.calibration.noise_estimate import SAMPLE, median
+from simtest.calibration.frame import SAMPLE, median
 from simtest.estimators.budget import quantile
 
 VALUES = arrays(np.float32, st.integers(1, 40), elements=st.floats(0, 2.0**100, width=32) | st.just(np.nan))

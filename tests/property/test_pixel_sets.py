@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis.extra.numpy import array_shapes, arrays
 from scipy import ndimage, stats
 
-from simtest.geometry import chi_squared, pixel_sets
+from simtest.geometry import chi_squared
+from simtest.geometry.patch import closed, connected, dilated, rows_and_columns
 
 SQUARE = np.ones((3, 3), dtype=bool)
 masks = arrays(np.bool_, array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24))
@@ -15,7 +16,7 @@ masks = arrays(np.bool_, array_shapes(min_dims=2, max_dims=2, min_side=1, max_si
 
 @given(masks, st.booleans())
 def test_connected_sets_are_those_of_scipy(mask, diagonally):
-    ours = pixel_sets.connected(mask, diagonally)
+    ours = connected(mask, diagonally)
     theirs, count = ndimage.label(mask, SQUARE if diagonally else None)
     assert ours.shape == mask.shape
     assert (ours.max(), ours.min() == 0) == (count, not mask.all())
@@ -29,8 +30,8 @@ def test_connected_sets_are_those_of_scipy(mask, diagonally):
 def test_dilation_and_closing_are_those_of_scipy(mask, as_view):
     # A part of a larger array, as regions of interest are
     mask = np.pad(mask, 2, constant_values=True)[2:-2, 2:-2] if as_view else mask
-    assert (pixel_sets.dilated(mask) == ndimage.binary_dilation(mask, SQUARE)).all()
-    assert (pixel_sets.closed(mask) == (mask | ndimage.binary_closing(mask, SQUARE))).all()
+    assert (dilated(mask) == ndimage.binary_dilation(mask, SQUARE)).all()
+    assert (closed(mask) == (mask | ndimage.binary_closing(mask, SQUARE))).all()
 
 
 @given(st.floats(1e-6, 1 - 1e-6), st.integers(1, 60))
@@ -53,5 +54,5 @@ def test_quantiles_need_a_share_and_freedom(share, freedom):
 
 @given(masks)
 def test_rows_and_columns_are_those_of_numpy(mask):
-    for ours, theirs in zip(pixel_sets.rows_and_columns(mask), np.nonzero(mask), strict=True):
+    for ours, theirs in zip(rows_and_columns(mask), np.nonzero(mask), strict=True):
         assert np.array_equal(ours, theirs)

@@ -6,12 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from simtest.dataset.scoring.dense.axes import ALL, matrix, to_camera
+from simtest.dataset.scoring.dense.conventions import ALL, matrix, to_camera
 from simtest.geometry import ellipse_of_conic
 from simtest.geometry.vectors import angle_deg, bisect, rotation, tangent_basis, tangent_coordinates
 from simtest.runtime.seeds import from_integer
 from simtest.spec import LightSpec
-from simtest.spec.views import Moved, Views
+from simtest.spec.camera import Moved, Views
 from simtest.surfaces.analytic import placement
 from simtest.validation.motion import told_pose
 

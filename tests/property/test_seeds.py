@@ -12,8 +12,7 @@ from simtest.advice.draws import drawn_values
 from simtest.advice.plan import Question, surroundings
 from simtest.advice.scope import read_scope
 from simtest.advice.twin.patches import make_pool
-from simtest.bench.draws import pooled
-from simtest.bench.suite import CaseSpec
+from simtest.bench.suite import CaseSpec, pooled
 from simtest.dataset.plan import Plan
 from simtest.realism.distance import distances
 from simtest.realism.fitting.frames import FrameMaker
@@ -22,15 +21,14 @@ from simtest.runtime.resources import data_root
 from simtest.runtime.seeds import Stage, from_integer, generator, integer
 from simtest.simulation.camera_chain import capture
 from simtest.spec import Experiment, load_dataset, scene_from_dict
-from simtest.spec.rig import Rig
+from simtest.spec.lights import Rig
+from simtest.spec.reflectance import TissueColour
 from simtest.spec.sensor import Sensor
-from simtest.spec.tissue_colour import TissueColour
 from simtest.surfaces import make_surface, poses
 from simtest.surfaces.liver import Body
 from simtest.surfaces.recipe import load_recipe
-from simtest.surfaces.surface_samples import surface_patch
 from simtest.surfaces.tube import Tube
-from simtest.surfaces.vessels import grow_vessels
+from simtest.surfaces.vessels import grow_vessels, surface_patch
 from simtest.validation import motion
 from simtest.validation.cases import expand
 

@@ -11,7 +11,7 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
-from simtest.geometry.isophotes import encloses
+from simtest.geometry.patch import encloses
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.rendering import Session, even_pixels, mesh_edges
+from simtest.rendering import Session, adaptive
 from simtest.spec import scene_from_dict
 from simtest.surfaces import Shape, TriangleMesh
 from simtest.surfaces.analytic import Quadric
@@ -115,8 +115,8 @@ def test_the_error_is_no_larger_than_that_of_samples_everywhere(name):
 @pytest.mark.parametrize("name", ["plane, spot", "sphere"])
 def test_centres_alone_err_more(name, monkeypatch):
     """Negative control: without the choice, edges show in the error."""
-    monkeypatch.setattr(even_pixels, "choose", lambda parts, *_: np.zeros(parts[0].shape, dtype=bool))
-    monkeypatch.setattr(mesh_edges.MeshEdges, "marks", lambda self, camera, *_: np.zeros((72, 96), dtype=bool))
+    monkeypatch.setattr(adaptive, "choose", lambda parts, *_: np.zeros(parts[0].shape, dtype=bool))
+    monkeypatch.setattr(adaptive.MeshEdges, "marks", lambda self, camera, *_: np.zeros((72, 96), dtype=bool))
     surface, more = SCENES[name]
     t, _ = judged(Session(scene(surface, **more)), SCENES[name])
     assert t > T_LIMIT
@@ -124,7 +124,7 @@ def test_centres_alone_err_more(name, monkeypatch):
 
 def test_centres_without_their_curvature_are_biased(monkeypatch):
     """Negative control."""
-    monkeypatch.setattr(even_pixels, "mean_of_pixel", lambda centres: centres.copy())
+    monkeypatch.setattr(adaptive, "mean_of_pixel", lambda centres: centres.copy())
     described = {"type": "plane"}, {"lights": [{}], "reflectance": {**GLOSSY, "exponent": 2000.0}}
     _, z = judged(Session(scene(described[0], **described[1])), described)
     assert z > Z_LIMIT
@@ -181,6 +181,6 @@ def test_a_wire_thinner_than_a_pixel_and_its_shadow_are_seen(wired):
 
 def test_without_the_meshs_edges_the_wire_is_missed(wired, monkeypatch):
     """Negative control."""
-    monkeypatch.setattr(mesh_edges.MeshEdges, "marks", lambda self, camera, *_: np.zeros((72, 96), dtype=bool))
+    monkeypatch.setattr(adaptive.MeshEdges, "marks", lambda self, camera, *_: np.zeros((72, 96), dtype=bool))
     t, _ = judged(Session(scene(wired[0], **wired[1])), wired)
     assert t > T_LIMIT

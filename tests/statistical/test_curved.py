@@ -20,7 +20,7 @@ from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, from_integer, generator
 from simtest.spec import scene_from_dict
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.metrics import curvature_errors, mahalanobis2
 from simtest.validation.paper.rows import pipeline_with
 

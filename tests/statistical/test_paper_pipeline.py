@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.measure import find_contours
 
 from simtest.errors import Failure
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.paper.published_pipeline import Pipeline, kernel_radius
 from simtest.validation.paper.slanted_view import draw_light, region_of_interest
 

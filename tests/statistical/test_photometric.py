@@ -21,7 +21,7 @@ from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import scene_from_dict
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.metrics import mahalanobis2
 from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.published_pipeline import Pipeline

@@ -8,7 +8,7 @@ from simtest.calibration import Priors
 from simtest.estimators.circle_pose import CirclePoseEstimator
 from simtest.estimators.pose_uncertainty import pose_region
 from simtest.runtime.seeds import from_integer
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.paper.published_pipeline import Pipeline
 
 ALPHA = 0.01

@@ -6,7 +6,7 @@ import numpy as np
 from simtest.dataset.scoring.dense.frame_truth import EXCLUDED, FrameTruth
 from simtest.dataset.scoring.dense.zones import zones
 from simtest.geometry import Camera
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt
+from simtest.geometry.lenses import BrownConrady, KannalaBrandt
 
 LENSES = {
     "pinhole": Camera(96, 72, 70.0, 70.0, 48.0, 36.0),

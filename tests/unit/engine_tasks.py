@@ -36,3 +36,22 @@ def meets_a_full_disk(number, tell):
 def blocked_signals(_, tell):
     """Return which signals the worker has blocked: as it was started, since nothing changes that."""
     return sorted(map(int, signal.pthread_sigmask(signal.SIG_BLOCK, [])))
+
+
+def threads(_, tell):
+    """Return what the worker's libraries read, or were told, of their threads."""
+    import cv2
+
+    return os.environ["SIMTEST_THREADS"], os.environ["OPENBLAS_NUM_THREADS"], cv2.getNumThreads()
+
+
+def swallows_memory(path):
+    """Need more memory than there is."""
+    return len(bytearray(2**40))
+
+
+def prints(path):
+    """Read a file as a library that prints would."""
+    print("a warning of the library")
+    os.write(1, b"another\n")
+    return Path(path).read_text()

@@ -3,9 +3,9 @@
 import numpy as np
 import polars as pl
 
-from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.quantities import setting_figures
 from simtest.nightly.records import NightlyRun, RunRecord
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 
 RUN = {"id": "x", "versions": {"numpy": "2.4", "simtest": "0.1"}, "processor": "one"}
 

@@ -5,9 +5,9 @@ from itertools import product
 
 import polars as pl
 
-from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.quantities import setting_figures
 from simtest.nightly.records import CELL, COMPARISONS, JudgedRun, NightlyRun, RunRecord, Verdict
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)
 

@@ -31,7 +31,7 @@ from simtest.advice.plan import (
 from simtest.advice.scope import SCOPES, ReliefPrior, read_scope
 from simtest.errors import InputError
 from simtest.rendering.placement_checks import check_camera, check_lights
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import kept
 from simtest.surfaces import make_surface
 from simtest.validation import laws, realisation
 from simtest.validation.cases import RELIEF_SEED

@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 from scipy import stats
 
-from simtest.rendering import Session, found_highlights, highlights
+from simtest.rendering import Session, highlights
 from simtest.spec import load_experiment, load_scene
 from simtest.validation.runner import run_experiment
 
@@ -61,7 +61,7 @@ def test_a_finer_grid_of_seeds_finds_nothing_more(monkeypatch):
         return np.array(sorted(pixels))
 
     quick = found()
-    monkeypatch.setattr(found_highlights, "FINE_STRIDE_PX", 1)
+    monkeypatch.setattr(highlights, "FINE_STRIDE_PX", 1)
     monkeypatch.setattr(highlights, "NEAR_CELLS", 12.0)
     full = found()
     assert len(quick) >= 8

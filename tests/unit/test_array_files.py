@@ -5,7 +5,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from simtest.runtime.array_files import write_arrays
+from simtest.runtime.arrays import write_arrays
 
 
 def arrays():

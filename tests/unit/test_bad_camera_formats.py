@@ -7,7 +7,7 @@ import pytest
 from scipy.io import savemat
 
 from simtest import InputError, load_calibration, load_camera
-from simtest.spec.camera_formats import read_poses
+from simtest.spec.camera_formats.files import read_poses
 
 COLMAP_LINE = "1 OPENCV 640 480 500 490 320 240 -0.1 0.03 0.002 -0.001"
 C3VD = (

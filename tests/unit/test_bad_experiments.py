@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from simtest.estimators import load_estimators
+from simtest.runtime.boundary import plain_errors
 from simtest.spec import load_experiment, load_scene
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces import make_surface
 from simtest.validation import realisation, runner
 from simtest.validation.cases import expand
@@ -170,11 +171,10 @@ def test_folders_that_cannot_be_written(tmp_path):
     plain = tmp_path / "plain"
     plain.write_text("mine")
     refused(lambda: runner.run_experiment(described, plain), f"--out {plain}: is a file; must be a folder")
-    refused(
-        lambda: runner.run_experiment(described, plain / "x"), f"--out {plain / 'x'}: cannot be", "Not a directory)"
-    )
-    refused(lambda: runner.run_experiment(described, tmp_path / ("n" * 300)), "File name too long)")
-    refused(lambda: runner.run_experiment(described, plain / "a\nb"), r"/a\nb")
+    run = plain_errors(runner.run_experiment)
+    refused(lambda: run(described, plain / "x"), f"{plain / 'x'}", "Not a directory")
+    refused(lambda: run(described, tmp_path / ("n" * 300)), "File name too long")
+    refused(lambda: run(described, plain / "a\nb"), r"/a\nb")
 
 
 # Recipes and meshes through a scene ------------------------------------------------------------------------------

@@ -219,7 +219,11 @@ def test_an_estimator_that_fails_is_a_value():
     assert {result.reason for result in found.estimates.values()} == {Reason.ESTIMATOR_ERROR}
     assert details["broken"].startswith("ZeroDivisionError: float division by zero (test_bad_pictures.py:")
     assert details["silent"] == "gave a NoneType; must be an Estimate or a Failure"
-    refused(lambda: reconstruct(SPOT, EYE, {"number": 5}), "estimator 'number'", "not callable")
+    refused(
+        lambda: reconstruct(SPOT, EYE, {"number": 5}),
+        "estimator 'number'",
+        "has neither estimate(patch, camera, priors)",
+    )
 
 
 @pytest.mark.parametrize("focal", [1e-300, 1e300])

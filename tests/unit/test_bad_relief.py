@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from simtest.spec import scene_from_dict
-from simtest.spec.relief import Relief
+from simtest.spec.surfaces import Relief
 from simtest.surfaces import make_surface
 from tests.refusals import refused
 

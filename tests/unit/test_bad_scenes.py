@@ -127,8 +127,8 @@ SCENES = {
     "samples 0": (PLANE + "[render]\nsamples_per_pixel = 0", "render.samples_per_pixel = 0: must be greater than"),
     "path depth 1": (PLANE + "[render]\npath_depth = 1", "render.path_depth = 1: must be greater than or equal to 2"),
     "seed negative": (PLANE + "[render]\nseed = -1", "render.seed = -1: must be greater than or equal to 0"),
-    "line break in a key": ('"a\\nb" = 1\n' + PLANE, r"'a\nb' = 1: unknown key"),
-    "endless key": ("k" * 5000 + " = 1\n" + PLANE, "kkk... = 1: unknown key"),
+    "line break in a key": ('"a\\nb" = 1\n' + PLANE, r"a\nb = 1: unknown key"),
+    "endless key": ("k" * 5000 + " = 1\n" + PLANE, "kkk...kkk", "kkk = 1: unknown key"),
 }  # fmt: skip
 
 
@@ -165,8 +165,8 @@ def test_files(tmp_path, name, load):
 def test_what_is_no_file(tmp_path, load):
     refused(lambda: load(tmp_path), f"{tmp_path}: is a folder")
     refused(lambda: load(tmp_path / "none.toml"), "none.toml: ", "no such file")
-    refused(lambda: load("n" * 5000), "nnn...: cannot be read (File name too long)")
-    refused(lambda: load("a\nb"), r"'a\nb': ")
+    refused(lambda: load("n" * 5000), "nnn...nnn", "File name too long")
+    refused(lambda: load("a\nb"), r"a\nb: ")
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     # Reading it would wait for ever.
@@ -179,7 +179,7 @@ NAMED = {load_scene: "anatomy, cylinder, plane", load_experiment: "anatomy, anat
 @pytest.mark.parametrize("load", NAMED)
 def test_unknown_names_list_the_shipped_ones(load):
     refused(lambda: load("plain"), f"plain: no such file; shipped by name: {NAMED[load]}")
-    refused(lambda: load(""), "'': is a folder")
+    refused(lambda: load(""), ".: is a folder")
     refused(lambda: load("~nobody-of-this-name/x.toml"), "~nobody-of-this-name/x.toml: no such home folder")
 
 
@@ -188,7 +188,7 @@ def test_unknown_names_list_the_shipped_ones(load):
 SETTINGS = {
     "surface.distance_mm": "--set surface.distance_mm: must be key=value, for example surface.distance_mm=12",
     "=3": "--set =3: must be key=value",
-    "a\nb": r"--set 'a\nb': must be key=value",
+    "a\nb": r"--set a\nb: must be key=value",
     "surface.distance_mm=": "surface.distance_mm = '': must be a number",
     "surface.distance_mm=ten": "surface.distance_mm = 'ten': must be a number",
     "surface.distance_mm=nan": "surface.distance_mm = nan: must be a finite number",

@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from simtest.bench.maps import _scene_sums
+from simtest.bench.run import _scene_sums
 
 
 def test_a_frame_without_a_row_moves_no_other_frame() -> None:
@@ -14,6 +14,6 @@ def test_a_frame_without_a_row_moves_no_other_frame() -> None:
 
     score = SimpleNamespace(scorer=SimpleNamespace(rows=[row("b", 1.0), row("c", 5.0), row("d", 5.0)]))
     numbers = {"a": 0, "b": 1, "c": 2, "d": 3}
-    assert _scene_sums(score, "normal", {"plane": (2, 2)}, numbers) == {"plane": [[10, 10.0], [20, 100.0]]}
+    assert _scene_sums(score, "normal", {"plane": (2, 2)}, numbers) == {"plane": [(10, 10.0), (20, 100.0)]}
     score.scorer.rows = [row("b", 1.0), row("c", 5.0)]
-    assert _scene_sums(score, "normal", {"plane": (2, 2)}, numbers) == {"plane": [[10, 10.0], [10, 50.0]]}
+    assert _scene_sums(score, "normal", {"plane": (2, 2)}, numbers) == {"plane": [(10, 10.0), (10, 50.0)]}

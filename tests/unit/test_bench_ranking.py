@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.bench.ranking import ALPHA, SceneSums, margin, rank
+from simtest.bench.table import ALPHA, SceneSums, margin, rank
 from studies.bench_ranking import claims, cores, rankings, with_any
 
 

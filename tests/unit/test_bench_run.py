@@ -11,17 +11,14 @@ import numpy as np
 import polars as pl
 import pytest
 
-from simtest.bench.certificate import CERTIFICATE, check_suite, read_certificate
-from simtest.bench.cores import core_record
-from simtest.bench.draws import experiment_of
-from simtest.bench.leaderboard import read_entries
-from simtest.bench.maps import export_frames, maps_record
-from simtest.bench.run import BenchRun, chosen_parts, run_bench, run_maps
-from simtest.bench.suite import Suite, digest_of, layout_of
-from simtest.cli import bench
+from simtest.bench.run import BenchRun, chosen_parts, core_record, export_frames, maps_record, run_bench, run_maps
+from simtest.bench.scores import CERTIFICATE
+from simtest.bench.suite import Suite, digest_of, experiment_of, layout_of
+from simtest.bench.table import check_suite, read_certificate, read_entries
+from simtest.cli import runs
 from simtest.dataset.scoring.dense.conventions import MapOptions
 from simtest.errors import InputError
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.runtime.provenance import file_hash, version
 from tests.bench_tiny import tiny_suite
 
@@ -210,9 +207,9 @@ def test_the_commands_run_and_rank(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("simtest.bench.suite.load_suite", lambda *_: suite)
-    bench.run(out=tmp_path / "run", core="brightest_point")
+    runs.run(out=tmp_path / "run", core="brightest_point")
     assert str(tmp_path / "run" / CERTIFICATE) in capsys.readouterr().out
-    bench.table(tmp_path / "run", out=tmp_path / "table", as_json=True)
+    runs.table(tmp_path / "run", out=tmp_path / "table", as_json=True)
     assert json.loads(capsys.readouterr().out)["parts"]["smooth"] == {f"brightest_point simtest {version()}": "1"}
     assert "brightest_point ranks first over all parts" in (tmp_path / "table" / "index.html").read_text()
 
@@ -230,10 +227,10 @@ def test_a_stop_says_what_is_kept(
         monkeypatch.setattr(f"simtest.bench.{name}", stopped)
     for command, told in (
         (
-            lambda: bench.run(out=tmp_path / "run", maps=tmp_path),
+            lambda: runs.run(out=tmp_path / "run", maps=tmp_path),
             "frames are kept; the same command scores all maps anew",
         ),
-        (lambda: bench.run(out=tmp_path / "run", core="cone_axis"), "^$"),
+        (lambda: runs.run(out=tmp_path / "run", core="cone_axis"), "^$"),
     ):
         with pytest.raises(KeyboardInterrupt, match=told):
             command()

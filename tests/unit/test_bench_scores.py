@@ -7,11 +7,17 @@ import polars as pl
 import pytest
 from scipy.stats import binom, chi2
 
-from simtest.bench.ranking import CAP_DEG
-from simtest.bench.scores import results_hash, score_part
-from simtest.bench.uncertainty import coverage_error, energy_scores, score_uncertainty, verdict_of
+from simtest.bench.scores import (
+    CAP_DEG,
+    coverage_error,
+    energy_scores,
+    results_hash,
+    score_part,
+    score_uncertainty,
+    verdict_of,
+)
 from simtest.geometry.vectors import basis_across
-from simtest.validation.results_table import ResultRow, table
+from simtest.validation.columns import table
 
 SD = np.radians(0.5)
 
@@ -32,7 +38,7 @@ def _rows(count: int, stated: float = 1.0, seed: int = 0, per_scene: int = 4) ->
         angle = np.hypot(*miss)
         truth = np.cos(angle) * normal + np.sin(angle) / angle * (miss @ basis_across(normal))
         rows.append(
-            ResultRow(
+            dict(
                 setting="plane",
                 realisation=i,
                 specularity=0,
@@ -171,9 +177,9 @@ def test_the_axis_is_that_of_the_region() -> None:
 def test_refused_and_missed_highlights_count_the_cap() -> None:
     rows = _rows(100)
     others = [
-        ResultRow(setting="plane", realisation=100, true_id=0, status="missed", estimator="x"),
-        ResultRow(setting="plane", realisation=101, specularity=0, true_id=0, status="not_converged", estimator="x"),
-        ResultRow(setting="plane", realisation=102, specularity=0, status="ok", estimator="x", error_deg=None),
+        dict(setting="plane", realisation=100, true_id=0, status="missed", estimator="x"),
+        dict(setting="plane", realisation=101, specularity=0, true_id=0, status="not_converged", estimator="x"),
+        dict(setting="plane", realisation=102, specularity=0, status="ok", estimator="x", error_deg=None),
     ]
     score = score_part(pl.concat([rows, table(others, {})]), LAYOUT)
     assert (score.n, score.answered, score.missed, score.false) == (102, 100, 1, 1)
@@ -193,7 +199,7 @@ def test_differences_between_frozen_cases_are_no_chance() -> None:
     rng, rows = np.random.default_rng(3), []
     for case, level in (("easy", 1.0), ("hard", 9.0)):
         rows += [
-            ResultRow(setting=case, realisation=i, true_id=0, status="ok", estimator="x", target="fine",
+            dict(setting=case, realisation=i, true_id=0, status="ok", estimator="x", target="fine",
                       error_deg=level + 0.3 * rng.standard_normal(), specularity=0)
             for i in range(20)
         ]  # fmt: skip
@@ -213,7 +219,7 @@ def test_an_error_beyond_the_cap_counts_the_cap() -> None:
 
 def test_a_frame_that_the_part_does_not_have_is_refused() -> None:
     for setting, realisation in (("plane", 4 * LAYOUT["plane"][0]), ("sphere", 0)):
-        stray = ResultRow(setting=setting, realisation=realisation, true_id=0, status="missed", estimator="x")
+        stray = dict(setting=setting, realisation=realisation, true_id=0, status="missed", estimator="x")
         with pytest.raises(ValueError, match=f"setting '{setting}', realisation {realisation}"):
             score_part(table([stray], {}), LAYOUT)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from simtest.bench.draws import experiment_of, pooled
 from simtest.bench.suite import (
     SUITE,
     CaseSpec,
@@ -17,14 +16,16 @@ from simtest.bench.suite import (
     Suite,
     SuiteSpec,
     canonical,
+    experiment_of,
     load_suite,
+    pooled,
     suite_folder,
-    unfrozen_keys,
 )  # fmt: skip
 from simtest.errors import InputError
 from simtest.spec import scene_from_dict
 from simtest.surfaces.factory import make_surface
 from simtest.validation.cases import expand
+from studies.bench_cases import unfrozen_keys
 from tests.bench_tiny import tiny_suite
 
 V1 = "d4ca908db0cf32f945db653d3cdff8a803ddec1b4946d63b1fee0de21422a6b3"

@@ -8,13 +8,14 @@ import pytest
 import simtest
 from simtest.calibration import Calibration, NoiseModel, Priors, Response, Uniform
 from simtest.calibration.calibration import MIN_FALLOFF
+from simtest.calibration.photometry import AngularProfile
 from simtest.detection import Region, detect, estimate_noise
 from simtest.detection.detector import Detection
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
+from simtest.estimators.clipping import plateau_area_px
 from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction.pipeline import reconstruct, run_pipeline
 from simtest.simulation.camera_chain import capture, collect
 from simtest.spec import load_calibration, load_camera, save_calibration
@@ -342,6 +343,18 @@ def test_two_highlights_on_one_clipped_plateau_keep_their_own_peaks():
     # Where it is one highlight, the plateau's centroid is its peak as before.
     whole = Patch.cut(smooth(frame, 1.0), (2, 2, 36, 36), (14, 19), saturated=clipped, raw=np.maximum(frame, clipped))
     assert whole.peak_px == pytest.approx([20.5, 20.5])
+
+
+@pytest.mark.parametrize("x", [4.3, 40.3])
+def test_a_plateau_does_not_take_in_that_of_another_highlight(x):
+    """At 4.3 px the region's border cuts the isophotes."""
+    lights = (spot(x, height=2.5), spot(x, height=2.5) + spot(130.3, height=2.5))
+    patches = [
+        Patch.cut(smooth(frame, 1.0), (0, 0, 160, 120), (int(x), 60), saturated=frame >= 1)
+        for frame in (np.minimum(light, 1.0) for light in lights)
+    ]
+    alone, both = (plateau_area_px(patch, 0.5) for patch in patches)
+    assert alone == both > 50
 
 
 def test_a_few_clipped_pixels_leave_the_parabola():

@@ -8,8 +8,8 @@ import pytest
 
 from simtest import Camera, KannalaBrandt, Scaramuzza, load_calibration, load_camera, save_camera
 from simtest.cli.main import main
-from simtest.spec.camera_formats import read_poses
-from simtest.spec.camera_summary import camera_summary
+from simtest.spec.camera_formats.files import read_poses
+from simtest.spec.camera_tables import camera_summary
 
 FISHEYE = Camera(640, 480, 200.0, 200.0, 320.0, 240.0, 0.0, KannalaBrandt(0.01))
 PHOTOMETRY = """<rig><camera><camera_model type="gamma"><gamma> [ 2.2 ] </gamma></camera_model></camera><light>

@@ -9,7 +9,7 @@ from scipy.io import loadmat, savemat
 from scipy.spatial.transform import Rotation
 
 from simtest import BrownConrady, Camera, InputError, KannalaBrandt, Scaramuzza, ViewMask, load_camera, save_camera
-from simtest.spec.camera_formats import read_poses, recognise
+from simtest.spec.camera_formats.files import read_poses, recognise
 
 RNG = np.random.default_rng(11)
 RAYS = np.concatenate([RNG.uniform(-0.45, 0.45, (2, 300)), RNG.uniform(0.8, 1.0, (1, 300))]).T

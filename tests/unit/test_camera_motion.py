@@ -14,8 +14,8 @@ from simtest.estimators import load_estimators
 from simtest.rendering import Session
 from simtest.simulation.frame_files import write_frame
 from simtest.spec import Experiment, load_camera, scene_from_dict
-from simtest.spec.dataset_recipe import Dataset
-from simtest.spec.motion import Motion
+from simtest.spec.camera import Motion
+from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
 from simtest.validation.realisation import Realiser
@@ -273,7 +273,7 @@ def test_an_experiment_sweeps_a_velocity():
     for made in (still, moved):
         (truth,) = made.truths
         assert truth.bp_px == pytest.approx(still.truths[0].bp_px, abs=1e-9)
-        assert made.rows[0].swept["camera.motion.velocity_mm_s.1"] in (0.0, 25.0)
+        assert made.rows[0]["camera.motion.velocity_mm_s.1"] in (0.0, 25.0)
 
 
 @pytest.mark.parametrize(

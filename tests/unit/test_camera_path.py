@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces import make_surface
-from simtest.surfaces.centreline import camera_path
 from simtest.surfaces.model import RayHits, Shape, SurfaceModel, TriangleMesh
-from simtest.surfaces.poses import MIN_CLEARANCE_MM
+from simtest.surfaces.poses import MIN_CLEARANCE_MM, camera_path
 from tests.marked import marked
 
 
@@ -108,3 +107,36 @@ def test_a_camera_on_the_path_looks_along_it_and_one_that_faces_the_wall_across_
 def test_an_organ_has_no_path():
     with pytest.raises(InputError, match=r"surface\.view = wall: liver is an organ"):
         make_surface(AnatomySurface(path="liver", view="wall"))
+
+
+POSES = {
+    ("colon", 0, "auto"): (
+        [0.1846280279399984, 0.9633884366154164, 0.19440990585536283],
+        [-2.594677227332398, -7.041270607678945, 37.89825294258695],
+    ),
+    ("colon", 2, "auto"): (
+        [-0.9229785514907074, 0.25327899415210453, -0.2897591147995414],
+        [17.370206960890435, 5.033494159174883, 41.030369782436786],
+    ),
+    ("liver", 0, "auto"): (
+        [-0.31880079764743613, 0.4472164868862102, -0.8356814376761725],
+        [-25.516140925727846, -72.43875130837469, 86.61693288966805],
+    ),
+    ("colon", 0, "off_axis"): (
+        [0.5257937454975778, -0.15952282633756482, 0.8355198412203648],
+        [36.2531652072239, 3.7643791141754077, 61.72211139636033],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", POSES, ids=str)
+def test_viewpoints_stay_where_they_are(case):
+    """A case is found again by the number of its viewpoint, from one release to the next."""
+    path, viewpoint, view = case
+    spec = {"path": path, "viewpoint": viewpoint, "view": view}
+    if view != "auto":
+        spec |= {"path_share": 0.7, "around_deg": 30.0}
+    pose = make_surface(AnatomySurface(**spec)).model_from_camera
+    forward, site = POSES[case]
+    np.testing.assert_allclose(pose[:3, 2], forward, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(pose[:3, 3], site, rtol=0, atol=1e-7)

@@ -8,7 +8,8 @@ from scipy import ndimage, stats
 
 from simtest.errors import InputError
 from simtest.simulation import camera_chain, coding, labelled_frame, mosaic, shot_noise, video_processor
-from simtest.spec.processing import (
+from simtest.spec.scene import scene_from_dict
+from simtest.spec.sensor import (
     Box,
     Caption,
     H264Coding,
@@ -16,10 +17,9 @@ from simtest.spec.processing import (
     Mosaic,
     Overlay,
     Scaling,
+    Sensor,
     Sharpening,
 )
-from simtest.spec.scene import scene_from_dict
-from simtest.spec.sensor import Sensor
 
 PATTERNS = ("rggb", "bggr", "grbg", "gbrg")
 

@@ -9,8 +9,7 @@ from scipy import ndimage, stats
 from simtest.calibration import Response
 from simtest.geometry import Camera
 from simtest.simulation import camera_chain, shot_noise, video_processor
-from simtest.spec.processing import Scaling
-from simtest.spec.sensor import Sensor
+from simtest.spec.sensor import Scaling, Sensor
 
 # Point spread ---------------------------------------------------------------------------------------------------------
 

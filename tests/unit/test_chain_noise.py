@@ -8,8 +8,7 @@ from simtest.simulation.chain_noise import noise_at
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import examine
 from simtest.spec import load_scene
-from simtest.spec.sensor import Sensor
-from simtest.spec.sensor_presets import PRESETS
+from simtest.spec.sensor import PRESETS, Sensor
 
 pytestmark = pytest.mark.render
 

@@ -1,135 +1,209 @@
-"""Charts: described once, drawn alike in pages and in files; and the bundle that draws them in pages."""
+"""Charts: records become specifications that Vega takes, whose rows are the records' numbers; and Vega itself."""
 
 import base64
-import hashlib
 import io
 import json
-import re
 import zlib
 
 import numpy as np
 import pytest
+import vl_convert
 from PIL import Image
 
-from simtest.pages import chart_png, chart_web, pixels
-from simtest.pages.axes import Axis, log_range
-from simtest.pages.chart import NOTHING, Bars, Chart, Mark, Panel, label_keys
-from simtest.pages.style import rgb, symbols
+from simtest.pages import charts, pixels
+from simtest.pages.charts import NOTHING, Axis, Bars, Chart, Mark, Panel, Picture, label_keys, log_range, png, spec
+from simtest.pages.style import SHAPES, rgb
 
 RED, BLUE = "#D03030", "#0072B2"
-DOT = symbols(["a"])["a"]
 
 
-def chart(*marks, **more):
-    return Chart("key", "Title", (Panel(Axis("x"), Axis("y", "log"), marks),), **more)
+def chart(*marks, x=None, y=None, **more):
+    return Chart("key", "Title", (Panel(x or Axis("x"), y or Axis("y", "log"), marks),), **more)
 
 
-def inked(picture, colour):
-    return int((np.abs(picture.astype(int) - rgb(colour)).max(axis=-1) < 8).sum())
-
-
-def drawn(*charts):
-    return chart_png.draw(charts)
-
-
-def test_the_bundle_is_the_published_one():
-    packed = chart_web.BUNDLE.read_bytes()
-    source = zlib.decompress(packed)
-    told = chart_web.BUNDLE.with_name("README.md").read_text(encoding="utf-8")
-    assert hashlib.sha256(packed).hexdigest() in told
-    assert hashlib.sha256(source).hexdigest() in told
-    (version,) = set(re.findall(r"plotly\.js-gl3d-dist-min` ([\d.]+)", told))
-    assert f"plotly.js (gl3d - minified) v{version}".encode() in source[:200]
-    assert (
-        b"Permission is hereby granted, free of charge"
-        in chart_web.BUNDLE.with_name("plotly-gl3d.LICENSE").read_bytes()
-    )
-    assert base64.b64decode(chart_web.packed_plotly()) == packed
+def rows_of(made, kind, panel=0):
+    """The rows of the layers of one kind of a chart's panel."""
+    whole = spec(made)
+    view = whole["vconcat"][panel] if "vconcat" in whole else whole
+    return [row for layer in view["layer"] if layer["mark"]["type"] == kind for row in layer["data"]["values"]]
 
 
 def test_a_name_has_one_entry_of_its_first_line_or_symbol():
     bars = Mark([1.0], [1.0], RED, "a", bars=Bars(np.array([0.5]), np.array([2.0])))
     law = Mark([1, 2], [1, 2], RED, "a", listed=False, line="dash")
-    points = Mark([1, 2], [1, 2], RED, "a", symbol=DOT)
+    points = Mark([1, 2], [1, 2], RED, "a", symbol="●")
     made = chart(
         bars, law, points, Mark([1, 2], [1, 2], BLUE, "b", line="solid"), Mark(NOTHING, NOTHING, RED, "c", line="dash")
     )
     assert [mark.name for mark in made.entries] == ["a", "b", "c"]
     assert made.entries[0] is points
-    traces = chart_web.figure(made)["data"]
-    assert [trace["showlegend"] for trace in traces] == [False, False, True, True, True]
-    assert [trace["legendgroup"] for trace in traces] == ["a", "a", "a", "b", "c"]
+    # All rows of a name are hidden together.
+    assert {row["name"] for kind in ("rule", "line", "point") for row in rows_of(made, kind)} == {"a", "b"}
+    assert all(layer["transform"] == [{"filter": "indexof(off, datum.name) < 0"}] for layer in spec(made)["layer"])
 
 
-def test_both_media_leave_out_what_a_log_axis_cannot_show():
-    made = chart(Mark([1, 2, 3], [0.0, 1.0, 10.0], RED, symbol=DOT, size=12, line="solid", width=3))
-    assert chart_web.figure(made)["data"][0]["y"] == [None, 1.0, 10.0]
-    low, high = chart_web.figure(made)["layout"]["yaxis"]["range"]
-    assert low < 0
-    assert high > 1
-    picture, _ = drawn(made)
-    assert inked(picture, RED) > 200
+def test_the_rows_are_the_marks():
+    bars = Bars(np.array([0.0, 0.5]), np.array([2.0, 3.0]), 1.2)
+    made = chart(
+        Mark([1, 2], [1.0, 2.0], RED, "a", symbol="▲", size=8, bars=bars, hover=["one\nmore", "two"]),
+        Mark([1, 2], [1.0, 2.0], BLUE, words=["4", "5"], bold=True),
+        Mark([1, 1, 3, 3], [1, 2, 2, 1], BLUE, fill=True, hover="tile"),
+    )
+    low = spec(made)["layer"][0]["encoding"]["y"]["scale"]["domain"][0]
+    # A bar that leaves a logarithmic axis is drawn to its edge, without a cap there.
+    assert [(row["low"], row["high"]) for row in rows_of(made, "rule")] == [
+        (pytest.approx(low, rel=1e-4), 2.0), (0.5, 3.0)
+    ]  # fmt: skip
+    caps = [row["y"] for row in rows_of(made, "point") if row["shape"] == SHAPES["–"]]
+    assert caps == [2.0, 0.5, 3.0]
+    points = [row for row in rows_of(made, "point") if row["shape"] == "triangle-up"]
+    assert [(row["x"], row["y"], row["told"], row["size"]) for row in points] == [
+        (1, 1, "one\nmore", 64), (2, 2, "two", 64)
+    ]  # fmt: skip
+    assert [(row["text"], row["bold"]) for row in rows_of(made, "text")] == [("4", True), ("5", True)]
+    (tile,) = rows_of(made, "rect")
+    assert (tile["x"], tile["x2"], tile["y"], tile["y2"], tile["told"]) == (1, 3, 1, 2, "tile")
 
 
-def test_texts_are_escaped_in_pages_and_plain_in_files():
-    evil = "<b>$x_1$ & $y"
-    made = chart(Mark([1], [1], RED, evil, symbol=DOT, words=[evil], hover=[f"{evil}\nline"]))
-    text = json.dumps(chart_web.figure(made))
-    assert "<b>$" not in text.replace("<b>&lt;", "")
-    assert "&lt;b&gt;$x_1$ &amp; $y" in text
-    drawn(made)
+def test_a_line_has_gaps_where_points_are_missing_or_no_axis_shows_them():
+    made = chart(Mark([1, 2, np.nan, 4, 5, 6], [1.0, 2.0, 3.0, 0.0, 5.0, 6.0], RED, line="dash", width=2))
+    pieces = {}
+    for row in rows_of(made, "line"):
+        pieces.setdefault(row["piece"], []).append(row["x"])
+    assert list(pieces.values()) == [[1, 2], [5, 6]]
+    assert {row["dash"] for row in rows_of(made, "line")} == {"dash"}
+    # Two lines are never joined.
+    two = chart(Mark([1, 2], [1, 1], RED, line="solid"), Mark([3, 4], [1, 1], RED, line="solid"))
+    assert len({row["piece"] for row in rows_of(two, "line")}) == 2
 
 
 def test_a_hover_may_hold_the_points_coordinates():
-    axis = Axis("x", "stretched")
-    mark = Mark([-1.0, 1.0], [1.0, 2.0], RED, line="dash", hover="law {x}: {y}")
-    (trace,) = chart_web.figure(Chart("k", "t", (Panel(axis, Axis("y"), (mark,)),)))["data"]
-    assert trace["hovertemplate"] == "law %{customdata:.3g}: %{y:.3g}<extra></extra>"
-    assert trace["customdata"] == [-1.0, 1.0]
-    np.testing.assert_allclose(trace["x"], axis.to_axis([-1.0, 1.0]), rtol=1e-4)
+    made = chart(Mark([-1.0, 1.0], [1.0, 2.0], RED, line="dash", hover="law {x}: {y}"), x=Axis("x", "stretched"))
+    told = rows_of(made, "point")
+    assert [row["told"] for row in told] == ["law -1: 1", "law 1: 2"]
+    # Points that are only told of are not seen.
+    assert [row["opacity"] for row in told] == [0.0, 0.0]
+    assert spec(made)["layer"][0]["encoding"]["x"]["scale"]["type"] == "symlog"
+
+
+def test_a_mark_without_a_text_tells_nothing():
+    made = chart(Mark([1, 2], [1.0, 2.0], RED, symbol="●"), Mark([1, 2], [1.0, 2.0], BLUE, hover=["one", "two"]))
+    assert [row["told"] for row in rows_of(made, "point")] == ["", "", "one", "two"]
+    svg = vl_convert.vega_to_svg(vl_convert.vegalite_to_vega(spec(made)))
+    assert "null" not in svg
 
 
 def test_panels_share_x_and_the_height():
     lower = Panel(
-        Axis("x"), Axis("failures", limits=(0, 1), named=()), (Mark([1, 2], [0.5, 0.5], RED, words="ab"),), 0.25
+        Axis("x"), Axis("failures", limits=(0, 1), named=()), (Mark([1, 9], [0.5, 0.5], RED, words="ab"),), 0.25
     )
     upper = Panel(Axis("x"), Axis("y"), (Mark([1, 2], [1, 2], BLUE, line="solid"),))
-    made = Chart("key", "Title", (upper, lower))
-    layout = chart_web.figure(made)["layout"]
-    assert layout["xaxis"]["anchor"] == "y2"
-    assert layout["yaxis"]["domain"][0] > layout["yaxis2"]["domain"][1]
-    assert layout["yaxis2"]["tickvals"] == []
-    picture, _ = drawn(made)
-    rows = np.flatnonzero((np.abs(picture.astype(int) - rgb(RED)).max(axis=-1) < 60).any(axis=1))
-    assert rows.min() > picture.shape[0] / 2
+    above, below = spec(Chart("key", "Title", (upper, lower)))["vconcat"]
+    x_above, x_below = (view["layer"][0]["encoding"]["x"] for view in (above, below))
+    assert x_above["scale"] == x_below["scale"]
+    assert (x_above["axis"]["labels"], x_below["axis"]["labels"]) == (False, True)
+    assert above["height"] == pytest.approx(4 * below["height"], abs=2)
+    assert below["layer"][0]["encoding"]["y"]["axis"]["values"] == []
 
 
-def test_several_charts_are_one_picture_and_its_parts():
-    made = [
-        chart(Mark([1, 2], [1, 2], colour, f"n{i}", line="solid"), height=300)
-        for i, colour in enumerate([RED, BLUE] * 2)
-    ]
-    whole, parts = drawn(*made)
-    assert len(parts) == 4
-    assert whole.shape[0] == pytest.approx(2 * parts[0].shape[0], abs=2)
-    assert whole.shape[1] == pytest.approx(3 * parts[0].shape[1], abs=3)
-    for part, colour, other in zip(parts, [RED, BLUE] * 2, [BLUE, RED] * 2, strict=True):
-        assert inked(part, colour) > 100
-        assert inked(part, other) == 0
+def test_axes_of_one_scale_keep_it():
+    axes = Axis("x", limits=(0.0, 4.0)), Axis("y", limits=(2.0, 0.0))
+    mark = Mark([0, 3], [0, 1], RED, line="solid", head=True)
+    picture = Picture(np.full((2, 4), 0.5, np.float32), (0.0, 4.0, 2.0, 0.0))
+    made = spec(Chart("key", "Title", (Panel(*axes, (mark,), equal=True, picture=picture),)))
+    assert made["width"] == 2 * made["height"]
+    assert made["usermeta"] == {"ratio": 2, "names": 0}
+    assert spec(chart())["usermeta"] == {"ratio": None, "names": 0}
+    image, *_ = made["layer"]
+    assert image["data"]["values"][0]["url"].startswith("data:image/jpeg;base64,")
+    (tip,) = (
+        row for layer in made["layer"] for row in layer["data"]["values"] if row.get("shape", "").startswith("M0,0")
+    )
+    assert (tip["x"], tip["y"]) == (3, 1)
 
 
 def test_axes_end_beyond_their_values_and_name_powers():
     axis = Axis("y", "log")
     low, high = axis.ends([[1e-7, 0.0, 2.0, np.nan]])
     assert low < 1e-7 < 2 < high
-    texts = [text for _, text in axis.ticks(low, high)]
-    assert {"10⁻⁷", "0.001", "1"} <= set(texts)
-    assert [text for _, text in axis.ticks(0.7, 30.0)] == ["1", "2", "5", "10", "20"]
-    assert axis.minor_ticks(0.7, 3.0) == pytest.approx([0.7, 0.8, 0.9, 2, 3])
+    assert axis.channel("y", (low, high))["axis"]["values"][:2] == [1e-7, 1e-6]
+    assert axis.channel("y", (0.7, 30.0))["axis"]["values"] == [1, 2, 5, 10, 20]
+    named = Axis("", named=((0.0, 'a "b"'), (1.0, "two,\nlines"))).channel("x", (0, 1))["axis"]
+    assert named["labelExpr"] == '[["a \\"b\\""], ["two,", "lines"]][indexof([0.0, 1.0], datum.value)]'
     assert Axis("y").ends([[]]) == (0.0, 1.0)
     assert log_range([[np.nan, -1.0]]) == (0.1, 100.0)
     assert label_keys(["one"]) == ()
     assert [key.name for key in label_keys(["one", "two", "one"])] == ["one", "two"]
+
+
+def test_vega_takes_every_kind_of_mark_as_it_is():
+    """A wrong name or value would be dropped with a warning, or refused."""
+    bars = Bars(np.array([0.5, 0.5]), np.array([2.0, 2.0]), 4.0)
+    marks = [Mark([1, 2], [1, 2], RED, f"n{i}", symbol=s, words=["a", "b"]) for i, s in enumerate(SHAPES)]
+    marks += [Mark([1, 2], [1, 2], RED, line=line, bars=bars) for line in ("solid", "dash", "dashdot", "dot")]
+    for x in (Axis("x"), Axis("x", "log"), Axis("x", "stretched"), Axis("x", named=((1.0, "one"),))):
+        made = spec(chart(*marks, Mark([1, 2, 2], [1, 1, 2], BLUE, fill=True), x=x))
+        compiled = json.dumps(vl_convert.vegalite_to_vega(made))
+        assert compiled.count('"type": "symbol"') == 1
+        assert all(
+            kind in compiled for kind in ('"type": "rect"', '"type": "rule"', '"type": "text"', '"type": "line"')
+        )
+
+
+def test_names_are_plain_text_for_vega():
+    evil = "</script><b>$x_1$ & $y"
+    made = chart(Mark([1], [1], RED, evil, symbol="●", words=[evil], hover=[f"{evil}\nline"]))
+    (row,) = rows_of(made, "text")
+    assert row["text"] == evil
+    assert "<" not in charts.embedded([made])["figures"]
+
+
+def test_files_are_drawn_and_are_the_same_every_time():
+    made = [chart(Mark([1, 2, 3], [1, 9, 1], c, f"n{i}", line="solid"), height=300) for i, c in enumerate([RED, BLUE])]
+    content = png(made)
+    assert png(made) == content
+    with Image.open(io.BytesIO(content)) as drawn:
+        picture = np.asarray(drawn.convert("RGB")).astype(int)
+    ink = {
+        colour: np.nonzero((np.abs(picture - rgb(colour)).max(axis=-1) < 30).any(axis=0))[0] for colour in (RED, BLUE)
+    }
+    # Beside each other.
+    assert ink[RED].size > 100
+    assert ink[BLUE].size > 100
+    assert ink[RED].max() < ink[BLUE].min()
+
+
+def test_vega_is_made_once_and_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(charts, "user_cache", lambda: tmp_path / "cache")
+    monkeypatch.setattr(charts, "_converter", lambda: FakeConverter)
+    charts.packed_vega.cache_clear()
+    first = charts.packed_vega()
+    assert zlib.decompress(base64.b64decode(first)) == b"script 1"
+    charts.packed_vega.cache_clear()
+    assert charts.packed_vega() == first
+    # A damaged file is made again.
+    (kept,) = (tmp_path / "cache").iterdir()
+    kept.write_bytes(kept.read_bytes()[:-3])
+    charts.packed_vega.cache_clear()
+    assert zlib.decompress(base64.b64decode(charts.packed_vega())) == b"script 2"
+    # A cache that cannot be written costs time alone.
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr(charts, "user_cache", lambda: tmp_path / "file" / "cache")
+    charts.packed_vega.cache_clear()
+    assert zlib.decompress(base64.b64decode(charts.packed_vega())) == b"script 3"
+    charts.packed_vega.cache_clear()
+
+
+class FakeConverter:
+    """Counts how often Vega is made."""
+
+    made = 0
+
+    @classmethod
+    def javascript_bundle(cls, snippet):
+        assert "vegaEmbed" in snippet
+        cls.made += 1
+        return f"script {cls.made}"
 
 
 def test_frames_are_drawn_in_their_own_pixels():

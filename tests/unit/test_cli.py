@@ -36,7 +36,7 @@ os.replace = and_stop
 """
 """A process that is stopped by Ctrl-C once its first case is kept, however fast it is."""
 
-SLOW_MODULES = {"mitsuba", "drjit", "vtk", "vtkmodules", "torch", "pyvista", "polars", "matplotlib", "plotly"}
+SLOW_MODULES = {"mitsuba", "drjit", "vtk", "vtkmodules", "torch", "pyvista", "polars", "matplotlib", "vl_convert"}
 SMALL = {"camera.width": 96, "camera.height": 96, "camera.fx": 96.0, "camera.fy": 96.0}
 SET_SMALL = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
 
@@ -327,10 +327,13 @@ def test_render_gives_the_same_bytes_twice(frames):
 def test_an_out_that_cannot_be_written(here, tmp_path):
     plain = tmp_path / "plain"
     plain.write_text("mine")
-    for out, why in ((plain, "is a file; must be a folder"), (plain / "below", "cannot be written (Not a directory)")):
+    for out, said in (
+        (plain, f"--out {plain}: is a file; must be a folder"),
+        (plain / "below", f"{plain / 'below'}: Not a directory"),
+    ):
         code, output, errors = here("render", "plane", *SET_SMALL, "--out", out)
         assert (code, output, len(errors)) == (2, "", 1)
-        assert errors[0] == f"simtest: --out {out}: {why}"
+        assert errors[0] == f"simtest: {said}"
     assert [path.name for path in tmp_path.iterdir()] == ["plain"]
     assert plain.read_text() == "mine"
 
@@ -402,14 +405,14 @@ def test_validate_refuses_what_it_has_not_made(here, tmp_path):
     plain.write_text("mine")
     other.mkdir()
     (other / "notes.txt").write_text("mine")
-    for out, reason in (
-        (plain, "is a file; must be a folder"),
-        (plain / "below", "cannot be written (Not a directory)"),
-        (other, "holds notes.txt, which is no part of a run; must be empty or hold a run"),
+    for out, said in (
+        (plain, f"--out {plain}: is a file; must be a folder"),
+        (plain / "below", f"{plain / 'below'}: Not a directory"),
+        (other, f"--out {other}: holds notes.txt, which is no part of a run; must be empty or hold a run"),
     ):
         code, output, errors = here("validate", "overview", "--out", out)
         assert (code, output) == (2, "")
-        assert without_bar(errors) == [f"simtest: --out {out}: {reason}"]
+        assert without_bar(errors) == [f"simtest: {said}"]
     assert [path.name for path in other.iterdir()] == ["notes.txt"]
 
 
@@ -457,8 +460,8 @@ def test_the_same_command_goes_on_and_gives_the_same_results(here, monkeypatch, 
 
     monkeypatch.setattr(runner, "run_experiment", spy)
     # The report has its own tests and takes longer than the run.
-    monkeypatch.setattr(simtest.report, "write_report", lambda folder, progress=None: folder / "index.html")
-    monkeypatch.setattr("simtest.cli.guide_table.print_guide", lambda run: None)
+    monkeypatch.setattr(simtest.report, "write_report", lambda folder, *_: folder / "index.html")
+    monkeypatch.setattr("simtest.cli.runs.print_guide", lambda run: None)
     monkeypatch.chdir(experiment.parent)
     # What a killed run was writing is no obstacle.
     (out / ".results.99999.part.parquet").write_bytes(b"half")

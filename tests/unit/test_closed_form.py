@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from simtest.rendering import Session
-from simtest.rendering.materials import bsdf_dict
+from simtest.rendering.reflectances import bsdf_dict
 from simtest.spec import scene_from_dict
 from tests.marked import marked
 

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Calibration
-from simtest.calibration.frame import Frame
-from simtest.calibration.noise_estimate import COLOURED, estimate_coarse_noise, estimate_noise
-from simtest.calibration.noise_model import NoiseModel
+from simtest.calibration.frame import COLOURED, Frame, estimate_coarse_noise, estimate_noise
+from simtest.calibration.photometry import NoiseModel
 from simtest.geometry import Camera, smooth
 
 SIGMA = 0.01

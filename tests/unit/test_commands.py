@@ -4,27 +4,31 @@ import json
 import subprocess
 import sys
 import time
+import tomllib
 import types
 import warnings
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from simtest.cli import commands, manners, printing, progress
-from simtest.cli.listing import HEADINGS, names_of
-from simtest.cli.options import gather_settings
-from simtest.cli.validate import validate
+import simtest
+from simtest.cli import commands, common, main, progress
+from simtest.cli.common import gather_settings
+from simtest.cli.runs import validate
+from simtest.cli.scenes import HEADINGS, names_of
 from simtest.dataset import verify as verifying
 from simtest.errors import InputError
 from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.registry import load_estimators
-from simtest.rendering import backend_check
+from simtest.rendering import backend
 from simtest.rendering.backend import BackendReport
-from simtest.runtime.entry_points import OWN
-from simtest.runtime.resources import suggestion
+from simtest.runtime.boundary import suggestion
+from simtest.runtime.resources import OWN
 from simtest.spec import load_dataset, load_experiment, load_profile, load_scene
 
+ROOT = Path(__file__).resolve().parents[2]
 MAIN = "from simtest.cli.main import main; main()"
 
 
@@ -32,8 +36,8 @@ MAIN = "from simtest.cli.main import main; main()"
 def ordinary(monkeypatch):
     """Leave no flags and no handler of warnings behind."""
     monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
-    monkeypatch.setattr(manners.MANNERS, "quiet", False)
-    monkeypatch.setattr(manners.MANNERS, "verbose", False)
+    monkeypatch.setattr(main.MANNERS, "quiet", False)
+    monkeypatch.setattr(main.MANNERS, "verbose", False)
 
 
 # Lists and completion --------------------------------------------------------------------------------------------
@@ -49,12 +53,14 @@ def test_the_list_names_what_commands_take(here):
         for name in listed[kind]:
             if name != "published":  # a scene of validate alone
                 load(name)
-    assert list(listed["trainings"]) == ["dense_normals", "highlight_instances", "spot_normals"]
     assert list(listed["estimators"]) == ESTIMATORS.names()
     for name in listed["sensors"]:
         load_scene("plane", {"sensor.preset": name})
     for name in listed["rigs"]:
         load_scene("plane", {"rig.preset": name})
+    # An editable installation may be older than the checkout, and register detectors that are gone.
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
+    listed["detectors"] = {name: listed["detectors"][name] for name in declared["simtest.detectors"]}
     # A line about each, which says more than the name.
     assert all(len(about) > 5 and "\n" not in about for names in listed.values() for about in names.values())
 
@@ -65,8 +71,8 @@ def test_one_kind_is_listed_alone(here):
     assert code == 0
     assert [line.split()[0] for line in lines] == ["full", "quick"]
     assert here("list", "profile")[2] == [
-        'simtest: Invalid value "profile" for KIND. Choose from: "scenes", "experiments", "datasets", "trainings", '
-        '"profiles", "estimators", "detectors", "sensors", "rigs". Did you mean "profiles"?'
+        'simtest: Invalid value "profile" for KIND. Choose from: "scenes", "experiments", "datasets", "profiles", '
+        '"estimators", "detectors", "sensors", "rigs". Did you mean "profiles"?'
     ]
 
 
@@ -97,7 +103,7 @@ def test_several_estimators_in_one_word_are_told_apart():
 
 def test_estimators_are_described_without_being_imported():
     code = (
-        "import sys; from simtest.cli.listing import names_of; print(names_of('estimators')['inverse_rendering'])\n"
+        "import sys; from simtest.cli.scenes import names_of; print(names_of('estimators')['inverse_rendering'])\n"
         "assert not {'numpy', 'scipy', 'mitsuba', 'cv2'} & set(sys.modules), sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
@@ -113,7 +119,7 @@ def test_shells_get_a_script_that_names_the_commands(here, shell):
 
 
 def test_names_and_files_are_completed(tmp_path, monkeypatch):
-    from simtest.cli.options import named
+    from simtest.cli.common import named
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.toml").touch()
@@ -199,7 +205,7 @@ def test_thousands_of_settings_take_linear_time(here):
 
 def test_doctor_prints_one_document(here, monkeypatch):
     report = BackendReport("llvm_ad_mono", None, [], {"mitsuba": "3"}, "broken")
-    monkeypatch.setattr(backend_check, "examine", lambda _: report)
+    monkeypatch.setattr(backend, "examine", lambda _: report)
     code, output, _ = here("doctor", "--json")
     assert code == 1
     assert json.loads(output)["problem"] == "broken"
@@ -229,7 +235,7 @@ def test_json_holds_neither_nan_nor_paths_that_break_it(capsys):
 
     import numpy as np
 
-    printing.print_json({"x": float("nan"), "y": np.array([1.0, np.inf]), "file": Path("a/b")})
+    common.print_json({"x": float("nan"), "y": np.array([1.0, np.inf]), "file": Path("a/b")})
     assert json.loads(capsys.readouterr().out) == {"x": None, "y": [1.0, None], "file": "a/b"}
 
 
@@ -239,7 +245,7 @@ def test_reports_are_json_on_request():
                "doctor", "list", "render", "views", "view", "export", "reconstruct", "realism", "fit", "validate",
                "nightly", "nightly accept", "dataset", "dataset verify", "dataset sample", "dataset preview",
                "dataset export", "mesh check", "mesh colon", "mesh liver", "bench run", "bench table",
-               "bench cases", "bench frames", "camera show", "camera convert", "train"}  # fmt: skip
+               "bench cases", "bench frames", "camera show", "camera convert"}  # fmt: skip
     without = {"schema", "completion", "mesh"}  # a schema is JSON, a script is none, mesh alone does nothing
     for name in reports:
         found, *_ = commands.APP.parse_commands(name.split())[1][-1:]
@@ -247,14 +253,25 @@ def test_reports_are_json_on_request():
     assert {name.split()[0] for name in reports} | without == set(commands.COMMANDS)
 
 
+def test_the_package_runs_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "simtest", "--version"], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, simtest.__version__, "")
+
+
+def test_a_command_that_is_gone_says_what_takes_its_place(here):
+    assert not set(commands.GONE) & set(commands.COMMANDS)
+    for name, instead in commands.GONE.items():
+        assert here(name, "--out", "x") == (2, "", [f"simtest: {name}: is gone; {instead}"])
+
+
 # How much is said ------------------------------------------------------------------------------------------------
 
 
 def test_flags_stand_anywhere_but_behind_two_dashes():
-    assert manners.take_flags(["--quiet", "render", "x", "--traceback"]) == (["render", "x"], True)
-    assert (manners.MANNERS.quiet, manners.MANNERS.verbose) == (True, False)
-    assert manners.take_flags(["render", "--", "--verbose"]) == (["render", "--", "--verbose"], False)
-    assert (manners.MANNERS.quiet, manners.MANNERS.verbose) == (False, False)
+    assert main.take_flags(["--quiet", "render", "x", "--traceback"]) == (["render", "x"], True)
+    assert (main.MANNERS.quiet, main.MANNERS.verbose) == (True, False)
+    assert main.take_flags(["render", "--", "--verbose"]) == (["render", "--", "--verbose"], False)
+    assert (main.MANNERS.quiet, main.MANNERS.verbose) == (False, False)
 
 
 def test_quiet_and_verbose_exclude_each_other(here):
@@ -270,7 +287,7 @@ def warned(*_):
 
 @pytest.mark.parametrize(("flags", "lines"), [((), ["simtest: warning: look here"]), (("--quiet",), [])])
 def test_quiet_leaves_out_warnings(here, monkeypatch, flags, lines):
-    monkeypatch.setattr(backend_check, "examine", warned)
+    monkeypatch.setattr(backend, "examine", warned)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         code, output, errors = here("doctor", *flags)
@@ -294,32 +311,32 @@ def test_a_log_gets_plain_lines_now_and_then(capsys, monkeypatch):
     assert steps(capsys) == ["simtest: 2/3 step 2 (16 s)"]
     monkeypatch.undo()
     # ... and each step only if asked for.
-    monkeypatch.setattr(manners.MANNERS, "verbose", True)
+    monkeypatch.setattr(main.MANNERS, "verbose", True)
     assert steps(capsys) == [f"simtest: {i}/3 {'the end' if i == 3 else f'step {i}'} (0 s)" for i in range(4)]
 
 
 def test_quiet_shows_no_progress_at_a_terminal_either(capsys, monkeypatch):
     monkeypatch.setattr(progress, "at_terminal", lambda: True)
-    monkeypatch.setattr(manners.MANNERS, "quiet", True)
+    monkeypatch.setattr(main.MANNERS, "quiet", True)
     assert steps(capsys) == []
 
 
 def test_long_tables_are_cut_unless_asked_for(capsys, monkeypatch):
     rows = [[f"row[{i}]", "x"] for i in range(108)]
-    printing.print_table(("name", "value"), rows, rest="results.csv holds them")
+    common.print_table(("name", "value"), rows, rest="results.csv holds them")
     output = capsys.readouterr().out
     # What looks like markup is text.
     assert "row[19]" in output
     assert "row[20]" not in output
     assert output.splitlines()[-1] == "and 88 more; --verbose prints them all, results.csv holds them"
-    monkeypatch.setattr(manners.MANNERS, "verbose", True)
-    printing.print_table(("name", "value"), rows)
+    monkeypatch.setattr(main.MANNERS, "verbose", True)
+    common.print_table(("name", "value"), rows)
     assert "row[107]" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("number", "text"), [(0, "0 frames"), (1, "1 frame"), (2, "2 frames")])
 def test_nouns_agree_with_their_number(number, text):
-    assert printing.counted(number, "frame") == text
+    assert common.counted(number, "frame") == text
 
 
 def spots(count):
@@ -332,7 +349,7 @@ def spots(count):
 
 
 def test_many_specularities_become_a_summary(capsys, monkeypatch):
-    from simtest.cli.reconstruct import _print_tables
+    from simtest.cli.pictures import _print_tables
 
     def printed(count):
         _print_tables(SimpleNamespace(specularities=spots(count), reference=None))
@@ -344,7 +361,7 @@ def test_many_specularities_become_a_summary(capsys, monkeypatch):
         ["isolated", "none", "72"], ["cluster", "none", "36"],
     ]  # fmt: skip
     assert "--verbose prints a row for each of the 108" in summary
-    monkeypatch.setattr(manners.MANNERS, "verbose", True)
+    monkeypatch.setattr(main.MANNERS, "verbose", True)
     assert printed(108).count("isolated") == 72
 
 

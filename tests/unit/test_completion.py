@@ -6,7 +6,7 @@ import pytest
 from simtest.errors import InputError
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt
 from simtest.geometry.vectors import tangent_basis
-from simtest.reconstruction.completion import LEAST_SLOPE_SD, CoarseError, complete, log_distance_gradients
+from studies.depth_completion import LEAST_SLOPE_SD, CoarseError, complete, log_distance_gradients
 
 CENTRE, RADIUS = np.array([3.0, -2.0, 40.0]), 25.0
 LENSES = {"pinhole": None, "Brown-Conrady": BrownConrady(-0.15, 0.03), "fisheye": KannalaBrandt(0.02, -0.01, 0.0, 0.0)}

@@ -31,11 +31,10 @@ from simtest.dataset.shard_writer import _write_shards, write_dataset
 from simtest.dataset.verify import repair_files, verify
 from simtest.errors import InputError, SimtestError
 from simtest.pages.markdown import escaped, yaml_string
-from simtest.runtime.engines import make_engine
-from simtest.runtime.engines.cluster import cores_per_task
+from simtest.runtime.processes import cores_per_task, make_engine
 from simtest.simulation.frame_files import write_frame
 from simtest.spec import load_dataset, load_scene, scene_from_dict
-from simtest.spec.dataset_recipe import Dataset, Distribution, Splits
+from simtest.spec.recipes import Dataset, Distribution, Splits
 from simtest.spec.spec_model import validate
 from tests.marked import marked
 from tests.unit.engine_tasks import breaks, dies_once, fails, meets_a_full_disk, square
@@ -515,7 +514,7 @@ def test_full_disk_keeps_what_is_written(made, tmp_path, monkeypatch):
         write_sample(file, key, members)
 
     monkeypatch.setattr("simtest.dataset.shard_writer.write_sample", full)
-    said = r"\(No space left on device; .* are free .*\); what is written stays valid"
+    said = r"full: No space left on device; .* are free .*; what is written stays valid"
     with pytest.raises(SimtestError, match=said) as error:
         write_dataset(tiny(**SIX), tmp_path / "full", make_engine())
     assert error.type is SimtestError

@@ -13,13 +13,12 @@ from simtest.dataset.preview import write_preview
 from simtest.dataset.shard_writer import write_dataset
 from simtest.dataset.verify import check_sample, verify
 from simtest.errors import InputError
-from simtest.runtime.engines import make_engine
-from simtest.spec.dataset_recipe import Dataset
-from simtest.spec.experiment import Experiment
+from simtest.runtime.processes import make_engine
+from simtest.spec.recipes import Dataset, Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand, swept_example
+from simtest.validation.columns import table
 from simtest.validation.realisation import Realiser
-from simtest.validation.results_table import table
 from simtest.validation.statistics import figures
 
 pytestmark = pytest.mark.render

@@ -18,8 +18,8 @@ from simtest.dataset.shard import read_member, samples
 from simtest.dataset.shard_writer import write_dataset
 from simtest.dataset.verify import check_sample, verify
 from simtest.errors import InputError
-from simtest.runtime.engines import make_engine
-from simtest.spec.dataset_recipe import Dataset
+from simtest.runtime.processes import make_engine
+from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
 
 pytestmark = pytest.mark.render

@@ -5,10 +5,9 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.spec import scene_from_dict
-from simtest.spec.deformation import MAX_STRETCH, Breathing, Contractions, Dent, Peristalsis
+from simtest.spec.surfaces import MAX_STRETCH, Breathing, Contractions, Dent, Peristalsis
 from simtest.surfaces import RayHits, make_surface
-from simtest.surfaces.deformation import DeformationAt
-from simtest.surfaces.deformed import DeformedSurface, stays_in_free_space
+from simtest.surfaces.deformation import DeformationAt, DeformedSurface, stays_in_free_space
 from simtest.surfaces.model import shape_operator
 
 PERISTALSIS = Peristalsis(

@@ -65,9 +65,13 @@ def test_flipped_maps_of_rendered_frames_score_their_turn(run, here, tmp_path):
     for seed, truth in enumerate(truths):
         # Relief: against the fine surface a degree is scored, against the base more.
         write_png(tmp_path / "maps" / f"{truth.name}.png", turned(truth.normal["fine"], 1.0, seed) * [1, -1, -1])
-    code, output, errors = here("score", tmp_path / "maps", "--on", on, "--out", tmp_path / "scored")
+    code, output, _ = here("score", tmp_path / "maps", "--on", on, "--out", tmp_path / "wrong")
+    assert code == 0
+    assert "warning: normals fit the truth better with --frame x,-y,-z" in output.replace("\n", " ")
+    options = ("--frame", "opengl", "--out", tmp_path / "scored")
+    code, output, errors = here("score", tmp_path / "maps", "--on", on, *options)
     assert (code, [line for line in errors if "Error" in line]) == (0, [])
-    assert "x,-y,-z (opengl), found out" in output.replace("\n", " ")
+    assert "x,-y,-z (opengl), as stated" in output.replace("\n", " ")
     record = json.loads((tmp_path / "scored" / "dense.json").read_text())
     cells = record["sources"]["normal"]["angle_deg"]
     for cell in cells["fine"]:
@@ -99,7 +103,8 @@ def test_maps_in_exr_are_read(run, here, tmp_path):
     (tmp_path / "maps").mkdir()
     for truth in truths:
         write_exr(tmp_path / "maps" / f"{truth.name}_depth.exr", truth.distance)
-    code, output, _ = here("score", tmp_path / "maps", "--on", on, "--out", tmp_path / "scored", "--json")
+    options = ("--depth", "ray", "--out", tmp_path / "scored", "--json")
+    code, output, _ = here("score", tmp_path / "maps", "--on", on, *options)
     assert code == 0
     record = json.loads(output)
     assert record["conventions"]["depths"]["along"] == "ray"
@@ -176,7 +181,7 @@ def test_a_run_is_not_written_over(run, here, tmp_path):
 
 
 def test_the_command_knows_the_methods():
-    from simtest.cli.dense_score import WORDS
+    from simtest.cli.runs import WORDS
     from simtest.dataset.scoring.dense import METHODS
 
     assert set(WORDS) == set(METHODS)

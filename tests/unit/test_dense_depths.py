@@ -22,7 +22,7 @@ def depth_of(truth, kind):
 
 
 def scored(folder, *truths, **options):
-    return score_frames(lambda: truths, MapFolder(folder), MapOptions(**options))
+    return score_frames(truths, MapFolder(folder), MapOptions(**options))
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -41,11 +41,10 @@ def test_normals_of_a_plane_are_exact_through_any_lens(lens):
 
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("kind", ["z", "ray"])
-def test_kind_of_depth_is_found_out(lens, kind, tmp_path):
+def test_both_kinds_of_depth_are_read(lens, kind, tmp_path):
     truth = sphere_truth(camera=LENSES[lens])
     np.save(tmp_path / "a.npy", depth_of(truth, kind))
-    score = scored(tmp_path, truth)
-    assert score.conventions.depth == kind
+    score = scored(tmp_path, truth, depth=None if kind == "z" else kind)
     percent = score.cell("depth_none", quantity="depth_percent")
     assert percent["p95"] < 1e-4
     # 90 deg stand for an unanswered normal; a depth has no such figure.
@@ -53,17 +52,23 @@ def test_kind_of_depth_is_found_out(lens, kind, tmp_path):
     assert "mean_penalised" in score.cell("depth_none")
     # At 96 px the central differences of the sphere's rim are coarse; the truth's own rim is not.
     assert score.cell("depth_none")["median"] < 0.2
-    assert any("along the" in line and "found out" in line for line in score.lines)
+    along, how = {"z": ("the axis (z)", "by default"), "ray": ("the ray", "as stated")}[kind]
+    assert f"depths: along {along}, {how}" in score.lines
+    assert not any(line.startswith("warning") for line in score.lines)
 
 
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("kind", ["z", "ray"])
 @pytest.mark.parametrize("shift", [-4.0, 4.0])
-def test_kind_of_relative_depths_is_found_out(lens, kind, shift, tmp_path):
+def test_the_other_kind_of_relative_depths_is_warned_of(lens, kind, shift, tmp_path):
     truth = sphere_truth(camera=LENSES[lens])
     np.save(tmp_path / "a.npy", 0.5 * depth_of(truth, kind) + shift)
-    score = scored(tmp_path, truth)
-    assert score.conventions.depth == kind
+    other = "ray" if kind == "z" else "z"
+    (warning,) = (line for line in scored(tmp_path, truth, depth=other).lines if "better" in line)
+    assert warning.startswith("warning: depths fit the truth better along")
+    assert f"--depth {kind}: " in warning
+    score = scored(tmp_path, truth, depth=kind)
+    assert not any("better" in line for line in score.lines)
     assert score.cell("depth_affine")["median"] < 0.2
 
 
@@ -110,18 +115,16 @@ def test_integers_need_a_unit(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.rint(truth.distance / 0.005).astype(np.uint16))
     with pytest.raises(InputError, match="--unit-mm must say"):
         scored(tmp_path, truth)
-    score = scored(tmp_path, truth, unit_mm=0.005)
-    assert score.conventions.depth == "ray"
+    score = scored(tmp_path, truth, unit_mm=0.005, depth="ray")
     assert score.cell("depth_none", quantity="depth_percent")["p95"] < 0.02
 
 
-def test_kinds_of_depth_that_fit_alike_are_refused(tmp_path):
+def test_kinds_of_depth_that_fit_alike_are_not_warned_of(tmp_path):
     # Through a narrow lens both are nearly the same.
     truth = sphere_truth(camera=Camera(96, 72, 9000.0, 9000.0, 48.0, 36.0))
     rng = np.random.default_rng(0)
     np.save(tmp_path / "a.npy", truth.distance * (1 + 0.01 * rng.standard_normal(truth.distance.shape)))
-    with pytest.raises(InputError, match="--depth z or --depth ray"):
-        scored(tmp_path, truth)
+    assert not any(line.startswith("warning") for line in scored(tmp_path, truth).lines)
 
 
 def test_depths_and_normals_are_scored_side_by_side(tmp_path):
@@ -159,7 +162,7 @@ def test_page_table_and_json(tmp_path):
     (tmp_path / "maps").mkdir()
     np.save(tmp_path / "maps" / "a_normal.npy", truths[0].normal["fine"])
     np.save(tmp_path / "maps" / "a_depth.npy", truths[0].distance)
-    score = scored(tmp_path / "maps", *truths, name="R & D")
+    score = scored(tmp_path / "maps", *truths, name="R & D", depth="ray")
     page = write_score(score, tmp_path / "out", "simtest score maps")
     text = page.read_text()
     assert "R &amp; D" in text
@@ -169,7 +172,7 @@ def test_page_table_and_json(tmp_path):
     for line in score.lines:
         assert line[1:20] in text
     record = json.loads((tmp_path / "out" / "dense.json").read_text())
-    assert record["schema"] == 2
+    assert record["schema"] == 3
     assert record["counts"]["frames_without_map"] == 1
     zone = {cell["label"]: cell for cell in record["sources"]["normal"]["angle_deg"]["fine"] if cell["group"] == "zone"}
     assert set(zone) == {"all", "highlight", "ring_1", "ring_2", "ring_4", "elsewhere"}

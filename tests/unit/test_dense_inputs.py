@@ -92,7 +92,7 @@ def test_what_is_out_of_view_is_empty(picture):
 
 
 def test_truth_is_missing_off_the_tissue():
-    from simtest.dataset.learn.dense_frames import truth_at
+    from studies.networks.examples import truth_at
 
     seen = camera(view_mask=ViewMask(80.0, 60.0, 70.0))
     depth = np.full((HEIGHT, WIDTH), 30.0)

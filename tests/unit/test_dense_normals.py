@@ -1,4 +1,4 @@
-"""Normal maps: encodings, axes that are stated or found out, and angles in every cell."""
+"""Normal maps: encodings, axes that are stated or those of the camera, and angles in every cell."""
 
 import cv2
 import numpy as np
@@ -6,11 +6,12 @@ import pytest
 from dense_frames import LENSES, sphere_truth, turned, write_png
 
 from simtest.dataset.scoring.dense import MapFolder, MapOptions, score_frames
-from simtest.dataset.scoring.dense.axes import ALL, matrix, parse_axes
+from simtest.dataset.scoring.dense.conventions import parse_axes
 from simtest.dataset.scoring.dense.frame_truth import frame_truth
 from simtest.dataset.scoring.dense.tally import frame_figures, joined_figures
 from simtest.dataset.scoring.dense.zones import zones
 from simtest.errors import InputError
+from simtest.geometry.axes import ALL, matrix
 
 
 def angles(score, figure, source="normal"):
@@ -18,7 +19,7 @@ def angles(score, figure, source="normal"):
 
 
 def scored(folder, *truths, **options):
-    return score_frames(lambda: truths, MapFolder(folder), MapOptions(**options))
+    return score_frames(truths, MapFolder(folder), MapOptions(**options))
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -33,7 +34,7 @@ def test_normals_turned_by_one_degree_score_one_degree_in_every_cell(lens, tmp_p
     assert len(angles(score, "mean")) > 30
     for figure in ("mean", "median", "rms", "p95", "mean_penalised"):
         np.testing.assert_allclose(angles(score, figure), 1.0, atol=1e-9)
-    assert score.conventions.axes == "x,y,z"
+    assert not any(line.startswith("warning") for line in score.lines)
     low, high = score.cell("normal")["ci95"]["median"]
     assert low == pytest.approx(1.0, abs=1e-9)
     assert high == pytest.approx(1.0, abs=1e-9)
@@ -53,15 +54,22 @@ def test_png_costs_no_more_than_its_steps(bits, tolerance, tmp_path):
     ("axes", "told"),
     [("x,-y,z", "x,-y,z"), ("x,-y,-z", "opengl"), ("x,y,-z", "directx"), ("-z,-y,x", "-z,-y,x"), ("y,x,z", "y,x,z")],
 )
-def test_other_axes_are_found_out_and_told(axes, told, tmp_path):
+def test_other_axes_are_read_and_warned_of(axes, told, tmp_path):
     truth = sphere_truth()
     # The transpose brings the camera frame to the channels.
     write_png(tmp_path / "a.png", turned(truth.normal["fine"], 1.0) @ matrix(axes))
-    score = scored(tmp_path, truth)
-    assert score.conventions.axes == axes
-    assert any(told in line and "found out" in line for line in score.lines)
-    assert score.to_json()["conventions"]["normals"]["axes_stated"] is False
+    score = scored(tmp_path, truth, frame=axes)
+    assert any(told in line and "as stated" in line for line in score.lines)
+    assert not any(line.startswith("warning") for line in score.lines)
     np.testing.assert_allclose(angles(score, "mean"), 1.0, atol=1e-3)
+    wrong = scored(tmp_path, truth)
+    assert any("channels hold x,y,z (opencv), by default" in line for line in wrong.lines)
+    assert any(
+        f"warning: normals fit the truth better with --frame {axes}: mean cosine 0.9998" in line for line in wrong.lines
+    )
+    held = wrong.to_json()["conventions"]["normals"]
+    assert (held["axes"], held["axes_stated"], held["best_axes"]) == ("x,y,z", False, axes)
+    assert held["mean_cosine"] < 0.9 < held["best_mean_cosine"]
 
 
 def test_all_48_axes_differ_and_are_parsed():
@@ -81,55 +89,34 @@ def test_stated_axes_are_taken_as_they_are(tmp_path):
     assert any("as stated" in line for line in score.lines)
 
 
-def test_axes_that_fit_alike_are_refused(tmp_path):
+@pytest.mark.parametrize("what", ["flat", "noise"])
+def test_normals_that_tell_no_axes_are_not_warned_of(what, tmp_path):
     truth = sphere_truth()
-    flat = np.broadcast_to([0.0, 0.0, -1.0], truth.normal["fine"].shape).copy()
-    np.save(tmp_path / "a.npy", flat)
-    with pytest.raises(InputError, match=r"fit the truth alike .* --frame") as refused:
-        scored(tmp_path, truth)
-    assert "\n" not in str(refused.value)
-    assert scored(tmp_path, truth, frame="opencv").cell("normal")["n"] == truth.scored.sum()
+    shape = truth.normal["fine"].shape
+    flat, noise = np.broadcast_to([0.0, 0.0, -1.0], shape), np.random.default_rng(1).normal(size=shape)
+    np.save(tmp_path / "a.npy", flat if what == "flat" else noise / np.linalg.norm(noise, axis=-1, keepdims=True))
+    score = scored(tmp_path, truth)
+    assert not any(line.startswith("warning") for line in score.lines)
+    assert score.cell("normal")["n"] == truth.scored.sum()
 
 
-def test_normals_that_fit_with_no_axes_are_refused(tmp_path):
-    truth = sphere_truth()
-    noise = np.random.default_rng(1).normal(size=truth.normal["fine"].shape)
-    np.save(tmp_path / "a.npy", noise)
-    with pytest.raises(InputError, match="fit the truth with no axes"):
-        scored(tmp_path, truth)
-
-
-def test_the_choice_is_that_of_all_frames_even_if_the_first_misleads(tmp_path):
-    # The first frame's map is another's: by itself it would choose flipped axes.
-    truths = [sphere_truth(name, centre=(x, -2.0, 30.0)) for name, x in zip("abcdef", range(-6, 6, 2), strict=True)]
-    flipped = matrix("-x,-y,z")
-    for truth in truths:
-        normal = truth.normal["fine"] @ (flipped if truth.name == "a" else np.eye(3))
-        np.save(tmp_path / f"{truth.name}.npy", normal)
-    score = scored(tmp_path, *truths)
-    assert score.conventions.axes == "x,y,z"
-    stated = scored(tmp_path, *truths, frame="opencv")
-    np.testing.assert_array_equal(angles(score, "mean"), angles(stated, "mean"))
-    assert score.counts["frames"] == 6
-
-
-@pytest.mark.parametrize(("encoding", "stated"), [("positive_z", None), ("unit", None), ("centred", "centred")])
-def test_encodings_of_integers(encoding, stated, tmp_path):
+@pytest.mark.parametrize("encoding", ["positive_z", "unit", "centred"])
+def test_encodings_of_integers(encoding, tmp_path):
     truth = sphere_truth()
     # Seen by the camera, z towards the viewer is positive but at steep rims.
     vectors = turned(truth.normal["fine"], 1.0) * [1, -1, -1]
     vectors[vectors[..., 2] < 0] = np.nan
     write_png(tmp_path / "a.png", vectors, 16, encoding)
-    score = scored(tmp_path, truth, encoding=stated)
-    assert (score.conventions.encoding, score.conventions.axes) == (encoding, "x,-y,-z")
+    score = scored(tmp_path, truth, encoding=None if encoding == "unit" else encoding, frame="opengl")
     np.testing.assert_allclose(angles(score, "mean"), 1.0, atol=1e-3)
 
 
-def test_floats_between_0_and_1_are_found_out(tmp_path):
+def test_floats_between_0_and_1_must_be_stated(tmp_path):
     truth = sphere_truth()
     np.save(tmp_path / "a.npy", ((truth.normal["fine"] + 1) / 2).astype(np.float32))
-    score = scored(tmp_path, truth)
-    assert score.conventions.encoding == "unit"
+    assert any("off from length 1" in line and "--encoding says" in line for line in scored(tmp_path, truth).lines)
+    score = scored(tmp_path, truth, encoding="unit")
+    assert not any(line.startswith("warning") for line in score.lines)
     assert score.cell("normal")["p95"] < 1e-3
 
 
@@ -194,14 +181,6 @@ def test_a_frame_without_a_map_is_unanswered_as_a_whole(tmp_path):
         (lambda folder, n: np.save(folder / "a.npy", np.float64(1.0)), r"has shape \(\)"),
         (lambda folder, n: np.save(folder / "a.npy", n[:0]), "has shape"),
         (lambda folder, n: _npz(folder / "a.npy", n), "holds several arrays"),
-        (lambda folder, n: np.save(folder / "a.npy", 1e300 * n), "hold no normal"),
-        (lambda folder, n: np.save(folder / "a.npy", 1e-300 * n), "hold no normal"),
-        (lambda folder, n: np.save(folder / "a.npy", np.nan * n), "hold no normal"),
-        (lambda folder, n: cv2.imwrite(str(folder / "a.png"), np.zeros((*n.shape[:2], 3), np.uint8)), "hold no normal"),
-        (
-            lambda folder, n: cv2.imwrite(str(folder / "a.png"), np.full((*n.shape[:2], 4), [9, 8, 7, 0], np.uint8)),
-            "hold no normal",
-        ),
         (
             lambda folder, n: (np.save(folder / "a.npy", n), write_png(folder / "a.png", n)),
             "a second map of frame a",
@@ -214,6 +193,24 @@ def test_what_does_not_fit_is_refused_in_one_line(make, message, tmp_path):
     with pytest.raises(InputError, match=message) as refused:
         scored(tmp_path, truth)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda folder, n: np.save(folder / "a.npy", 1e300 * n),
+        lambda folder, n: np.save(folder / "a.npy", 1e-300 * n),
+        lambda folder, n: np.save(folder / "a.npy", np.nan * n),
+        lambda folder, n: cv2.imwrite(str(folder / "a.png"), np.zeros((*n.shape[:2], 3), np.uint8)),
+        lambda folder, n: cv2.imwrite(str(folder / "a.png"), np.full((*n.shape[:2], 4), [9, 8, 7, 0], np.uint8)),
+    ],
+)
+def test_maps_without_any_answer_count_as_unanswered_and_are_told(make, tmp_path):
+    truth = sphere_truth()
+    make(tmp_path, truth.normal["fine"])
+    score = scored(tmp_path, truth)
+    assert score.cell("normal")["share_unanswered"] == 1
+    assert "warning: normals: no pixel holds a direction; all count as unanswered" in score.lines
 
 
 def _npz(path, values):

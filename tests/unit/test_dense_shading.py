@@ -83,7 +83,7 @@ def test_it_is_scored_as_maps_are():
     from dataclasses import replace
 
     shown = replace(truth, image=image, calibration=Calibration(truth.camera))
-    score = score_frames(lambda: [shown], Shading(), MapOptions())
+    score = score_frames([shown], Shading(), MapOptions())
     found, _ = shading_maps(image, Calibration(truth.camera))
     error = angle_deg(found, truth.normal["fine"])[truth.scored]
     assert score.cell("normal")["mean"] == pytest.approx(error.mean())

@@ -2,7 +2,7 @@
 
 import pytest
 
-from simtest.spec.describe import describe_key, name_key
+from simtest.spec.keys import describe_key, name_key
 
 
 @pytest.mark.parametrize(

@@ -42,23 +42,6 @@ def test_study_frames_are_the_same_again_and_their_anatomies_disjoint(tmp_path):
     assert not (truth.mask & ~(wider.mask | wider.unclear)).any()
 
 
-def test_a_frame_that_a_detector_refuses_counts_as_missed_in_the_study():
-    from simtest.errors import Failure, Reason
-    from studies.detection.tissue_frames import TissueFrame
-    from studies.learned_detector import counted
-
-    regions = np.zeros((40, 60), dtype=np.int32)
-    regions[5:9, 5:9], regions[20:32, 20:32], regions[35:38, 50:53] = 1, 2, 3
-    # The last one touches the border: it need not be found.
-    labels = TissueFrame(
-        "drawn", np.zeros((40, 60, 3), dtype=np.uint8), np.array([[7.0, 7.0], [26.0, 26.0], [51.5, 36.5]]),
-        np.array([1.5, 6.8, 1.7]), np.full(3, np.inf), np.array([True, True, False]), np.zeros(3), regions,
-    )  # fmt: skip
-    refused = counted(labels, Failure(Reason.NO_ESTIMATE, "unlike the network's training"))
-    assert refused.tolist() == [[0, 0, 1], [0, 0, 0], [0, 0, 1], [0, 0, 0]]
-    assert counted(labels, ()).tolist() == refused.tolist()
-
-
 @pytest.mark.render
 @pytest.mark.parametrize("radius", [4.0, 30.0])
 def test_normals_through_a_clipped_8_bit_picture_of_a_tilted_sphere(radius):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from simtest.calibration import NO_PRIORS, Calibration, Frame, NoiseModel, Response, srgb_encode
+from simtest.calibration.photometry import AngularProfile
 from simtest.detection import Detection, Detector, Region, load_detector, peak_shape
 from simtest.detection.colour import ColourDetector, colour
 from simtest.detection.peaks import PeakDetector, peaks
 from simtest.errors import Failure, InputError
 from simtest.geometry import Camera, Patch, ViewMask
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.reconstruction.choices import complete
 from simtest.reconstruction.pipeline import reconstruct, reconstruct_colour
 

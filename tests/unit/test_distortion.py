@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from simtest.errors import InputError
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Scaramuzza, ViewMask
-from simtest.geometry.distortion import undistort_with_errors, with_radial_error
+from simtest.geometry.lenses import undistort_with_errors, with_radial_error
 from tests.example_counts import examples
 
 WIDTH, HEIGHT = 640, 480

@@ -7,8 +7,8 @@ import pytest
 
 from simtest import load_calibration, save_calibration
 from simtest.calibration import NO_PRIORS
+from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.rendering import Session
 from simtest.simulation.camera_chain import capture, collect
 from simtest.spec import camera_table, scene_from_dict

@@ -12,8 +12,8 @@ from simtest.errors import InputError
 from simtest.rendering import Session, plugins
 from simtest.rendering.mitsuba_export import SAMPLES
 from simtest.spec import scene_from_dict
-from simtest.spec.camera_spec import CameraSpec
-from simtest.spec.rig import LightSpec
+from simtest.spec.camera import CameraSpec
+from simtest.spec.lights import LightSpec
 from tests.marked import marked
 
 pytestmark = pytest.mark.render

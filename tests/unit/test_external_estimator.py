@@ -106,7 +106,7 @@ for name, result in found.estimates.items():
     failed = isinstance(result, simtest.Failure)
     said[name] = [str(result.reason), result.detail] if failed else ["ok", result.normal.tolist(), list(result.flags)]
 refused = {}
-for name in ("other_missing", "other_constant", "nobody", "cone_axis", "nobody:cone_axis"):
+for name in ("other_missing", "other_constant", "other_plain", "nobody", "cone_axis", "nobody:cone_axis"):
     try:
         load_estimators([name])
     except simtest.InputError as error:
@@ -116,9 +116,6 @@ for name in ("nobody", "other_constant"):
         load_detector(name)
     except simtest.InputError as error:
         refused["detector " + name] = str(error)
-with warnings.catch_warnings(record=True) as told:
-    warnings.simplefilter("always")
-    load_estimators(["other_plain"])
 seen = Frame(frame, Calibration(camera), 2.0)
 asked = Options(fov_deg=60.0, detector="other_middle", estimators=("brightest_point",))
 taken = reconstruct_values("frame", frame, Calibration(camera), asked)
@@ -129,7 +126,6 @@ except simtest.InputError as error:
 print(json.dumps({
     "available": ESTIMATORS.names(), "detectors": DETECTORS.names(), "said": said, "refused": refused,
     "distributions": ESTIMATORS.distributions(["other_axis", "Other-Core:cone_axis", "nobody"]),
-    "deprecated": [[warning.category.__name__, str(warning.message)] for warning in told],
     "taken": [taken.detector, [list(spot.box_px) for spot in taken.specularities]],
     "middle": list(load_detector("other_middle").detect(seen, camera, Priors()).regions[0].box),
 }))
@@ -204,24 +200,18 @@ def test_a_name_of_two_packages_is_refused_unless_the_package_is_named(answer):
     assert answer["said"]["Other_Core:cone_axis"][2] == ["from outside"]
 
 
-def test_a_plain_function_is_told_to_be_of_the_old_form(answer):
-    ((category, message),) = answer["deprecated"]
-    assert category == "DeprecationWarning"
-    assert "'other_plain' is a plain callable" in message
-
-
 def test_a_broken_registration_is_refused_with_one_line(answer):
     refused = answer["refused"]
-    assert set(refused) == {"other_missing", "other_constant", "nobody", "cone_axis", "nobody:cone_axis",
+    assert set(refused) == {"other_missing", "other_constant", "other_plain", "nobody", "cone_axis", "nobody:cone_axis",
                             "--detector nobody", "detector nobody", "detector other_constant"}  # fmt: skip
     assert "cannot be imported" in refused["other_missing"]
-    assert "not callable" in refused["other_constant"]
+    for name in ("other_constant", "other_plain"):
+        assert f"estimator '{name}': " in refused[name]
+        assert "has neither estimate(patch, camera, priors) nor estimate_frame(" in refused[name]
     assert "other_axis" in refused["nobody"]
     assert "not installed" in refused["nobody:cone_axis"]
     assert "peaks" in refused["detector nobody"]
-    assert (
-        "detector 'nobody': not installed; allowed: colour, learned_detector, other_constant, other_middle, peaks"
-        in refused["--detector nobody"]
-    )
+    assert "detector 'nobody': not installed; allowed: colour, " in refused["--detector nobody"]
+    assert "other_constant, other_middle, peaks" in refused["--detector nobody"]
     assert "no object with a method detect" in refused["detector other_constant"]
     assert all("\n" not in message for message in refused.values())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest import BrownConrady, Camera, InputError, KannalaBrandt, Scaramuzza, load_calibration, load_camera
-from simtest.geometry.field_of_view import field_of_view, focal_of_view
+from simtest.geometry.camera import field_of_view, focal_of_view
 from simtest.spec import CameraSpec, apply_settings, load_scene, scene_from_dict
 
 LENSES = {

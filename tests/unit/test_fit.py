@@ -22,7 +22,7 @@ from simtest.realism.fitting.summaries import NAMES, summarise
 from simtest.realism.frame_sets import open_frames
 from simtest.realism.frame_statistics import COLUMNS
 from simtest.runtime.seeds import from_integer
-from simtest.spec.dataset_recipe import Dataset, Distribution, load_dataset
+from simtest.spec.recipes import Dataset, Distribution, load_dataset
 from simtest.spec.spec_model import validate
 
 RECIPE = {

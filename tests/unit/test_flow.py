@@ -10,7 +10,7 @@ from simtest.simulation.flow import HIDDEN, INSTRUMENT, NONE, OUT, SEEN, Flow, S
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.sequence_labels import STRIDE_PX, SequenceLabels
 from simtest.spec import scene_from_dict
-from simtest.spec.views import Moved
+from simtest.spec.camera import Moved
 from tests.marked import marked
 
 pytestmark = pytest.mark.render

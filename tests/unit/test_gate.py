@@ -6,7 +6,7 @@ import pytest
 from gate_nights import changed, night, raised, rows, whole
 
 from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.figures import digest, setting_figures
+from simtest.nightly.gate.quantities import digests_of, setting_figures
 from simtest.nightly.records import COMPARISONS, FIGURES, OUTCOMES, POOLED
 from tests.marked import marked
 
@@ -118,7 +118,7 @@ def test_detections_that_no_longer_count_as_on_an_instrument_are_false_ones():
     assert moved["baseline"].to_list() == [0, 0]
     assert moved["tonight"].to_list() == [5, 5]
     # Where nothing lies on an instrument, the column says nothing.
-    assert digest(lost) == digest(whole(settings=("a",)))
+    assert digests_of(lost) == digests_of(whole(settings=("a",)))
 
 
 def test_counts_are_written_in_full():
@@ -400,12 +400,12 @@ def test_figures_of_a_cell():
 
 def test_the_hash_is_that_of_the_numbers():
     table = rows(count=5)
-    assert digest(table) == digest(table.reverse())
+    assert digests_of(table) == digests_of(table.reverse())
     next_number = np.nextafter(table["error_deg"][2], 9)
-    assert digest(table) != digest(changed(table, pl.col("realisation") == 2, error_deg=next_number))
+    assert digests_of(table) != digests_of(changed(table, pl.col("realisation") == 2, error_deg=next_number))
     nothing = changed(table, pl.col("realisation") == 2, choice_margin=0.0)
-    assert digest(nothing) != digest(table)
-    assert digest(changed(table, True, flags="saturated")) != digest(table)
+    assert digests_of(nothing) != digests_of(table)
+    assert digests_of(changed(table, True, flags="saturated")) != digests_of(table)
     failed = changed(table, pl.col("realisation") == 1, status="no_peak", flags="12 points")
-    assert digest(changed(failed, pl.col("status") == "no_peak", flags="13 points")) == digest(failed)
-    assert digest(changed(table, pl.col("realisation") == 1, status="missed")) != digest(table)
+    assert digests_of(changed(failed, pl.col("status") == "no_peak", flags="13 points")) == digests_of(failed)
+    assert digests_of(changed(table, pl.col("realisation") == 1, status="missed")) != digests_of(table)

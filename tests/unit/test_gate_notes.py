@@ -6,12 +6,9 @@ import polars as pl
 import pytest
 from gate_nights import changed, night, raised, rows, whole
 
-from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.figures import setting_figures
-from simtest.nightly.gate.limits import Limits
-from simtest.nightly.gate.pairing import with_all_frames
-from simtest.nightly.gate.quantities import HARMS, quantities
-from simtest.nightly.measure import frames_of
+from simtest.nightly.gate.compare import compare, with_all_frames
+from simtest.nightly.gate.quantities import setting_figures
+from simtest.nightly.run import frames_of
 from simtest.spec import Experiment
 from simtest.validation.cases import expand
 
@@ -76,10 +73,6 @@ def test_frames_are_counted_on_only_where_realisations_are_a_count():
     made = with_all_frames(both, frames, both)
     assert made.filter(pl.col("cell") == 0).height == 3
     assert made.filter(pl.col("cell") == 1, pl.col("value") == 0)["realisation"].to_list() == [1]
-
-
-def test_every_quantity_has_a_value_of_rows():
-    assert set(quantities(Limits())) - {"false"} == set(HARMS)
 
 
 def test_what_changed_in_kind_is_named_only_where_it_was_measured():

@@ -7,7 +7,7 @@ from gate_nights import night, rows
 
 from simtest.conventions import MOTION, MOTION_COLUMNS
 from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.figures import digests_of
+from simtest.nightly.gate.quantities import digests_of
 
 SETTINGS = tuple("abcdefghijkl")
 

@@ -200,7 +200,7 @@ def test_smooth_runs_and_those_of_older_versions_have_none(run, tmp_path):
 def test_the_page_shows_the_figures(run, tmp_path):
     run.results.write_parquet(tmp_path / "results.parquet")
     (tmp_path / "summary.json").write_text(json.dumps({"run": {}, "experiments": {}}))
-    page = write_report(tmp_path).read_text()
+    page = write_report(tmp_path, charts=True).read_text()
     for figure in glint_figures(run):
         assert f' id="{figure.chart.key}"' in page
         assert (tmp_path / "figures" / f"{figure.chart.key}.png").stat().st_size > 5000

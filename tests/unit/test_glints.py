@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from simtest.rendering import Session, glints
+from simtest.rendering import Session, highlights
 from simtest.simulation.rendered_view import render_view
 from simtest.simulation.visible_highlights import find_spots, glints_of, shape_of
 from simtest.spec.scene import scene_from_dict
@@ -47,7 +47,7 @@ def off_zero(session, pixels, light):
 @pytest.mark.parametrize("surface", SURFACES)
 def test_every_glint_is_a_zero(sessions, surface):
     session = sessions[surface]
-    pixels = glints.search(session, 0)
+    pixels = highlights.search_glints(session, 0)
     assert len(pixels) >= 5
     assert off_zero(session, pixels, np.zeros(3)).max() < 1e-8
     assert off_zero(session, pixels + 0.5, np.zeros(3)).max() > 1e-3
@@ -59,7 +59,7 @@ def test_every_glint_is_a_zero(sessions, surface):
 def test_search_finds_what_an_exhaustive_one_finds(sessions, surface):
     """Every sign change of the misfit on a grid of quarter pixels, followed by bisection of boxes, is a found glint."""
     session = sessions[surface]
-    found = glints.search(session, 0)
+    found = highlights.search_glints(session, 0)
     missing = [zero for zero in boxed_zeros(session) if np.linalg.norm(found - zero, axis=1).min() > 0.3]
     assert missing == []
 
@@ -73,10 +73,10 @@ PITS = {"bands": [{"kind": "ridged", "slope_deg": 5.5, "wavelength_mm": 2.0},
 def test_creases_hide_no_glint_that_a_grid_twice_as_fine_finds(relief, monkeypatch):
     """The normal turns fastest at ridges and at the rims of pits; the glints there are the smallest."""
     session = Session(scene("inside", relief))
-    found = glints.search(session, 0)
+    found = highlights.search_glints(session, 0)
     for name in ("GRID_WAVE", "MAX_DIVISION"):
-        monkeypatch.setattr(glints, name, 2 * getattr(glints, name))
-    finer = glints.search(session, 0)
+        monkeypatch.setattr(highlights, name, 2 * getattr(highlights, name))
+    finer = highlights.search_glints(session, 0)
     assert len(finer) > 100
     assert cKDTree(found).query(finer)[0].max() < 0.05
     assert cKDTree(finer).query(found)[0].max() < 0.05
@@ -92,16 +92,16 @@ def divided():
 
 
 def test_search_by_tiles_is_that_of_the_whole_divided_frame(divided, monkeypatch):
-    found = glints.search(divided, 0)
-    tiles = glints.tiles_near_zeros(divided.misfits().fine[0])
+    found = highlights.search_glints(divided, 0)
+    tiles = highlights.tiles_near_zeros(divided.misfits().fine[0])
     assert len(found) > 50
     assert 0 < len(tiles) < 0.7 * (CAMERA["width"] / 4 + 1) * (CAMERA["height"] / 4 + 1)
-    monkeypatch.setattr(glints, "VARIES", np.inf)
-    assert len(glints.tiles_near_zeros(divided.misfits().fine[0])) == 51 * 41
-    assert glints.search(divided, 0).tobytes() == found.tobytes()
+    monkeypatch.setattr(highlights, "VARIES", np.inf)
+    assert len(highlights.tiles_near_zeros(divided.misfits().fine[0])) == 51 * 41
+    assert highlights.search_glints(divided, 0).tobytes() == found.tobytes()
     # Too strict a choice loses some.
-    monkeypatch.setattr(glints, "VARIES", -0.4)
-    assert len(glints.search(divided, 0)) < len(found)
+    monkeypatch.setattr(highlights, "VARIES", -0.4)
+    assert len(highlights.search_glints(divided, 0)) < len(found)
 
 
 def test_tiles_hold_the_frames_own_misfits(divided):
@@ -125,12 +125,12 @@ def test_the_tile_of_a_zero_is_chosen_and_far_ones_are_not(x, y, turn, holes):
     far = w + np.array([100.0, 0.0], dtype=np.float32)[:, None, None]
     if np.hypot(rows[holes // 30 % 22, 0] - y, columns[0, holes % 30] - x) > 6:
         w[:, holes // 30 % 22, holes % 30] = np.nan
-    chosen = glints.tiles_near_zeros(w).tolist()
+    chosen = highlights.tiles_near_zeros(w).tolist()
     assert [int(x) // 4 * 4, int(y) // 4 * 4] in chosen
     # Zeros of the two components that run along each other pass through many tiles together.
     assert len(chosen) < 25 or abs(np.cos(turn) + 0.3 * np.sin(turn)) < 0.3
-    assert len(glints.tiles_near_zeros(far)) == 0
-    assert len(glints.tiles_near_zeros(np.full_like(w, np.nan))) == 0
+    assert len(highlights.tiles_near_zeros(far)) == 0
+    assert len(highlights.tiles_near_zeros(np.full_like(w, np.nan))) == 0
 
 
 def boxed_zeros(session, size=0.25):
@@ -149,13 +149,13 @@ def boxed_zeros(session, size=0.25):
 
 def test_jacobian_is_the_misfits_derivative(sessions):
     session = sessions["sphere"]
-    pixels = glints.search(session, 0)[:10] + 0.3
-    state = glints.exact_misfit(session, pixels, np.zeros(3))
+    pixels = highlights.search_glints(session, 0)[:10] + 0.3
+    state = highlights.exact_misfit(session, pixels, np.zeros(3))
     step = 1e-4
     for axis in range(2):
         move = step * np.eye(2)[axis]
-        high = glints.exact_misfit(session, pixels + move, np.zeros(3)).w
-        low = glints.exact_misfit(session, pixels - move, np.zeros(3)).w
+        high = highlights.exact_misfit(session, pixels + move, np.zeros(3)).w
+        low = highlights.exact_misfit(session, pixels - move, np.zeros(3)).w
         # The tangent basis turns with the sightline, which moves w by w itself times the turn.
         assert (
             np.abs((high - low) / (2 * step) - state.jacobian[:, :, axis]).max() < 0.02 * np.abs(state.jacobian).max()
@@ -198,7 +198,7 @@ def test_a_smooth_highlight_is_its_own_cloud():
 def test_unresolved_relief_has_no_list_of_glints():
     relief = {"bands": [{"slope_deg": 3.0, "wavelength_mm": 0.05}]}
     session = Session(scene("plane", relief))
-    assert len(glints.search(session, 0)) == 0
+    assert len(highlights.search_glints(session, 0)) == 0
     # It acts as roughness: the highlight is the base's, and its fine normal is anyone's.
     (point,) = session.highlights(session.radiance())
     sightline = session.camera.unproject(point.bp_px[None])[0]
@@ -210,7 +210,7 @@ def test_unresolved_relief_has_no_list_of_glints():
 def test_a_fine_band_without_slope_hides_no_glints():
     bands = [{"slope_deg": 4.0, "wavelength_mm": 2.0}, {"slope_deg": 0.1, "wavelength_mm": 0.1}]
     both, alone = (
-        len(glints.search(Session(scene("plane", {"bands": bands[:n], "seed": 3})), 0)) for n in (2, 1)
+        len(highlights.search_glints(Session(scene("plane", {"bands": bands[:n], "seed": 3})), 0)) for n in (2, 1)
     )  # fmt: skip
     assert both >= alone > 5
 
@@ -223,7 +223,7 @@ def test_glints_on_a_users_mesh():
         pytest.skip(f"no {path.name}: reference data is not part of the repository")
     surface = {"type": "anatomy", "path": str(path), "relief": {"bands": [{"slope_deg": 4.0, "wavelength_mm": 1.5}]}}
     session = Session(scene_from_dict({"surface": surface, "camera": CAMERA}))
-    found = glints.search(session, 0)
+    found = highlights.search_glints(session, 0)
     assert len(found) >= 10
     assert off_zero(session, found, np.zeros(3)).max() < 1e-8
     zeros = boxed_zeros(session)

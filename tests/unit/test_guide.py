@@ -453,7 +453,7 @@ def test_summary_json_holds_conditions_and_descriptions():
 def printed(run, width, terminal):
     from rich.console import Console
 
-    from simtest.cli.guide_table import print_guide
+    from simtest.cli.runs import print_guide
 
     write_report(run)
     file = io.StringIO()
@@ -512,7 +512,7 @@ def test_a_run_without_true_highlights_says_so(tmp_path):
 
 
 def test_guide_json_holds_rows_and_figures_and_is_printed_with_json(tmp_path, capsys):
-    from simtest.cli.printing import print_run
+    from simtest.cli.common import print_run
 
     run = make_run(tmp_path, items=0)
     write_report(run)
@@ -532,8 +532,8 @@ def test_guide_json_holds_rows_and_figures_and_is_printed_with_json(tmp_path, ca
 
 @pytest.mark.parametrize("spoil", [lambda file: file.unlink(), lambda file: file.write_text("{")])
 def test_a_guide_that_is_missing_is_told_as_missing(tmp_path, capsys, spoil):
-    from simtest.cli.guide_table import print_guide
-    from simtest.cli.printing import print_run
+    from simtest.cli.common import print_run
+    from simtest.cli.runs import print_guide
 
     run = make_run(tmp_path, items=0)
     write_report(run)
@@ -547,8 +547,8 @@ def test_a_guide_that_is_missing_is_told_as_missing(tmp_path, capsys, spoil):
 
 
 def test_verbose_prints_every_situation(tmp_path, monkeypatch):
-    from simtest.cli.manners import MANNERS
-    from simtest.cli.printing import MOST_ROWS
+    from simtest.cli.common import MOST_ROWS
+    from simtest.cli.main import MANNERS
 
     rows = [
         row | {"surface": f"organ {k}"} for k in range(MOST_ROWS + 3) for row in rows_of("cone_axis", [1.0], f"{k}")

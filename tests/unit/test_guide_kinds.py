@@ -6,8 +6,8 @@ import pytest
 from test_guide import FLAT, guide_from, rows_of
 
 from simtest.spec import load_scene
+from simtest.spec.lights import LightSpec, Rig
 from simtest.spec.reflectance import Reflectance
-from simtest.spec.rig import LightSpec, Rig
 from simtest.spec.sensor import Sensor
 from simtest.validation.conditions import DEGREES, conditions
 

@@ -128,14 +128,6 @@ def test_a_shadowed_highlight_does_not_take_a_lit_one_s_peak():
     assert [j.why_not for j in judged] == ["in shadow", ""]
 
 
-def test_the_former_way_to_a_true_highlight_still_works_and_warns():
-    radiance = np.ones((60, 80), dtype=np.float32)
-    spots = [spot(40.0, lit=True)]
-    (truth,) = verdicts(spots, examine(spots, radiance), np.zeros(1))
-    with pytest.warns(DeprecationWarning, match="use the highlight itself"):
-        assert truth.highlight.normal is truth.normal
-
-
 def test_mahalanobis_distance_is_that_of_the_tangent_plane():
     rng = np.random.default_rng(1)
     normal = rng.normal(size=3)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from simtest.rendering import Session, highlights
-from simtest.rendering.exact_misfit import exact_misfit
-from simtest.rendering.misfit_grid import crossed, turned_pixels
+from simtest.rendering.misfits import crossed, exact_misfit, turned_pixels
 from simtest.spec.scene import scene_from_dict
 
 CAMERA = {"width": 200, "height": 160, "fx": 200.0, "fy": 200.0, "cx": 100.0, "cy": 80.0}
@@ -125,5 +124,5 @@ def test_seeds_beside_the_surface_find_nothing():
 
 def test_first_of_each_keeps_the_earliest_of_each_light():
     points = np.array([[1.0, 1.0], [1.3, 1.0], [1.0, 1.0], [9.0, 1.0], [9.2, 1.4], [9.2, 1.5]])
-    kept = highlights._first_of_each(points, np.array([0, 0, 1, 0, 0, 0]), 0.5)
+    kept = highlights._first_of_each(points, 0.5, np.array([0, 0, 1, 0, 0, 0]))
     assert kept.tolist() == [True, False, True, True, False, True]

@@ -10,7 +10,7 @@ from simtest.dataset.plan import Plan
 from simtest.rendering import Session
 from simtest.simulation.rendered_view import render_view
 from simtest.spec import scene_from_dict
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 
 pytestmark = pytest.mark.render
 

@@ -12,8 +12,8 @@ from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.simulation.frame_files import write_frame
 from simtest.simulation.labelled_frame import make_frame
-from simtest.spec.instrument import Instrument
 from simtest.spec.scene import scene_from_dict
+from simtest.spec.surfaces import Instrument
 from simtest.surfaces.instrument import round_cones
 
 F, WIDTH, HEIGHT, DISTANCE = 64.0, 80, 60, 60.0
@@ -131,9 +131,9 @@ angles = st.floats(-180, 180)
 def test_rays_meet_a_grasper_first_on_its_surface(session, azimuth, roll, tilt, opening, seed):
     grasper = Instrument(kind="grasper", azimuth_deg=azimuth, roll_deg=roll, tilt_deg=tilt, opening_deg=opening)
     cones = round_cones({3: grasper}, {3: np.array([1.0, -2.0, 50.0])})
-    from simtest.rendering.instrument_kernel import InstrumentKernel
+    from simtest.rendering.instruments import InstrumentKernel
 
-    kernel = InstrumentKernel(session.mi, cones, {3: grasper})
+    kernel = InstrumentKernel(cones, {3: grasper})
     rng = np.random.default_rng(seed)
     targets = cones.starts[rng.integers(len(cones.starts), size=64)] + rng.normal(0, 2, (64, 3))
     rays = targets / np.linalg.norm(targets, axis=1, keepdims=True)

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 from scipy import stats
 
-from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.quantities import setting_figures
 from simtest.report.curves import bar
 from simtest.report.pairs import pairs
 from simtest.report.run_folder import Run
@@ -19,9 +19,9 @@ from simtest.runtime.statistics import (
     share_interval,
     student_quantile,
 )
+from simtest.validation.columns import table
 from simtest.validation.guide import guide_of
 from simtest.validation.paired import difference_interval
-from simtest.validation.results_table import ResultRow, table
 from simtest.validation.statistics import summarise, units
 from tests.unit.given_numbers import of_given_numbers
 
@@ -185,7 +185,7 @@ def rows_of(each):
     errors = {"cone_axis": rng.gamma(2.0, 0.5, 10), "curved": rng.gamma(2.0, 0.6, 10)}
     for frame, number, name in itertools.product(range(10), range(each), errors):
         error = float(errors[name][frame])
-        rows.append(ResultRow(
+        rows.append(dict(
             experiment="e", label="a", surface="a", setting="s", realisation=frame, specularity=number, true_id=number,
             estimator=name, status="ok" if error < 1.5 else "no_peak", target="fine", error_deg=error,
             mahalanobis2=12 * error, axis_ratio=1 + error / 9, axis_ratio_law=1.0,

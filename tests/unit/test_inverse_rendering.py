@@ -14,8 +14,7 @@ from simtest.estimators.photometric import photometric
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg, tangent_basis
 from simtest.inverse import InverseRendering, inverse_rendering
-from simtest.inverse.patch_renderer import PatchRenderer
-from simtest.inverse.rendered_quadric import RenderedQuadric
+from simtest.inverse.patch import PatchRenderer, RenderedQuadric
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer

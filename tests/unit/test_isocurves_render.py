@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from skimage.measure import find_contours
 
-from simtest.geometry import isocurves
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
+from simtest.validation.paper import isocurves
 from tests import isocurve_formulas as formulas
 
 pytestmark = pytest.mark.render

@@ -9,7 +9,7 @@ from skimage.measure import find_contours
 
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry import Patch, ellipse_of_conic, fit_ellipse, smooth
-from simtest.geometry.isophotes import encloses
+from simtest.geometry.patch import encloses
 
 WIDTH, HEIGHT = 90, 70
 CENTRE = np.array([41.3, 33.8])

@@ -9,12 +9,11 @@ import warnings
 import numpy as np
 import pytest
 
-from simtest.runtime import kept_arrays
-from simtest.runtime.kept_arrays import cache_folder, kept, only_reading
+from simtest.runtime import arrays
+from simtest.runtime.arrays import cache_folder, kept, only_reading
 from simtest.runtime.resources import find
-from simtest.spec.relief import Relief, ReliefBand
-from simtest.spec.surface import PlaneSurface
-from simtest.spec.tissue_colour import TissueColour
+from simtest.spec.reflectance import TissueColour
+from simtest.spec.surfaces import PlaneSurface, Relief, ReliefBand
 from simtest.surfaces import colon, liver, relief_field, tissue_pattern
 from simtest.surfaces.analytic import Plane
 from simtest.surfaces.recipe import load_recipe
@@ -56,7 +55,7 @@ def test_arrays_are_made_once_for_a_key(folder):
 def test_other_code_makes_other_files(folder, monkeypatch):
     make, calls = counted()
     kept("kind", "one", make)
-    monkeypatch.setattr(kept_arrays, "_code", lambda: "changed")
+    monkeypatch.setattr(arrays, "_code", lambda: "changed")
     kept("kind", "one", make)
     assert len(calls) == 2
 
@@ -65,15 +64,15 @@ def test_the_hash_of_the_code_follows_sources_versions_and_processor(monkeypatch
     (tmp_path / "surfaces").mkdir()
     file = tmp_path / "surfaces" / "one.py"
     file.write_text("a = 1")
-    monkeypatch.setattr(kept_arrays, "_ROOT", tmp_path)
-    monkeypatch.setattr(kept_arrays, "SOURCES", ("surfaces",))
-    hashes = [kept_arrays._code.__wrapped__() for _ in range(2)]
+    monkeypatch.setattr(arrays, "_ROOT", tmp_path)
+    monkeypatch.setattr(arrays, "SOURCES", ("surfaces",))
+    hashes = [arrays._code.__wrapped__() for _ in range(2)]
     file.write_text("a = 2")
-    hashes.append(kept_arrays._code.__wrapped__())
-    monkeypatch.setattr(kept_arrays.provenance, "processor", lambda: "another")
-    hashes.append(kept_arrays._code.__wrapped__())
-    monkeypatch.setattr(kept_arrays.importlib.metadata, "version", lambda name: "0")
-    hashes.append(kept_arrays._code.__wrapped__())
+    hashes.append(arrays._code.__wrapped__())
+    monkeypatch.setattr(arrays.provenance, "processor", lambda: "another")
+    hashes.append(arrays._code.__wrapped__())
+    monkeypatch.setattr(arrays.importlib.metadata, "version", lambda name: "0")
+    hashes.append(arrays._code.__wrapped__())
     assert hashes[0] == hashes[1]
     assert len(set(hashes)) == 4
 
@@ -101,7 +100,7 @@ def test_a_damaged_file_is_made_anew(folder, damage):
 
 def test_the_folder_is_bounded_and_the_files_used_last_stay(folder, monkeypatch):
     big = {"a": np.zeros(1000)}
-    monkeypatch.setattr(kept_arrays, "MAX_BYTES", 3 * 8500)
+    monkeypatch.setattr(arrays, "MAX_BYTES", 3 * 8500)
     make, calls = counted(big)
     for number in range(3):
         kept("kind", str(number), make)
@@ -186,7 +185,7 @@ def test_kinds_that_are_only_read(folder):
 
 def test_several_processes_at_once(folder):
     code = (
-        "import numpy as np; from simtest.runtime.kept_arrays import kept\n"
+        "import numpy as np; from simtest.runtime.arrays import kept\n"
         "for i in range(20):\n"
         "    a = kept('kind', str(i % 4), lambda: {'a': np.full(20000, i % 4)})['a']\n"
         "    assert len(a) == 20000 and (a == i % 4).all()\n"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from simtest.rendering import Session, backend
-from simtest.rendering.kernel_arrays import to_kernel, vectors_from_kernel, vectors_to_kernel
+from simtest.rendering.kernel_values import to_kernel, vectors_from_kernel, vectors_to_kernel
 from simtest.spec import load_scene
 
 
@@ -59,7 +59,7 @@ def test_the_number_of_rays_is_in_no_kernel():
 
     def cast(count):
         rays = session.sightlines.in_model(rng.uniform(100, 200, (count, 2)))
-        return lambda: (session.exact_hits(*rays), session._hits(*rays))
+        return lambda: (session.exact_hits(*rays), session._cast(*rays, None))
 
     first = kernels(cast(3))
     assert first

@@ -7,9 +7,9 @@ from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators import isophote_fit as base
 from simtest.geometry import Patch
-from simtest.validation import error_ladder as ladder
 from simtest.validation import laws
-from simtest.validation.error_ladder import CAMERA, DISTANCE_MM, EXPONENT, RUNGS, SCENES, ClosedScene, error_ladder
+from studies import error_ladder as ladder
+from studies.error_ladder import CAMERA, DISTANCE_MM, EXPONENT, RUNGS, SCENES, ClosedScene, error_ladder
 
 PLANE, TURNED, CYLINDER = SCENES
 NAMES = list(RUNGS)

@@ -7,7 +7,6 @@ import polars as pl
 import pytest
 
 from simtest.errors import InputError
-from simtest.pages import chart_png
 from simtest.report.error_laws import ABSENT, DEPARTS, LAWS, MET, SLOPE, law_results, sentence
 from simtest.report.law_charts import law_charts
 from simtest.report.pairs import pairs
@@ -143,9 +142,6 @@ def test_runs_that_name_no_law_have_no_section(tmp_path):
     assert len(results) == len(LAWS)
     charts = law_charts(results)
     assert [chart.key for chart in charts] == ["laws_angles", "laws_departures"]
-    whole, parts = chart_png.draw(charts)
-    assert len(parts) == 2
-    assert whole.shape[1] == sum(part.shape[1] for part in parts)
 
 
 def test_the_experiment_tests_every_law():

@@ -7,15 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from simtest.detection.blobs import Highlight, Kind
-from simtest.detection.detector import Detection
 from simtest.detection.regions import Region
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
 from simtest.geometry import Patch
 from simtest.reconstruction import Specularity
 from studies.detection.real_frames import OutlinedFrame
-from studies.detection.tissue import Counts
 from studies.hard.cases import scene_of
 from studies.hard.scenes import KINDS
 from studies.learned_transfer import answers as answering
@@ -33,12 +30,10 @@ def a_frame(**changes):
     normal = np.zeros((height, width, 3), dtype=np.float16)
     normal[..., 2] = -1
     normal[:, :4] = np.nan
-    regions = np.zeros((height, width), dtype=np.uint16)
-    regions[9:12, 14:17] = 1
     made = HardFrame(
         FIRST, GUIDES[0], np.full((height, width, 3), 90, dtype=np.uint8), normal,
-        np.full((height, width), 20, dtype=np.float32), regions, np.array([[15.5, 10.5]]), np.array([1.7]),
-        np.array([50.0]), np.array([True]), np.array([[math.sin(0.1), 0.0, -math.cos(0.1)]]),
+        np.full((height, width), 20, dtype=np.float32), np.array([[15.5, 10.5]]),
+        np.array([[math.sin(0.1), 0.0, -math.cos(0.1)]]),
     )  # fmt: skip
     return replace(made, **changes)
 
@@ -53,13 +48,6 @@ def a_specularity(estimates, peak=(15, 10)):
     values[4, 4] = 3.0
     patch = Patch.cut(values, (0, 0, 9, 9), raw=values, noise=0.01, smoothing_px=1.0)
     return Specularity(Region((11, 6, 9, 9), peak, 1.0), patch, estimates)
-
-
-def a_highlight(box, kind=Kind.ISOLATED):
-    x, y, w, h = box
-    outline = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h], [x, y]], dtype=float)
-    peak = (x + w // 2, y + h // 2)
-    return Highlight(Region(box, peak, 1.0), kind, 1.0, w * h, None, None, None, 1.0, 0.0, outline)
 
 
 def answer(estimator, spot, base_deg, scene=1, status=OK, row=GUIDES[0].name, inside=math.nan):
@@ -131,11 +119,6 @@ def test_the_tables_count_answers_refusals_and_coverage():
     assert lines[2:] == ["| all | t | 5 | 4 | 1 why | 1.50 | 2.85 | none | 75.0 (4) |"]
     (pair,) = list(tables.pairs(made, ALL, [("t", "s")]))[2:]
     assert pair == "| all | t - s | 0 | 0 | none | none | none |"
-    row = GUIDES[0].name
-    counts = {"colour": {row: [{0: Counts(1, 1, 0)}, {0: Counts(2, 0, 1)}]}}
-    assert list(tables.detection(counts, {"one": (row,)}))[2] == (
-        "| one | colour | 0.750 (3 + 1, 1) | none | none | none |"
-    )
 
 
 def test_regions_overlap_as_a_search_over_their_points_says():
@@ -169,25 +152,6 @@ def test_agreement_turns_the_other_covariance_into_the_first_basis():
     (line,) = list(tables.agreement([made], []))[2:]
     assert line == "| all | n - b | 1 | 3.44 | 3.44 | 0 of 1 |"
     assert real.refusals(found, "b") == {OK: 1, "no_peak": 1}
-
-
-def test_detections_on_real_frames_are_scored_alike_for_all_detectors():
-    shape = (40, 60)
-    specular, text = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
-    specular[10:14, 10:14], text[30:34, 40:50] = True, True
-    nothing = np.zeros(shape, dtype=bool)
-    frame = OutlinedFrame("f", "figures", np.zeros((*shape, 3), np.float32), specular, nothing, {"text": text})
-    own, other = (a_highlight((10, 10, 4, 4)), a_highlight((42, 30, 4, 4))), (a_highlight((9, 9, 6, 6)),)
-    found = Detection(tuple(each.region for each in own), None, own)
-    score = real.detection_score(frame, found)
-    assert (score.covered, score.answered, score.iou, score.count) == (1.0, 1.0, 0.5, 2)
-    assert score.marks == {"text": 1}
-    cluster = replace(found, highlights=(a_highlight((10, 10, 4, 4), Kind.CLUSTER), own[1]))
-    assert real.detection_score(frame, cluster).answered == 0
-    assert (real.shared(own, other, shape), real.shared(other, own, shape)) == (0.5, 1.0)
-    assert math.isnan(real.shared((), own, shape))
-    line = real.detection_line(frame, "n", found, Detection((), None, other))
-    assert line == "| f | n | 1.000 | 1.000 | 0.500 | 2 | 0.50 | 1.00 | 0, 1, 0, 0 | no |"
 
 
 def test_answers_on_an_instrument_are_counted_in_the_frame_s_own_pixels():
@@ -229,7 +193,7 @@ def test_frames_are_kept_and_those_that_a_scene_cannot_show_left_out(tmp_path, m
         np.testing.assert_array_equal(read.normal_base, made.normal_base)
         assert (read.scene, read.row, read.kind) == (FIRST, GUIDES[0], KINDS[FIRST % len(KINDS)])
     assert calls == [row.name for row in GUIDES[:2]]
-    assert read.as_tissue().regions.max() == 1
+    np.testing.assert_array_equal(read.peaks, made.peaks)
     assert read.frame().camera.width == 480
 
 
@@ -244,10 +208,6 @@ def test_answers_are_kept_by_the_hash_of_the_network(tmp_path, monkeypatch):
         def __init__(self, model):
             self.model = model
 
-        def detect(self, frame, camera, priors):
-            asked.append("detect")
-            return Detection((), None)
-
     monkeypatch.setattr(kept, "answers", made)
     for name, text in (("one", "a"), ("two", "b"), ("same", "a")):
         (tmp_path / name).write_text(text)
@@ -259,27 +219,17 @@ def test_answers_are_kept_by_the_hash_of_the_network(tmp_path, monkeypatch):
     (read,) = folder.normals(frame, {"n, other": Network(tmp_path / "same")})
     assert (read.estimator, read.base_deg, math.isnan(read.stated_deg)) == ("n, other", 1.5, True)
     assert asked == [sorted(networks)]
-    for _ in range(2):
-        counts = folder.detection(frame, "d, smooth", networks["n, smooth"])
-        assert counts == {0: Counts(missed=1)}
-    assert asked[1:] == ["detect"]
 
 
 def test_a_sheet_is_small_and_needles_point_as_normals_do(tmp_path):
     picture = np.random.default_rng(0).random((90, 120, 3)).astype(np.float32)
     dark = np.zeros_like(picture)
-    one, many = a_highlight((10, 10, 20, 8)), a_highlight((50, 50, 9, 9), Kind.CLUSTER)
-    drawn = sheet.outlined(dark, [one, many], 2)
-    assert drawn.shape == (180, 240, 3)
-    blue, green, red = np.moveaxis(drawn.astype(int), 2, 0)
-    assert (green > red + blue)[18:40, 18:64].any()
-    assert not (green > red)[80:].any()
-    assert (red > green + blue)[98:122, 98:122].any()
-    drawn = sheet.outlined(picture, [one, many], 2)
     estimate = replace(an_estimate(math.pi / 4, 1e-4), look_px=np.array([60.0, 45.0]))
     columns = np.nonzero((sheet.needles(dark, [a_specularity({"n": estimate})], "n") > 0).any(axis=(0, 2)))[0]
     assert 57 <= columns.min() <= 60 < 66 <= columns.max() <= 71
     assert not sheet.needles(dark, [a_specularity({"n": Failure(Reason.NO_PEAK, "")})], "n").any()
+    drawn = sheet.needles(picture, [a_specularity({"n": estimate})], "n", 2)
+    assert drawn.shape == (180, 240, 3)
     sheet.write_sheet([[drawn] * 3] * 4, ["one", "two", "three"], tmp_path / "sheet.jpg")
     assert (tmp_path / "sheet.jpg").stat().st_size <= sheet.LARGEST_BYTES
     assert cv2.imread(str(tmp_path / "sheet.jpg")).shape[1] == 3 * (sheet.TILE_PX + 3)
@@ -287,4 +237,3 @@ def test_a_sheet_is_small_and_needles_point_as_normals_do(tmp_path):
 
 def test_without_files_the_classical_methods_alone_are_measured():
     assert tuple(networks.estimators(None, None)) == networks.CLASSICAL
-    assert tuple(networks.detectors(None)) == (networks.COLOUR,)

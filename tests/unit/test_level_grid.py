@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.runtime.resources import find
-from simtest.surfaces.level_grid import in_blocks, level_grid
-from simtest.surfaces.liver import Body
+from simtest.surfaces.liver import Body, in_blocks, level_grid
 from simtest.surfaces.recipe import LiverRecipe, load_recipe
 
 

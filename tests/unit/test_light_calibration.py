@@ -332,7 +332,7 @@ def write_inputs(folder: Path) -> None:
     ],
 )
 def test_refused_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], words: str) -> None:
-    from simtest.cli.calibrate import calibrate
+    from simtest.cli.pictures import calibrate
 
     write_inputs(tmp_path)
     monkeypatch.chdir(tmp_path)

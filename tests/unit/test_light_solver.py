@@ -12,7 +12,7 @@ from simtest.calibration.lights.result import LightCalibration, judge
 from simtest.calibration.lights.search import find_lights
 from simtest.geometry import Array
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import KannalaBrandt
+from simtest.geometry.lenses import KannalaBrandt
 from simtest.geometry.vectors import bisect
 
 CAMERA = Camera(640, 512, 420.0, 420.0, 322.0, 251.0)

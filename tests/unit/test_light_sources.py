@@ -8,7 +8,7 @@ import pytest
 import simtest
 from simtest.rendering import Session
 from simtest.spec import LightSpec, scene_from_dict
-from simtest.spec.light_source import CrescentSource
+from simtest.spec.lights import CrescentSource
 from tests.refusals import refused
 
 render = pytest.mark.render

@@ -4,7 +4,6 @@ import os
 import signal
 import struct
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -12,26 +11,23 @@ import numpy as np
 import pytest
 
 from simtest.api import sample_views
-from simtest.cli.fit import fit
-from simtest.dataset.manifest import ManifestError, read_manifest
+from simtest.cli.data import fit
 from simtest.errors import InputError, SimtestError
 from simtest.realism.frame_sets import open_generated
 from simtest.reconstruction.image_io import _tiff_size, read_picture
-from simtest.runtime.engines.engine import check_workers
-from simtest.runtime.files import require_plain
-from simtest.runtime.limits import DEFAULTS, VARIABLE, check_file, check_limit, limit
-from simtest.runtime.machine_errors import disk_problem
+from simtest.runtime.files import DEFAULTS, VARIABLE, check_limit, limit, require_plain
+from simtest.runtime.processes import call_apart, check_workers
 from simtest.spec import load_experiment, load_scene
 from simtest.spec.toml_files import apply_settings, parse_settings
-from simtest.surfaces import mesh_file, vtk_file
-from simtest.surfaces.mesh_file import read_mesh
-from simtest.surfaces.ply_header import check_ply
+from simtest.surfaces import mesh_file
+from simtest.surfaces.mesh_file import check_ply, read_mesh
 from simtest.surfaces.vtk_file import read_vtk
 from simtest.validation import run_folder
 from simtest.validation.cases import check_effort
 from simtest.validation.depth_maps import read_depth
 from studies.bad_inputs import files
 from tests.refusals import refused
+from tests.unit.engine_tasks import prints, swallows_memory
 
 
 @pytest.fixture(autouse=True)
@@ -40,27 +36,29 @@ def no_limits_of_ones_own(monkeypatch):
 
 
 def test_the_variable_replaces_limits_by_name(monkeypatch):
-    assert limit("settings") == DEFAULTS["settings"]
-    monkeypatch.setenv(VARIABLE, " settings = 2e4, picture_pixels=1e9 ,")
-    assert (limit("settings"), limit("picture_pixels"), limit("views")) == (20_000, 10**9, DEFAULTS["views"])
-    check_limit("settings", 20_000, "x", "settings")
-    refused(lambda: check_limit("settings", 20_001, "x", "settings"), "x: 20001 settings; at most 20000 are allowed (")
+    assert limit("mesh_faces") == DEFAULTS["mesh_faces"]
+    monkeypatch.setenv(VARIABLE, " mesh_faces = 2e4, picture_pixels=1e9 ,")
+    found = (limit("mesh_faces"), limit("picture_pixels"), limit("text_bytes"))
+    assert found == (20_000, 10**9, DEFAULTS["text_bytes"])
+    check_limit("mesh_faces", 20_000, "x", "faces")
+    refused(lambda: check_limit("mesh_faces", 20_001, "x", "faces"), "x: 20001 faces; at most 20000 are allowed (")
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("speed=3", "speed: unknown limit; allowed: text_bytes, "),
-        ("settings", "settings = '': must be a number from 1 on"),
-        ("settings=nan", "settings = nan: must be a number"),
-        ("settings=-1", "settings = -1: must be a number"),
-        ("settings=1e300", "settings = 1e300: must be a number"),
-        ("settings=many", "settings = many: must be a number"),
+        ("settings=3", "settings: unknown limit; allowed: text_bytes, "),
+        ("mesh_faces", "mesh_faces = '': must be a number from 1 on"),
+        ("mesh_faces=nan", "mesh_faces = nan: must be a number"),
+        ("mesh_faces=-1", "mesh_faces = -1: must be a number"),
+        ("mesh_faces=1e300", "mesh_faces = 1e300: must be a number"),
+        ("mesh_faces=many", "mesh_faces = many: must be a number"),
     ],
 )
 def test_a_malformed_variable_is_refused(monkeypatch, text, said):
     monkeypatch.setenv(VARIABLE, text)
-    refused(lambda: limit("views"), f"{VARIABLE}: {said}")
+    refused(lambda: limit("text_bytes"), f"{VARIABLE}: {said}")
 
 
 def test_what_is_no_plain_file_is_refused_without_opening_it(tmp_path):
@@ -71,9 +69,9 @@ def test_what_is_no_plain_file_is_refused_without_opening_it(tmp_path):
     ):  # fmt: skip
         make(tmp_path / name)
         refused(
-            lambda path=tmp_path / name: check_file(path, "text_bytes", "a TOML file"), f"{tmp_path / name}: ", said
+            lambda path=tmp_path / name: require_plain(path, "text_bytes", "a TOML file"), f"{tmp_path / name}: ", said
         )
-    refused(lambda: check_file(tmp_path / ("n" * 300), "text_bytes", "a TOML file"), "File name too long")
+    refused(lambda: require_plain(tmp_path / ("n" * 300), "text_bytes", "a TOML file"), "File name too long")
 
 
 @pytest.mark.parametrize(("width", "height"), [(10_001, 10_000), (65_500, 1), (1, 65_500)])
@@ -117,42 +115,36 @@ def test_a_picture_of_49_megapixels_passes_the_limits_and_one_of_99_does_not(tmp
     refused(lambda: read_picture(path), "x.png: no picture (")
     path.write_bytes(files.png(10_000, 9_999, b""))
     refused(lambda: read_picture(path), "picture_pixels")
-    sizes = {"mesh_bytes": 248 * 5_000_000, "film_bytes": 50 * 10**9, "picture_pixels": 48_000_000}
+    sizes = {"mesh_bytes": 248 * 5_000_000, "picture_pixels": 48_000_000}
     for name, size in sizes.items():
         check_limit(name, size, "x", "units")
 
 
 @pytest.mark.parametrize(
-    ("name", "call", "said"),
+    ("call", "said"),
     [
-        ("workers", lambda: check_workers(257), "workers = 257: must be 1 to 256"),
-        ("workers", lambda: check_workers(True), "workers = True: must be 1 to 256"),
-        ("workers", lambda: check_workers(2.0), "workers = 2.0: must be 1 to 256"),
-        ("views", lambda: sample_views("anatomy", "out", 1001), "count = 1001: must be 1 to 1000"),
-        ("generated_frames", lambda: open_generated("plane", 0), "--count 0: must be 1 to 10000"),
+        (lambda: check_workers(257), "workers = 257: must be 1 to 256"),
+        (lambda: check_workers(True), "workers = True: must be 1 to 256"),
+        (lambda: check_workers(2.0), "workers = 2.0: must be 1 to 256"),
+        (lambda: sample_views("anatomy", "out", 1001), "count = 1001: must be 1 to 1000"),
+        (lambda: open_generated("plane", 0), "--count 0: must be 1 to 10000"),
         (
-            "generated_frames",
             lambda: fit([Path("a.png")], recipe="tiny", out=Path("x.toml"), size=10_001),
             "--size 10001: must be 1 to 10000",
         ),
     ],
 )
-def test_counts_of_work_are_refused_with_the_limit_s_name(tmp_path, monkeypatch, name, call, said):
+def test_counts_of_work_are_refused_before_anything_is_written(tmp_path, monkeypatch, call, said):
     monkeypatch.chdir(tmp_path)
-    refused(call, f"{said} ({VARIABLE}={name}=N sets another limit)")
+    refused(call, said)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_large_records_are_refused_with_the_limit_s_name(tmp_path, monkeypatch):
-    monkeypatch.setenv(VARIABLE, "manifest_bytes=3,record_bytes=3")
+    monkeypatch.setenv(VARIABLE, "record_bytes=3")
     (tmp_path / "manifest.json").write_text("{   }")
-    with pytest.raises(ManifestError, match=rf"manifest.json: 5 bytes; .* \({VARIABLE}=manifest_bytes=N sets another"):
-        read_manifest(tmp_path)
-    with pytest.raises(OSError, match="at most 3 are allowed") as error:
-        require_plain(tmp_path / "manifest.json", "record_bytes")
-    told = f"5 bytes; at most 3 are allowed ({VARIABLE}=record_bytes=N sets another limit)"
-    # The system's limit (ulimit -f) has nothing to do with it.
-    assert disk_problem(error.value) == f"{tmp_path / 'manifest.json'}: {told}"
+    told = f"manifest.json: 5 bytes; at most 3 are allowed ({VARIABLE}=record_bytes=N sets another limit)"
+    refused(lambda: require_plain(tmp_path / "manifest.json", "record_bytes"), told)
 
 
 @pytest.mark.parametrize(("kind", "suffix"), [("PNG", "png"), ("WEBP", "webp"), ("TIFF", "tif"), ("GIF", "gif")])
@@ -263,28 +255,30 @@ def test_a_vtk_file_that_breaks_vtk_down_is_refused(tmp_path):
     refused(lambda: read_mesh(path), "POINTS 9000000000: the file has", "too few for them")
 
 
-def test_what_the_machine_lacks_is_no_damage_of_a_vtk_file(tmp_path, monkeypatch, capsys):
+def test_what_the_machine_lacks_is_no_damage_of_a_vtk_file(tmp_path, monkeypatch):
     path = tmp_path / "m.vtk"
     path.write_text(files.vtk())
 
-    def ended(code, said=""):
+    def ended(code, said=b""):
         monkeypatch.setattr(subprocess, "run", lambda command, **_: subprocess.CompletedProcess(command, code, said))
         with pytest.raises(SimtestError) as error:
             read_mesh(path)
         return error
 
     killed = ended(-signal.SIGKILL)
-    assert str(killed.value) == f"{path}: VTK was killed while it read the file, mostly for want of memory"
+    assert str(killed.value) == f"{path}: the reader of a VTK mesh was killed, mostly for want of memory"
     assert killed.type is SimtestError
     assert ended(-signal.SIGSEGV).type is InputError
-    # In VTK's process: no room for the triangles, no memory.
-    monkeypatch.setattr(sys, "argv", ["vtk_file", str(path), str(tmp_path / "none" / "out.npz")])
-    code, said = vtk_file.main(), capsys.readouterr().out
-    full = ended(code, said)
-    assert full.type is SimtestError
-    assert str(full.value).startswith(f"{path}: its triangles cannot be stored ({tmp_path / 'none' / 'out.npz'}: No")
-    monkeypatch.setattr(vtk_file, "_triangles", lambda _: np.empty(2**58))
-    assert str(ended(vtk_file.main(), capsys.readouterr().out).value).startswith(f"{path}: not enough memory (")
+
+
+def test_what_a_process_of_its_own_makes_of_a_file(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("content")
+    assert call_apart(prints, path, 1e9, "text", "damaged") == "content"
+    with pytest.raises(SimtestError, match=r"a\.txt: not enough memory") as error:
+        call_apart(swallows_memory, path, 1e9, "text", "damaged")
+    assert error.type is SimtestError
+    refused(lambda: call_apart(prints, tmp_path / "none", 1e9, "text", "damaged"), "none: not a readable text (")
 
 
 def test_the_first_bytes_of_a_film_tell_its_container(tmp_path):

@@ -7,17 +7,16 @@ import pytest
 import trimesh
 
 from simtest.errors import InputError
-from simtest.surfaces.fineness import (
+from simtest.surfaces.mesh_check import check_mesh
+from simtest.surfaces.mesh_file import examine, read_mesh, repair
+from simtest.surfaces.mesh_surface import (
     EDGES_PER_HALF_WIDTH,
     concentration,
     ggx_concentration,
     half_width,
     phong_concentration,
+    prepare,
 )
-from simtest.surfaces.mesh_check import check_mesh
-from simtest.surfaces.mesh_file import read_mesh
-from simtest.surfaces.mesh_surface import prepare
-from simtest.surfaces.repair import examine, repair
 
 C = phong_concentration(10.0)
 
@@ -143,7 +142,7 @@ def test_huge_meshes_are_refused_by_their_size_alone(tmp_path, monkeypatch):
 
 def test_large_meshes_are_not_searched_and_it_is_said(tmp_path, monkeypatch):
     path = save(tmp_path / "ball.ply", *ball())
-    monkeypatch.setattr("simtest.surfaces.repair.MAX_CROSSING_FACES", 100)
+    monkeypatch.setattr("simtest.surfaces.mesh_file.MAX_CROSSING_FACES", 100)
     monkeypatch.setattr("simtest.surfaces.mesh_check.MAX_CURVATURE_FACES", 100)
     verdict = check_mesh(path, 30.0, C)
     assert verdict.condition.crossing_faces is None

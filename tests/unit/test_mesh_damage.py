@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from simtest.cli.manners import MANNERS
-from simtest.cli.validate import validate
+from simtest.cli.main import MANNERS
+from simtest.cli.runs import validate
 from simtest.errors import InputError
 from simtest.spec import Experiment, Group
-from simtest.surfaces.fineness import concentration
 from simtest.surfaces.mesh_check import check_mesh
-from simtest.surfaces.mesh_file import read_mesh
-from simtest.surfaces.ply_polygons import read_mixed_polygons
+from simtest.surfaces.mesh_file import read_mesh, read_mixed_polygons
+from simtest.surfaces.mesh_surface import concentration
 from simtest.surfaces.vtk_file import _triangles
 from simtest.validation.mesh_verdicts import MeshVerdict, mesh_verdicts
 from tests.refusals import refused
@@ -177,7 +176,7 @@ def test_an_experiment_judges_its_mesh_files_once(tmp_path, monkeypatch):
         refined.text,
     )
     # One that would need more faces than are allowed is not fine enough, and says so.
-    monkeypatch.setattr("simtest.surfaces.subdivision.MAX_SUBDIVIDED_FACES", 1500)
+    monkeypatch.setattr("simtest.surfaces.mesh_surface.MAX_SUBDIVIDED_FACES", 1500)
     (limited,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.edge_mm": "auto"}))
     assert not limited.usable
     assert ": too coarse, 0." in limited.text

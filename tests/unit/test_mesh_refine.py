@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import read_mesh
-from simtest.surfaces.mesh_geometry import edge_lengths, edge_uses
-from simtest.surfaces.mesh_surface import Refinement, prepare
+from simtest.surfaces.mesh_surface import Refinement, fair, halvings, prepare, refine, shape_operators, vertex_normals
 from simtest.surfaces.model import principal_curvatures
-from simtest.surfaces.subdivision import fair, halvings, refine, shape_operators, vertex_normals
+from simtest.surfaces.triangles import edge_lengths, edge_uses
 
 
 def plane_lattice(side, reach):
@@ -128,7 +127,7 @@ def test_a_surface_of_an_edge_length_is_read_back_from_its_dump():
 def test_smoothing_is_left_out_with_a_warning_where_it_cannot_be(tmp_path, monkeypatch):
     path = tmp_path / "ball.ply"
     trimesh.creation.icosphere(3, radius=15.0).export(path)
-    monkeypatch.setattr("simtest.surfaces.subdivision.MAX_SMOOTHED_FACES", 1000)
+    monkeypatch.setattr("simtest.surfaces.mesh_surface.MAX_SMOOTHED_FACES", 1000)
     with pytest.warns(UserWarning, match="1280 faces, at most 1000 can be smoothed; using smoothing_mm = 0"):
         prepare(path, Refinement(0, smoothing_mm=3.0))
 

@@ -7,11 +7,11 @@ import pytest
 import trimesh
 
 from simtest.errors import InputError
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import read_mesh
-from simtest.surfaces.mesh_geometry import isoperimetric_quotient
 from simtest.surfaces.mesh_surface import LUMEN_QUOTIENT, MeshSurface, prepare
 from simtest.surfaces.model import RayHits
+from simtest.surfaces.triangles import isoperimetric_quotient
 from tests.marked import marked
 
 MESHES = Path(__file__).resolve().parents[2].parent / "shared/data/meshes"
@@ -184,7 +184,7 @@ def test_orientation_is_mended(tmp_path):
 def test_subdivision_is_reduced_with_a_warning(tmp_path, monkeypatch):
     path = save(sphere(level=3), tmp_path / "ball.ply")
     assert len(prepare(path, 1).mesh.faces) == 4 * 1280
-    monkeypatch.setattr("simtest.surfaces.subdivision.MAX_SUBDIVIDED_FACES", 10_000)
+    monkeypatch.setattr("simtest.surfaces.mesh_surface.MAX_SUBDIVIDED_FACES", 10_000)
     with pytest.warns(UserWarning, match=r"3 subdivisions of 1280 faces .* 10000; using 1\. Decimated to 625 faces"):
         prepared = prepare(path, 3)
     assert prepared.subdivisions == 1

@@ -4,7 +4,7 @@ import pytest
 
 from simtest.detection.detector import DETECTORS, load_detector
 from simtest.errors import InputError
-from simtest.runtime.model_names import parse_model
+from simtest.runtime.resources import parse_model
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
 from simtest.spec import load_experiment, scene_from_dict
-from simtest.spec.views import Moved, Views
+from simtest.spec.camera import Moved, Views
 from simtest.validation.cases import expand
 from simtest.validation.motion import told_pose, true_gains
 from simtest.validation.motion_counts import motion_counts, motion_rows

@@ -12,15 +12,26 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from simtest.errors import InputError
-from simtest.nightly import layout
-from simtest.nightly.baseline import accept, load_baseline, log_note
+from simtest.nightly import store
 from simtest.nightly.gate.quantities import OLDEST_COLUMNS
 from simtest.nightly.history import HISTORY, TREND_COLUMNS, TRENDS, append, clock_note, history_rows, read_history
-from simtest.nightly.layout import Reports, exclusive_replacement, new_run_id, remove_dead, replace_folder, scratch
 from simtest.nightly.phrases import short_commit
 from simtest.nightly.records import CELL
-from simtest.nightly.storage import BASELINE_ROWS, LATEST_ROWS, load_run, save_run
-from simtest.nightly.verdict import judge
+from simtest.nightly.run import judge
+from simtest.nightly.store import (
+    BASELINE_ROWS,
+    LATEST_ROWS,
+    Reports,
+    accept,
+    exclusive_replacement,
+    load_baseline,
+    load_run,
+    log_note,
+    new_run_id,
+    only_night,
+    replace_folder,
+    save_run,
+)
 from tests.unit.nightly_samples import STARTED, make_rows, make_run, no_baseline
 
 
@@ -266,7 +277,7 @@ def test_a_baseline_is_the_last_night_with_a_reason(reports):
     assert pl.read_parquet_schema(reports.baseline("quick") / BASELINE_ROWS)["peak_snr"] == pl.Float32()
     assert_frame_equal(found.rows, kept)
     assert {"error_deg", "seed", "true_id", "realisation"} <= set(kept.columns)
-    assert not list(reports.work.glob("2*"))
+    assert list(reports.work.iterdir()) == []
 
 
 def test_reading_a_baseline_writes_nothing(reports):
@@ -365,7 +376,7 @@ def test_a_damaged_baseline_is_named(reports, name, damage):
         file.write_bytes(kept)
     # A record of another night names the first table, whose hash it does not hold.
     named = BASELINE_ROWS if (name, damage) == ("run.json", "another night's") else name
-    with pytest.raises(InputError, match=f"{named}: (damaged|cannot be read)"):
+    with pytest.raises(InputError, match=f"{named}: (damaged|no such file)"):
         load_baseline(reports, "quick")
 
 
@@ -396,7 +407,10 @@ def test_an_accept_that_is_killed_leaves_one_of_the_two(reports, monkeypatch, re
         with pytest.raises(KeyboardInterrupt):
             accept(reports, "quick", "second")
     else:
-        monkeypatch.setattr(layout, "sync_folder", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        swapped = reports.baseline("quick").parent
+        monkeypatch.setattr(
+            store, "sync_folder", lambda made: (_ for _ in ()).throw(KeyboardInterrupt) if made == swapped else None
+        )
         with pytest.raises(KeyboardInterrupt):
             accept(reports, "quick", "second")
     monkeypatch.undo()
@@ -409,18 +423,20 @@ def test_an_accept_that_is_killed_leaves_one_of_the_two(reports, monkeypatch, re
 # Scratch ---------------------------------------------------------------------------------------------------------
 
 
-def test_what_dead_nights_left_is_removed_and_the_living_are_left_alone(tmp_path):
+def test_what_a_killed_night_left_is_removed_and_other_profiles_are_left_alone(tmp_path):
     reports = Reports(tmp_path)
-    dead = reports.work / "20260101T000000Z-1-dead"
-    dead.mkdir(parents=True)
-    (dead / "lock").touch()
-    (dead / "rows").write_text("half")
-    with scratch(reports, "20260102T000000Z-1-alive") as alive:
-        assert remove_dead(reports) == [dead.name]
-        assert alive.is_dir()
-    assert not alive.exists()
-    assert not dead.exists()
-    assert remove_dead(reports) == []
+    dead, other = reports.work / "quick" / "rows", reports.work / "full" / "rows"
+    for rows in (dead, other):
+        rows.parent.mkdir(parents=True)
+        rows.write_text("half")
+    with only_night(reports, "quick") as folder:
+        assert folder == dead.parent
+        assert list(folder.iterdir()) == []
+        with pytest.raises(InputError, match="is in use by process"), only_night(reports, "quick"):
+            pass
+        assert folder.is_dir()
+    assert not folder.exists()
+    assert other.exists()
 
 
 def test_a_folder_is_replaced_whole(tmp_path):

@@ -12,10 +12,8 @@ from contextlib import contextmanager
 import polars as pl
 import pytest
 
-from simtest.nightly.baseline import load_baseline
 from simtest.nightly.history import read_history
-from simtest.nightly.layout import Reports
-from simtest.nightly.storage import LATEST_ROWS, load_run
+from simtest.nightly.store import LATEST_ROWS, Reports, load_baseline, load_run
 
 MAIN = "from simtest.cli.main import main; main()"
 ROUNDS = 2
@@ -78,7 +76,7 @@ def check_whole(reports):
 def test_of_two_nights_at_once_the_second_is_refused(tmp_path, profile):
     reports = Reports(tmp_path / "reports")
     first = night(profile, reports)
-    while not list(reports.root.glob("work/2*")) and first.poll() is None:
+    while not list(reports.root.glob("work/tiny")) and first.poll() is None:
         time.sleep(0.01)
     errors = finish(night(profile, reports), 2)
     assert errors.startswith(f"simtest: --reports {reports.root / 'tiny'}: is in use by process {first.pid} (")
@@ -116,7 +114,7 @@ def test_a_night_killed_at_any_moment_loses_nothing(tmp_path, profile):
     finish(night(profile, reports))
     finish(accept(profile, reports, "first"))
     killed = 0
-    for number, stage in enumerate([*STAGES, "work/*/baseline"] * ROUNDS):
+    for number, stage in enumerate([*STAGES, "work/.tiny.baseline"] * ROUNDS):
         before, accepted = kept(reports), load_baseline(reports, "tiny").record
         accepting = stage.endswith("baseline")
         process = accept(profile, reports, f"number {number}") if accepting else night(profile, reports)

@@ -6,8 +6,7 @@ import json
 import polars as pl
 import pytest
 
-from simtest.nightly.outputs import write_outputs
-from simtest.nightly.outputs.summary import MAX_CHARACTERS, summary
+from simtest.nightly.outputs import MAX_CHARACTERS, summary, write_outputs
 from simtest.nightly.records import OUTCOMES, RunRecord, Verdict
 from tests.unit.nightly_samples import RUN, compared, judged, make_run, no_baseline, regression
 

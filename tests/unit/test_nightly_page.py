@@ -20,8 +20,8 @@ from simtest.nightly.page.run_tables import comparisons
 from simtest.nightly.page.trends import trends
 from simtest.nightly.phrases import headline_sentence, measure, short_commit, signed
 from simtest.nightly.records import COMPARISONS, FIGURES, JudgedRun, NightlyRun, RunRecord, Verdict
-from simtest.pages.chart_web import BUNDLE
-from simtest.validation.results_table import SCHEMA
+from simtest.pages.charts import packed_vega
+from simtest.validation.columns import SCHEMA
 from tests.unit.nightly_samples import make_run
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)
@@ -107,8 +107,9 @@ def test_the_page_stands_alone_and_is_sound_html(whole):
     assert "http" not in re.sub(
         r'http-equiv|<script type="application/json".*?</script>', "", without_scripts, flags=re.S
     )
-    (packed,) = re.findall(r'<script type="application/octet-stream" id="plotly-packed">(.*?)</script>', text)
-    assert zlib.decompress(base64.b64decode(packed)) == zlib.decompress(BUNDLE.read_bytes())
+    (packed,) = re.findall(r'<script type="application/octet-stream" id="vega-packed">(.*?)</script>', text)
+    assert packed == packed_vega()
+    assert b"vegaEmbed" in zlib.decompress(base64.b64decode(packed))
 
 
 def test_the_page_can_be_read_without_eyes_or_mouse(whole):

@@ -17,22 +17,16 @@ import pytest
 
 from simtest.cli import main as command_line
 from simtest.errors import BackendError, InputError, SimtestError
-from simtest.nightly import draw as draw_module
-from simtest.nightly import measure
 from simtest.nightly import run as run_module
-from simtest.nightly import verdict as verdict_module
-from simtest.nightly.baseline import accept, load_baseline
-from simtest.nightly.gate.figures import setting_figures
+from simtest.nightly.gate.quantities import setting_figures
 from simtest.nightly.history import read_history
-from simtest.nightly.layout import Reports
-from simtest.nightly.measure import RunOptions
-from simtest.nightly.run import run_nightly
-from simtest.nightly.storage import BASELINE_ROWS, save_run
+from simtest.nightly.run import RunOptions, run_nightly
+from simtest.nightly.store import BASELINE_ROWS, Reports, accept, load_baseline, save_run
 from simtest.runtime.resources import data_root
 from simtest.spec import Profile, experiments_of, load_profile
 from simtest.validation.cases import expand
+from simtest.validation.columns import SCHEMA
 from simtest.validation.fingerprints import definition
-from simtest.validation.results_table import SCHEMA
 from tests.marked import marked
 from tests.unit.nightly_samples import STARTED, make_rows, make_run, regression
 
@@ -80,7 +74,7 @@ def sample():
     return make_run()
 
 
-plan_run = measure.plan_run
+plan_run = run_module.plan_run
 
 
 @cache
@@ -246,8 +240,8 @@ def test_experiments_with_findings_have_their_report(small, reports, monkeypatch
         run,
         rows=run.rows.with_columns(pl.when(experiment="planes").then(9.0).otherwise("error_deg").alias("error_deg")),
     )
-    compare = verdict_module.compare
-    monkeypatch.setattr(verdict_module, "compare", lambda tonight, before: compare(refigured(moved(tonight)), before))
+    compare = run_module.compare
+    monkeypatch.setattr(run_module, "compare", lambda tonight, before: compare(refigured(moved(tonight)), before))
     outcome = run_nightly(profile, reports)
     assert outcome.judged.verdict.state == "regression"
     assert outcome.judged.reports == ("planes",)
@@ -263,7 +257,7 @@ def refigured(run):
 
 def test_a_regression_exits_1(measured, reports, monkeypatch):
     accept_first(reports)
-    monkeypatch.setattr(verdict_module, "compare", lambda tonight, baseline: regression(tonight))
+    monkeypatch.setattr(run_module, "compare", lambda tonight, baseline: regression(tonight))
     outcome = run_nightly(quick(), reports)
     assert outcome.judged.verdict.exit_code == 1
     assert json.loads((outcome.folder / "verdict.json").read_text())["exit_code"] == 1
@@ -306,7 +300,7 @@ def test_an_error_inside_an_estimator_is_the_first_cause(measured, reports):
     accept(reports, "quick", "it is known to fail")
     verdict = run_nightly(quick(), reports).judged.verdict
     assert (verdict.state, verdict.causes) == ("fine", ())
-    alone = verdict_module.verdict_on(broken, None)
+    alone = run_module.verdict_on(broken, None)
     assert (alone.state, alone.causes) == ("no baseline", (f"{said}.",))
 
 
@@ -405,7 +399,7 @@ def fails_with(error):
 
 def test_a_night_whose_report_cannot_be_drawn_is_kept_and_says_so(measured, reports, monkeypatch):
     accept_first(reports)
-    monkeypatch.setattr(draw_module, "write_report", fails_with(RuntimeError("no such\nframe")))
+    monkeypatch.setattr(run_module, "write_report", fails_with(RuntimeError("no such\nframe")))
     monkeypatch.setattr(Path, "is_dir", lambda path, own=Path.is_dir: path.name in ("first", "second") or own(path))
     measured[:] = [make_run(rows=make_rows().with_columns(pl.col("error_deg") * 1.5))]
     outcome = run_nightly(quick(), reports)
@@ -430,7 +424,7 @@ def test_nothing_is_kept_of_a_night_that_stops_before_it_is_whole(measured, repo
     accept_first(reports)
     error = STOPS[stop]
     before = contents(reports.root)
-    monkeypatch.setattr(draw_module if step == "write_nightly_page" else run_module, step, fails_with(error))
+    monkeypatch.setattr(run_module, step, fails_with(error))
     with pytest.raises(type(error)) as raised:
         run_nightly(quick(), reports)
     assert contents(reports.root) == before
@@ -479,7 +473,7 @@ def finished():
 @pytest.fixture
 def parts(monkeypatch, finished):
     """Have experiments that were run already."""
-    experiments = measure.run_experiments
+    experiments = run_module.run_experiments
 
     def work(*arguments):
         described = tuple(experiment.model_dump_json() for experiment, _ in arguments[0])
@@ -487,7 +481,7 @@ def parts(monkeypatch, finished):
             finished[described] = experiments(*arguments)
         return finished[described]
 
-    monkeypatch.setattr(measure, "run_experiments", work)
+    monkeypatch.setattr(run_module, "run_experiments", work)
 
 
 PAPER = '[[experiments]]\nexperiment = "paper"\nlabels = ["noise"]\nrealisations = 1\n'
@@ -496,7 +490,7 @@ PAPER = '[[experiments]]\nexperiment = "paper"\nlabels = ["noise"]\nrealisations
 def night_of(tmp_path, text=PAPER):
     folder = tmp_path / f"night-{len(list(tmp_path.glob('night-*')))}"
     folder.mkdir()
-    return measure.measure_run(profile_of(tmp_path, text), folder, "id")
+    return run_module.measure_run(profile_of(tmp_path, text), folder, "id")
 
 
 def test_a_run_that_measured_nothing_is_refused(tmp_path):

@@ -1,10 +1,8 @@
 """Notebook manners: short texts, HTML with pictures, overrides by the last name of a key, results of runs."""
 
-import copy
 import json
 import os
 import re
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -19,10 +17,11 @@ from simtest.geometry.vectors import tilt_deg
 from simtest.pages.notebook import normal_html, picture_html, table_html
 from simtest.rendering.frames import Radiance
 from simtest.report.run_results import RunResults
-from simtest.runtime.short_repr import LONGEST, short
+from simtest.runtime.arrays import LONGEST, short
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.preview import SURFACE_LEVEL, preview
-from simtest.spec.short_keys import full_keys, scene_models
+from simtest.spec.keys import full_keys
+from simtest.spec.recipes import scene_models
 from simtest.validation.cases import expand
 
 SIZE = 160
@@ -263,20 +262,6 @@ def test_results_of_a_run_are_read_when_asked(tmp_path):
     html = run._repr_html_()
     assert "0.25" in html
     assert "and 28 more settings" in html
-
-
-def test_results_of_a_run_still_do_what_the_path_of_the_page_did(tmp_path):
-    (tmp_path / "index.html").write_text("page")
-    run = RunResults(tmp_path / "index.html")
-    with pytest.warns(DeprecationWarning, match=r"RunResults.read_text is deprecated and goes in 0.3.0; use .page"):
-        assert run.read_text() == "page"
-    with pytest.warns(DeprecationWarning, match=r"use .page.parent"):
-        assert run.parent == tmp_path
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert copy.copy(run) == run
-        assert not hasattr(run, "_ipython_display_")
-        assert not hasattr(run, "results_of")
 
 
 @pytest.mark.slow

@@ -39,7 +39,6 @@ def test_wheel_holds_data_and_marker(wheel):
     for file in shipped:
         assert f"simtest/_data/{file.relative_to(ROOT)}" in names
     assert {"simtest/py.typed", "simtest/report/run.html.j2", "simtest/pages/templates/parts.html.j2"} <= names
-    assert {f"simtest/pages/vendor/{file.name}" for file in (ROOT / "simtest/pages/vendor").iterdir()} <= names
     assert not [name for name in names if name.startswith(("tests/", "docs/"))]
 
 

@@ -15,7 +15,7 @@ from tests.unit.test_report import make_run
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory):
     made = make_run(tmp_path_factory.mktemp("run") / "run", items=2, realisations=3)
-    write_report(made)
+    write_report(made, charts=True)
     return made
 
 
@@ -35,7 +35,7 @@ def draws(monkeypatch, run):
     drawn = []
     draw = page.draw_page
     monkeypatch.setattr(page, "draw_page", lambda *arguments: drawn.append(1) or draw(*arguments))
-    assert write_report(run) == run / "index.html"
+    assert write_report(run, charts=True) == run / "index.html"
     return bool(drawn)
 
 
@@ -46,6 +46,7 @@ def test_a_page_that_is_up_to_date_stays(run, monkeypatch):
     told = []
     assert not draws(monkeypatch, run)
     write_report(run, lambda *step: told.append(step))
+    write_report(run, lambda *step: told.append(step), charts=True)
     assert not told
     assert {file: file.stat().st_mtime_ns for file in before} == before
 
@@ -118,7 +119,7 @@ def test_other_code_or_versions_draw_the_page_again(run, monkeypatch):
 
 def steps_of(run):
     told = []
-    write_report(run, lambda *step: told.append(step))
+    write_report(run, lambda *step: told.append(step), charts=True)
     return told
 
 
@@ -152,11 +153,22 @@ def test_a_stop_leaves_the_earlier_page_and_the_next_call_makes_it_whole(run, tm
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            write_report(run, press)
+            write_report(run, press, charts=True)
         assert (run / "index.html").read_bytes() == before
         assert not list((run / "figures").glob(".*"))
-    write_report(run)
+    write_report(run, charts=True)
     assert contents(run) == contents(other)
+
+
+def test_charts_are_files_where_they_are_asked_for(run):
+    (run / "index.html").unlink()
+    write_report(run)
+    assert {file.stem for file in (run / "figures").iterdir()} == {"gallery_000", "gallery_001"}
+    # The same page, and what is missing beside it.
+    text = (run / "index.html").read_text(encoding="utf-8").rpartition("<!--")[0]
+    write_report(run, charts=True)
+    assert (run / "figures" / "axis_ratio.png").stat().st_size > 5000
+    assert (run / "index.html").read_text(encoding="utf-8").rpartition("<!--")[0] == text
 
 
 def test_a_frame_that_cannot_be_drawn_stops_the_page(run, monkeypatch):

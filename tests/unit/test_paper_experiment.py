@@ -7,11 +7,11 @@ import pytest
 
 from simtest import validate
 from simtest.errors import InputError
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import Experiment, load_experiment, load_scene
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import expand
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 from simtest.validation.runner import run_experiment
 
 SMALL = {"paper.size": 128, "paper.height": 315.0, "paper.isovalue": 0.3, "paper.smoothing_px": 2.0}

@@ -1,13 +1,16 @@
 """The page of the published protocol: figures hold the rows' numbers, verdicts are computed from them."""
 
+import io
 import json
 import re
 
 import numpy as np
 import polars as pl
 import pytest
+from PIL import Image
 
-from simtest.pages import chart_png, chart_web, style
+from simtest.pages import style
+from simtest.pages.charts import png, spec
 from simtest.report import write_report
 from simtest.report.paper.fits import line, offset_inside_window
 from simtest.report.paper.isocurve_figure import KAPPA, OFFSET_LIGHT, isocurve_figure
@@ -126,16 +129,17 @@ def test_both_media_hold_bars_bound_law_and_failures(tmp_path):
     assert failures.bold
     assert "5 of 40 failed: no_closed_isophote 5" in failures.hover[0]
     assert (upper.y.title, lower.x.title) == ("error of the better candidate (deg)", "slant θ (deg)")
-    drawn = chart_web.figure(chart)
-    assert drawn["layout"]["yaxis"]["title"]["text"].endswith("(deg)")
-    spread = [trace["error_y"] for trace in drawn["data"] if "error_y" in trace]
-    np.testing.assert_allclose(spread[0]["array"], sweep.largest - sweep.mean, rtol=1e-4)
-    np.testing.assert_allclose(spread[0]["arrayminus"], sweep.mean - sweep.least, rtol=1e-4)
-    np.testing.assert_allclose(spread[1]["array"], sweep.std, rtol=1e-4)
-    strip = next(trace for trace in drawn["data"] if trace["yaxis"] == "y2")
-    assert strip["text"] == ["<b>5</b>"] * 3
-    picture, (part,) = chart_png.draw([chart])
-    assert picture.shape == part.shape
+    above, below = spec(chart)["vconcat"]
+    rows = {layer["mark"]["type"]: layer["data"]["values"] for layer in above["layer"]}
+    thin = [row for row in rows["rule"] if row["width"] == 1.0]
+    thick = [row for row in rows["rule"] if row["width"] > 3]
+    np.testing.assert_allclose([row["low"] for row in thin], sweep.least, rtol=1e-4)
+    np.testing.assert_allclose([row["high"] for row in thin], sweep.largest, rtol=1e-4)
+    np.testing.assert_allclose([row["high"] for row in thick], sweep.mean + sweep.std, rtol=1e-4)
+    (counts,) = (layer["data"]["values"] for layer in below["layer"] if layer["mark"]["type"] == "text")
+    assert [(row["text"], row["bold"]) for row in counts] == [("5", True)] * 3
+    with Image.open(io.BytesIO(png([chart]))) as file:
+        picture = np.asarray(file.convert("RGB"))
     # Ink of the curve, of the bound and of the failures.
     for colour in (COLOURS["circle_pose"], "#8A6D00", "#D03030"):
         assert (np.abs(picture.astype(int) - style.rgb(colour)).max(axis=-1) < 8).sum() > 20, colour
@@ -258,15 +262,15 @@ def small(tmp_path_factory):
 
 
 def test_the_pages_sections_and_files(small):
-    html = write_report(small.folder).read_text(encoding="utf-8")
+    html = write_report(small.folder, charts=True).read_text(encoding="utf-8")
     wanted = {"statements", "isocurves", "pipeline", "error_vs_paper_sigma", "gallery"}
     assert wanted <= set(re.findall(r'<(?:section|details)[^>]* id="(\w+)"', html))
     assert "error_vs_curvature" not in html
     assert "surfaces" not in re.findall(r'<(?:section|details)[^>]* id="(\w+)"', html)
     assert "at the article&#39;s defaults" in html or "at the article's defaults" in html
     files = {file.name for file in (small.folder / "figures").iterdir()}
-    assert {"isocurves.png", "pipeline.png", "pipeline_6.png", "error_vs_paper_sigma.png", "gallery_000.png"} <= files
-    assert "texture units" in html
+    assert {"isocurves.png", "pipeline.png", "error_vs_paper_sigma.png", "gallery_000.png"} <= files
+    assert "texture of the specular term" in html
     assert line_figures(read_run(small.folder)) == []
 
 

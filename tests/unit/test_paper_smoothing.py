@@ -5,7 +5,7 @@ import pytest
 
 from simtest.errors import Failure
 from simtest.geometry.vectors import angle_deg
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.paper import smoothing
 from simtest.validation.paper.published_pipeline import Pipeline
 from simtest.validation.paper.smoothing import smoothing_bias

@@ -8,7 +8,7 @@ from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
 from simtest.estimators.family_fit import fit_isophote_family
 from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_PX2, MEAN_SHARE, MEAN_SIZE, PEAK_PX2, SUSPECT_CHI2
 from simtest.geometry import Camera, Patch, smooth
-from simtest.geometry.distortion import KannalaBrandt
+from simtest.geometry.lenses import KannalaBrandt
 from simtest.geometry.vectors import angle_deg
 
 CAMERA = Camera(200, 160, 300.0, 300.0, 100.0, 80.0)

@@ -9,7 +9,7 @@ from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL, HIGHLIGHT_WIDTH_EXCE
 from simtest.detection import detect, flat_pixels, peak_shape
 from simtest.errors import Failure
 from simtest.geometry import Camera, Patch, smooth
-from simtest.geometry.gaussian_smoothing import share_of_noise
+from simtest.geometry.patch import share_of_noise
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import reconstruct
 from tests.marked import marked

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Uniform
-from simtest.cli.reconstruct import _print_assumed, _print_counts, _print_silent
+from simtest.cli.pictures import _print_assumed, _print_counts, _print_silent
 from simtest.detection.blobs import Highlight, Kind
 from simtest.detection.regions import Region
 from simtest.detection.view_mask import View

@@ -6,7 +6,7 @@ from scipy import stats
 
 from simtest.estimators.pose_uncertainty import _conic, _ellipse
 from simtest.geometry import circle_pose
-from simtest.geometry.pose_region import PoseRegion
+from simtest.geometry.cones import PoseRegion
 
 FRAME = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0].T
 

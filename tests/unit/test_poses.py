@@ -172,7 +172,7 @@ def test_malformed_files_are_one_line(words, tmp_path):
 
 
 def test_a_missing_file_is_one_line(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="no such file; must be a file of poses"):
         read_poses(tmp_path / "none.json")
 
 

@@ -20,8 +20,7 @@ from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
 from simtest.estimators.process.naming import close_cores
 from simtest.runtime.provenance import file_hash
-from simtest.spec.dataset_recipe import Dataset, load_dataset
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import Dataset, PaperSetting, load_dataset
 from simtest.validation.paper.gallery_item import reproduce_command
 from tests.marked import marked
 from tests.unit.core_helpers import BAD_CORE, CORES, OWN_CORE, processes_with, wait_until
@@ -302,8 +301,8 @@ def test_a_run_tells_of_its_cores(tmp_path, published):
 
 
 def test_an_experiment_and_a_nightly_profile_name_a_core(tmp_path, published):
-    from simtest.nightly.measure import measure_run, plan_run
-    from simtest.spec.profile import load_profile
+    from simtest.nightly.run import measure_run, plan_run
+    from simtest.spec.recipes import load_profile
 
     core = command(BAD_CORE, "none")
     published.write_text(PUBLISHED.replace('"cone_axis"', json.dumps(core)))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from simtest.calibration.photometry import AngularProfile
 from simtest.errors import InputError
-from simtest.geometry.angular_profile import AngularProfile
-from simtest.spec.falloff import CosineProfile, TableProfile
+from simtest.spec.lights import CosineProfile, TableProfile
 from simtest.spec.spec_model import validate
 
 

@@ -7,8 +7,7 @@ import pytest
 from rich import progress as rich
 
 from simtest.cli import progress
-from simtest.cli.progress import progress_bar
-from simtest.cli.remaining import LEAST_STEPS, Remaining
+from simtest.cli.progress import LEAST_STEPS, Remaining, progress_bar
 from simtest.validation.case_work import names_of as told
 
 

@@ -16,15 +16,15 @@ ROOT = Path(__file__).resolve().parents[2]
 
 PUBLIC = {
     "BackendError": "simtest.errors",
-    "BrownConrady": "simtest.geometry.perspective",
+    "BrownConrady": "simtest.geometry.lenses",
     "Calibration": "simtest.calibration.calibration",
     "Camera": "simtest.geometry.camera",
     "Estimate": "simtest.estimators.protocol",
-    "Experiment": "simtest.spec.experiment",
+    "Experiment": "simtest.spec.recipes",
     "Failure": "simtest.errors",
     "InputError": "simtest.errors",
-    "KannalaBrandt": "simtest.geometry.distortion",
-    "Scaramuzza": "simtest.geometry.omnidirectional",
+    "KannalaBrandt": "simtest.geometry.lenses",
+    "Scaramuzza": "simtest.geometry.lenses",
     "LabelledFrame": "simtest.simulation.labelled_frame",
     "Patch": "simtest.geometry.patch",
     "Reason": "simtest.errors",
@@ -35,13 +35,13 @@ PUBLIC = {
     "ViewMask": "simtest.geometry.camera",
     "export": "simtest.api",
     "load_calibration": "simtest.spec.calibration_file",
-    "load_camera": "simtest.spec.camera_spec",
-    "load_experiment": "simtest.spec.experiment",
+    "load_camera": "simtest.spec.camera",
+    "load_experiment": "simtest.spec.recipes",
     "load_scene": "simtest.spec.scene",
     "reconstruct": "simtest.reconstruction.pipeline",
     "render": "simtest.api",
     "save_calibration": "simtest.spec.calibration_file",
-    "save_camera": "simtest.spec.camera_spec",
+    "save_camera": "simtest.spec.camera",
     "validate": "simtest.api",
 }
 """Public name and the module that defines it. A change here is a change of the interface."""
@@ -79,7 +79,7 @@ def test_importing_the_package_loads_no_library():
     heavy = child(
         "import simtest, sys, json; dir(simtest);"
         "print(json.dumps(sorted({m.partition('.')[0] for m in sys.modules}"
-        " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'plotly', 'matplotlib', 'numpy', 'pydantic', 'cv2'})))"
+        " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'vl_convert', 'matplotlib', 'numpy', 'pydantic', 'cv2'})))"
     )
     assert heavy == []
 
@@ -88,7 +88,7 @@ def test_reconstructing_loads_neither_renderer_nor_viewer():
     loaded = child(
         "import simtest, sys, json; simtest.reconstruct; simtest.Camera; simtest.load_camera;"
         "print(json.dumps(sorted({m.partition('.')[0] for m in sys.modules}"
-        " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'plotly', 'matplotlib'})))"
+        " & {'mitsuba', 'drjit', 'vtk', 'pyvista', 'torch', 'vl_convert', 'matplotlib'})))"
     )
     assert loaded == []
 

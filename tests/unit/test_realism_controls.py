@@ -9,7 +9,7 @@ from simtest.errors import InputError
 from simtest.realism.comparison import compare
 from simtest.realism.distance import distances
 from simtest.realism.frame_sets import open_frames, open_generated, rendered_frames, varied
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.runtime.resources import data_root
 from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.labelled_frame import make_frame

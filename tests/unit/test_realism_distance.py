@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 import simtest.rendering
-from simtest.cli.realism import realism
+from simtest.cli.data import realism
 from simtest.errors import InputError
 from simtest.realism.comparison import compare
 from simtest.realism.distance import distances
@@ -16,9 +16,9 @@ from simtest.realism.fitting.frames import FrameMaker
 from simtest.realism.fitting.parameters import one_family
 from simtest.realism.frame_sets import NamedFrame, open_frames, open_generated, varied
 from simtest.realism.frame_statistics import COLUMNS
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import kept
 from simtest.spec import load_scene
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.recipes import load_dataset
 
 SPREAD = 0.3
 """Of the scenes' means, where a scene's own values spread by 1."""

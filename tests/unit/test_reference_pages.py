@@ -13,9 +13,9 @@ from simtest.estimators.budget import PARTS, STATED
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spot import UNRESOLVED
 from simtest.reconstruction.explanations import FLAGS
-from simtest.runtime.limits import DEFAULTS
+from simtest.runtime.files import DEFAULTS
 from simtest.spec import Scene
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 from simtest.validation.statistics import Figures
 
 ROOT = Path(__file__).resolve().parents[2]

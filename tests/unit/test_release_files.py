@@ -94,7 +94,7 @@ def test_a_wheel_that_holds_more_than_the_package_or_is_too_large_is_refused(tmp
 def test_an_installation_must_have_all_entry_points_and_data():
     told = loaded("release_check").told()
     assert {"cone_axis", "circle_pose"} <= set(told["simtest.estimators"])
-    assert {"peaks", "colour", "learned_detector"} == set(told["simtest.detectors"])
+    assert {"peaks", "colour"} == set(told["simtest.detectors"])
     assert {"cylinder", "published"} <= set(told["scenes"])
     assert {"overview", "laws"} <= set(told["experiments"])
     assert {"colon", "liver"} == set(told["meshes"])
@@ -157,13 +157,3 @@ def test_version_changelog_and_citation_agree():
     assert next(heading for heading in headings if heading != "Unreleased") == version
     assert "Unreleased" not in headings[1:]
     assert f"\nversion: {version}\n" in (CI.parent / "CITATION.cff").read_text(encoding="utf-8")
-
-
-def test_every_deprecated_name_is_listed_with_the_release_in_which_it_goes():
-    from simtest._renamed import GONE, MODULES
-
-    page = (CI.parent / "docs" / "reference" / "stable.md").read_text(encoding="utf-8")
-    rows = [line for line in page.splitlines() if line.endswith(f"| {GONE} |")]
-    listed = set(re.findall(r"`(simtest[\w.]*)`", " ".join(row.split("|")[1] for row in rows)))
-    # Modules below a listed one follow it.
-    assert {old for old in MODULES if not any(old == n or old.startswith(f"{n}.") for n in listed)} == set()

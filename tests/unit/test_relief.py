@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
-from simtest.spec.relief import MAX_HEIGHT_MM, Relief
+from simtest.spec.surfaces import MAX_HEIGHT_MM, Relief
 from simtest.surfaces import forget_meshes
 from simtest.surfaces.relief_field import NODES, HeightJets, fine_normals, make_relief
 from tests.example_counts import examples
@@ -191,7 +191,7 @@ def test_on_a_users_mesh_the_base_is_its_interpolated_normal_and_operator():
     session = Session(scene({"type": "anatomy", "path": str(MESH)}, RELIEF))
     pixels = np.random.default_rng(5).uniform([4, 4], [60, 44], (900, 2))
     origins, directions = session.sightlines.in_model(pixels)
-    hits = session._hits(origins, directions)[0]
+    hits = session.exact_hits(origins, directions)
     base = session.surface.points(origins, directions, hits)
     fine = session.surface.fine_points(origins, directions, hits)
     keep = np.flatnonzero(base.valid)
@@ -431,11 +431,11 @@ def test_the_kernel_computes_the_same(level):
     session = Session(scene(SURFACES["plane"], RELIEF))
     import drjit as dr
 
-    from simtest.rendering.relief_kernel import ReliefKernel
+    from simtest.rendering.tissue_kernels import ReliefKernel
 
     mi, field = session.mi, make_relief(session.scene.surface.relief, level)
     points = np.random.default_rng(9).uniform(-40, 40, (5000, 3)).astype(np.float32)
-    jets = ReliefKernel(mi, field).jets(mi.Point3f(points.T.copy()), True, bent=True)
+    jets = ReliefKernel(field).jets(mi.Point3f(points.T.copy()), True, bent=True)
     dr.eval(jets.height, jets.gradient, jets.diffused, jets.hessian)
     exact, diffused = field.jets(points.astype(float)), field.tissue_jets(points.astype(float), diffused=True)
     assert np.abs(np.array(jets.gradient).T - exact.gradient).max() < 1e-5
@@ -451,7 +451,7 @@ def test_the_kernel_finds_the_lattices_nodes():
     session = Session(scene(SURFACES["plane"], RELIEF))
     import drjit as dr
 
-    from simtest.rendering.relief_kernel import _modulo
+    from simtest.rendering.tissue_kernels import _modulo
 
     cells = np.arange(-200_000, 200_000)
     given_cells = session.mi.Float(cells.astype(np.float32))

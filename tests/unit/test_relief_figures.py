@@ -52,8 +52,8 @@ def swept(tmp_path):
 
 def marks(figure):
     """By name and symbol: the marks of a figure's only panel."""
-    return {(m.name, m.symbol.text if m.symbol else "") for m in figure.chart.panels[0].marks}, {
-        (m.name, m.symbol.text if m.symbol else ""): m for m in figure.chart.panels[0].marks
+    return {(m.name, m.symbol) for m in figure.chart.panels[0].marks}, {
+        (m.name, m.symbol): m for m in figure.chart.panels[0].marks
     }
 
 
@@ -141,7 +141,7 @@ def test_a_method_of_clouds_is_drawn_against_the_base_alone(tmp_path):
 def test_the_page_shows_the_figures(swept, tmp_path):
     swept.results.write_parquet(tmp_path / "results.parquet")
     (tmp_path / "summary.json").write_text(json.dumps({"run": {}, "experiments": {}}))
-    page = write_report(tmp_path).read_text()
+    page = write_report(tmp_path, charts=True).read_text()
     for figure in relief_figures(swept, COLOURS):
         assert f' id="{figure.chart.key}"' in page
         assert (tmp_path / "figures" / f"{figure.chart.key}.png").stat().st_size > 5000

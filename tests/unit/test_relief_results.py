@@ -1,6 +1,5 @@
 """Results on a relief: errors against both truths, their law, and a fresh relief for each realisation."""
 
-import dataclasses
 import itertools
 import shlex
 
@@ -14,10 +13,10 @@ from simtest.runtime.seeds import Stage, integer
 from simtest.spec import Experiment, load_scene, scene_from_dict
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
+from simtest.validation.columns import SCHEMA, table
 from simtest.validation.metrics import rows
 from simtest.validation.predicted import base_law_deg
 from simtest.validation.realisation import Realiser
-from simtest.validation.results_table import SCHEMA, ResultRow, table
 from simtest.validation.statistics import summarise
 
 SMALL = {"camera.width": 96, "camera.height": 96, "camera.fx": 120.0, "camera.fy": 120.0, "sensor.noise_sigma": 0.0}
@@ -159,19 +158,10 @@ def test_rows_of_truths_that_nothing_found_have_a_target_and_no_error():
     from simtest.simulation.true_highlights import TrueHighlight
 
     truths = [TrueHighlight(**vars(point), peak_snr=50.0, why_not="") for point in view[:2]]
-    made = rows(session, ResultRow(experiment="e", setting="s"), [], truths, {}, {"cone_axis": ()})
+    made = rows(session, dict(experiment="e", setting="s"), [], truths, {}, {"cone_axis": ()})
     found = table(made, {})
     assert found.columns == list(SCHEMA)
     assert found["status"].to_list() == ["missed"] * len(truths)
     assert found["target"].to_list() == ["fine"] * len(truths)
     assert found["error_base_deg"].null_count() == len(truths)
     assert summarise(found)["s"]["cone_axis"].mean_base_deg is None
-
-
-def test_a_row_with_other_values_is_that_of_replace():
-    row = ResultRow(experiment="e", swept={"a": 1.0}, true_id=2)
-    made = row.having(true_id=3, status="missed", budget={"noise": 0.1})
-    assert made == dataclasses.replace(row, true_id=3, status="missed", budget={"noise": 0.1})
-    assert (row.true_id, row.status) == (2, None)
-    with pytest.raises(TypeError, match="no field 'eror_deg'"):
-        row.having(eror_deg=1.0)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from simtest.rendering import Session
-from simtest.rendering.materials import bsdf_dict
-from simtest.rendering.shapes import make_shape
+from simtest.rendering.built_scene import make_shape
+from simtest.rendering.reflectances import bsdf_dict
 from simtest.spec import scene_from_dict
 from simtest.surfaces import Shape, TriangleMesh
 from tests.marked import marked
@@ -457,7 +457,7 @@ def test_a_mesh_is_shaded_with_the_normals_given(session):
     vertices = np.array([[-50.0, -50, 0], [50, -50, 0], [0, 80, 0]])
     normal = np.array([np.sin(np.radians(10)), 0, np.cos(np.radians(10))])
     mesh = TriangleMesh(vertices, np.array([[0, 1, 2]]), np.tile(normal, (3, 1)))
-    made = make_shape(mi, Shape("mesh", False, {}, mesh, "triangle"), {"type": "diffuse"})
+    made = make_shape(Shape("mesh", False, {}, mesh, "triangle"), {"type": "diffuse"})
     hit = mi.load_dict({"type": "scene", "shape": made}).ray_intersect(mi.Ray3f([1.0, 2.0, 10.0], [0.0, 0.0, -1.0]))
     np.testing.assert_allclose(np.array(hit.sh_frame.n).ravel(), normal, atol=1e-6)
     np.testing.assert_allclose(np.array(hit.n).ravel(), [0, 0, 1], atol=1e-6)

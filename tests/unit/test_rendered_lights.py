@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Priors
-from simtest.cli.calibrate import calibrate
+from simtest.cli.pictures import calibrate
 from simtest.geometry import chi_squared
 from simtest.spec.calibration_file import load_calibration, save_calibration
 from studies.light_calibration.closed_loop import plain_calibration, rows_of_rig

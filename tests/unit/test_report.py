@@ -14,15 +14,15 @@ from scipy.special import stdtrit
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.pages.axes import Axis
+from simtest.pages.charts import Axis
 from simtest.pages.style import colours, number
 from simtest.report import write_report
 from simtest.report.curves import Curve
 from simtest.report.heat_maps import heat_maps, heat_range
 from simtest.report.run_folder import read_run
+from simtest.report.scene3d import curvature_limit, framed, kept_scene
 from simtest.report.series import _join_mark, law_misses, line_chart, line_figures
 from simtest.report.surface_errors import _apart
-from simtest.report.view3d import view_3d, view_json
 from simtest.validation import laws
 
 ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
@@ -222,14 +222,14 @@ def read_page(path):
         for key in ("src", "href"):
             value = attrs.get(key) or "#"
             assert value.startswith(("#", "data:", "figures/")), value
-    assert html.count('id="plotly-packed"') <= 1
+    assert html.count('id="vega-packed"') <= 1
     assert all(attrs.get("alt") for tag, attrs in page.tags if tag == "img")
     assert not re.search(r"@import|url\(", html[: html.index("</style>")])
     return page
 
 
 def charts_of(page):
-    """The page's figures as its script finds them: plotly's JSON by key."""
+    """The page's figures as its script finds them: specifications by key."""
     html = page.read_text(encoding="utf-8")
     (packed,) = re.findall(r'<script type="application/octet-stream" id="figures-packed">(.*?)</script>', html)
     return json.loads(zlib.decompress(base64.b64decode(packed)))
@@ -245,7 +245,7 @@ def png_size(path):
 @pytest.fixture(scope="module")
 def overview(tmp_path_factory):
     path = make_run(tmp_path_factory.mktemp("overview"), items=2)
-    return path, write_report(path)
+    return path, write_report(path, charts=True)
 
 
 def test_overview_page_has_its_sections(overview):
@@ -273,15 +273,17 @@ def test_overview_page_has_its_sections(overview):
 def test_the_3d_view_is_coloured_by_curvature_where_the_run_kept_it(tmp_path):
     path = make_run(tmp_path, items=0)
     make_item(path / "gallery" / "item_00.npz", radius=4.0, curved=True)
-    view = view_3d(read_run(path), colours(ESTIMATORS))
-    np.testing.assert_allclose(view.curvature, 0.25, rtol=1e-3)
-    assert view.curvature.shape == view.intensity.shape
-    assert view.curvature_limit == pytest.approx(0.25, rel=1e-3)
-    figure = view_json(view)
-    assert [trace.get("visible", True) for trace in figure["data"] if trace["type"] == "mesh3d"] == [False, True]
-    assert [button["label"] for button in figure["layout"]["updatemenus"][0]["buttons"]] == ["curvature", "picture"]
-    (light,) = [trace for trace in figure["data"] if trace["name"] == "light"]
-    assert [light[axis][0] for axis in "xyz"] == [1.0, 2.0, 0.0]
+    content = kept_scene(read_run(path)).content
+    np.testing.assert_allclose(content.curvature, 0.25, rtol=1e-3)
+    assert content.lit.shape == content.vertices.shape
+    # The one curvature of a sphere is not the end of the colours.
+    assert curvature_limit(content.curvature) == pytest.approx(0.25 * 1.4, rel=1e-3)
+    np.testing.assert_array_equal(content.lights, [[1.0, 2.0, 0.0]])
+    _, parts = framed(content, "curvature")
+    assert [(part.name, part.shown) for part in parts if not part.colour] == [
+        ("surface: lit", False), ("surface: curvature from −0.35 (blue) to 0.35 (red)", True)
+    ]  # fmt: skip
+    assert {"true normal", "cone_axis", "light"} <= {part.name for part in parts}
     page = write_report(path)
     assert "coloured by its curvature" in page.read_text(encoding="utf-8")
 
@@ -297,11 +299,16 @@ def test_overview_figures_are_written(overview):
         assert 400 <= height <= 2500, name
 
 
-def test_overview_charts_are_data_of_both_kinds(overview):
+def test_a_point_of_the_page_s_charts_tells_its_setting(overview):
     charts = charts_of(overview[1])
-    assert set(charts) == {"error_vs_curvature", "axis_ratio", "error_vs_offset", "surface3d"}
-    kinds = {trace["type"] for chart in charts.values() for trace in chart["data"]}
-    assert kinds == {"scatter", "mesh3d", "scatter3d"}
+    assert set(charts) == {"error_vs_curvature", "axis_ratio", "error_vs_offset"}
+    run = read_run(overview[0])
+    for key, chart in charts.items():
+        told = [row["told"] for layer in chart["layer"] for row in layer["data"]["values"] if row["told"]]
+        figure = next(each for each in line_figures(run) if each.key == key)
+        for curve in figure.curves:
+            for setting in curve.names:
+                assert any(setting in text for text in told), (key, setting)
 
 
 def test_series_follow_the_rows_and_the_laws(tmp_path):
@@ -366,7 +373,7 @@ def test_grid_gives_heat_maps_and_slices(tmp_path):
     curvature, _, offset = line_figures(run)
     np.testing.assert_allclose(curvature.curves[0].x, [0.1, 0.5, 1])
     np.testing.assert_allclose(offset.curves[0].x, [0, 0.05, 0.2])
-    page = read_page(write_report(path))
+    page = read_page(write_report(path, charts=True))
     assert "heatmap" in page.ids()
     assert png_size(path / "figures" / "heatmap.png")[0] > 1000
     assert heat_range(maps)[0] > 0
@@ -375,7 +382,7 @@ def test_grid_gives_heat_maps_and_slices(tmp_path):
 def test_anatomy_gives_surfaces_and_bins(tmp_path):
     path = make_run(tmp_path, "anatomy", realisations=3)
     run = read_run(path)
-    page = read_page(write_report(path))
+    page = read_page(write_report(path, charts=True))
     assert {"surfaces", "coverage", "error_vs_curvature", "fineness"} <= page.ids()
     assert png_size(path / "figures" / "anatomy.png")[0] > 800
     # What triangles alone cost is shown with every run over anatomies, and with no other.
@@ -499,7 +506,7 @@ def test_surface_without_truth_or_pixels(tmp_path):
     content |= {"meta": json.dumps(meta), "position": content["position"] * np.nan}
     np.savez(tmp_path / "gallery" / "a.npz", **content)
     make_run(tmp_path, "noise", items=0)
-    assert view_3d(read_run(tmp_path), {}) is None
+    assert kept_scene(read_run(tmp_path)) is None
     assert "surface3d" not in read_page(write_report(tmp_path)).ids()
 
 
@@ -512,10 +519,10 @@ def test_style():
     axis = Axis("x", "stretched")
     np.testing.assert_allclose(axis.from_axis(axis.to_axis([-0.5, 0, 3])), [-0.5, 0, 3], atol=1e-12)
     ends = axis.ends([[-0.5, 2]])
-    assert ends[0] < axis.to_axis(-0.5)
-    assert ends[1] > axis.to_axis(2)
-    ticks = dict(axis.ticks(*ends))
-    assert {"−0.3", "0", "1"} <= set(ticks.values())
+    assert ends[0] < -0.5
+    assert ends[1] > 2
+    ticks = axis.channel("x", ends)["axis"]["values"]
+    assert {-0.3, 0, 1} <= set(ticks)
     assert all(ends[0] <= at <= ends[1] for at in ticks)
 
 

@@ -5,10 +5,10 @@ import pytest
 
 from simtest.dataset.maker import Maker, colour_variant
 from simtest.dataset.plan import Plan
-from simtest.rendering import Session, found_highlights, glints, highlights, light_points
+from simtest.rendering import Session, highlights, lighting
 from simtest.simulation.rendered_view import DEAR_SAMPLES, has_quick_look, render_view, shows_isolated
 from simtest.spec import scene_from_dict
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
 from tests.marked import marked
 
@@ -58,8 +58,8 @@ SEARCHED_AGAIN = {"lights", "camera", "back"}
 )
 def test_highlights_and_labels_are_those_of_a_fresh_session(surface, steps, monkeypatch):
     searched = []
-    search = found_highlights.search
-    monkeypatch.setattr(found_highlights, "search", lambda s, base: searched.append(base) or search(s, base))
+    search = highlights.search
+    monkeypatch.setattr(highlights, "search", lambda s, base: searched.append(base) or search(s, base))
     kept = Session(scene(surface))
     kept.highlights(kept.frame().radiance)
     for name in steps:
@@ -84,10 +84,10 @@ def test_highlights_that_get_their_radiance_later_stand_as_if_found_with_it(surf
     session.highlights()
     found = session.highlights(radiance)
     if surface is ROUGH:
-        assert glints.is_resolved(session)
-        wanted = glints.find(session, radiance)
+        assert highlights.is_resolved(session)
+        wanted = highlights.find_glints(session, radiance)
     else:
-        wanted = highlights.find(session, radiance, stride=found_highlights.FINE_STRIDE_PX)
+        wanted = highlights.find_smooth(session, radiance, stride=highlights.FINE_STRIDE_PX)
     assert len(found) > 1
     assert described(found) == described(wanted)
     assert all(point.radiance == 0 for point in session.highlights())
@@ -190,7 +190,7 @@ def test_a_quick_look_is_taken_where_it_costs_less_than_the_frame(samples, depth
 
 def test_the_quick_look_of_a_wide_source_takes_as_many_points_as_that_many_samples():
     """A control: datasets keep their draws where the renderer's numbers change, and this says that they have."""
-    assert light_points.FIXED == light_points.DRAWN * DEAR_SAMPLES
+    assert lighting.FIXED == lighting.DRAWN * DEAR_SAMPLES
 
 
 @pytest.mark.parametrize("tries", [pytest.param(8, marks=pytest.mark.ci), 2])

@@ -13,8 +13,8 @@ from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, integer
 from simtest.spec import LightSpec, scene_from_dict
-from simtest.spec.experiment import Experiment
-from simtest.spec.rig import COLOCATED_MM, PRESETS, Rig
+from simtest.spec.lights import COLOCATED_MM, PRESETS, Rig
+from simtest.spec.recipes import Experiment
 from simtest.spec.toml_files import apply_settings
 from simtest.validation.cases import expand
 

@@ -9,13 +9,13 @@ from nightly_samples import judged, make_run, no_baseline
 
 from simtest.advice.figures import _counted
 from simtest.nightly.gate.quantities import harms
-from simtest.nightly.page.run_tables import failures, results
+from simtest.nightly.page.run_tables import results
 from simtest.nightly.records import CELL
 from simtest.report.coverage import coverage
 from simtest.report.run_folder import Run, completed
 from simtest.report.sentences import headline
 from simtest.report.surface_errors import surface_errors
-from simtest.validation.results_table import SCHEMA
+from simtest.validation.columns import SCHEMA
 from simtest.validation.row_kinds import KINDS, counts, is_false, row_kind
 from simtest.validation.statistics import summarise
 
@@ -106,7 +106,6 @@ def test_every_row_is_of_one_kind_and_all_count_alike(seed):
     assert [entry.text for entry in (line[1], line[2], *line[4:7])] == [
         total["ok"] + total["failed"] + total["missed"], *(total[kind] for kind in ("ok", "failed", "missed", "false"))
     ]  # fmt: skip
-    assert sum(entry.text for entry in failures(night).rows[0][1:]) == total["failed"]
     cells = rows.select(CELL).unique(maintain_order=True).with_row_index("cell")
     gate = harms(pl.concat([rows, pl.DataFrame(schema=SCHEMA)], how="diagonal"), cells)
     assert gate.filter(pl.col("quantity") == "false")["value"].sum() == total["false"]

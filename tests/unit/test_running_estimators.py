@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from simtest.calibration import NO_PRIORS, Calibration, Frame, Priors
+from simtest.calibration import Calibration, Frame, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.detection import Detection, Region
 from simtest.errors import Failure, InputError, Reason
@@ -354,17 +354,10 @@ def test_the_protocols_tell_the_kinds_apart():
     assert not isinstance(Peaks(), Estimator)
 
 
-def test_a_plain_callable_is_accepted_for_one_release(patches):
-    with pytest.warns(DeprecationWarning, match="'old' is a plain callable"):
-        made = load_estimators({"old": lambda patch, camera: brightest_point.estimate(patch, camera)})
-    found = run(made["old"], patches[0], CAMERA)
-    np.testing.assert_array_equal(found.normal, brightest_point.estimate(patches[0], CAMERA, NO_PRIORS).normal)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert load_estimators({"new": brightest_point}) == {"new": brightest_point}
-
-
-@pytest.mark.parametrize(("given", "said"), [(3, "not callable"), (Peaks, "is a class"), ("peaks", "not callable")])
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [(3, "3 has neither estimate"), (Peaks, "is a class"), (len, "has neither estimate")],
+)
 def test_what_is_no_estimator_is_refused(given, said):
     with pytest.raises(InputError, match=said):
         load_estimators({"given": given})

@@ -14,7 +14,7 @@ from simtest.dataset.plan import Plan
 from simtest.rendering import Session
 from simtest.rendering.backend import COLOUR_VARIANT, DEFAULT_VARIANT
 from simtest.spec import load_dataset, load_scene
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
 
 pytestmark = [pytest.mark.render, pytest.mark.slow]

@@ -204,7 +204,7 @@ def test_an_estimator_of_a_row_is_checked_too(record, tmp_path):
 
 @pytest.mark.parametrize("path", ["nothing.csv", "."])
 def test_a_table_that_cannot_be_read_is_refused(record, tmp_path, path):
-    with pytest.raises(InputError, match=r"cannot be read .*; must be a CSV or Parquet table"):
+    with pytest.raises(InputError, match=r"; must be a CSV or Parquet table"):
         read_answers(tmp_path / path, record, "mine")
 
 

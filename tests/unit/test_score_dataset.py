@@ -18,7 +18,7 @@ from simtest.dataset.scoring.frames import scored_frames
 from simtest.dataset.scoring.run import score_table
 from simtest.dataset.shard_writer import write_dataset
 from simtest.dataset.verify import verify
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.runtime.resources import data_root
 from simtest.spec import calibration_toml, load_dataset, load_experiment
 from simtest.validation.cases import expand

@@ -16,7 +16,7 @@ from simtest.dataset.scoring.frames import scored_frames
 from simtest.dataset.scoring.record import image_hash
 from simtest.errors import InputError
 from simtest.reconstruction.image_io import read_picture
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import load_experiment
 
 SMALL = '"camera.width" = 96, "camera.height" = 80, "camera.fx" = 90.0, "camera.fy" = 90.0'

@@ -352,7 +352,7 @@ def test_another_exported_run_is_not_replaced(sensor, table, tmp_path):
 
 @pytest.mark.slow
 def test_the_rows_do_not_depend_on_the_workers(sensor, base, table):
-    from simtest.runtime.engines import make_engine
+    from simtest.runtime.processes import make_engine
 
     one = score_table(table, sensor, base / "one").results
     two = score_table(table, sensor, base / "two", engine=make_engine(workers=2)).results

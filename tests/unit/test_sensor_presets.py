@@ -9,8 +9,7 @@ from simtest.runtime.files import write_json
 from simtest.simulation.camera_chain import capture
 from simtest.spec import load_scene
 from simtest.spec.scene import scene_from_dict
-from simtest.spec.sensor import Sensor
-from simtest.spec.sensor_presets import PRESETS
+from simtest.spec.sensor import PRESETS, Sensor
 from tests.refusals import refused
 
 

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 from simtest.errors import InputError
-from simtest.nightly.small_rows import NEAR_REFERENCE, SINGLE_PRECISION, small, whole
+from simtest.nightly.store import NEAR_REFERENCE, SINGLE_PRECISION, small, whole
 from tests.unit.nightly_samples import make_rows
 
 FILE = Path("baseline/quick/night.parquet")

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.calibration import Calibration, Frame
+from simtest.calibration.photometry import AngularProfile
 from simtest.errors import Failure, Reason
 from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.circle_pose import circle_pose
@@ -19,7 +20,6 @@ from simtest.estimators.highlight_fit import fit_highlights
 from simtest.estimators.photometric import photometric
 from simtest.estimators.small_spot import fit_small_spots, is_small, radius_before_smoothing_px
 from simtest.geometry import Camera, Patch
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.geometry.vectors import angle_deg
 
 CAMERA = Camera.from_fov(60.0, 96, 80)

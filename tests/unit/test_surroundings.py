@@ -12,15 +12,15 @@ import platformdirs
 import pytest
 
 from simtest.calibration import Calibration
+from simtest.cli.common import named_path
 from simtest.cli.main import _mend_terminal
-from simtest.cli.options import named_path
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction import reconstruct_colour
 from simtest.reconstruction.picture_values import is_coloured
 from simtest.rendering import bitmap
-from simtest.runtime.kept_arrays import cache_folder
-from simtest.runtime.user_cache import user_cache
+from simtest.runtime.arrays import cache_folder
+from simtest.runtime.files import user_cache
 from simtest.spec import load_calibration, load_scene
 from simtest.surfaces.mesh_file import read_mesh
 
@@ -126,7 +126,7 @@ def test_an_image_that_cannot_be_written_whole_names_the_cause(tmp_path, monkeyp
         def write(self, name):
             raise RuntimeError(f'[FileStream] "{name}": I/O error while writing: {os.strerror(number)}')
 
-    monkeypatch.setattr(bitmap.backend, "load", lambda _: Stream())
+    monkeypatch.setattr(bitmap, "mi", Stream())
     with pytest.raises(OSError, match=os.strerror(number)) as error:
         bitmap.write_exr(path, np.ones((4, 4), np.float32))
     assert (error.value.errno, error.value.filename) == (number, str(path))

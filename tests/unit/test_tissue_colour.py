@@ -3,15 +3,21 @@
 import numpy as np
 import pytest
 
-from simtest.rendering import Session, integrate
+from simtest.rendering import Session, trace
 from simtest.spec import scene_from_dict
-from simtest.spec.tissue_colour import PRESETS, TissueColour
+from simtest.spec.reflectance import TISSUE_PRESETS, TissueColour
 from simtest.surfaces import make_surface
-from simtest.surfaces.haemoglobin import blood_absorption, reach
-from simtest.surfaces.segment_table import ENDLESS, make_table, seen_profile
-from simtest.surfaces.surface_samples import spread_points, surface_patch
-from simtest.surfaces.tissue_pattern import BLUR_PER_DEPTH, _make, make_pattern
-from simtest.surfaces.vessels import Segments, grow_vessels, segments
+from simtest.surfaces.tissue_pattern import BLUR_PER_DEPTH, _make, blood_absorption, make_pattern, reach
+from simtest.surfaces.vessels import (
+    ENDLESS,
+    VesselSegments,
+    grow_vessels,
+    make_table,
+    seen_profile,
+    segments,
+    spread_points,
+    surface_patch,
+)
 from tests.marked import marked
 
 DEPTH_MM = TissueColour().vessels.depth_mm
@@ -176,7 +182,7 @@ def test_smaller_vessels_are_fainter_and_red_is_darkened_least():
     start = np.stack([np.zeros(4), 10.0 * np.arange(4), np.zeros(4)], axis=1)
     normal, half = np.tile([0.0, 0.0, 1.0], (4, 1)), np.array([2.5, 0.0, 0.0])
     for vein in (False, True):
-        lines = Segments(start, start + 2 * half, normal, radius, np.full(4, vein))
+        lines = VesselSegments(start, start + 2 * half, normal, radius, np.full(4, vein))
         table = make_table(lines, BLUR_PER_DEPTH * DEPTH_MM, np.full(3, ENDLESS))
         chord = table.chords(start + half)[:, int(vein)]
         assert (table.chords(start + half)[:, int(not vein)] == 0).all()
@@ -273,7 +279,7 @@ def test_the_net_has_meshes_of_the_told_width():
     assert 0.05 < dark.mean() < 0.5
 
 
-@pytest.mark.parametrize("preset", sorted(PRESETS))
+@pytest.mark.parametrize("preset", sorted(TISSUE_PRESETS))
 def test_albedo_is_a_share(preset):
     tissue = {"preset": preset, "base": [1.0, 1.0, 0.9], "mottling": {"amplitude": 1.0}}
     pattern = make_pattern(surface_of("plane"), scene(tissue=tissue).albedo)
@@ -287,8 +293,8 @@ def test_albedo_is_a_share(preset):
 def test_presets_can_be_overridden_number_by_number():
     tissue = TissueColour.model_validate({"preset": "stomach", "vessels": {"depth_mm": 0.1}})
     assert tissue.vessels.depth_mm == 0.1
-    assert tissue.vessels.largest_mm == PRESETS["stomach"]["vessels"]["largest_mm"]
-    assert tissue.base == PRESETS["stomach"]["base"]
+    assert tissue.vessels.largest_mm == TISSUE_PRESETS["stomach"]["vessels"]["largest_mm"]
+    assert tissue.base == TISSUE_PRESETS["stomach"]["base"]
     assert TissueColour() == TissueColour.model_validate({}) == TissueColour(preset="colon_mucosa")
 
 
@@ -430,7 +436,7 @@ def test_the_launches_size_changes_nothing_of_coloured_tissue(monkeypatch):
     session = Session(scene("colon", samples_per_pixel=8), "llvm_ad_rgb")
     whole = session.radiance()
     # Runs of five samples.
-    monkeypatch.setattr(integrate, "RAYS", 5 * session.camera.width * session.camera.height)
+    monkeypatch.setattr(trace, "RAYS", 5 * session.camera.width * session.camera.height)
     cut = session.radiance()
     for a, b in ((whole.specular, cut.specular), (whole.diffuse, cut.diffuse)):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)

@@ -7,10 +7,10 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.geometry.distortion import KannalaBrandt
+from simtest.geometry.lenses import KannalaBrandt
 from simtest.geometry.vectors import rotation
 from simtest.reconstruction.poses import read_poses
-from simtest.spec.trajectories import Trajectory, stack, tum_text, write_trajectory
+from simtest.spec.camera_formats.trajectories import Trajectory, stack, tum_text, write_trajectory
 
 CAMERA = Camera(640, 480, 320.0, 322.0, 318.0, 243.0)
 
@@ -102,5 +102,5 @@ def test_the_unit_may_be_a_number_of_millimetres(tmp_path):
 def test_a_file_that_cannot_be_written_is_no_lens_that_a_format_lacks(tmp_path):
     (tmp_path / "colmap" / "cameras.txt").mkdir(parents=True)
     held = Trajectory(["0.png"], np.eye(4)[None])
-    with pytest.raises(InputError, match=r"cameras.txt"):
+    with pytest.raises(OSError, match=r"cameras.txt"):
         write_trajectory(held, Camera(64, 48, 50.0, 50.0, 32.0, 24.0), tmp_path)

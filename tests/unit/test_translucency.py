@@ -7,8 +7,8 @@ from scipy.linalg import solve_banded
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering.subsurface import once_scattered, pixels_per_mm, reflectance, spread, transfer
+from simtest.spec.reflectance import Translucency
 from simtest.spec.spec_model import validate
-from simtest.spec.translucency import Translucency
 
 CAMERA = Camera(320, 240, 320, 320, 160, 120)
 RAYS = CAMERA.unproject(CAMERA.pixel_centres())

@@ -21,18 +21,18 @@ from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot, usable_spots
 from simtest.advice.twin.tissue import NAMES, WIDER, tissue_of
 from simtest.advice.twin.writing import COLUMNS, write_twins
 from simtest.calibration import Calibration, CameraPrior, Normal, Priors, Response, Uniform
+from simtest.calibration.photometry import AngularProfile
 from simtest.errors import InputError, SimtestError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
-from simtest.geometry.angular_profile import AngularProfile
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
+from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import run_picture
-from simtest.runtime.kept_arrays import kept
+from simtest.runtime.arrays import kept
 from simtest.spec import load_scene
-from simtest.spec.camera_spec import SceneCamera
-from simtest.spec.dataset_recipe import load_dataset
+from simtest.spec.camera import SceneCamera
+from simtest.spec.recipes import load_dataset
 from simtest.spec.spec_model import validate
 from simtest.surfaces.factory import make_surface
 

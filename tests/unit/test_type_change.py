@@ -7,9 +7,9 @@ import pytest
 from simtest.errors import InputError
 from simtest.runtime.resources import find
 from simtest.spec import Scene, load_calibration, load_dataset, load_experiment, load_scene, read_toml
+from simtest.spec.keys import replace_values
 from simtest.spec.scene import scene_from_dict
 from simtest.spec.toml_files import apply_settings
-from simtest.spec.type_change import replace_values
 from simtest.validation.cases import expand
 from tests.refusals import refused
 
@@ -79,7 +79,7 @@ def test_a_setting_replaces_what_it_excludes_of_a_group_too():
     # What lies below such a key goes as well.
     cases = expand(load_experiment("known_light", {"rig.preset": "laparoscope"}))
     assert {len(scene_from_dict(case.data).rig.lights) for case in cases} == {8}
-    families = load_dataset("learning", {"camera.fov_deg": 90.0}).families
+    families = load_dataset("tiny", {"camera.fov_deg": 90.0}).families
     assert all("camera.fx" not in family.set and "camera.width" in family.set for family in families)
 
 

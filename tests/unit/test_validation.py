@@ -21,10 +21,10 @@ from simtest.simulation.rendered_view import render_view
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example
+from simtest.validation.columns import SCHEMA, swept_columns, table
 from simtest.validation.matching import match
 from simtest.validation.metrics import mahalanobis2, rows
 from simtest.validation.realisation import realise
-from simtest.validation.results_table import SCHEMA, ResultRow, table
 from simtest.validation.runner import run_experiment
 from simtest.validation.statistics import figures, summarise
 
@@ -107,7 +107,7 @@ def context(look_normal=NORTH):
     seen = SimpleNamespace(valid=np.array([True]), normal=look_normal[None])
     described = scene_from_dict({"surface": {"type": "plane"}})
     session = SimpleNamespace(scene=described, cast=lambda points: (seen, None, None))
-    return session, ResultRow(experiment="e", setting="s", realisation=3, seed=11)
+    return session, dict(experiment="e", setting="s", realisation=3, seed=11)
 
 
 def leaned(degrees, towards=0.0):
@@ -144,10 +144,17 @@ def test_rows_count_matched_false_and_missed():
 
 
 def test_a_row_has_the_columns_of_the_table_and_swept_parameters_by_their_own_names():
-    row = ResultRow(estimator="a", surface="plane", swept={"surface.radius_mm": 5.0, "surface": "sphere"}).to_row()
-    assert set(row) == {*SCHEMA, "surface.radius_mm"}
+    swept = {"surface.radius_mm": 5.0, "surface": "sphere"}
+    made = table([{"estimator": "a", "surface": "plane", **swept_columns(swept)}], swept)
+    assert made.columns == [*SCHEMA, "surface.radius_mm"]
     # The scene's own column wins over a swept one of its name.
-    assert (row["surface"], row["surface.radius_mm"], row["label"]) == ("plane", 5.0, None)
+    assert made.select("surface", "surface.radius_mm", "label").row(0) == ("plane", 5.0, None)
+
+
+def test_a_row_with_a_column_that_the_table_lacks_is_refused():
+    """polars would drop it."""
+    with pytest.raises(KeyError, match="no such column of results: eror_deg"):
+        table([{"estimator": "a"}, {"estimator": "b", "eror_deg": 1.0}], {})
 
 
 def test_errors_of_a_row():
@@ -155,11 +162,11 @@ def test_errors_of_a_row():
     result = estimate(leaned(5), [leaned(5), leaned(1, 180)])
     found = [detection(0, 0, 50, 50, (20, 20), {"a": result})]
     (row,) = rows(*context(leaned(7)), found, [truth_at(20, 20)], {0: 0}, {"a": ()})
-    assert row.error_deg == pytest.approx(5)
-    assert row.error_oracle_deg == pytest.approx(1)
-    assert row.error_look_deg == pytest.approx(2)
-    assert row.rank_correct == 1
-    assert row.n_candidates == 2
+    assert row["error_deg"] == pytest.approx(5)
+    assert row["error_oracle_deg"] == pytest.approx(1)
+    assert row["error_look_deg"] == pytest.approx(2)
+    assert row["rank_correct"] == 1
+    assert row["n_candidates"] == 2
 
 
 def test_columns_of_a_row_are_what_their_names_say():
@@ -169,12 +176,12 @@ def test_columns_of_a_row_are_what_their_names_say():
     result = replace(estimate(leaned(3), look=(81.0, 63.0)), budget={"noise": np.diag([3e-4, 1e-4])})
     found = [detection(0, 0, 50, 50, (20, 20), {"a": result})]
     (row,) = rows(session, common, found, [truth_at(21.0, 33.0)], {0: 0}, {"a": ()})
-    assert (row.bp_true_x_px, row.bp_true_y_px, row.look_x_px, row.look_y_px) == (21.0, 33.0, 81.0, 63.0)
-    assert (row.kd_min, row.kd_max, row.distance_mm, row.peak_snr) == (0.2, 0.5, 10.0, 50.0)
+    assert (row["bp_true_x_px"], row["bp_true_y_px"], row["look_x_px"], row["look_y_px"]) == (21.0, 33.0, 81.0, 63.0)
+    assert (row["kd_min"], row["kd_max"], row["distance_mm"], row["peak_snr"]) == (0.2, 0.5, 10.0, 50.0)
     # 2 mm over 10 mm.
-    assert row.eps_over_d == pytest.approx(0.2)
-    assert row.axis_ratio_law == pytest.approx(1.2 / 1.5)
-    assert row.budget["budget_noise_deg"] == pytest.approx(np.degrees(0.02))
+    assert row["eps_over_d"] == pytest.approx(0.2)
+    assert row["axis_ratio_law"] == pytest.approx(1.2 / 1.5)
+    assert row["budget_noise_deg"] == pytest.approx(np.degrees(0.02))
 
 
 def test_angles_are_exact_near_zero_and_near_180_deg():
@@ -211,7 +218,7 @@ def hand_made():
         "error_base_deg",
     )
     rows = [dict(zip(names, line, strict=False)) for line in lines]
-    return table([ResultRow(realisation=i, **row) for i, row in enumerate(rows)], {})
+    return table([dict(realisation=i, **row) for i, row in enumerate(rows)], {})
 
 
 def test_summary_of_a_hand_made_table():
@@ -246,7 +253,7 @@ def test_summary_of_a_hand_made_table():
 def test_median_and_coverage_of_skewed_errors():
     lines = [(0, 1.0, 1.0), (1, 2.0, 4.5), (2, 9.0, 7.0)]
     made = [
-        ResultRow(setting="s", estimator="a", true_id=number, status="ok", error_deg=error, mahalanobis2=squared)
+        dict(setting="s", estimator="a", true_id=number, status="ok", error_deg=error, mahalanobis2=squared)
         for number, error, squared in lines
     ]
     (found,) = summarise(table(made, {}))["s"].values()
@@ -457,7 +464,7 @@ def test_what_drowns_in_noise_is_missed():
     scene, drawn = case.scene(described, 0)
     session = Session(scene)
     made = realise(session, described, case, 0, render_view(session, scene), drawn, load_estimators(["cone_axis"]))
-    statuses = [row.status for row in made.rows if row.true_id is not None]
+    statuses = [row["status"] for row in made.rows if row["true_id"] is not None]
     assert statuses == ["missed"]
     assert all(isinstance(s.patch, Patch | Failure) for s in made.specularities)
 
@@ -479,4 +486,4 @@ def test_highlights_of_a_frame_that_the_detector_refuses_are_missed(monkeypatch)
     scene, drawn = case.scene(described, 0)
     session = Session(scene)
     made = realise(session, described, case, 0, render_view(session, scene), drawn, load_estimators(["cone_axis"]))
-    assert [(row.status, row.true_id) for row in made.rows] == [("missed", 0)]
+    assert [(row["status"], row["true_id"]) for row in made.rows] == [("missed", 0)]

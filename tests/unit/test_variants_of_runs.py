@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.rendering import Session
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import load_experiment
 from simtest.validation.case_work import by_variant
 from simtest.validation.cases import expand

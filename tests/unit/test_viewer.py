@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
+from simtest.report.scene3d import curvature_limit, framed
 from simtest.report.viewer import Content, make_content, save_screenshot, show, window, write_scene_page
-from simtest.report.viewer.web_page import errors_deg, scene_json
+from simtest.report.viewer.web_page import errors_deg
 from simtest.spec import load_scene
 
 SMALL = {"camera.width": 120, "camera.height": 120, "camera.fx": 120.0, "camera.fy": 120.0}
@@ -44,20 +45,22 @@ def test_the_page_of_a_scene_is_one_small_file(content, tmp_path):
     page = (tmp_path / "scene.html").read_text("utf-8")
     assert len(page) < 3_000_000
     assert "true normal" in page
-    drawn = scene_json(content)
-    lit, curved, *others = drawn["data"]
-    assert [trace["name"] for trace in others] == [
+    frame, parts = framed(content, "lit")
+    assert frame.startswith("<!DOCTYPE html>") or "<html" in frame
+    lit, curved, *lines = parts
+    assert (lit.name, lit.shown) == ("surface: lit", True)
+    assert (curved.name, curved.shown) == ("surface: curvature from −0.28 (blue) to 0.28 (red)", False)
+    assert [part.name for part in lines] == [
         "field of view", "true normal", "cone_axis", "circle_pose", "brightest_point", "curved", "camera", "light",
     ]  # fmt: skip
-    assert len(lit["vertexcolor"]) == len(lit["x"]) == len(content.vertices)
     # The sphere's one curvature is not the end of the colours.
-    assert curved["cmax"] == pytest.approx(0.2 * 1.4, rel=1e-3)
+    assert curvature_limit(content.curvature) == pytest.approx(0.2 * 1.4, rel=1e-3)
     errors = errors_deg(content)
     assert max(errors["cone_axis"]) < 0.1
     assert min(errors["circle_pose"]) > 10
     with pytest.raises(InputError, match=r"must be \.html"):
         write_scene_page(content, tmp_path / "scene.png", "sphere")
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(OSError, match="No such file"):
         write_scene_page(content, tmp_path / "nowhere" / "scene.html", "sphere")
 
 

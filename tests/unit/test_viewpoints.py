@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.spec.surface import AnatomySurface
+from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.colon import Colon
 from simtest.surfaces.liver import Liver
 from simtest.surfaces.mesh_surface import MeshSurface

@@ -13,8 +13,7 @@ from simtest.dataset.maker import colour_variant
 from simtest.errors import SimtestError
 from simtest.reconstruction.found import Reconstruction
 from simtest.rendering import Session
-from simtest.runtime.arrays import Array, Image, Mask, Picture
-from simtest.runtime.kept_arrays import only_reading
+from simtest.runtime.arrays import Array, Image, Mask, Picture, only_reading
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.video_processor import luma

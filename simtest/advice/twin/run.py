@@ -21,7 +21,6 @@ from simtest.reconstruction.image_io import is_sequence, read_picture
 from simtest.reconstruction.picture import Options, read_calibration
 from simtest.reconstruction.pipeline import run_picture
 from simtest.runtime.arrays import Array, Image
-from simtest.runtime.resources import shown
 
 LEAST_TWINS = 20
 """A bank with fewer highlights measures nothing."""
@@ -144,23 +143,15 @@ def twin_picture(
         Called with frames rendered, frames in all, and what is done.
     organ : str, optional
         Whose relief and film the twins have (`simtest.advice.twin.tissue.NAMES`); default: any tissue's.
-
-    Raises
-    ------
-    InputError
-        If the picture, the calibration or the organ is malformed, the picture holds no usable highlight, or the bank
-        too few.
-    BackendError
-        If the rendering backend cannot be used.
     """
     started = time.process_time()
     if is_sequence(image):
-        raise InputError(f"{shown(image)}: is a folder or a film; twin takes one picture")
+        raise InputError(f"{image}: is a folder or a film; twin takes one picture")
     # A wrong name is told before minutes of rendering.
     tissue_of(organ)
     picture = read_picture(image)
     calibration, warnings = read_calibration(options, picture)
-    found, bank, look, assumed = twins_of(picture, calibration, options, shown(image), frames, seed, progress, organ)
+    found, bank, look, assumed = twins_of(picture, calibration, options, str(image), frames, seed, progress, organ)
     spots = all_spots(bank)
     return TwinResult(
         image.name, picture, found, bank, spots, look, assumed, warnings, time.process_time() - started

@@ -9,9 +9,9 @@ import numpy as np
 from simtest.advice.twin.patches import TissuePatch, look_at
 from simtest.advice.twin.tissue import ANY, Tissue, between
 from simtest.calibration import Calibration, CameraPrior, Distribution, LogUniform, Uniform
+from simtest.calibration.photometry import AngularProfile
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.geometry.angular_profile import AngularProfile
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.resources import find

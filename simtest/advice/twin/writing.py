@@ -8,7 +8,6 @@ from simtest.advice.twin.run import SpotTwins, TwinResult
 from simtest.reconstruction.output_files import write_csv
 from simtest.runtime import provenance
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
-from simtest.runtime.machine_errors import write_error
 
 FILES = ("twin.json", "twin.csv", "index.html")
 
@@ -26,12 +25,9 @@ def write_twins(result: TwinResult, out: Path, command: str = "") -> list[Path]:
     """
     make_folder(out)
     html = render_page(result, command)
-    try:
-        write_json(out / FILES[0], to_json(result, command))
-        write_atomically(out / FILES[1], lambda part: write_csv(part, COLUMNS, [_row(each) for each in result.spots]))
-        write_atomically(out / FILES[2], lambda part: part.write_text(html, encoding="utf-8"))
-    except OSError as error:
-        raise write_error(error, out) from error
+    write_json(out / FILES[0], to_json(result, command))
+    write_atomically(out / FILES[1], lambda part: write_csv(part, COLUMNS, [_row(each) for each in result.spots]))
+    write_atomically(out / FILES[2], lambda part: part.write_text(html, encoding="utf-8"))
     return [out / name for name in FILES]
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration.lights.mirrors import Index, Mirrors
-from simtest.geometry import Array
 from simtest.geometry.camera import Camera
+from simtest.runtime.arrays import Array
 
 REACH_MM = 30.0
 """A light of an endoscope lies about so far from the camera, at most. A prior of this standard deviation along each
@@ -103,19 +103,10 @@ def derivatives(camera: Camera, mirrors: Mirrors, view: Index, lights: Array, z:
 def solve(
     camera: Camera, mirrors: Mirrors, highlights: Highlights, source: npt.NDArray[np.intp], start: Array
 ) -> Bundle | None:
-    """Fit lights to highlights by Gauss-Newton steps, the pictures' mirror errors eliminated.
+    """Fit lights to highlights by Gauss-Newton steps from `start`, (S, 3), mm, the mirror errors eliminated.
 
-    Parameters
-    ----------
-    source : ndarray of int, shape (N,)
-        Which light made each highlight; negative: none, it is left out.
-    start : ndarray, shape (S, 3)
-        mm.
-
-    Returns
-    -------
-    Bundle or None
-        None where a step leads to lights that no mirror shows.
+    `source`, (N,), says which light made each highlight; negative: none, it is left out. None where a step leads to
+    lights that no mirror shows.
     """
     kept = np.flatnonzero(source >= 0)
     lights, z = np.array(start, dtype=float), np.zeros((len(mirrors), 3))

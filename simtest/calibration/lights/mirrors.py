@@ -11,9 +11,9 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from simtest.geometry import Array
 from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import basis_across
+from simtest.runtime.arrays import Array
 
 Index = npt.NDArray[np.intp]
 
@@ -85,13 +85,7 @@ def mirror_points(centres: Array, radii: Array, lights: Array) -> Array:
     At the point at the angle t from the direction to the camera, seen from the ball's centre, the angle of incidence is
     g(t, d) = t + atan2(R sin t, d - R cos t), with d the camera's distance from the centre. The light's is
     g(phi - t, l), with phi its own angle and l its distance. g rises with t, so Newton's method finds where both agree.
-
-    Parameters
-    ----------
-    centres, lights : ndarray, shape (..., 3)
-        mm, camera frame.
-    radii : ndarray, shape (...)
-        mm.
+    Centres and lights, shape (..., 3), are in the camera frame.
     """
     d, from_centre = np.linalg.norm(centres, axis=-1), lights - centres
     towards = -centres / d[..., None]

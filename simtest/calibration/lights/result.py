@@ -10,11 +10,10 @@ import numpy.typing as npt
 from simtest.calibration.lights.bundle import REACH_MM, Bundle, Highlights, solve
 from simtest.calibration.lights.mirrors import Mirrors
 from simtest.calibration.lights.search import Found
-from simtest.geometry import Array, chi_squared
+from simtest.geometry import chi_squared
 from simtest.geometry.camera import Camera
+from simtest.runtime.arrays import Array
 from simtest.runtime.statistics import NORMAL_QUANTILE
-
-"""Standard deviations in half of a 95 % interval."""
 
 UNLIKELY = 1e-3
 """Residuals that are so unlikely to be as large by chance are told."""

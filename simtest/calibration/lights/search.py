@@ -8,6 +8,7 @@ that explains most highlights becomes a light, its highlights are taken away, an
 import math
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +23,9 @@ from simtest.calibration.lights.bundle import (
     with_error,
 )
 from simtest.calibration.lights.mirrors import Mirrors
-from simtest.geometry import Array, chi_squared
+from simtest.geometry import chi_squared
 from simtest.geometry.camera import Camera
+from simtest.runtime.arrays import Array
 
 Labels = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
@@ -84,6 +86,14 @@ class Found:
     further: Array
 
 
+class _Views(NamedTuple):
+    """Pictures of mirrors, and the highlights measured in them."""
+
+    camera: Camera
+    mirrors: Mirrors
+    highlights: Highlights
+
+
 @dataclass
 class _Candidates:
     """Positions (N, 3), covariances (N, 3, 3), the highlight taken in each picture (N, V), and chi-squared (N,)."""
@@ -103,33 +113,32 @@ def find_lights(camera: Camera, mirrors: Mirrors, highlights: Highlights, most: 
     Highlights that no light explains are left out: a second reflection, a window, a lamp that does not move with the
     camera.
     """
-    loose = with_error(highlights, SLACK_PX)
-    candidates = _grow(camera, mirrors, loose, _candidates(camera, mirrors, loose))
+    loose = _Views(camera, mirrors, with_error(highlights, SLACK_PX))
+    candidates = _grow(loose, _candidates(loose))
     shown = len(np.unique(highlights.view))
     least = max(min(LEAST_PICTURES, max(len(mirrors), 2)), math.ceil(LEAST_SHARE * shown))
     everything = np.ones(len(highlights), dtype=bool)
-    starts = _chosen(camera, mirrors, loose, candidates, [], everything, (least, most))
+    starts = _chosen(loose, candidates, [], everything, (least, most))
     if not starts:
         return None
-    together = _refined(camera, mirrors, loose, np.array(starts), everything, ROUNDS)
+    together = _refined(loose, np.array(starts), everything, ROUNDS)
     if together is None:
         return None
-    source = _without_merged(camera, mirrors, loose, *together)
+    source = _without_merged(loose, *together)
     bundle = solve(camera, mirrors, highlights, source, together[0].lights)
     if bundle is None:
         return None
     left = together[1] < 0
     known = list(bundle.lights)
-    more = _chosen(camera, mirrors, loose, candidates, known, left, (SEEN_TOO_SELDOM, most))[len(known) :]
+    more = _chosen(loose, candidates, known, left, (SEEN_TOO_SELDOM, most))[len(known) :]
     found = Found(bundle, source, np.empty((0, 3)), np.array(more).reshape(-1, 3))
-    others = _ambiguities(camera, mirrors, highlights, candidates, replace(found, source=together[1]), least)
+    others = _ambiguities(_Views(camera, mirrors, highlights), candidates, replace(found, source=together[1]), least)
     return replace(found, others=others)
 
 
 def _chosen(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, candidates: _Candidates, starts: list[Array], free: Mask,
-    counts_allowed: tuple[int, int],
-) -> list[Array]:  # fmt: skip
+    views: _Views, candidates: _Candidates, starts: list[Array], free: Mask, counts_allowed: tuple[int, int]
+) -> list[Array]:
     """Return positions of lights: those given, and the candidates that explain most of the highlights left, in turn.
 
     `counts_allowed` is the least number of highlights of a light and the largest number of lights.
@@ -141,7 +150,7 @@ def _chosen(
         best = int(np.lexsort((candidates.chi2, -counts))[0])
         if counts[best] < least:
             break
-        alone = _refined(camera, mirrors, highlights, candidates.lights[best][None], free, 1)
+        alone = _refined(views, candidates.lights[best][None], free, 1)
         if alone is None or (alone[1] >= 0).sum() < least:
             candidates = candidates.only(np.arange(len(candidates.lights)) != best)
             continue
@@ -150,18 +159,18 @@ def _chosen(
     return starts
 
 
-def _without_merged(camera: Camera, mirrors: Mirrors, highlights: Highlights, bundle: Bundle, source: Labels) -> Labels:
+def _without_merged(views: _Views, bundle: Bundle, source: Labels) -> Labels:
     """Return the assignment without highlights that lie where a light without a highlight of its own is expected too.
 
     The lights' images have merged there, and the centre is that of both. A light that would keep fewer than two
     highlights keeps all.
     """
-    kept = source.copy()
+    kept, highlights = source.copy(), views.highlights
     lights = np.arange(len(bundle.lights))
     for view in np.unique(highlights.view):
         own = np.flatnonzero((highlights.view == view) & (source >= 0))
         unseen = np.setdiff1d(lights, source[own])
-        predicted, _ = prediction(camera, mirrors, bundle, np.full(len(lights), view), lights)
+        predicted, _ = prediction(views.camera, views.mirrors, bundle, np.full(len(lights), view), lights)
         for row in own:
             gaps = np.linalg.norm(predicted[unseen] - highlights.pixels[row], axis=1)
             if (gaps < MERGED_PX).any():
@@ -171,8 +180,9 @@ def _without_merged(camera: Camera, mirrors: Mirrors, highlights: Highlights, bu
     return np.where(few, source, kept)
 
 
-def _candidates(camera: Camera, mirrors: Mirrors, highlights: Highlights) -> _Candidates:
+def _candidates(views: _Views) -> _Candidates:
     """Return positions where the reflected rays of two highlights of different pictures meet."""
+    camera, mirrors, highlights = views
     first, second = _pairs(highlights, camera)
     none = _Candidates(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, len(mirrors)), np.intp), np.empty(0))
     if not len(first):
@@ -187,7 +197,7 @@ def _candidates(camera: Camera, mirrors: Mirrors, highlights: Highlights) -> _Ca
         gradient = -lights / REACH_MM**2
         chi2 = np.zeros(len(lights))
         for k in (first, second):
-            residual, J, weights = _weighted(camera, mirrors, highlights, lights, highlights.view[k], k)
+            residual, J, weights = _weighted(views, lights, k)
             normal += np.swapaxes(J, 1, 2) @ weights @ J
             gradient += np.einsum("nki,nkl,nl->ni", J, weights, residual)
             chi2 += np.einsum("nk,nkl,nl->n", residual, weights, residual)
@@ -229,19 +239,30 @@ def _nearest_points(p: Array, u: Array, q: Array, v: Array) -> Array:
     return np.asarray(middle * np.minimum(1.0, 2 * REACH_MM / np.maximum(length, 1e-9)))
 
 
-def _weighted(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, lights: Array, view: Labels, measured: Labels
-) -> tuple[Array, Array, Array]:
+def _weighted(views: _Views, lights: Array, measured: Labels) -> tuple[Array, Array, Array]:
     """Return residuals (N, 2), derivatives by the light (N, 2, 3) and inverse covariances (N, 2, 2) of highlights."""
-    predicted, J, K = derivatives(camera, mirrors, view, lights, np.zeros(3))
+    camera, mirrors, highlights = views
+    predicted, J, K = derivatives(camera, mirrors, highlights.view[measured], lights, np.zeros(3))
     spread = highlights.covariance[measured] + K @ np.swapaxes(K, 1, 2)
     fine = np.asarray(np.isfinite(spread).all(axis=(1, 2)))
-    weights = np.linalg.inv(np.where(fine[:, None, None], spread, np.eye(2)))
-    return highlights.pixels[measured] - predicted, J, np.where(fine[:, None, None], weights, np.nan)
+    return highlights.pixels[measured] - predicted, J, np.where(fine[:, None, None], _inverse(spread, fine), np.nan)
 
 
-def _grow(camera: Camera, mirrors: Mirrors, highlights: Highlights, held: _Candidates) -> _Candidates:
+def _inverse(covariances: Array, fine: Mask) -> Array:
+    """Return the inverses of those covariances, shape (..., 2, 2), that are finite; of the others the unit matrix."""
+    return np.linalg.inv(np.where(fine[..., None, None], covariances, np.eye(2)))
+
+
+def _squares(gaps: Array, covariances: Array) -> tuple[Array, Array]:
+    """Return squared Mahalanobis distances, inf where they are not known, and the covariances' inverses."""
+    fine = np.asarray(np.isfinite(covariances).all(axis=(-2, -1)) & np.isfinite(gaps).all(axis=-1))
+    inverse = _inverse(covariances, fine)
+    return np.where(fine, np.einsum("nhi,nhij,nhj->nh", gaps, inverse, gaps), np.inf), inverse
+
+
+def _grow(views: _Views, held: _Candidates) -> _Candidates:
     """Let every candidate take the highlight that it predicts in each further picture, and be corrected by it."""
+    camera, mirrors, highlights = views
     for view in range(len(mirrors)):
         own = np.flatnonzero(highlights.view == view)
         asked = np.flatnonzero(held.taken[:, view] < 0)
@@ -252,10 +273,7 @@ def _grow(camera: Camera, mirrors: Mirrors, highlights: Highlights, held: _Candi
         spread = J @ held.covariances[asked] @ np.swapaxes(J, 1, 2) + K @ np.swapaxes(K, 1, 2)
         # the nearest highlight, in standard deviations
         gaps = highlights.pixels[own][None] - predicted[:, None]
-        whole = spread[:, None] + highlights.covariance[own][None]
-        fine = np.asarray(np.isfinite(whole).all(axis=(2, 3)) & np.isfinite(gaps).all(axis=2))
-        inverse = np.linalg.inv(np.where(fine[..., None, None], whole, np.eye(2)))
-        squares = np.where(fine, np.einsum("nhi,nhij,nhj->nh", gaps, inverse, gaps), np.inf)
+        squares, inverse = _squares(gaps, spread[:, None] + highlights.covariance[own][None])
         nearest = squares.argmin(axis=1)
         rows = np.flatnonzero(squares[np.arange(len(asked)), nearest] < GATE)
         if not len(rows):
@@ -274,31 +292,27 @@ def _counted(candidates: _Candidates, free: Mask) -> npt.NDArray[np.intp]:
     return np.asarray(((candidates.taken >= 0) & free[candidates.taken]).sum(axis=1), np.intp)
 
 
-def _refined(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, starts: Array, free: Mask, rounds: int
-) -> tuple[Bundle, Labels] | None:
+def _refined(views: _Views, starts: Array, free: Mask, rounds: int) -> tuple[Bundle, Labels] | None:
     """Assign highlights to lights and fit the lights, in turn, until the assignment stays."""
     bundle: Bundle | None = Bundle(starts, np.eye(starts.size), np.zeros(3), 0.0, 0)
-    source = np.full(len(highlights), -1, dtype=np.intp)
+    source = np.full(len(views.highlights), -1, dtype=np.intp)
     for _ in range(max(rounds, 2)):
         assert bundle is not None
-        assigned = assign(camera, mirrors, highlights, bundle, free)
+        assigned = _assign(views, bundle, free)
         if np.array_equal(assigned, source):
             break
         source = assigned
         counts = np.bincount(source[source >= 0], minlength=len(starts))
         if counts.min() < 1:
             return None
-        bundle = solve(camera, mirrors, highlights, source, bundle.lights)
+        bundle = solve(*views, source, bundle.lights)
         if bundle is None:
             return None
     assert bundle is not None
     return bundle, source
 
 
-def assign(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, bundle: Bundle, free: npt.NDArray[np.bool_]
-) -> Labels:
+def _assign(views: _Views, bundle: Bundle, free: Mask) -> Labels:
     """Return which light made each highlight, one highlight a light and picture at most; -1 where none did.
 
     Of all assignments of a picture's highlights the one with the smallest sum of squared distances is taken, where a
@@ -306,6 +320,7 @@ def assign(
     """
     from scipy.optimize import linear_sum_assignment
 
+    camera, mirrors, highlights = views
     source = np.full(len(highlights), -1, dtype=np.intp)
     lights = np.arange(len(bundle.lights))
     for view in np.unique(highlights.view):
@@ -314,10 +329,7 @@ def assign(
             continue
         predicted, spread = prediction(camera, mirrors, bundle, np.full(len(lights), view), lights)
         gaps = highlights.pixels[own][:, None] - predicted[None]
-        whole = spread[None] + highlights.covariance[own][:, None]
-        fine = np.asarray(np.isfinite(whole).all(axis=(2, 3)) & np.isfinite(gaps).all(axis=2))
-        inverse = np.linalg.inv(np.where(fine[..., None, None], whole, np.eye(2)))
-        squares = np.where(fine, np.einsum("hsi,hsij,hsj->hs", gaps, inverse, gaps), np.inf)
+        squares, _ = _squares(gaps, spread[None] + highlights.covariance[own][:, None])
         rows, columns = linear_sum_assignment(np.minimum(squares, GATE))
         for row, column in zip(rows, columns, strict=True):
             if squares[row, column] < GATE:
@@ -325,18 +337,17 @@ def assign(
     return source
 
 
-def _ambiguities(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, candidates: _Candidates, found: Found, least: int
-) -> Array:
+def _ambiguities(views: _Views, candidates: _Candidates, found: Found, least: int) -> Array:
     """Return positions of further lights that are part of an explanation about as good as the one found; (A, 3), mm.
 
     A candidate that explains as many highlights as a light is often a chance meeting of other lights' rays. It is a
     doubt only if the best set of lights that holds it explains as many highlights as the lights found, about as well.
     """
-    loose, bundle = with_error(highlights, SLACK_PX), found.bundle
+    highlights, bundle = views.highlights, found.bundle
+    loose = views._replace(highlights=with_error(highlights, SLACK_PX))
     everything = np.ones(len(highlights), dtype=bool)
     explained, lights = int((found.source >= 0).sum()), len(bundle.lights)
-    own = solve(camera, mirrors, highlights, found.source, bundle.lights)
+    own = solve(*views, found.source, bundle.lights)
     if not len(candidates.lights) or own is None:
         return np.empty((0, 3))
     inflation = max(1.0, own.chi2 / own.freedom) if own.freedom > 0 else 1.0
@@ -349,14 +360,14 @@ def _ambiguities(
         if min((light - each) @ np.linalg.solve(spread + about, light - each) for each, about in known) < DISTINCT:
             continue
         tried.append((light, spread))
-        alone = _refined(camera, mirrors, loose, light[None], everything, 1)
+        alone = _refined(loose, light[None], everything, 1)
         if alone is None or (alone[1] >= 0).sum() < least or not _is_apart(alone[0], 0, bundle):
             continue
-        starts = _chosen(camera, mirrors, loose, candidates, [alone[0].lights[0]], alone[1] < 0, (least, lights))
-        other = _refined(camera, mirrors, loose, np.array(starts), everything, ROUNDS)
+        starts = _chosen(loose, candidates, [alone[0].lights[0]], alone[1] < 0, (least, lights))
+        other = _refined(loose, np.array(starts), everything, ROUNDS)
         if other is None or (other[1] >= 0).sum() < explained:
             continue
-        strict = solve(camera, mirrors, highlights, other[1], other[0].lights)
+        strict = solve(*views, other[1], other[0].lights)
         if strict is None or (strict.chi2 - own.chi2) / inflation > GATE:
             continue
         for number in range(len(strict.lights)):

@@ -1,4 +1,4 @@
-"""A dataset as an iterable of PyTorch tensors."""
+"""A dataset as an iterable of PyTorch tensors, for training loops of one's own (extra ``learn``)."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -10,7 +10,6 @@ import torch
 from torch.utils.data import IterableDataset, default_collate, get_worker_info
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from simtest.dataset.learn.shares import share_of_rank, share_of_worker
 from simtest.dataset.reader import Record, SamplePosition, read, read_at, sample_positions
 from simtest.errors import InputError
 
@@ -58,11 +57,6 @@ class Samples(IterableDataset[Item]):
     [0, 1], NaN where there is no surface), and ``meta``, the sample's metadata. In a batch ``meta`` is a list.
 
     Ranks and workers divide samples, not shards, so there may be more of them than shards. No process group is needed.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no finished dataset, there is no such split or field, or rank or world is out of range.
     """
 
     def __init__(
@@ -172,3 +166,27 @@ def _tensors(record: Record) -> Item:
         is_picture = tensor.dtype == torch.uint8 and name != "instrument"
         made[name] = tensor.float() / 255 if is_picture else tensor
     return made | {"meta": Meta(record["meta"])}
+
+
+def share_of_rank(count: int, rank: int, world: int, even: bool) -> list[int]:
+    """Return the indices of `count` samples that a rank reads: neighbours, since those stand in one shard.
+
+    With `even` each rank has ceil(count / world) of them; the last ranks go on with the first samples. Without, the
+    samples are divided, and the first ranks have one more where there is a remainder.
+    """
+    if not even or count == 0:
+        return _block(count, rank, world)
+    each = -(-count // world)
+    return [i % count for i in range(rank * each, (rank + 1) * each)]
+
+
+def share_of_worker(indices: list[int], number: int, workers: int) -> list[int]:
+    """Return the part of a rank's indices that one of its workers reads: neighbours, each index in one part."""
+    return [indices[i] for i in _block(len(indices), number, workers)]
+
+
+def _block(count: int, number: int, blocks: int) -> list[int]:
+    """Return the indices of one of several blocks of `count`, whose lengths differ by one at most."""
+    least, left = divmod(count, blocks)
+    first = number * least + min(number, left)
+    return list(range(first, first + least + (number < left)))

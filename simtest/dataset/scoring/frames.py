@@ -8,9 +8,8 @@ from simtest.dataset.scoring.record import Record, Source, check_frame, open_sou
 from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import shown
 from simtest.simulation.rendered_view import RenderedView
-from simtest.validation.results_table import Value
+from simtest.validation.columns import Value
 
 
 @dataclass(frozen=True)
@@ -55,11 +54,6 @@ def scored_frames(folder: Path | str) -> Iterator[ScoredFrame]:
     """Render the exported frames of a run or dataset again, in the order of its cases, or of its shards.
 
     A frame that stands for several realisations comes once for each.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no export, or one of another version, or a frame comes out otherwise than it was exported.
     """
     folder = Path(folder)
     record = read_record(folder)
@@ -73,7 +67,7 @@ def _frames(record: Record, source: Source) -> Iterator[ScoredFrame]:
         for each in views:
             name = names.get((each.case, each.number))
             if name is None:
-                raise InputError(f"{shown(source.folder)}: {each.setting} was not exported as a whole; export again")
+                raise InputError(f"{source.folder}: {each.setting} was not exported as a whole; export again")
             check_frame(source.folder, name, record.frames[name].sha256, each.image)
             yield ScoredFrame(
                 name,

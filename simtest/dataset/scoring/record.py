@@ -1,7 +1,6 @@
 """What was exported of a run or a dataset, as the run keeps it: frames by name, their hashes, what they show."""
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +15,9 @@ from simtest.dataset.scoring.views import ShardViews, Views, views_of_cases
 from simtest.errors import InputError
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image
-from simtest.runtime.files import require_plain, write_json
-from simtest.runtime.resources import shown
+from simtest.runtime.files import read_json, require_plain, write_json
 from simtest.spec import Experiment
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import Case, expand
 from simtest.validation.fingerprints import definition
@@ -169,12 +167,12 @@ def read_summary(folder: Path) -> Mapping[str, str]:
     """Return how a finished run was made, from its summary.json; raise `InputError` where there is none."""
     path = folder / "summary.json"
     try:
-        run = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))["run"]
+        run = read_json(path)["run"]
         return {key: str(run[key]) for key in ("version", "fingerprint", "variant")}
-    except OSError as error:
-        raise InputError(f"{shown(folder)}: no finished run (summary.json: {error.strerror})") from error
+    except InputError as error:
+        raise InputError(f"{folder}: no finished run ({error})") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{shown(path)}: is no summary of a run; give the simtest validate command again") from error
+        raise InputError(f"{path}: is no summary of a run; give the simtest validate command again") from error
 
 
 def read_record(folder: Path) -> Record:
@@ -182,43 +180,33 @@ def read_record(folder: Path) -> Record:
     path = Path(folder) / EXPORT
     if not path.parent.is_dir():
         what = "is a file" if path.parent.exists() else "no such folder"
-        raise InputError(
-            f"{shown(folder)}: {what}; must be the folder of the run or dataset whose frames were exported"
-        )
+        raise InputError(f"{folder}: {what}; must be the folder of the run or dataset whose frames were exported")
     if not path.is_file() and (path.parent / "frames.csv").is_file() and (path.parent / "cameras").is_dir():
         raise InputError(
-            f"{shown(folder)}: holds the exported frames (frames.csv); must be the folder of the run or dataset that "
+            f"{folder}: holds the exported frames (frames.csv); must be the folder of the run or dataset that "
             "they were exported from, which holds export.json"
         )
     again = "give the command again with --export DIR" if not (path.parent / MANIFEST).is_file() else (
-        f"give simtest dataset export {shown(folder)} --out DIR"
+        f"give simtest dataset export {folder} --out DIR"
     )  # fmt: skip
     try:
-        text = require_plain(path, "manifest_bytes").read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"{shown(path)}: {error.strerror or 'cannot be read'}; nothing was exported: {again}"
-        ) from error
+        text = require_plain(path).read_bytes()
+    except InputError as error:
+        raise InputError(f"{error}; nothing was exported: {again}") from None
     try:
         return Record.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "whole"
-        raise InputError(f"{shown(path)}: no record of an export ({where}: {first['msg']}); {again}") from error
+        raise InputError(f"{path}: no record of an export ({where}: {first['msg']}); {again}") from error
 
 
 def open_source(folder: Path, record: Record) -> Source:
-    """Return the run or dataset that a record is of, ready to be rendered again.
-
-    Raises
-    ------
-    InputError
-        If another version of simtest made it, or it has changed since.
-    """
+    """Return the run or dataset that a record is of, ready to be rendered again."""
     here = provenance.version()
     if record.version != here:
         raise InputError(
-            f"{shown(folder)}: made by simtest {record.version}, this is {here}; score with that version, or run and "
+            f"{folder}: made by simtest {record.version}, this is {here}; score with that version, or run and "
             "export again"
         )
     if record.kind == "dataset":
@@ -231,7 +219,7 @@ def open_source(folder: Path, record: Record) -> Source:
         what = "the run was made anew since its frames were exported" if changed == "fingerprint" else (
             "scenes or meshes have changed since its frames were exported"
         )  # fmt: skip
-        raise InputError(f"{shown(folder)}: {what}; export again")
+        raise InputError(f"{folder}: {what}; export again")
     return source
 
 
@@ -245,6 +233,6 @@ def check_frame(folder: Path, name: str, expected: str, image: Image) -> None:
     """Raise `InputError` where a frame that was rendered again differs from the exported one."""
     if image_hash(image) != expected:
         raise InputError(
-            f"{shown(folder)}: frame {name} comes out otherwise than it was exported; score where it was exported, "
+            f"{folder}: frame {name} comes out otherwise than it was exported; score where it was exported, "
             "with the same package versions and processor, or export again"
         )

@@ -20,18 +20,16 @@ from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
 from simtest.rendering import backend
 from simtest.runtime import provenance
-from simtest.runtime.engines import Engine, OnStep, make_engine
 from simtest.runtime.files import Json, are_nested
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
+from simtest.runtime.processes import Engine, OnStep, make_engine
 from simtest.validation import gallery_items
 from simtest.validation.cases import swept_example
+from simtest.validation.columns import Row, Value
+from simtest.validation.columns import table as results_table
 from simtest.validation.execution import forget, gallery_cases
 from simtest.validation.fingerprints import input_hashes
 from simtest.validation.realisation import answer, realise
-from simtest.validation.results_table import ResultRow, Value
-from simtest.validation.results_table import table as results_table
 from simtest.validation.run_folder import EXPORT, check_folder, remove_folder
 from simtest.validation.run_summary import run_summary, settings_summary, write_results
 from simtest.validation.runner import Progress, Run, RunRecord
@@ -102,11 +100,6 @@ def score_table(
     -------
     Run
         With results.parquet, summary.json and gallery/; `simtest.report.write_report` makes its page.
-
-    Raises
-    ------
-    InputError
-        If the table is malformed, nothing was exported, or a frame comes out otherwise than it was exported.
     """
     started, clock = datetime.now(UTC), time.monotonic()
     method = table.stem if name is None else name
@@ -117,26 +110,23 @@ def score_table(
     _check_apart(on, out)
     with exclusive_folder(out):
         check_folder(out)
-        try:
-            remove_folder(out / "gallery")
-            (out / "gallery").mkdir(parents=True)
-            results = _results(source, record, answers, out, engine or make_engine(), progress)
-            for doubt in filter(None, [stray_rows(answers, record), *reversed_axes(results), *wide_regions(results)]):
-                warnings.warn(f"{shown(table)}: {doubt}", stacklevel=2)
-            made = _run_record(source, record.fingerprint, (table, on / EXPORT), command, started, clock)
-            described = {each: f"Answers of {table.name}, made elsewhere." for each in answers}
-            write_results(out, made, results, _summary(source, results, described))
-        except OSError as error:
-            raise write_error(error, out) from error
+        remove_folder(out / "gallery")
+        (out / "gallery").mkdir(parents=True)
+        results = _results(source, record, answers, out, engine or make_engine(), progress)
+        for doubt in filter(None, [stray_rows(answers, record), *reversed_axes(results), *wide_regions(results)]):
+            warnings.warn(f"{table}: {doubt}", stacklevel=2)
+        made = _run_record(source, record.fingerprint, (table, on / EXPORT), command, started, clock)
+        described = {each: f"Answers of {table.name}, made elsewhere." for each in answers}
+        write_results(out, made, results, _summary(source, results, described))
     return Run(out, 0, results)
 
 
 def _check_apart(on: Path, out: Path) -> None:
     """Raise `InputError` where the scored run would replace, or lie in, a run whose frames were exported."""
     if are_nested(on, out):
-        raise InputError(f"--out {shown(out)}: must be neither the run that is scored on nor inside or around it")
+        raise InputError(f"--out {out}: must be neither the run that is scored on nor inside or around it")
     if (out / EXPORT).exists():
-        raise InputError(f"--out {shown(out)}: holds a run whose frames were exported; must be another folder")
+        raise InputError(f"--out {out}: holds a run whose frames were exported; must be another folder")
 
 
 def _run_record(
@@ -238,18 +228,18 @@ def _summary(source: Source, results: pl.DataFrame, described: Mapping[str, str]
 
 def score_part(part: ScorePart, on_step: OnStep) -> pl.DataFrame:
     """Score the frames of a part; call `on_step` after each. Raises `InputError` where a frame comes out otherwise."""
-    rows: list[ResultRow] = []
+    rows: list[Row] = []
     for count, each in enumerate(part.views):
         name = part.names.get(each.number)
         if name is None:
-            raise InputError(f"{shown(part.folder)}: {each.setting} was not exported as a whole; export again")
+            raise InputError(f"{part.folder}: {each.setting} was not exported as a whole; export again")
         check_frame(part.folder, name, part.hashes[each.number], each.image)
         rows += _scored(part, each, part.item if count == 0 else None)
         on_step()
     return results_table(rows, part.swept)
 
 
-def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[ResultRow]:
+def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[Row]:
     """Score one frame, and keep it for the gallery where `item` names a file."""
     views, estimators = part.views, part.estimators(each.number)
     if isinstance(views, CaseViews):
@@ -262,4 +252,4 @@ def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[ResultRow]:
     maker = maker_of(views.dataset.model_dump_json(), views.variant)
     answers = answer(each.view, each.image, estimators)
     rows = maker.score(each.number, each.session, each.view, answers, estimators)
-    return [row.having(swept={**row.swept, ANATOMY: each.anatomy}) for row in rows]
+    return [row | {ANATOMY: each.anatomy} for row in rows]

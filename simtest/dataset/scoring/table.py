@@ -15,8 +15,7 @@ from simtest.estimators.estimate_check import check
 from simtest.estimators.protocol import Target
 from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array, Mask
-from simtest.runtime.resources import shown
-from simtest.spec.camera_spec import CameraSpec
+from simtest.spec.camera import CameraSpec
 from simtest.spec.spec_model import validate
 from simtest.validation.metrics import MISSED
 
@@ -44,12 +43,6 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
     mapping
         Answers by estimator and frame. Rows whose status is missed are left out, as highlights without a row are; their
         estimator is there all the same.
-
-    Raises
-    ------
-    InputError
-        If the table cannot be read, lacks a column, or a row is malformed: the message names it, counted from 1 without
-        the header.
     """
     table = read_table(path)
     is_answer = _answered(table)
@@ -64,7 +57,7 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
     seen: dict[tuple[object, ...], int] = {}
     for row in range(table.rows):
         frame, estimator = table.texts["frame"][row], table.texts["estimator"][row] or name
-        check_name(estimator, f"{shown(path)}: row {row + 1}: estimator")
+        check_name(estimator, f"{path}: row {row + 1}: estimator")
         of_estimator = made.setdefault(estimator, {})
         if table.texts["status"][row] == MISSED:
             continue
@@ -78,7 +71,7 @@ def read_answers(path: Path, record: Record, name: str) -> Answers:
             raise table.refuse(row, result.detail)
         own.append(Answer(result, points[row], numbers[row]))
     if not any(made.values()):
-        raise InputError(f"{shown(path)}: holds no answer; must have a row for each normal")
+        raise InputError(f"{path}: holds no answer; must have a row for each normal")
     return made
 
 
@@ -86,7 +79,7 @@ def check_name(name: str, what: str) -> None:
     """Raise `InputError` where a method's name cannot stand in results, pages and names of folders."""
     if not 0 < len(name) <= LONGEST_NAME or not name.isprintable() or "/" in name or name.strip() in ("", ".", ".."):
         allowed = f"1 to {LONGEST_NAME} printable characters without /, and neither . nor .."
-        raise InputError(f"{what} = {shown(name, 40)}: must be {allowed}")
+        raise InputError(f"{what} = {name}: must be {allowed}")
 
 
 # Checks of all rows --------------------------------------------------------------------------------------------------
@@ -99,13 +92,13 @@ def _answered(table: Table) -> Mask:
     ok = (status == "ok") | ((status == "") & ((reason == "") | given.any(axis=1)))
     is_known = np.isin(status, ["", MISSED, *map(str, Reason)])
     if (row := table.first(~ok & ~is_known & given.all(axis=1))) is not None:
-        raise table.refuse(row, f"status = {shown(status[row], 40)}: must be ok or empty where a normal is given")
+        raise table.refuse(row, f"status = {status[row]!s:.40}: must be ok or empty where a normal is given")
     if (row := table.first(ok & ~given.all(axis=1))) is not None:
         name = NORMAL[int(np.flatnonzero(~given[row])[0])]
         raise table.refuse(row, f"{name} is empty; must be a number, or status must name why there is no normal")
     targets = np.array(table.texts["target"])
     if (row := table.first(~np.isin(targets, ("", "fine", "base")))) is not None:
-        raise table.refuse(row, f"target = {shown(targets[row], 40)}: must be fine, base or empty")
+        raise table.refuse(row, f"target = {targets[row]!s:.40}: must be fine, base or empty")
     return np.asarray(ok)
 
 
@@ -114,10 +107,10 @@ def _check_frames(table: Table, record: Record) -> None:
     for row, frame in enumerate(table.texts["frame"]):
         if frame not in record.frames:
             what = f"among the {len(record.frames)} names of frames.csv"
-            raise table.refuse(row, f"frame = {shown(frame, 60) if frame else 'empty'}: must be {what}")
+            raise table.refuse(row, f"frame = {str(frame) if frame else 'empty'}: must be {what}")
     if left := len(record.frames) - len(set(table.texts["frame"])):
         what = "frame has no row; its" if left == 1 else "frames have no row; their"
-        warnings.warn(f"{shown(table.path)}: {left} of {len(record.frames)} {what} highlights count as missed",
+        warnings.warn(f"{table.path}: {left} of {len(record.frames)} {what} highlights count as missed",
                       stacklevel=4)  # fmt: skip
 
 

@@ -13,8 +13,8 @@ import polars as pl
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
+from simtest.runtime.boundary import close_names
 from simtest.runtime.files import require_plain
-from simtest.runtime.resources import close_names, shown
 
 NORMAL = ("normal_x", "normal_y", "normal_z")
 SECOND = ("second_x", "second_y", "second_z")
@@ -39,7 +39,7 @@ class Table:
 
     def refuse(self, row: int, what: str) -> InputError:
         """Return the error of a row, counted from 1 without the header."""
-        return InputError(f"{shown(self.path)}: row {row + 1}: {what}")
+        return InputError(f"{self.path}: row {row + 1}: {what}")
 
     def first(self, wrong: npt.ArrayLike) -> int | None:
         """Return the first row of which something is true, shape (rows,); None where it is true of none."""
@@ -53,19 +53,16 @@ class Table:
 
 def read_table(path: Path) -> Table:
     """Read a table; numbers that are not given are NaN, texts that are not given empty."""
-    try:
-        require_plain(path)
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror}); must be a CSV or Parquet table") from error
+    require_plain(path, wanted="a CSV or Parquet table")
     is_parquet = path.suffix.lower() in (".parquet", ".pq")
     if not is_parquet and _is_utf16(path):
-        raise InputError(f"{shown(path)}: is UTF-16; must be a CSV table in UTF-8")
+        raise InputError(f"{path}: is UTF-16; must be a CSV table in UTF-8")
     try:
         # As text: whether a value is a number is judged below, where the row is known.
         frame = pl.read_parquet(path, hive_partitioning=False) if is_parquet else pl.read_csv(path, infer_schema=False)
     except (pl.exceptions.PolarsError, OSError, UnicodeDecodeError) as error:
         kind = "Parquet" if is_parquet else "CSV"
-        raise InputError(f"{shown(path)}: no {kind} table ({str(error).splitlines()[0][:120]})") from error
+        raise InputError(f"{path}: no {kind} table ({str(error).splitlines()[0][:120]})") from error
     # "frame, x_px" is a header that people write.
     names = [name.strip() for name in frame.columns]
     if len(set(names)) == len(names):
@@ -81,7 +78,7 @@ def read_table(path: Path) -> Table:
                 numbers[name] = _number_column(path, frame[name])
         except pl.exceptions.PolarsError as error:
             kind = "text" if name in texts else "numbers"
-            raise InputError(f"{shown(path)}: column {name} is {frame[name].dtype}; must hold {kind}") from error
+            raise InputError(f"{path}: column {name} is {frame[name].dtype}; must hold {kind}") from error
     return Table(path, numbers, texts, frame.height)
 
 
@@ -101,19 +98,19 @@ def _check_columns(path: Path, columns: Sequence[str]) -> None:
     missing += [n for g in groups if set(g) & set(columns) for n in g if n not in columns and n not in missing]
     if missing:
         raise InputError(
-            f"{shown(path)}: column {missing[0]} is missing; must have frame, x_px and y_px or specularity, "
+            f"{path}: column {missing[0]} is missing; must have frame, x_px and y_px or specularity, "
             f"{', '.join(NORMAL)}, and all of a group such as {', '.join(COVARIANCE)} or none; "
-            f"has {shown(', '.join(columns), 120)}{' (commas must separate them)' if len(columns) == 1 else ''}"
+            f"has {', '.join(columns)!s:.120}{' (commas must separate them)' if len(columns) == 1 else ''}"
         )
     unknown = [name for name in columns if name not in COLUMNS]
     twice = next((base for name in unknown if (base := DOUBLED.sub("", name)) != name and base in COLUMNS), None)
     if twice is not None:
-        raise InputError(f"{shown(path)}: column {twice} is given twice; must be one column")
+        raise InputError(f"{path}: column {twice} is given twice; must be one column")
     if unknown:
         near = close_names(unknown[0], COLUMNS)
         meant = f" (is {near[0]} meant?)" if near else ""
-        listed = ", ".join(shown(name, 40) for name in unknown[:5]) + (", ..." if len(unknown) > 5 else "")
-        warnings.warn(f"{shown(path)}: columns that are not read: {listed}{meant}", stacklevel=5)
+        listed = ", ".join(str(name) for name in unknown[:5]) + (", ..." if len(unknown) > 5 else "")
+        warnings.warn(f"{path}: columns that are not read: {listed}{meant}", stacklevel=5)
 
 
 def _number_column(path: Path, column: pl.Series) -> Array:
@@ -122,13 +119,13 @@ def _number_column(path: Path, column: pl.Series) -> Array:
         column = column.str.strip_chars()
         column = column.set(column == "", None)
     if column.dtype.is_temporal() or column.dtype == pl.Boolean:
-        raise InputError(f"{shown(path)}: column {column.name} is {column.dtype}; must hold numbers")
+        raise InputError(f"{path}: column {column.name} is {column.dtype}; must hold numbers")
     made = column.cast(pl.Float64, strict=False)
     bad = (made.is_null() & column.is_not_null()) | (made.is_not_null() & ~made.is_finite().fill_null(False))
     rows = bad.arg_true()
     if len(rows):
         row = int(rows[0])
         raise InputError(
-            f"{shown(path)}: row {row + 1}: {column.name} = {shown(column[row], 40)}: must be a finite number or empty"
+            f"{path}: row {row + 1}: {column.name} = {column[row]!s:.40}: must be a finite number or empty"
         )
     return made.fill_null(np.nan).to_numpy().astype(float)

@@ -15,12 +15,12 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Image
 from simtest.simulation.rendered_view import RenderedView
 from simtest.spec import Experiment
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.sensor import Sensor
 from simtest.validation.cases import Case
+from simtest.validation.columns import Value
 from simtest.validation.execution import realiser_of
 from simtest.validation.realisation import answer
-from simtest.validation.results_table import Value
 
 
 @dataclass(frozen=True)

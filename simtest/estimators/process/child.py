@@ -86,13 +86,7 @@ class Child:
 
     @classmethod
     def start(cls, arguments: Sequence[str], environment: Mapping[str, str]) -> "Child":
-        """Start a core in an empty folder of its own, with this environment and no open files but its three pipes.
-
-        Raises
-        ------
-        OSError
-            If the program cannot be run.
-        """
+        """Start a core in an empty folder of its own, with this environment and no open files but its three pipes."""
         folder = tempfile.mkdtemp(prefix="simtest-core-")
         guard = None
         try:

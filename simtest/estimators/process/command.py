@@ -13,7 +13,6 @@ from pydantic import Field
 from simtest.errors import InputError
 from simtest.estimators.process import PREFIX
 from simtest.runtime import provenance
-from simtest.runtime.resources import shown
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
 
@@ -115,11 +114,6 @@ def parse_core(text: str) -> CoreCommand:
 
     Arguments that name existing files become absolute. Relative ones are looked for in the current folder; those of a
     TOML file in that file's folder.
-
-    Raises
-    ------
-    InputError
-        If the file or the command is malformed, or the program is missing or cannot be run.
     """
     if text.startswith(PREFIX):
         arguments, files, name = _resolved(text, text.removeprefix(PREFIX), Path.cwd())
@@ -127,7 +121,7 @@ def parse_core(text: str) -> CoreCommand:
     path = Path(text)
     table = validate(CoreFile, read_toml(path), str(path)).core
     folder = path.absolute().parent
-    arguments, files, _ = _resolved(f"{shown(text)}: core.command", table.command, folder)
+    arguments, files, _ = _resolved(f"{text}: core.command", table.command, folder)
     further = tuple(_further(text, folder, name) for name in table.files)
     return CoreCommand(
         text, table.name, arguments, (*dict.fromkeys((*files, *further)), path.absolute()), table.time_limit_s,
@@ -139,13 +133,13 @@ def _further(text: str, folder: Path, name: str) -> Path:
     """Return the absolute path of a file that a TOML file lists; raise `InputError` where it is none."""
     file = Path(os.path.normpath(folder / name))
     if not _exists(file) or not file.is_file():
-        raise InputError(f"{shown(text)}: core.files: {shown(name)} is no file in {shown(folder)}; must be a file")
+        raise InputError(f"{text}: core.files: {name} is no file in {folder}; must be a file")
     return file
 
 
 def _resolved(text: str, command: str, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...], str]:
     """Return a command's absolute arguments, the files among them, and the name that they give it."""
-    what = f"estimator {shown(text, 120)!r}"
+    what = f"estimator {text!r:.120}"
     try:
         words = shlex.split(command)
     except ValueError as error:
@@ -180,7 +174,7 @@ def _exists(path: Path) -> bool:
 def _called(word: str) -> str:
     """Return how a script is called; nothing if its name does not tell what runs it."""
     interpreter = SCRIPTS.get(Path(word).suffix)
-    return f'a script is called with what runs it: "{interpreter} {shown(word, 80)}"' if interpreter else ""
+    return f'a script is called with what runs it: "{interpreter} {word!s:.80}"' if interpreter else ""
 
 
 def _program(what: str, word: str, folder: Path) -> Path:
@@ -196,18 +190,14 @@ def _program(what: str, word: str, folder: Path) -> Path:
                 if not _exists(folder / word)
                 else _called(word) or "a program in this folder is named ./ and its name"
             )
-            raise InputError(f"{what}: no program {shown(word, 80)!r} on PATH{f' ({near})' if near else ''}")
+            raise InputError(f"{what}: no program {word!r:.80} on PATH{f' ({near})' if near else ''}")
         return Path(os.path.abspath(found))
     path = folder / word
     if not _exists(path):
-        raise InputError(f"{what}: {shown(word, 200)} does not exist; must be a program")
+        raise InputError(f"{what}: {word!s:.200} does not exist; must be a program")
     if not path.is_file():
-        raise InputError(
-            f"{what}: {shown(word, 200)} is a {'folder' if path.is_dir() else 'device'}; must be a program"
-        )
+        raise InputError(f"{what}: {word!s:.200} is a {'folder' if path.is_dir() else 'device'}; must be a program")
     if not os.access(path, os.X_OK):
-        raise InputError(
-            f"{what}: {shown(word, 200)} is not executable; must be a program ({_called(word) or 'chmod +x'})"
-        )
+        raise InputError(f"{what}: {word!s:.200} is not executable; must be a program ({_called(word) or 'chmod +x'})")
     # Links stay: a virtual environment's Python is one.
     return Path(os.path.normpath(path))

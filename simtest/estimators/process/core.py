@@ -18,7 +18,6 @@ from simtest.estimators.process.child import Child
 from simtest.estimators.process.command import CoreCommand, parse_core
 from simtest.estimators.process.wire import PROTOCOL, CoreFault, Message, broken, encode, excerpt
 from simtest.runtime import provenance
-from simtest.runtime.resources import shown
 
 PATCH_ARRAYS = ("values", "raw", "noise", "saturated", "seen", "rays")
 FRAME_ARRAYS = ("encoded", "channels", "intensity", "smoothed", "noise", "clipped", "seen", "rays")
@@ -270,11 +269,6 @@ def kept_core(text: str) -> Core:
 
     One that was closed, as the cores of a run are at its end, greets anew: a module that its script imports may have
     changed.
-
-    Raises
-    ------
-    InputError
-        If the name is malformed, or the core does not start.
     """
     command = parse_core(text)
     signature = (os.getpid(), *command.signature())
@@ -286,7 +280,7 @@ def kept_core(text: str) -> Core:
         try:
             core.start()
         except CoreFault as fault:
-            raise InputError(f"estimator {shown(text, 120)!r}: {fault.detail}") from fault
+            raise InputError(f"estimator {text!r:.120}: {fault.detail}") from fault
     # The last used one stands last.
     _kept[text] = signature, core
     while len(_kept) > KEPT_CORES:

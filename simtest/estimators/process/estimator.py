@@ -73,13 +73,7 @@ class ProcessFrameEstimator(_Process):
 
 
 def load_core(text: str) -> ProcessEstimator | ProcessFrameEstimator:
-    """Start a core, if it does not run in this process already, and return it as an estimator.
-
-    Raises
-    ------
-    InputError
-        If its name is malformed (see `simtest.estimators.process.command.parse_core`), or it does not start.
-    """
+    """Start a core, if it does not run in this process already, and return it as an estimator."""
     core = kept_core(text)
     assert core.hello is not None
     return ProcessEstimator(core) if core.hello.kind == "patch" else ProcessFrameEstimator(core)

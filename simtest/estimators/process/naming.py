@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 from simtest.errors import InputError
 from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.process import is_core
-from simtest.runtime.model_names import parse_model
-from simtest.runtime.resources import shown
+from simtest.runtime.resources import parse_model
 
 if TYPE_CHECKING:
     from simtest.estimators.process.command import CoreCommand
@@ -25,19 +24,13 @@ def has_files(name: str) -> bool:
 
 
 def short_name(name: str) -> str:
-    """Return the short name of a core, or of an estimator with a network's file.
-
-    Raises
-    ------
-    InputError
-        If the name is malformed, or the short one is that of an installed estimator, for which it would be taken.
-    """
+    """Return the short name of a core, or of an estimator with a network's file."""
     model = parse_model(name)
     short = _parsed(name).name if model is None else model.short
     if short in ESTIMATORS.names():
         how = "in a TOML file (core.name)" if model is None else "by its file"
         raise InputError(
-            f"estimator {shown(name, 120)!r}: is called {short}, as an installed estimator is; name it otherwise {how}"
+            f"estimator {name!r}: is called {short}, as an installed estimator is; name it otherwise {how}"
         )
     return short
 

@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
-from simtest.calibration.distributions import Distribution, LogUniform, Normal
+from simtest.calibration.priors import Distribution, LogUniform, Normal
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators.process.core import Hello, outline_names
 from simtest.geometry import Array, Camera, Patch
-from simtest.geometry.distortion import lens_name
+from simtest.geometry.lenses import lens_name
 
 Named = dict[str, npt.NDArray[Any]]
 Offer = Mapping[str, Callable[[], npt.NDArray[Any] | str]]

@@ -1,7 +1,6 @@
 """The gate: a run against the baseline, by tests whose error rates are measured (docs/gallery/gate_measured.md).
 
-`compare.compare` is the way in. It hashes cells (`figures`), pairs the rows of differing ones (`pairing`,
-`pairing_units`), tests them (`contrasts`, `pooling`) for the quantities of `quantities` against the margins of
-`limits`, and corrects the p-values (`holm`). `missing_results`, `single_results`, `causes` and `notes` add what needs
-no test.
+`compare.compare` is the way in: it pairs the rows of the cells that differ, tests them (`contrasts`) for the
+`quantities` against their margins, corrects the p-values, and adds single results, which need no test. `findings` says
+in sentences what was found.
 """

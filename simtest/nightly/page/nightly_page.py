@@ -7,7 +7,8 @@ from simtest.nightly import phrases
 from simtest.nightly.page import run_tables as tables
 from simtest.nightly.page.trends import trends
 from simtest.nightly.records import JudgedRun
-from simtest.pages import chart_web, style
+from simtest.pages import style
+from simtest.pages.charts import embedded
 from simtest.pages.html import environment
 from simtest.runtime.files import write_atomically
 
@@ -66,6 +67,5 @@ def _render(judged: JudgedRun, files: Sequence[str]) -> str:
         provenance=tables.provenance(judged),
         files=files,
         colours={name: colours[name] for name in style.estimator_order(names)},
-        figures=chart_web.packed({chart.key: chart_web.figure(chart) for chart in charts}),
-        plotly=chart_web.packed_plotly() if charts else None,
+        **embedded(charts),
     )  # fmt: skip

@@ -117,18 +117,6 @@ def _percent(part: int, whole: int) -> str:
     return f"{100 * part / whole:.1f}" if whole else "–"
 
 
-def failures(run: NightlyRun) -> Table:
-    """Count the failures by reason, the commonest first, and estimator."""
-    failed = run.rows.filter(row_kind(run.rows) == "failed")
-    reasons = failed.group_by("status").len().sort("len", "status", descending=[True, False])["status"].to_list()
-    numbers = {(name, reason): count for name, reason, count in failed.group_by("estimator", "status").len().rows()}
-    entries = [
-        [Entry(name, "text estimator", head=True), *(Entry(numbers.get((name, reason), "–")) for reason in reasons)]
-        for name in estimator_order(failed["estimator"])
-    ]
-    return Table("Failures by reason", ("=estimator", *(reason.replace("_", " ") for reason in reasons)), entries)
-
-
 def provenance(judged: JudgedRun) -> Table:
     """Return what made the numbers of tonight, and of the baseline where there is one."""
     records = {"=tonight": judged.run.record, "=baseline": judged.verdict.baseline}

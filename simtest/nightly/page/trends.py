@@ -9,9 +9,8 @@ import polars as pl
 from simtest.nightly.history import TRENDS
 from simtest.nightly.phrases import short_commit
 from simtest.nightly.records import RunRecord
-from simtest.pages.axes import Axis
-from simtest.pages.chart import Chart, Mark, Panel
-from simtest.pages.style import NEUTRAL, Symbol, number
+from simtest.pages.charts import Axis, Chart, Mark, Panel
+from simtest.pages.style import NEUTRAL, number
 
 TITLES = dict(zip(TRENDS, ("mean error (deg)", "unanswered", "in the 95 % region"), strict=True))
 """What the panels show, by quantity."""
@@ -20,7 +19,7 @@ _TICKS = 4
 """As many dates stand side by side on a phone."""
 
 _DAY_S = 86_400.0
-_POINT, _CROSS = Symbol("o", "circle", "●"), Symbol("X", "x", "✖")
+_POINT, _CROSS = "●", "✖"
 
 
 def trends(history: pl.DataFrame, baseline: RunRecord | None, colours: Mapping[str, str]) -> list[Chart]:
@@ -67,4 +66,5 @@ def _curve(name: str, runs: pl.DataFrame, colour: str) -> Iterator[Mark]:
     yield Mark(day, value, colour, name, line="solid", width=1.3, symbol=_POINT, size=4, hover=told)
     found = runs["state"].is_in(["regression", "changed"]).fill_null(False).to_numpy()
     if found.any():
-        yield Mark(day[found], value[found], colour, name, listed=False, symbol=_CROSS, size=10)
+        why = [text for text, is_found in zip(told, found, strict=True) if is_found]
+        yield Mark(day[found], value[found], colour, name, listed=False, symbol=_CROSS, size=10, hover=why)

@@ -14,10 +14,9 @@ from simtest.realism.fitting.parameters import Parameter
 from simtest.realism.fitting.summaries import NAMES, summarise
 from simtest.realism.frame_statistics import measure
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.files import Json, make_folder, require_plain, write_json
+from simtest.runtime.files import Json, make_folder, read_json, write_json
 from simtest.runtime.provenance import source_hash
-from simtest.runtime.resources import shown
-from simtest.spec.dataset_recipe import Dataset, Splits
+from simtest.spec.recipes import Dataset, Splits
 
 if TYPE_CHECKING:
     from simtest.realism.fitting.frames import DrawnFrame
@@ -96,11 +95,6 @@ def make_bank(
         Radiances, and pictures of each.
     progress : callable, optional
         See `Progress`.
-
-    Raises
-    ------
-    InputError
-        If the folder holds another bank or cannot be written, or the recipe is malformed.
     """
     recipe = bank_recipe(dataset, size)
     _claim(recipe, folder, chains)
@@ -133,7 +127,7 @@ def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
     for index in range(size):
         path = folder / f"{index:06d}.json"
         try:
-            rows = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
+            rows = read_json(path)
             for row in rows:
                 told = [np.nan if value is None else value for value in row["summaries"]]
                 values = [row["values"][parameter.key] for parameter in parameters]
@@ -144,9 +138,9 @@ def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
                 else:
                     reason = str(row["left_out"])
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{shown(path)}: no file of a bank ({error}); remove it, and it is made again") from error
+            raise InputError(f"{path}: no file of a bank ({error}); remove it, and it is made again") from error
     if not shares:
-        raise InputError(f"{shown(folder)}: the bank holds no frame that can be measured ({reason})")
+        raise InputError(f"{folder}: the bank holds no frame that can be measured ({reason})")
     return Bank(np.array(shares), np.array(summaries, dtype=float), np.array(radiance))
 
 
@@ -172,11 +166,11 @@ def _claim(recipe: Dataset, folder: Path, chains: int) -> None:
         write_json(path, wanted)
         return
     try:
-        held = json.loads(require_plain(path, "record_bytes").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{shown(path)}: not valid JSON ({error}); remove the folder") from error
+        held = read_json(path)
+    except InputError as error:
+        raise InputError(f"{error}; remove the folder") from None
     if held != json.loads(json.dumps(wanted)):
         raise InputError(
-            f"{shown(folder)}: holds the bank of another recipe, seed, size or release of simtest; remove it or name "
+            f"{folder}: holds the bank of another recipe, seed, size or release of simtest; remove it or name "
             "another --out"
         )

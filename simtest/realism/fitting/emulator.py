@@ -127,11 +127,6 @@ def learn(bank: Bank, rng: np.random.Generator, draws: int) -> Emulator:
         Deals radiances to folds, and draws the errors of the weights.
     draws : int
         How many errors are drawn.
-
-    Raises
-    ------
-    InputError
-        If the bank is too small.
     """
     radiances, numbers = np.unique(bank.radiance, return_inverse=True)
     if len(radiances) < LEAST_RADIANCES:

@@ -17,7 +17,7 @@ from simtest.realism.frame_statistics import measure
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 from simtest.spec import load_scene
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 
 LEAST_SCENES = 3
 """Of fewer scenes neither a spread nor an interval can be said."""
@@ -92,13 +92,7 @@ class FittedRecipe:
 
 
 def summarise_scenes(frames: Sequence[NamedFrame], progress: Progress | None = None) -> Seen:
-    """Return the mean summaries of each scene, the sizes of frames, and why frames were left out.
-
-    Raises
-    ------
-    InputError
-        If there are fewer than three scenes that can be measured.
-    """
+    """Return the mean summaries of each scene, the sizes of frames, and why frames were left out."""
     held: dict[str, list[Array]] = {}
     sizes, left_out = set(), {}
     for number, frame in enumerate(frames):
@@ -154,11 +148,6 @@ def fit(
         See `Progress`.
     repeats : int
         Repeated fits for the intervals.
-
-    Raises
-    ------
-    InputError
-        If there are too few scenes, nothing to fit, or the bank cannot be made.
     """
     parameters = fitted_parameters(dataset)
     seen = summarise_scenes(frames, progress)

@@ -9,13 +9,12 @@ from simtest.dataset.maker import colour_variant
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.errors import InputError
 from simtest.rendering import Session
-from simtest.runtime.arrays import Image
-from simtest.runtime.kept_arrays import only_reading
+from simtest.runtime.arrays import Image, only_reading
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.simulation.camera_chain import displayed
 from simtest.simulation.rendered_view import expose_picture
 from simtest.spec import Scene, apply_settings
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.sensor import Sensor
 
 TRIES = 8
@@ -54,11 +53,6 @@ class FrameMaker:
         The recipe; all its ranges are drawn.
     variant : str, optional
         Mitsuba variant.
-
-    Raises
-    ------
-    InputError
-        If the recipe is malformed (`Plan`).
     """
 
     def __init__(self, dataset: Dataset, variant: str | None = None) -> None:
@@ -69,13 +63,7 @@ class FrameMaker:
         self._anatomy: Anatomy | None = None
 
     def frames(self, index: int, chains: int) -> Iterator[DrawnFrame]:
-        """Render one radiance and yield its pictures, each by another draw of the sensor; the first is the sample's.
-
-        Raises
-        ------
-        InputError
-            If no draw of this number can be rendered.
-        """
+        """Render one radiance and yield its pictures, each by another draw of the sensor; the first is the sample's."""
         drawn = self.plan.draw(index)
         for attempt in range(1, TRIES + 1):
             try:

@@ -13,35 +13,24 @@ from simtest.realism.fitting.fit import FittedRecipe
 from simtest.realism.fitting.parameters import KNOWN
 from simtest.realism.fitting.summaries import NAMES
 from simtest.runtime.files import Json, write_atomically, write_json
-from simtest.runtime.machine_errors import write_error
-from simtest.runtime.resources import shown
-from simtest.spec.dataset_recipe import Dataset
+from simtest.spec.recipes import Dataset
 from simtest.spec.toml_files import toml_value
 
 UNITS = {kind: unit for kind, _, unit in KNOWN}
 
 
 def write_fit(found: FittedRecipe, path: Path) -> tuple[Path, Path]:
-    """Write the recipe, and the report beside it with the suffix .json; return both paths.
-
-    Raises
-    ------
-    InputError
-        If they cannot be written.
-    """
+    """Write the recipe, and the report beside it with the suffix .json; return both paths."""
     report = path.with_suffix(".json")
-    try:
-        write_atomically(path, lambda part: part.write_text(recipe_toml(found.recipe), encoding="utf-8"))
-        write_json(report, report_json(found))
-    except OSError as error:
-        raise write_error(error, path) from error
+    write_atomically(path, lambda part: part.write_text(recipe_toml(found.recipe), encoding="utf-8"))
+    write_json(report, report_json(found))
     return path, report
 
 
 def check_out(path: Path) -> None:
     """Raise `InputError` if a recipe cannot be written there: before the fit, which takes long."""
     if path.suffix != ".toml" or path.is_dir():
-        raise InputError(f"--out {shown(path)}: must be a file whose name ends in .toml")
+        raise InputError(f"--out {path}: must be a file whose name ends in .toml")
 
 
 def recipe_toml(dataset: Dataset) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
-from simtest.spec.dataset_recipe import Dataset, Distribution, Family
+from simtest.spec.recipes import Dataset, Distribution, Family
 
 KNOWN: tuple[tuple[str, str, str], ...] = (
     ("relief slope", r"surface\.relief\.bands\.\d+\.slope_deg", "deg"),
@@ -81,11 +81,6 @@ def one_family(dataset: Dataset, scene: str | None = None) -> Dataset:
         The recipe.
     scene : str, optional
         Base scene of the family; may be left out where there is only one.
-
-    Raises
-    ------
-    InputError
-        If no family, or more than one, has that base scene.
     """
     names = [family.scene for family in dataset.families]
     found = [family for family in dataset.families if scene is None or family.scene == scene]
@@ -96,13 +91,7 @@ def one_family(dataset: Dataset, scene: str | None = None) -> Dataset:
 
 
 def fitted_parameters(dataset: Dataset) -> list[Parameter]:
-    """Return the parameters of a recipe of one family, in the order of `KNOWN`, then by key.
-
-    Raises
-    ------
-    InputError
-        If no range of the recipe can be fitted.
-    """
+    """Return the parameters of a recipe of one family, in the order of `KNOWN`, then by key."""
     family = dataset.families[0]
     tables = {"per_anatomy": family.per_anatomy, "per_sample": family.per_sample, "shared": dataset.per_sample}
     found = []

@@ -15,7 +15,6 @@ from simtest.geometry.camera import Camera
 from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
 from simtest.reconstruction.light_calibration.ball_search import find_ball, trace_outline
 from simtest.reconstruction.light_calibration.outline import BallOutline, has_dark_ring, refine_outline
-from simtest.runtime.resources import shown
 
 OUTLINE_FLOOR_PX = 0.02
 """Error of an outline that stays however little noise there is, px: pixels are squares, lenses no Gaussians."""
@@ -118,11 +117,6 @@ def read_balls(
         Of the camera, with the response.
     circles : dict
         Rough outline of the ball by the picture's name, where it need not be searched.
-
-    Raises
-    ------
-    InputError
-        If a picture cannot be read, or has another size than the camera.
     """
     found = Views()
     camera = calibration.camera
@@ -130,7 +124,7 @@ def read_balls(
     for name, read in pictures:
         values = read()
         if (first := _first_of(contents, name, values)) != name:
-            found.left_out[name] = _SAME.format(shown(first))
+            found.left_out[name] = _SAME.format(str(first))
             continue
         intensity = _linear(name, values, calibration)
         outline = _outline(intensity, camera, circles.get(name))
@@ -183,7 +177,7 @@ def read_plates(
             continue
         values = read()
         if (first := _first_of(contents, name, values)) != name:
-            found.left_out[name] = _SAME.format(shown(first))
+            found.left_out[name] = _SAME.format(str(first))
             continue
         intensity = _linear(name, values, calibration)
         widest = WIDEST_ON_PLATE * max(camera.width, camera.height)
@@ -216,7 +210,7 @@ def _linear(name: str, values: Image, calibration: Calibration) -> Array:
     camera = calibration.camera
     if values.shape[:2] != (camera.height, camera.width):
         raise InputError(
-            f"{shown(name)}: {values.shape[1]} x {values.shape[0]} px; must be {camera.width} x {camera.height} px as "
+            f"{name}: {values.shape[1]} x {values.shape[0]} px; must be {camera.width} x {camera.height} px as "
             "the calibration's camera"
         )
     return np.asarray(calibration.correct(np.asarray(values, dtype=np.float32)).intensity, dtype=float)
@@ -333,14 +327,14 @@ def circles_of(path: Path) -> dict[str, Circle]:
     """Read rough outlines: lines of name, x, y, radius, px, separated by commas; a header line is skipped."""
     import csv
 
-    from simtest.runtime.limits import check_file
+    from simtest.runtime.files import require_plain
 
-    check_file(path, "record_bytes", "a file of outlines (name,x,y,radius)")
+    require_plain(path, "record_bytes", "a file of outlines (name,x,y,radius)")
     found: dict[str, Circle] = {}
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (UnicodeDecodeError, OSError, csv.Error) as error:
-        raise InputError(f"--outlines {shown(path)}: cannot be read as text ({type(error).__name__})") from error
+        raise InputError(f"--outlines {path}: cannot be read as text ({type(error).__name__})") from error
     for number, row in enumerate(rows, 1):
         if not row or (number == 1 and [cell.strip() for cell in row] == ["name", "x", "y", "radius"]):
             continue
@@ -349,14 +343,14 @@ def circles_of(path: Path) -> dict[str, Circle]:
             if not (max(abs(x), abs(y), radius) <= FARTHEST_PX and radius > 0):
                 raise ValueError
         except ValueError:
-            text = shown(",".join(row), 60)
+            text = f"{','.join(row)!s:.60}"
             raise InputError(
-                f"--outlines {shown(path)}: line {number}: {text}: must be name,x,y,radius, px, radius > 0, all "
+                f"--outlines {path}: line {number}: {text}: must be name,x,y,radius, px, radius > 0, all "
                 f"within {FARTHEST_PX:g}"
             ) from None
         if name in found:
-            raise InputError(f"--outlines {shown(path)}: line {number}: {shown(name, 60)} is given twice")
+            raise InputError(f"--outlines {path}: line {number}: {name} is given twice")
         found[name] = (x, y, radius)
     if not found:
-        raise InputError(f"--outlines {shown(path)}: holds no outline; must be lines of name,x,y,radius in px")
+        raise InputError(f"--outlines {path}: holds no outline; must be lines of name,x,y,radius in px")
     return found

@@ -125,11 +125,6 @@ def calibrate_lights(
         As of `simtest.reconstruct`.
     most : int
         Lights at most, 1 to 4.
-
-    Raises
-    ------
-    InputError
-        If a picture cannot be read, fewer than two pictures can be used, or no light explains the highlights.
     """
     check_integer("--most", most, 1, MOST_LIGHTS)
     check_encoding(encoding, calibration)

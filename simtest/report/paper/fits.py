@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from simtest.geometry.isocurves import isophote_radius
 from simtest.report.paper.sweeps import Value
 from simtest.runtime.arrays import Array
+from simtest.validation.paper.isocurves import isophote_radius
 
 
 class Line(NamedTuple):

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.measure import find_contours
 
-from simtest.geometry.isocurves import brightest_point, isocurve_radii, on_isophote_branch, specular_isocurve
-from simtest.pages.axes import Axis
-from simtest.pages.chart import Chart, Mark, Panel
+from simtest.pages.charts import Axis, Chart, Mark, Panel
 from simtest.pages.palette import NEUTRAL, SERIES
-from simtest.pages.style import Symbol, symbols
+from simtest.pages.style import symbols
 from simtest.runtime.arrays import Array
+from simtest.validation.paper.isocurves import brightest_point, isocurve_radii, on_isophote_branch, specular_isocurve
 
 KAPPA = 0.55  # the article's value
 OFFSET_LIGHT = (1.2, 0.0, 1.0)  # a light beside the camera, abs(V_Z)
@@ -18,8 +17,8 @@ REACH = 3.6  # half-width of the drawn part of the plane, abs(V_Z)
 _SAMPLES, _POINTS, _CURVE = 721, 241, 200
 _LIMITS = (1e-3, 0.999)
 _ISOPHOTE, _BRANCH, _FOOT = SERIES[0], SERIES[1], SERIES[5]
-_CROSS, _STAR = Symbol("+", "cross-thin-open", "+"), Symbol("*", "star", "★")
-_TILTED = Symbol("x", "x-thin-open", "×")
+_CROSS, _STAR = "+", "★"
+_TILTED = "×"
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ def _plane(key: str, title: str, branches: tuple[Branch, ...], more: tuple[Mark,
     return Chart(key, title, (Panel(x_axis, y_axis, (*marks, *more), equal=True),), 440)
 
 
-def _point(at: tuple[float, float], symbol: Symbol, name: str) -> Mark:
+def _point(at: tuple[float, float], symbol: str, name: str) -> Mark:
     return Mark([at[0]], [at[1]], _FOOT, name, symbol=symbol, size=10, hover=name)
 
 

@@ -1,11 +1,10 @@
 """The section of the published protocol: the article's statements, figures and the pipeline in pictures."""
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
 
-from simtest.pages import chart_png, pixels, style
-from simtest.pages.chart import Chart
+from simtest.pages import style
+from simtest.pages.charts import Chart
 from simtest.pages.style import labelled
 from simtest.report.figure_files import FigureFiles
 from simtest.report.paper.isocurve_figure import isocurve_charts, isocurve_figure
@@ -25,13 +24,8 @@ class PaperSection:
     because: list[tuple[str, str]]  # statements, and the reason why they differ
     isocurves: list[Chart]
     stages: Stages | None
-    drawn: Future[list[str]] | None
+    pipeline: list[Chart]
     sweeps: list[tuple[SweepFigure, Chart]]
-
-    @property
-    def pictures(self) -> list[str]:
-        """Pictures of the stages, as data addresses."""
-        return self.drawn.result() if self.drawn else []
 
 
 def paper_section(run: Run, colours: Mapping[str, str], files: FigureFiles) -> PaperSection | None:
@@ -41,20 +35,11 @@ def paper_section(run: Run, colours: Mapping[str, str], files: FigureFiles) -> P
         return None
     sweeps = [(figure, files.draw(figure.key, [sweep_chart(figure, colours)])[0]) for figure in figures]
     curves = files.draw("isocurves", isocurve_charts(isocurve_figure()))
-    rows, kept, drawn = statements(figures), stages(run), None
-    if kept is not None:
-        charts = stage_charts(kept, colours.get("circle_pose", style.NEUTRAL))
-        drawn = files.start("pipeline", _draw_stages, charts, files)
-    return PaperSection(_headline(rows), rows, _because(rows), curves, kept, drawn, sweeps)
-
-
-def _draw_stages(charts: list[Chart], files: FigureFiles) -> list[str]:
-    """Write the stages in one file and in a file each, and return them as data addresses."""
-    whole, parts = chart_png.draw(charts)
-    files.write("pipeline", pixels.png(whole))
-    for i, part in enumerate(parts, 1):
-        files.write(f"pipeline_{i}", pixels.png(part))
-    return [pixels.data_address(part) for part in parts]
+    rows, kept = statements(figures), stages(run)
+    pipeline = stage_charts(kept, colours.get("circle_pose", style.NEUTRAL)) if kept else []
+    if pipeline:
+        files.draw("pipeline", pipeline)
+    return PaperSection(_headline(rows), rows, _because(rows), curves, kept, pipeline, sweeps)
 
 
 def _headline(rows: Sequence[Statement]) -> str:

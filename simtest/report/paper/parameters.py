@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 
 PREFIX = "paper."
 

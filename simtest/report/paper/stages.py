@@ -5,17 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtest.geometry.vectors import angle_deg
-from simtest.pages.axes import Axis
-from simtest.pages.chart import Chart, Mark, Panel, Picture
+from simtest.pages.charts import Axis, Chart, Mark, Panel, Picture
 from simtest.pages.pixels import displayed
-from simtest.pages.style import NEUTRAL, TRUTH, Symbol, degrees, labelled
+from simtest.pages.style import NEUTRAL, TRUTH, degrees, labelled
 from simtest.report.paper.parameters import PARAMETERS
 from simtest.report.run_folder import GalleryItem, KeptEstimate, Run
 from simtest.runtime.arrays import Array, Image
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 
-_ISOPHOTE, _PLANE = "#00C2D1", "#444444"
-_DOT, _CROSS = Symbol("o", "circle", "●"), Symbol("X", "x", "✖")
+_ISOPHOTE = "#00C2D1"
+_DOT, _CROSS = "●", "✖"
 PICTURES = ("texture", "clean", "smoothed")
 
 
@@ -120,7 +119,7 @@ def _picture(
     x0, x1, y1, y0 = extent
     x, y = Axis(titles[0], limits=(x0, x1)), Axis(titles[1], limits=(y1, y0))
     panel = Panel(x, y, marks, equal=True, picture=Picture(displayed(values), extent))
-    return Chart("", title, (panel,), round(105 + 365 * min((y1 - y0) / (x1 - x0), 1.0)))
+    return Chart(f"pipeline_{title[0]}", title, (panel,), round(105 + 365 * min((y1 - y0) / (x1 - x0), 1.0)))
 
 
 def _fitted(data: Stages, colour: str) -> list[Mark]:
@@ -140,11 +139,11 @@ def _side_view(data: Stages, colour: str) -> Chart:
     end = 0.95 * np.array([np.cos(theta), np.sin(theta)])
     marks = [
         Mark([0, 0], [0, -1.12], NEUTRAL, line="dot"),
-        Mark([0], [-1.2], _PLANE, words=["towards the camera"]),
+        Mark([0], [-1.2], NEUTRAL, words=["towards the camera"]),
         Mark(
             [-end[0], end[0]],
             [-end[1], end[1]],
-            _PLANE,
+            NEUTRAL,
             f"plane, slant {data.setting.theta_deg:g}°",
             line="solid",
             width=3,
@@ -156,9 +155,9 @@ def _side_view(data: Stages, colour: str) -> Chart:
         name = f"{which} candidate, off by {data.errors_deg[index]:.2f}°"
         marks.append(_normal(candidate, colour, name, 2.4, dashed))
     if not data.candidates:
-        marks.append(Mark([0], [0.8], _PLANE, words=[f"no normal: {data.status}"]))
+        marks.append(Mark([0], [0.8], NEUTRAL, words=[f"no normal: {data.status}"]))
     x, y = Axis("y of the unit normal", limits=(-1.25, 1.25)), Axis("z of the unit normal", limits=(1.05, -1.35))
-    return Chart("", "5  normals from the side", (Panel(x, y, tuple(marks), equal=True),), 460)
+    return Chart("pipeline_5", "5  normals from the side", (Panel(x, y, tuple(marks), equal=True),), 460)
 
 
 def _normal(normal: Array, colour: str, name: str, width: float, dashed: bool = False) -> Mark:
@@ -185,4 +184,4 @@ def _close_up(data: Stages, colour: str) -> Chart:
         ]  # fmt: skip
         reach = 1.35 * error
     x, y = (Axis(f"error of the {of} (deg)", limits=(-reach, reach)) for of in ("tilt's direction", "slant"))
-    return Chart("", "6  better candidate about the truth", (Panel(x, y, tuple(marks), equal=True),), 460)
+    return Chart("pipeline_6", "6  better candidate about the truth", (Panel(x, y, tuple(marks), equal=True),), 460)

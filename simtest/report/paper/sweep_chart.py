@@ -4,9 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from simtest.pages.axes import Axis, finite
-from simtest.pages.chart import NOTHING, Bars, Chart, Mark, Panel
-from simtest.pages.style import NEUTRAL, Symbol, number, symbols
+from simtest.pages.charts import NOTHING, Axis, Bars, Chart, Mark, Panel, finite
+from simtest.pages.style import NEUTRAL, number, symbols
 from simtest.report.paper.sweeps import Sweep, SweepFigure
 from simtest.runtime.arrays import Array
 
@@ -17,8 +16,8 @@ _WIDE = 20.0  # means that span more than this factor are drawn on a logarithmic
 _STD_PX, _SHARE = 6.0, 0.2  # width of the standard deviation's bars, and the failures' strip over the panel above it
 
 _KEYS = (
-    Mark(NOTHING, NOTHING, NEUTRAL, "± standard deviation", symbol=Symbol("|", "line-ns", "▮"), size=13, width=_STD_PX),
-    Mark(NOTHING, NOTHING, NEUTRAL, "least and largest error", symbol=Symbol("|", "line-ns", "|"), size=13, width=1.0),
+    Mark(NOTHING, NOTHING, NEUTRAL, "± standard deviation", symbol="▮", size=13, width=_STD_PX),
+    Mark(NOTHING, NOTHING, NEUTRAL, "least and largest error", symbol="|", size=13, width=1.0),
 )
 
 _CLOSE, _STAGGER = 0.09, 0.24
@@ -82,7 +81,7 @@ def _shifted(data: SweepFigure, axis: Axis) -> list[Array]:
     return [s.shown_x * np.exp(shift) if is_log else s.shown_x + shift for s, shift in columns]
 
 
-def _means(sweep: Sweep, x: Array, colour: str, symbol: Symbol, floor: float) -> list[Mark]:
+def _means(sweep: Sweep, x: Array, colour: str, symbol: str, floor: float) -> list[Mark]:
     name = f"{sweep.estimator}: {sweep.label}"
     columns = (sweep.x, sweep.mean, sweep.std, sweep.least, sweep.largest, sweep.bound, sweep.law, sweep.answered,
                sweep.failed)  # fmt: skip
@@ -101,11 +100,11 @@ def _means(sweep: Sweep, x: Array, colour: str, symbol: Symbol, floor: float) ->
     ]
 
 
-def _failures(data: SweepFigure, index: int, axis: Axis, colour: str, symbol: Symbol) -> list[Mark]:
+def _failures(data: SweepFigure, index: int, axis: Axis, colour: str, symbol: str) -> list[Mark]:
     """Return the counts of a sweep's failed realisations; those of several sweeps in colour and with symbols."""
     sweep, several = data.sweeps[index], len(data.sweeps) > 1
     name = f"{sweep.estimator}: {sweep.label}"
-    prefix = f"{symbol.text} " if several else ""
+    prefix = f"{symbol} " if several else ""
     hover = np.array([
         f"{name}\n{sweep.parameter.text(float(at))}\n{failed:.0f} of {failed + ok:.0f} failed"
         + (f": {reasons}" if reasons else "")

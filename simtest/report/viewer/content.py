@@ -1,17 +1,14 @@
-"""Content of the 3D view of a scene, as arrays in the camera frame."""
-
-from dataclasses import dataclass, fields
-from pathlib import Path
+"""Content of the 3D view of a scene that is rendered for it."""
 
 import numpy as np
 
-from simtest.calibration.response import srgb_encode
+from simtest.calibration.photometry import srgb_encode
 from simtest.errors import Failure, InputError
 from simtest.pages.palette import estimator_order
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.report.view3d import grid_triangles
-from simtest.runtime.arrays import AnyArray, Array, IntArray
+from simtest.report.scene3d import CAMERA, TRUE, TRUE_BASE, Content, grid_triangles
+from simtest.runtime.arrays import Array, IntArray
 from simtest.simulation.preview import coloured, expose, matt_light
 from simtest.simulation.rendered_view import RenderedView, render_view
 from simtest.simulation.true_highlights import TrueHighlight
@@ -22,34 +19,7 @@ PAGE_GRID = 110  # the same of a page, which holds the samples as text
 FINE_GRID = 1000  # the same where relief or vessels are to be seen: they are as fine as a pixel
 BRIGHTEST = 0.9  # share of full scale that the brightest colours of tissue are shown with
 OCCLUSION = 1.15  # factor between the distances of neighbouring samples beyond which there is an edge
-CAMERA, TRUE, TRUE_BASE = "camera", "true normal", "true normal of the base"
 SHORTER = 0.11  # share of its length by which each estimator's line is shorter than that of the one before
-
-
-@dataclass(frozen=True)
-class Content:
-    """A scene's 3D view, camera frame, mm: a surface, light positions, and line segments by name."""
-
-    vertices: Array  # samples of the visible surface, shape (V, 3)
-    faces: IntArray  # triangles between them, shape (F, 3)
-    curvature: Array  # of the base: principal one of larger size, 1/mm, convex to the camera positive, shape (V,)
-    normal: Array  # unit normals of the fine surface, shape (V, 3), or (0, 3) without a relief
-    colour: Array  # of the tissue, sRGB from 0 to 1, shape (V, 3), or (0, 3) without one
-    lit: Array  # the surface as an eye sees it under its lights, sRGB from 0 to 1, shape (V, 3)
-    lights: Array  # shape (L, 3)
-    names: AnyArray  # `CAMERA`, `TRUE`, `TRUE_BASE` or an estimator, shape (S,)
-    starts: Array  # shape (S, 3)
-    ends: Array
-
-    def save(self, path: Path) -> None:
-        """Write the arrays to a NumPy archive."""
-        np.savez(path, **{field.name: getattr(self, field.name) for field in fields(self)})
-
-    @classmethod
-    def load(cls, path: Path) -> "Content":
-        """Read what `save` wrote."""
-        with np.load(path) as archive:
-            return cls(**{field.name: archive[field.name] for field in fields(cls)})
 
 
 def make_content(scene: Scene, variant: str | None = None, grid: int | None = None) -> Content:
@@ -83,11 +53,6 @@ def make_content(scene: Scene, variant: str | None = None, grid: int | None = No
     lights = np.asarray(scene.rig.true_mm())
     shown = (vertices, faces, curvature, normal, colour, lit)
     return Content(*shown, lights, np.array(names), np.array(starts), np.array(ends))
-
-
-def estimators(content: Content) -> list[str]:
-    """Return the estimators whose normals a view shows, in the palette's order."""
-    return estimator_order(set(content.names.tolist()) - {CAMERA, TRUE, TRUE_BASE})
 
 
 def _true(seen: RenderedView) -> list[TrueHighlight]:

@@ -14,11 +14,8 @@ from typing import Any
 
 from simtest.errors import InputError
 from simtest.pages.palette import LIGHT, colours
-from simtest.report.viewer.content import CAMERA, TRUE, TRUE_BASE, Content, estimators
-from simtest.report.viewer.web_page import curvature_limit
+from simtest.report.scene3d import CAMERA, TRUE, TRUE_BASE, Content, curvature_limit, estimators
 from simtest.runtime.files import write_atomically
-from simtest.runtime.machine_errors import cannot_write
-from simtest.runtime.resources import shown
 
 OFF_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 """VTK's ways to draw without a display: libegl1, libosmesa6."""
@@ -69,10 +66,7 @@ def save_screenshot(content: Content, path: Path) -> None:
         for window in OFF_SCREEN:
             done, said = _draw([str(stored), str(picture)], {"VTK_DEFAULT_OPENGL_WINDOW": window}, TIMEOUT_S)
             if done and picture.is_file():
-                try:
-                    write_atomically(path, functools.partial(shutil.copyfile, picture))
-                except OSError as error:
-                    raise cannot_write(error, f"--screenshot {shown(path)}", path) from error
+                write_atomically(path, functools.partial(shutil.copyfile, picture))
                 return
     raise InputError(
         "--screenshot: nothing here draws without a display; install libegl1 (with libgl1-mesa-dri) or libosmesa6"

@@ -1,22 +1,4 @@
-"""Camera files of other programs: a module a format, which `files` chooses by what a file holds.
+"""Camera files of other programs; `files` holds the table of the formats.
 
-Each module states its format's pixel convention and axes. `read_table` gives the table of a `CameraSpec`, `read_poses`
-the poses that a file holds beside its camera.
+Each module states its formats' pixel conventions and axes.
 """
-
-from typing import TYPE_CHECKING
-
-from simtest.runtime.lazy_names import lazy_names
-
-if TYPE_CHECKING:
-    from simtest.spec.camera_formats.files import read_poses, read_table, recognise
-    from simtest.spec.camera_formats.writing import FORMATS, write_camera
-
-_HOMES = {
-    "simtest.spec.camera_formats.files": ("read_poses", "read_table", "recognise"),
-    "simtest.spec.camera_formats.writing": ("FORMATS", "write_camera"),
-}
-
-__all__ = ["FORMATS", "read_poses", "read_table", "recognise", "write_camera"]
-
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -3,9 +3,11 @@
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,14 +15,19 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.camera import ViewMask
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import suggestion
 from simtest.spec.toml_files import read_text
+
+Read = TypeVar("Read")
 
 Table = dict[str, Any]
 """A camera as the table of a `CameraSpec`."""
 
 Poses = Sequence[tuple[str, Array]]
 """Names of frames, and their world_from_camera, shape (4, 4): OpenCV axes, in the file's unit of length."""
+
+Files = dict[Path, bytes]
+"""What is written into each file."""
 
 LARGEST = 1e9
 """Largest number of a transform, in the file's unit of length."""
@@ -35,18 +42,47 @@ MOST_SHOWN = 12
 """Cameras of a file that a message lists."""
 
 
+@contextmanager
+def within(place: str) -> Iterator[None]:
+    """Put a place, such as a file's name or a line, before the message of an `InputError` that is raised inside."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from error
+
+
+def of_text(
+    kind: str = "camera", limit: str = "text_bytes"
+) -> Callable[[Callable[[str], Read]], Callable[[Path], Read]]:
+    """Make a reader of files of a reader of their text; messages begin with the file's name."""
+
+    def of_file(read: Callable[[str], Read]) -> Callable[[Path], Read]:
+        @wraps(read)
+        def read_file(path: Path) -> Read:
+            text = read_text(path, kind, limit)
+            with within(str(path)):
+                return read(text)
+
+        return read_file
+
+    return of_file
+
+
 def read_json(path: Path, kind: str = "camera") -> dict[str, Any]:
     """Read a JSON object; raise `InputError` where the file holds none."""
-    # Programs write these files, too, with a pose for each of many frames.
-    where, text = shown(path), read_text(path, kind, "record_bytes")
+    return of_text(kind, "record_bytes")(json_object)(path)
+
+
+def json_object(text: str) -> dict[str, Any]:
+    """Return the JSON object of a text."""
     try:
         data = parse_json(text)
     except RecursionError:
-        raise InputError(f"{where}: not valid JSON: nested too deeply") from None
+        raise InputError("not valid JSON: nested too deeply") from None
     except ValueError as error:
-        raise InputError(f"{where}: not valid JSON: {shown(error, 80)}") from error
+        raise InputError(f"not valid JSON: {error!s:.80}") from error
     if not isinstance(data, dict):
-        raise InputError(f"{where}: holds a {type(data).__name__}; must be an object of keys and values")
+        raise InputError(f"holds a {type(data).__name__}; must be an object of keys and values")
     return data
 
 
@@ -68,19 +104,23 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return made
 
 
-def read_xml(path: Path) -> ElementTree.Element:
-    """Read an XML file without a document type, and return its root; raise `InputError` where it is malformed."""
-    where, text = shown(path), read_text(path, "camera")
+def parse_xml(text: str) -> ElementTree.Element:
+    """Return the root of an XML text without a document type; raise `ValueError` or `ParseError` for any other."""
     # Entities, which a document type declares, can grow without end; no calibration has any.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(f"{where}: not valid XML: document types and entities are not allowed")
+        raise ValueError("document types and entities are not allowed")
+    return ElementTree.fromstring(text)  # nosec B314: without entities nothing grows or is fetched
+
+
+def xml_root(text: str) -> ElementTree.Element:
+    """Return the root of an XML text; raise `InputError` where it is malformed."""
     try:
-        return ElementTree.fromstring(text)  # nosec B314: without entities nothing grows or is fetched
+        return parse_xml(text)
     except (ElementTree.ParseError, ValueError, RecursionError) as error:
-        raise InputError(f"{where}: not valid XML: {shown(error, 80)}") from error
+        raise InputError(f"not valid XML: {error!s:.80}") from error
 
 
-def number(value: Any, where: str, name: str, whole: bool = False) -> float:
+def number(value: Any, name: str, whole: bool = False) -> float:
     """Return a finite number, given as one or as text; raise `InputError` for anything else."""
     try:
         # Python alone reads 1_000 as a number.
@@ -90,43 +130,43 @@ def number(value: Any, where: str, name: str, whole: bool = False) -> float:
         found = math.nan
     if not math.isfinite(found) or (whole and found != round(found)):
         kind = "whole" if whole else "finite"
-        raise InputError(f"{where}: {name} = {shown(repr(value), 60)}: must be a {kind} number")
+        raise InputError(f"{name} = {value!r:.60}: must be a {kind} number")
     return found
 
 
-def numbers(values: Any, where: str, name: str, counts: int | Sequence[int]) -> list[float]:
+def numbers(values: Any, name: str, counts: int | Sequence[int]) -> list[float]:
     """Return a list of finite numbers of an allowed length."""
     allowed = (counts,) if isinstance(counts, int) else tuple(counts)
     if not isinstance(values, list | tuple):
-        raise InputError(f"{where}: {name} = {shown(repr(values), 60)}: must be a list of numbers")
+        raise InputError(f"{name} = {values!r:.60}: must be a list of numbers")
     if len(values) not in allowed:
         said = " or ".join(str(count) for count in allowed)
-        raise InputError(f"{where}: {name}: {len(values)} values; must be {said}")
-    return [number(value, where, name) for value in values]
+        raise InputError(f"{name}: {len(values)} values; must be {said}")
+    return [number(value, name) for value in values]
 
 
-def check_alike(where: str, names: tuple[str, str], told: float, other: float, unit: str = "px") -> None:
+def check_alike(names: tuple[str, str], told: float, other: float, unit: str = "px") -> None:
     """Raise `InputError` where two keys of a file, both as the first one's quantity, differ by more than rounding."""
     if not abs(told - other) <= ALIKE * max(abs(told), abs(other)):
         raise InputError(
-            f"{where}: {names[0]} = {told:g} and {names[1]}, which says {other:g} {unit}: must agree within "
+            f"{names[0]} = {told:g} and {names[1]}, which says {other:g} {unit}: must agree within "
             f"{100 * ALIKE:g} %; give one of them"
         )
 
 
-def rigid(rows: Any, where: str, name: str) -> Array:
+def rigid(rows: Any, name: str) -> Array:
     """Return a rigid transform, shape (4, 4), of 3 or 4 rows of 4 numbers; the rotation's rounding is taken out."""
     if not isinstance(rows, list) or len(rows) not in (3, 4):
-        raise InputError(f"{where}: {name} = {shown(repr(rows), 60)}: must be 4 rows of 4 numbers")
+        raise InputError(f"{name} = {rows!r:.60}: must be 4 rows of 4 numbers")
     T = np.eye(4)
-    T[: len(rows)] = [numbers(row, where, f"{name}[{i}]", 4) for i, row in enumerate(rows)]
+    T[: len(rows)] = [numbers(row, f"{name}[{i}]", 4) for i, row in enumerate(rows)]
     R = T[:3, :3]
     if not np.abs(T).max() <= LARGEST:
-        raise InputError(f"{where}: {name}: holds {np.abs(T).max():.3g}; must be at most {LARGEST:g}")
+        raise InputError(f"{name}: holds {np.abs(T).max():.3g}; must be at most {LARGEST:g}")
     if not np.allclose(R @ R.T, np.eye(3), atol=ROUNDED) or np.linalg.det(R) < 0:
-        raise InputError(f"{where}: {name}: must begin with a rotation; R R^T is {shown((R @ R.T).round(3).tolist())}")
+        raise InputError(f"{name}: must begin with a rotation; R R^T is {(R @ R.T).round(3).tolist()}")
     if not np.allclose(T[3], [0, 0, 0, 1]):
-        raise InputError(f"{where}: {name}: last row is {T[3].tolist()}; must be 0, 0, 0, 1")
+        raise InputError(f"{name}: last row is {T[3].tolist()}; must be 0, 0, 0, 1")
     U, _, V = np.linalg.svd(R)
     T[:3, :3] = U @ V
     return T
@@ -140,20 +180,18 @@ def inverse(T: Array) -> Array:
     return made
 
 
-def chosen(cameras: Mapping[str, Table], wanted: str | None, where: str) -> Table:
+def chosen(cameras: Mapping[str, Table], wanted: str | None) -> Table:
     """Return the camera of an id, or the only one; raise `InputError`, which lists them, where that is unclear."""
     if not cameras:
-        raise InputError(f"{where}: holds no camera; must hold one")
+        raise InputError("holds no camera; must hold one")
     listed = ", ".join(list(cameras)[:MOST_SHOWN]) + (", ..." if len(cameras) > MOST_SHOWN else "")
     if wanted is not None:
         if wanted not in cameras:
-            raise InputError(
-                f"{where}: no camera {shown(wanted, 40)}; must be one of {listed}{suggestion(wanted, list(cameras))}"
-            )
+            raise InputError(f"no camera {wanted}; must be one of {listed}{suggestion(wanted, list(cameras))}")
         return cameras[wanted]
     tables = list(cameras.values())
     if any(table != tables[0] for table in tables):
-        raise InputError(f"{where}: holds {len(cameras)} cameras ({listed}); name one as FILE#ID")
+        raise InputError(f"holds {len(cameras)} cameras ({listed}); name one as FILE#ID")
     return tables[0]
 
 
@@ -162,14 +200,14 @@ def mask_text(mask: ViewMask) -> str:
     return json.dumps(mask_table(mask))
 
 
-def mask_of_text(text: Any, where: str) -> Table:
+def mask_of_text(text: Any) -> Table:
     """Return the table of a `ViewMaskSpec` that `mask_text` wrote."""
     try:
         made = json.loads(text)
     except (TypeError, ValueError):
         made = None
     if not isinstance(made, dict):
-        raise InputError(f"{where}: view mask {shown(repr(text), 60)}: must be a JSON object")
+        raise InputError(f"view mask {text!r:.60}: must be a JSON object")
     return made
 
 

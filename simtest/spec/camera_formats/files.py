@@ -1,65 +1,119 @@
-"""Reads camera files of any known format, which it recognises by what they hold.
+"""Reads and writes camera files of any known format; `FORMATS` is the list of them.
 
-A file of several cameras is named FILE#ID.
+A file is recognised by what it holds. One of several cameras is named FILE#ID.
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any
 
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown
-from simtest.spec.camera_formats.common import LARGEST, Poses, Table, chosen
+from simtest.geometry.camera import Camera
+from simtest.runtime.boundary import suggestion
+from simtest.runtime.files import write_atomically
+from simtest.spec.camera_formats.common import LARGEST, Files, Poses, Table, chosen, within
+from simtest.spec.camera_tables import camera_toml
 from simtest.spec.toml_files import read_text
 
-Kind = Literal[
-    "toml", "opencv", "matlab", "colmap", "colmap images", "transforms", "kalibr", "vicalib", "ocamcalib", "c3vd",
-    "photometric",
-]  # fmt: skip
 
-KINDS: tuple[Kind, ...] = get_args(Kind)
+@dataclass(frozen=True)
+class Format:
+    """A format of camera files.
 
-NAMES: dict[Kind, str] = {
-    "toml": "simtest's TOML",
-    "opencv": "OpenCV or ROS",
-    "matlab": "MATLAB",
-    "colmap": "COLMAP cameras.txt",
-    "colmap images": "COLMAP images.txt",
-    "transforms": "transforms.json of NeRF",
-    "kalibr": "Kalibr YAML",
-    "vicalib": "Vicalib XML",
-    "ocamcalib": "OCamCalib calib_results.txt",
-    "c3vd": "parameters of C3VD",
-    "photometric": "EndoMapper's photometric XML",
-}
-"""How messages and pages call the formats."""
+    Parameters
+    ----------
+    name : str
+        As `recognise` returns it and `write_camera` takes it.
+    title : str
+        How messages and pages call it.
+    module : str
+        Of this package, with the functions below; loaded on demand, since OpenCV and SciPy are slow to load.
+    looks_like : mapping
+        Pattern that a file holds, by its syntax: xml, json, yaml or text. Of several that fit the first row counts.
+    cameras : str
+        Function that reads the cameras of a file: tables of `CameraSpec` by id. Empty: it holds none.
+    poses : str
+        Function that reads names and world_from_camera of frames. Empty: it holds none.
+    write : str
+        Function of a camera, the file's path and poses or None that returns the `Files` to write. Empty: none is.
+    suffixes : tuple of str
+        Of the files that are written; the first format that has a suffix is its default.
+    writes_poses : bool
+        Whether poses are written too.
+    """
 
-OPENCV_SUFFIXES = (".yml", ".yaml", ".xml", ".json")
-MATLAB_SUFFIX = ".mat"
-FOREIGN_SUFFIXES = (*OPENCV_SUFFIXES, MATLAB_SUFFIX)
+    name: str
+    title: str
+    module: str = ""
+    looks_like: Mapping[str, str] | None = None
+    cameras: str = ""
+    poses: str = ""
+    write: str = ""
+    suffixes: tuple[str, ...] = ()
+    writes_poses: bool = False
+
+    def function(self, name: str) -> Callable[..., Any]:
+        """Return a function of the format's module."""
+        found: Callable[..., Any] = getattr(import_module(f"simtest.spec.camera_formats.{self.module}"), name)
+        return found
+
+
+_ROWS = (
+    Format("toml", "simtest's TOML", "files", write="toml_file", suffixes=(".toml",)),
+    Format(
+        "opencv", "OpenCV or ROS", "opencv", cameras="read_opencv", write="opencv_file",
+        suffixes=(".yml", ".yaml", ".xml", ".json"),
+    ),
+    Format("ros", "ROS camera_info", "opencv", write="ros_file", suffixes=(".yml", ".yaml")),
+    Format(
+        "colmap", "COLMAP cameras.txt", "colmap", {"text": r"^[ \t]*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d"},
+        "read_colmap", "read_images", "colmap_files", (".txt",), True,
+    ),
+    Format(
+        "transforms", "transforms.json of NeRF", "colmap",
+        {"json": r"\"(transform_matrix|camera_angle_x|fl_x)\"\s*:"},
+        "read_transforms", "transforms_poses", "transforms_file", (".json",), True,
+    ),
+    Format("matlab", "MATLAB", "matlab", cameras="read_matlab", write="matlab_file", suffixes=(".mat",)),
+    Format(
+        "colmap images", "COLMAP images.txt", "colmap",
+        {"text": r"^[ \t]*\d+([ \t]+[-+.\deE]+){7}[ \t]+\d+[ \t]+\S"}, poses="read_images",
+    ),
+    Format(
+        "ocamcalib", "OCamCalib calib_results.txt", "omnidirectional",
+        {"text": r"^[ \t]*#?[ \t]*polynomial coefficients|^[ \t]*\d+([ \t]+[-+.\deE]+){5,}[ \t]*$"}, "read_ocamcalib",
+    ),
+    Format(
+        "c3vd", "parameters of C3VD", "omnidirectional", {"json": r"\"a0\"\s*:", "text": r"^[ \t]*a0[ \t]*[=:]"},
+        "read_c3vd",
+    ),
+    Format(
+        "kalibr", "Kalibr YAML", "opencv", {"yaml": r"^cam\d+\s*:", "text": r"^cam\d+\s*:"}, "read_kalibr",
+        "kalibr_poses",
+    ),
+    Format(
+        "photometric", "EndoMapper's photometric XML",
+        looks_like={"xml": r"<light_model\b|<camera_model\b[^>]*type=[\"']gamma[\"']"},
+    ),
+    Format("vicalib", "Vicalib XML", "omnidirectional", {"xml": r"<camera_model\b"}, "read_vicalib"),
+)  # fmt: skip
+
+FORMATS = {each.name: each for each in _ROWS}
+"""The formats by name."""
+
+WRITTEN = tuple(each.name for each in _ROWS if each.write)
+
+FOREIGN_SUFFIXES = (*FORMATS["opencv"].suffixes, *FORMATS["matlab"].suffixes)
 """Suffixes of other programs' files: no calibration is saved under such a name."""
 
 HEAD = 20_000
 """Characters by which a format is recognised."""
-
-_XML_KINDS: tuple[tuple[str, Kind], ...] = (
-    (r"<light_model\b|<camera_model\b[^>]*type=[\"']gamma[\"']", "photometric"),
-    (r"<camera_model\b", "vicalib"),
-)
-_JSON_KINDS: tuple[tuple[str, Kind], ...] = (
-    (r"\"(transform_matrix|camera_angle_x|fl_x)\"\s*:", "transforms"),
-    (r"\"a0\"\s*:", "c3vd"),
-)
-_YAML_KINDS: tuple[tuple[str, Kind], ...] = ((r"^cam\d+\s*:", "kalibr"),)
-_TEXT_KINDS: tuple[tuple[str, Kind], ...] = (
-    (r"^[ \t]*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d", "colmap"),
-    (r"^[ \t]*\d+([ \t]+[-+.\deE]+){7}[ \t]+\d+[ \t]+\S", "colmap images"),
-    (r"^[ \t]*#?[ \t]*polynomial coefficients|^[ \t]*\d+([ \t]+[-+.\deE]+){5,}[ \t]*$", "ocamcalib"),
-    (r"^[ \t]*a0[ \t]*[=:]", "c3vd"),
-)
 
 
 def split_id(path: str | Path) -> tuple[Path, str | None]:
@@ -71,33 +125,28 @@ def split_id(path: str | Path) -> tuple[Path, str | None]:
     return path.with_name(head), wanted
 
 
-def recognise(path: str | Path) -> Kind:
-    """Return the format of a camera file, by its suffix and by what it holds; files that are nothing else are TOML.
+def recognise(path: str | Path) -> str:
+    """Return the name of a camera file's format, by its suffix and by what it holds; what is nothing else is TOML.
 
-    A folder is a COLMAP model where it holds cameras.txt. Raises `InputError` if the file cannot be read, or is one of
-    COLMAP's binary ones.
+    A folder is a COLMAP model where it holds cameras.txt.
     """
     path, _ = split_id(path)
     suffix = path.suffix.lower()
     if _holds(path / "cameras.txt", Path.is_file):
         return "colmap"
-    if suffix == MATLAB_SUFFIX:
-        return "matlab"
-    if suffix == ".toml":
-        return "toml"
+    if suffix in (".mat", ".toml"):
+        return "matlab" if suffix == ".mat" else "toml"
     if suffix == ".bin":
         how = "colmap model_converter --output_type TXT writes text files"
-        raise InputError(f"{shown(path)}: binary models are not read; {how}")
+        raise InputError(f"{path}: binary models are not read; {how}")
     text = read_text(path, "camera", "record_bytes")
     head = text[:HEAD]
     if head.lstrip().startswith("<"):
-        return _first(_XML_KINDS, head, "opencv")
+        return _first("xml", head, "opencv")
     if head.lstrip().startswith("{"):
         # Keys have no order: what tells the format may stand last.
-        return _first(_JSON_KINDS, text, "opencv")
-    if suffix in OPENCV_SUFFIXES:
-        return _first(_YAML_KINDS, head, "opencv")
-    return _first((*_TEXT_KINDS, *_YAML_KINDS), head, "toml")
+        return _first("json", text, "opencv")
+    return _first("yaml", head, "opencv") if suffix in FORMATS["opencv"].suffixes else _first("text", head, "toml")
 
 
 def _holds(path: Path, test: Callable[[Path], bool]) -> bool:
@@ -108,63 +157,29 @@ def _holds(path: Path, test: Callable[[Path], bool]) -> bool:
         return False
 
 
-def _first(kinds: tuple[tuple[str, Kind], ...], head: str, otherwise: Kind) -> Kind:
-    """Return the kind of the first pattern that is found."""
-    return next((kind for pattern, kind in kinds if re.search(pattern, head, re.MULTILINE)), otherwise)
+def _first(syntax: str, text: str, otherwise: str) -> str:
+    """Return the name of the first format whose pattern for a syntax is found."""
+    patterns = ((each.name, (each.looks_like or {}).get(syntax)) for each in _ROWS)
+    return next((name for name, pattern in patterns if pattern and re.search(pattern, text, re.MULTILINE)), otherwise)
 
 
-def read_cameras(path: str | Path) -> dict[str, Table]:
-    """Read all cameras of a file of another program, as tables of `CameraSpec` by id; TOML is read elsewhere.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, malformed, holds no camera, or a lens that simtest lacks.
-    """
-    path, _ = split_id(path)
-    kind = recognise(path)
-    if path.is_dir():
-        path = path / "cameras.txt"
-    if kind == "photometric":
-        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no lens; give it as --photometric beside a camera file")
-    if kind in ("colmap images", "toml"):
-        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no camera; must be a camera file of another program")
-    return _readers()[kind](path)
-
-
-def _readers() -> dict[str, Callable[[Path], dict[str, Table]]]:
-    """Return the reader of each format, imported on demand: OpenCV and SciPy are slow to load."""
-    from importlib import import_module
-
-    def late(module: str, name: str) -> Callable[[Path], dict[str, Table]]:
-        def read(path: Path) -> dict[str, Table]:
-            found: dict[str, Table] = getattr(import_module(f"simtest.spec.camera_formats.{module}"), name)(path)
-            return found
-
-        return read
-
-    return {
-        "opencv": late("opencv", "read_cameras"),
-        "matlab": late("matlab", "read_cameras"),
-        "colmap": late("colmap", "read_cameras"),
-        "transforms": late("transforms", "read_cameras"),
-        "kalibr": late("kalibr", "read_cameras"),
-        "vicalib": late("vicalib", "read_cameras"),
-        "ocamcalib": late("omnidirectional", "read_ocamcalib"),
-        "c3vd": late("omnidirectional", "read_c3vd"),
-    }
+# Reading ---------------------------------------------------------------------------------------------------------
 
 
 def read_table(path: str | Path) -> Table:
     """Read a camera of a file of another program as the table of a `CameraSpec`; "FILE#ID" names one of several.
 
-    Raises
-    ------
-    InputError
-        As `read_cameras` does, and where a file holds several different cameras and none is named.
+    TOML is read elsewhere.
     """
-    file, wanted = split_id(path)
-    return chosen(read_cameras(file), wanted, shown(file))
+    path, wanted = split_id(path)
+    where, form = str(path), FORMATS[recognise(path)]
+    if form.name == "photometric":
+        raise InputError(f"{where}: {form.title} holds no lens; give it as --photometric beside a camera file")
+    if not form.cameras:
+        raise InputError(f"{where}: {form.title} holds no camera; must be a camera file of another program")
+    cameras: dict[str, Table] = form.function(form.cameras)(path / "cameras.txt" if path.is_dir() else path)
+    with within(where):
+        return chosen(cameras, wanted)
 
 
 def read_poses(path: str | Path) -> Poses:
@@ -179,33 +194,65 @@ def read_poses(path: str | Path) -> Poses:
         If the file is missing or malformed, or its format holds no poses.
     """
     path, _ = split_id(path)
-    kind = recognise(path)
-    if path.is_dir():
-        path = path / "images.txt"
-    elif kind == "colmap":
-        path = path.with_name("images.txt")
-    if kind in ("colmap", "colmap images"):
-        from simtest.spec.camera_formats.colmap import read_images
-
-        poses = read_images(path)
-    elif kind == "transforms":
-        from simtest.spec.camera_formats import transforms
-
-        poses = transforms.read_poses(path)
-    elif kind == "kalibr":
-        from simtest.spec.camera_formats import kalibr
-
-        poses = kalibr.read_poses(path)
-    else:
+    form = FORMATS[recognise(path)]
+    if path.is_dir() or form.name == "colmap":
+        path = path / "images.txt" if path.is_dir() else path.with_name("images.txt")
+    if not form.poses:
         must = "COLMAP's images.txt, transforms.json or a Kalibr chain"
-        raise InputError(f"{shown(path)}: {NAMES[kind]} holds no poses; must be {must}")
+        raise InputError(f"{path}: {form.title} holds no poses; must be {must}")
+    poses: Poses = form.function(form.poses)(path)
     if not poses:
-        raise InputError(f"{shown(path)}: holds no pose; must hold one for each frame")
+        raise InputError(f"{path}: holds no pose; must hold one for each frame")
     seen: set[str] = set()
     for name, pose in poses:
         if name in seen:
-            raise InputError(f"{shown(path)}: names {shown(name, 60)} twice; must give each frame one pose")
+            raise InputError(f"{path}: names {name} twice; must give each frame one pose")
         if not np.abs(pose).max() <= LARGEST:
-            raise InputError(f"{shown(path)}: {shown(name, 60)}: a position beyond {LARGEST:g}; must be within it")
+            raise InputError(f"{path}: {name}: a position beyond {LARGEST:g}; must be within it")
         seen.add(name)
     return poses
+
+
+# Writing ---------------------------------------------------------------------------------------------------------
+
+
+def write_camera(camera: Camera, path: str | Path, format: str | None = None, poses: Poses | None = None) -> None:
+    """Write a camera file, and the poses of a sequence's frames where they are given (see `simtest.save_camera`).
+
+    COLMAP's images.txt and an empty points3D.txt are written beside cameras.txt. Poses are world_from_camera, shape (4,
+    4), OpenCV axes, mm: lengths are written as they are, and both formats state mm.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera")
+    name = format or next((name for name in WRITTEN if suffix in FORMATS[name].suffixes), "opencv")
+    if name not in WRITTEN:
+        raise InputError(f"format = {name!r}: must be one of {', '.join(WRITTEN)}{suggestion(name, WRITTEN)}")
+    form = FORMATS[name]
+    if suffix not in form.suffixes:
+        raise InputError(f"{path}: {name} needs a file name that ends in {', '.join(form.suffixes)}")
+    if name == "colmap" and path.name in ("images.txt", "points3D.txt"):
+        raise InputError(f"{path}: COLMAP keeps no camera under this name; must be cameras.txt")
+    if poses is not None and not form.writes_poses:
+        must = ", ".join(name for name in WRITTEN if FORMATS[name].writes_poses)
+        raise InputError(f"{path}: {name} holds no poses; must be one of {must}")
+    write_files(file_contents(camera, path, name, poses))
+
+
+def write_files(files: Files) -> None:
+    """Write files whole or not at all; raise `InputError` for one that cannot be written."""
+    for file, data in files.items():
+        write_atomically(file, partial(Path.write_bytes, data=data))
+
+
+def file_contents(camera: Camera, path: Path, format: str, poses: Poses | None) -> Files:
+    """Return what goes into each file; raise `InputError` if the format lacks the camera's lens."""
+    form = FORMATS[format]
+    files: Files = form.function(form.write)(camera, path, poses)
+    return files
+
+
+def toml_file(camera: Camera, path: Path, _: Poses | None) -> Files:
+    """Return a camera as simtest's own TOML file."""
+    return {path: camera_toml(camera).encode()}

@@ -13,9 +13,8 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt, Scaramuzza
-from simtest.runtime.resources import shown
-from simtest.spec.camera_formats.common import Table, check_alike, mask_of_text, mask_text, number
+from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
+from simtest.spec.camera_formats.common import Files, Poses, Table, check_alike, mask_of_text, mask_text, number, within
 from simtest.spec.camera_formats.matlab_struct import HOW, read_struct
 from simtest.spec.camera_formats.omnidirectional import scaramuzza_table
 
@@ -23,36 +22,32 @@ PARAMETERS = ((1, 1), (1, 3), (2, 2), (2, 3))
 """Rows and columns of fx, cx, fy, cy in K, as MATLAB counts."""
 
 
-def read_cameras(path: Path) -> dict[str, Table]:
-    """Return the file's one camera, whose id is empty; see `read_matlab`."""
-    return {"": read_matlab(path)}
-
-
-def read_matlab(path: Path) -> Table:
-    """Read a calibration of MATLAB as the table of a `CameraSpec`.
+def read_matlab(path: Path) -> dict[str, Table]:
+    """Read a calibration of MATLAB: its one camera, whose id is empty.
 
     The .mat file holds one struct, under any name, with IntrinsicMatrix (transposed, as MATLAB has it) or K, ImageSize,
     RadialDistortion and TangentialDistortion; or, of a fisheye, with MappingCoefficients, StretchMatrix,
     DistortionCenter and ImageSize.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, malformed, of version 7.3, or holds a cameraParameters object instead of a struct.
     """
-    where, fields = shown(path), read_struct(path)
-    mask = mask_of_text(fields["ViewMask"], where) if "ViewMask" in fields else None
+    fields = read_struct(path)
+    with within(str(path)):
+        return {"": _table(fields)}
+
+
+def _table(fields: Mapping[str, Any]) -> Table:
+    """Return the camera of a struct's fields."""
+    mask = mask_of_text(fields["ViewMask"]) if "ViewMask" in fields else None
     if "MappingCoefficients" in fields:
-        return _fisheye(fields, where) | {"view_mask": mask}
-    matrix = _matrix(fields, "K", where) if "K" in fields else _matrix(fields, "IntrinsicMatrix", where).T
-    _check_repeated(fields, matrix, where)
+        return _fisheye(fields) | {"view_mask": mask}
+    matrix = _matrix(fields, "K") if "K" in fields else _matrix(fields, "IntrinsicMatrix").T
+    _check_repeated(fields, matrix)
     # upper triangular
     if not np.array_equal(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
-        raise InputError(f"{where}: IntrinsicMatrix or K = {matrix.tolist()}: must be triangular with 1 in its corner")
-    height, width = _array(fields, "ImageSize", 2, where).tolist()
+        raise InputError(f"IntrinsicMatrix or K = {matrix.tolist()}: must be triangular with 1 in its corner")
+    height, width = _array(fields, "ImageSize", 2).tolist()
     # Two or three radial coefficients, in OpenCV's order k1 k2 p1 p2 k3 with the tangential ones
-    radial = _array(fields, "RadialDistortion", (2, 3), where).tolist()
-    tangential = _array(fields, "TangentialDistortion", 2, where).tolist()
+    radial = _array(fields, "RadialDistortion", (2, 3)).tolist()
+    tangential = _array(fields, "TangentialDistortion", 2).tolist()
     lens = dict(zip(("k1", "k2", "k3", "p1", "p2"), [*radial, 0.0][:3] + tangential, strict=True))
     return {
         "width": width, "height": height, "fx": float(matrix[0, 0]), "fy": float(matrix[1, 1]),
@@ -62,7 +57,7 @@ def read_matlab(path: Path) -> Table:
     }  # fmt: skip
 
 
-def _check_repeated(fields: Mapping[str, Any], matrix: Any, where: str) -> None:
+def _check_repeated(fields: Mapping[str, Any], matrix: Any) -> None:
     """Raise `InputError` where other fields do not repeat what the camera matrix says."""
     (fx, _, cx), (_, fy, cy), _ = matrix
     name = "K" if "K" in fields else "IntrinsicMatrix"
@@ -70,56 +65,53 @@ def _check_repeated(fields: Mapping[str, Any], matrix: Any, where: str) -> None:
         (f"{field}({index})", told, other)
         for field, own in (("FocalLength", (fx, fy)), ("PrincipalPoint", (cx, cy)))
         if field in fields
-        for index, (told, other) in enumerate(zip(_array(fields, field, 2, where), own, strict=True), 1)
+        for index, (told, other) in enumerate(zip(_array(fields, field, 2), own, strict=True), 1)
     ]
     if name == "K" and "IntrinsicMatrix" in fields:
-        other = _matrix(fields, "IntrinsicMatrix", where)
+        other = _matrix(fields, "IntrinsicMatrix")
         said += [(f"IntrinsicMatrix({c},{r})", other[c - 1, r - 1], matrix[r - 1, c - 1]) for r, c in PARAMETERS]
     for field, told, own in said:
-        check_alike(where, (field, name), float(told), float(own))
+        check_alike((field, name), float(told), float(own))
 
 
-def _fisheye(fields: Mapping[str, Any], where: str) -> Table:
+def _fisheye(fields: Mapping[str, Any]) -> Table:
     """Return a fisheyeIntrinsics: Scaramuzza's model with x before y."""
-    mapping = _array(fields, "MappingCoefficients", 4, where).tolist()
-    height, width = (
-        number(value, where, "ImageSize", whole=True) for value in _array(fields, "ImageSize", 2, where).tolist()
-    )
-    x, y = _array(fields, "DistortionCenter", 2, where).tolist()
-    c, d, e, one = _array(fields, "StretchMatrix", 4, where).tolist() if "StretchMatrix" in fields else (1, 0, 0, 1)
+    mapping = _array(fields, "MappingCoefficients", 4).tolist()
+    height, width = (number(value, "ImageSize", whole=True) for value in _array(fields, "ImageSize", 2).tolist())
+    x, y = _array(fields, "DistortionCenter", 2).tolist()
+    c, d, e, one = _array(fields, "StretchMatrix", 4).tolist() if "StretchMatrix" in fields else (1, 0, 0, 1)
     if one != 1:
-        raise InputError(f"{where}: StretchMatrix = {[[c, d], [e, one]]}: must have 1 in its last corner")
-    return scaramuzza_table((width, height), (x - PIXEL_CENTRE, y - PIXEL_CENTRE), mapping, (c, d, e), where)
+        raise InputError(f"StretchMatrix = {[[c, d], [e, one]]}: must have 1 in its last corner")
+    return scaramuzza_table((width, height), (x - PIXEL_CENTRE, y - PIXEL_CENTRE), mapping, (c, d, e))
 
 
-def _matrix(fields: Mapping[str, Any], name: str, where: str) -> Any:
+def _matrix(fields: Mapping[str, Any], name: str) -> Any:
     """Return a field of 3 x 3 numbers."""
-    values = _array(fields, name, 9, where)
+    values = _array(fields, name, 9)
     if np.shape(fields[name]) != (3, 3):
-        raise InputError(f"{where}: {name}: has shape {np.shape(fields[name])}; must be (3, 3)")
+        raise InputError(f"{name}: has shape {np.shape(fields[name])}; must be (3, 3)")
     return values.reshape(3, 3)
 
 
-def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...], where: str) -> Any:
+def _array(fields: Mapping[str, Any], name: str, counts: int | tuple[int, ...]) -> Any:
     """Return a field as numbers in row order."""
     allowed = (counts,) if isinstance(counts, int) else counts
     if name not in fields:
-        raise InputError(f"{where}: {name}: missing; {HOW}")
+        raise InputError(f"{name}: missing; {HOW}")
     value = np.asarray(fields[name])
     if value.dtype.kind not in "iuf" or value.size not in allowed:
         said = " or ".join(str(count) for count in allowed)
-        raise InputError(f"{where}: {name} = {shown(repr(fields[name]), 80)}: must be {said} numbers")
+        raise InputError(f"{name} = {fields[name]!r:.80}: must be {said} numbers")
     return value.astype(float).ravel()
 
 
 # Writing ---------------------------------------------------------------------------------------------------------
 
 
-def matlab_bytes(camera: Camera) -> bytes:
+def matlab_file(camera: Camera, path: Path, _: Poses | None) -> Files:
     """Return a camera as a .mat file of version 5 that holds the struct `camera`.
 
-    Its fields are the arguments of MATLAB's cameraParameters, or of fisheyeIntrinsics. Raises `InputError` if MATLAB
-    has no such lens.
+    Its fields are the arguments of MATLAB's cameraParameters, or of fisheyeIntrinsics.
     """
     from scipy.io import savemat
 
@@ -150,4 +142,4 @@ def matlab_bytes(camera: Camera) -> bytes:
         fields["ViewMask"] = mask_text(camera.view_mask)
     buffer = io.BytesIO()
     savemat(buffer, {"camera": fields})
-    return buffer.getvalue()
+    return {path: buffer.getvalue()}

@@ -1,21 +1,16 @@
 """The struct of a camera in a .mat file, read in a process of its own.
 
 SciPy crashes over some damaged files, and takes gigabytes over others.
-
-python -m simtest.spec.camera_formats.matlab_struct CAMERA.mat OUT.json
 """
 
-import json
-import sys
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.runtime.limits import check_file
-from simtest.runtime.reader_process import limit_memory, read_apart, serve
-from simtest.runtime.resources import shown
+from simtest.runtime.files import require_plain
+from simtest.runtime.processes import call_apart
 
 HOW = "in MATLAB: s = toStruct(cameraParams); save('camera.mat', 's', '-v7')"
 
@@ -33,28 +28,10 @@ MEMORY_BYTES = 1e9
 
 
 def read_struct(path: Path) -> Mapping[str, Any]:
-    """Read the fields of the one struct in a .mat file that is a calibration: numbers, text and nested lists.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, of version 7.3, or holds no struct of a camera, or several.
-    SimtestError
-        If memory, or the disk of temporary files, does not hold it.
-    """
-    try:
-        check_file(path, "matlab_bytes", "a .mat file")
-        with path.open("rb") as file:
-            file.read(1)
-    except OSError as error:
-        raise InputError(f"{shown(path)}: cannot be read ({error.strerror or error})") from error
+    """Read the fields of the one struct in a .mat file that is a calibration: numbers, text and nested lists."""
+    require_plain(path, None, "a .mat file")
     breakdown = f"a damaged MATLAB file: SciPy breaks down over it; {HOW}"
-    return read_apart(path, "simtest.spec.camera_formats.matlab_struct", _load, "SciPy", breakdown)
-
-
-def _load(made: Path) -> Mapping[str, Any]:
-    fields: Mapping[str, Any] = json.loads(made.read_text(encoding="ascii"))
-    return fields
+    return call_apart(struct_of, path, MEMORY_BYTES, "MATLAB file", breakdown)
 
 
 def struct_of(path: str) -> dict[str, Any]:
@@ -70,7 +47,7 @@ def struct_of(path: str) -> dict[str, Any]:
         raise InputError(f"MATLAB 7.3 files (HDF5) are not read; {HOW}") from error
     except Exception as error:
         # SciPy raises whatever its parser runs into.
-        told = shown(error, 80) if str(error).strip() else type(error).__name__
+        told = f"{error!s:.80}" if str(error).strip() else type(error).__name__
         raise InputError(f"{_kind(path)}: {told}; {HOW}") from error
     # The variables themselves may be the fields of the struct.
     nested = {name: value["Intrinsics"] for name, value in data.items() if _holds_intrinsics(value)}
@@ -82,7 +59,7 @@ def struct_of(path: str) -> dict[str, Any]:
     if any(isinstance(value, MatlabOpaque | MatlabObject | MatlabFunction) for value in data.values()):
         raise InputError(f"holds an object, which only MATLAB can read; {HOW}")
     names = [name for name in data if not name.startswith("__")]
-    raise InputError(f"holds no struct with IntrinsicMatrix or K (but {shown(names, 80)}); {HOW}")
+    raise InputError(f"holds no struct with IntrinsicMatrix or K (but {names!s:.80}); {HOW}")
 
 
 def _kind(path: str) -> str:
@@ -98,7 +75,7 @@ def _plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, bool | int | float | str):
         return value
-    return shown(repr(value), 80)
+    return f"{value!r:.80}"
 
 
 def _is_calibration(value: Any) -> bool:
@@ -108,17 +85,3 @@ def _is_calibration(value: Any) -> bool:
 def _holds_intrinsics(value: Any) -> bool:
     """Return whether a variable is a struct of fisheyeParameters, which holds its intrinsics as a struct."""
     return isinstance(value, Mapping) and isinstance(value.get("Intrinsics"), Mapping)
-
-
-def _store(fields: dict[str, Any], out: str) -> None:
-    Path(out).write_text(json.dumps(fields), encoding="ascii")
-
-
-def main() -> int:
-    """Read a file and store its fields; print why that cannot be."""
-    return serve(struct_of, _store, "MATLAB file", "its fields")
-
-
-if __name__ == "__main__":
-    limit_memory(MEMORY_BYTES)
-    sys.exit(main())

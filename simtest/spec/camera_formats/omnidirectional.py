@@ -1,30 +1,63 @@
-"""Scaramuzza's omnidirectional cameras: OCamCalib's calib_results.txt, and the parameters of C3VD.
+"""Files of endoscopes' calibrations: OCamCalib, C3VD, Vicalib, EndoMapper's photometric XML.
 
-In both files the centre of the first pixel is (0, 0), in simtest (0.5, 0.5): the centre gains half a pixel. They differ
-in everything else. C3VD names x before y and has a0 > 0: the polynomial is along the viewing direction. OCamCalib names
-row before column and has a0 < 0: its z axis points backwards.
+In all the centre of the first pixel is (0, 0), in simtest (0.5, 0.5): the centre gains half a pixel (Calibu's detector,
+in Vicalib, fits circles at whole pixel numbers). OCamCalib and C3VD hold Scaramuzza's model and differ in everything
+else. C3VD names x before y and has a0 > 0: the polynomial is along the viewing direction. OCamCalib names row before
+column and has a0 < 0: its z axis points backwards. Vicalib's XML (Calibu) holds EndoMapper's geometrical calibrations.
+
+In EndoMapper's photometric calibration (EM_Dataset-PhotometricCalibration) a pixel holds
+(gain V sigma e^(-mu (1 - cos a)) / d^2 times the surface's reflectance)^(1 / gamma) (Batlle, Montiel and Tardos 2022):
+a is the angle at the light between its principal direction D and the surface, d its distance, and V = cos^k of the
+angle from the optical axis. Gain and sigma scale all pixels alike and are not read. Positions are metres in the camera
+frame.
 """
 
+import math
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
-from simtest.runtime.resources import shown, suggestion
-from simtest.spec.camera_formats.common import Table, number, numbers, read_json
-from simtest.spec.toml_files import read_text
+from simtest.runtime.boundary import suggestion
+from simtest.spec.camera_formats.common import Table, json_object, number, numbers, of_text, within, xml_root
 
 C3VD_KEYS = ("width", "height", "cx", "cy", "a0", "a2", "a3", "a4", "c", "d", "e")
+
 LONGEST = 1e6
 """Of a focal length, px."""
 
 MOST_APART = 5.0
 """px by which OCamCalib's two polynomials may differ; the inverse one is a fit to the other."""
+
+FOCAL = ("fx", "fy", "cx", "cy")
+
+VICALIB_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "calibu_fu_fv_u0_v0": ("", ()),
+    "calibu_fu_fv_u0_v0_k1_k2": ("brown_conrady", ("k1", "k2")),
+    "calibu_fu_fv_u0_v0_k1_k2_k3": ("brown_conrady", ("k1", "k2", "k3")),
+    "calibu_fu_fv_u0_v0_rational6": ("brown_conrady", ("k1", "k2", "k3", "k4", "k5", "k6")),
+    "calibu_fu_fv_u0_v0_kb4": ("kannala_brandt", ("k1", "k2", "k3", "k4")),
+    "ocamcalib_cx_cy_a0_a2_a3_a4_e_f_g": ("scaramuzza", ()),
+}
+"""The lens of each camera type, and its parameters after the focal lengths and the principal point."""
+
+AXES = {"right": (1.0, 0.0, 0.0), "down": (0.0, 1.0, 0.0), "forward": (0.0, 0.0, 1.0)}
+
+Tables = dict[str, dict[str, Any]]
+
+MM = 1000.0
+
+STEP_DEG = 0.5
+"""Of the table of the light's spread: with mu = 10, linear interpolation is off by 1e-4."""
+
+FARTHEST_MM = 1000.0
+
+MOST_SPREAD = 1000.0
 
 
 def scaramuzza_table(
@@ -32,33 +65,17 @@ def scaramuzza_table(
     centre: Sequence[float],
     mapping: Sequence[float],
     stretch: Sequence[float],
-    where: str,
 ) -> Table:
     """Return the table of a `CameraSpec` of Scaramuzza's model with x before y and z along the viewing direction.
 
-    Parameters
-    ----------
-    size : sequence of float
-        Width and height, px.
-    centre : sequence of float
-        cx and cy, px, pixel centres at integer + 0.5.
-    mapping : sequence of float
-        a0, a2, a3, a4 for radii in px: px, 1/px, 1/px^2, 1/px^3.
-    stretch : sequence of float
-        c, d, e of the matrix ((c, d), (e, 1)).
-    where : str
-        The file, for messages.
-
-    Raises
-    ------
-    InputError
-        If a0 is not positive.
+    `mapping` is a0, a2, a3, a4 for radii in px, `stretch` c, d, e of the matrix ((c, d), (e, 1)); the centre has pixel
+    centres at integer + 0.5.
     """
     a0, a2, a3, a4 = mapping
     if not a0 > 0:
-        raise InputError(f"{where}: a0 = {a0:g}: must be > 0, since z points along the viewing direction")
+        raise InputError(f"a0 = {a0:g}: must be > 0, since z points along the viewing direction")
     if not a0 <= LONGEST:
-        raise InputError(f"{where}: a0 = {a0:g}: must be at most {LONGEST:g} px")
+        raise InputError(f"a0 = {a0:g}: must be at most {LONGEST:g} px")
     lens = {"k2": a2 * a0, "k3": a3 * a0**2, "k4": a4 * a0**3, **dict(zip("cde", stretch, strict=True))}
     return {
         "width": int(size[0]), "height": int(size[1]), "fx": a0, "fy": a0, "cx": centre[0], "cy": centre[1],
@@ -66,40 +83,31 @@ def scaramuzza_table(
     }  # fmt: skip
 
 
-# C3VD -------------------------------------------------------------------------------------------------------------
-
-
-def read_c3vd(path: Path) -> dict[str, Table]:
+@of_text()
+def read_c3vd(text: str) -> dict[str, Table]:
     """Read the parameters of C3VD: JSON, or lines ``key = value`` as in its config.ini.
 
-    The published Python loader takes c, d, e as ((c, d), (e, 1)), which is the model's definition; so does this.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, or a parameter is missing.
+    The published Python loader takes c, d, e as ((c, d), (e, 1)), which is the model's definition; so does this. Raises
+    `InputError` if the file is malformed, or a parameter is missing.
     """
-    where = shown(path)
-    text = read_text(path, "camera")
-    data = read_json(path) if text.lstrip().startswith("{") else _lines(text, where)
+    data = json_object(text) if text.lstrip().startswith("{") else _lines(text)
     missing = next((key for key in C3VD_KEYS if key not in data), None)
     if missing is not None:
-        raise InputError(f"{where}: {missing}: missing{suggestion(missing, data)}; must give {', '.join(C3VD_KEYS)}")
-    told = {key: number(data[key], where, key, whole=key in ("width", "height")) for key in C3VD_KEYS}
-    if number(data.get("a1", 0.0), where, "a1") != 0:
-        raise InputError(f"{where}: a1 = {data['a1']}: must be 0, as in Scaramuzza's model")
+        raise InputError(f"{missing}: missing{suggestion(missing, data)}; must give {', '.join(C3VD_KEYS)}")
+    told = {key: number(data[key], key, whole=key in ("width", "height")) for key in C3VD_KEYS}
+    if number(data.get("a1", 0.0), "a1") != 0:
+        raise InputError(f"a1 = {data['a1']}: must be 0, as in Scaramuzza's model")
     return {
         "": scaramuzza_table(
             (told["width"], told["height"]),
             (told["cx"] + PIXEL_CENTRE, told["cy"] + PIXEL_CENTRE),
             [told[key] for key in ("a0", "a2", "a3", "a4")],
             [told[key] for key in "cde"],
-            where,
         )
     }
 
 
-def _lines(text: str, where: str) -> Mapping[str, Any]:
+def _lines(text: str) -> Mapping[str, Any]:
     """Return what lines of ``key = value`` or ``key: value`` say; comments begin with ; or #."""
     data: dict[str, Any] = {}
     for count, line in enumerate(text.splitlines(), 1):
@@ -108,75 +116,197 @@ def _lines(text: str, where: str) -> Mapping[str, Any]:
             continue
         found = re.fullmatch(r"(\w+)\s*[=:]\s*(.*)", content)
         if not found:
-            raise InputError(f"{where}: line {count}: {shown(content, 60)}: must be key = value")
+            raise InputError(f"line {count}: {content}: must be key = value")
         if found[1] in data:
-            raise InputError(f"{where}: line {count}: {shown(found[1], 40)} is given twice")
+            raise InputError(f"line {count}: {found[1]} is given twice")
         data[found[1]] = found[2].strip()
     return data
 
 
-# OCamCalib --------------------------------------------------------------------------------------------------------
-
-
-def read_ocamcalib(path: Path) -> dict[str, Table]:
+@of_text()
+def read_ocamcalib(text: str) -> dict[str, Table]:
     """Read calib_results.txt: both polynomials, centre, affine parameters, size.
 
     The direct polynomial, from pixels to directions, is the model; the inverse one, a fit to it, is only compared.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, its polynomial has more terms than a0, a2, a3, a4, or the two contradict each other.
     """
-    where = shown(path)
-    rows = [line.split() for line in read_text(path, "camera").splitlines()]
+    rows = [line.split() for line in text.splitlines()]
     rows = [row for row in rows if row and not row[0].startswith("#")]
     if len(rows) < 5:
-        raise InputError(f"{where}: {len(rows)} lines of numbers; must be 5: two polynomials, centre, c d e, size")
-    direct, back = _polynomial(rows[0], where, "direct polynomial"), _polynomial(rows[1], where, "inverse polynomial")
-    row, column = numbers(rows[2], where, "centre (row, column)", 2)
-    c, d, e = numbers(rows[3], where, "affine parameters c d e", 3)
-    height, width = (number(word, where, "size (height, width)", whole=True) for word in _pair(rows[4], where))
+        raise InputError(f"{len(rows)} lines of numbers; must be 5: two polynomials, centre, c d e, size")
+    direct, back = _polynomial(rows[0], "direct polynomial"), _polynomial(rows[1], "inverse polynomial")
+    row, column = numbers(rows[2], "centre (row, column)", 2)
+    c, d, e = numbers(rows[3], "affine parameters c d e", 3)
+    if len(rows[4]) != 2:
+        raise InputError(f"size: {len(rows[4])} values; must be 2, height and width")
+    height, width = (number(word, "size (height, width)", whole=True) for word in rows[4])
     if any(direct[5:]) or len(direct) < 1 or (len(direct) > 1 and direct[1] != 0):
-        raise InputError(f"{where}: direct polynomial: must have the terms a0, a2, a3, a4 alone")
+        raise InputError("direct polynomial: must have the terms a0, a2, a3, a4 alone")
     a0, _, a2, a3, a4 = (*direct, 0.0, 0.0, 0.0, 0.0)[:5]
     if not a0 < 0:
-        raise InputError(f"{where}: direct polynomial: a0 = {a0:g}: must be < 0, since OCamCalib's z points backwards")
+        raise InputError(f"direct polynomial: a0 = {a0:g}: must be < 0, since OCamCalib's z points backwards")
     if not c > 0:
-        raise InputError(f"{where}: affine parameters: c = {c:g}: must be > 0")
-    _check_inverse(direct, back, min(width, height) / 4, where)
+        raise InputError(f"affine parameters: c = {c:g}: must be > 0")
+    _check_inverse(direct, back, min(width, height) / 4)
     # From (row, column) to (x, y) the matrix ((c, d), (e, 1)) becomes ((1, e), (d, c)), c times ((1/c, e/c), (d/c, 1)).
     table = scaramuzza_table(
         (width, height),
         (column + PIXEL_CENTRE, row + PIXEL_CENTRE),
         (-a0, -a2, -a3, -a4),
         (1 / c, e / c, d / c),
-        where,
     )
     return {"": table | {"fx": -a0 * c, "fy": -a0 * c}}
 
 
-def _pair(row: list[str], where: str) -> list[str]:
-    if len(row) != 2:
-        raise InputError(f"{where}: size: {len(row)} values; must be 2, height and width")
-    return row
-
-
-def _polynomial(row: list[str], where: str, name: str) -> list[float]:
+def _polynomial(row: list[str], name: str) -> list[float]:
     """Return the coefficients of a line that begins with their number."""
-    count = number(row[0], where, f"{name}: number of coefficients", whole=True)
+    count = number(row[0], f"{name}: number of coefficients", whole=True)
     if count != len(row) - 1 or count < 1:
-        raise InputError(f"{where}: {name}: says {count:g} coefficients and holds {len(row) - 1}; must be as many")
-    return numbers(row[1:], where, name, len(row) - 1)
+        raise InputError(f"{name}: says {count:g} coefficients and holds {len(row) - 1}; must be as many")
+    return numbers(row[1:], name, len(row) - 1)
 
 
-def _check_inverse(direct: list[float], back: list[float], most: float, where: str) -> None:
+def _check_inverse(direct: list[float], back: list[float], most: float) -> None:
     """Raise `InputError` where the inverse polynomial does not lead back from radii up to `most`, px."""
     radius = np.linspace(0.1, 1.0, 10) * most
     # world2cam takes the angle from the image plane, which is negative in front of the camera.
     apart = np.abs(Polynomial(back)(np.arctan2(Polynomial(direct)(radius), radius)) - radius).max()
     if not apart <= MOST_APART:
         raise InputError(
-            f"{where}: the two polynomials differ by {apart:.3g} px; must be each other's inverse within "
-            f"{MOST_APART:g} px"
+            f"the two polynomials differ by {apart:.3g} px; must be each other's inverse within {MOST_APART:g} px"
         )
+
+
+@of_text()
+def read_vicalib(text: str) -> dict[str, Table]:
+    """Read the cameras of a rig, by their index; raise `InputError` where the file is malformed."""
+    cameras: dict[str, Table] = {}
+    for i, element in enumerate(xml_root(text).iter("camera_model")):
+        name = element.get("index") or str(i)
+        if name in cameras:
+            raise InputError(f"camera index {name} is given twice")
+        with within(f"camera {name}"):
+            cameras[name] = _vicalib_camera(element)
+    return cameras
+
+
+def _vicalib_camera(element: ElementTree.Element) -> Table:
+    kind = element.get("type") or ""
+    if kind not in VICALIB_MODELS:
+        raise InputError(
+            f"type = {kind!r:.60}: simtest lacks it; must be one of {', '.join(VICALIB_MODELS)}"
+            f"{suggestion(kind, VICALIB_MODELS)}"
+        )
+    for axis, wanted in AXES.items():
+        found = element.find(axis)
+        if found is not None and values(found, axis, 3) != list(wanted):
+            raise InputError(f"{axis} = {' '.join((found.text or '').split())}: must be {list(wanted)}")
+    width, height = (int(number(text_of(element, key), key, whole=True)) for key in ("width", "height"))
+    params = element.find("params")
+    if params is None:
+        raise InputError("params: missing; must be a list of numbers")
+    lens, names = VICALIB_MODELS[kind]
+    if lens == "scaramuzza":
+        cx, cy, *mapping, e, f, g = values(params, "params", 9)
+        return scaramuzza_table((width, height), (cx + PIXEL_CENTRE, cy + PIXEL_CENTRE), mapping, (e, f, g))
+    told = dict(zip((*FOCAL, *names), values(params, "params", 4 + len(names)), strict=True))
+    table: Table = {"width": width, "height": height, "fx": told["fx"], "fy": told["fy"]}
+    table |= {key: told[key] + PIXEL_CENTRE for key in ("cx", "cy")}
+    if lens:
+        table["distortion"] = {"type": lens, **{key: told[key] for key in names}}
+    return table
+
+
+def text_of(element: ElementTree.Element, key: str) -> str:
+    """Return the text of a child; raise `InputError` where there is none."""
+    found = element.find(key)
+    if found is None or not (found.text or "").strip():
+        raise InputError(f"{key}: missing")
+    return (found.text or "").strip()
+
+
+def values(element: ElementTree.Element, name: str, count: int) -> list[float]:
+    """Return the numbers of a text such as ``[ 1; 2; 3 ]``."""
+    words = re.split(r"[;,\s]+", (element.text or "").strip().strip("[]").strip())
+    return numbers([word for word in words if word], name, count)
+
+
+@of_text()
+def read_photometric(text: str) -> Tables:
+    """Read a photometric calibration as tables of a calibration file: response, vignetting, emission, rig.
+
+    Several lights must spread their light alike.
+    """
+    root = xml_root(text)
+    tables: Tables = {}
+    cameras = root.findall("camera")
+    if len(cameras) > 1:
+        raise InputError(f"holds {len(cameras)} cameras; must be one")
+    model = cameras[0].find("camera_model") if cameras else None
+    if model is not None:
+        with within("camera"):
+            tables |= _lens_and_response(model)
+    lights = []
+    for i, element in enumerate(root.findall("light/light_model")):
+        with within(f"light {i}"):
+            lights.append(_light(element))
+    if lights:
+        tables |= _rig(lights)
+    if not tables:
+        raise InputError("holds neither a camera_model nor a light_model; must hold one of them")
+    return tables
+
+
+def _lens_and_response(model: ElementTree.Element) -> Tables:
+    if model.get("type") != "gamma":
+        raise InputError(f"type = {model.get('type')!r:.40}: simtest lacks it; must be 'gamma'")
+    gamma = _number(model, "gamma")
+    if not 0.1 <= gamma <= 10:
+        raise InputError(f"gamma = {gamma:g}: must be 0.1 to 10")
+    tables: Tables = {"response": {"type": "gamma", "gamma": gamma}}
+    power = _number(model, "vignetting") if model.find("vignetting") is not None else 0.0
+    if not 0 <= power <= 1000:
+        raise InputError(f"vignetting = {power:g}: must be 0 to 1000")
+    tables["vignetting"] = {"type": "cosine", "power": power}
+    return tables
+
+
+def _light(model: ElementTree.Element) -> dict[str, Any]:
+    """Return the spread, position, mm, and direction of a light."""
+    if model.get("type") != "sls":
+        raise InputError(f"type = {model.get('type')!r:.40}: simtest lacks it; must be 'sls'")
+    mu = _number(model, "mu")
+    if not 0 <= mu <= MOST_SPREAD:
+        raise InputError(f"mu = {mu:g}: must be 0 to {MOST_SPREAD:g}")
+    _number(model, "sigma")
+    told = {}
+    for key in ("P", "D"):
+        element = model.find(key)
+        if element is None:
+            raise InputError(f"{key}: missing; must be [ x; y; z ]")
+        told[key] = np.array(values(element, key, 3))
+    position, length = told["P"] * MM, float(np.linalg.norm(told["D"]))
+    if not np.abs(position).max() <= FARTHEST_MM:
+        raise InputError(f"P = {told['P'].tolist()}: must be metres, within 1 m of the camera")
+    if not abs(length - 1) <= 0.01:
+        raise InputError(f"D has length {length:.3g}; must be a unit vector")
+    return {"mu": mu, "position": position.round(9).tolist(), "direction": (told["D"] / length).tolist()}
+
+
+def _rig(lights: list[dict[str, Any]]) -> Tables:
+    """Return where the lights are and how they emit."""
+    first = lights[0]
+    for light in lights[1:]:
+        if light["mu"] != first["mu"] or not np.allclose(light["direction"], first["direction"], atol=1e-3):
+            raise InputError("lights of different mu or D; must spread their light alike")
+    angles = np.arange(0.0, 180 + STEP_DEG, STEP_DEG)
+    emission = {
+        "type": "table", "angle_deg": angles.tolist(),
+        "value": [math.exp(-first["mu"] * (1 - math.cos(math.radians(angle)))) for angle in angles],
+        "direction": first["direction"],
+    }  # fmt: skip
+    return {"emission": emission, "rig": {"lights_mm": [light["position"] for light in lights]}}
+
+
+def _number(model: ElementTree.Element, key: str) -> float:
+    """Return a number, in brackets or not."""
+    return number(text_of(model, key).strip("[] "), key)

@@ -46,12 +46,8 @@ class _CameraLoader(yaml.SafeLoader):
 def parse_yaml(text: str) -> Any:
     """Read the first document of a YAML file: maps, lists, numbers and text; None if it is empty.
 
-    Tags of OpenCV are allowed and ignored. Keys are text, whatever they look like.
-
-    Raises
-    ------
-    ValueError
-        If the text is no such YAML; the message is one line and begins with the line's number.
+    Tags of OpenCV are allowed and ignored. Keys are text, whatever they look like. Raises `ValueError` if the text is
+    no such YAML; the message is one line and begins with the line's number.
     """
     try:
         # OpenCV's header, %YAML:1.0, is no valid directive.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from simtest.runtime.arrays import Array, Mask
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.paper.slanted_view import region_of_interest
 
 _STEPS = np.array([1e-5, 1e-5, 1e-2, 1e-2, 1e-4, 1e-2, 1e-3])

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from simtest.errors import Failure
-from simtest.geometry.isocurves import brightest_point
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import from_integer
 from simtest.spec import Experiment
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import Case
 from simtest.validation.gallery_items import (
     MAP_SIDE,
@@ -20,6 +19,7 @@ from simtest.validation.gallery_items import (
     PublishedDetails,
     write_item,
 )
+from simtest.validation.paper.isocurves import brightest_point
 from simtest.validation.paper.published_pipeline import Stages
 from simtest.validation.paper.rows import SURFACE, pipeline_with
 from simtest.validation.paper.slanted_view import Box, plane_from_image, texture, window_centre
@@ -80,7 +80,7 @@ def reproduce_command(setting: PaperSetting, estimators: tuple[str, ...], seed: 
     """Return the command that makes a realisation alone and prints its estimates."""
     values = ", ".join(f"{key}={value!r}" for key, value in setting.model_dump(exclude_defaults=True).items())
     code = (
-        "from simtest.runtime.seeds import from_integer; from simtest.spec.paper import PaperSetting; "
+        "from simtest.runtime.seeds import from_integer; from simtest.spec.recipes import PaperSetting; "
         "from simtest.validation.paper.rows import pipeline_with; "
         f"print(pipeline_with(PaperSetting({values}), {estimators!r}).realise([from_integer({seed})]))"
     )

@@ -14,7 +14,7 @@ from simtest.estimators.circle_pose import CirclePoseEstimator
 from simtest.estimators.dispatch import run_each
 from simtest.geometry import Patch
 from simtest.runtime.arrays import Array
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
 from simtest.validation.paper.slanted_view import Box, draw_light, picture, region_of_interest, sample_positions
 
 KERNEL_SIGMAS = 4.0

@@ -13,11 +13,11 @@ from simtest.estimators.circle_pose import CirclePoseEstimator
 from simtest.estimators.photometric import Photometric, photometric_plane
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.seeds import from_integer
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
+from simtest.validation.columns import SCHEMA, Row, Value
 from simtest.validation.metrics import mahalanobis2
 from simtest.validation.paper.published_pipeline import Pipeline
 from simtest.validation.paper.smoothing import smoothing_bias
-from simtest.validation.results_table import SCHEMA, ResultRow, Value
 
 SURFACE = "published plane"
 
@@ -25,7 +25,7 @@ Columns = dict[str, list[Value]]
 
 
 def paper_rows(
-    setting: PaperSetting, common: ResultRow, numbers: range, seeds: list[int], estimators: tuple[str, ...]
+    setting: PaperSetting, common: Row, numbers: range, seeds: list[int], estimators: tuple[str, ...]
 ) -> pl.DataFrame:
     """Make the rows of some realisations of one setting, in their order; runs in any process.
 
@@ -35,16 +35,16 @@ def paper_rows(
     pipeline = pipeline_with(setting, estimators)
     made = pipeline.realise(from_integer(seed) for seed in seeds)
     truth_x, truth_y, truth_z = setting.normal.tolist()
-    shared = replace(
-        common, surface=SURFACE, reflectance="phong", noise_sigma=setting.sigma, n_lights=1, truth_x=truth_x,
-        truth_y=truth_y, truth_z=truth_z, specularity=0, true_id=0, target="fine",
-    )  # fmt: skip
+    shared = common | {
+        "surface": SURFACE, "reflectance": "phong", "noise_sigma": setting.sigma, "n_lights": 1, "truth_x": truth_x,
+        "truth_y": truth_y, "truth_z": truth_z, "specularity": 0, "true_id": 0, "target": "fine",
+    }  # fmt: skip
     bias = smoothing_bias(setting)
     tables = []
     for name, results in made.items():
         # The law is that of circle pose.
         law_deg = float(np.degrees(bias)) if name == "circle_pose" and bias is not None else None
-        own = replace(shared, estimator=name, error_law_deg=law_deg).to_row()
+        own = shared | {"estimator": name, "error_law_deg": law_deg}
         columns = {"realisation": list(numbers), "seed": seeds, **_columns(setting, results)}
         table = pl.DataFrame(columns, schema_overrides=SCHEMA)
         constant = {key: pl.lit(value) for key, value in own.items() if value is not None}

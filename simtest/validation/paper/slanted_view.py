@@ -9,9 +9,9 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from simtest.conventions import PIXEL_CENTRE
-from simtest.geometry.isocurves import brightest_point
 from simtest.runtime.arrays import Array
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
+from simtest.validation.paper.isocurves import brightest_point
 
 Box = tuple[int, int, int, int]
 """Column, row, width, height, px."""
@@ -41,7 +41,7 @@ def texture(setting: PaperSetting, light: Array) -> Array:
     side = np.arange(setting.size) + PIXEL_CENTRE - setting.size / 2
     centre = window_centre(setting, light)
     x, y = side + centre[0], (side + centre[1])[:, None]
-    # `geometry.isocurves.cosine_beta` for V over the origin: every factor is a sum of one in x and one in y.
+    # `isocurves.cosine_beta` for V over the origin: every factor is a sum of one in x and one in y.
     product = x * (light[0] - x) + (y * (light[1] - y) + light[2] * setting.height)
     to_mirrored = (light[0] - x) ** 2 + ((light[1] - y) ** 2 + light[2] ** 2)
     to_camera = x**2 + (y**2 + setting.height**2)

@@ -3,11 +3,11 @@
 import numpy as np
 
 from simtest.errors import Failure
-from simtest.geometry.circle_from_cone import circle_pose
-from simtest.geometry.isocurves import isophote_radius
+from simtest.geometry.cones import circle_pose
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.vectors import tangent_coordinates
-from simtest.spec.paper import PaperSetting
+from simtest.spec.recipes import PaperSetting
+from simtest.validation.paper.isocurves import isophote_radius
 from simtest.validation.paper.slanted_view import plane_from_image
 
 MARGIN_WIDTHS = 2.0

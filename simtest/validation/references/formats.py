@@ -7,7 +7,7 @@ the user must state it.
 from dataclasses import dataclass
 
 from simtest.errors import InputError
-from simtest.runtime.resources import shown, suggestion
+from simtest.runtime.boundary import suggestion
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class MapFormat:
         End of the file name of a normal map, None where the data set has none. Such a map has three channels of 16
         bits, -1 to 1 over the whole range; all three are 0 where there is no normal. It stands beside the depth map.
     normal_axes : str
-        The camera's axes that red, green and blue hold (`simtest.geometry.axes`).
+        The camera's axes that red, green and blue hold (`simtest.geometry.vectors`).
     depths : str
         End of the file name of a depth map.
     cautions : tuple of str
@@ -89,6 +89,6 @@ def map_format(name: str) -> MapFormat:
     """Return a format by name; raise `InputError` for one that is not known."""
     if name not in FORMATS:
         raise InputError(
-            f"--reference-format {shown(name)}: unknown; allowed: {', '.join(FORMATS)}{suggestion(name, list(FORMATS))}"
+            f"--reference-format {name}: unknown; allowed: {', '.join(FORMATS)}{suggestion(name, list(FORMATS))}"
         )
     return FORMATS[name]

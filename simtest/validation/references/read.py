@@ -9,7 +9,6 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.geometry.axes import ALL, described, matrix
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown
 from simtest.validation.depth_maps import (
     FARTHEST_MM,
     depth_normals,
@@ -49,11 +48,6 @@ def load_map_reference(path: Path, name: str, camera: Camera, scale_mm: float | 
     -------
     DepthReference
         Unit normals in the camera frame, and what a user must know of the maps.
-
-    Raises
-    ------
-    InputError
-        If the map is not of the format, the camera is of another size, or the scale is missing or not wanted.
     """
     form = map_format(name)
     _check_scale(path, name, form, scale_mm)
@@ -82,13 +76,13 @@ def read_depth_counts(path: Path, form: MapFormat, scale_mm: float | None = None
     _check_type(path, values, form.depth_type, "a depth map")
     if values.ndim == 3:
         if form.channels == 1 or (values[..., :3] != values[..., :1]).any():
-            raise InputError(f"{shown(path)}: channels differ; a depth map has one, or equal ones")
+            raise InputError(f"{path}: channels differ; a depth map has one, or equal ones")
         values = values[..., 0]
     step = form.step_mm or scale_mm
     assert step is not None
     known = ~np.isin(values, form.empty)
     if not known.any():
-        raise InputError(f"{shown(path)}: holds no depth; counts {', '.join(map(str, form.empty))} stand for none")
+        raise InputError(f"{path}: holds no depth; counts {', '.join(map(str, form.empty))} stand for none")
     return np.where(known, values.astype(float) * step, np.nan)
 
 
@@ -97,14 +91,14 @@ def read_normals(path: Path, form: MapFormat) -> Array:
     values = read_values(path, "a normal map")
     _check_type(path, values, "uint16", "a normal map")
     if values.ndim != 3 or values.shape[2] < 3:
-        raise InputError(f"{shown(path)}: has shape {values.shape}; a normal map has three channels")
+        raise InputError(f"{path}: has shape {values.shape}; a normal map has three channels")
     # OpenCV's order is blue, green, red.
     counts = values[..., 2::-1].astype(float)
     vectors = (2 * counts / (2**16 - 1) - 1) @ matrix(form.normal_axes).T
     length = np.linalg.norm(vectors, axis=-1)
     known = (counts > 0).any(axis=-1) & (np.abs(length - 1) < 0.01)
     if not known.any():
-        raise InputError(f"{shown(path)}: holds no unit vector; channels must be -1 to 1 over 16 bits")
+        raise InputError(f"{path}: holds no unit vector; channels must be -1 to 1 over 16 bits")
     return np.where(known[..., None], vectors / np.where(known, length, 1.0)[..., None], np.nan)
 
 
@@ -154,7 +148,7 @@ def _median_deg(first: Array, second: Array) -> float:
 
 def _check_scale(path: Path, name: str, form: MapFormat, scale_mm: float | None) -> None:
     if form.step_mm is None and scale_mm is None:
-        raise InputError(f"{shown(path)}: {name} does not tell its unit; --depth-scale must say how many mm a count is")
+        raise InputError(f"{path}: {name} does not tell its unit; --depth-scale must say how many mm a count is")
     if form.step_mm is not None and scale_mm is not None:
         raise InputError(f"--depth-scale {scale_mm:g}: {name} has its own, {form.step_mm:.6g} mm a count; leave it out")
     if scale_mm is not None and not 1e-9 <= scale_mm <= FARTHEST_MM:
@@ -165,14 +159,14 @@ def _check_size(path: Path, name: str, form: MapFormat, camera: Camera) -> None:
     """Raise `InputError` where the map is missing, or the camera has neither the frames' size nor that of a copy."""
     width, height = form.size_px
     if not path.exists():
-        raise InputError(f"{shown(path)}: no such file; must be a map of {name}")
+        raise InputError(f"{path}: no such file; must be a map of {name}")
     if abs(camera.width * height - camera.height * width) > max(width, height):
         raise InputError(
-            f"{shown(path)}: the camera is of {camera.width} x {camera.height} px; frames of {name} are of "
+            f"{path}: the camera is of {camera.width} x {camera.height} px; frames of {name} are of "
             f"{width} x {height} px"
         )
 
 
 def _check_type(path: Path, values: npt.NDArray[np.generic], wanted: str, what: str) -> None:
     if values.dtype != np.dtype(wanted):
-        raise InputError(f"{shown(path)}: holds {values.dtype}; {what} of this format holds {wanted}")
+        raise InputError(f"{path}: holds {values.dtype}; {what} of this format holds {wanted}")

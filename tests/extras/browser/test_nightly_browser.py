@@ -13,6 +13,7 @@ from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
 
 TREND = "#trends [data-chart=trend0]"
+LIGHT, DARK, PAPER = "rgb(27, 31, 36)", "rgb(231, 234, 238)", "rgb(0, 0, 0)"  # of texts
 DESKTOP, PHONE = {"width": 1200, "height": 900}, {"width": 390, "height": 844}
 
 
@@ -43,7 +44,7 @@ class Reader:
         page.goto(self.address)
         # Charts are drawn once they come into view.
         page.locator(TREND).scroll_into_view_if_needed()
-        page.wait_for_selector("#trends .main-svg")
+        page.wait_for_selector("#trends svg.marks")
         return page
 
     def close(self):
@@ -83,8 +84,8 @@ def visible_rows(page):
 def test_all_plots_are_drawn_where_the_reader_comes_by(page):
     for box in page.locator("[data-chart]:visible").all():
         box.scroll_into_view_if_needed()
-        box.locator(".main-svg").first.wait_for()
-        assert box.locator(".scatterlayer .trace").count() > 0
+        box.locator("svg.marks").first.wait_for()
+        assert box.locator(".mark-symbol path").count() > 0
     assert page.locator("#trends [data-chart]:visible").count() == 1
 
 
@@ -124,21 +125,13 @@ def test_headings_sort_what_the_filters_left(page):
 
 def test_hover_tells_commit_and_night(page):
     page.locator(TREND).scroll_into_view_if_needed()
-    place = page.evaluate(
-        f"""() => {{
-          const box = document.querySelector("{TREND}"), trace = box.data[0], {{xaxis, yaxis}} = box._fullLayout;
-          const area = box.getBoundingClientRect();
-          return [area.x + xaxis._offset + xaxis.d2p(trace.x[5]), area.y + yaxis._offset + yaxis.d2p(trace.y[5])];
-        }}"""
-    )
-    page.mouse.move(place[0] - 30, place[1])
-    page.mouse.move(*place, steps=4)
-    told = page.locator(f"{TREND} .hoverlayer .hovertext")
-    told.first.wait_for()
-    for part in page.evaluate(f"document.querySelector('{TREND}').data[0].hovertext[5]").split("<br>")[1:]:
-        # The label of a neighbour that the mouse came by may stand there first.
-        expect(told.first).to_contain_text(part)
-    assert "UTC" in told.first.text_content()
+    place = page.locator(f"{TREND} .mark-symbol path").nth(5).bounding_box()
+    x, y = place["x"] + place["width"] / 2, place["y"] + place["height"] / 2
+    page.mouse.move(x - 30, y)
+    page.mouse.move(x, y, steps=4)
+    told = page.locator("#tooltip")
+    for part in ("brightest_point: ", " UTC", "commit "):
+        expect(told).to_contain_text(part)
 
 
 def test_links_lead_to_their_sections(page):
@@ -161,7 +154,7 @@ def test_one_experiment_is_shown_at_a_time(page):
     assert shown.count() == 1
     assert shown.first.get_attribute("data-key") == last
     shown.scroll_into_view_if_needed()
-    shown.locator(".main-svg").first.wait_for()
+    shown.locator("svg.marks").first.wait_for()
 
 
 def test_a_phone_needs_no_sideways_scrolling(opened):
@@ -172,21 +165,23 @@ def test_a_phone_needs_no_sideways_scrolling(opened):
 
 def test_dark_colours_reach_the_plots_and_paper_shows_what_was_folded(opened):
     page = opened(color_scheme="dark")
-    ink = f"document.querySelector('{TREND}').layout.font.color"
+    ink = f"getComputedStyle(document.querySelector('{TREND} .role-axis-label text')).fill"
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 23, 27)"
-    assert page.evaluate(ink) == "#e7eaee"
+    assert page.evaluate(ink) == DARK
     page.emulate_media(media="print")
     page.evaluate("dispatchEvent(new Event('beforeprint'))")
-    # The headings that sort are buttons too, but look like text.
-    assert page.locator(":not(th) > button:visible, select:visible, nav:visible").count() == 0
+    # The headings that sort and the names of the legends are buttons too, but look like text.
+    assert page.locator(":not(th):not(li) > button:visible, select:visible, nav:visible").count() == 0
     assert page.locator("details:not([open])").count() == 0
     for box in page.locator("[data-chart]:visible").all():
-        box.locator(".main-svg").first.wait_for()
-        assert box.evaluate("box => box.layout.font.color") == "#1b1f24"
+        box.locator("svg.marks").first.wait_for()
+        text = box.locator(".role-axis-label text").first
+        assert text.evaluate("text => getComputedStyle(text).fill") == PAPER
     page.evaluate("dispatchEvent(new Event('afterprint'))")
-    assert page.evaluate(ink) == "#e7eaee"
-    page.emulate_media(media="screen", color_scheme="light")
-    page.wait_for_function(ink + " === '#1b1f24'")
+    page.emulate_media(media="screen")
+    assert page.evaluate(ink) == DARK
+    page.emulate_media(color_scheme="light")
+    page.wait_for_function(f"{ink} === '{LIGHT}'")
 
 
 def test_the_axis_of_a_night_alone_shows_days(browser, tmp_path):
@@ -194,8 +189,9 @@ def test_the_axis_of_a_night_alone_shows_days(browser, tmp_path):
     reader = Reader(
         browser, write_nightly_page(tmp_path, JudgedRun(run, compare(run, None), history_of(run, 1))).as_uri()
     )
-    ticks = reader.open().locator(f"{TREND} .xtick text").all_text_contents()
+    ticks = reader.open().locator(f"{TREND} .role-axis-label text").all_text_contents()
     reader.close()
-    assert ticks
-    # Neither hours nor shares of a second.
-    assert all(re.fullmatch(r"\d{4}-\d{2}-\d{2}", tick) for tick in ticks), ticks
+    # Neither hours nor shares of a second; the other ticks are numbers of y.
+    days = [tick for tick in ticks if not re.fullmatch(r"−?[\d.]+", tick)]
+    assert days
+    assert all(re.fullmatch(r"\d{4}-\d{2}-\d{2}", day) for day in days), days

@@ -22,7 +22,7 @@ from simtest.realism.comparison import compare
 from simtest.realism.page import write_comparison
 from simtest.reconstruction.picture import Options
 from simtest.report import write_report
-from simtest.report.view3d import grid_triangles
+from simtest.report.scene3d import grid_triangles
 from simtest.report.viewer import Content, write_scene_page
 
 pytestmark = pytest.mark.slow
@@ -34,13 +34,13 @@ PHONE_HEIGHT = 844
 MOST_SCREENS = 8
 """Screens of a phone that a page takes before the reader opens a section."""
 
-# What sticks out of the page, or out of its own box without scrolling there. Plotly clips what it draws itself, and
+# What sticks out of the page, or out of its own box without scrolling there. Vega clips what it draws itself, and
 # what lies within a box that scrolls is reached by scrolling.
 OVERFLOWS = """() => {
   const width = document.documentElement.clientWidth, found = [];
   for (const part of document.body.querySelectorAll("*")) {
     const box = part.getBoundingClientRect();
-    if (!box.width || !box.height || part.closest("svg, .js-plotly-plot, .skip")) continue;
+    if (!box.width || !box.height || part.closest("svg, .skip")) continue;
     const frame = part.parentElement.closest(".scroll, [data-scrolls]");
     if (frame) continue;
     const style = getComputedStyle(part), name = part.tagName + "." + part.className;
@@ -60,11 +60,12 @@ SILENT = """() => [...document.querySelectorAll(".scroll")].filter(box => {
   return box.getClientRects().length && ways.some(([cut, way]) => cut && !told.includes(way));
 }).map(box => box.getAttribute("aria-label"))"""
 
-# Texts at the ticks of a chart's axis that lie on each other, by more than the blank rim of their boxes.
+# Texts at the ticks of a chart's axis that are seen and lie on each other, by more than the blank rim of their boxes.
 OVERPRINTS = """() => {
   const found = [];
-  for (const axis of document.querySelectorAll(".xaxislayer-above, .yaxislayer-above")) {
-    const texts = [...axis.querySelectorAll("text")].filter(text => text.textContent.trim());
+  for (const axis of document.querySelectorAll(".role-axis-label")) {
+    const texts = [...axis.querySelectorAll("text")].filter(
+      text => text.textContent.trim() && getComputedStyle(text).opacity > 0);
     const boxes = texts.map(text => text.getBoundingClientRect());
     for (let i = 0; i < boxes.length; i++) for (let j = 0; j < i; j++) {
       const [a, b] = [boxes[i], boxes[j]];
@@ -142,7 +143,7 @@ def open_all(page):
     page.evaluate("document.querySelectorAll('details').forEach(box => { box.open = true; })")
     for box in page.locator("[data-chart]:visible").all():
         box.scroll_into_view_if_needed()
-        box.locator(".main-svg, canvas, img").first.wait_for()
+        box.locator("svg.marks").first.wait_for()
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -172,8 +173,8 @@ def test_axe_finds_nothing_serious(opened, name, width, scheme):
     page = opened(name, width, scheme)
     open_all(page)
     page.evaluate(Path(found.submodule_search_locations[0], "axe.min.js").read_text(encoding="utf-8"))
-    # Charts that plotly draws are described by their boxes' labels, captions and tables.
-    report = page.evaluate("axe.run({exclude: ['.js-plotly-plot .main-svg']}, {resultTypes: ['violations']})")
+    # Charts that Vega draws are described by their boxes' labels, captions and tables.
+    report = page.evaluate("axe.run({exclude: ['.chart svg', 'iframe']}, {resultTypes: ['violations']})")
     grave = [each for each in report["violations"] if each["impact"] in ("serious", "critical")]
     assert [(each["id"], each["nodes"][0]["html"]) for each in grave] == []
 
@@ -197,7 +198,7 @@ def test_a_link_opens_the_section_that_is_folded_on_a_phone(opened):
     chart = page.locator("#error_vs_curvature .chart")
     assert not chart.is_visible()
     page.locator("nav a[href='#error_vs_curvature']").click()
-    page.wait_for_selector("#error_vs_curvature .main-svg")
+    page.wait_for_selector("#error_vs_curvature svg.marks")
     assert chart.is_visible()
 
 
@@ -217,7 +218,57 @@ def test_the_overprint_check_sees_a_planted_fault(opened):
     page = opened("realism", 1400)
     open_all(page)
     page.evaluate("""() => {
-      const [one, other] = document.querySelectorAll(".yaxislayer-above text");
+      const [one, other] = document.querySelectorAll(".role-axis-label text");
       other.setAttribute("transform", one.getAttribute("transform"));
     }""")
     assert page.evaluate(OVERPRINTS) != []
+
+
+def test_a_chart_is_enlarged_by_dragging_and_its_names_hide_marks(opened):
+    page = opened("run", 1400)
+    box = page.locator("#error_vs_curvature .chart")
+    box.scroll_into_view_if_needed()
+    points = box.locator(".mark-symbol path")
+    points.first.wait_for()
+    axes, count, ticks = box.locator(".background[stroke]").bounding_box(), points.count(), ticks_of(box)
+    name = page.locator("#error_vs_curvature [data-name]").first
+    name.click()
+    assert 0 < points.count() < count
+    page.mouse.move(axes["x"] + 0.2 * axes["width"], axes["y"] + 0.2 * axes["height"])
+    page.mouse.down()
+    page.mouse.move(axes["x"] + 0.6 * axes["width"], axes["y"] + 0.6 * axes["height"], steps=3)
+    page.mouse.up()
+    page.wait_for_function(
+        "old => document.querySelector('#error_vs_curvature .role-axis-label').textContent != old", arg=ticks
+    )
+    # What was hidden stays so.
+    assert points.count() < count
+    box.dblclick(position={"x": 300, "y": 100})
+    page.wait_for_function(
+        "old => document.querySelector('#error_vs_curvature .role-axis-label').textContent == old", arg=ticks
+    )
+    name.click()
+    assert points.count() == count
+
+
+def ticks_of(box):
+    return box.locator(".role-axis-label").first.text_content()
+
+
+def test_a_point_tells_its_setting(opened):
+    page = opened("run", 1400)
+    box = page.locator("#error_vs_curvature .chart")
+    box.scroll_into_view_if_needed()
+    box.locator(".mark-symbol path").last.hover(force=True)
+    page.locator("#tooltip:not([hidden])").wait_for()
+    assert "mean " in page.locator("#tooltip").text_content()
+
+
+def test_the_parts_of_a_3d_view_are_hidden_by_their_names(opened):
+    page = opened("view", 1400)
+    shown = "part => document.querySelector('.scene').contentWindow.scene?.getObjectByName(part)?.visible"
+    # Of the two surfaces one is shown.
+    page.wait_for_function(f"({shown})('part0') === true && ({shown})('part1') === false")
+    page.locator("[data-part=part1]").click()
+    page.locator("[data-part=part2]").click()
+    assert [page.evaluate(shown, f"part{i}") for i in range(4)] == [False, True, False, True]

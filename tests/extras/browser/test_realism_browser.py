@@ -19,8 +19,8 @@ def test_page_in_a_browser(browser, tmp_path):
         tab.goto(page.as_uri())
         # Sections are folded on a phone.
         tab.evaluate("document.querySelectorAll('details').forEach(section => { section.open = true })")
-        tab.wait_for_selector("[data-chart=distances] .main-svg", timeout=60_000)
+        tab.wait_for_selector("[data-chart=distances] svg.marks", timeout=60_000)
         tab.locator("[data-chart=column_noise]").scroll_into_view_if_needed()
-        tab.wait_for_selector("[data-chart=column_noise] .main-svg", timeout=60_000)
+        tab.wait_for_selector("[data-chart=column_noise] svg.marks", timeout=60_000)
         assert tab.evaluate("document.documentElement.scrollWidth") == width
         assert [text for text in heard if not text.startswith(("file:", "data:", "blob:"))] == []

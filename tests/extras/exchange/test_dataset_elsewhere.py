@@ -21,7 +21,7 @@ from PIL import Image
 from simtest.dataset import fields, read
 from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import load_dataset
 
 # Others warn as they like.

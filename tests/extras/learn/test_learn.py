@@ -1,4 +1,4 @@
-"""Samples as tensors, crops, and a network that learns. Skipped where PyTorch is absent."""
+"""Samples as tensors. Skipped where PyTorch is absent."""
 
 import shutil
 from itertools import chain, islice
@@ -10,12 +10,11 @@ import torch
 
 import simtest
 from simtest.dataset import calibration_of, read
-from simtest.dataset.learn import Samples, read_crops
-from simtest.dataset.learn.network import propose, train
+from simtest.dataset.learn import Samples
 from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
 from simtest.geometry.vectors import angle_deg
-from simtest.runtime.engines import make_engine
+from simtest.runtime.processes import make_engine
 from simtest.spec import load_dataset
 
 pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
@@ -142,38 +141,3 @@ def test_tensors_are_channels_first(made):
         Samples.collate([item, small])
     with pytest.raises(InputError, match="field colour: unknown"):
         Samples(made, fields=("colour",))
-
-
-def test_crops_hold_the_truth(made):
-    crops = read_crops(made, "train")
-    assert len(crops) >= 8
-    assert np.allclose(np.linalg.norm(crops.normal, axis=1), 1)
-    # Light and camera are at one place: the normal is close to the direction to the camera.
-    assert angle_deg(crops.towards, crops.normal).max() < 3
-    assert ((crops.axis_ratio > 0) & (crops.axis_ratio <= 1)).all()
-    assert set(crops.classical) == {"circle_pose", "brightest_point", "cone_axis"}
-
-
-def test_a_network_learns_the_truth(made):
-    crops = read_crops(made, "train")
-    untaught = np.abs(propose(train(crops, epochs=0), crops)[1] - crops.axis_ratio).mean()
-    taught = train(crops, epochs=150)
-    normal, ratio = propose(taught, crops)
-    assert np.allclose(np.linalg.norm(normal, axis=1), 1)
-    assert np.abs(ratio - crops.axis_ratio).mean() < 0.5 * untaught
-
-
-def test_the_same_seed_gives_the_same_network(made):
-    crops = read_crops(made, "train")
-    assert np.array_equal(propose(train(crops, epochs=2), crops)[0], propose(train(crops, epochs=2), crops)[0])
-
-
-def test_crops_are_linear_whatever_the_response(tmp_path):
-    crops = []
-    for name, response in (("srgb", {}), ("encoded", {"sensor.response": {"type": "gamma", "gamma": 1.2}})):
-        values = {"samples": 6, "samples_per_anatomy": 1, "sensor.noise_sigma": 0.0, **response}
-        write_dataset(load_dataset("tiny", values), tmp_path / name, make_engine())
-        crops.append(read_crops(tmp_path / name, "train"))
-    assert len(crops[0]) >= 2
-    # A value's step is 1/255; taken for sRGB the second ones would differ by a third.
-    assert np.abs(crops[0].images - crops[1].images).max() < 0.03

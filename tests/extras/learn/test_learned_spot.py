@@ -11,20 +11,18 @@ import pytest
 import torch
 
 from simtest.calibration import Calibration, Priors
-from simtest.dataset.learn.calibration import fitted_scale
-from simtest.dataset.learn.spot_export import export_spots
-from simtest.dataset.learn.spot_task import SpotNormals, squared_distance
-from simtest.dataset.learn.training import Training
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
 from simtest.estimators.covariance_scale import CovarianceScale
 from simtest.estimators.learned_spot import LearnedSpot, log_deviation
+from simtest.estimators.onnx_model import METADATA
 from simtest.estimators.spot_inputs import EXTRAS, rays_of, spot_inputs
+from simtest.estimators.training_range import TrainingRange, inflation
 from simtest.geometry import BrownConrady, Camera
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import run_pipeline
-from simtest.runtime.onnx_model import METADATA
-from simtest.runtime.training_range import TrainingRange, inflation
+from studies.networks.fitted import fitted_scale
+from studies.networks.spots import SpotNormals, squared_distance
 
 pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
@@ -70,9 +68,9 @@ def made(tmp_path_factory):
     taught, judged = examples(range(30)), examples(range(100, 120))
     task = SpotNormals()
     torch.manual_seed(3)
-    network = task.network(taught, Training(name="spot", task="spot_normals")).eval()
-    out = tmp_path_factory.mktemp("spot")
-    return network, taught, judged, export_spots(network, taught, judged, out, {"dataset": "drawn"})
+    network = task.network(taught, 1.0).eval()
+    path = tmp_path_factory.mktemp("spot") / "model.onnx"
+    return network, taught, judged, task.export(network, taught, judged, path, {"dataset": "drawn"})
 
 
 def test_onnx_gives_what_pytorch_gives(made):
@@ -225,7 +223,7 @@ def scales(deviations, factors):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (without_metadata, "is no network of simtest train"),
+        (without_metadata, "is no network for learned_spot"),
         (changed(format="mine"), "format 'mine'"),
         (changed(scales={"fine": 1.0}), "KeyError"),
         (changed(scales={"base": 1.0, "fine": 1.0}), "TypeError"),
@@ -233,7 +231,7 @@ def scales(deviations, factors):
         (changed(scales=scales((0.0,), (1.0, 2.0))), "as many factors as deviations"),
         (changed(scales=scales((1.0, 0.0), (1.0, 2.0))), "must ascend"),
         (changed(feature_mean=[0.0]), "does not fit"),
-        (changed(low=3), "is no network of simtest train"),
+        (changed(low=3), "is no network for learned_spot"),
         (changed(feature_usual=0.0), "feature_usual = 0.0: must be above 0"),
     ],
     ids=["no metadata", "another format", "a scale missing", "a scale of an older form", "a scale of 0",
@@ -264,7 +262,7 @@ def test_what_is_no_model_is_refused_in_one_line(tmp_path):
     (tmp_path / "text.onnx").write_text("no model")
     with pytest.raises(InputError, match=r"text.onnx: is no ONNX model"):
         LearnedSpot(tmp_path / "text.onnx").check()
-    with pytest.raises(InputError, match=r"none.onnx: cannot be read \(No such file"):
+    with pytest.raises(InputError, match=r"none.onnx: no such file"):
         LearnedSpot(tmp_path / "none.onnx").check()
     with pytest.raises(InputError, match="target = both: must be base or fine"):
         LearnedSpot(tmp_path / "none.onnx", "both")

@@ -3,7 +3,7 @@
 import test_dataset_relief
 import torch
 
-from simtest.dataset.learn.samples import Samples
+from simtest.dataset.learn import Samples
 
 made = test_dataset_relief.made
 

@@ -6,13 +6,13 @@ import test_dense_inputs
 import torch
 from test_dense_inputs import LIGHTS, frame
 
-from simtest.dataset.learn.dense_frames import truth_at
-from simtest.dataset.learn.dense_task import moved
 from simtest.dataset.sample import Sample
 from simtest.estimators.dense_inputs import (
     dense_inputs,
     output_centres,
 )
+from studies.networks.dense import moved
+from studies.networks.examples import truth_at
 
 picture = test_dense_inputs.picture
 

@@ -6,12 +6,12 @@ import test_spot_inputs
 import torch
 from test_spot_inputs import LIGHTS, PEAK, WIDTH, frame
 
-from simtest.dataset.learn import spot_task
 from simtest.estimators.spot_inputs import (
     rays_of,
     rotation_of,
     spot_inputs,
 )
+from studies.networks.spots import moved as moved_batch
 
 picture = test_spot_inputs.picture
 
@@ -43,7 +43,7 @@ def test_a_moved_picture_gives_moved_inputs(picture, change, moved):
             "crops": torch.from_numpy(crops), "extras": torch.from_numpy(extras),
             "base": torch.from_numpy(rotation), "fine": torch.from_numpy(rotation),
         }  # fmt: skip
-    turned = spot_task.moved(batch["before"], flip_x, flip_y, transpose)
+    turned = moved_batch(batch["before"], flip_x, flip_y, transpose)
     assert torch.allclose(turned["crops"], batch["after"]["crops"], atol=1e-4)
     # The basis follows the image's x, so off the axis a transposed one is turned by a small angle.
     tolerance = 0.03 if transpose else 1e-5

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from simtest.bench.cores import core_record
+from simtest.bench.run import core_record
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.installed import ESTIMATORS
@@ -16,7 +16,7 @@ from simtest.runtime.resources import data_root
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """Return the shipped network's copy as `simtest train --out models/spots` would leave one."""
+    """Return the shipped network's copy in a folder of its own."""
     (tmp_path / "models" / "spots").mkdir(parents=True)
     shutil.copy(data_root("scenes").joinpath(*SHIPPED), tmp_path / "models" / "spots" / "model.onnx")
     monkeypatch.chdir(tmp_path)
@@ -42,7 +42,7 @@ def test_an_own_network_stands_beside_the_shipped_one(own, tmp_path):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("learned_spot:none.onnx", "none.onnx: cannot be read (No such file or directory)"),
+        ("learned_spot:none.onnx", "none.onnx: no such file"),
         ("learned_spot:text.onnx", "text.onnx: is no ONNX model"),
         ("learned_spt:text.onnx", "estimator 'learned_spt': not installed"),
         ("cloud:text.onnx", "estimator 'cloud:text.onnx': cloud runs no network; must stand alone"),

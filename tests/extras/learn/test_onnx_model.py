@@ -7,12 +7,12 @@ import onnx
 import pytest
 import torch
 
-from simtest.dataset.learn import onnx_export
-from simtest.dataset.learn.calibration import fitted_range
 from simtest.errors import InputError, SimtestError
-from simtest.runtime import onnx_model
-from simtest.runtime.onnx_model import METADATA, OnnxModel
-from simtest.runtime.training_range import TrainingRange
+from simtest.estimators import onnx_model
+from simtest.estimators.onnx_model import METADATA, OnnxModel
+from simtest.estimators.training_range import TrainingRange
+from studies.networks import onnx_file
+from studies.networks.fitted import fitted_range
 
 pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("one_torch_thread")]
 
@@ -33,8 +33,7 @@ def line(tmp_path_factory):
     torch.manual_seed(0)
     network = Line()
     path = tmp_path_factory.mktemp("line") / "line.onnx"
-    axes = {"x": {0: "n"}, "y": {0: "n"}}
-    onnx_export.export(network, {"x": torch.zeros(2, 40)}, ["y"], axes, {"format": FORM, "about": "drawn"}, path)
+    onnx_file.export(network, {"x": torch.zeros(2, 40)}, ["y"], {"format": FORM, "about": "drawn"}, path)
     return network, path
 
 
@@ -49,7 +48,7 @@ def test_a_written_network_gives_what_pytorch_gives_for_any_number_of_rows(line)
 
 def test_half_precision_moves_weights_by_a_part_in_2000(line, tmp_path):
     network, path = line
-    onnx.save(onnx_export.halved(onnx.load(path)), tmp_path / "half.onnx")
+    onnx.save(onnx_file.stored(onnx.load(path), 16), tmp_path / "half.onnx")
     assert (tmp_path / "half.onnx").stat().st_size < 0.7 * path.stat().st_size
     x = np.eye(40, dtype=np.float32)
     rows = [OnnxModel(each, FORM, "line").run({"x": x}, {"y": (40, 50)})[0] for each in (path, tmp_path / "half.onnx")]
@@ -64,7 +63,7 @@ def test_a_layer_that_onnx_computes_otherwise_is_not_written(tmp_path):
             return x + torch.randn(2, 40)
 
     with pytest.raises(SimtestError, match=r"bad.onnx: ONNX Runtime differs from PyTorch by"):
-        onnx_export.export(Drawn(), {"x": torch.zeros(2, 40)}, ["y"], {}, {"format": FORM}, tmp_path / "bad.onnx")
+        onnx_file.export(Drawn(), {"x": torch.zeros(2, 40)}, ["y"], {"format": FORM}, tmp_path / "bad.onnx")
     assert not (tmp_path / "bad.onnx").exists()
 
 
@@ -85,7 +84,7 @@ def test_other_metadata_are_refused_in_one_line(line, tmp_path, text, said):
     if text is not None:
         onnx.helper.set_model_props(model, {METADATA: text})
     onnx.save(model, tmp_path / "other.onnx")
-    with pytest.raises(InputError, match=rf"other.onnx: is no network of simtest train \({said}") as raised:
+    with pytest.raises(InputError, match=rf"other.onnx: is no network for line \({said}") as raised:
         OnnxModel(tmp_path / "other.onnx", FORM, "line")
     assert str(raised.value).endswith("its metadata must hold 'simtest' of the form 'simtest line, version 1'")
     assert "\n" not in str(raised.value)
@@ -95,7 +94,7 @@ def test_other_metadata_are_refused_in_one_line(line, tmp_path, text, said):
 def test_numbers_of_metadata_that_no_network_has_are_refused_in_one_line(line, limit):
     model = OnnxModel(line[1], FORM, "line")
     range_ = {"low": {"x": 0.0}, "high": {"x": 1.0}, "feature_mean": [0.0], "feature_precision": [1.0]}
-    with pytest.raises(InputError, match=r"line.onnx: is no network of simtest train \(") as raised, model.reading():
+    with pytest.raises(InputError, match=r"line.onnx: is no network for line \(") as raised, model.reading():
         TrainingRange.read({**range_, "feature_limit": limit}, ["x"])
     assert "\n" not in str(raised.value)
 
@@ -104,7 +103,7 @@ def test_outputs_that_are_no_floating_point_numbers_are_refused(line, tmp_path):
     helper, types = onnx.helper, onnx.TensorProto
     value = [helper.make_tensor_value_info(name, kind, [2]) for name, kind in (("x", types.FLOAT), ("y", types.BOOL))]
     graph = helper.make_graph([helper.make_node("Greater", ["x", "x"], ["y"])], "logical", value[:1], value[1:])
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", onnx_export.OPSET)], ir_version=8)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", onnx_file.OPSET)], ir_version=8)
     helper.set_model_props(model, {METADATA: json.dumps({"format": FORM})})
     onnx.save(model, tmp_path / "logical.onnx")
     with pytest.raises(InputError, match=r"logical.onnx: cannot be run \(y holds bool; must be floating-point numbers"):
@@ -130,8 +129,8 @@ def test_files_that_cannot_be_a_network_are_told_in_one_line(line, tmp_path, mon
     (tmp_path / "empty.onnx").write_bytes(b"")
     (tmp_path / "cut.onnx").write_bytes(line[1].read_bytes()[:500])
     (tmp_path / "folder.onnx").mkdir()
-    for name, said in (("empty", "is no ONNX model"), ("cut", "is no ONNX model"), ("folder", "cannot be read"),
-                       ("none", "cannot be read")):  # fmt: skip
+    for name, said in (("empty", "is no ONNX model"), ("cut", "is no ONNX model"), ("folder", "is a folder"),
+                       ("none", "no such file")):  # fmt: skip
         with pytest.raises(InputError, match=rf"{name}.onnx: {said}") as raised:
             OnnxModel(tmp_path / f"{name}.onnx", FORM, "line")
         assert "\n" not in str(raised.value)

@@ -5,7 +5,7 @@ import pytest
 from test_camera_stages import picture
 
 from simtest.simulation import coding
-from simtest.spec.processing import (
+from simtest.spec.sensor import (
     H264Coding,
 )
 

@@ -9,13 +9,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 from simtest.calibration import Priors
-from simtest.calibration.distributions import LogUniform, Uniform, exactly
-from simtest.calibration.distributions import Normal as NormalPrior
-from simtest.calibration.priors import CameraPrior
+from simtest.calibration.priors import CameraPrior, LogUniform, Uniform, exactly
+from simtest.calibration.priors import Normal as NormalPrior
 from simtest.errors import Failure
 from simtest.estimators import load_estimators
 from simtest.geometry import Camera, Patch, ViewMask
-from simtest.geometry.distortion import BrownConrady, KannalaBrandt
+from simtest.geometry.lenses import BrownConrady, KannalaBrandt
 
 FILES = "--files" in sys.argv
 LENSES = {"brown_conrady": BrownConrady, "kannala_brandt": KannalaBrandt}

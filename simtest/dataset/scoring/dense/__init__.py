@@ -1,6 +1,6 @@
 """The dense track: maps of normals or depths, a pixel each, scored against the truth of a run or a dataset.
 
-`map_files` reads maps, `axes` and `depth` judge what their values mean, `conventions` decides it over all frames,
+`map_files` reads maps, `conventions` says what their values mean, `depth` aligns depths,
 `zones` and `cells` sort pixels, `tally` makes figures, `scorer` scores a frame, `score` all of them, `page`
 writes the page.
 `methods` holds what answers maps: a folder, or the baseline `shading`.
@@ -16,25 +16,4 @@ if TYPE_CHECKING:
     from simtest.dataset.scoring.dense.methods import METHODS, MapFolder, Shading, open_method
     from simtest.dataset.scoring.dense.score import DenseScore, score_frames, score_maps, write_score
 
-_HOMES = {
-    "simtest.dataset.scoring.dense.conventions": ("MapOptions",),
-    "simtest.dataset.scoring.dense.frame_truth": ("FrameTruth", "truth_of_view"),
-    "simtest.dataset.scoring.dense.methods": ("METHODS", "MapFolder", "Shading", "open_method"),
-    "simtest.dataset.scoring.dense.score": ("DenseScore", "score_frames", "score_maps", "write_score"),
-}
-
-__all__ = [
-    "METHODS",
-    "DenseScore",
-    "FrameTruth",
-    "MapFolder",
-    "MapOptions",
-    "Shading",
-    "open_method",
-    "score_frames",
-    "score_maps",
-    "truth_of_view",
-    "write_score",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

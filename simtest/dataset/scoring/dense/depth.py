@@ -1,14 +1,11 @@
 """Depth maps: what their values count, how they are aligned with the truth, and the normals that they imply."""
 
-from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
-from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Array, Mask
-from simtest.runtime.files import JsonObject
 from simtest.runtime.seeds import from_integer
 from simtest.validation.depth_maps import depth_normals
 
@@ -32,9 +29,6 @@ MOST_PIXELS = 20_000
 
 MAD_TO_SIGMA = 1.4826
 LEAST_PIXELS = 3
-
-CLEAR_RATIO = 1.02
-"""By such a factor at least the residuals of one kind of depth are below those of the other."""
 
 
 def depth_factor(camera: Camera, kind: DepthKind) -> Array:
@@ -115,51 +109,10 @@ def normals_of_distance(distance: Array, rays: Array) -> Array:
     return depth_normals(distance[..., None] * rays, radius_px=1)
 
 
-@dataclass
-class DepthEvidence:
-    """How well depths fit the truth as each kind, over all frames that were added.
-
-    Each kind is judged after its own affine alignment: the shift of relative depths would otherwise hide the kind.
-    """
-
-    spreads: dict[DepthKind, list[float]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
-    """Spread of the relative residuals, a frame: 0 where a factor and a shift alone are missing."""
-
-    def add(self, depth: Array, distance: Array, factors: dict[DepthKind, Array]) -> None:
-        """Add a frame: depths, true distances and `depth_factor` of its answered pixels, shape (N,)."""
-        if len(depth) < LEAST_PIXELS:
-            return
-        for kind in KINDS:
-            sound = np.isfinite(factors[kind])
-            true, own = distance[sound] * factors[kind][sound], depth[sound]
-            factor, shift = align(own, true, "affine")
-            self.spreads[kind].append(_spread((factor * own + shift) / true - 1))
-
-    @property
-    def best(self) -> DepthKind:
-        """The kind that fits best so far."""
-        return min(KINDS, key=self._mean)
-
-    def _mean(self, kind: DepthKind) -> float:
-        return float(np.mean(self.spreads[kind])) if self.spreads[kind] else 0.0
-
-    def decide(self, what: str) -> DepthKind:
-        """Return the kind that fits best by a clear margin; raise `InputError` where both fit alike."""
-        best = self.best
-        other = next(kind for kind in KINDS if kind != best)
-        if self._mean(other) <= CLEAR_RATIO * self._mean(best) or not self.spreads[best]:
-            raise InputError(
-                f"{what}: depths fit the truth alike along the axis and along the ray (spreads {self._mean('z'):.3g} "
-                f"and {self._mean('ray'):.3g}); say which: --depth z or --depth ray"
-            )
-        return best
-
-    def to_json(self) -> JsonObject:
-        """Return the mean spread of each kind."""
-        return {f"spread_{kind}": self._mean(kind) for kind in KINDS if self.spreads[kind]}
-
-
-def _spread(values: Array) -> float:
+def spread(depth: Array, truth: Array) -> float:
+    """Return the spread of the relative errors of depths after an affine alignment: 0 where these are alike."""
+    factor, shift = align(depth, truth, "affine")
+    values = (factor * depth + shift) / truth - 1
     values = values[np.isfinite(values)]
     return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
 

@@ -10,8 +10,7 @@ import numpy.typing as npt
 from simtest.calibration import Calibration
 from simtest.dataset.scoring.dense.zones import zones
 from simtest.geometry import Camera
-from simtest.runtime.arrays import Array, Image, IntArray, Mask
-from simtest.runtime.short_repr import short_repr
+from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
 
 if TYPE_CHECKING:
     from simtest.rendering import Session, TruthMaps

@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
-from simtest.runtime.resources import shown
 from simtest.validation.depth_maps import DEPTH_SUFFIXES, read_values
 
 Kind = Literal["normal", "depth"]
@@ -42,32 +41,23 @@ class MapFile:
 
 
 def find_maps(folder: Path) -> list[MapFile]:
-    """Return the maps of a folder, and of its folders normal/ and depth/.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be read, holds none, or two of one frame and kind.
-    """
+    """Return the maps of a folder, and of its folders normal/ and depth/."""
     places: list[tuple[Path, Kind | None]] = [
         (folder, None),
         (folder / "normal", "normal"),
         (folder / "depth", "depth"),
     ]
     found: list[MapFile] = []
-    try:
-        for place, kind in places:
-            files = sorted(place.iterdir()) if place.is_dir() else []
-            found += [_named(path, kind) for path in files if path.suffix.lower() in DEPTH_SUFFIXES and path.is_file()]
-    except OSError as error:
-        raise InputError(f"{shown(folder)}: cannot be read ({error.strerror})") from error
+    for place, kind in places:
+        files = sorted(place.iterdir()) if place.is_dir() else []
+        found += [_named(path, kind) for path in files if path.suffix.lower() in DEPTH_SUFFIXES and path.is_file()]
     if not found:
-        raise InputError(f"{shown(folder)}: holds no maps; must be {', '.join(DEPTH_SUFFIXES)}, called as their frames")
+        raise InputError(f"{folder}: holds no maps; must be {', '.join(DEPTH_SUFFIXES)}, called as their frames")
     held: dict[tuple[str, str | None], Path] = {}
     for one in found:
         other = held.setdefault((one.frame, one.kind), one.path)
         if other is not one.path:
-            raise InputError(f"{shown(one.path)}: a second map of frame {shown(one.frame)}, beside {shown(other.name)}")
+            raise InputError(f"{one.path}: a second map of frame {one.frame}, beside {other.name}")
     return found
 
 
@@ -113,13 +103,7 @@ class RawMap:
 
 
 def read_map(one: MapFile, size: tuple[int, int]) -> RawMap:
-    """Read a map of a frame of a size, height and width.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is of another size or kind.
-    """
+    """Read a map of a frame of a size, height and width."""
     path = one.path
     values = read_values(path, "a map of normals or depths")
     if values.ndim == 3 and values.shape[1:] == size and values.shape[0] in (1, 3):
@@ -135,18 +119,18 @@ def read_map(one: MapFile, size: tuple[int, int]) -> RawMap:
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[:, :, 0]
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] != 3):
-        raise InputError(f"{shown(path)}: has shape {values.shape}; must be (H, W, 3) for normals or (H, W) for depths")
+        raise InputError(f"{path}: has shape {values.shape}; must be (H, W, 3) for normals or (H, W) for depths")
     if values.shape[:2] != size:
         height, width = values.shape[:2]
-        raise InputError(f"{shown(path)}: is {width} x {height} px; must be {size[1]} x {size[0]}, as its frame")
+        raise InputError(f"{path}: is {width} x {height} px; must be {size[1]} x {size[0]}, as its frame")
     kind = one.kind or kind_of(values)
     if kind == "normal" and values.ndim == 2:
-        raise InputError(f"{shown(path)}: has one channel; a normal map has three")
+        raise InputError(f"{path}: has one channel; a normal map has three")
     if kind == "normal" and values.dtype.kind in "iu" and values.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{shown(path)}: normals are {values.dtype}; must be uint8, uint16 or floats")
+        raise InputError(f"{path}: normals are {values.dtype}; must be uint8, uint16 or floats")
     if kind == "depth" and values.ndim == 3:
         if (values != values[:, :, :1]).any():
-            raise InputError(f"{shown(path)}: channels differ; a depth map has one, or equal ones")
+            raise InputError(f"{path}: channels differ; a depth map has one, or equal ones")
         values = values[:, :, 0]
     return RawMap(path, kind, values, clear)
 
@@ -189,11 +173,6 @@ def channel_vectors(raw: RawMap, encoding: Encoding) -> Array:
     return vectors
 
 
-def candidates(raw: RawMap) -> tuple[Encoding, ...]:
-    """Return the encodings among which the length of the vectors decides, where none is stated."""
-    return ("unit", "positive_z") if raw.is_encoded else ("components", "unit")
-
-
 def length_error(vectors: Array) -> float:
     """Return how far channel vectors, shape (..., 3), are from length 1, in the mean; inf without any."""
     off = np.abs(np.linalg.norm(vectors, axis=-1) - 1)
@@ -202,16 +181,10 @@ def length_error(vectors: Array) -> float:
 
 
 def decode_depth(raw: RawMap, unit_mm: float | None) -> Array:
-    """Return the depths of a map in mm, or in its own unit where that is not told; NaN where there is no answer.
-
-    Raises
-    ------
-    InputError
-        If integers have no unit.
-    """
+    """Return the depths of a map in mm, or in its own unit where that is not told; NaN where there is no answer."""
     if raw.is_encoded and unit_mm is None:
         raise InputError(
-            f"{shown(raw.path)}: holds integers; --unit-mm must say how many mm one step is (1 where nobody knows; "
+            f"{raw.path}: holds integers; --unit-mm must say how many mm one step is (1 where nobody knows; "
             "then take the aligned figures)"
         )
     depth = raw.values.astype(float) * (1.0 if unit_mm is None else unit_mm)

@@ -13,7 +13,6 @@ from simtest.dataset.scoring.dense.frame_truth import FrameTruth
 from simtest.dataset.scoring.dense.map_files import Kind, MapFile, RawMap, find_maps, read_map
 from simtest.errors import InputError
 from simtest.estimators.shading_maps import shading_maps
-from simtest.runtime.resources import shown
 
 
 class Method(Protocol):
@@ -82,10 +81,10 @@ class MapFolder:
                 continue
             raw = read_map(one, truth.size)
             if raw.kind in found:
-                raise InputError(f"{shown(one.path)}: a second {raw.kind} map of frame {shown(truth.name)}")
+                raise InputError(f"{one.path}: a second {raw.kind} map of frame {truth.name}")
             if kind is None and raw.kind not in self.kinds:
                 raise InputError(
-                    f"{shown(one.path)}: holds a {raw.kind} map, others {self.kinds[0]} maps; call the files "
+                    f"{one.path}: holds a {raw.kind} map, others {self.kinds[0]} maps; call the files "
                     "NAME_normal and NAME_depth"
                 )
             found[raw.kind] = raw
@@ -102,12 +101,11 @@ class MapFolder:
         if strangers and len(strangers) == len(self.maps):
             example = min(names, default="")
             raise InputError(
-                f"{shown(self.folder)}: no map is called as a frame (found {shown(strangers[0])}; a frame is called "
-                f"{shown(example)})"
+                f"{self.folder}: no map is called as a frame (found {strangers[0]}; a frame is called {example})"
             )
         if strangers:
             more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
-            warnings.warn(f"{shown(self.folder)}: {shown(strangers[0])}{more}: no such frame; left out", stacklevel=3)
+            warnings.warn(f"{self.folder}: {strangers[0]}{more}: no such frame; left out", stacklevel=3)
 
 
 def _peek(one: MapFile) -> Kind:
@@ -135,7 +133,7 @@ class Shading:
     def answer(self, truth: FrameTruth) -> Answer:
         """Compute the maps of a frame from its picture and calibration."""
         if truth.image is None or truth.calibration is None:
-            raise InputError(f"frame {shown(truth.name)}: has no picture, which the method shading needs")
+            raise InputError(f"frame {truth.name}: has no picture, which the method shading needs")
         normal, distance = shading_maps(truth.image, truth.calibration)
         where = Path(truth.name)
         return Answer(RawMap(where, "normal", normal), RawMap(where, "depth", distance))
@@ -154,5 +152,5 @@ def open_method(maps: str | Path) -> Method:
         return made()
     folder = Path(maps)
     if not folder.is_dir():
-        raise InputError(f"{shown(folder)}: no folder of maps; must be one, or a method: {', '.join(METHODS)}")
+        raise InputError(f"{folder}: no folder of maps; must be one, or a method: {', '.join(METHODS)}")
     return MapFolder(folder)

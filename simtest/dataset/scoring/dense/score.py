@@ -1,6 +1,6 @@
 """`score_maps`: dense maps of a method against the truth of a run or a dataset, with tables, JSON and a page."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.dataset.scoring.dense.cells import BINS, ZONE_MEANINGS
-from simtest.dataset.scoring.dense.conventions import Answer, Conventions, Evidence, MapOptions
+from simtest.dataset.scoring.dense.conventions import Answer, Fit, MapOptions
 from simtest.dataset.scoring.dense.depth import ALIGNMENTS
 from simtest.dataset.scoring.dense.frame_truth import EXCLUDED, FrameTruth, Progress
 from simtest.dataset.scoring.dense.methods import Method, open_method
@@ -19,16 +19,12 @@ from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.resources import shown
 
 TABLE, SUMMARY, PAGE = "dense.parquet", "dense.json", "index.html"
-SCHEMA = 2
+SCHEMA = 3
 
 MOST_SHOWN, LEAST_SHOWN = 6, 3
 """Frames that the page shows: one of each setting up to the larger number, and the first ones up to the smaller."""
-
-Frames = Callable[[], Iterable[FrameTruth]]
-"""Yields the frames anew at each call, in the same order."""
 
 
 @dataclass
@@ -41,10 +37,8 @@ class DenseScore:
         Of the method.
     on : str
         The run or dataset, as it was named.
-    conventions : Conventions
-        By which the maps were read.
-    evidence : Evidence
-        What speaks for them.
+    fit : Fit
+        How the maps were read, and how well they fit the truth so.
     scorer : Scorer
         The figures of each frame.
     counts : dict of int
@@ -57,8 +51,7 @@ class DenseScore:
 
     name: str
     on: str
-    conventions: Conventions
-    evidence: Evidence
+    fit: Fit
     scorer: Scorer
     counts: dict[str, int]
     shown: list[Shown] = field(default_factory=list)
@@ -67,7 +60,7 @@ class DenseScore:
     @property
     def lines(self) -> list[str]:
         """What is told in words: conventions, alignments, and what was not answered."""
-        told = self.evidence.lines(self.conventions)
+        told = self.fit.lines()
         for how, found in self.scorer.alignment_summary().items():
             if turned := found["frames_turned_round"]:
                 told.append(
@@ -102,7 +95,7 @@ class DenseScore:
             cells.setdefault(source, {}).setdefault(quantity, {}).setdefault(surface, []).append(found)
         return {
             "schema": SCHEMA, "name": self.name, "on": self.on, "counts": self.counts,
-            "conventions": self.evidence.to_json(self.conventions),
+            "conventions": self.fit.to_json(),
             "alignments": self.scorer.alignment_summary(), "zones": ZONE_MEANINGS,
             "bins": {name: [edge if np.isfinite(edge) else None for edge in edges] for name, edges in BINS.items()},
             "sources": cells, "told": self.lines,
@@ -110,36 +103,33 @@ class DenseScore:
 
 
 def score_frames(
-    frames: Frames, method: Method, options: MapOptions, on: str = "", is_checked: bool = False
+    frames: Iterable[FrameTruth], method: Method, options: MapOptions, on: str = "", is_checked: bool = False
 ) -> DenseScore:
     """Score a method's maps on frames, one at a time.
 
-    Conventions that nobody stated are those that fit the truth of all frames best. The frames are scored by those
-    that fit the frames so far; where all of them together say otherwise, all are scored once more. `is_checked` says
-    that the names of the method's maps were checked against the frames before.
+    `is_checked` says that the names of the method's maps were checked against the frames before.
 
     Raises
     ------
     InputError
-        If a map cannot be read, no convention fits, or two fit alike.
+        If a map cannot be read, or there is no frame.
     """
     options.check()
     options = method.options(options)
-    evidence = Evidence(options)
-    names: list[str] = []
-    sources = _sources(method)
-    score = _pass(frames, method, options, None, evidence, sources, names)
+    counts = dict.fromkeys(("frames", "frames_without_map", "scored", *EXCLUDED), 0)
+    scorer = Scorer(options, sources=_sources(method))
+    score = DenseScore(options.name or method.name, on, Fit(options), scorer, counts)
+    names = []
+    for truth in frames:
+        names.append(truth.name)
+        answer = method.answer(truth)
+        score.fit.add(truth, answer)
+        _count(counts, truth, answer)
+        _show(score, truth, scorer.add(truth, answer))
     if not is_checked:
         method.check(names)
-    what = f"maps {shown(method.name)}"
-    if score is None:
-        raise InputError(f"{shown(on) if on else 'the run'}: holds no frame")
-    final = evidence.decide(what)
-    if final != score.conventions:
-        again = _pass(frames, method, options, final, None, sources, [])
-        assert again is not None
-        score = again
-    score.name, score.on, score.evidence = options.name or method.name, on, evidence
+    if not names:
+        raise InputError(f"{str(on) if on else 'the run'}: holds no frame")
     return score
 
 
@@ -147,32 +137,6 @@ def _sources(method: Method) -> tuple[str, ...]:
     """Return the sources of normals that a method gives."""
     own = (NORMAL,) if "normal" in method.kinds else ()
     return own + (tuple(map(depth_source, ALIGNMENTS)) if "depth" in method.kinds else ())
-
-
-def _pass(
-    frames: Frames, method: Method, options: MapOptions, conventions: Conventions | None, evidence: Evidence | None,
-    sources: tuple[str, ...], names: list[str],
-) -> DenseScore | None:  # fmt: skip
-    """Score all frames by given conventions, or by those of the evidence; None without frames.
-
-    Where the evidence changes its mind, the frames before were scored otherwise: the conventions of the score are then
-    those of the first frame, and `score_frames` scores all again.
-    """
-    score: DenseScore | None = None
-    for truth in frames():
-        names.append(truth.name)
-        answer = method.answer(truth)
-        if evidence is not None:
-            evidence.add(truth, answer)
-        if score is None:
-            chosen = conventions or (evidence or Evidence(options)).provisional()
-            counts = dict.fromkeys(("frames", "frames_without_map", "scored", *EXCLUDED), 0)
-            held = evidence or Evidence(options)
-            score = DenseScore("", "", chosen, held, Scorer(options, chosen, sources=sources), counts)
-        _count(score.counts, truth, answer)
-        normals = score.scorer.add(truth, answer)
-        _show(score, truth, normals)
-    return score
 
 
 def _count(counts: dict[str, int], truth: FrameTruth, answer: Answer) -> None:
@@ -233,7 +197,7 @@ def score_maps(
     Raises
     ------
     InputError
-        If a folder or a map cannot be read, no convention fits, or two fit alike.
+        If a folder or a map cannot be read.
     """
     from simtest.dataset.scoring.dense.from_folder import frame_names, frames_of
 
@@ -245,7 +209,7 @@ def score_maps(
     # Before anything is rendered, which takes long.
     method.check(names)
     with exclusive_folder(out):
-        score = score_frames(lambda: frames_of(on, progress, len(names)), method, options, str(on), is_checked=True)
+        score = score_frames(frames_of(on, progress, len(names)), method, options, str(on), is_checked=True)
         write_score(score, out, command)
     return score
 
@@ -253,7 +217,7 @@ def score_maps(
 def _refuse_run(out: Path) -> None:
     """Raise `InputError` where a folder for figures holds something else that has a page."""
     if out.is_dir() and (out / PAGE).exists() and not (out / SUMMARY).exists():
-        raise InputError(f"--out {shown(out)}: holds another page; must be an empty folder or one of such figures")
+        raise InputError(f"--out {out}: holds another page; must be an empty folder or one of such figures")
 
 
 __all__ = ["DenseScore", "Key", "score_frames", "score_maps", "write_score"]

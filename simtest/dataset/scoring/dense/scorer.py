@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from simtest.dataset.scoring.dense.cells import CELLS, Cell, labels
-from simtest.dataset.scoring.dense.conventions import Answer, Conventions, MapOptions
+from simtest.dataset.scoring.dense.conventions import Answer, MapOptions
 from simtest.dataset.scoring.dense.depth import ALIGNMENTS, align, answered, depth_factor, normals_of_distance
 from simtest.dataset.scoring.dense.frame_truth import SURFACES, FrameTruth
 from simtest.dataset.scoring.dense.map_files import decode_depth
@@ -37,18 +37,15 @@ Key = tuple[str, str, str]
 
 @dataclass
 class Scorer:
-    """The figures of all frames that were added, read by the same conventions.
+    """The figures of all frames that were added.
 
     Parameters
     ----------
     options : MapOptions
-        What the user stated.
-    conventions : Conventions
         How maps are read.
     """
 
     options: MapOptions
-    conventions: Conventions
     rows: list[JsonObject] = field(default_factory=list)
     alignments: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     sources: tuple[str, ...] = ()
@@ -82,10 +79,10 @@ class Scorer:
         normals: dict[str, Array] = {}
         distances: dict[str, Array] = {}
         if answer.normal is not None:
-            normals[NORMAL] = self.conventions.normals(answer.normal)
+            normals[NORMAL] = self.options.normals(answer.normal)
         if answer.depth is not None:
             depth = decode_depth(answer.depth, self.options.unit_mm)
-            factor = depth_factor(truth.camera, self.conventions.depth)
+            factor = depth_factor(truth.camera, self.options.along)
             rays = truth.camera.unproject(truth.camera.pixel_centres())
             true, fitted_on = truth.distance * factor, answered(depth, truth.scored & np.isfinite(factor))
             for how in ALIGNMENTS:

@@ -1,0 +1,380 @@
+"""What belongs to the tissue inside a kernel: relief, albedo, and where the tissue was before a deformation.
+
+Relief and colour are looked up at the point at rest, and derivatives are carried to the deformed surface.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.rendering.backend import dr, mi
+from simtest.rendering.kernel_values import channels
+from simtest.runtime.arrays import Array
+from simtest.surfaces import SurfaceModel
+from simtest.surfaces.deformation import DeformedSurface
+from simtest.surfaces.relief_field import NODES, ReliefField
+from simtest.surfaces.vessels import ENDLESS, PRIMES
+
+if TYPE_CHECKING:
+    from simtest.surfaces.tissue_pattern import Lattice, TissuePattern
+
+
+Order = tuple[int, ...]
+"""Orders of a derivative along x, y and z of the lattice."""
+
+
+@dataclass(frozen=True)
+class KernelJets:
+    """Jets of the height at the lanes of a kernel, model frame, mm."""
+
+    height: Any  # Of the tissue, mm
+    # gradient, diffused: Gradients of the surface that the film's reflection sees, and of the one that diffuse light
+    # sees
+    gradient: Any
+    diffused: Any
+    hessian: tuple[Any, ...] | None  # xx, xy, xz, yy, yz, zz of the former, 1/mm; None where not asked for
+
+
+@dataclass(frozen=True)
+class _Band:
+    """One band in the kernel: lattice from model, its field, and the field that diffuse light sees, if it sees any."""
+
+    lattice: Any
+    fine: Any
+    diffused: Any
+
+
+class ReliefKernel:
+    """Evaluates a relief; of a deformed surface `rest` says where the tissue was."""
+
+    def __init__(self, field: ReliefField, rest: "RestMap | None" = None) -> None:
+        self.field, self._rest = field, rest
+        self._bands = [
+            _Band(
+                mi.Matrix3f(band.lattice_from_model.tolist()),
+                _stored(band.coefficients),
+                _stored(band.diffused) if band.is_seen_diffusely else None,
+            )
+            for band in field.bands
+        ]
+        self._pool = None if field.level is None else (mi.Float(field.level), mi.Float(field.meniscus))
+        # Opaque, so that another relief of as many bands compiles no new kernel.
+        dr.make_opaque([band.lattice for band in self._bands], self._pool)
+
+    @property
+    def key(self) -> tuple[tuple[bool, ...], bool]:
+        """What of the relief is compiled into the kernel: each band, whether diffuse light sees it; and a film."""
+        return tuple(band.diffused is not None for band in self._bands), self._pool is not None
+
+    def jets_at(self, si: Any, bent: bool = False) -> KernelJets:
+        """Compute the jets at surface points, mitsuba.SurfaceInteraction3f, as `jets` does."""
+        active = si.is_valid()
+        if self._rest is None:
+            return self.jets(si.p, active, bent)
+        return self._rest.carry(si, active, self.jets(self._rest.point(si, active), active, bent))
+
+    def jets(self, p: Any, active: Any, bent: bool = False) -> KernelJets:
+        """Compute the jets at points, mitsuba.Point3f, model frame; with second derivatives if `bent`."""
+        height, gradient, diffused = mi.Float(0), mi.Vector3f(0), mi.Vector3f(0)
+        hessian = [mi.Float(0) for _ in range(6)]
+        for band in self._bands:
+            own = _band(band, mi.Vector3f(p), active, bent)
+            height += own.height
+            gradient += own.gradient
+            diffused += own.diffused
+            if own.hessian is not None:
+                hessian = [total + part for total, part in zip(hessian, own.hessian, strict=True)]
+        return self._fill(KernelJets(height, gradient, diffused, tuple(hessian) if bent else None))
+
+    def pool(self, jets: KernelJets) -> Any:
+        """Return at which lanes a film fills a valley, mitsuba.Bool."""
+        return mi.Bool(False) if self._pool is None else jets.height < self._pool[0]
+
+    def _fill(self, jets: KernelJets) -> KernelJets:
+        """Fill valleys as `ReliefField.fill` does."""
+        if self._pool is None:
+            return jets
+        level, meniscus = self._pool
+        share = dr.rcp(1 + dr.exp(-dr.clip((jets.height - level) / meniscus, -60, 60)))
+        hessian = jets.hessian
+        if hessian is not None:
+            bend, g = share * (1 - share) / meniscus, jets.gradient
+            outer = (g.x * g.x, g.x * g.y, g.x * g.z, g.y * g.y, g.y * g.z, g.z * g.z)
+            hessian = tuple(share * own + bend * product for own, product in zip(hessian, outer, strict=True))
+        return KernelJets(jets.height, share * jets.gradient, jets.diffused, hessian)
+
+
+def turned(si: Any, gradient: Any) -> Any:
+    """Return a copy of surface points with the normal of a relief, N - grad h along the surface, normalised."""
+    copy = mi.SurfaceInteraction3f(si)
+    N, view = si.sh_frame.n, si.to_world(si.wi)
+    m = N - gradient + N * dr.dot(N, gradient)
+    copy.sh_frame = mi.Frame3f(dr.normalize(m))
+    copy.wi = copy.to_local(view)
+    return copy
+
+
+def _stored(coefficients: Array) -> Any:
+    """Store coefficients, mitsuba.UInt64: each node's own and the next along z in one number, for fewer reads."""
+    own = coefficients.astype(np.float32)
+    return mi.UInt64(np.stack([own, np.roll(own, -1, axis=2)], axis=-1).view(np.uint64).ravel())
+
+
+def _modulo(cell: Any) -> Any:
+    """Return whole numbers, mitsuba.Float, modulo `NODES`."""
+    return cell - NODES * dr.floor(cell * (1 / NODES))
+
+
+def _weights(t: Any, bent: bool) -> list[list[Any]]:
+    """Return the four cubic B-splines at a share t of a cell, and their derivatives, as `relief` has them."""
+    one = 1 - t
+    value = [one**3 / 6, 2 / 3 - t**2 + t**3 / 2, 2 / 3 - one**2 + one**3 / 2, t**3 / 6]
+    first = [-(one**2) / 2, -2 * t + 1.5 * t**2, 2 * one - 1.5 * one**2, t**2 / 2]
+    second = [one, 3 * t - 2, 3 * one - 2, t]
+    return [value, first, second] if bent else [value, first]
+
+
+def _band(band: _Band, p: Any, active: Any, bent: bool) -> KernelJets:
+    """Compute one band's jets."""
+    cells = band.lattice @ p
+    corner = dr.floor(cells)
+    weights = [_weights(cells[axis] - corner[axis], bent) for axis in range(3)]
+    # The four nodes along each axis.
+    nodes = [[mi.UInt32(_modulo(corner[axis] + (step - 1))) for step in range(4)] for axis in range(3)]
+    back = band.lattice.T
+    fine = _contract(band.fine, nodes, weights, active, 2 if bent else 1)
+    diffused = mi.Vector3f(0)
+    if band.diffused is not None:
+        diffused = back @ _gradient(_contract(band.diffused, nodes, weights, active, 1))
+    hessian = None
+    if bent:
+        rows = [[fine[_order(i, j)] for j in range(3)] for i in range(3)]
+        whole = back @ mi.Matrix3f(*rows[0], *rows[1], *rows[2]) @ band.lattice
+        hessian = tuple(whole[i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    return KernelJets(fine[0, 0, 0], back @ _gradient(fine), diffused, hessian)
+
+
+def _contract(pairs: Any, nodes: Any, weights: Any, active: Any, order: int) -> dict[Order, Any]:
+    """Sum coefficients times B-splines, for all derivatives up to an order; axis by axis, from z to x."""
+    totals: dict[Order, Any] = {}
+    depths = [mi.Vector4f(*weights[2][k]) for k in range(order + 1)]
+    for a in range(4):
+        plane: dict[tuple[int, int], Any] = {}
+        for b in range(4):
+            row = (nodes[0][a] * NODES + nodes[1][b]) * NODES
+            read = (dr.gather(mi.UInt64, pairs, row + nodes[2][z], active) for z in (0, 2))
+            packet = mi.Vector4f(*(half for pair in read for half in _halves(pair)))
+            for k in range(order + 1):
+                along = dr.dot(packet, depths[k])
+                for j in range(order + 1 - k):
+                    plane[j, k] = dr.fma(weights[1][j][b], along, plane.get((j, k), 0))
+        for (j, k), value in plane.items():
+            for i in range(order + 1 - j - k):
+                totals[i, j, k] = dr.fma(weights[0][i][a], value, totals.get((i, j, k), 0))
+    return totals
+
+
+def _halves(pair: Any) -> list[Any]:
+    """Return the two numbers that one of 64 bits holds."""
+    return [dr.reinterpret_array(mi.Float, mi.UInt32(half)) for half in (pair, pair >> 32)]
+
+
+def _gradient(derivatives: dict[Order, Any]) -> Any:
+    return mi.Vector3f(derivatives[1, 0, 0], derivatives[0, 1, 0], derivatives[0, 0, 1])
+
+
+def _order(i: int, j: int) -> Order:
+    """Return the orders of derivative along x, y, z of the derivative along axes i and j."""
+    return tuple((axis == i) + (axis == j) for axis in range(3))
+
+
+CHANNELS = 3
+
+HEADER = 64
+"""Numbers at the buffer's start; see `_header`."""
+
+PACKET = 4
+"""Numbers that one gather reads."""
+
+TURN, PER_MM, MASK, ROWS, HALF = 32, 50, 51, 52, 53
+"""Where the header holds both lattices' turns, cells over mm, what of a hash is the slot, the first row, and half-sizes
+beyond which vessels are mirrored."""
+
+
+class AlbedoKernel:
+    """Evaluates the albedo of tissue; of a deformed surface `rest` says where the tissue was.
+
+    All numbers of the pattern lie in one buffer. Dr.Jit orders a kernel's arguments at random where there are several,
+    and compiles each order once.
+    """
+
+    def __init__(self, pattern: "TissuePattern") -> None:
+        self.pattern = pattern
+        self.rest: RestMap | None = None
+        lattices = (pattern.mottling, pattern.capillaries)
+        self._nodes = len(pattern.mottling.values)
+        table = pattern.vessels
+        self._is_mirrored = bool((table.half_mm < ENDLESS).any())
+        first = np.zeros(-(-len(table.first) // PACKET) * PACKET, dtype=np.float32)
+        first.view(np.uint32)[: len(table.first)] = table.first
+        parts = [_header(pattern), *(_packets(lattice) for lattice in lattices), first, table.rows.ravel()]
+        # The sizes of all but the last two are the same for all patterns.
+        self._lattices = [sum(map(len, parts[: 1 + i])) // PACKET for i in range(len(lattices))]
+        self._first = sum(map(len, parts[:3]))
+        parts[0].view(np.uint32)[ROWS] = sum(map(len, parts[:4])) // PACKET
+        self._buffer = mi.Float(np.concatenate(parts))
+
+    def of(self, si: Any, active: Any) -> Any:
+        """Compute the albedo, mitsuba.Spectrum, of surface points, mitsuba.SurfaceInteraction3f."""
+        return self.at(si.p if self.rest is None else self.rest.point(si, active), active)
+
+    def at(self, p: Any, active: Any) -> Any:
+        """Compute the albedo, mitsuba.Spectrum, at points of the surface, mitsuba.Point3f, model frame, mm."""
+        p = mi.Vector3f(p)
+        field, net = (self._lattice(i, p, active) for i in range(len(self._lattices)))
+        artery, vein = self._chords(p, active)
+        colour = []
+        for channel in range(CHANNELS):
+            numbers = [self._number(8 * channel + i) for i in range(6)]
+            base, mottled, netted, share, arterial, venous = numbers
+            below = 1 - share * (1 - dr.exp(-arterial * artery))
+            below *= 1 - share * (1 - dr.exp(-venous * vein))
+            colour.append(dr.clip(base * dr.exp(-field * mottled - net * netted) * below, 0, 1))
+        if channels() == CHANNELS:
+            return mi.Spectrum(*colour)
+        return mi.Spectrum(mi.luminance(mi.Color3f(*colour)))
+
+    def _number(self, index: int) -> Any:
+        """Return a number of the header."""
+        return dr.gather(mi.Float, self._buffer, mi.UInt32(index))
+
+    def _whole(self, index: Any, active: Any = True) -> Any:
+        """Return a whole number of the buffer."""
+        return dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._buffer, index, active))
+
+    def _packet(self, index: Any, active: Any) -> Any:
+        return dr.gather(mi.Vector4f, self._buffer, index, active)
+
+    def _chords(self, p: Any, active: Any) -> tuple[Any, Any]:
+        """Compute the chords, mm, through arteries and veins below points; see `SegmentTable.chords`."""
+        if self._is_mirrored:
+            half = mi.Vector3f(*(self._number(HALF + axis) for axis in range(3)))
+            number = dr.round(p / (2 * half))
+            odd = number - 2 * dr.floor(number / 2)
+            p = (p - 2 * number * half) * (1 - 2 * odd)
+        cell = mi.Vector3i(dr.floor(p * self._number(PER_MM)))
+        parts = [mi.UInt32(cell[axis]) * prime for axis, prime in enumerate(PRIMES)]
+        slot = (parts[0] ^ parts[1] ^ parts[2]) & self._whole(mi.UInt32(MASK))
+        row, last = (self._whole(self._first + slot + i, active) for i in range(2))
+        # A row is two packets.
+        rows = self._whole(mi.UInt32(ROWS))
+        row, last = rows + 2 * row, rows + 2 * last
+
+        def step(row: Any, artery: Any, vein: Any) -> tuple[Any, Any, Any]:
+            start, along = self._packet(row, active), self._packet(row + 1, active)
+            gap, d = p - mi.Vector3f(*start[:3]), mi.Vector3f(*along[:3])
+            t = dr.clip(dr.dot(gap, d) / dr.squared_norm(d), 0, 1)
+            inside = dr.maximum(1 - dr.squared_norm(gap - t * d) / (start[3] * start[3]), 0)
+            chord = along[3] * inside * dr.sqrt(inside)
+            return row + 2, dr.maximum(artery, chord), dr.maximum(vein, -chord)
+
+        none = mi.Float(0)
+        _, artery, vein = dr.while_loop((row, none, none), lambda row, *_: mi.Bool(active) & (row < last), step)
+        return artery, vein
+
+    def _lattice(self, which: int, p: Any, active: Any) -> Any:
+        """Interpolate a periodic lattice; see `Lattice.at`."""
+        nodes = self._nodes
+        turn = mi.Matrix3f(*(self._number(TURN + 9 * which + i) for i in range(9)))
+        cells = turn @ p
+        corner = dr.floor(cells)
+        share = cells - corner
+        # The number of nodes is a power of two.
+        x, y, z = (mi.UInt32(cell) & (nodes - 1) for cell in mi.Vector3i(corner))
+        total = mi.Float(0)
+        for up, weight in ((0, 1 - share.x), (1, share.x)):
+            slab = (x + up) & (nodes - 1)
+            low = self._packet(self._lattices[which] + (slab * nodes + y) * nodes + z, active)
+            first, second = dr.lerp(low[0], low[1], share.z), dr.lerp(low[2], low[3], share.z)
+            total += weight * dr.lerp(first, second, share.y)
+        return total
+
+
+def _header(pattern: "TissuePattern") -> npt.NDArray[np.float32]:
+    """Return, 8 numbers for each channel, ground, absorbances, share and absorptions; then what `TURN` etc. say."""
+    header = np.zeros(HEADER, dtype=np.float32)
+    rows = (pattern.base, pattern.mottled, pattern.netted, pattern.share, *pattern.absorption)
+    for i, values in enumerate(rows):
+        header[i : 8 * CHANNELS : 8] = values
+    for i, lattice in enumerate((pattern.mottling, pattern.capillaries)):
+        header[TURN + 9 * i : TURN + 9 * (i + 1)] = lattice.lattice_from_model.ravel()
+    header[PER_MM] = 1 / pattern.vessels.cell_mm
+    header[HALF : HALF + 3] = pattern.vessels.half_mm
+    header.view(np.uint32)[MASK] = pattern.vessels.mask
+    return header
+
+
+def _packets(lattice: "Lattice") -> npt.NDArray[np.float32]:
+    """Return, for each node, the values there and at the next along z, and the same at the next along y."""
+    rows = [np.roll(lattice.values, (-y, -z), axis=(1, 2)) for y in range(2) for z in range(2)]
+    return np.stack(rows, axis=-1).astype(np.float32).ravel()
+
+
+ROW = 8
+"""Packets of a vertex: its position at rest, J^-T, and the second derivatives, upper triangles, padded."""
+
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+class RestMap:
+    """Finds points at rest on a deformed surface, whose mesh is rendered, and carries derivatives from there."""
+
+    def __init__(self, surface: DeformedSurface) -> None:
+        mesh, jets = surface.rest.shape().mesh, surface.vertex_jets
+        assert mesh is not None
+        rows, columns = np.transpose(_UPPER)
+        upper = jets.hessian[:, :, rows, columns].reshape(-1, 18)
+        parts = [mesh.vertices, jets.inverse_transpose.reshape(-1, 9), upper]
+        packed = np.zeros((len(mesh.vertices), PACKET * ROW), dtype=np.float32)
+        packed[:, :30] = np.concatenate(parts, axis=1)
+        self._rows, self._faces = mi.Float(packed.ravel()), mi.UInt32(mesh.faces.astype(np.uint32).ravel())
+
+    def point(self, si: Any, active: Any) -> Any:
+        """Return the points at rest, mitsuba.Point3f, of surface points of the deformed mesh."""
+        return mi.Point3f(*self._numbers(si, active, 0, 3))
+
+    def carry(self, si: Any, active: Any, jets: KernelJets) -> KernelJets:
+        """Return the jets of a height at the deformed surface points, from those at rest."""
+        K = mi.Matrix3f(*self._numbers(si, active, 3, 12))
+        gradient, hessian = K @ jets.gradient, jets.hessian
+        if hessian is not None:
+            second = self._numbers(si, active, 12, 30)
+            # H - sum_i g_i Hess phi_i, by its upper triangle.
+            own = [h - sum(gradient[i] * second[6 * i + n] for i in range(3)) for n, h in enumerate(hessian)]
+            xx, xy, xz, yy, yz, zz = own
+            whole = K @ mi.Matrix3f(xx, xy, xz, xy, yy, yz, xz, yz, zz) @ K.T
+            hessian = tuple(whole[i, j] for i, j in _UPPER)
+        return KernelJets(jets.height, gradient, K @ jets.diffused, hessian)
+
+    def _numbers(self, si: Any, active: Any, first: int, last: int) -> list[Any]:
+        """Interpolate numbers of the vertices' rows between the corners of the hit triangle."""
+        # A mesh without texture coordinates has its barycentric ones there.
+        u, v = si.uv
+        index = dr.select(active, si.prim_index, 0) * 3
+        totals = [mi.Float(0)] * (last - first)
+        for corner, weight in enumerate((1 - u - v, u, v)):
+            row = dr.gather(mi.UInt32, self._faces, index + corner, active) * ROW
+            packets: dict[int, Any] = {}
+            for n in range(first, last):
+                which, part = divmod(n, PACKET)
+                if which not in packets:
+                    packets[which] = dr.gather(mi.Vector4f, self._rows, row + which, active)
+                totals[n - first] = dr.fma(weight, packets[which][part], totals[n - first])
+        return totals
+
+
+def rest_map(surface: SurfaceModel) -> RestMap | None:
+    """Return the map of a deformed surface; None of any other."""
+    return RestMap(surface) if isinstance(surface, DeformedSurface) else None

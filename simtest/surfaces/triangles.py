@@ -1,0 +1,258 @@
+"""Triangle meshes: edges and areas, cuts at edges' middles, and the surfaces that are rendered as such."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from simtest.runtime.arrays import Array, IntArray, Mask
+from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh, in_rows, pack_points
+
+MIN_CLEARANCE_MM = 5.0
+"""A camera in a lumen keeps this distance from the wall if the lumen is wide enough."""
+
+Generator = np.random.Generator
+
+
+def face_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the edges of faces, shape (E, 2), smaller vertex first, and their numbers after each corner, (F, 3)."""
+    codes, span = _edge_codes(faces)
+    # Each edge once, and for each corner which of them it starts
+    found, index = np.unique(codes, return_inverse=True)
+    return np.stack(np.divmod(found, span), axis=1), index.reshape(-1, 3)
+
+
+def edge_uses(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the edges, shape (E, 2), smaller vertex first, and how many faces each belongs to, shape (E,)."""
+    codes, span = _edge_codes(faces)
+    found, uses = np.unique(codes, return_counts=True)
+    return np.stack(np.divmod(found, span), axis=1), uses
+
+
+def _edge_codes(faces: IntArray) -> tuple[IntArray, int]:
+    """Return one number for the edge after each corner, shape (3 F,), the same for both directions, and its base."""
+    pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    span = int(faces.max()) + 1
+    return pairs[:, 0] * span + pairs[:, 1], span
+
+
+def edge_lengths(vertices: Array, faces: IntArray) -> Array:
+    """Return the length of each edge of `edge_uses`, mm, shape (E,)."""
+    edges, _ = edge_uses(faces)
+    return np.asarray(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1))
+
+
+def area_vectors(vertices: Array, faces: IntArray) -> Array:
+    """Return the normals of faces, twice as long as their areas, mm^2, shape (F, 3)."""
+    corners = vertices[faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def vertex_areas(vertices: Array, faces: IntArray) -> Array:
+    """Return the sum of the adjacent faces' areas at each vertex, in any one unit, shape (V,)."""
+    area = np.linalg.norm(area_vectors(vertices, faces), axis=1)
+    return np.asarray(np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices)), dtype=float)
+
+
+def area_quantile(values: Array, vertices: Array, faces: IntArray, share: float) -> float:
+    """Return the value that this share of the surface lies below; values at the vertices, shape (V,), NaN ignored."""
+    weight, known = vertex_areas(vertices, faces), np.isfinite(values)
+    # Values in rising order, against the area that has at most that value
+    order = np.argsort(values[known])
+    filled = np.cumsum(weight[known][order])
+    return float(values[known][order][np.searchsorted(filled, share * filled[-1])])
+
+
+def isoperimetric_quotient(vertices: Array, faces: IntArray) -> float:
+    """Return 36 pi V^2 / A^3 of outward faces, closed by cones from their centroid: 1 for a sphere."""
+    centred = vertices - vertices.mean(axis=0)
+    cross = area_vectors(centred, faces)
+    area = np.linalg.norm(cross, axis=1).sum() / 2
+    # Sum of the signed volumes of the cones from the centroid to the faces
+    volume = np.einsum("ni,ni->n", centred[faces][:, 0], cross).sum() / 6
+    return float(36 * np.pi * volume**2 / area**3)
+
+
+def cut_faces(faces: IntArray, middles: IntArray) -> IntArray:
+    """Cut each triangle into 1 to 4, by how many of its edges have a new vertex; the winding is kept.
+
+    `middles`, of the shape (F, 3) of `faces`, holds the new vertex on the edge from each corner to the next; -1 for
+    none.
+    """
+    count = (middles >= 0).sum(axis=1)
+    parts = [faces[count == 0]]
+    # Rotate the corners of each face: a single halved edge comes first, a single whole edge last.
+    first = np.where(count == 1, np.argmax(middles >= 0, axis=1), np.argmin(middles >= 0, axis=1) + 1) % 3
+    order = (first[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(faces, order, axis=1).T
+    p, q, r = np.take_along_axis(middles, order, axis=1).T  # on ab, bc, ca
+
+    def add(chosen: IntArray, *triangles: tuple[IntArray, IntArray, IntArray]) -> None:
+        parts.extend(np.stack(triangle, axis=1)[chosen] for triangle in triangles)
+
+    add(count == 1, (a, p, c), (p, b, c))
+    add(count == 2, (p, b, q), (a, p, q), (a, q, c))
+    add(count == 3, (a, p, r), (p, b, q), (r, q, c), (p, q, r))
+    return np.concatenate(parts)
+
+
+def rough_edges(
+    normals: Array, edges: IntArray, middle_normals: Callable[[IntArray], Array], limit_deg: float
+) -> IntArray:
+    """Return the numbers of the edges, shape (E, 2), at whose middle the mean of the end normals is wrong.
+
+    `normals`, shape (V, 3), are exact at the vertices; `middle_normals` returns exact ones at the middles of edges, by
+    their numbers. `limit_deg` is the allowed error.
+    """
+    limit, ends = math.radians(limit_deg), normals[edges]
+    # If the end normals nearly agree nothing between can be far off, which settles most edges.
+    tried = np.flatnonzero(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > 10 * limit)
+    return np.asarray(tried[off_between(ends[tried], middle_normals(tried), 0.5, limit_deg)])
+
+
+def off_between(ends: Array, normals: Array, share: float, limit_deg: float) -> Mask:
+    """Return where the normal interpolated along an edge is wrong by more than a limit, shape (N,).
+
+    `ends`, shape (N, 2, 3), are the exact unit normals at both ends, `normals`, shape (N, 3), those at a share of the
+    way from the first to the second.
+    """
+    between = (1 - share) * ends[:, 0] + share * ends[:, 1]
+    between /= np.linalg.norm(between, axis=1, keepdims=True)
+    # By the chord, which grows with the angle up to 180 deg; a sine would fall again beyond 90.
+    return np.asarray(np.linalg.norm(between - normals, axis=1) > 2 * math.sin(math.radians(limit_deg) / 2))
+
+
+def halve(faces: IntArray, index: IntArray, chosen: IntArray, first_vertex: int, edge_count: int) -> IntArray:
+    """Cut faces at the chosen edges, whose middles are the vertices from `first_vertex` on, in the same order."""
+    added = np.full(edge_count, -1, dtype=np.int64)
+    added[chosen] = first_vertex + np.arange(len(chosen))
+    return cut_faces(faces, added[index])
+
+
+class MeshProbe:
+    """Distances to a triangle mesh, whose normals face the space of the camera, and rays against it."""
+
+    def __init__(self, mesh: TriangleMesh) -> None:
+        self._mesh = mesh
+        self._vertices = np.ascontiguousarray(mesh.vertices)
+        self._faces = np.ascontiguousarray(mesh.faces)
+        import igl  # slow to import
+
+        self._tree = igl.AABB()
+        self._tree.init(self._vertices, self._faces)
+
+    def clearance(self, points: Array) -> Array:
+        """Return signed distances of points, mm, by the interpolated normal: also of an open mesh."""
+        squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points))
+        # The normal at the closest point, interpolated in its triangle
+        corners = self._mesh.vertices[self._mesh.faces[face]]
+        weights = _barycentric(closest, corners)
+        normal = np.einsum("nc,nci->ni", weights, self._mesh.normals[self._mesh.faces[face]])
+        side = np.einsum("ni,ni->n", points - closest, normal)
+        return np.where(side >= 0, 1.0, -1.0) * np.sqrt(squared)
+
+    def distance(self, points: Array) -> Array:
+        """Return the unsigned distance of points, shape (N, 3), to the mesh, mm."""
+        squared, _, _ = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points))
+        return np.sqrt(squared)
+
+    def cast(self, origins: Array, directions: Array) -> Array:
+        """Return the distance along unit rays, shape (N, 3), to the first wall, mm; inf if there is none."""
+        face, distance, _ = self._tree.intersect_ray_first(
+            self._vertices, self._faces, np.ascontiguousarray(origins), np.ascontiguousarray(directions)
+        )
+        return np.where(face >= 0, distance, np.inf)
+
+    def targets(self, rng: Generator, count: int) -> tuple[Array, Array]:
+        """Draw points of the mesh, even by area, with unit normals of their faces; two arrays of shape (count, 3)."""
+        corners = self._mesh.vertices[self._mesh.faces]
+        cross = area_vectors(self._mesh.vertices, self._mesh.faces)
+        # A face is drawn in proportion to its area, then a point in it by the square-root rule.
+        cumulative = np.cumsum(np.linalg.norm(cross, axis=1))
+        face = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right").clip(max=len(cross) - 1)
+        a, b = np.sqrt(rng.random(count)), rng.random(count)
+        weights = np.stack([1 - a, a * (1 - b), a * b], axis=1)
+        points = np.einsum("nc,nci->ni", weights, corners[face])
+        return points, cross[face] / np.linalg.norm(cross[face], axis=1, keepdims=True)
+
+    def sites(self, rng: Generator) -> Array:
+        """Draw points well inside a lumen, shape (N, 3): between a random point of the wall and the wall opposite."""
+        points, normals = self.targets(rng, 16)
+        width = self.cast(points + 1e-3 * normals, normals)
+        # The middle of a chord is the safest, other shares add variety; an open end has no chord.
+        width = np.where(np.isfinite(width), width, 2 * MIN_CLEARANCE_MM)
+        shares = np.array([0.25, 0.4, 0.5, 0.6, 0.75])
+        sites = points[:, None] + (shares[None, :, None] * width[:, None, None]) * normals[:, None]
+        return sites.reshape(-1, 3)
+
+
+def _barycentric(points: Array, corners: Array) -> Array:
+    """Return barycentric weights, shape (N, 3), of points in triangles with corners of shape (N, 3, 3)."""
+    a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
+    aa, ab, bb = (np.einsum("ni,ni->n", *pair) for pair in ((a, a), (a, b), (b, b)))
+    pa, pb = np.einsum("ni,ni->n", p, a), np.einsum("ni,ni->n", p, b)
+    determinant = np.maximum(aa * bb - ab * ab, np.finfo(float).tiny)
+    second, third = (bb * pa - ab * pb) / determinant, (aa * pb - ab * pa) / determinant
+    return np.stack([1 - second - third, second, third], axis=1)
+
+
+@dataclass(frozen=True)
+class BuiltMesh(ABC):
+    """A surface's mesh, shared by all its poses."""
+
+    mesh: TriangleMesh  # mm; normals and winding on the camera's side
+    key: str  # Identity of recipe or file, and settings
+
+    @cached_property
+    def probe(self) -> MeshProbe:
+        """Distances and rays for the choice of a pose."""
+        return MeshProbe(self.mesh)
+
+    @property
+    @abstractmethod
+    def shape_operators(self) -> Array:
+        """S at the mesh's vertices for its normals, 1/mm, shape (V, 3, 3)."""
+
+    @abstractmethod
+    def clearance(self, points: Array) -> Array:
+        """Return the signed distance of points, shape (N, 3), to the surface, mm; positive on the camera's side."""
+
+    @abstractmethod
+    def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
+        """Return distance, normal and S of the surface on rays that hit the mesh; NaN if there is no solution."""
+
+    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return the distances of `at_hits` alone."""
+        return self.at_hits(origins, directions, hits)[0]
+
+
+class MeshedSurface(SurfaceModel):
+    """A surface that is rendered as a mesh."""
+
+    _build: BuiltMesh
+
+    def shape(self) -> Shape:
+        """Return the mesh; winding and normals on the camera's side."""
+        return Shape("mesh", False, np.eye(4), self._build.mesh, self._build.key)
+
+    def vertex_shape_operators(self) -> Array:
+        """Return S at the mesh's vertices (see `SurfaceModel.vertex_shape_operators`)."""
+        return self._build.shape_operators
+
+    def clearance(self, points: Array) -> Array:
+        """Return the signed distance to the surface (see `SurfaceModel.clearance`)."""
+        return self._build.clearance(points)
+
+    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return how far along rays the surface lies (see `SurfaceModel.distances`)."""
+        hit = np.flatnonzero(np.isfinite(hits.distance))
+        return in_rows(len(origins), hit, self._build.distances(origins[hit], directions[hit], hits.rows(hit)))[0]
+
+    def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
+        """Return the points where rays meet the surface (see `SurfaceModel.points`)."""
+        hit = np.flatnonzero(np.isfinite(hits.distance))
+        at_hits = self._build.at_hits(origins[hit], directions[hit], hits.rows(hit))
+        return pack_points(origins, directions, *in_rows(len(origins), hit, *at_hits))
