@@ -91,12 +91,14 @@ def stop_between_steps() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[int, int, str], None]]:
+def progress_bar(
+    afterwards: str = "writing the report", stopped: str = ""
+) -> Iterator[Callable[[int, int, str], None]]:
     """Show a bar, or lines, while the body runs, and yield the callable that moves it: (done, total, what).
 
     `afterwards` is what the body does once all steps are done, unless the last step is that of a page (`WRITTEN`):
     nothing follows it. A single step shows no bar. What comes after all steps of a bar, such as the steps of a page,
-    has a bar of its own below.
+    has a bar of its own below. `stopped` is what a stop leaves; default what `main` says of the command.
     """
     display: _Lines | _Bar | None = None
     with stop_between_steps() as check:
@@ -115,6 +117,8 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
 
         try:
             yield move
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(str(stop) or stopped) from None
         finally:
             if display is not None:
                 display.close()
