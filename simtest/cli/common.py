@@ -100,6 +100,13 @@ def _gathered(_: Any, tokens: Sequence[Token]) -> list[str]:
     return [value for token in tokens for value in token.value.split(_SEPARATOR)]
 
 
+def values_of(settings: Sequence[str] | None, **own: Any) -> dict[str, Any]:
+    """Return the values of --set, and those of options of their own where they are given."""
+    from simtest.spec import parse_settings
+
+    return parse_settings(list(settings or [])) | {key: value for key, value in own.items() if value is not None}
+
+
 def named(kind: str, files: bool = False, **options: Any) -> Parameter:
     """Return the parameter of a name that `simtest list` knows, which a shell completes; or of a TOML file."""
 
@@ -347,6 +354,11 @@ def command(function: Callable[..., Told]) -> Callable[..., int]:
     option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
     vars(run)["__signature__"] = given.replace(parameters=[*given.parameters.values(), option])
     return run
+
+
+def fixed(value: float | None, digits: int = 2, missing: str = "") -> str:
+    """Return a number with so many digits behind the point, or what stands for none."""
+    return missing if value is None else f"{value:.{digits}f}"
 
 
 def counted(number: int, one: str, many: str = "") -> str:

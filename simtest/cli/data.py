@@ -24,6 +24,7 @@ from simtest.cli.common import (
     path,
     print_json,
     replacing,
+    values_of,
     whole,
     whole_number,
 )
@@ -70,12 +71,9 @@ def make(
     """
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS, write_dataset
     from simtest.rendering.backend import needs_gpu
-    from simtest.spec import load_dataset, parse_settings
+    from simtest.spec import load_dataset
 
-    values = parse_settings(settings or []) | {
-        key: value for key, value in (("samples", samples), ("seed", seed)) if value is not None
-    }
-    wanted = load_dataset(described, values)
+    wanted = load_dataset(described, values_of(settings, samples=samples, seed=seed))
     with progress_bar("writing the tables") as progress:
         chosen = engine.make(needs_gpu(variant), SHARDS_PER_PROCESS)
         write_dataset(wanted, out, chosen, variant, progress)

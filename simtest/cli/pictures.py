@@ -1,11 +1,13 @@
 """Commands about pictures and cameras: reconstruct, twin, calibrate, camera."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
+from simtest.api import Extras, reconstruct_picture
 from simtest.cli.common import (
     DEFAULTS,
     MOST_ROWS,
@@ -20,6 +22,7 @@ from simtest.cli.common import (
     command_line,
     counted,
     few,
+    fixed,
     path,
     whole,
 )
@@ -48,6 +51,9 @@ MEANING = (
 )
 
 
+NO_EXTRAS = Extras()
+
+
 @command
 def reconstruct(
     image: NamedPath,
@@ -56,17 +62,7 @@ def reconstruct(
     out: Out,
     known: PictureOptions = DEFAULTS,
     roi: Annotated[str | None, about("Region of interest x,y,w,h in px; default: detected.")] = None,
-    reference: Annotated[Path | None, about("Mesh in mm, or depth map, that the normals are compared with.")] = None,
-    reference_format: Annotated[
-        str | None, about("Data set whose map the reference is: c3vd, simcol3d, ucl or endoslam.")
-    ] = None,
-    camera_from_model: Annotated[
-        Path | None, about("Pose of the reference mesh: TOML with matrix, or rotation and translation_mm.")
-    ] = None,
-    depth: Annotated[
-        str | None, about("Depth at which the points of normals.ply stand: mm, or a depth map; default 1.")
-    ] = None,
-    depth_scale: Annotated[float | None, about("mm of one step of an integer depth map.")] = None,
+    extras: Annotated[Extras, Parameter(name="*")] = NO_EXTRAS,
     poses: Annotated[
         Path | None,
         about("Poses of a sequence's frames: views.json, JSON of matrices or a TUM file; tells convex from concave."),
@@ -83,16 +79,13 @@ def reconstruct(
     from simtest.reconstruction.picture import parse_roi
 
     sequence = is_sequence(image)
-    if sequence and (reference or reference_format or camera_from_model or depth):
+    if sequence and any(vars(replace(extras, depth_scale=None)).values()):
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
     if poses and not sequence:
         raise InputError(f"{image}: --poses is for a folder or a film")
     options = known.checked(roi=None if roi is None else parse_roi(roi), poses=poses)
     if sequence:
         return _sequence(image, out, options)
-    from simtest.api import Extras, reconstruct_picture
-
-    extras = Extras(reference, camera_from_model, depth, depth_scale, reference_format)
     record, files = reconstruct_picture(image, out, options, extras)
     return Told(files, record.to_json, _record_parts(record, image))
 
@@ -158,7 +151,7 @@ def _summary(spots: "Sequence[SpecularityRecord]") -> Table:
         stated = [d for s in held if s.best_estimate and (d := s.best_estimate.deviation_deg) is not None]
         flags = Counter(flag for s in held if s.best_estimate for flag in s.best_estimate.flags)
         named = ", ".join(f"{flag} {count}" for flag, count in flags.most_common(MOST_FLAGS))
-        rows.append((kind, best, str(len(held)), f"{median(stated):.2f}" if stated else "", named))
+        rows.append((kind, best, str(len(held)), fixed(median(stated) if stated else None), named))
     return Table(("kind", "best", "n", "median ± deg", "flags"), rows)
 
 
@@ -205,7 +198,7 @@ def count_lines(record: "PictureRecord", image: Path) -> "Iterator[str]":
 
 
 def _pair(mean: float, spread: float | None) -> str:
-    return f"{mean:.2f}" + ("" if spread is None else f" ± {spread:.2f}")
+    return fixed(mean) if spread is None else f"{mean:.2f} ± {spread:.2f}"
 
 
 def _cells(spot: "SpecularityRecord") -> list[str]:
@@ -213,13 +206,10 @@ def _cells(spot: "SpecularityRecord") -> list[str]:
 
     best, published = spot.best_estimate, spot.normals.get("circle_pose")
     x, y = (math.nan, math.nan) if spot.peak_px is None else spot.peak_px
-    deviation = None if best is None else best.deviation_deg
-    margin = None if published is None else published.choice_margin
     return [
-        str(spot.id), f"{x:.1f}", f"{y:.1f}", kind_name(spot.kind), "" if spot.score is None else f"{spot.score:.2f}",
-        spot.best or "none",
-        " ".join(f"{v:+.3f}" for v in best.normal) if best else "", "" if deviation is None else f"{deviation:.2f}",
-        "" if margin is None else f"{margin:.1f}", ", ".join(best.flags) if best else "",
+        str(spot.id), fixed(x, 1), fixed(y, 1), kind_name(spot.kind), fixed(spot.score), spot.best or "none",
+        " ".join(f"{v:+.3f}" for v in best.normal) if best else "", fixed(best.deviation_deg if best else None),
+        fixed(published.choice_margin if published else None, 1), ", ".join(best.flags) if best else "",
     ]  # fmt: skip
 
 
@@ -286,8 +276,8 @@ def _twin_cells(each: "SpotTwins") -> list[str]:
     x, y = spot.peak_px
     low, high = twins.interval_deg
     return [
-        str(spot.index), f"{x:.1f}", f"{y:.1f}", f"{spot.radius_px:.1f}", spot.estimator,
-        "" if each.stated_deg is None else f"{each.stated_deg:.2f}", f"{twins.rms_deg:.2f}",
+        str(spot.index), fixed(x, 1), fixed(y, 1), fixed(spot.radius_px, 1), spot.estimator,
+        fixed(each.stated_deg), fixed(twins.rms_deg),
         f"{low:.2f} to {high:.2f}", "" if twins.coverage is None else f"{100 * twins.coverage:.0f} %",
     ]  # fmt: skip
 
@@ -409,22 +399,18 @@ def _camera_parts(shown: "dict[str, Any]") -> "Iterator[str | Table]":
     yield f"lens: {shown['lens']}{''.join(f', {name} {value:.6g}' for name, value in told.items())}"
     if (mask := shown.get("view_mask")) is not None:
         yield f"view mask: {', '.join(f'{name} {value:.6g}' for name, value in mask.items())} px"
-    spans = ", ".join(f"{name} {_cell(value, 2)}" for name, value in shown["fov_deg"].items())
+    spans = ", ".join(f"{name} {fixed(value, missing='none')}" for name, value in shown["fov_deg"].items())
     yield f"field of view, deg: {spans}"
     rows = [
         [
             each["at"],
             "{:.0f}, {:.0f}".format(*each["pixel"]),
-            _cell(each["angle_deg"], 2) if each["in_view"] else "outside the view",
-            _cell(each["moved_px"], 1) if each["in_view"] else "",
+            fixed(each["angle_deg"], 2, "none") if each["in_view"] else "outside the view",
+            fixed(each["moved_px"], 1, "none") if each["in_view"] else "",
         ]
         for each in shown["border"]
     ]
     yield Table(["border", "pixel", "deg off the axis", "px from a pinhole's"], rows)
-
-
-def _cell(value: "float | None", digits: int) -> str:
-    return "none" if value is None else f"{value:.{digits}f}"
 
 
 @camera.command

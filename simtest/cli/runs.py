@@ -34,6 +34,7 @@ from simtest.cli.common import (
     path,
     read_guide,
     run_record,
+    values_of,
     whole,
 )
 from simtest.cli.main import MANNERS
@@ -81,14 +82,12 @@ def validate(
     """
     from simtest.api import validate as run
     from simtest.rendering.backend import needs_gpu
-    from simtest.spec import load_experiment, parse_settings
+    from simtest.spec import load_experiment
     from simtest.validation.mesh_verdicts import mesh_verdicts
 
     if Path(experiment).suffix.lower() in MESHES:
         raise InputError(f"{experiment}: is a mesh; use simtest validate mesh --set surface.path={experiment}")
-    values = parse_settings(settings or [])
-    own = {"realisations": realisations, "seed": seed, "estimators": estimators, "viewpoints": views}
-    values |= {key: value for key, value in own.items() if value is not None}
+    values = values_of(settings, realisations=realisations, seed=seed, estimators=estimators, viewpoints=views)
     described = load_experiment(experiment, values)
     meshes = mesh_verdicts(described)
     for mesh in meshes:

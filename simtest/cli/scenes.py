@@ -23,6 +23,7 @@ from simtest.cli.common import (
     print_json,
     replacing,
     seed_number,
+    values_of,
     whole,
 )
 from simtest.cli.main import MANNERS
@@ -40,11 +41,10 @@ def render(scene: SceneName, /, *, out: Out, settings: Settings = None, variant:
     """
     from simtest import api
     from simtest.simulation.frame_files import write_frame
-    from simtest.spec import parse_settings
 
     with exclusive_folder(out):
         with progress_bar("finding the truth", stopped="nothing is written") as move:
-            frame = api.render(scene, parse_settings(settings or []), variant, move)
+            frame = api.render(scene, values_of(settings), variant, move)
         files = write_frame(frame, out)
     return Told(files, lambda: {"highlights": len(frame.highlights)})
 
@@ -73,11 +73,10 @@ def views(
     With --along, a film along the camera path instead. The poses are written for other programs, too.
     """
     from simtest import api
-    from simtest.spec import parse_settings
 
     ends = None if along is None else _ends(along)
     with progress_bar("sampling views") as move:
-        sampled = api.sample_views(scene, out, count, parse_settings(settings or []), variant, move, ends, fps, labels)
+        sampled = api.sample_views(scene, out, count, values_of(settings), variant, move, ends, fps, labels)
     with_one = sum(view.isolated_highlights > 0 for view in sampled.views)
     counts = {"tried": sampled.tried, "kept": len(sampled.views), "with_isolated_highlight": with_one}
     lines = [
@@ -116,9 +115,9 @@ def view(
         write_scene_page,
     )
     from simtest.report.viewer.content import PAGE_GRID
-    from simtest.spec import load_scene, parse_settings
+    from simtest.spec import load_scene
 
-    described = load_scene(scene, parse_settings(settings or []))
+    described = load_scene(scene, values_of(settings))
     if page is not None:
         check_page(page)
     if screenshot is not None or page is None:
@@ -138,9 +137,8 @@ def view(
 def export(scene: SceneName, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> Told:
     """Write a scene as files that Mitsuba itself loads: scene.xml, and surface.ply where the surface is a mesh."""
     from simtest import api
-    from simtest.spec import parse_settings
 
-    return Told(api.export(scene, out, parse_settings(settings or []), variant))
+    return Told(api.export(scene, out, values_of(settings), variant))
 
 
 Kind = Literal["scenes", "experiments", "datasets", "profiles", "estimators", "detectors", "sensors", "rigs"]
@@ -311,7 +309,6 @@ def liver(*, options: Recipe) -> Told:
 
 
 def _make(kind: Literal["colon", "liver"], given: Recipe) -> Told:
-    from simtest.spec import parse_settings
     from simtest.surfaces.factory import make_mesh
     from simtest.surfaces.mesh_file import check_target, write_mesh
     from simtest.surfaces.recipe import load_anatomy
@@ -319,7 +316,7 @@ def _make(kind: Literal["colon", "liver"], given: Recipe) -> Told:
     check_target(given.out)
     if given.curvature and given.out.suffix.lower() != ".ply":
         raise InputError(f"--curvature: {given.out.suffix} files hold none; allowed: .ply")
-    anatomy = load_anatomy(kind, given.recipe, given.seed, parse_settings(given.settings or []))
+    anatomy = load_anatomy(kind, given.recipe, given.seed, values_of(given.settings))
     with exclusive_file(given.out):
         made, k_min, k_max = make_mesh(anatomy, given.edge_mm)
         write_mesh(given.out, made, {"k_min": k_min, "k_max": k_max} if given.curvature else None)
