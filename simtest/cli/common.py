@@ -313,24 +313,25 @@ def few(lines: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class Told:
-    """What a command has done: what --json prints, what the terminal shows, and the exit code.
+    """What a command has done: files that it wrote, the record for --json, parts for the terminal, the exit code.
 
-    The files are the last lines of the terminal, and the last key of the JSON document.
+    A record and a part may be a function that makes it, or prints it: what is not printed is not made. The files are
+    the last lines of the terminal, and the last key of the JSON document.
     """
 
     files: Sequence[object] = ()
-    data: Callable[[], Any] | None = None
+    data: Any = None
     parts: "Iterable[str | Path | Table | Callable[[], None]]" = ()
     code: int = 0
 
     def print(self, as_json: bool) -> None:
-        """Print it; what is not printed is not made."""
+        """Print it as one JSON document, or for people."""
         if as_json:
-            content = self.data() if self.data else {}
+            data = self.data() if callable(self.data) else self.data
             if self.files:
-                content = {**content, "files": [str(file) for file in self.files]}
-            if self.data or self.files:
-                print_json(content)
+                data = {**(data or {}), "files": [str(file) for file in self.files]}
+            if data is not None:
+                print_json(data)
             return
         for part in (*self.parts, *self.files):
             if isinstance(part, Table):

@@ -77,7 +77,7 @@ def make(
     with progress_bar("writing the tables") as progress:
         chosen = engine.make(needs_gpu(variant), SHARDS_PER_PROCESS)
         write_dataset(wanted, out, chosen, variant, progress)
-    return Told([out / "README.md"], lambda: {"dataset": wanted.name, "samples": wanted.samples})
+    return Told([out / "README.md"], {"dataset": wanted.name, "samples": wanted.samples})
 
 
 @dataset.command
@@ -137,7 +137,7 @@ def sample(
     verdict = compare(folder, index, target)
     same = verdict.endswith("same bytes")
     record = {"same": same, "verdict": verdict, "files": files}
-    return Told(data=lambda: record, parts=[*files, verdict], code=0 if same else 1)
+    return Told(data=record, parts=[*files, verdict], code=0 if same else 1)
 
 
 @dataset.command

@@ -102,7 +102,7 @@ def _sequence(source: Path, out: Path, options: "Options") -> Told:
     found = counted(made.specularities, "specularity", "specularities")
     lines = [f"{counted(made.frames, 'frame')}{unread}: {found}, {made.tracks} seen in several frames"]
     parts = (*assumed_lines(made.assumed), *lines, *([made.motion] if made.motion else []))
-    return Told(made.files, lambda: asdict(made), parts)
+    return Told(made.files, asdict(made), parts)
 
 
 def _record_parts(record: "PictureRecord", image: Path) -> "Iterator[str | Table]":
@@ -386,7 +386,7 @@ def show(file: Path, /, *, view_radius: ViewRadius = None) -> Told:
 
     shown = camera_summary(load_camera(file, view_radius))
     shown = {"file": str(file), "format": FORMATS[recognise(file)].title, **shown}
-    return Told(data=lambda: shown, parts=_camera_parts(shown))
+    return Told(data=shown, parts=_camera_parts(shown))
 
 
 def _camera_parts(shown: "dict[str, Any]") -> "Iterator[str | Table]":

@@ -344,7 +344,7 @@ def accept(
     accepted = accept_night(folder, name, reason)
     told = {"baseline": accepted.id, "profile": accepted.profile, "reason": accepted.reason, "note": note}
     line = f"{accepted.id} is the baseline of {accepted.profile}: {accepted.reason}"
-    return Told(data=lambda: told, parts=[note, line] if note else [line])
+    return Told(data=told, parts=[note, line] if note else [line])
 
 
 def _cores() -> int:
@@ -416,7 +416,7 @@ def run(
         else:
             how.refuse(name=name)
             made = run_bench(read, core, out, parts, chosen, progress)
-    return Told([made.certificate], lambda: made.content, _part_rows(made.content))
+    return Told([made.certificate], made.content, _part_rows(made.content))
 
 
 @bench.command
@@ -468,7 +468,7 @@ def cases(*, suite: SuiteVersion = "v1") -> Told:
     ]
     record = {"suite": read.spec.name, "version": suite, "sha256": read.digest, "cases": read.hashes}
     title = f"{read.spec.title}: {read.digest}"
-    return Told(data=lambda: record, parts=[Table(("case", "scenes", "frames", "sha256"), rows, title)])
+    return Told(data=record, parts=[Table(("case", "scenes", "frames", "sha256"), rows, title)])
 
 
 def _part_rows(content: dict[str, Any]) -> "Iterator[str | Table]":

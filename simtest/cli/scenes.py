@@ -46,7 +46,7 @@ def render(scene: SceneName, /, *, out: Out, settings: Settings = None, variant:
         with progress_bar("finding the truth", stopped="nothing is written") as move:
             frame = api.render(scene, values_of(settings), variant, move)
         files = write_frame(frame, out)
-    return Told(files, lambda: {"highlights": len(frame.highlights)})
+    return Told(files, {"highlights": len(frame.highlights)})
 
 
 @command
@@ -84,7 +84,7 @@ def views(
         *(f"left out: {number} ({reason})" for reason, number in sampled.rejected.items()),
         *(f"not written: {reason}" for reason in sampled.poses_left_out),
     ]
-    return Told([out / "views.json"], lambda: counts | {"left_out": sampled.rejected}, lines)
+    return Told([out / "views.json"], counts | {"left_out": sampled.rejected}, lines)
 
 
 def _ends(text: str) -> tuple[float, float]:
@@ -168,7 +168,7 @@ def listing(kind: Kind | None = None, /) -> Told:
         What to list; default everything.
     """
     found = {each: names_of(each) for each in HEADINGS if kind in (None, each)}
-    return Told(data=lambda: found, parts=_listed(found, kind is None))
+    return Told(data=found, parts=_listed(found, kind is None))
 
 
 def _listed(found: dict[str, dict[str, str]], has_headings: bool) -> Iterator[str]:
@@ -278,7 +278,7 @@ def check(
     if not 0.1 <= distance <= 1e4:
         raise InputError(f"--distance {distance:g}: must be 0.1 to 10000 mm")
     verdict = check_mesh(file, distance, concentration(exponent, roughness), kind)
-    return Told(data=lambda: verdict, parts=verdict.lines(), code=0 if verdict.usable else 1)
+    return Told(data=verdict, parts=verdict.lines(), code=0 if verdict.usable else 1)
 
 
 @Parameter(name="*")
@@ -321,4 +321,4 @@ def _make(kind: Literal["colon", "liver"], given: Recipe) -> Told:
         made, k_min, k_max = make_mesh(anatomy, given.edge_mm)
         write_mesh(given.out, made, {"k_min": k_min, "k_max": k_max} if given.curvature else None)
     told = {"file": str(given.out), "vertices": len(made.vertices), "faces": len(made.faces)}
-    return Told(data=lambda: told, parts=["{file}: {vertices} vertices, {faces} faces".format_map(told)])
+    return Told(data=told, parts=["{file}: {vertices} vertices, {faces} faces".format_map(told)])
