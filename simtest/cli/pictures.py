@@ -29,6 +29,7 @@ from simtest.cli.common import (
 from simtest.cli.main import MANNERS
 from simtest.cli.progress import progress_bar
 from simtest.errors import InputError
+from simtest.runtime.files import check_count
 from simtest.runtime.locks import exclusive_file, exclusive_folder
 
 if TYPE_CHECKING:
@@ -213,7 +214,7 @@ def _cells(spot: "SpecularityRecord") -> list[str]:
     ]  # fmt: skip
 
 
-FEWEST, MOST = 1, 1000
+MOST_FRAMES = 1000
 
 
 @command
@@ -240,8 +241,8 @@ def twin(
     from simtest.advice.twin.run import twin_picture
     from simtest.advice.twin.writing import to_json, write_twins
 
-    if frames is not None and not FEWEST <= frames <= MOST:
-        raise InputError(f"--frames {frames}: must be {FEWEST} to {MOST}")
+    if frames is not None:
+        check_count(frames, "--frames", MOST_FRAMES)
     options, line = known.checked(), command_line()
     with exclusive_folder(out):
         with progress_bar("writing the page") as progress:

@@ -118,10 +118,12 @@ def progress_bar(
         try:
             yield move
         except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt(str(stop) or stopped) from None
+            if stopped and not str(stop):
+                raise KeyboardInterrupt(stopped) from None
+            raise
         finally:
-            if display is not None:
-                display.close()
+            if isinstance(display, _Bar):
+                display.bar.stop()
 
 
 def at_terminal() -> bool:
@@ -146,9 +148,6 @@ class _Lines:
         about = f", about {left:.0f} s left" if left and done < total else ""
         print(f"simtest: {done}/{total} {what} ({passed:.0f} s{about})", file=sys.stderr, flush=True)
 
-    def close(self) -> None:
-        """Do nothing: the command says what came of it."""
-
 
 class _Bar:
     """A bar for each stretch of the work."""
@@ -167,10 +166,6 @@ class _Bar:
         seconds = self.remaining.seconds(done, total, time.monotonic())
         left = f"about {timedelta(seconds=round(seconds))} left" if seconds and done < total else ""
         self.bar.update(self.task, completed=done, total=total, description=what, left=left)
-
-    def close(self) -> None:
-        """Leave the bar as it stands."""
-        self.bar.stop()
 
 
 def _rich_bar() -> "Progress":
