@@ -29,21 +29,11 @@ LARGEST_STEP_MM = 20.0
 
 @dataclass(frozen=True)
 class Highlights:
-    """Measured highlights of all pictures.
+    """Measured highlights of all pictures."""
 
-    Parameters
-    ----------
-    view : ndarray of int, shape (N,)
-        Number of the picture.
-    pixels : ndarray, shape (N, 2)
-        Centres, px.
-    covariance : ndarray, shape (N, 2, 2)
-        Of the centres, px^2.
-    """
-
-    view: Index
-    pixels: Array
-    covariance: Array
+    view: Index  # (N,): number of the picture
+    pixels: Array  # (N, 2): centres, px
+    covariance: Array  # (N, 2, 2): of the centres, px^2
 
     def __len__(self) -> int:
         """Return the number of highlights."""
@@ -52,27 +42,13 @@ class Highlights:
 
 @dataclass(frozen=True)
 class Bundle:
-    """Lights that explain assigned highlights.
+    """Lights that explain assigned highlights."""
 
-    Parameters
-    ----------
-    lights : ndarray, shape (S, 3)
-        mm, camera frame.
-    covariance : ndarray, shape (3 S, 3 S)
-        mm^2, if the stated errors of highlights and mirrors hold.
-    z : ndarray, shape (V, 3)
-        Fitted errors of the mirrors, in their standard deviations.
-    chi2 : float
-        Sum of squared residuals in their standard deviations.
-    freedom : int
-        Its degrees of freedom.
-    """
-
-    lights: Array
-    covariance: Array
-    z: Array
-    chi2: float
-    freedom: int
+    lights: Array  # (S, 3): mm, camera frame
+    covariance: Array  # (3 S, 3 S): mm^2, if the stated errors of highlights and mirrors hold
+    z: Array  # (V, 3): fitted errors of the mirrors, in their standard deviations
+    chi2: float  # sum of squared residuals in their standard deviations
+    freedom: int  # its degrees of freedom
 
     def covariance_of(self, source: int) -> Array:
         """Return the covariance of one light, shape (3, 3), mm^2."""

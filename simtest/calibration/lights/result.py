@@ -32,24 +32,12 @@ FOREIGN_SURE = 3.0
 
 @dataclass(frozen=True)
 class MeasuredLight:
-    """A light.
+    """A light."""
 
-    Parameters
-    ----------
-    position_mm : ndarray, shape (3,)
-        Camera frame.
-    covariance_mm2 : ndarray, shape (3, 3)
-        Of the position, residuals and the errors of radius and camera included.
-    pictures : int
-        How many pictures show its highlight.
-    is_foreign : bool
-        Whether it lies farther from the camera than any light of an endoscope: a lamp or a window.
-    """
-
-    position_mm: Array
-    covariance_mm2: Array
-    pictures: int
-    is_foreign: bool
+    position_mm: Array  # (3,): camera frame
+    covariance_mm2: Array  # (3, 3): of the position, residuals and the errors of radius and camera included
+    pictures: int  # how many pictures show its highlight
+    is_foreign: bool  # whether it lies farther from the camera than any light of an endoscope: a lamp or a window
 
     @property
     def half_widths_mm(self) -> Array:
@@ -59,37 +47,17 @@ class MeasuredLight:
 
 @dataclass(frozen=True)
 class LightCalibration:
-    """The lights, and how well they explain the highlights.
+    """The lights, and how well they explain the highlights."""
 
-    Parameters
-    ----------
-    lights : tuple of MeasuredLight
-        By their distance from the camera.
-    source : ndarray of int, shape (N,)
-        Which light made each highlight; -1: none.
-    residuals_px : ndarray, shape (N, 2)
-        Measured less predicted centre; NaN where no light made it.
-    predicted_px : ndarray, shape (V, S, 2)
-        Where each picture should show each light.
-    chi2, freedom : float, int
-        Of the fit.
-    inflation : float
-        Factor, at least 1, by which the residuals have widened all covariances.
-    notes : tuple of str
-        What is to be known about the result.
-    problems : tuple of str
-        Why it must not be used; empty: it may be.
-    """
-
-    lights: tuple[MeasuredLight, ...]
-    source: npt.NDArray[np.intp]
-    residuals_px: Array
-    predicted_px: Array
-    chi2: float
-    freedom: int
-    inflation: float
-    notes: tuple[str, ...]
-    problems: tuple[str, ...]
+    lights: tuple[MeasuredLight, ...]  # by their distance from the camera
+    source: npt.NDArray[np.intp]  # (N,): which light made each highlight; -1: none
+    residuals_px: Array  # (N, 2): measured less predicted centre; NaN where no light made it
+    predicted_px: Array  # (V, S, 2): where each picture should show each light
+    chi2: float  # of the fit
+    freedom: int  # of the fit
+    inflation: float  # factor, at least 1, by which the residuals have widened all covariances
+    notes: tuple[str, ...]  # what is to be known about the result
+    problems: tuple[str, ...]  # why it must not be used; empty: it may be
 
     @property
     def rms_px(self) -> float:

@@ -66,24 +66,14 @@ DISTINCT = chi_squared.quantile(0.9999, 3)
 
 @dataclass(frozen=True)
 class Found:
-    """Lights, and which one made each highlight.
+    """Lights, and which one made each highlight."""
 
-    Parameters
-    ----------
-    bundle : Bundle
-        The fit.
-    source : ndarray of int, shape (N,)
-        Number of the light of each highlight; -1: none.
-    others : ndarray, shape (A, 3)
-        Positions, mm, of another set of lights that explains the highlights about as well: the result is ambiguous.
-    further : ndarray, shape (B, 3)
-        Positions, mm, that explain three or more of the highlights left, but too few for a light.
-    """
-
-    bundle: Bundle
-    source: Labels
+    bundle: Bundle  # the fit
+    source: Labels  # (N,): number of the light of each highlight; -1: none
+    # (A, 3): positions, mm, of another set of lights that explains the highlights about as well: the result is
+    # ambiguous.
     others: Array
-    further: Array
+    further: Array  # (B, 3): positions, mm, that explain three or more of the highlights left, but too few for a light
 
 
 class _Views(NamedTuple):
