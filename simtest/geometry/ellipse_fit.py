@@ -85,12 +85,9 @@ class FittedConic:
         T = self.normalised_from_image
         return np.asarray(T.T @ self.normalised @ T)
 
-    def centre_and_matrix(self) -> tuple[Array, Array]:
-        """Return centre, px, and Q of the ellipse as (x - centre)^T Q (x - centre) = 1."""
-        return self._centre_and_matrix
-
     @cached_property
-    def _centre_and_matrix(self) -> tuple[Array, Array]:
+    def centre_and_matrix(self) -> tuple[Array, Array]:
+        """Centre, px, and Q of the ellipse as (x - centre)^T Q (x - centre) = 1."""
         C, T = self.normalised, self.normalised_from_image
         centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
         level = -(C[2, 2] + C[:2, 2] @ centre)
@@ -99,7 +96,7 @@ class FittedConic:
 
     def relative_radii(self, points: Array) -> Array:
         """Return the distance of points, shape (N, 2), px, from the centre over the ellipse's radius that way."""
-        centre, Q = self.centre_and_matrix()
+        centre, Q = self.centre_and_matrix
         gap = points - centre
         return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", gap, Q, gap)))
 

@@ -86,15 +86,12 @@ class LevelSet:
     # these count.
     sound: Mask | None = None
 
+    @cached_property
     def polygon(self) -> Array:
-        """Return the crossings in order, shape (N + 1, 2), the first repeated at the end, integer-centred.
+        """The crossings in order, shape (N + 1, 2), the first repeated at the end, integer-centred.
 
         A pixel whose value is the level is passed each time that the border comes to it.
         """
-        return self._polygon
-
-    @cached_property
-    def _polygon(self) -> Array:
         # Traced on the region itself: on the values, contours that meet at such a pixel would separate there.
         (middles,) = find_contours(self.inside.astype(float), 0.5)
         first, last = np.floor(middles).astype(int), np.ceil(middles).astype(int)

@@ -9,11 +9,10 @@ lights alone, whose inverse normal matrix is the covariance of the joint problem
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from simtest.calibration.lights.mirrors import Index, Mirrors
+from simtest.calibration.lights.mirrors import Mirrors
 from simtest.geometry.camera import Camera
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, Index
 
 REACH_MM = 30.0
 """A light of an endoscope lies about so far from the camera, at most. A prior of this standard deviation along each
@@ -76,9 +75,7 @@ def derivatives(camera: Camera, mirrors: Mirrors, view: Index, lights: Array, z:
     return mirrors.predict(camera, view, lights, z), along(STEP_MM, 0.0), along(0.0, STEP_Z)
 
 
-def solve(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, source: npt.NDArray[np.intp], start: Array
-) -> Bundle | None:
+def solve(camera: Camera, mirrors: Mirrors, highlights: Highlights, source: Index, start: Array) -> Bundle | None:
     """Fit lights to highlights by Gauss-Newton steps from `start`, (S, 3), mm, the mirror errors eliminated.
 
     `source`, (N,), says which light made each highlight; negative: none, it is left out. None where a step leads to
@@ -102,7 +99,7 @@ def solve(
 
 
 def _normal_equations(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, source: npt.NDArray[np.intp],
+    camera: Camera, mirrors: Mirrors, highlights: Highlights, source: Index,
     kept: Index, at: tuple[Array, Array],
 ) -> tuple[Array, Array, float, Array]:  # fmt: skip
     """Return the normal matrix and gradient in the lights, chi-squared, and the mirror errors at these lights."""

@@ -9,13 +9,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import basis_across
-from simtest.runtime.arrays import Array
-
-Index = npt.NDArray[np.intp]
+from simtest.runtime.arrays import Array, Index
 
 NEWTON_STEPS = 8
 """From the start that is used, angles of incidence converge to rounding in at most five."""

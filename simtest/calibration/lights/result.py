@@ -5,14 +5,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration.lights.bundle import REACH_MM, Bundle, Highlights, solve
 from simtest.calibration.lights.mirrors import Mirrors
 from simtest.calibration.lights.search import Found
 from simtest.geometry import chi_squared
 from simtest.geometry.camera import Camera
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, Index
 from simtest.runtime.statistics import NORMAL_QUANTILE
 
 UNLIKELY = 1e-3
@@ -50,7 +49,7 @@ class LightCalibration:
     """The lights, and how well they explain the highlights."""
 
     lights: tuple[MeasuredLight, ...]  # by their distance from the camera
-    source: npt.NDArray[np.intp]  # (N,): which light made each highlight; -1: none
+    source: Index  # (N,): which light made each highlight; -1: none
     residuals_px: Array  # (N, 2): measured less predicted centre; NaN where no light made it
     predicted_px: Array  # (V, S, 2): where each picture should show each light
     chi2: float  # of the fit
@@ -75,13 +74,9 @@ def judge(
 ) -> LightCalibration:
     """Return what was found, with its intervals and what is doubtful about it.
 
-    Parameters
-    ----------
-    radius_sd_share : float
-        Standard deviation of the ball's radius as a share of it. A scene and its scaled copy give the same pictures,
-        so each position is wrong by the same share, which no residual shows.
-    further : ndarray, shape (3 S, 3 S)
-        Covariance by errors that are common to all pictures (`covariance_of_variations`), mm^2.
+    `radius_sd_share` is the standard deviation of the ball's radius as a share of it: a scene and its scaled copy give
+    the same pictures, so each position is wrong by the same share, which no residual shows. `further` is from
+    `covariance_of_variations`.
     """
     bundle = found.bundle
     inflation = max(1.0, bundle.chi2 / bundle.freedom) if bundle.freedom > 0 else 1.0
@@ -182,10 +177,7 @@ def covariance_of_variations(
 ) -> Array:
     """Return the covariance of the lights by errors that are common to all pictures, shape (3 S, 3 S), mm^2.
 
-    Parameters
-    ----------
-    variations : iterable of tuple
-        Camera and mirrors as they are if one of several independent errors is one standard deviation.
+    Each variation is camera and mirrors as they are if one of several independent errors is one standard deviation.
     """
     size = found.bundle.lights.size
     total = np.zeros((size, size))

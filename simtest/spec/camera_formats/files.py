@@ -168,11 +168,6 @@ def read_poses(path: str | Path) -> Poses:
 
     Axes are OpenCV's: x right, y down, z forward. The unit of length is the file's: COLMAP's and NeRF's is arbitrary,
     Kalibr's is made mm.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed, or its format holds no poses.
     """
     path, _ = split_id(path)
     form = FORMATS[recognise(path)]
