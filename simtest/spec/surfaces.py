@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from simtest.runtime.arrays import Array
+from simtest.runtime.fitted import fitted_number
 from simtest.runtime.resources import find
 from simtest.spec.spec_model import Coordinate, Curvature, Millimetres, Share, Spec
 
@@ -18,8 +19,7 @@ MAX_HEIGHT_MM = 0.3
 MAX_DEVIATIONS = 3.0
 """Standard deviations of a gaussian height that are taken as its peak: 99.7 % of the surface stay within."""
 
-PEAK_PER_SLOPE = {"ridged": 1.33, "pits": 2.4}
-"""What 99.7 % of the heights stay within, over slope (rad) and wavelength: measured, much the same for all widths."""
+PEAK_PER_SLOPE = {"ridged": fitted_number("relief_peak.ridged"), "pits": fitted_number("relief_peak.pits")}
 
 Component = Annotated[float, Field(ge=-1e3, le=1e3)]
 Direction = tuple[Component, Component, Component]
