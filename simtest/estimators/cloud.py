@@ -7,7 +7,7 @@ import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors, exactly
 from simtest.errors import Failure, Reason
-from simtest.estimators.budget import CONFIDENCE, Budget, equivalent_covariance
+from simtest.estimators.budget import Budget, equivalent_covariance
 from simtest.estimators.cloud_base import MOST_EXTENT, BaseEvidence, evidence_of
 from simtest.estimators.cloud_mixture import (
     CLUMPING,
@@ -28,6 +28,7 @@ from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Array, Camera, chi_squared
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.fitted import fitted_number
+from simtest.runtime.statistics import CONFIDENCE
 
 LEAST_SPOTS = 6
 """A cloud of fewer spots gets no answer: a lone large highlight is a cloud of one."""

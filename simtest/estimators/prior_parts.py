@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Normal, Priors
 from simtest.calibration.priors import AT_CAMERA_MM
-from simtest.estimators.budget import CONFIDENCE, equivalent_covariance
+from simtest.estimators.budget import equivalent_covariance
 from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.near_misses import near_miss_parts
@@ -22,6 +22,7 @@ from simtest.geometry import Array, Camera, chi_squared
 from simtest.geometry.lenses import undistort_with_errors
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
 from simtest.runtime.fitted import fitted_number
+from simtest.runtime.statistics import CONFIDENCE
 
 NEAR_SHARE = 0.05
 """Share of the distances that are nearer than the one at which a told light's offset must be negligible."""

@@ -17,6 +17,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.ellipse_fit import FittedConic, FittedConics
 from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.statistics import CONFIDENCE
 
 _ROUND = np.diag([1.0, 1.0, -1.0])
 
@@ -25,8 +26,6 @@ _HUGE = 1e100
 FORWARD: Array = np.array([0.0, 0.0, 1.0])
 
 FORWARD.flags.writeable = False
-
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
