@@ -16,7 +16,6 @@ from simtest.runtime.resources import data_root
 from simtest.spec import AnatomySurface, Scene, load_scene, scene_from_dict
 from simtest.spec.toml_files import toml_tables, toml_value
 from simtest.surfaces.recipe import load_recipe
-from simtest.validation.rough_truth import shown
 
 Tables = dict[str, Any]
 
@@ -209,7 +208,7 @@ def unfrozen_keys(case: FrozenCase) -> list[str]:
     frozen = _flat(case.scene)
     for path, value in frozen.items():
         if now.get(path) != value:
-            raise InputError(f"{shown(case.file)}: {path} = {value!r} is read as {now.get(path)!r}")
+            raise InputError(f"{case.file}: {path} = {value!r} is read as {now.get(path)!r}")
     return sorted(now.keys() - frozen.keys())
 
 

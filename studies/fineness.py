@@ -1,6 +1,6 @@
 """Measure what triangulation alone does to a highlight: python -m studies.fineness OUT.png OUT.json [--quick].
 
-OUT.json, as shipped simtest/report/fineness.json, is what the page of a run over anatomies shows.
+OUT.json, as shipped simtest/report/triangle_cost.json, is what the page of a run over anatomies shows.
 
 A highlight (Phong, camera and light together) on a patch of known shape is traced on triangles of several edge lengths,
 shaded with flat normals, with normals interpolated between exact vertex normals, and between vertex normals estimated

@@ -102,7 +102,7 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
         main = write_experiment(main_experiment(question), out / MAIN)
         # The frame first: what cannot be rendered is found before the long part.
         frame = make_frame(load_scene(write_scene(question, main, out / SCENE)))
-    except InputError:
+    except (InputError, OSError):
         for path in written:
             path.unlink(missing_ok=True)
         raise

@@ -196,11 +196,6 @@ def _schemas(plan: Plan) -> dict[str, dict[str, pl.DataType]]:
     return {SAMPLES: of_samples, HIGHLIGHTS: _schema(HighlightRow), ESTIMATES: of_estimates}
 
 
-def table_columns(plan: Plan) -> dict[str, dict[str, str]]:
-    """Return the columns of each table of a dataset, with the name of their type."""
-    return {name: {column: str(kind) for column, kind in schema.items()} for name, schema in _schemas(plan).items()}
-
-
 def _stored(path: Path) -> Iterator[tuple[SampleMeta, int, int]]:
     """Yield the metadata of a shard's samples, each with offset and size."""
     with path.open("rb") as file:

@@ -213,11 +213,6 @@ def rank_by_motions(
     views : sequence of MovedView
         Those without an estimate that states its uncertainty, and those too far off for the patch, are passed over.
         Where none is left a Failure ``no_estimate`` or ``undecided``.
-
-    Raises
-    ------
-    InputError
-        If a motion is not rigid.
     """
     if first.curvature is None or first.curvature.hypotheses is None or priors.distance_mm is None:
         return Failure(Reason.NOT_KNOWN, "needs curvature hypotheses of the first picture, and its distance")

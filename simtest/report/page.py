@@ -126,7 +126,7 @@ def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
             "realism": summary.realism, "meshes": summary.meshes, "faults": summary.faults,
             "gallery": [card.result() for card in sections["cards"]],
             "first": _FIRST_CARDS, "isophotes": isophote_keys(run.gallery), "truth_colour": style.TRUTH,
-            "columns": HEADINGS, **_guide(guide_json(run)),
+            "columns": HEADINGS, "chart_files": figures.chart_files, **_guide(guide_json(run)),
             "length_units": " or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",
             **embedded(figures.charts),
         }

@@ -1,6 +1,6 @@
 """Files: written atomically, so that a reader never meets half of one, and refused beyond limits before they are read.
 
-The environment variable SIMTEST_LIMITS replaces limits by name: ``SIMTEST_LIMITS="picture_pixels=1e8,settings=50000"``.
+The environment variable SIMTEST_LIMITS replaces limits by name: ``SIMTEST_LIMITS="picture_pixels=1e8,mesh_faces=1e7"``.
 The ranges of single values (a width, an exponent) stand in the schemas and are fixed.
 """
 

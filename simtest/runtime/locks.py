@@ -130,18 +130,6 @@ def is_same(path: Path, file: IO[bytes]) -> bool:
         return False
 
 
-def is_held(lock: Path) -> bool:
-    """Return whether a living process holds a lock."""
-    try:
-        with lock.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
-
-
 @contextlib.contextmanager
 def waiting_for(path: Path) -> Iterator[IO[bytes]]:
     """Open a file to append to, made if need be, once no other process holds it.

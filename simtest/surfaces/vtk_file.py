@@ -15,14 +15,7 @@ A point takes at least 6 bytes of a file, and a few arrays of 24 bytes in memory
 
 
 def read_vtk(path: Path) -> tuple[Array, IntArray]:
-    """Read a PolyData or an UnstructuredGrid as triangles: vertices, in the file's unit, and faces.
-
-    Returns
-    -------
-    vertices : ndarray, shape (V, 3)
-        In the file's unit.
-    faces : ndarray of int, shape (F, 3)
-    """
+    """Read a PolyData or an UnstructuredGrid as triangles: vertices, in the file's unit, and faces."""
     memory = MEMORY_BYTES + MEMORY_PER_BYTE * path.stat().st_size
     return call_apart(_triangles, path, memory, "VTK mesh", "damaged: VTK breaks down over its points or cells")
 

@@ -43,7 +43,7 @@ def holds_finished(folder: Path, digest: str) -> bool:
         return False
     try:
         return provenance.file_hash(folder / RESULTS) == record.get("results")
-    except OSError:
+    except (InputError, OSError):
         return False
 
 

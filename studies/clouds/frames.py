@@ -1,7 +1,7 @@
 """Frames of tissue with relief for the study of clouds, each with the highlight points of its base; kept on disk."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -211,12 +211,3 @@ def _render(case: Case, session: Session | None) -> tuple[BaseFrame, Session]:
         owners=np.array(owners, dtype=np.int16),
     )
     return frame, session
-
-
-def all_of(cases: Sequence[Case], folder: Path) -> list[BaseFrame]:
-    """Return the frames of all cases; those that are not in the folder are rendered."""
-    frames, session = [], None
-    for case in cases:
-        frame, session = load(case, folder, session)
-        frames.append(frame)
-    return frames

@@ -59,14 +59,3 @@ def angle_deg(first: Array, second: Array) -> Array:
     first, second = (v / np.sqrt((v**2).sum(axis=-1, keepdims=True)) for v in (first, second))
     gap = np.sqrt(((first - second) ** 2).sum(axis=-1))
     return np.asarray(2 * np.arcsin(np.minimum(gap / 2, 1.0)) * (180 / math.pi))
-
-
-def blurred(image: Array, sigma_px: float) -> Array:
-    """Smooth an image with a Gaussian, row by row and column by column; it is mirrored at its borders."""
-    reach = math.ceil(5 * sigma_px)
-    kernel = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * sigma_px**2))
-    kernel /= kernel.sum()
-    for axis in (0, 1):
-        wide = np.pad(image, [(reach, reach) if k == axis else (0, 0) for k in (0, 1)], mode="symmetric")
-        image = np.apply_along_axis(np.convolve, axis, wide, kernel, "valid")
-    return image

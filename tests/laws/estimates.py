@@ -1,4 +1,4 @@
-"""Canaries of estimates: whether stated uncertainties hold what they promise, and whether their parts add up.
+"""Laws of estimates: whether stated uncertainties hold what they promise, and whether their parts add up.
 
 Frames are drawn here, from the closed form of a Phong plane with the light at the camera; nothing is rendered.
 """

@@ -1,4 +1,4 @@
-"""Canaries of the geometry alone: nothing is rendered, and every expected number is computed by hand."""
+"""Laws of the geometry alone: nothing is rendered, and every expected number is computed by hand."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Canaries of labels and files: what stands in truth, traced labels, frame files and datasets, against rays by hand."""
+"""Laws of labels and files: what stands in truth, traced labels, frame files and datasets, against rays by hand."""
 
 import json
 import math

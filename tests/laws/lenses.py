@@ -1,4 +1,4 @@
-"""Canaries of lenses, view masks, camera files and rigs against their published formulas."""
+"""Laws of lenses, view masks, camera files and rigs against their published formulas."""
 
 import math
 import tempfile

@@ -1,4 +1,4 @@
-"""Canaries of randomness: as many different noises as realisations, of the right size."""
+"""Laws of randomness: as many different noises as realisations, of the right size."""
 
 from hashlib import sha256
 

@@ -1,4 +1,4 @@
-"""Canaries of reflectances, lights and bounces: every pixel of a plane, or of a closed sphere, against closed forms."""
+"""Laws of reflectances, lights and bounces: every pixel of a plane, or of a closed sphere, against closed forms."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""Canaries that render: radiance, truth and noise-free reconstructions against formulas computed by hand."""
+"""Laws that render: radiance, truth and noise-free reconstructions against formulas computed by hand."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Canaries of seeds: what is drawn hangs on its experiment, setting, realisation and stage, and on no other."""
+"""Laws of seeds: what is drawn hangs on its experiment, setting, realisation and stage, and on no other."""
 
 import itertools
 from hashlib import blake2b

@@ -1,4 +1,4 @@
-"""Canaries of the sensor: noise, curve, vignetting, point spread and smoothing against their definitions.
+"""Laws of the sensor: noise, curve, vignetting, point spread and smoothing against their definitions.
 
 Nothing is rendered: pictures are made by hand, and expected values are formulas written down anew.
 """

@@ -1,4 +1,4 @@
-"""Canaries of results: statistics, counts and columns against numbers by hand, laws against measured ones."""
+"""Laws of results: statistics, counts and columns against numbers by hand, laws against measured ones."""
 
 import math
 from dataclasses import replace

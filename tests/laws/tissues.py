@@ -1,4 +1,4 @@
-"""Canaries of wet tissue: relief, translucency and the law of glints, against statistics and formulas taken anew."""
+"""Laws of wet tissue: relief, translucency and the law of glints, against statistics and formulas taken anew."""
 
 import math
 from typing import Any

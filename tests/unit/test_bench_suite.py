@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from simtest.surfaces.factory import make_surface
 from simtest.validation.cases import expand
 from studies.bench_cases import unfrozen_keys
 from tests.bench_tiny import tiny_suite
+from tests.refusals import refused
 
 V1 = "d4ca908db0cf32f945db653d3cdff8a803ddec1b4946d63b1fee0de21422a6b3"
 """Never changed: a changed case, seed or part is a new version of the suite."""
@@ -61,6 +63,11 @@ def test_an_added_default_is_seen(copied: Path) -> None:
     file.write_text(file.read_text().replace("skew = 0.0\n", ""))
     (case,) = [case for case in _read(copied).cases if case.name == "smooth/plane"]
     assert unfrozen_keys(case) == ["camera.skew"]
+
+
+def test_a_value_that_is_read_as_another_is_refused(suite: Suite) -> None:
+    case = replace(suite.cases[0], scene=suite.cases[0].scene | {"sensor": {"preset": "old_sd"}})
+    refused(lambda: unfrozen_keys(case), f"{case.file}: sensor.preset = 'old_sd' is read as None")
 
 
 def _read(folder: Path) -> Suite:

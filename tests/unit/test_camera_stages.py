@@ -258,9 +258,6 @@ def test_overlay_of_a_grey_picture_takes_the_lumas():
 
 # Coding ---------------------------------------------------------------------------------------------------------------
 
-LUMA_75_DC, LUMA_75_FIRST = 8, 6
-"""Annex K of the JPEG standard: the luma table's 16 and 11, halved at quality 75."""
-
 
 @pytest.mark.parametrize("quality", [50, 75, 90])
 def test_jpeg_quality_shows_in_the_blocks(quality):

@@ -27,6 +27,7 @@ from simtest.validation.metrics import mahalanobis2
 from simtest.validation.realisation import realise
 from simtest.validation.runner import run_experiment
 from tests.marked import marked
+from tests.refusals import refused
 
 CAMERA = Camera(80, 60, 100.0, 100.0, 40.0, 30.0)
 GOOD = {"normal": np.array([0, 0, -1.0]), "candidates": np.array([[0, 0, -1.0]]), "look_px": np.array([40.0, 30.0])}
@@ -234,8 +235,11 @@ def test_a_finished_run_is_given_back_and_another_is_replaced_aloud(tmp_path):
     assert again.results.equals(first.results)
     assert (tmp_path / "results.parquet").stat().st_mtime_ns == before
     with pytest.warns(UserWarning, match="holds another run"):
-        other = run_experiment(experiment.model_copy(update={"seed": 9}), tmp_path)
+        other = run_experiment(another := experiment.model_copy(update={"seed": 9}), tmp_path)
     assert not other.results.equals(first.results)
+    # Without its results it is no run.
+    (tmp_path / "results.parquet").unlink()
+    refused(lambda: run_experiment(another, tmp_path), f"--out {tmp_path}: holds gallery, which is no part")
 
 
 def test_a_refused_number_of_workers_touches_no_folder(tmp_path):

@@ -20,7 +20,6 @@ from studies.learned_transfer import frames, kept, networks, real, sheet, tables
 from studies.learned_transfer.answers import OK, Answer
 from studies.learned_transfer.frames import FIRST, GUIDES, LENS, ONE_LIGHT, ROWS, HardFrame, hard_frames
 
-TOWARDS = np.array([0.0, 0.0, -1.0])
 ALL = {"all": tuple(row.name for row in ROWS)}
 
 

@@ -20,7 +20,7 @@ from simtest.errors import InputError, SimtestError
 from simtest.runtime import processes
 from simtest.runtime.boundary import explain, plain, plain_errors
 from simtest.runtime.files import write_atomically, write_json
-from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_held, waiting_for
+from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, waiting_for
 from simtest.surfaces.mesh_file import write_mesh
 from simtest.surfaces.model import TriangleMesh
 from simtest.validation import runner
@@ -35,6 +35,15 @@ MAIN = "from simtest.cli.main import main; main()"
 def entered(context):
     with context:
         pass
+
+
+def is_held(lock):
+    with lock.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def test_a_folder_in_use_is_refused_with_its_process(tmp_path, monkeypatch):

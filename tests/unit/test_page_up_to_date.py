@@ -1,5 +1,6 @@
 """A run's page: written once, again where anything it is made of has changed, and whole at every moment."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,8 @@ import pytest
 from simtest.report import page, up_to_date, write_report
 from tests.marked import marked
 from tests.unit.test_report import make_run
+
+LINK = r'<a class="png" href="([^"]*)">PNG</a>'
 
 
 @pytest.fixture(scope="module")
@@ -164,11 +167,16 @@ def test_charts_are_files_where_they_are_asked_for(run):
     (run / "index.html").unlink()
     write_report(run)
     assert {file.stem for file in (run / "figures").iterdir()} == {"gallery_000", "gallery_001"}
-    # The same page, and what is missing beside it.
+    # The same page but for its links, and what is missing beside it.
     text = (run / "index.html").read_text(encoding="utf-8").rpartition("<!--")[0]
+    assert not re.findall(LINK, text)
     write_report(run, charts=True)
     assert (run / "figures" / "axis_ratio.png").stat().st_size > 5000
-    assert (run / "index.html").read_text(encoding="utf-8").rpartition("<!--")[0] == text
+    linking = (run / "index.html").read_text(encoding="utf-8").rpartition("<!--")[0]
+    files = re.findall(LINK, linking)
+    assert "figures/axis_ratio.png" in files
+    assert all((run / file).is_file() for file in files)
+    assert re.sub(LINK, "", linking) == text
 
 
 def test_a_frame_that_cannot_be_drawn_stops_the_page(run, monkeypatch):

@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import json
-import shutil
 
 import cv2
 import numpy as np
@@ -21,10 +20,6 @@ from simtest.realism.frame_sets import NamedFrame, _Film, open_frames
 from simtest.realism.frame_statistics import COLUMNS
 from simtest.realism.page import write_comparison
 from simtest.reconstruction.image_io import Source, open_source
-
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
-)
 
 
 def frame(seed, spots=4, size=(96, 128)):

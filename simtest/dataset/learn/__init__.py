@@ -9,5 +9,5 @@ if TYPE_CHECKING:
 
 __all__ = ["Samples"]
 
-# Crops need no PyTorch.
+# Who imports the package alone needs no PyTorch.
 __getattr__, *_ = lazy_names(__name__)

@@ -50,11 +50,6 @@ class Parameter:
     table: str
 
     @property
-    def of_sensor(self) -> bool:
-        """Whether it acts behind the radiance, which then need not be rendered again."""
-        return self.key.startswith("sensor.")
-
-    @property
     def ends(self) -> tuple[float, float]:
         """Both ends of the range, in logarithms where it is even in them."""
         low, high = (float(end) for end in self.prior.ends)

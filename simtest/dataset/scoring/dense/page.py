@@ -1,4 +1,4 @@
-"""The page of a dense score: what was found out, figures by zone and bin, and some frames as pictures."""
+"""The page of a dense score: how the maps were read, figures by zone and bin, and some frames as pictures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

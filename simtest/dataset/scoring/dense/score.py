@@ -108,11 +108,6 @@ def score_frames(
     """Score a method's maps on frames, one at a time.
 
     `is_checked` says that the names of the method's maps were checked against the frames before.
-
-    Raises
-    ------
-    InputError
-        If a map cannot be read, or there is no frame.
     """
     options.check()
     options = method.options(options)
@@ -193,11 +188,6 @@ def score_maps(
         How the scoring was called.
     progress : callable, optional
         Called with the frames done, frames in all, and the frame's name.
-
-    Raises
-    ------
-    InputError
-        If a folder or a map cannot be read.
     """
     from simtest.dataset.scoring.dense.from_folder import frame_names, frames_of
 

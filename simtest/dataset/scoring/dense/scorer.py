@@ -28,9 +28,6 @@ def depth_source(how: str) -> str:
     return f"depth_{how}"
 
 
-SOURCES = (NORMAL, *map(depth_source, ALIGNMENTS))
-"""Where normals come from: a normal map, or a depth map after each alignment."""
-
 Key = tuple[str, str, str]
 """Source, quantity, surface."""
 
