@@ -13,7 +13,7 @@ from simtest.dataset.plan import Plan
 from simtest.errors import InputError
 from simtest.estimators.process.naming import core_hashes, short_name
 from simtest.runtime import provenance
-from simtest.runtime.files import write_json
+from simtest.runtime.files import check_limit, write_json
 from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
 
@@ -119,7 +119,10 @@ def read_manifest(folder: Path) -> Manifest:
         # A pipe or a device might never end.
         if not path.is_file() and path.exists():
             raise ManifestError(f"{NAME}: is no plain file")
+        check_limit("manifest_bytes", path.stat().st_size, NAME, "bytes")
         content = json.loads(path.read_bytes())
+    except InputError as error:
+        raise ManifestError(str(error)) from None
     except FileNotFoundError:
         raise ManifestError(f"{NAME}: missing") from None
     except OSError as error:

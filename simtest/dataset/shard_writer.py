@@ -167,7 +167,7 @@ def remake(folder: Path, manifest: Manifest, broken: list[str], engine: Engine, 
 
 @contextmanager
 def _telling_what_stays(folder: Path) -> Iterator[None]:
-    """Say in an error of the disk what stays of the work."""
+    """Raise an error of the disk as one that says what stays of the work."""
     try:
         yield
     except OSError as error:

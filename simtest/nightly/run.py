@@ -75,12 +75,13 @@ def run_nightly(profile: Profile, reports: Reports, options: RunOptions = DEFAUL
     disk = disk_errors_in_one_line(
         reports.root, "the night could not be written", "what earlier nights wrote is as it was"
     )
-    with disk, only_night(reports, profile.name) as folder:
-        # Before the work: a damaged baseline must not cost a run.
+    with disk:
+        # Before the work, and before a folder is made: a damaged baseline must not cost a run.
         baseline = load_baseline(reports, profile.name)
-        run = measure_run(profile, folder, new_run_id(datetime.now(UTC)), options, planned)
-        judged = draw(judge(run, baseline, reports), folder / "tonight")
-        return _published(reports, judged, folder / "tonight")
+        with only_night(reports, profile.name) as folder:
+            run = measure_run(profile, folder, new_run_id(datetime.now(UTC)), options, planned)
+            judged = draw(judge(run, baseline, reports), folder / "tonight")
+            return _published(reports, judged, folder / "tonight")
 
 
 def _published(reports: Reports, judged: JudgedRun, page: Path) -> Outcome:

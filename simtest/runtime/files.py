@@ -134,6 +134,7 @@ DEFAULTS = {
     # files, bytes
     "text_bytes": 1_000_000,  # TOML, YAML, XML, JSON
     "record_bytes": 20_000_000,  # JSON that a run has written
+    "manifest_bytes": 100_000_000,  # of a dataset or an export
     "picture_bytes": 250_000_000,
     "mesh_bytes": 1_500_000_000,  # five million faces: an STL of text takes about 250 bytes a face, others less
     # pictures and frames, px

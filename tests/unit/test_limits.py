@@ -12,6 +12,8 @@ import pytest
 
 from simtest.api import sample_views
 from simtest.cli.data import fit
+from simtest.dataset.manifest import ManifestError, read_manifest
+from simtest.dataset.scoring.record import read_record
 from simtest.errors import InputError, SimtestError
 from simtest.realism.frame_sets import open_generated
 from simtest.reconstruction.image_io import _tiff_size, read_picture
@@ -141,8 +143,12 @@ def test_counts_of_work_are_refused_before_anything_is_written(tmp_path, monkeyp
 
 
 def test_large_records_are_refused_with_the_limit_s_name(tmp_path, monkeypatch):
-    monkeypatch.setenv(VARIABLE, "record_bytes=3")
-    (tmp_path / "manifest.json").write_text("{   }")
+    monkeypatch.setenv(VARIABLE, "manifest_bytes=3,record_bytes=3")
+    for name in ("manifest.json", "export.json"):
+        (tmp_path / name).write_text("{   }")
+    with pytest.raises(ManifestError, match=rf"manifest.json: 5 bytes; .* \({VARIABLE}=manifest_bytes=N sets another"):
+        read_manifest(tmp_path)
+    refused(lambda: read_record(tmp_path), f"export.json: 5 bytes; at most 3 are allowed ({VARIABLE}=manifest_bytes=N")
     told = f"manifest.json: 5 bytes; at most 3 are allowed ({VARIABLE}=record_bytes=N sets another limit)"
     refused(lambda: require_plain(tmp_path / "manifest.json", "record_bytes"), told)
 

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import re
+import shutil
 import signal
 import sys
 from dataclasses import replace
@@ -350,10 +351,12 @@ def test_a_baseline_that_cannot_be_compared_stops_a_night_before_it_works(measur
     """Its hashes are right: it was written so."""
     accept_first(reports)
     save_run(reports.baseline("quick"), change(load_baseline(reports, "quick")), BASELINE_ROWS)
+    shutil.rmtree(reports.work)
     before, left = contents(reports.root), len(measured)
     with pytest.raises(InputError, match=said):
         run_nightly(quick(), reports)
     assert contents(reports.root) == before
+    assert not reports.work.exists()
     assert len(measured) == left
 
 

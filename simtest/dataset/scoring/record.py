@@ -190,7 +190,7 @@ def read_record(folder: Path) -> Record:
         f"give simtest dataset export {folder} --out DIR"
     )  # fmt: skip
     try:
-        text = require_plain(path).read_bytes()
+        text = require_plain(path, "manifest_bytes").read_bytes()
     except InputError as error:
         raise InputError(f"{error}; nothing was exported: {again}") from None
     try:
