@@ -323,22 +323,27 @@ def _experiment(
 
 @dataclass(frozen=True)
 class Extras:
-    """What else a picture is reconstructed with."""
+    """What else a picture is reconstructed with; the command line prints these texts as its help.
+
+    Parameters
+    ----------
+    reference : Path, optional
+        Mesh in mm, or depth map, that the normals are compared with.
+    reference_format : str, optional
+        Data set whose map the reference is: c3vd, simcol3d, ucl or endoslam.
+    camera_from_model : Path, optional
+        Pose of the reference mesh: TOML with matrix, or rotation and translation_mm.
+    depth : str, optional
+        Depth at which the points of normals.ply stand: mm, or a depth map; default 1.
+    depth_scale : float, optional
+        mm of one step of an integer depth map.
+    """
 
     reference: Path | None = None
-    """Mesh in mm, or a depth map, to compare with."""
-
-    pose: Path | None = None
-    """camera_from_model of the mesh."""
-
-    depth: str | None = None
-    """Depth of the points: a number in mm, or a depth map."""
-
-    depth_scale_mm: float | None = None
-    """mm of one step of an integer depth map."""
-
     reference_format: str | None = None
-    """Data set whose map the reference is."""
+    camera_from_model: Path | None = None
+    depth: str | None = None
+    depth_scale: float | None = None
 
 
 @plain_errors
@@ -365,11 +370,11 @@ def _reconstruct_picture(
     for caution in cautions:
         warnings.warn(caution, stacklevel=2)
     reference = None
-    if (extras.reference, extras.pose, extras.reference_format) != (None, None, None):
+    if (extras.reference, extras.camera_from_model, extras.reference_format) != (None, None, None):
         from simtest.validation.reference_surface import load_reference
 
         reference = load_reference(
-            extras.reference, extras.pose, calibration.camera, extras.depth_scale_mm, extras.reference_format
+            extras.reference, extras.camera_from_model, calibration.camera, extras.depth_scale, extras.reference_format
         )
     # linear light, detect, estimate, describe
     record = reconstruct_values(str(image), picture, calibration, options, cautions)
@@ -381,7 +386,7 @@ def _reconstruct_picture(
         from simtest.validation.depth_maps import depths_at
 
         peaks = [spot.peak_px for spot in record.specularities]
-        depth = depths_at(extras.depth, peaks, (picture.shape[1], picture.shape[0]), extras.depth_scale_mm)
+        depth = depths_at(extras.depth, peaks, (picture.shape[1], picture.shape[0]), extras.depth_scale)
     if reference is not None:
         from simtest.validation.reference_surface import compare
 

@@ -102,11 +102,10 @@ def matlab_here(monkeypatch):
 
     from simtest.errors import InputError
     from simtest.spec.camera_formats import matlab
-    from simtest.spec.camera_formats.matlab_struct import struct_of
 
     def read(path):
         try:
-            return json.loads(json.dumps(struct_of(str(path))))
+            return json.loads(json.dumps(matlab.struct_of(str(path))))
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from simtest.advice.plan import DISTANCES
-from simtest.runtime.statistics import Interval, mean_interval
+from simtest.runtime.statistics import Interval, mean_interval, root_mean_square
 from simtest.validation.guide import Advice, MethodFigures, advice_of
 from simtest.validation.paired import targets_of
 from simtest.validation.ranking import Pair, best_of
@@ -170,7 +170,7 @@ def _answers(name: str, target: str, rows: pl.DataFrame, frames: int) -> MethodA
     own = _asked(rows.filter(pl.col("estimator") == name), target)
     answered = own.filter(pl.col("status") == "ok")
     missed = own.filter(pl.col("status") == "missed").height
-    parts = {column: _root_mean_square(answered, column) for column in answered.columns if column.startswith("budget_")}
+    parts = {c.name: root_mean_square(c.drop_nulls().to_numpy()) for c in answered.select("^budget_.*$")}
     told = {name: value for name, value in parts.items() if value and value > LEAST_PART_DEG}
     budget = {name.removeprefix("budget_").removesuffix("_deg"): value for name, value in told.items()}
     return MethodAnswers(
@@ -200,11 +200,6 @@ def mean_error(answered: pl.DataFrame, column: str, frames: int | None = None) -
         np.concatenate([strata, nothing]), np.concatenate([counts, none]),
     )  # fmt: skip
     return MeanError(float(np.mean(values)), (low if low is None else max(low, 0.0), high), len(values), len(answering))
-
-
-def _root_mean_square(rows: pl.DataFrame, column: str) -> float | None:
-    values = rows[column].drop_nulls().to_numpy()
-    return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
 def _stated(answered: pl.DataFrame) -> float | None:

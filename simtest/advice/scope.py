@@ -144,7 +144,7 @@ def read_scope(name: str, camera: Path | None = None) -> Scope:
     scope = _named(name)
     if camera is None:
         return scope
-    return replace(scope, tables={**scope.tables, "camera": dict(camera_table(load_camera(camera)))})
+    return replace(scope, tables={**scope.tables, "camera": camera_table(load_camera(camera))})
 
 
 def _named(name: str) -> Scope:

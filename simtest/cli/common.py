@@ -1,13 +1,15 @@
-"""What the commands share: options, and how results are printed."""
+"""What the commands share: options, and the record that each returns, which `command` prints."""
 
 import glob
+import inspect
 import json
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from cyclopts import Parameter, Token
 
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from simtest.reconstruction.picture import Options
     from simtest.runtime.processes import Engine
 
+
+Row = TypeVar("Row")
 
 _SEPARATOR = "\0"
 """No argument of a command can hold it."""
@@ -51,6 +55,26 @@ def named_path(_: Any, tokens: Sequence[Token]) -> Path:
     return Path(tokens[0].value)
 
 
+def about(text: str, name: str | None = None) -> Parameter:
+    """Return an option with its line of help, and its name where that is not the argument's."""
+    return Parameter(name=name, help=text)
+
+
+def whole(text: str, name: str | None = None) -> Parameter:
+    """Return the option for a whole number."""
+    return Parameter(name=name, help=text, converter=whole_number)
+
+
+def path(text: str, name: str | None = None) -> Parameter:
+    """Return the option for a file or folder that must have a name."""
+    return Parameter(name=name, help=text, converter=named_path)
+
+
+def flag(text: str, name: str | None = None) -> Parameter:
+    """Return the option that takes no value, and has no opposite."""
+    return Parameter(name=name, help=text, negative="")
+
+
 def replacing(example: str) -> Parameter:
     """Return the option that replaces values of a file, with an example of one in its help."""
     text = f"Replace a value: key=value, such as {example}; may be repeated."
@@ -76,6 +100,13 @@ def _gathered(_: Any, tokens: Sequence[Token]) -> list[str]:
     return [value for token in tokens for value in token.value.split(_SEPARATOR)]
 
 
+def values_of(settings: Sequence[str] | None, **own: Any) -> dict[str, Any]:
+    """Return the values of --set, and those of options of their own where they are given."""
+    from simtest.spec import parse_settings
+
+    return parse_settings(list(settings or [])) | {key: value for key, value in own.items() if value is not None}
+
+
 def named(kind: str, files: bool = False, **options: Any) -> Parameter:
     """Return the parameter of a name that `simtest list` knows, which a shell completes; or of a TOML file."""
 
@@ -99,12 +130,13 @@ def _toml_files(begun: str) -> dict[str, str]:
 
 
 SceneName = Annotated[str, named("scenes", files=True, help="A scene file, a sample's JSON, or a shipped scene.")]
-AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print JSON.")]
+NamedPath = Annotated[Path, Parameter(converter=named_path)]
+AsJson = Annotated[bool, flag("Print JSON.", "--json")]
 Settings = Annotated[list[str] | None, replacing("surface.radius_mm=5")]
 Variant = Annotated[
     str | None,
-    Parameter(
-        help="llvm, cuda on an NVIDIA GPU, or a Mitsuba variant by name; default SIMTEST_VARIANT, else llvm. A device "
+    about(
+        "llvm, cuda on an NVIDIA GPU, or a Mitsuba variant by name; default SIMTEST_VARIANT, else llvm. A device "
         "renders one channel, or three for the colours of tissue."
     ),
 ]
@@ -119,15 +151,12 @@ Estimators = Annotated[
         "'command: PROGRAM ARGUMENT...' or FILE.toml; may be repeated.",
     ),
 ]
-Out = Annotated[Path, Parameter(help="Folder for the results; made if need be.", converter=named_path)]
-Realisations = Annotated[int | None, Parameter(help="Realisations of each setting.", converter=whole_number)]
-Views = Annotated[
-    int | None,
-    Parameter(help="Viewpoints of each group that varies them, the first ones; default all.", converter=whole_number),
-]
+Out = Annotated[Path, path("Folder for the results; made if need be.")]
+Realisations = Annotated[int | None, whole("Realisations of each setting.")]
+Views = Annotated[int | None, whole("Viewpoints of each group that varies them, the first ones; default all.")]
 Seed = Annotated[int | None, Parameter(help="Seed of the run.", converter=seed_number)]
-EngineName = Annotated[Literal["local", "ray"], Parameter(name="--engine", help="Local processes, or a Ray cluster.")]
-Address = Annotated[str | None, Parameter(help="Of the Ray cluster's head, HOST:PORT; default: one is started here.")]
+EngineName = Annotated[Literal["local", "ray"], about("Local processes, or a Ray cluster.", "--engine")]
+Address = Annotated[str | None, about("Of the Ray cluster's head, HOST:PORT; default: one is started here.")]
 
 
 @Parameter(name="*")
@@ -136,9 +165,7 @@ class EngineOptions:
     """What runs the work."""
 
     engine: EngineName = "local"
-    workers: Annotated[
-        int, Parameter(help="Processes that work at once; each takes its share of the cores.", converter=whole_number)
-    ] = 1
+    workers: Annotated[int, whole("Processes that work at once; each takes its share of the cores.")] = 1
     address: Address = None
 
     def make(self, gpu: bool = False, renew_after: int | None = None) -> "Engine":
@@ -158,23 +185,23 @@ class PictureOptions:
 
     camera: Annotated[
         Path | None,
-        Parameter(help="Calibration: the camera and what else is known of it; TOML, or a file of OpenCV, ROS, MATLAB."),
+        about("Calibration: the camera and what else is known of it; TOML, or a file of OpenCV, ROS, MATLAB."),
     ] = None
-    fov: Annotated[
+    fov_deg: Annotated[
         float | None,
-        Parameter(help="Field of view in deg across the whole picture, where there is no calibration; see --fov-of."),
+        about("Field of view in deg across the whole picture, where there is no calibration; see --fov-of.", "--fov"),
     ] = None
     fov_of: Annotated[
         Literal["width", "height", "diagonal", "view"],
-        Parameter(
-            help="What --fov spans: a side or the diagonal of the whole picture, or the round view found in it. "
+        about(
+            "What --fov spans: a side or the diagonal of the whole picture, or the round view found in it. "
             "Makers of endoscopes mostly state the diagonal."
         ),
     ] = "width"
     estimators: Estimators = None
     encoding: Annotated[
         Literal["srgb", "linear"] | None,
-        Parameter(help="How the picture's values are encoded, where the calibration does not say; default srgb."),
+        about("How the picture's values are encoded, where the calibration does not say; default srgb."),
     ] = None
     detector: Annotated[
         str,
@@ -184,31 +211,23 @@ class PictureOptions:
             "auto: by colour where there is any.",
         ),
     ] = "auto"
-    smoothing: Annotated[float | None, Parameter(help="Smoothing in px; default 1 where found by colour, else 2.")] = (
-        None
-    )
+    smoothing_px: Annotated[
+        float | None, about("Smoothing in px; default 1 where found by colour, else 2.", "--smoothing")
+    ] = None
     target: Annotated[
         Literal["fine", "base"],
-        Parameter(help="Whose normals: the fine surface's, or the base's, with the relief's slope in the uncertainty."),
+        about("Whose normals: the fine surface's, or the base's, with the relief's slope in the uncertainty."),
     ] = "fine"
     every: Annotated[
-        bool,
-        Parameter(
-            name="--all",
-            negative="",
-            help="Take peaks too that the border cuts or whose shape is not that of one point highlight.",
-        ),
+        bool, flag("Take peaks too that the border cuts or whose shape is not that of one point highlight.", "--all")
     ] = False
 
-    def checked(self, roi: tuple[int, int, int, int] | None = None, poses: Path | None = None) -> "Options":
-        """Return them as the reconstruction takes them; raise `InputError` where they are malformed."""
+    def checked(self, **others: Any) -> "Options":
+        """Return them, and others, as the reconstruction takes them; raise `InputError` where they are malformed."""
         from simtest.reconstruction.picture import Options
 
         names = None if self.estimators is None else tuple(self.estimators)
-        return Options(
-            self.camera, self.fov, names, roi, self.encoding, self.every, self.detector, self.smoothing, self.target,
-            self.fov_of, poses,
-        )  # fmt: skip
+        return Options(**vars(self) | {"estimators": names} | others)
 
 
 DEFAULTS = PictureOptions()
@@ -232,11 +251,11 @@ def print_json(value: Any) -> None:
     print(json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2, allow_nan=False))
 
 
-def print_run(folder: Path, **told: Any) -> None:
-    """Print a run as one JSON document: its files, what guide.json and summary.json hold, and what else is told."""
+def run_record(folder: Path, **others: Any) -> dict[str, Any]:
+    """Return what --json prints of a run: its files, what guide.json and summary.json hold, and what else is known."""
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     files = {"page": folder / "index.html", "results": folder / "results.parquet"}
-    print_json({**files, **told, "guide": read_guide(folder), **summary})
+    return {**files, **others, "guide": read_guide(folder), **summary}
 
 
 def read_guide(folder: Path) -> dict[str, Any] | None:
@@ -248,54 +267,99 @@ def read_guide(folder: Path) -> dict[str, Any] | None:
     return guide
 
 
-def print_files(files: Iterable[object], as_json: bool, **told: Any) -> None:
-    """Print the files that a command has written: a line each, or as JSON with what else is told."""
-    if as_json:
-        print_json({**told, "files": [str(file) for file in files]})
-    else:
-        for file in files:
-            print(file)
+@dataclass(frozen=True)
+class Table:
+    """A table for the terminal; one of fewer columns than `width` counts as that wide, or cells would be cut off."""
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    title: str | None = None
+    width: int = TABLE_WIDTH
+
+    def print(self) -> None:
+        """Print at most `MOST_ROWS` rows, or all with --verbose."""
+        from rich.console import Console
+        from rich.markup import escape
+        from rich.table import Table as Drawn
+
+        class Lines(Console):
+            def on_broken_pipe(self) -> None:
+                # A reader that has gone is answered in one place.
+                raise BrokenPipeError
+
+        # Without the names of emojis, which take as long to load as the table to print.
+        console = Lines(emoji=False)
+        console.width = max(console.width, self.width)
+        drawn = Drawn(*self.columns, title=self.title, title_justify="left")
+        rows, more = first(self.rows)
+        for row in rows:
+            drawn.add_row(*(escape(cell) for cell in row))
+        console.print(drawn)
+        print(*more, sep="\n", end="\n" * len(more))
 
 
-def print_lines(lines: Sequence[str]) -> None:
-    """Print lines, at most `MOST_ROWS` of them unless --verbose is given."""
-    kept = lines if MANNERS.verbose else lines[:MOST_ROWS]
-    for line in kept:
-        print(line)
-    print_rest(len(lines) - len(kept))
-
-
-def print_rest(count: int, rest: str = "", tell: Callable[[str], object] = print) -> None:
-    """Report through `tell` how many rows are left out, if any, and where else they can be read."""
-    if count:
-        tell(f"and {count} more; --verbose prints them all{rest and f', {rest}'}")
-
-
-def print_table(
-    columns: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None, rest: str = "", width: int = 0
-) -> None:
-    """Print a table of at most `MOST_ROWS` rows, all with --verbose; `rest` says where the others can be read.
-
-    A terminal of fewer columns than `width` (default `TABLE_WIDTH`) counts as that wide, or cells would be cut off.
-    """
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    class Lines(Console):
-        def on_broken_pipe(self) -> None:
-            # A reader that has gone is answered in one place.
-            raise BrokenPipeError
-
-    # Without the names of emojis, which take as long to load as the table to print.
-    console = Lines(emoji=False)
-    console.width = max(console.width, width or TABLE_WIDTH)
-    table = Table(*columns, title=title, title_justify="left")
+def first(rows: Sequence[Row], where: str = "") -> tuple[Sequence[Row], list[str]]:
+    """Return `MOST_ROWS` rows, or all with --verbose; and a line, if any, on those left out and `where` they stand."""
     kept = rows if MANNERS.verbose else rows[:MOST_ROWS]
-    for row in kept:
-        table.add_row(*(escape(cell) for cell in row))
-    console.print(table)
-    print_rest(len(rows) - len(kept), rest)
+    count = len(rows) - len(kept)
+    return kept, [f"and {count} more; --verbose prints them all{where and f', {where}'}"] if count else []
+
+
+def few(lines: Sequence[str]) -> list[str]:
+    """Return at most `MOST_ROWS` lines and one on those left out, or all lines with --verbose."""
+    kept, more = first(lines)
+    return [*kept, *more]
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a command has done: files that it wrote, the record for --json, parts for the terminal, the exit code.
+
+    A record and a part may be a function that makes it, or prints it: what is not printed is not made. The files are
+    the last lines of the terminal, and the last key of the JSON document.
+    """
+
+    files: Sequence[object] = ()
+    data: Any = None
+    parts: "Iterable[str | Path | Table | Callable[[], None]]" = ()
+    code: int = 0
+
+    def print(self, as_json: bool) -> None:
+        """Print it as one JSON document, or for people."""
+        if as_json:
+            data = self.data() if callable(self.data) else self.data
+            if self.files:
+                data = {**(data or {}), "files": [str(file) for file in self.files]}
+            if data is not None:
+                print_json(data)
+            return
+        for part in (*self.parts, *self.files):
+            if isinstance(part, Table):
+                part.print()
+            elif callable(part):
+                part()
+            else:
+                print(part)
+
+
+def command(function: Callable[..., Told]) -> Callable[..., int]:
+    """Give a command the option --json, print what it returns, and return its exit code."""
+
+    @wraps(function)
+    def run(*arguments: Any, as_json: bool = False, **options: Any) -> int:
+        told = function(*arguments, **options)
+        told.print(as_json)
+        return told.code
+
+    given = inspect.signature(function)
+    option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
+    vars(run)["__signature__"] = given.replace(parameters=[*given.parameters.values(), option])
+    return run
+
+
+def fixed(value: float | None, digits: int = 2, missing: str = "") -> str:
+    """Return a number with so many digits behind the point, or what stands for none."""
+    return missing if value is None else f"{value:.{digits}f}"
 
 
 def counted(number: int, one: str, many: str = "") -> str:

@@ -1,6 +1,6 @@
 """Commands about frames for learning and about real ones: dataset, realism, fit, advise."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,15 +12,20 @@ from simtest.cli.common import (
     EngineOptions,
     Out,
     Seed,
+    Table,
+    Told,
+    about,
+    command,
     command_line,
     counted,
+    few,
+    flag,
     named,
-    named_path,
-    print_files,
+    path,
     print_json,
-    print_lines,
-    print_table,
     replacing,
+    values_of,
+    whole,
     whole_number,
 )
 from simtest.cli.progress import progress_bar
@@ -35,28 +40,27 @@ if TYPE_CHECKING:
 
 dataset = App(name="dataset", help="Make a labelled dataset for learning, check it, look at it.")
 
-Folder = Annotated[Path, Parameter(help="The dataset's folder.", converter=named_path)]
+Folder = Annotated[Path, path("The dataset's folder.")]
 Settings = Annotated[list[str] | None, replacing("samples_per_anatomy=5 or sensor.noise_sigma=0")]
 Variant = Annotated[
     str | None,
-    Parameter(help="llvm, cuda on an NVIDIA GPU, or a Mitsuba variant by name; default SIMTEST_VARIANT, else llvm."),
+    about("llvm, cuda on an NVIDIA GPU, or a Mitsuba variant by name; default SIMTEST_VARIANT, else llvm."),
 ]
-Samples = Annotated[int | None, Parameter(help="Number of samples; default the file's.", converter=whole_number)]
 
 
 @dataset.default
+@command
 def make(
     described: Annotated[str, named("datasets", files=True, name="DATASET")],
     /,
     *,
-    out: Annotated[Path, Parameter(help="Folder of the dataset; made if need be.", converter=named_path)],
-    samples: Samples = None,
+    out: Annotated[Path, path("Folder of the dataset; made if need be.")],
+    samples: Annotated[int | None, whole("Number of samples; default the file's.")] = None,
     seed: Seed = None,
     settings: Settings = None,
     engine: EngineOptions = ONE_PROCESS,
     variant: Variant = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Make a dataset: shards, tables, manifest and card; the same command goes on where it was stopped.
 
     Parameters
@@ -67,16 +71,13 @@ def make(
     """
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS, write_dataset
     from simtest.rendering.backend import needs_gpu
-    from simtest.spec import load_dataset, parse_settings
+    from simtest.spec import load_dataset
 
-    values = parse_settings(settings or []) | {
-        key: value for key, value in (("samples", samples), ("seed", seed)) if value is not None
-    }
-    wanted = load_dataset(described, values)
+    wanted = load_dataset(described, values_of(settings, samples=samples, seed=seed))
     with progress_bar("writing the tables") as progress:
         chosen = engine.make(needs_gpu(variant), SHARDS_PER_PROCESS)
         write_dataset(wanted, out, chosen, variant, progress)
-    print_files([out / "README.md"], as_json, dataset=wanted.name, samples=wanted.samples)
+    return Told([out / "README.md"], {"dataset": wanted.name, "samples": wanted.samples})
 
 
 @dataset.command
@@ -84,9 +85,7 @@ def verify(
     folder: Folder,
     /,
     *,
-    repair: Annotated[
-        bool, Parameter(negative="", help="Make again what is broken; remove files that do not belong.")
-    ] = False,
+    repair: Annotated[bool, flag("Make again what is broken; remove files that do not belong.")] = False,
     engine: EngineOptions = ONE_PROCESS,
     as_json: AsJson = False,
 ) -> int:
@@ -99,7 +98,7 @@ def verify(
     with progress_bar("done") as progress:
         faults = check(folder, progress)
         if not as_json:
-            print_lines(list(map(str, faults)))
+            print(*few(list(map(str, faults))), sep="\n", end="\n" * bool(faults))
         if faults and repair:
             chosen = engine.make(renew_after=SHARDS_PER_PROCESS)
             left = repair_files(folder, faults, chosen, progress)
@@ -108,25 +107,22 @@ def verify(
         print_json({"folder": str(folder), "sound": not broken, "repaired": left is not None,
                     "faults": faults, "left": broken})  # fmt: skip
     elif left is not None:
-        print_lines([f"still broken: {fault}" for fault in left])
-        print("mended" if not left else f"left: {len(left)}")
+        print(*few([f"still broken: {fault}" for fault in left]), f"left: {len(left)}" if left else "mended", sep="\n")
     else:
         print(counted(len(faults), "fault") if faults else "sound")
     return 1 if broken else 0
 
 
 @dataset.command
+@command
 def sample(
     folder: Folder,
     index: Annotated[int, Parameter(converter=whole_number)],
     /,
     *,
-    out: Annotated[
-        Path | None, Parameter(help="Folder for the files; default sample-INDEX.", converter=named_path)
-    ] = None,
-    variant: Annotated[str | None, Parameter(help="Mitsuba variant; default the dataset's own.")] = None,
-    as_json: AsJson = False,
-) -> int:
+    out: Annotated[Path | None, path("Folder for the files; default sample-INDEX.")] = None,
+    variant: Annotated[str | None, about("Mitsuba variant; default the dataset's own.")] = None,
+) -> Told:
     """Make one sample of a dataset again, alone; exit 1 if it differs from the stored one.
 
     Parameters
@@ -140,66 +136,58 @@ def sample(
     files = reproduce_sample(folder, index, target, variant)
     verdict = compare(folder, index, target)
     same = verdict.endswith("same bytes")
-    print_files(files, as_json, **({"same": same, "verdict": verdict} if as_json else {}))
-    if not as_json:
-        print(verdict)
-    return 0 if same else 1
+    record = {"same": same, "verdict": verdict, "files": files}
+    return Told(data=record, parts=[*files, verdict], code=0 if same else 1)
 
 
 @dataset.command
+@command
 def preview(
     folder: Folder,
     /,
     *,
-    out: Annotated[
-        Path | None, Parameter(help="Page to write; default preview.html in the current folder.", converter=named_path)
-    ] = None,
-    samples: Annotated[int, Parameter(help="How many samples to show.", converter=whole_number)] = 24,
-    as_json: AsJson = False,
-) -> None:
+    out: Annotated[Path | None, path("Page to write; default preview.html in the current folder.")] = None,
+    samples: Annotated[int, whole("How many samples to show.")] = 24,
+) -> Told:
     """Write a page with a dataset's frames, labels, highlights and distributions."""
     from simtest.dataset.preview import write_preview
 
     page = out or Path("preview.html")
     with exclusive_file(page):
-        print_files([write_preview(folder, page, samples)], as_json)
+        return Told([write_preview(folder, page, samples)])
 
 
 @dataset.command
+@command
 def export(
     folder: Folder,
     /,
     *,
-    out: Annotated[Path, Parameter(help="Folder for the frames; made if need be.", converter=named_path)],
+    out: Annotated[Path, path("Folder for the frames; made if need be.")],
     engine: EngineOptions = ONE_PROCESS,
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Export a dataset's frames without their truth, for methods that run elsewhere; `simtest score` takes answers."""
     from simtest.dataset.export import export_dataset
     from simtest.dataset.shard_writer import SHARDS_PER_PROCESS
 
     with progress_bar("writing the tables") as progress:
         chosen = engine.make(renew_after=SHARDS_PER_PROCESS)
-        readme = export_dataset(folder, out, chosen, progress)
-    print_files([readme], as_json)
+        return Told([export_dataset(folder, out, chosen, progress)])
 
 
+@command
 def realism(
     frames: list[Path],
     /,
     *,
-    against: Annotated[str, Parameter(help="Generated frames: a dataset's folder, a folder of pictures, or a scene.")],
+    against: Annotated[str, about("Generated frames: a dataset's folder, a folder of pictures, or a scene.")],
     out: Out,
-    count: Annotated[
-        int, Parameter(help="Generated frames that are taken or rendered, at most.", converter=whole_number)
-    ] = 40,
+    count: Annotated[int, whole("Generated frames that are taken or rendered, at most.")] = 40,
     surfaces: Annotated[
-        list[str] | None,
-        Parameter(name="--surface", negative="", help="Take samples of this surface alone; may be repeated."),
+        list[str] | None, flag("Take samples of this surface alone; may be repeated.", "--surface")
     ] = None,
     seed: Seed = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Measure how far generated frames are from real ones, statistic by statistic; write a page and JSON.
 
     Parameters
@@ -213,21 +201,14 @@ def realism(
     from simtest.realism.page import write_comparison
 
     real, generated = open_frames(frames), open_generated(against, count, surfaces or ())
-    command = command_line()
-    try:
-        with exclusive_folder(out), progress_bar("compared") as progress:
-            found = compare(real, generated, progress, seed or 0)
-            page = write_comparison(found, out, against, command, progress)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt("an earlier page stays; the same command begins anew") from None
-    if as_json:
-        print_files([page], as_json, **found.to_json())
-        return
-    _print_distances(found)
-    print(page)
+    stopped = "an earlier page stays; the same command begins anew"
+    with exclusive_folder(out), progress_bar("compared", stopped) as progress:
+        found = compare(real, generated, progress, seed or 0)
+        page = write_comparison(found, out, against, command_line(), progress)
+    return Told([page], found.to_json, _distances(found))
 
 
-def _print_distances(found: "Comparison") -> None:
+def _distances(found: "Comparison") -> "Iterator[str | Table]":
     from simtest.realism.distance import distance_text
 
     rows = []
@@ -235,32 +216,27 @@ def _print_distances(found: "Comparison") -> None:
         interval = f"{distance_text(d.interval[0])} to {distance_text(d.interval[1])}"
         counts = f"{d.n_real} / {d.n_generated}"
         rows.append((d.statistic.title, distance_text(d.distance), interval, counts, d.verdict))
-    print_table(("statistic", "distance", "95 % interval", "scenes, real / generated", "verdict"), rows)
-    print_lines([f"left out: {frame.frame}: {frame.reason}" for frame in found.left_out])
-    print(found.verdict)
+    yield Table(("statistic", "distance", "95 % interval", "scenes, real / generated", "verdict"), rows)
+    yield from few([f"left out: {frame.frame}: {frame.reason}" for frame in found.left_out])
+    yield found.verdict
 
 
+@command
 def fit(
     frames: list[Path],
     /,
     *,
-    recipe: Annotated[str, Parameter(help="A dataset file, or the name of a shipped one, whose ranges are fitted.")],
-    out: Annotated[
-        Path, Parameter(help="TOML file for the fitted recipe; the report stands beside it.", converter=named_path)
-    ],
+    recipe: Annotated[str, about("A dataset file, or the name of a shipped one, whose ranges are fitted.")],
+    out: Annotated[Path, path("TOML file for the fitted recipe; the report stands beside it.")],
     scene: Annotated[
-        str | None, Parameter(help="Base scene of the family that is fitted; needed where there are several.")
+        str | None, about("Base scene of the family that is fitted; needed where there are several.")
     ] = None,
-    size: Annotated[int, Parameter(help="Frames that are rendered over the ranges.", converter=whole_number)] = 150,
+    size: Annotated[int, whole("Frames that are rendered over the ranges.")] = 150,
     bank: Annotated[
-        Path | None,
-        Parameter(
-            help="Folder that keeps them, for other fits too; default OUT with the suffix .bank.", converter=named_path
-        ),
+        Path | None, path("Folder that keeps them, for other fits too; default OUT with the suffix .bank.")
     ] = None,
     seed: Seed = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Fit the ranges of a dataset recipe to real frames, with intervals, and say what the frames do not tell.
 
     Parameters
@@ -283,15 +259,10 @@ def fit(
         with progress_bar("writing") as progress:
             found = fitted_to(opened, dataset, kept, size, seed or 0, progress)
         paths = write_fit(found, out)
-    if as_json:
-        print_files(paths, as_json, **report_json(found))
-        return
-    _print_ranges(found)
-    print_files(paths, as_json)
+    return Told(paths, lambda: report_json(found), _ranges(found))
 
 
-def _print_ranges(found: "FittedRecipe") -> None:
-
+def _ranges(found: "FittedRecipe") -> "Iterator[str | Table]":
     rows = []
     for number, parameter in enumerate(found.parameters):
         share = found.fitted.interval[number]
@@ -300,9 +271,9 @@ def _print_ranges(found: "FittedRecipe") -> None:
         told = "yes" if found.fitted.told[number] else "not told"
         rows.append((parameter.kind, parameter.key, f"{centre:.3g}", f"{low:.3g} to {high:.3g}",
                      f"{share[1] - share[0]:.0%}", told))  # fmt: skip
-    print_table(("parameter", "key", "centre", "95 % interval", "of its range", "told"), rows, width=140)
-    print_lines([f"note: {note}" for note in found.notes()])
-    print_lines([f"left out: {name}: {reason}" for name, reason in found.left_out.items()])
+    yield Table(("parameter", "key", "centre", "95 % interval", "of its range", "told"), rows, width=140)
+    yield from few([f"note: {note}" for note in found.notes()])
+    yield from few([f"left out: {name}: {reason}" for name, reason in found.left_out.items()])
 
 
 def _numbers(_: Any, tokens: Sequence[Token]) -> tuple[float, ...]:
@@ -313,12 +284,13 @@ def _numbers(_: Any, tokens: Sequence[Token]) -> tuple[float, ...]:
         raise ValueError(f"{tokens[0].value!r}: must be numbers separated by commas, such as 20,60") from None
 
 
+@command
 def advise(
     rig: str,
     /,
     *,
     out: Out,
-    organ: Annotated[str, Parameter(help="colon, stomach, liver, gallbladder, or plane (a phantom).")] = "colon",
+    organ: Annotated[str, about("colon, stomach, liver, gallbladder, or plane (a phantom).")] = "colon",
     distances: Annotated[
         tuple[float, ...],
         Parameter(
@@ -326,21 +298,17 @@ def advise(
             negative="", converter=_numbers, n_tokens=1, allow_leading_hyphen=True,
         ),
     ] = (20.0, 60.0),
-    camera: Annotated[
-        Path | None, Parameter(help="Camera file in place of the scope's camera.", converter=named_path)
-    ] = None,
-    bound: Annotated[float, Parameter(help="Error beyond which a method counts as broken, deg.")] = 5.0,
+    camera: Annotated[Path | None, path("Camera file in place of the scope's camera.")] = None,
+    bound: Annotated[float, about("Error beyond which a method counts as broken, deg.")] = 5.0,
     frames: Annotated[
         int | None,
-        Parameter(
-            help="Frames of the organ, rounded up to as many at each of 8 distances; default what two minutes allow.",
-            converter=whole_number,
+        whole(
+            "Frames of the organ, rounded up to as many at each of 8 distances; default what two minutes allow."
         ),
     ] = None,
     seed: Seed = None,
-    workers: Annotated[int, Parameter(help="Processes that work at once.", converter=whole_number)] = 2,
-    as_json: AsJson = False,
-) -> None:  # fmt: skip
+    workers: Annotated[int, whole("Processes that work at once.")] = 2,
+) -> Told:  # fmt: skip
     """Measure what a scope and its lights can reach before an organ: best method, expected error, break-points.
 
     The errors are measured on frames rendered for the purpose, the break-points follow from laws; the page prints the
@@ -361,18 +329,13 @@ def advise(
         raise InputError(f"--distances: {len(distances)} numbers; must be two, the nearest and the farthest, mm")
     scope = read_scope(rig, camera)
     question = Question(scope, organ, (distances[0], distances[1]), bound, frames, seed or 0)
-    command = command_line()
     with exclusive_folder(out), progress_bar("writing the page") as progress:
         found = run(question, out, progress, workers)
-        page = write_advice(found, out, command)
-    if as_json:
-        print_files([page], as_json, **found.to_json())
-        return
-    _print(found)
-    print(page)
+        page = write_advice(found, out, command_line())
+    return Told([page], found.to_json, _advice(found))
 
 
-def _print(found: "Advised") -> None:
+def _advice(found: "Advised") -> "Iterator[str | Table]":
     from simtest.advice.page import NOTHING, interval, sentence
     from simtest.advice.plan import DISTANCES
     from simtest.pages.style import number
@@ -383,12 +346,12 @@ def _print(found: "Advised") -> None:
         for m in found.found.methods
     ]  # fmt: skip
     columns = ("method", "states", "answered", "error, fine", "95 % interval", "error, base", "95 % interval")
-    print_table(columns, rows)
-    print(f"{found.found.frames} frames, {found.question.per_distance} at each of {DISTANCES} distances")
+    yield Table(columns, rows)
+    yield f"{found.found.frames} frames, {found.question.per_distance} at each of {DISTANCES} distances"
     breaks = [
         (b.title, b.method, f"{b.quantity} {number(b.value)} {b.unit}".strip(),
          "refuses" if b.expected is None else number(b.expected))
         for b in found.breaks
     ]  # fmt: skip
-    print_table(("what breaks", "method", "at", "law, deg"), breaks)
-    print_lines([sentence(found, choice) for choice in found.found.choices] or [NOTHING])
+    yield Table(("what breaks", "method", "at", "law, deg"), breaks)
+    yield from few([sentence(found, choice) for choice in found.found.choices] or [NOTHING])

@@ -1,34 +1,39 @@
 """Commands about pictures and cameras: reconstruct, twin, calibrate, camera."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
+from simtest.api import Extras, reconstruct_picture
 from simtest.cli.common import (
     DEFAULTS,
     MOST_ROWS,
-    AsJson,
+    NamedPath,
     Out,
     PictureOptions,
     Seed,
+    Table,
+    Told,
+    about,
+    command,
     command_line,
     counted,
-    named_path,
-    print_files,
-    print_json,
-    print_lines,
-    print_table,
-    whole_number,
+    few,
+    fixed,
+    path,
+    whole,
 )
 from simtest.cli.main import MANNERS
 from simtest.cli.progress import progress_bar
 from simtest.errors import InputError
+from simtest.runtime.files import check_count
 from simtest.runtime.locks import exclusive_file, exclusive_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from typing import Any
 
     from simtest.advice.twin.run import SpotTwins, TwinResult
@@ -46,41 +51,24 @@ MEANING = (
     "(docs/concepts/uncertainty.md)"
 )
 
-Roi = Annotated[str | None, Parameter(help="Region of interest x,y,w,h in px; default: detected.")]
-Reference = Annotated[Path | None, Parameter(help="Mesh in mm, or depth map, that the normals are compared with.")]
-ReferenceFormat = Annotated[
-    str | None, Parameter(help="Data set whose map the reference is: c3vd, simcol3d, ucl or endoslam.")
-]
-Pose = Annotated[
-    Path | None, Parameter(help="Pose of the reference mesh: TOML with matrix, or rotation and translation_mm.")
-]
-Depth = Annotated[
-    str | None, Parameter(help="Depth at which the points of normals.ply stand: mm, or a depth map; default 1.")
-]
-Poses = Annotated[
-    Path | None,
-    Parameter(
-        help="Poses of a sequence's frames: views.json, JSON of matrices or a TUM file; tells convex from concave."
-    ),
-]
-DepthScale = Annotated[float | None, Parameter(help="mm of one step of an integer depth map.")]
+
+NO_EXTRAS = Extras()
 
 
+@command
 def reconstruct(
-    image: Annotated[Path, Parameter(converter=named_path)],
+    image: NamedPath,
     /,
     *,
     out: Out,
     known: PictureOptions = DEFAULTS,
-    roi: Roi = None,
-    reference: Reference = None,
-    reference_format: ReferenceFormat = None,
-    camera_from_model: Pose = None,
-    depth: Depth = None,
-    depth_scale: DepthScale = None,
-    poses: Poses = None,
-    as_json: AsJson = False,
-) -> None:
+    roi: Annotated[str | None, about("Region of interest x,y,w,h in px; default: detected.")] = None,
+    extras: Annotated[Extras, Parameter(name="*")] = NO_EXTRAS,
+    poses: Annotated[
+        Path | None,
+        about("Poses of a sequence's frames: views.json, JSON of matrices or a TUM file; tells convex from concave."),
+    ] = None,
+) -> Told:
     """Reconstruct the normals at the specularities of a picture, of each picture of a folder, or of a video's frames.
 
     Parameters
@@ -92,74 +80,65 @@ def reconstruct(
     from simtest.reconstruction.picture import parse_roi
 
     sequence = is_sequence(image)
-    if sequence and (reference or reference_format or camera_from_model or depth):
+    if sequence and any(vars(replace(extras, depth_scale=None)).values()):
         raise InputError(f"{image}: --reference, --camera-from-model and --depth are for single pictures")
     if poses and not sequence:
         raise InputError(f"{image}: --poses is for a folder or a film")
-    box = None if roi is None else parse_roi(roi)
-    options = known.checked(box, poses)
+    options = known.checked(roi=None if roi is None else parse_roi(roi), poses=poses)
     if sequence:
-        _sequence(image, out, options, as_json)
-        return
-    from simtest.api import Extras, reconstruct_picture
-
-    extras = Extras(reference, camera_from_model, depth, depth_scale, reference_format)
+        return _sequence(image, out, options)
     record, files = reconstruct_picture(image, out, options, extras)
-    if as_json:
-        print_files(files, as_json, **record.to_json())
-        return
-    _print_tables(record)
-    if record.stated is not None:
-        print(f"reported: {record.stated}")
-        print(MEANING)
-    _print_silent(record.specularities)
-    _print_assumed(record.assumed)
-    _print_counts(record, image)
-    print_files(files, as_json)
+    return Told(files, record.to_json, _record_parts(record, image))
 
 
-def _sequence(source: Path, out: Path, options: "Options", as_json: bool) -> None:
-    """Reconstruct the frames of a folder or a video, and print what came of them."""
+def _sequence(source: Path, out: Path, options: "Options") -> Told:
+    """Reconstruct the frames of a folder or a video."""
     from dataclasses import asdict
 
     from simtest.reconstruction.sequence import reconstruct_sequence
 
     with progress_bar("writing the tables") as progress:
         made = reconstruct_sequence(source, out, options, progress)
-    if as_json:
-        print_json(asdict(made))
-        return
-    _print_assumed(made.assumed)
     unread = f", {made.failed} unreadable" if made.failed else ""
     found = counted(made.specularities, "specularity", "specularities")
-    print(f"{counted(made.frames, 'frame')}{unread}: {found}, {made.tracks} seen in several frames")
-    if made.motion:
-        print(made.motion)
-    print_files(made.files, as_json)
+    lines = [f"{counted(made.frames, 'frame')}{unread}: {found}, {made.tracks} seen in several frames"]
+    parts = (*assumed_lines(made.assumed), *lines, *([made.motion] if made.motion else []))
+    return Told(made.files, asdict(made), parts)
 
 
-def _print_tables(record: "PictureRecord") -> None:
-    """Print the best normals, or a summary of many, and how the estimators compare with a reference."""
+def _record_parts(record: "PictureRecord", image: Path) -> "Iterator[str | Table]":
+    """Tell the best normals, what they state, what is assumed, and how many highlights have one."""
+    yield from record_tables(record)
+    if record.stated is not None:
+        yield f"reported: {record.stated}"
+        yield MEANING
+    yield from silent_lines(record.specularities)
+    yield from assumed_lines(record.assumed)
+    yield from count_lines(record, image)
+
+
+def record_tables(record: "PictureRecord") -> "Iterator[str | Table]":
+    """Tell the best normals, or a summary of many, and how the estimators compare with a reference."""
     spots = record.specularities
     if len(spots) > MOST_ROWS and not MANNERS.verbose:
-        _print_summary(spots)
+        yield _summary(spots)
+        yield f"--verbose prints a row for each of the {len(spots)}; normals.csv and index.html hold them"
     elif spots:
         columns = ("no.", "x (px)", "y (px)", "kind", "score", "best", "normal", "± deg", "choice", "flags")
-        print_table(columns, [_cells(spot) for spot in spots])
+        yield Table(columns, [_cells(spot) for spot in spots])
     if (compared := record.reference) is not None:
-        for problem in compared.problems:
-            print(f"reference: {problem}")
+        yield from (f"reference: {problem}" for problem in compared.problems)
         rows = [
             (name, str(errors.n), _pair(errors.mean_deg, errors.std_deg),
              _pair(errors.mean_oracle_deg, errors.std_oracle_deg))
             for name, errors in compared.estimators.items()
         ]  # fmt: skip
-        print_table(("estimator", "n", "mean ± std (deg)", "better candidate (deg)"), rows)
-        print(f"{compared.missed} sightlines miss {compared.source}")
+        yield Table(("estimator", "n", "mean ± std (deg)", "better candidate (deg)"), rows)
+        yield f"{compared.missed} sightlines miss {compared.source}"
 
 
-def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
-    """Print how many specularities of each kind have which best estimator, and what that states."""
+def _summary(spots: "Sequence[SpecularityRecord]") -> Table:
+    """Return how many specularities of each kind have which best estimator, and what that states."""
     from collections import Counter
     from statistics import median
 
@@ -173,13 +152,12 @@ def _print_summary(spots: "Sequence[SpecularityRecord]") -> None:
         stated = [d for s in held if s.best_estimate and (d := s.best_estimate.deviation_deg) is not None]
         flags = Counter(flag for s in held if s.best_estimate for flag in s.best_estimate.flags)
         named = ", ".join(f"{flag} {count}" for flag, count in flags.most_common(MOST_FLAGS))
-        rows.append((kind, best, str(len(held)), f"{median(stated):.2f}" if stated else "", named))
-    print_table(("kind", "best", "n", "median ± deg", "flags"), rows)
-    print(f"--verbose prints a row for each of the {len(spots)}; normals.csv and index.html hold them")
+        rows.append((kind, best, str(len(held)), fixed(median(stated) if stated else None), named))
+    return Table(("kind", "best", "n", "median ± deg", "flags"), rows)
 
 
-def _print_silent(spots: "Sequence[SpecularityRecord]") -> None:
-    """Print why best normals have no ±, and how many."""
+def silent_lines(spots: "Sequence[SpecularityRecord]") -> "Iterator[str]":
+    """Tell why best normals have no ±, and how many."""
     from collections import Counter
 
     from simtest.reconstruction.explanations import why_no_error
@@ -187,41 +165,41 @@ def _print_silent(spots: "Sequence[SpecularityRecord]") -> None:
     reasons = Counter(why_no_error(s.best, s.best_estimate) for s in spots if s.best and s.best_estimate)
     for reason, count in reasons.items():
         if reason:
-            print(f"no ± at {counted(count, 'best normal')}: {reason}")
+            yield f"no ± at {counted(count, 'best normal')}: {reason}"
 
 
-def _print_assumed(assumed: "Sequence[Assumption]") -> None:
-    """Print what the normals are without the light's position; what is given with a spread; what is assumed."""
+def assumed_lines(assumed: "Sequence[Assumption]") -> "Iterator[str]":
+    """Tell what the normals are without the light's position; what is given with a spread; what is assumed."""
     from simtest.reconstruction.assumptions import light_note
 
     if note := light_note(assumed):
-        print(f"note: {note}")
+        yield f"note: {note}"
     for each in sorted(assumed, key=lambda each: not each.given):
-        print(f"given: {each.what}: {each.distribution}" if each.given else f"assumed: {each}")
+        yield f"given: {each.what}: {each.distribution}" if each.given else f"assumed: {each}"
 
 
-def _print_counts(record: "PictureRecord", image: Path) -> None:
-    """Print how many highlights were found, how many have a normal, and what the others are."""
+def count_lines(record: "PictureRecord", image: Path) -> "Iterator[str]":
+    """Tell how many highlights were found, how many have a normal, and what the others are."""
     from simtest.reconstruction.borders import BORDERED
     from simtest.reconstruction.explanations import kinds_counted
     from simtest.reconstruction.picture import REFUSED
 
     for warning in record.warnings:
         if warning.startswith((BORDERED, REFUSED)):
-            print(f"note: {warning}")
+            yield f"note: {warning}"
 
     spots, others = record.specularities, record.other_highlights
     answered = sum(spot.best is not None for spot in spots)
     found = f"{counted(len(spots), 'specularity', 'specularities')} found in {image}"
-    print(found + (f", {answered} with a normal" if answered < len(spots) else ""))
+    yield found + (f", {answered} with a normal" if answered < len(spots) else "")
     if others:
         kinds = kinds_counted(each.kind for each in others)
         left = f"{counted(len(others), 'more highlight')} found and left out"
-        print(f"{left}, because no single normal can be read from them: {kinds} (index.html shows them)")
+        yield f"{left}, because no single normal can be read from them: {kinds} (index.html shows them)"
 
 
 def _pair(mean: float, spread: float | None) -> str:
-    return f"{mean:.2f}" + ("" if spread is None else f" ± {spread:.2f}")
+    return fixed(mean) if spread is None else f"{mean:.2f} ± {spread:.2f}"
 
 
 def _cells(spot: "SpecularityRecord") -> list[str]:
@@ -229,36 +207,30 @@ def _cells(spot: "SpecularityRecord") -> list[str]:
 
     best, published = spot.best_estimate, spot.normals.get("circle_pose")
     x, y = (math.nan, math.nan) if spot.peak_px is None else spot.peak_px
-    deviation = None if best is None else best.deviation_deg
-    margin = None if published is None else published.choice_margin
     return [
-        str(spot.id), f"{x:.1f}", f"{y:.1f}", kind_name(spot.kind), "" if spot.score is None else f"{spot.score:.2f}",
-        spot.best or "none",
-        " ".join(f"{v:+.3f}" for v in best.normal) if best else "", "" if deviation is None else f"{deviation:.2f}",
-        "" if margin is None else f"{margin:.1f}", ", ".join(best.flags) if best else "",
+        str(spot.id), fixed(x, 1), fixed(y, 1), kind_name(spot.kind), fixed(spot.score), spot.best or "none",
+        " ".join(f"{v:+.3f}" for v in best.normal) if best else "", fixed(best.deviation_deg if best else None),
+        fixed(published.choice_margin if published else None, 1), ", ".join(best.flags) if best else "",
     ]  # fmt: skip
 
 
-FEWEST, MOST = 1, 1000
+MOST_FRAMES = 1000
 
 
+@command
 def twin(
-    frame: Annotated[Path, Parameter(converter=named_path)],
+    frame: NamedPath,
     /,
     *,
     out: Out,
     known: PictureOptions = DEFAULTS,
     organ: Annotated[
         Literal["colon", "stomach", "liver", "gallbladder"] | None,
-        Parameter(help="Organ in the picture, whose relief the twins have; default: any tissue's."),
+        about("Organ in the picture, whose relief the twins have; default: any tissue's."),
     ] = None,
-    frames: Annotated[
-        int | None,
-        Parameter(help="Rendered frames; default 48, fewer where the picture is large.", converter=whole_number),
-    ] = None,
+    frames: Annotated[int | None, whole("Rendered frames; default 48, fewer where the picture is large.")] = None,
     seed: Seed = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Render twins of a picture's highlights, and measure the error at each.
 
     Parameters
@@ -269,40 +241,35 @@ def twin(
     from simtest.advice.twin.run import twin_picture
     from simtest.advice.twin.writing import to_json, write_twins
 
-    if frames is not None and not FEWEST <= frames <= MOST:
-        raise InputError(f"--frames {frames}: must be {FEWEST} to {MOST}")
-    options = known.checked()
-    command = command_line()
+    if frames is not None:
+        check_count(frames, "--frames", MOST_FRAMES)
+    options, line = known.checked(), command_line()
     with exclusive_folder(out):
         with progress_bar("writing the page") as progress:
             result = twin_picture(frame, options, frames, seed or 0, progress, organ)
-        files = write_twins(result, out, command)
-    if as_json:
-        print_files(files, as_json, **to_json(result, command))
-        return
-    _print_twins(result)
-    print_files(files, as_json)
+        files = write_twins(result, out, line)
+    return Told(files, lambda: to_json(result, line), _twin_parts(result))
 
 
-def _print_twins(result: "TwinResult") -> None:
-    """Print the highlights, the bank and what was drawn."""
+def _twin_parts(result: "TwinResult") -> "Iterator[str | Table]":
+    """Tell the highlights, the bank and what was drawn."""
     columns = ("no.", "x (px)", "y (px)", "radius (px)", "best", "± deg", "twins deg", "95 % interval", "held")
     spots = sorted(result.spots, key=lambda each: -each.spot.radius_px)
-    print_table(columns, [_twin_cells(each) for each in spots[:MOST_ROWS]])
+    yield Table(columns, [_twin_cells(each) for each in spots[:MOST_ROWS]])
     if len(spots) > MOST_ROWS:
-        print(f"the {MOST_ROWS} largest of {len(spots)}; twin.csv and index.html hold all")
+        yield f"the {MOST_ROWS} largest of {len(spots)}; twin.csv and index.html hold all"
     held = "" if result.coverage is None else f"; their 95 % regions hold the truth in {100 * result.coverage:.0f} %"
-    print(f"twins: {result.rms_deg():.2f} deg RMS against the fine normal{held}")
-    print(f"twins: {result.rms_deg('base_rms_deg'):.2f} deg RMS against the base's normal")
+    yield f"twins: {result.rms_deg():.2f} deg RMS against the fine normal{held}"
+    yield f"twins: {result.rms_deg('base_rms_deg'):.2f} deg RMS against the base's normal"
     drawn = f"{counted(len(result.bank), 'rendered frame')}, {counted(len(result.bank_spots), 'highlight')} in them"
-    print(f"bank: {drawn}, {100 * result.share_of('near_miss'):.0f} % near misses")
+    yield f"bank: {drawn}, {100 * result.share_of('near_miss'):.0f} % near misses"
     near, middle, far = result.distance_mm
-    print(f"twins stand at {near:.0f} to {far:.0f} mm (80 %), half nearer than {middle:.0f} mm")
+    yield f"twins stand at {near:.0f} to {far:.0f} mm (80 %), half nearer than {middle:.0f} mm"
     unlike = sum(not each.twins.is_covered for each in result.spots)
     if unlike:
-        print(f"note: the bank holds no highlight like {unlike} of {len(spots)}; their figures are of the nearest ones")
+        yield f"note: the bank holds no highlight like {unlike} of {len(spots)}; their figures are of the nearest ones"
     for each in result.assumed:
-        print(f"given: {each.what}: {each.distribution}" if each.given else f"drawn: {each.what}: {each.distribution}")
+        yield f"given: {each.what}: {each.distribution}" if each.given else f"drawn: {each.what}: {each.distribution}"
 
 
 def _twin_cells(each: "SpotTwins") -> list[str]:
@@ -310,8 +277,8 @@ def _twin_cells(each: "SpotTwins") -> list[str]:
     x, y = spot.peak_px
     low, high = twins.interval_deg
     return [
-        str(spot.index), f"{x:.1f}", f"{y:.1f}", f"{spot.radius_px:.1f}", spot.estimator,
-        "" if each.stated_deg is None else f"{each.stated_deg:.2f}", f"{twins.rms_deg:.2f}",
+        str(spot.index), fixed(x, 1), fixed(y, 1), fixed(spot.radius_px, 1), spot.estimator,
+        fixed(each.stated_deg), fixed(twins.rms_deg),
         f"{low:.2f} to {high:.2f}", "" if twins.coverage is None else f"{100 * twins.coverage:.0f} %",
     ]  # fmt: skip
 
@@ -320,34 +287,30 @@ calibrate = App(name="calibrate", help="Measure what a calibration file states: 
 
 
 @calibrate.command
+@command
 def light(
     pictures: list[Path],
     /,
     *,
-    camera: Annotated[
-        Path,
-        Parameter(help="Calibration or camera file; the lights are added to what it states.", converter=named_path),
-    ],
+    camera: Annotated[Path, path("Calibration or camera file; the lights are added to what it states.")],
     out: Out,
-    ball_radius: Annotated[float | None, Parameter(help="Radius of the ball in the pictures, mm.")] = None,
-    ball_radius_sd: Annotated[float, Parameter(help="Standard deviation of that radius, mm.")] = 0.0,
+    ball_radius: Annotated[float | None, about("Radius of the ball in the pictures, mm.")] = None,
+    ball_radius_sd: Annotated[float, about("Standard deviation of that radius, mm.")] = 0.0,
     outlines: Annotated[
-        Path | None,
-        Parameter(help="Rough outlines of the ball where it is not found: lines of name,x,y,radius in px (CSV)."),
+        Path | None, about("Rough outlines of the ball where it is not found: lines of name,x,y,radius in px (CSV).")
     ] = None,
     plate: Annotated[
         Path | None,
-        Parameter(help="Instead of a ball: poses of the camera to a flat plate in the plane z = 0, as of reconstruct."),
+        about("Instead of a ball: poses of the camera to a flat plate in the plane z = 0, as of reconstruct."),
     ] = None,
-    plate_sd: Annotated[float, Parameter(help="Standard deviation of the plate's distance, mm.")] = 0.2,
-    plate_tilt_sd: Annotated[float, Parameter(help="Standard deviation of the plate's tilt an axis, deg.")] = 0.2,
+    plate_sd: Annotated[float, about("Standard deviation of the plate's distance, mm.")] = 0.2,
+    plate_tilt_sd: Annotated[float, about("Standard deviation of the plate's tilt an axis, deg.")] = 0.2,
     encoding: Annotated[
         Literal["srgb", "linear"] | None,
-        Parameter(help="How the values are encoded, where the calibration does not say; default srgb."),
+        about("How the values are encoded, where the calibration does not say; default srgb."),
     ] = None,
-    most: Annotated[int, Parameter(help="Lights at most, 1 to 4.", converter=whole_number)] = 4,
-    as_json: AsJson = False,
-) -> int:
+    most: Annotated[int, whole("Lights at most, 1 to 4.")] = 4,
+) -> Told:
     """Measure where the lights are, from their highlights on a ball of known radius or on a flat plate at known poses.
 
     Exit 1 if the result is doubtful; then no calibration is written.
@@ -362,16 +325,10 @@ def light(
     from simtest.spec.calibration_file import load_calibration
 
     mirror = _mirror(ball_radius, ball_radius_sd, outlines, plate, (plate_sd, plate_tilt_sd))
-    command = command_line()
     with exclusive_folder(out):
         made = calibrate_lights(picture_readers(pictures), load_calibration(camera), mirror, encoding, most)
-        files = write_calibration(made, out, command)
-    if as_json:
-        print_files(files, as_json, **result_json(made))
-    else:
-        _print_result(made)
-        print_files(files, as_json)
-    return 1 if made.result.problems else 0
+        files = write_calibration(made, out, command_line())
+    return Told(files, lambda: result_json(made), _light_parts(made), 1 if made.result.problems else 0)
 
 
 def _mirror(
@@ -390,8 +347,7 @@ def _mirror(
     return Plate(plate, *plate_sd)
 
 
-def _print_result(made: "Calibrated") -> None:
-
+def _light_parts(made: "Calibrated") -> "Iterator[str | Table]":
     result = made.result
     rows = []
     for number, each in enumerate(result.lights, 1):
@@ -399,25 +355,25 @@ def _print_result(made: "Calibrated") -> None:
             f"{value:+.3f} ± {half:.3f}" for value, half in zip(each.position_mm, each.half_widths_mm, strict=True)
         ]
         rows.append((str(number), *cells, str(each.pictures), "no: left out" if each.is_foreign else "yes"))
-    print_table(("light", "x (mm)", "y (mm)", "z (mm)", "pictures", "on the tip"), rows)
-    print("± is half of a 95 % interval; camera frame: x right, y down, z forward")
+    yield Table(("light", "x (mm)", "y (mm)", "z (mm)", "pictures", "on the tip"), rows)
+    yield "± is half of a 95 % interval; camera frame: x right, y down, z forward"
     used = counted(len(made.views.views), "picture")
-    print(f"{used}, residuals {result.rms_px:.3f} px RMS an axis, chi2 {result.chi2:.1f} for {result.freedom}")
-    print_lines([f"left out: {name}: {why}" for name, why in made.views.left_out.items()])
-    print_lines([f"note: {note}" for note in result.notes])
-    print_lines([f"problem: {problem}; no calibration was written" for problem in result.problems])
+    yield f"{used}, residuals {result.rms_px:.3f} px RMS an axis, chi2 {result.chi2:.1f} for {result.freedom}"
+    yield from few([f"left out: {name}: {why}" for name, why in made.views.left_out.items()])
+    yield from few([f"note: {note}" for note in result.notes])
+    yield from few([f"problem: {problem}; no calibration was written" for problem in result.problems])
 
 
 camera = App(name="camera", help="Show what a camera file means, or convert it to another program's format.")
 
 ViewRadius = Annotated[
-    float | None,
-    Parameter(help="Radius in px of the round view about the picture's centre, where the file states none."),
+    float | None, about("Radius in px of the round view about the picture's centre, where the file states none.")
 ]
 
 
 @camera.command
-def show(file: Path, /, *, view_radius: ViewRadius = None, as_json: AsJson = False) -> None:
+@command
+def show(file: Path, /, *, view_radius: ViewRadius = None) -> Told:
     """Show a camera file as it is understood: format, fields of view, and what the lens does at the border.
 
     Parameters
@@ -431,61 +387,53 @@ def show(file: Path, /, *, view_radius: ViewRadius = None, as_json: AsJson = Fal
 
     shown = camera_summary(load_camera(file, view_radius))
     shown = {"file": str(file), "format": FORMATS[recognise(file)].title, **shown}
-    if as_json:
-        print_json(shown)
-    else:
-        _print_camera(shown)
+    return Told(data=shown, parts=_camera_parts(shown))
 
 
-def _print_camera(shown: "dict[str, Any]") -> None:
-    """Print a camera's summary as lines and a table."""
+def _camera_parts(shown: "dict[str, Any]") -> "Iterator[str | Table]":
+    """Tell a camera's summary as lines and a table."""
     (fx, skew, cx), (_, fy, cy), _ = shown["K"]
-    print(f"{shown['file']}: {shown['format']}, {shown['width']} x {shown['height']} px")
-    print(f"fx {fx:.8g}, fy {fy:.8g}, cx {cx:.8g}, cy {cy:.8g}{f', skew {skew:.6g}' if skew else ''} px")
-    print("the centre of the first pixel is (0.5, 0.5)")
+    yield f"{shown['file']}: {shown['format']}, {shown['width']} x {shown['height']} px"
+    yield f"fx {fx:.8g}, fy {fy:.8g}, cx {cx:.8g}, cy {cy:.8g}{f', skew {skew:.6g}' if skew else ''} px"
+    yield "the centre of the first pixel is (0.5, 0.5)"
     told = {name: value for name, value in shown.get("distortion", {}).items() if name != "type"}
-    print(f"lens: {shown['lens']}{''.join(f', {name} {value:.6g}' for name, value in told.items())}")
+    yield f"lens: {shown['lens']}{''.join(f', {name} {value:.6g}' for name, value in told.items())}"
     if (mask := shown.get("view_mask")) is not None:
-        print(f"view mask: {', '.join(f'{name} {value:.6g}' for name, value in mask.items())} px")
-    spans = ", ".join(f"{name} {_cell(value, 2)}" for name, value in shown["fov_deg"].items())
-    print(f"field of view, deg: {spans}")
+        yield f"view mask: {', '.join(f'{name} {value:.6g}' for name, value in mask.items())} px"
+    spans = ", ".join(f"{name} {fixed(value, missing='none')}" for name, value in shown["fov_deg"].items())
+    yield f"field of view, deg: {spans}"
     rows = [
         [
             each["at"],
             "{:.0f}, {:.0f}".format(*each["pixel"]),
-            _cell(each["angle_deg"], 2) if each["in_view"] else "outside the view",
-            _cell(each["moved_px"], 1) if each["in_view"] else "",
+            fixed(each["angle_deg"], 2, "none") if each["in_view"] else "outside the view",
+            fixed(each["moved_px"], 1, "none") if each["in_view"] else "",
         ]
         for each in shown["border"]
     ]
-    print_table(["border", "pixel", "deg off the axis", "px from a pinhole's"], rows)
-
-
-def _cell(value: "float | None", digits: int) -> str:
-    return "none" if value is None else f"{value:.{digits}f}"
+    yield Table(["border", "pixel", "deg off the axis", "px from a pinhole's"], rows)
 
 
 @camera.command
+@command
 def convert(
     file: Path,
     /,
     *,
-    out: Annotated[Path, Parameter(help="File to write; replaced if it exists.", converter=named_path)],
+    out: Annotated[Path, path("File to write; replaced if it exists.")],
     to: Annotated[
         Literal["toml", "opencv", "ros", "colmap", "transforms", "matlab"] | None,
-        Parameter(help="Format; default by the suffix of --out."),
+        about("Format; default by the suffix of --out."),
     ] = None,
     poses: Annotated[
         Path | None,
-        Parameter(help="File whose poses are written too, for colmap and transforms: images.txt or transforms.json."),
+        about("File whose poses are written too, for colmap and transforms: images.txt or transforms.json."),
     ] = None,
     photometric: Annotated[
-        Path | None,
-        Parameter(help="EndoMapper's photometric calibration, for toml: response, vignetting, light."),
+        Path | None, about("EndoMapper's photometric calibration, for toml: response, vignetting, light.")
     ] = None,
     view_radius: ViewRadius = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Convert a camera file; the half pixel and the axes of both formats are seen to.
 
     Parameters
@@ -505,7 +453,7 @@ def convert(
             save_calibration(load_calibration(file, photometric, view_radius), out)
         else:
             save_camera(load_camera(file, view_radius), out, to, None if poses is None else _frames(poses))
-    print_files([out], as_json)
+    return Told([out])
 
 
 def _frames(poses: Path) -> "list[tuple[str, Array]]":

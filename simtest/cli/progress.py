@@ -91,12 +91,14 @@ def stop_between_steps() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[int, int, str], None]]:
+def progress_bar(
+    afterwards: str = "writing the report", stopped: str = ""
+) -> Iterator[Callable[[int, int, str], None]]:
     """Show a bar, or lines, while the body runs, and yield the callable that moves it: (done, total, what).
 
     `afterwards` is what the body does once all steps are done, unless the last step is that of a page (`WRITTEN`):
     nothing follows it. A single step shows no bar. What comes after all steps of a bar, such as the steps of a page,
-    has a bar of its own below.
+    has a bar of its own below. `stopped` is what a stop leaves; default what `main` says of the command.
     """
     display: _Lines | _Bar | None = None
     with stop_between_steps() as check:
@@ -115,9 +117,13 @@ def progress_bar(afterwards: str = "writing the report") -> Iterator[Callable[[i
 
         try:
             yield move
+        except KeyboardInterrupt as stop:
+            if stopped and not str(stop):
+                raise KeyboardInterrupt(stopped) from None
+            raise
         finally:
-            if display is not None:
-                display.close()
+            if isinstance(display, _Bar):
+                display.bar.stop()
 
 
 def at_terminal() -> bool:
@@ -142,9 +148,6 @@ class _Lines:
         about = f", about {left:.0f} s left" if left and done < total else ""
         print(f"simtest: {done}/{total} {what} ({passed:.0f} s{about})", file=sys.stderr, flush=True)
 
-    def close(self) -> None:
-        """Do nothing: the command says what came of it."""
-
 
 class _Bar:
     """A bar for each stretch of the work."""
@@ -163,10 +166,6 @@ class _Bar:
         seconds = self.remaining.seconds(done, total, time.monotonic())
         left = f"about {timedelta(seconds=round(seconds))} left" if seconds and done < total else ""
         self.bar.update(self.task, completed=done, total=total, description=what, left=left)
-
-    def close(self) -> None:
-        """Leave the bar as it stands."""
-        self.bar.stop()
 
 
 def _rich_bar() -> "Progress":

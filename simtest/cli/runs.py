@@ -1,37 +1,41 @@
 """Commands that run experiments and judge methods: validate, score, core, nightly, bench."""
 
 import itertools
+import json
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
 from simtest.cli.common import (
-    MOST_ROWS,
     ONE_PROCESS,
     Address,
-    AsJson,
     EngineName,
     EngineOptions,
     Estimators,
+    NamedPath,
     Out,
     Realisations,
     Seed,
     Settings,
+    Table,
+    Told,
     Variant,
     Views,
+    about,
+    command,
     command_line,
+    few,
+    first,
+    flag,
     named,
-    named_path,
-    print_files,
-    print_json,
-    print_lines,
-    print_rest,
-    print_run,
-    print_table,
+    path,
     read_guide,
-    whole_number,
+    run_record,
+    values_of,
+    whole,
 )
 from simtest.cli.main import MANNERS
 from simtest.cli.progress import progress_bar
@@ -39,8 +43,11 @@ from simtest.errors import InputError
 from simtest.runtime.locks import exclusive_folder
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from rich.console import Console
 
+    from simtest.dataset.scoring.dense import MapOptions
     from simtest.nightly.run import Outcome
 
 RUNS = Path("reports/runs")
@@ -48,13 +55,12 @@ MESHES = (".ply", ".obj", ".stl", ".vtk")
 """Suffixes of files that may be taken for an experiment by mistake."""
 
 
+@command
 def validate(
     experiment: Annotated[str, named("experiments", files=True)],
     /,
     *,
-    out: Annotated[
-        Path | None, Parameter(help="Folder of the run; default reports/runs/EXPERIMENT.", converter=named_path)
-    ] = None,
+    out: Annotated[Path | None, path("Folder of the run; default reports/runs/EXPERIMENT.")] = None,
     realisations: Realisations = None,
     seed: Seed = None,
     views: Views = None,
@@ -62,13 +68,9 @@ def validate(
     estimators: Estimators = None,
     variant: Variant = None,
     engine: EngineOptions = ONE_PROCESS,
-    export: Annotated[
-        Path | None,
-        Parameter(help="Folder for the frames without their truth, for methods elsewhere.", converter=named_path),
-    ] = None,
-    charts: Annotated[bool, Parameter(negative="", help="Write the page's charts as PNG files too.")] = False,
-    as_json: AsJson = False,
-) -> None:
+    export: Annotated[Path | None, path("Folder for the frames without their truth, for methods elsewhere.")] = None,
+    charts: Annotated[bool, flag("Write the page's charts as PNG files too.")] = False,
+) -> Told:
     """Run an experiment and write results.parquet, summary.json and index.html; a stopped run goes on.
 
     Parameters
@@ -80,36 +82,29 @@ def validate(
     """
     from simtest.api import validate as run
     from simtest.rendering.backend import needs_gpu
-    from simtest.spec import load_experiment, parse_settings
+    from simtest.spec import load_experiment
     from simtest.validation.mesh_verdicts import mesh_verdicts
 
     if Path(experiment).suffix.lower() in MESHES:
         raise InputError(f"{experiment}: is a mesh; use simtest validate mesh --set surface.path={experiment}")
-    values = parse_settings(settings or [])
-    own = {"realisations": realisations, "seed": seed, "estimators": estimators, "viewpoints": views}
-    values |= {key: value for key, value in own.items() if value is not None}
+    values = values_of(settings, realisations=realisations, seed=seed, estimators=estimators, viewpoints=views)
     described = load_experiment(experiment, values)
     meshes = mesh_verdicts(described)
     for mesh in meshes:
         if not mesh.usable:
             # Before the work: it takes long, and its figures may mean nothing.
             warnings.warn(str(mesh), stacklevel=1)
-    command = command_line()
     with progress_bar() as progress:
         folder = out or RUNS / described.name
         chosen = engine.make(needs_gpu(variant))
-        run(described, folder, None, command, variant, progress, engine=chosen, export=export, charts=charts)
-    if as_json:
-        exported = {} if export is None else {"export": export / "README.md"}
-        print_run(folder, meshes=meshes, **exported)
-        return
+        run(described, folder, None, command_line(), variant, progress, engine=chosen, export=export, charts=charts)
+    exported = {} if export is None else {"export": export / "README.md"}
     # A warning has told what is wrong with a mesh, unless --quiet left it out.
-    verdicts = [mesh for mesh in meshes if mesh.usable or MANNERS.quiet]
-    print(*verdicts, sep="\n", end="\n" * bool(verdicts))
-    print_guide(folder)
-    print(folder / "index.html")
-    if export is not None:
-        print(export / "README.md")
+    verdicts = [str(mesh) for mesh in meshes if mesh.usable or MANNERS.quiet]
+    return Told(
+        data=lambda: run_record(folder, meshes=meshes, **exported),
+        parts=[*verdicts, lambda: print_guide(folder), folder / "index.html", *exported.values()],
+    )
 
 
 GUIDE_WIDTH = 80
@@ -136,7 +131,7 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
     if not rows:
         console.print("No true highlight: there is nothing to compare the methods by.")
         return
-    kept = rows if MANNERS.verbose else rows[:MOST_ROWS]
+    kept, more = first(rows, "as the page shows them")
     room = max(console.width, GUIDE_WIDTH) - sum(_WIDTHS) - len(_WIDTHS)
 
     def table(show_header: bool) -> Table:
@@ -159,9 +154,8 @@ def print_guide(run: Path, console: "Console | None" = None) -> None:
                 own = f"{guest['estimator']}\n({guest['standing']})"
                 part.add_row(*map(escape, ("", own, *_figures(guest))))
         console.print(part)
-    print_rest(len(rows) - len(kept), "as the page shows them", console.print)
-    for sentence in filter(None, (guide["shared"], guide.get("seen"))):
-        console.print(escape(sentence))
+    for line in (*more, *map(escape, filter(None, (guide["shared"], guide.get("seen"))))):
+        console.print(line)
 
 
 def _figures(row: "dict[str, Any]") -> tuple[str, str, str]:
@@ -170,20 +164,37 @@ def _figures(row: "dict[str, Any]") -> tuple[str, str, str]:
     return row["error"].replace(" (", "\n("), answered, row["breaks"]
 
 
-MapEncoding = Annotated[
-    str | None,
-    Parameter(help="Maps: how values hold a component: components, unit, centred or positive_z; integers: unit."),
-]
-MapFrame = Annotated[
-    str | None,
-    Parameter(help="Maps: axes of the channels: opencv (default), opengl, directx, or such as x,-y,-z."),
-]
-MapDepth = Annotated[
-    str | None, Parameter(help="Maps: depths are along the axis (z, default) or the pixel's ray (ray).")
-]
-MapUnit = Annotated[
-    float | None, Parameter(help="Maps: mm of one unit of the depths; integers need it. Default 1 for floats.")
-]
+@Parameter(name="*")
+@dataclass(frozen=True)
+class HowMapsAreRead:
+    """What is stated of maps of normals or depths; None: the default."""
+
+    encoding: Annotated[
+        str | None,
+        about("Maps: how values hold a component: components, unit, centred or positive_z; integers: unit."),
+    ] = None
+    frame: Annotated[
+        str | None, about("Maps: axes of the channels: opencv (default), opengl, directx, or such as x,-y,-z.")
+    ] = None
+    depth: Annotated[str | None, about("Maps: depths are along the axis (z, default) or the pixel's ray (ray).")] = None
+    unit_mm: Annotated[
+        float | None, about("Maps: mm of one unit of the depths; integers need it. Default 1 for floats.")
+    ] = None
+
+    def named(self, name: str | None) -> "MapOptions":
+        """Return it with the name of the method."""
+        from simtest.dataset.scoring.dense.conventions import MapOptions
+
+        return MapOptions(name, **vars(self))
+
+    def refuse(self, **others: str | None) -> None:
+        """Raise `InputError` for options of maps, these and others, where there are none."""
+        for name, value in {**others, **vars(self)}.items():
+            if value is not None:
+                raise InputError(f"--{name.replace('_', '-')} {value}: for folders of maps alone; a table needs none")
+
+
+NOTHING_STATED = HowMapsAreRead()
 
 WORDS = ("shading",)
 """Words that stand for maps of a method of our own, where no file or folder is called so."""
@@ -197,34 +208,16 @@ def is_dense(answers: Path) -> bool:
     return answers.is_dir() or (str(answers) in WORDS and not answers.exists())
 
 
-def refuse_dense_options(**options: object) -> None:
-    """Raise `InputError` for options of maps where a table is scored."""
-    for name, value in options.items():
-        if value is not None:
-            raise InputError(f"--{name.replace('_', '-')} {value}: for folders of maps alone; a table needs none")
-
-
-def score_dense(
-    maps: Path, on: Path, out: Path | None, name: str | None, encoding: str | None, frame: str | None,
-    depth: str | None, unit_mm: float | None, as_json: bool,
-) -> None:  # fmt: skip
-    """Score maps, print how they were read and the figures by zone, and name the page."""
-    from simtest.dataset.scoring.dense import MapOptions, score_maps
+def score_dense(maps: Path, on: Path, out: Path | None, options: "MapOptions") -> Told:
+    """Score maps; tell how they were read, and the figures by zone."""
+    from simtest.dataset.scoring.dense import score_maps
     from simtest.pages.style import number
 
-    command = command_line()
-    folder = out or Path("reports/scores") / (name or maps.resolve().name)
-    options = MapOptions(name, encoding, frame, depth, unit_mm)
-    try:
-        with progress_bar("writing the page") as progress:
-            score = score_maps(str(maps), on, folder, options, command, progress)
-    except KeyboardInterrupt:
-        # The sums over frames are held in memory alone.
-        raise KeyboardInterrupt("an earlier page stays; the same command begins anew") from None
-    if as_json:
-        print_files([score.page], as_json, **score.to_json())
-        return
-    print_lines(score.lines)
+    folder = out or SCORES / (options.name or maps.resolve().name)
+    # The sums over frames are held in memory alone.
+    stopped = "an earlier page stays; the same command begins anew"
+    with progress_bar("writing the page", stopped) as progress:
+        score = score_maps(str(maps), on, folder, options, command_line(), progress)
     rows = []
     for (source, quantity, surface), cell in score.scorer.cells():
         if quantity == "angle_deg" and cell["group"] == "zone" and cell["label"] in ZONES:
@@ -232,32 +225,23 @@ def score_dense(
             shares = [f"{100 * float(str(cell[key])):.1f} %" for key in ("below_11.25", "share_unanswered")]
             rows.append((source, surface, str(cell["label"]), *figures, *shares))
     heads = ("source", "surface", "zone", "median, deg", "mean", "p95", "below 11.25 deg", "unanswered")
-    print_table(heads, rows)
-    print(score.page)
+    return Told([score.page], score.to_json, [*few(score.lines), Table(heads, rows)])
 
 
 SCORES = Path("reports/scores")
 
 
+@command
 def score(
-    answers: Annotated[Path, Parameter(converter=named_path)],
+    answers: NamedPath,
     /,
     *,
-    on: Annotated[
-        Path,
-        Parameter(help="Run or dataset whose frames were exported; it holds export.json.", converter=named_path),
-    ],
-    out: Annotated[
-        Path | None, Parameter(help="Folder of the scored run; default reports/scores/NAME.", converter=named_path)
-    ] = None,
-    name: Annotated[str | None, Parameter(help="Name of the method in the results; default that of the file.")] = None,
+    on: Annotated[Path, path("Run or dataset whose frames were exported; it holds export.json.")],
+    out: Annotated[Path | None, path("Folder of the scored run; default reports/scores/NAME.")] = None,
+    name: Annotated[str | None, about("Name of the method in the results; default that of the file.")] = None,
     engine: EngineOptions = ONE_PROCESS,
-    encoding: MapEncoding = None,
-    frame: MapFrame = None,
-    depth: MapDepth = None,
-    unit_mm: MapUnit = None,
-    as_json: AsJson = False,
-) -> None:
+    how: HowMapsAreRead = NOTHING_STATED,
+) -> Told:
     """Score normals that were estimated elsewhere on exported frames, as our own estimators are scored.
 
     Parameters
@@ -267,30 +251,24 @@ def score(
         folder of maps of normals or depths, or the word shading, for a score of every pixel (docs/howto/dense.md).
     """
     if is_dense(answers):
-        score_dense(answers, on, out, name, encoding, frame, depth, unit_mm, as_json)
-        return
-    refuse_dense_options(encoding=encoding, frame=frame, depth=depth, unit_mm=unit_mm)
+        return score_dense(answers, on, out, how.named(name))
+    how.refuse()
     from simtest.dataset.scoring.run import score_table
     from simtest.report import write_report
 
-    command = command_line()
     folder = out or SCORES / (name or answers.stem)
     with progress_bar() as progress:
-        chosen = engine.make()
-        run = score_table(answers, on, folder, name, command, chosen, progress)
+        run = score_table(answers, on, folder, name, command_line(), engine.make(), progress)
         page = write_report(run.folder, progress)
-    if as_json:
-        print_run(folder)
-        return
-    print_guide(folder)
-    print(page)
+    return Told(data=lambda: run_record(folder), parts=[lambda: print_guide(folder), page])
 
 
 core = App(name="core", help="Check a reconstruction core that runs as a command of its own.")
 
 
 @core.command
-def check(command: str, /, *, as_json: AsJson = False) -> int:
+@command
+def check(command: str, /) -> Told:
     """Check a core against the process protocol, step by step; exit 1 if a step is wrong.
 
     The core is started, asked about highlights whose normals are known by formula, and ended. Each step has a line:
@@ -304,12 +282,7 @@ def check(command: str, /, *, as_json: AsJson = False) -> int:
     from simtest.validation.core_check import check_core
 
     report = check_core(command)
-    if as_json:
-        print_json(report.to_json())
-    else:
-        for line in report.lines():
-            print(line)
-    return 0 if report.is_ok else 1
+    return Told(data=report.to_json, parts=report.lines(), code=0 if report.is_ok else 1)
 
 
 nightly = App(name="nightly", help="Run the fixed experiments, compare with the baseline, write the page.")
@@ -317,67 +290,50 @@ nightly = App(name="nightly", help="Run the fixed experiments, compare with the 
 ProfileName = Annotated[
     str, named("profiles", files=True, help="A profile file, or the name of a shipped one: quick, full.")
 ]
-ReportsFolder = Annotated[
-    Path, Parameter(name="--reports", help="Folder of history, baselines and pages.", converter=named_path)
-]
+ReportsFolder = Annotated[Path, path("Folder of history, baselines and pages.", "--reports")]
 DEFAULT_REPORTS = Path("reports")
 
 
 @nightly.default
+@command
 def run_nightly(
     *,
     profile: ProfileName = "quick",
     reports: ReportsFolder = DEFAULT_REPORTS,
     variant: Variant = None,
     engine: EngineName = "local",
-    workers: Annotated[
-        int | None,
-        Parameter(help="Processes that work at once; default one for each core, 8 at most.", converter=whole_number),
-    ] = None,
+    workers: Annotated[int | None, whole("Processes that work at once; default one for each core, 8 at most.")] = None,
     address: Address = None,
-    as_json: AsJson = False,
-) -> int:
+) -> Told:
     """Run a profile; exit 0 fine, 1 a regression or a change to explain, 2 it could not be run.
 
     The night is kept in the history, compared with the accepted baseline, and its page written.
     """
-    try:
-        outcome = _run(profile, reports, variant, engine, workers, address)
-    except KeyboardInterrupt as stop:
-        nothing = "nothing of this night is kept; history, baseline and the last page are as they were"
-        raise KeyboardInterrupt(str(stop) or nothing) from None
-    if as_json:
-        _print_json(outcome)
-    else:
-        _print(outcome)
-    return outcome.judged.verdict.exit_code
-
-
-def _run(
-    profile: str, reports: Path, variant: str | None, engine: str, workers: int | None, address: str | None
-) -> "Outcome":
-    from simtest.nightly.run import RunOptions, run_nightly
+    from simtest.nightly.run import RunOptions
+    from simtest.nightly.run import run_nightly as run_profile
     from simtest.nightly.store import Reports
     from simtest.rendering.backend import needs_gpu
     from simtest.runtime.processes import make_engine
     from simtest.spec import load_profile
 
-    described = load_profile(profile)
-    command = command_line()
-    count = _cores() if workers is None else workers
-    chosen = make_engine(engine, count, address, gpu=needs_gpu(variant))
-    with progress_bar("writing the page") as progress:
-        return run_nightly(described, Reports(reports), RunOptions(command, variant, chosen, count, progress))
+    stopped = "nothing of this night is kept; history, baseline and the last page are as they were"
+    with progress_bar("writing the page", stopped) as progress:
+        described, count = load_profile(profile), _cores() if workers is None else workers
+        chosen = make_engine(engine, count, address, gpu=needs_gpu(variant))
+        options = RunOptions(command_line(), variant, chosen, count, progress)
+        outcome = run_profile(described, Reports(reports), options)
+    code = outcome.judged.verdict.exit_code
+    return Told([outcome.folder / "index.html"], lambda: _verdict(outcome), _night_parts(outcome), code)
 
 
 @nightly.command
+@command
 def accept(
     *,
-    reason: Annotated[str, Parameter(help="Why these numbers are right; stored with them.")],
+    reason: Annotated[str, about("Why these numbers are right; stored with them.")],
     profile: ProfileName = "quick",
     reports: ReportsFolder = DEFAULT_REPORTS,
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Make the last night's numbers the baseline."""
     from simtest.nightly.store import Reports, log_note
     from simtest.nightly.store import accept as accept_night
@@ -385,13 +341,10 @@ def accept(
 
     folder, name = Reports(reports), load_profile(profile).name
     note = log_note(folder, name)
-    if note and not as_json:
-        print(note)
     accepted = accept_night(folder, name, reason)
-    if as_json:
-        print_json({"baseline": accepted.id, "profile": accepted.profile, "reason": accepted.reason, "note": note})
-        return
-    print(f"{accepted.id} is the baseline of {accepted.profile}: {accepted.reason}")
+    told = {"baseline": accepted.id, "profile": accepted.profile, "reason": accepted.reason, "note": note}
+    line = f"{accepted.id} is the baseline of {accepted.profile}: {accepted.reason}"
+    return Told(data=told, parts=[note, line] if note else [line])
 
 
 def _cores() -> int:
@@ -400,18 +353,16 @@ def _cores() -> int:
     return min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
-def _print_json(outcome: "Outcome") -> None:
-    """Print the verdict as it stands in the folder of the last run, with the page."""
-    import json
-
+def _verdict(outcome: "Outcome") -> dict[str, Any]:
+    """Read the verdict as it stands in the folder of the last run."""
     from simtest.nightly.outputs import VERDICT
 
-    told = json.loads((outcome.folder / VERDICT).read_text(encoding="utf-8"))
-    print_files([outcome.folder / "index.html"], True, **told)
+    verdict: dict[str, Any] = json.loads((outcome.folder / VERDICT).read_text(encoding="utf-8"))
+    return verdict
 
 
-def _print(outcome: "Outcome") -> None:
-    """Print what the gate says, a table by experiment, and where the page lies."""
+def _night_parts(outcome: "Outcome") -> "Iterator[str | Table]":
+    """Tell what the gate says, and a table by experiment."""
     from simtest.nightly.phrases import headline
     from simtest.nightly.records import OUTCOMES
 
@@ -422,11 +373,10 @@ def _print(outcome: "Outcome") -> None:
         ["" if value is None else str(value) for value in values]
         for values in judged.by_experiment().select(columns).iter_rows()
     ]
-    print_table(columns, rows, title=f"{judged.run.record.profile}: {headline(verdict)}")
+    yield Table(columns, rows, title=f"{judged.run.record.profile}: {headline(verdict)}")
     # The cause first, then what else a reader must know.
-    print(*verdict.causes, sep="\n", end="\n" * bool(verdict.causes))
-    print(*verdict.notes, sep="\n", end="\n" * bool(verdict.notes))
-    print(outcome.folder / "index.html")
+    yield from verdict.causes
+    yield from verdict.notes
 
 
 bench = App(name="bench", help="Run the frozen benchmark, make a table of its certificates.")
@@ -434,68 +384,50 @@ bench = App(name="bench", help="Run the frozen benchmark, make a table of its ce
 BENCH_WIDTH = 170
 """Columns of the table of parts; in fewer its words would be cut."""
 
-SuiteVersion = Annotated[str, Parameter(name="--suite", help="Version of the suite.")]
-Core = Annotated[str | None, Parameter(help='Estimator by name, or a command: "command: ./core --flag".')]
-Maps = Annotated[
-    Path | None,
-    Parameter(help="Folder of maps for the part dense, in place of a core; or shading.", converter=named_path),
-]
+SuiteVersion = Annotated[str, about("Version of the suite.", "--suite")]
 
 
 @bench.command
+@command
 def run(
     *,
     out: Out,
-    core: Core = None,
-    maps: Maps = None,
-    name: Annotated[str | None, Parameter(help="Maps: name of the method; default that of the folder.")] = None,
-    encoding: MapEncoding = None,
-    frame: MapFrame = None,
-    depth: MapDepth = None,
-    unit_mm: MapUnit = None,
-    parts: Annotated[
-        list[str] | None, Parameter(name="--part", negative="", help="Run this part alone; may be repeated.")
-    ] = None,
+    core: Annotated[str | None, about('Estimator by name, or a command: "command: ./core --flag".')] = None,
+    maps: Annotated[Path | None, path("Folder of maps for the part dense, in place of a core; or shading.")] = None,
+    name: Annotated[str | None, about("Maps: name of the method; default that of the folder.")] = None,
+    how: HowMapsAreRead = NOTHING_STATED,
+    parts: Annotated[list[str] | None, flag("Run this part alone; may be repeated.", "--part")] = None,
     suite: SuiteVersion = "v1",
     engine: EngineOptions = ONE_PROCESS,
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Run a core on the frozen cases; print its table and write certificate.json. A stopped run goes on."""
     from simtest.bench.run import run_bench, run_maps
     from simtest.bench.suite import load_suite
-    from simtest.dataset.scoring.dense.conventions import MapOptions
 
     if (core is None) == (maps is None):
         raise InputError("--core and --maps: give one of them; --maps runs the part dense, --core all others")
     if core is None and parts not in (None, ["dense"]):
         raise InputError(f"--part {parts[0] if parts else ''}: maps are scored on the part dense alone")
     read, chosen = load_suite(suite), engine.make()
-    with exclusive_folder(out), progress_bar() as progress:
+    stopped = "finished frames are kept; the same command scores all maps anew" if core is None else ""
+    with exclusive_folder(out), progress_bar(stopped=stopped) as progress:
         if core is None:
-            options = MapOptions(name, encoding, frame, depth, unit_mm)
-            try:
-                made = run_maps(read, maps or "", out, options, chosen, progress)
-            except KeyboardInterrupt:
-                raise KeyboardInterrupt("finished frames are kept; the same command scores all maps anew") from None
+            made = run_maps(read, maps or "", out, how.named(name), chosen, progress)
         else:
-            refuse_dense_options(name=name, encoding=encoding, frame=frame, depth=depth, unit_mm=unit_mm)
+            how.refuse(name=name)
             made = run_bench(read, core, out, parts, chosen, progress)
-    if as_json:
-        print_files([made.certificate], True, **made.content)
-        return
-    _print_parts(made.content)
-    print(made.certificate)
+    return Told([made.certificate], made.content, _part_rows(made.content))
 
 
 @bench.command
+@command
 def table(
     folder: Path,
     /,
     *,
-    out: Annotated[Path, Parameter(help="The page; or a folder, which gets index.html.", converter=named_path)],
+    out: Annotated[Path, path("The page; or a folder, which gets index.html.")],
     suite: SuiteVersion = "v1",
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Make a page that ranks the certificates below a folder.
 
     Parameters
@@ -508,53 +440,45 @@ def table(
 
     read = load_suite(suite)
     board = read_entries(folder, read)
-    page = write_leaderboard(read, board, out)
-    print_files([page], as_json, **(board.to_json() if as_json else {}))
+    return Told([write_leaderboard(read, board, out)], board.to_json)
 
 
 @bench.command
-def frames(
-    *,
-    out: Out,
-    suite: SuiteVersion = "v1",
-    engine: EngineOptions = ONE_PROCESS,
-    as_json: AsJson = False,
-) -> None:
+@command
+def frames(*, out: Out, suite: SuiteVersion = "v1", engine: EngineOptions = ONE_PROCESS) -> Told:
     """Write the frames of the part dense without their truth, for methods that give maps."""
     from simtest.bench.run import export_frames
     from simtest.bench.suite import load_suite
 
     read = load_suite(suite)
     with exclusive_folder(out), progress_bar() as progress:
-        folder = export_frames(read, out, engine.make(), progress)
-    print_files([folder], as_json)
+        return Told([export_frames(read, out, engine.make(), progress)])
 
 
 @bench.command
-def cases(*, suite: SuiteVersion = "v1", as_json: AsJson = False) -> None:
+@command
+def cases(*, suite: SuiteVersion = "v1") -> Told:
     """List the frozen cases with their hashes."""
     from simtest.bench.suite import load_suite
 
     read = load_suite(suite)
-    if as_json:
-        print_json({"suite": read.spec.name, "version": suite, "sha256": read.digest, "cases": read.hashes})
-        return
     rows = [
         (case.name, str(case.spec.draws), str(case.spec.draws * case.spec.realisations), case.digest[:16])
         for case in read.cases
     ]
-    print_table(("case", "scenes", "frames", "sha256"), rows, title=f"{read.spec.title}: {read.digest}")
+    record = {"suite": read.spec.name, "version": suite, "sha256": read.digest, "cases": read.hashes}
+    title = f"{read.spec.title}: {read.digest}"
+    return Told(data=record, parts=[Table(("case", "scenes", "frames", "sha256"), rows, title)])
 
 
-def _print_parts(content: dict[str, Any]) -> None:
-    """Print a row for each part, the reasons of its refusals, and the headline."""
+def _part_rows(content: dict[str, Any]) -> "Iterator[str | Table]":
+    """Tell a row for each part, the reasons of its refusals, and the headline."""
     from simtest.bench.table import COLUMNS, part_cells, refusals
 
     rows = [(part, *part_cells(told)) for part, told in content["parts"].items()]
-    print_table(
-        ("part", *COLUMNS), rows, title=f"{content['core']['name']} on {content['suite']['version']}", width=BENCH_WIDTH
-    )
-    print(*refusals(content["parts"]), sep="\n", end="\n" * bool(refusals(content["parts"])))
+    title = f"{content['core']['name']} on {content['suite']['version']}"
+    yield Table(("part", *COLUMNS), rows, title, BENCH_WIDTH)
+    yield from refusals(content["parts"])
     overall = content["overall"]
     if overall["complete"]:
-        print(f"overall: {overall['score_deg']:.3f} deg, the mean of the parts' scores")
+        yield f"overall: {overall['score_deg']:.3f} deg, the mean of the parts' scores"

@@ -2,6 +2,7 @@
 
 import json
 import textwrap
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,13 +14,17 @@ from simtest.cli.common import (
     Out,
     SceneName,
     Settings,
+    Told,
     Variant,
-    named_path,
-    print_files,
+    about,
+    command,
+    flag,
+    path,
     print_json,
     replacing,
     seed_number,
-    whole_number,
+    values_of,
+    whole,
 )
 from simtest.cli.main import MANNERS
 from simtest.cli.progress import progress_bar
@@ -27,9 +32,8 @@ from simtest.errors import InputError
 from simtest.runtime.locks import exclusive_file, exclusive_folder
 
 
-def render(
-    scene: SceneName, /, *, out: Out, settings: Settings = None, variant: Variant = None, as_json: AsJson = False
-) -> None:
+@command
+def render(scene: SceneName, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> Told:
     """Render a scene with its ground truth: frame.png, radiance.exr, truth.npz, frame.json, camera.toml.
 
     calibration.toml holds what reconstruction is told of frame.png: camera, response, falloff, noise, lights, distance
@@ -37,23 +41,21 @@ def render(
     """
     from simtest import api
     from simtest.simulation.frame_files import write_frame
-    from simtest.spec import parse_settings
 
     with exclusive_folder(out):
-        try:
-            with progress_bar("finding the truth") as move:
-                frame = api.render(scene, parse_settings(settings or []), variant, move)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("nothing is written") from None
-        print_files(write_frame(frame, out), as_json, highlights=len(frame.highlights))
+        with progress_bar("finding the truth", stopped="nothing is written") as move:
+            frame = api.render(scene, values_of(settings), variant, move)
+        files = write_frame(frame, out)
+    return Told(files, {"highlights": len(frame.highlights)})
 
 
+@command
 def views(
     scene: SceneName,
     /,
     *,
     out: Out,
-    count: Annotated[int, Parameter(help="Views wanted, 1 to 1000.", converter=whole_number)] = 50,
+    count: Annotated[int, whole("Views wanted, 1 to 1000.")] = 50,
     along: Annotated[
         str | None,
         Parameter(
@@ -61,36 +63,28 @@ def views(
             allow_leading_hyphen=True,
         ),
     ] = None,
-    fps: Annotated[float | None, Parameter(help="Frames a second of the sequence; default 25.")] = None,
-    labels: Annotated[
-        bool,
-        Parameter(help="Write the sequence's optical flow and co-visibility.", negative=""),
-    ] = False,
+    fps: Annotated[float | None, about("Frames a second of the sequence; default 25.")] = None,
+    labels: Annotated[bool, flag("Write the sequence's optical flow and co-visibility.")] = False,
     settings: Settings = None,
     variant: Variant = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Pick viewpoints of an anatomy that show isolated highlights: views.json, a picture of each, a sheet of all.
 
     With --along, a film along the camera path instead. The poses are written for other programs, too.
     """
     from simtest import api
-    from simtest.spec import parse_settings
 
     ends = None if along is None else _ends(along)
     with progress_bar("sampling views") as move:
-        sampled = api.sample_views(scene, out, count, parse_settings(settings or []), variant, move, ends, fps, labels)
+        sampled = api.sample_views(scene, out, count, values_of(settings), variant, move, ends, fps, labels)
     with_one = sum(view.isolated_highlights > 0 for view in sampled.views)
-    if as_json:
-        told = {"tried": sampled.tried, "kept": len(sampled.views), "with_isolated_highlight": with_one}
-        print_files([out / "views.json"], as_json, **told, left_out=sampled.rejected)
-        return
-    print(f"{with_one} of {sampled.tried} views show an isolated highlight")
-    for reason, number in sampled.rejected.items():
-        print(f"left out: {number} ({reason})")
-    for reason in sampled.poses_left_out:
-        print(f"not written: {reason}")
-    print(out / "views.json")
+    counts = {"tried": sampled.tried, "kept": len(sampled.views), "with_isolated_highlight": with_one}
+    lines = [
+        f"{with_one} of {sampled.tried} views show an isolated highlight",
+        *(f"left out: {number} ({reason})" for reason, number in sampled.rejected.items()),
+        *(f"not written: {reason}" for reason in sampled.poses_left_out),
+    ]
+    return Told([out / "views.json"], counts | {"left_out": sampled.rejected}, lines)
 
 
 def _ends(text: str) -> tuple[float, float]:
@@ -101,22 +95,16 @@ def _ends(text: str) -> tuple[float, float]:
     return first, last
 
 
+@command
 def view(
     scene: SceneName,
     /,
     *,
-    screenshot: Annotated[
-        Path | None,
-        Parameter(help="PNG to draw to, without a display, instead of opening a window.", converter=named_path),
-    ] = None,
-    page: Annotated[
-        Path | None,
-        Parameter(help="HTML file with the scene to turn and zoom in a browser, offline.", converter=named_path),
-    ] = None,
+    screenshot: Annotated[Path | None, path("PNG to draw to, without a display, instead of opening a window.")] = None,
+    page: Annotated[Path | None, path("HTML file with the scene to turn and zoom in a browser, offline.")] = None,
     settings: Settings = None,
     variant: Variant = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Told:
     """Show a scene in 3D: surface coloured by curvature, camera, lights, true and estimated normals."""
     from simtest.report.viewer import (
         check_page,
@@ -127,33 +115,30 @@ def view(
         write_scene_page,
     )
     from simtest.report.viewer.content import PAGE_GRID
-    from simtest.spec import load_scene, parse_settings
+    from simtest.spec import load_scene
 
-    described = load_scene(scene, parse_settings(settings or []))
+    described = load_scene(scene, values_of(settings))
     if page is not None:
         check_page(page)
     if screenshot is not None or page is None:
         check_target(screenshot)
     if screenshot is None and page is None:
         show(make_content(described, variant))
-        return
     if page is not None:
         with exclusive_file(page, "--page"):
             write_scene_page(make_content(described, variant, PAGE_GRID), page, described.name)
     if screenshot is not None:
         with exclusive_file(screenshot, "--screenshot"):
             save_screenshot(make_content(described, variant), screenshot)
-    print_files([file for file in (page, screenshot) if file is not None], as_json)
+    return Told([file for file in (page, screenshot) if file is not None])
 
 
-def export(
-    scene: SceneName, /, *, out: Out, settings: Settings = None, variant: Variant = None, as_json: AsJson = False
-) -> None:
+@command
+def export(scene: SceneName, /, *, out: Out, settings: Settings = None, variant: Variant = None) -> Told:
     """Write a scene as files that Mitsuba itself loads: scene.xml, and surface.ply where the surface is a mesh."""
     from simtest import api
-    from simtest.spec import parse_settings
 
-    print_files(api.export(scene, out, parse_settings(settings or []), variant), as_json)
+    return Told(api.export(scene, out, values_of(settings), variant))
 
 
 Kind = Literal["scenes", "experiments", "datasets", "profiles", "estimators", "detectors", "sensors", "rigs"]
@@ -173,7 +158,8 @@ LONGEST = 110
 """Characters about a name; --verbose and --json tell all."""
 
 
-def listing(kind: Kind | None = None, /, *, as_json: AsJson = False) -> None:
+@command
+def listing(kind: Kind | None = None, /) -> Told:
     """List what is shipped and installed, by the names that commands take, with a line about each.
 
     Parameters
@@ -182,16 +168,17 @@ def listing(kind: Kind | None = None, /, *, as_json: AsJson = False) -> None:
         What to list; default everything.
     """
     found = {each: names_of(each) for each in HEADINGS if kind in (None, each)}
-    if as_json:
-        print_json(found)
-        return
-    for each, names in found.items():
-        if kind is None:
-            print(f"{each} ({HEADINGS[each]})")
+    return Told(data=found, parts=_listed(found, kind is None))
+
+
+def _listed(found: dict[str, dict[str, str]], has_headings: bool) -> Iterator[str]:
+    for kind, names in found.items():
+        if has_headings:
+            yield f"{kind} ({HEADINGS[kind]})"
         width = max(map(len, names), default=0)
-        for name, about in names.items():
-            line = about if MANNERS.verbose else textwrap.shorten(about, LONGEST, placeholder=" ...")
-            print(f"{'  ' * (kind is None)}{name:<{width}}  {line}".rstrip())
+        for name, text in names.items():
+            line = text if MANNERS.verbose else textwrap.shorten(text, LONGEST, placeholder=" ...")
+            yield f"{'  ' * has_headings}{name:<{width}}  {line}".rstrip()
 
 
 def names_of(kind: str) -> dict[str, str]:
@@ -258,6 +245,7 @@ Seed = Annotated[int | None, Parameter(help="Seed of the shape; default the reci
 
 
 @mesh.command
+@command
 def check(
     file: Path,
     /,
@@ -266,8 +254,7 @@ def check(
     exponent: float | None = None,
     roughness: float | None = None,
     kind: Literal["auto", "lumen", "organ"] = "auto",
-    as_json: AsJson = False,
-) -> int:
+) -> Told:
     """Check what is wrong with a mesh, what is mended when it is used, and whether it is fine enough for highlights.
 
     Exit 1 if it is too coarse or has a problem that cannot be mended, 2 if it is no mesh that can be used.
@@ -291,11 +278,7 @@ def check(
     if not 0.1 <= distance <= 1e4:
         raise InputError(f"--distance {distance:g}: must be 0.1 to 10000 mm")
     verdict = check_mesh(file, distance, concentration(exponent, roughness), kind)
-    if as_json:
-        print_json(verdict)
-    else:
-        print(*verdict.lines(), sep="\n")
-    return 0 if verdict.usable else 1
+    return Told(data=verdict, parts=verdict.lines(), code=0 if verdict.usable else 1)
 
 
 @Parameter(name="*")
@@ -303,33 +286,29 @@ def check(
 class Recipe:
     """The options of an anatomy: its recipe, and where its mesh goes."""
 
-    out: Annotated[Path, Parameter(help="File to write: .ply, .obj or .stl.", converter=named_path)]
+    out: Annotated[Path, path("File to write: .ply, .obj or .stl.")]
     seed: Seed = None
-    edge_mm: Annotated[float | None, Parameter(help="Edge length, mm; default that of the scenes.")] = None
-    recipe: Annotated[
-        Path | None, Parameter(help="Recipe file (TOML); default the shipped one.", converter=named_path)
-    ] = None
+    edge_mm: Annotated[float | None, about("Edge length, mm; default that of the scenes.")] = None
+    recipe: Annotated[Path | None, path("Recipe file (TOML); default the shipped one.")] = None
     settings: Annotated[list[str] | None, replacing("length_mm=40")] = None
-    curvature: Annotated[
-        bool, Parameter(negative="", help="Write the principal curvatures k_min and k_max, 1/mm, into a PLY file.")
-    ] = False
-    as_json: AsJson = False
+    curvature: Annotated[bool, flag("Write the principal curvatures k_min and k_max, 1/mm, into a PLY file.")] = False
 
 
 @mesh.command
-def colon(*, options: Recipe) -> None:
+@command
+def colon(*, options: Recipe) -> Told:
     """Make a colon from its recipe: another one for each seed, the same bytes for the same."""
-    _make("colon", options)
+    return _make("colon", options)
 
 
 @mesh.command
-def liver(*, options: Recipe) -> None:
+@command
+def liver(*, options: Recipe) -> Told:
     """Make a liver from its recipe: another one for each seed, the same bytes for the same."""
-    _make("liver", options)
+    return _make("liver", options)
 
 
-def _make(kind: Literal["colon", "liver"], given: Recipe) -> None:
-    from simtest.spec import parse_settings
+def _make(kind: Literal["colon", "liver"], given: Recipe) -> Told:
     from simtest.surfaces.factory import make_mesh
     from simtest.surfaces.mesh_file import check_target, write_mesh
     from simtest.surfaces.recipe import load_anatomy
@@ -337,12 +316,9 @@ def _make(kind: Literal["colon", "liver"], given: Recipe) -> None:
     check_target(given.out)
     if given.curvature and given.out.suffix.lower() != ".ply":
         raise InputError(f"--curvature: {given.out.suffix} files hold none; allowed: .ply")
-    anatomy = load_anatomy(kind, given.recipe, given.seed, parse_settings(given.settings or []))
+    anatomy = load_anatomy(kind, given.recipe, given.seed, values_of(given.settings))
     with exclusive_file(given.out):
         made, k_min, k_max = make_mesh(anatomy, given.edge_mm)
         write_mesh(given.out, made, {"k_min": k_min, "k_max": k_max} if given.curvature else None)
     told = {"file": str(given.out), "vertices": len(made.vertices), "faces": len(made.faces)}
-    if given.as_json:
-        print_json(told)
-    else:
-        print("{file}: {vertices} vertices, {faces} faces".format_map(told))
+    return Told(data=told, parts=["{file}: {vertices} vertices, {faces} faces".format_map(told)])

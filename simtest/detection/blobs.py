@@ -311,7 +311,7 @@ def _kind(
 def _outline(one: _Traced, shape: tuple[int, ...]) -> tuple[Array, Box]:
     """Return the isophote at half height, or the border of the pixels, and the region of interest around them."""
     half, (x, y), (rows, columns) = one.sets[0], one.spot.corner, one.spot.mask.shape
-    own = border_of(one.spot.mask) + one.spot.corner if half is None else half.polygon() + PIXEL_CENTRE + one.corner
+    own = border_of(one.spot.mask) + one.spot.corner if half is None else half.polygon + PIXEL_CENTRE + one.corner
     x0, x1 = x - columns // 2 - MARGIN_PX, x + columns + columns // 2 + MARGIN_PX
     y0, y1 = y - rows // 2 - MARGIN_PX, y + rows + rows // 2 + MARGIN_PX
     x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, shape[1]), min(y1, shape[0])
@@ -351,7 +351,7 @@ def _shape(fits: list[_Fitted]) -> tuple[float | None, float | None, float | Non
     if not fits:
         return None, None, None
     residuals = [float(np.sqrt(np.mean((conic.relative_radii(points) - 1) ** 2))) for points, conic in fits]
-    shapes = [conic.centre_and_matrix() for _, conic in fits]
+    shapes = [conic.centre_and_matrix for _, conic in fits]
     low, high = np.linalg.eigvalsh(shapes[0][1])
     wander = max(float(np.hypot(*(centre - shapes[0][0]))) for centre, _ in shapes) * (low * high) ** 0.25
     return float(np.sqrt(low / high)), float(np.mean(residuals)), float(wander)

@@ -163,5 +163,5 @@ def _largest_width_ratio(inner: FittedConic, outer: FittedConic) -> float:
 
     The squared widths are w^T Q^-1 w, so it is the root of the largest generalised eigenvalue of the two inverses.
     """
-    ratios = np.linalg.eigvals(np.linalg.solve(inner.centre_and_matrix()[1], outer.centre_and_matrix()[1]))
+    ratios = np.linalg.eigvals(np.linalg.solve(inner.centre_and_matrix[1], outer.centre_and_matrix[1]))
     return float(np.sqrt(ratios.real.max()))

@@ -9,14 +9,11 @@ are ellipses to a percent or better; a melted one may look no less like an ellip
 import numpy as np
 
 from simtest.geometry import Array
+from simtest.runtime.fitted import fitted_number
 
-MEAN_BENDS, PEAK_BENDS = 5.5, 4.5
-"""Standard deviation of the mean axis, and of the axis at the peak, over that of the bend ..."""
-
-MELTED, MELTED_RESIDUAL, STEEPNESS = 0.3, 0.02, 4
-"""... and, as a share of the radius, where the residual is so large that a melted spot is as likely as a single one;
-below it the share falls with this power of the residual. All were fitted to 506 highlights on 32 of the scenes 0 to 35
-of the corpus `hard`, 396 of which hold one glint (docs/concepts/uncertainty.md)."""
+MEAN_BENDS, PEAK_BENDS = fitted_number("bends.mean"), fitted_number("bends.peak")
+MELTED, MELTED_RESIDUAL = fitted_number("bends.melted"), fitted_number("bends.melted_residual")
+STEEPNESS = fitted_number("bends.steepness")
 
 
 def bend_variance(residuals: Array, by_noise: Array, moments: Array, slope: float) -> float:

@@ -17,14 +17,10 @@ from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, Law
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.patch import slope_divisor_px2
+from simtest.runtime.fitted import fitted_number
 
-PIXEL_PX2 = 0.005
-"""Variance of the parabola's apex, px^2: the peak of three pixels is not the lobe's."""
-
-GAP_SHARE, RIPPLES = 1.5, 7.0
-"""Variances of the peak over its squared gap from the isophotes' axis followed to t -> 1, which is usually nearer to
-the truth, and over the ripples (`IsophoteFamily.ripple_error`). All three were fitted to random fields of glints that
-no published figure uses (docs/concepts/uncertainty.md)."""
+PIXEL_PX2 = fitted_number("ripples.brightest_px2")
+GAP_SHARE, RIPPLES = fitted_number("ripples.brightest_gap"), fitted_number("ripples.brightest")
 
 TOP_ISOVALUE = 0.9
 """Where the border cuts even the isophote at this value, it may cut off the peak."""

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from simtest.geometry import Array, chi_squared
+from simtest.runtime.statistics import CONFIDENCE
 
 PARTS = ("noise", "resolution", "shape", "light_offset", "camera", "distance", "response", "relief")
 """Names of the parts.
@@ -30,8 +31,6 @@ MISPLACED = ("noise", "resolution", "shape", "response", STATED)
 
 LARGEST_VARIANCE = math.pi**2
 """rad^2; no direction is less certain. What states more has other units."""
-
-CONFIDENCE = 0.95
 
 Budget = Mapping[str, Array]
 """Covariance of each part, shape (2, 2), rad^2, in the basis ``tangent_basis(normal)``."""

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from simtest.geometry import Array, Mask, Patch
+from simtest.runtime.fitted import fitted_number
 
 NEARLY_CLIPPED = 0.93
 """Pixels above this share of the clipped ones' intensity count as clipped: coding blurs the plateau."""
@@ -14,11 +15,8 @@ AROUND_PX = 17
 """Side of the square around a pixel whose clipped ones are meant: where a falloff was divided away, those elsewhere are
 brighter or darker."""
 
-PLATEAU_SHARE, BENT_SHARE, BENT_RESIDUAL, MOST_BENT = 0.02, 0.8, 0.05, 1.5
-"""Variance of the axis over that of a point anywhere on the plateau: where the isophotes below are ellipses, and what
-is added where the innermost differs from one by this share of its radius, growing with its third power up to so many
-times as much: peaks have then melted under the plateau. Fitted to 217 clipped highlights with one glint each, on
-relief, colons and livers, of seeds that no figure quotes."""
+PLATEAU_SHARE, BENT_SHARE = fitted_number("plateau.share"), fitted_number("plateau.bent_share")
+BENT_RESIDUAL, MOST_BENT = fitted_number("plateau.bent_residual"), fitted_number("plateau.most_bent")
 
 
 def clipped_pixels(patch: Patch) -> Mask | None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors, exactly
 from simtest.errors import Failure, Reason
-from simtest.estimators.budget import CONFIDENCE, Budget, equivalent_covariance
+from simtest.estimators.budget import Budget, equivalent_covariance
 from simtest.estimators.cloud_base import MOST_EXTENT, BaseEvidence, evidence_of
 from simtest.estimators.cloud_mixture import (
     CLUMPING,
@@ -27,6 +27,8 @@ from simtest.estimators.prior_parts import add_common_parts, light_offset_part, 
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.geometry import Array, Camera, chi_squared
 from simtest.geometry.vectors import basis_across
+from simtest.runtime.fitted import fitted_number
+from simtest.runtime.statistics import CONFIDENCE
 
 LEAST_SPOTS = 6
 """A cloud of fewer spots gets no answer: a lone large highlight is a cloud of one."""
@@ -44,10 +46,7 @@ LARGELY_SEEN = 0.98
 UNEVEN = 0.2
 """Standard deviation of the spots that each light makes, as a share of an even part."""
 
-BENDS = 0.35
-"""How far tissue's changes of curvature inside a cloud move its centre, standard deviation along one direction as a
-share of the cloud's extent. ``python -m studies.clouds.shading`` finds 0.15 to 0.2 of clouds that lie about their
-highlight point; what is more is for those that do not."""
+BENDS = fitted_number("clouds.bends")
 
 LEAST_INDEPENDENT = 2.5
 """Fewer independent spots state no extent at all."""

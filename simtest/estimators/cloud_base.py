@@ -1,8 +1,7 @@
 """What the diffuse light says of a cloud: whether the base has a highlight point there at all, and where.
 
 Spots alone do not tell a highlight point from a fold that nearly faces the camera, nor how far changes of the base's
-gains move their centroid. The diffuse light does (`cloud_shading`), as well as the albedo lets it. The constants were
-fitted by ``python -m studies.clouds.shading``, on frames that no figure stands on.
+gains move their centroid. The diffuse light does (`cloud_shading`), as well as the albedo lets it.
 """
 
 import math
@@ -16,25 +15,15 @@ from simtest.estimators.cloud_shading import DiffuseLight, Shading
 from simtest.estimators.prior_parts import light_offset_part
 from simtest.geometry import Array, chi_squared
 from simtest.geometry.vectors import basis_across
+from simtest.runtime.fitted import fitted_number
 
-ALBEDO_SLOPE = 0.12
-"""Standard deviation of grad ln L by the albedo along one direction, per rad."""
-
-JACKKNIFE_CUBIC = 3.0
-"""The jackknife's standard deviation of a cubic's gradient is too small by this factor."""
-
-MOST_MISFIT = math.radians(2.5)
-"""A misfit with a larger standard deviation, rad, verifies nothing."""
-
-LEAST_GAIN = 0.7
-"""Along a direction of a smaller gain 1 + d k the diffuse light does not tell where the highlight point is."""
+ALBEDO_SLOPE, JACKKNIFE_CUBIC = fitted_number("clouds.albedo_slope"), fitted_number("clouds.jackknife_cubic")
+MOST_MISFIT = math.radians(fitted_number("clouds.most_misfit"))
+MOST_EXTENT = math.radians(fitted_number("clouds.most_extent"))
+LEAST_GAIN = fitted_number("clouds.least_gain")
 
 REFUSED, DOUBTED = 0.95, 0.68
 """A misfit that a base with a highlight point there exceeds with less than the rest gets no answer, or a flag."""
-
-MOST_EXTENT = math.radians(8.0)
-"""A cloud that is longer lies on a base that hardly turns along it, since the slopes of tissue are 2 to 8 deg: where
-the base is tissue, several highlight points or none."""
 
 
 @dataclass(frozen=True)

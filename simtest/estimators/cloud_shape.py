@@ -13,6 +13,7 @@ from simtest.calibration import Distribution, Uniform
 from simtest.geometry import Array, chi_squared
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import short_repr
+from simtest.runtime.statistics import CONFIDENCE
 
 BASE_KD = Uniform(-0.5, 1.0)
 """Distance times curvature of the base along both principal directions, where nobody told: a lumen's wall from inside
@@ -24,8 +25,6 @@ LOBE_SHARE = 1.2
 
 LOBE_RAD2 = Uniform(0.0, math.radians(1.5) ** 2)
 """1 / c of a lobe that nobody told: its variance along one direction."""
-
-CONFIDENCE = 0.95
 
 OUTLINE = 2.0
 """A cloud is drawn with so many standard deviations: 86 % of it is inside."""

@@ -27,26 +27,17 @@ from simtest.geometry import Array, Camera, CirclePose, Mask, Patch, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.patch import share_of_noise
 from simtest.geometry.vectors import basis_across
+from simtest.runtime.fitted import fitted_number
 
 DRIFT_CHI2, SUSPECT_CHI2 = 13.82, 3.22
 """Squared Mahalanobis distances beyond which the axis's drift is more than noise, or may be: 0.1 % and 20 % of normal
 pairs lie beyond. On a surface of constant curvature the drift is noise alone; on a colon hardly a highlight is like
 that, and where noise hides the drift it hides an error several times the mean axis's noise."""
 
-MEAN_SHARE, MEAN_SIZE, DRIFT_SHARE, DRIFT_PX2 = 1.0, 5e-5, 0.15, 0.005
-"""Variances of the mean axis over the squared drift, along it, and over the lobe's variance, where the drift may be
-more than noise: the peak lies 0.8 to 1.8 times the drift away, and a texture pulls at all isophotes. Of both axes over
-the squared drift, in all directions, and a constant where the drift is more than noise, px^2: terms of higher order
-and, in renders of meshes, triangles."""
-
-MEAN_PX2, PEAK_PX2 = 4e-5, 8e-5
-"""Variances of the mean axis and of the axis at the peak by the grid of pixels, px^2: crossings are interpolated, and a
-lobe is averaged over a pixel. These and the numbers of the drift were fitted to 718 highlights of the corpus `hard`, on
-scenes that no quoted figure uses (docs/concepts/uncertainty.md)."""
-
-MEAN_RIPPLES, PEAK_RIPPLES = 11.0, 17.0
-"""Variances of the mean axis and of the axis at the peak over that of the ripples (`simtest.estimators.ripples`);
-fitted to random fields of glints that no published figure uses (docs/concepts/uncertainty.md)."""
+MEAN_SHARE, MEAN_SIZE = fitted_number("drift.mean_share"), fitted_number("drift.mean_size")
+DRIFT_SHARE, DRIFT_PX2 = fitted_number("drift.both_share"), fitted_number("drift.both_px2")
+MEAN_PX2, PEAK_PX2 = fitted_number("drift.mean_grid_px2"), fitted_number("drift.peak_grid_px2")
+MEAN_RIPPLES, PEAK_RIPPLES = fitted_number("ripples.mean"), fitted_number("ripples.peak")
 
 STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""

@@ -17,6 +17,7 @@ import numpy as np
 from simtest.calibration import Priors
 from simtest.estimators.budget import Budget
 from simtest.geometry import Patch
+from simtest.runtime.fitted import fitted_number
 
 CROWD = 3
 """A frame with more highlights than this for each light shows relief or folds: a smooth patch shows one for each."""
@@ -24,14 +25,10 @@ CROWD = 3
 AROUND = 12
 """The brightest of so many nearest highlights stands for a highlight point's radiance."""
 
-BRIGHT, FAINT = np.radians(0.93) ** 2, np.radians(1.26) ** 2
-"""Variance along each axis, rad^2, of a highlight as bright as those around, and its growth with ln(I0 / I). The region
-of such a normal held 97 % of the highlights that were fitted, of which nearly a half are near misses: lobes and slopes
-differ from frame to frame, and the frame does not tell them."""
-
-USUAL, RARER, MOST = 60, 0.15, 400
-"""Near misses get rarer with the number of highlights, since stronger relief makes more highlight points: the variance
-falls with this power of the number of highlights for each light, over the usual one, up to the largest."""
+BRIGHT = np.radians(fitted_number("near_misses.bright")) ** 2
+FAINT = np.radians(fitted_number("near_misses.faint")) ** 2
+USUAL, MOST = fitted_number("near_misses.usual"), fitted_number("near_misses.most")
+RARER = fitted_number("near_misses.rarer")
 
 APART = 3
 """Lights of a larger number are a ring, whose highlights melt: it counts as so many."""
@@ -53,9 +50,6 @@ def near_miss_parts(patch: Patch, priors: Priors) -> Budget:
 
 def near_miss_variance(patch: Patch, lights: int) -> float:
     """Return the variance of a highlight's normal along each axis by the chance that it is a near miss, rad^2.
-
-    The numbers were fitted to the errors of 3,568 highlights on rendered colons, stomachs, livers and gallbladders
-    under one light, at the camera or beside it, with slopes of 2 to 8 deg (docs/concepts/uncertainty.md).
 
     Parameters
     ----------

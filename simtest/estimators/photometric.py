@@ -23,6 +23,7 @@ from simtest.estimators.small_spot import SmallSpot
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Index
+from simtest.runtime.fitted import fitted_number
 
 REGIONS = (0.05, 0.1, 0.2, 0.3, 0.5)
 """The pixels inside the first of these isophotes that closes are fitted. Further out there is little but noise."""
@@ -36,9 +37,7 @@ MAX_PIXELS = 16384
 COARSE = 4
 """Every fourth pixel suffices to choose between the two candidates of a plane."""
 
-MISFIT_SHARE = 0.9
-"""Variance of a misfitting lobe's normal over the squared shift of its misfit, or the squared drift of the isophotes'
-axis; fitted to 614 highlights of the generated colon (`simtest.estimators.isophote_family`)."""
+MISFIT_SHARE = fitted_number("misfit.share")
 
 MISFIT_FACTOR = 1.5
 """A misfit is told where it makes the stated standard deviation this many times larger: texture and lobes of another

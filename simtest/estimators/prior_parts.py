@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Normal, Priors
 from simtest.calibration.priors import AT_CAMERA_MM
-from simtest.estimators.budget import CONFIDENCE, equivalent_covariance
+from simtest.estimators.budget import equivalent_covariance
 from simtest.estimators.highlight_fit import HighlightAxis
 from simtest.estimators.light_table import light_table
 from simtest.estimators.near_misses import near_miss_parts
@@ -21,6 +21,8 @@ from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, chi_squared
 from simtest.geometry.lenses import undistort_with_errors
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
+from simtest.runtime.fitted import fitted_number
+from simtest.runtime.statistics import CONFIDENCE
 
 NEAR_SHARE = 0.05
 """Share of the distances that are nearer than the one at which a told light's offset must be negligible."""
@@ -28,18 +30,13 @@ NEAR_SHARE = 0.05
 NEGLIGIBLE = 0.1
 """A squared error below this share of the stated variance is left out."""
 
-SPOT_SPREAD, SPOT_ONSET = math.radians(3.2), math.radians(1.3)
-"""Highlights lie wider about the base's brightest point than the relief's slope says, since a lobe of finite width
-lights points that miss the light: by this much an axis on wet tissue (lobes of 1 to 2 deg half-angle), in squares,
-where the slope is well above the second angle; a smooth surface has one highlight. Fitted to 1,125 detected highlights
-of rough planes; theory.md 7.4 has the same excess of visible highlights."""
+SPOT_SPREAD = math.radians(fitted_number("spots_on_relief.spread"))
+SPOT_ONSET = math.radians(fitted_number("spots_on_relief.onset"))
 
-STEEPER = 1.4
-"""Slope of an organ's highlights over that of all its surface. Highlights lie where a surface bends (theory.md 7.1),
-and pits and ridges are steep where they bend: all glints by 1.07 (colon), 1.80 (liver) and 2.42 times (stomach;
-`studies.clouds.glint_slope`). A view that cuts a cloud may also show its steep side alone. Fitted to 3,069 highlights
-of `studies.one_light` (seeds 9641 and 9642): with their slope told exactly, 89 % of them were held with 1.0 and 97 %
-with 1.4. A plane shows the whole cloud of a relief that is alike everywhere, so that the factor is 1 there."""
+STEEPER = fitted_number("steeper.share")
+"""Highlights lie where a surface bends (theory.md 7.1), and pits and ridges are steep where they bend: all glints by
+1.07 (colon), 1.80 (liver) and 2.42 times (stomach; `studies.clouds.glint_slope`). A view that cuts a cloud may also
+show its steep side alone. A plane shows the whole cloud of a relief that is alike everywhere, so that it is 1 there."""
 
 STEP_MM = 1e-3
 """Step of a light's position, mm, for the differences of the normal."""

@@ -4,12 +4,9 @@ import numpy as np
 
 from simtest.geometry import Array
 from simtest.geometry.vectors import tangent_basis
+from simtest.runtime.fitted import fitted_number
 
-RELIEF_RAD = 0.18
-"""Deviation, along each axis, of the bisector at a highlight from the base's normal: relief, and near misses.
-
-On the validation split of `highlights` the median angle between both is 12.4 deg.
-"""
+RELIEF_RAD = fitted_number("reflection.relief")
 
 
 def reflection_distances(

@@ -20,6 +20,7 @@ from simtest.estimators.protocol import Estimate
 from simtest.estimators.spot_fit import LEAST_VARIANCE_PX2, XX, XY, YY, SpotFits, SpotWindows, X, Y, fit_spots
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.geometry.vectors import basis_across
+from simtest.runtime.fitted import fitted_number
 
 RESOLVED_PX = 3.0
 """Least radius at half height, before smoothing, of a highlight whose isophotes are used."""
@@ -37,12 +38,9 @@ WINDOW_RADII, WINDOW_PX = 1.3, 0.7
 OTHER_ISOVALUES = (0.1, 0.2, 0.3, 0.5)
 """Pixels as bright as the first of these isophotes that closes, but outside of it, belong to something else."""
 
-PIXEL_PX2, RADIUS_SHARE, MOMENTS_SHARE, RESIDUAL_SHARE, NEIGHBOUR_PX4 = 3e-4, 7e-5, 0.0061, 5.7, 10.2
-"""What the centre's covariance has beyond noise: a constant, px^2; shares of the fourth power of the radius before
-smoothing and of the squared second moments, since a lopsided spot's centre lies off its peak by the square of its size;
-of the covariance that the fit's residuals imply; and of the second moments over the fourth power of the distance of the
-nearest other highlight, px. Fitted to 713 spots with one glint each on tissue and colons with relief, through plain,
-clipped and processed sensors, on seeds that no quoted figure uses."""
+PIXEL_PX2, RADIUS_SHARE = fitted_number("small_spot.constant"), fitted_number("small_spot.radius")
+MOMENTS_SHARE, RESIDUAL_SHARE = fitted_number("small_spot.moments"), fitted_number("small_spot.residual")
+NEIGHBOUR_PX4 = fitted_number("small_spot.neighbour")
 
 LEAST_GAP_PX = 4.0
 """A neighbour that is nearer is part of the spot."""

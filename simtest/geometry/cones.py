@@ -17,6 +17,7 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.ellipse_fit import FittedConic, FittedConics
 from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.statistics import CONFIDENCE
 
 _ROUND = np.diag([1.0, 1.0, -1.0])
 
@@ -25,8 +26,6 @@ _HUGE = 1e100
 FORWARD: Array = np.array([0.0, 0.0, 1.0])
 
 FORWARD.flags.writeable = False
-
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
@@ -196,23 +195,14 @@ def cone_rays(cone: npt.ArrayLike, sightline: npt.ArrayLike | None = None, count
 
 @dataclass(frozen=True)
 class FittingPlanes:
-    """N contours, each in a plane in which its sightlines' cone is an ellipse.
+    """N contours, each in a plane in which its sightlines' cone is an ellipse."""
 
-    Parameters
-    ----------
-    points : sequence of ndarray, shape (N_i, 2)
-        The contours in their planes' coordinates.
-    plane_from_camera : ndarray, shape (3, 3) or (N, 3, 3)
-        From the camera frame to homogeneous coordinates of the one plane, or of each contour's own.
-    sightlines : ndarray, shape (N, 3)
-        A direction inside each cone, unit, camera frame.
-    failures : mapping
-        Failure by the contour's index; the other entries of such a contour mean nothing.
-    """
-
-    points: Sequence[Array]
+    points: Sequence[Array]  # the contours in their planes' coordinates
+    # (3, 3) or (N, 3, 3): from the camera frame to homogeneous coordinates of the one plane, or of each contour's
+    # own.
     plane_from_camera: Array
-    sightlines: Array
+    sightlines: Array  # (N, 3): A direction inside each cone, unit, camera frame
+    # Failure by the contour's index; the other entries of such a contour mean nothing.
     failures: Mapping[int, Failure] = field(default_factory=dict)
 
 
@@ -262,20 +252,13 @@ class PoseRegion:
     two conditions that are linear in the cone's five parameters; the other three are the circle's position and size.
     With Gaussian noise on the cone, g^T cov(g)^-1 g at the true N is therefore exactly chi-squared with two degrees of
     freedom, also where N+ and N- meet and the errors of the normals are not Gaussian.
-
-    Parameters
-    ----------
-    frame : ndarray, shape (3, 3)
-        Rows: two unit vectors across the cone's axis, and the axis, camera frame.
-    conic : ndarray, shape (5,)
-        (a, b, c, d, e) of a x^2 + b x y + c y^2 + d x + e y = 1, the cone on the plane at unit distance along the axis.
-    covariance : ndarray, shape (5, 5)
-        Of the conic.
     """
 
-    frame: Array
+    frame: Array  # (3, 3): rows: two unit vectors across the cone's axis, and the axis, camera frame
+    # (5,): (a, b, c, d, e) of a x^2 + b x y + c y^2 + d x + e y = 1, the cone on the plane at unit distance along
+    # the axis.
     conic: Array
-    covariance: Array
+    covariance: Array  # (5, 5): of the conic
 
     def statistic(self, normals: npt.ArrayLike) -> Array:
         """Compute the squared Mahalanobis distance of the cone from the cones of circles perpendicular to normals.

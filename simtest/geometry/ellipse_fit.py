@@ -85,12 +85,9 @@ class FittedConic:
         T = self.normalised_from_image
         return np.asarray(T.T @ self.normalised @ T)
 
-    def centre_and_matrix(self) -> tuple[Array, Array]:
-        """Return centre, px, and Q of the ellipse as (x - centre)^T Q (x - centre) = 1."""
-        return self._centre_and_matrix
-
     @cached_property
-    def _centre_and_matrix(self) -> tuple[Array, Array]:
+    def centre_and_matrix(self) -> tuple[Array, Array]:
+        """Centre, px, and Q of the ellipse as (x - centre)^T Q (x - centre) = 1."""
         C, T = self.normalised, self.normalised_from_image
         centre = -np.linalg.solve(C[:2, :2], C[:2, 2])
         level = -(C[2, 2] + C[:2, 2] @ centre)
@@ -99,26 +96,18 @@ class FittedConic:
 
     def relative_radii(self, points: Array) -> Array:
         """Return the distance of points, shape (N, 2), px, from the centre over the ellipse's radius that way."""
-        centre, Q = self.centre_and_matrix()
+        centre, Q = self.centre_and_matrix
         gap = points - centre
         return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", gap, Q, gap)))
 
 
 @dataclass(frozen=True)
 class FittedConics:
-    """Ellipses of several contours (see `FittedConic`).
+    """Ellipses of several contours (see `FittedConic`)."""
 
-    Parameters
-    ----------
-    normalised, normalised_from_image : ndarray, shape (N, 3, 3)
-        As of `FittedConic`; those of a failed fit mean nothing.
-    failures : mapping
-        Failure by the contour's index.
-    """
-
-    normalised: Array
-    normalised_from_image: Array
-    failures: Mapping[int, Failure] = field(default_factory=dict)
+    normalised: Array  # (N, 3, 3): as of `FittedConic`; those of a failed fit mean nothing
+    normalised_from_image: Array  # (N, 3, 3): as of `FittedConic`; those of a failed fit mean nothing
+    failures: Mapping[int, Failure] = field(default_factory=dict)  # failure by the contour's index
 
     def __len__(self) -> int:
         return len(self.normalised)
@@ -239,22 +228,12 @@ def angular_extent(vectors: Array) -> float:
 
 @dataclass(frozen=True)
 class Ellipse:
-    """An ellipse in the plane.
+    """An ellipse in the plane."""
 
-    Parameters
-    ----------
-    centre : ndarray, shape (2,)
-        px.
-    semi_major, semi_minor : float
-        px.
-    angle : float
-        Direction of the major axis, rad from x to y, in (-pi/2, pi/2].
-    """
-
-    centre: Array
-    semi_major: float
-    semi_minor: float
-    angle: float
+    centre: Array  # (2,): px
+    semi_major: float  # px
+    semi_minor: float  # px
+    angle: float  # direction of the major axis, rad from x to y, in (-pi/2, pi/2]
 
 
 def ellipse_of_conic(conic: npt.ArrayLike) -> Ellipse:
@@ -358,16 +337,10 @@ class _Batch:
     """Points of B contours one after the other.
 
     Every sum runs over one contour's points alone, so that a fit's last bits do not depend on the rest of the batch.
-
-    Parameters
-    ----------
-    points : ndarray, shape (2, N)
-    counts : ndarray of int, shape (B,)
-        Points of each contour.
     """
 
-    points: Array
-    counts: Index
+    points: Array  # (2, N)
+    counts: Index  # (B,): points of each contour
 
     @classmethod
     def of(cls, contours: list[Array]) -> "_Batch":

@@ -8,7 +8,7 @@ two directions.
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -135,6 +135,8 @@ class BrownConrady:
     >>> camera.project([[1.0, 0.0, 10.0]]).round(2)
     array([[369.9, 240. ]])
     """
+
+    type: ClassVar = "brown_conrady"
 
     k1: float = 0.0
     k2: float = 0.0
@@ -316,6 +318,8 @@ class Scaramuzza:
     array([[0.894, 0.   , 0.447]])
     """
 
+    type: ClassVar = "scaramuzza"
+
     k2: float = 0.0
     k3: float = 0.0
     k4: float = 0.0
@@ -404,6 +408,8 @@ class KannalaBrandt:
     array([[541.4, 240. ]])
     """
 
+    type: ClassVar = "kannala_brandt"
+
     k1: float = 0.0
     k2: float = 0.0
     k3: float = 0.0
@@ -450,14 +456,6 @@ class KannalaBrandt:
 Distortion = BrownConrady | KannalaBrandt | Scaramuzza
 
 
-LENSES: dict[str, type[Distortion]] = {
-    "brown_conrady": BrownConrady,
-    "kannala_brandt": KannalaBrandt,
-    "scaramuzza": Scaramuzza,
-}
-"""Lenses by the names that they have in files."""
-
-
 def with_radial_error(lens: Distortion, error: float, edge_reach: float) -> tuple[Distortion, float]:
     """Return a lens whose k1 is larger by an error, and its focal length over the former's."""
     at_axis = float(_at_axis(np.array(error), edge_reach))
@@ -501,8 +499,3 @@ def undistort_with_errors(lens: Distortion, m: Array, errors: Array, edge_reach:
 def _at_axis(errors: Array, edge_reach: float) -> Array:
     """Return the focal lengths of lenses with radial errors over that of the lens without one."""
     return np.maximum(1 - errors * edge_reach**2, 0.3)
-
-
-def lens_name(lens: Distortion) -> str:
-    """Return the name that a lens has in files."""
-    return next(name for name, kind in LENSES.items() if isinstance(lens, kind))

@@ -32,26 +32,13 @@ class Crossings:
 
     One set after the other; in each, row by row, first the points between horizontal neighbours, then those between
     vertical ones. A pixel whose value is the level, where several lines cross the border, counts once.
-
-    Parameters
-    ----------
-    counts : ndarray of int, shape (K,)
-        Points of each set.
-    first : ndarray of int, shape (N, 2)
-        Column and row of each line's first pixel in the regions' array.
-    vertical : ndarray of bool, shape (N,)
-        Whether the line is vertical; else it is horizontal.
-    share : ndarray, shape (N,)
-        Distance of the crossing from the first pixel, px.
-    rise : ndarray, shape (N,)
-        Intensity of the line's second pixel less that of its first.
     """
 
-    counts: Index
-    first: Index
-    vertical: Mask
-    share: Array
-    rise: Array
+    counts: Index  # (K,): points of each set
+    first: Index  # (N, 2): column and row of each line's first pixel in the regions' array
+    vertical: Mask  # (N,): whether the line is vertical; else it is horizontal
+    share: Array  # (N,): distance of the crossing from the first pixel, px
+    rise: Array  # (N,): intensity of the line's second pixel less that of its first
 
     @property
     def points(self) -> Array:
@@ -89,38 +76,22 @@ class Crossings:
 
 @dataclass(frozen=True, eq=False)
 class LevelSet:
-    """A 4-connected region of pixels above a level, its holes filled, with one pixel of margin on all sides.
+    """A 4-connected region of pixels above a level, its holes filled, with one pixel of margin on all sides."""
 
-    Parameters
-    ----------
-    values : ndarray, shape (H, W)
-        Intensities of the array that the region was found in.
-    inside : ndarray of bool, shape (h, w)
-        The region; the outermost rows and columns are outside of it.
-    level : float
-        The level.
-    corner : tuple of int
-        Column and row of the region's first pixel in the array; -1 where the margin lies outside.
-    sound : ndarray of bool, shape (h, w), optional
-        For a cut region: the pixels far enough from the cut, none of them in the margin. Only lines between these
-        count.
-    """
-
-    values: Image | Array
-    inside: Mask
+    values: Image | Array  # (H, W): intensities of the array that the region was found in
+    inside: Mask  # (h, w): the region; the outermost rows and columns are outside of it
     level: float
-    corner: tuple[int, int]
+    corner: tuple[int, int]  # column and row of the region's first pixel in the array; -1 where the margin lies outside
+    # (h, w): for a cut region: the pixels far enough from the cut, none of them in the margin. Only lines between
+    # these count.
     sound: Mask | None = None
 
+    @cached_property
     def polygon(self) -> Array:
-        """Return the crossings in order, shape (N + 1, 2), the first repeated at the end, integer-centred.
+        """The crossings in order, shape (N + 1, 2), the first repeated at the end, integer-centred.
 
         A pixel whose value is the level is passed each time that the border comes to it.
         """
-        return self._polygon
-
-    @cached_property
-    def _polygon(self) -> Array:
         # Traced on the region itself: on the values, contours that meet at such a pixel would separate there.
         (middles,) = find_contours(self.inside.astype(float), 0.5)
         first, last = np.floor(middles).astype(int), np.ceil(middles).astype(int)

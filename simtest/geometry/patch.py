@@ -242,7 +242,7 @@ class Patch:
         Where the border meets itself, at a pixel whose value is the level, a point is passed more than once.
         """
         found = self._closed(isovalue)
-        return found if isinstance(found, Failure) else found.polygon() + PIXEL_CENTRE + self.origin_px
+        return found if isinstance(found, Failure) else found.polygon + PIXEL_CENTRE + self.origin_px
 
     @property
     def _level_sets(self) -> _LevelSets:

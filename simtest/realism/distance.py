@@ -7,7 +7,6 @@ its two distributions over the spread of the real scenes: the mean distance of e
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from simtest.errors import InputError
 from simtest.realism.frame_statistics import COLUMNS, STATISTICS, Measured, Statistic
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.seeds import from_integer
-from simtest.runtime.statistics import student_quantile
+from simtest.runtime.statistics import CONFIDENCE, bootstrap_interval
 
 VERDICTS = ("near", "between", "far", "too few scenes")
 
@@ -25,7 +24,7 @@ LEAST_SCENES = 5
 NEAR = 1.5
 """A distance up to here is near; one is far where it is larger and its interval lies above 1."""
 
-RESAMPLES, LEVEL = 400, 0.95
+RESAMPLES = 400
 
 BLOCK_VALUES = 2_000_000
 """Values of drawn scenes that are held at a time."""
@@ -152,24 +151,12 @@ def _interval(value: float, samples: Array, exchanged: Array, scenes: int) -> tu
     if scenes < 2:
         return np.nan, np.nan
     if np.isfinite(samples).all():
-        low, high = widened(value, samples, scenes)
+        low, high = bootstrap_interval(value, samples, scenes)
     else:
         # Order statistics: between infinite distances nothing can be interpolated.
-        low, high = np.quantile(samples, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], method="nearest")
-    alike = np.mean(exchanged >= exchanged[0] * (1 - 1e-9)) > 1 - LEVEL
+        low, high = np.quantile(samples, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="nearest")
+    alike = np.mean(exchanged >= exchanged[0] * (1 - 1e-9)) > 1 - CONFIDENCE
     return 0.0 if alike else max(float(low), 0.0), float(high)
-
-
-def widened(values: Array | float, samples: Array, scenes: int) -> Array:
-    """Return 95 % intervals of values, shape (2, ...), from resampled ones, shape (R, ...).
-
-    Their quantiles about their median are moved to the value. Few scenes resample too narrowly: the deviations are
-    widened from a normal to Student's distribution.
-    """
-    share = (1 + LEVEL) / 2
-    wider = student_quantile(scenes - 1) / NormalDist().inv_cdf(share) * np.sqrt(scenes / (scenes - 1))
-    low, middle, high = np.quantile(samples, [1 - share, 0.5, share], axis=0)
-    return np.stack([values + (low - middle) * wider, values + (high - middle) * wider])
 
 
 def _means(scenes: Array, rows: IntArray) -> Array:

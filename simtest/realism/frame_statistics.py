@@ -19,6 +19,7 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction.picture_values import is_coloured
 from simtest.runtime.arrays import Array, Image, Mask
+from simtest.runtime.fitted import fitted_number
 
 CLIPPED = 250 / 255
 """A highlight is clipped where a channel of its peak reaches this encoded value: coding leaves few peaks at 1."""
@@ -37,8 +38,7 @@ MID_GREY = (0.3, 0.7)
 NOISE_BLOCK, NOISE_PERCENTILE = 8, 20.0
 """Noise is that of the smoothest fifth of blocks of so many pixels along a side: the others hold detail."""
 
-NOISE_SHOWN = 0.853
-"""Share of the deviation of white noise that the smoothest fifth of blocks shows (570,000 blocks of planted noise)."""
+NOISE_SHOWN = fitted_number("noise.shown")
 
 VESSEL_SHARES = (1 / 400, 1 / 100)
 """Standard deviations of the two Gaussians whose difference is the band of vessels, shares of the width."""

@@ -165,7 +165,7 @@ MAX_BYTES = 1_000_000_000
 ABANDONED_S = 3600.0
 """A half-written file of this age belongs to a process that was ended."""
 
-SOURCES = ("surfaces", "geometry", "spec", "runtime/seeds.py")
+SOURCES = ("surfaces", "geometry", "spec", "runtime/seeds.py", "fitted.toml")
 """Below simtest/: what the arrays are made by."""
 
 LIBRARIES = ("numpy", "scipy", "scikit-image")

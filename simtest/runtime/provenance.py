@@ -84,9 +84,9 @@ def processor() -> str:
 
 @cache
 def source_hash() -> str:
-    """Return a hash of simtest's own source: two runs are the same run only under the same code."""
+    """Return a hash of simtest's own source and fitted numbers: two runs are the same run only under the same code."""
     digest = hashlib.sha256()
-    for path in sorted(_ROOT.rglob("*.py")):
+    for path in sorted([*_ROOT.rglob("*.py"), _ROOT / "fitted.toml"]):
         digest.update(str(path.relative_to(_ROOT)).encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()

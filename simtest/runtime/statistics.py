@@ -1,4 +1,4 @@
-"""Intervals of means, shares and medians of values in groups: the groups, not the values, are the independent units.
+"""Intervals of means, shares and medians of values in groups, the independent units; quantiles; root mean squares.
 
 The group is the frame, or in a dataset the anatomy: highlights of one frame share its noise, its light and its surface.
 Strata are what was chosen and not drawn, such as the settings of an experiment or the cases of a benchmark: the spread
@@ -6,6 +6,8 @@ between them is no chance. `studies/intervals.py` prints how often these interva
 """
 
 import math
+from statistics import NormalDist
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +15,8 @@ import numpy.typing as npt
 from simtest.runtime.arrays import Array, IntArray
 
 Interval = tuple[float | None, float | None]
+
+_Freedom = TypeVar("_Freedom", float, Array)
 
 CONFIDENCE = 0.95
 
@@ -181,11 +185,38 @@ def freedom_of(counts: Array, strata: IntArray) -> int:
     return max(math.floor(free * float(weights.sum() ** 2 / (weights @ weights)) + _ROUNDING), 1)
 
 
-def student_quantile(freedom: float) -> float:
-    """Return what Student's t stays below in 97.5 of 100."""
+def student_quantile(freedom: _Freedom) -> _Freedom:
+    """Return what Student's t stays below in 97.5 of 100, of a number or an array of degrees of freedom."""
     from scipy.special import stdtrit
 
-    return float(stdtrit(freedom, (1 + CONFIDENCE) / 2))
+    return stdtrit(freedom, (1 + CONFIDENCE) / 2)
+
+
+def bootstrap_interval(values: Array | float, samples: Array, groups: int) -> Array:
+    """Return 95 % intervals of values, shape (2, ...), from those of resampled groups, shape (R, ...).
+
+    Their quantiles about their median are moved to the value. Few groups resample too narrowly: the deviations are
+    widened from a normal to Student's distribution.
+    """
+    share = (1 + CONFIDENCE) / 2
+    wider = student_quantile(groups - 1) / NormalDist().inv_cdf(share) * np.sqrt(groups / (groups - 1))
+    low, middle, high = np.quantile(samples, [1 - share, 0.5, share], axis=0)
+    return np.stack([values + (low - middle) * wider, values + (high - middle) * wider])
+
+
+def root_mean_square(values: Array) -> float | None:
+    """Return the root mean square of values; None of none."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+
+def weighted_quantile(values: Array, weights: Array, share: float) -> float:
+    """Return the value below which a share, above 0, of the weight lies; NaN where no value is known."""
+    known = np.isfinite(values) & (weights > 0)
+    if not known.any():
+        return math.nan
+    order = np.argsort(values[known])
+    below = np.cumsum(weights[known][order])
+    return float(values[known][order][np.searchsorted(below, share * below[-1])])
 
 
 def reach(t: npt.ArrayLike, skewness: npt.ArrayLike) -> tuple[Array, Array]:

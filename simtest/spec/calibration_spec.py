@@ -80,6 +80,8 @@ LightCoordinate = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 class RigCalibration(Spec):
     """What is known of the lights and of the working distance."""
 
+    exclusive = (("distance_range_mm", "distance_mm"), ("light_offset_mm", "lights_mm"))
+
     lights_mm: tuple[tuple[LightCoordinate, LightCoordinate, LightCoordinate], ...] = Field(
         (), max_length=32, description="positions of the lights, camera frame, mm; default not known"
     )
@@ -106,10 +108,6 @@ class RigCalibration(Spec):
     def _about_a_distance(self) -> Self:
         if self.distance_sd_mm > 0 and self.distance_mm is None:
             raise ValueError(f"distance_sd_mm = {self.distance_sd_mm:g}: needs distance_mm")
-        if self.distance_range_mm is not None and self.distance_mm is not None:
-            raise ValueError("distance_range_mm and distance_mm exclude each other; give one of them")
-        if self.light_offset_mm is not None and self.lights_mm:
-            raise ValueError("light_offset_mm and lights_mm exclude each other; give one of them")
         check_light_covariances(self.lights_covariance_mm2, len(self.lights_mm))
         _check_interval("distance_range_mm", self.distance_range_mm, above=0.0)
         _check_interval("light_offset_mm", self.light_offset_mm)
@@ -147,6 +145,8 @@ class UncertaintyCalibration(Spec):
 class SurfaceCalibration(Spec):
     """What is known of the surface's lobe and relief."""
 
+    exclusive = (("phong_exponent", "lobe_curvature"),)
+
     phong_exponent: float | None = Field(None, gt=0, le=1e5, description="roughness exponent n; default not known")
     lobe_curvature: float | None = Field(
         None,
@@ -161,8 +161,6 @@ class SurfaceCalibration(Spec):
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        if self.phong_exponent is not None and self.lobe_curvature is not None:
-            raise ValueError("phong_exponent and lobe_curvature exclude each other; give one of them")
         _check_interval("relief_slope_deg", self.relief_slope_deg)
         return self
 
@@ -173,15 +171,11 @@ Direction = Annotated[float, Field(ge=-1e6, le=1e6)]
 class _Emission(Spec):
     """Where an emission's axis points."""
 
+    directions = ("direction",)
+
     direction: tuple[Direction, Direction, Direction] = Field(
         OPTICAL_AXIS, description="in which the light shines, camera frame, any length; default the optical axis"
     )
-
-    @model_validator(mode="after")
-    def _points(self) -> Self:
-        if not any(self.direction):
-            raise ValueError(f"direction = {list(self.direction)}: must have a length")
-        return self
 
     @property
     def axis(self) -> tuple[float, float, float]:
@@ -289,7 +283,7 @@ def calibration_toml(calibration: Calibration, note: str = "") -> str:
 def calibration_tables(calibration: Calibration) -> Tables:
     """Return a calibration as the tables that `CalibrationSpec` reads; what it does not know is left out."""
     priors, noise = calibration.priors, calibration.noise
-    tables: Tables = {"camera": dict(camera_table(calibration.camera))}
+    tables: Tables = {"camera": camera_table(calibration.camera)}
     if calibration.response is not None:
         tables["response"] = _response(calibration.response)
     # That no falloff is left in the frame a file says by giving both, even where they are uniform.

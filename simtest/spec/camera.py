@@ -3,14 +3,14 @@
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera, FovExtent, ViewMask, focal_of_view
-from simtest.geometry.lenses import LENSES, Distortion
+from simtest.geometry.lenses import BrownConrady, Distortion, KannalaBrandt, Scaramuzza
 from simtest.geometry.vectors import rotation
 from simtest.runtime.arrays import Array
 from simtest.runtime.boundary import plain_errors
@@ -133,10 +133,11 @@ NOT_OF_THE_CAMERA = frozenset({"vignetting", "emission", "response", "sensor", "
 
 
 class _Lens(Spec):
+    lens: ClassVar[type[Distortion]]
+
     def model(self) -> Distortion:
         """Return the lens as the geometry package uses it."""
-        told = self.model_dump()
-        return LENSES[told.pop("type")](**told)
+        return self.lens(**self.model_dump(exclude={"type"}))
 
 
 class BrownConradySpec(_Lens):
@@ -146,6 +147,8 @@ class BrownConradySpec(_Lens):
     (1 + k1 u + k2 u^2 + k3 u^3) / (1 + k4 u + k5 u^2 + k6 u^3); then 2 p1 x y + p2 (u + 2 x^2) is added to x, and
     p1 (u + 2 y^2) + 2 p2 x y to y.
     """
+
+    lens = BrownConrady
 
     type: Literal["brown_conrady"] = "brown_conrady"
     k1: Coefficient = Field(0.0, description="radial")
@@ -165,6 +168,8 @@ class KannalaBrandtSpec(_Lens):
     lengths from the principal point, also at 90 deg and beyond. All coefficients 0 is the equidistant lens.
     """
 
+    lens = KannalaBrandt
+
     type: Literal["kannala_brandt"] = "kannala_brandt"
     k1: Coefficient = 0.0
     k2: Coefficient = 0.0
@@ -179,6 +184,8 @@ class ScaramuzzaSpec(_Lens):
     lies (c x + d y, e x + y) focal lengths from the principal point. Of the coefficients in pixels, fx = fy = a0,
     k2 = a2 a0, k3 = a3 a0^2 and k4 = a4 a0^3. It images angles of 90 deg and beyond.
     """
+
+    lens = Scaramuzza
 
     type: Literal["scaramuzza"] = "scaramuzza"
     k2: Coefficient = 0.0

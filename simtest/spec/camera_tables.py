@@ -4,27 +4,12 @@ Without the models that read it, which are slower to load.
 """
 
 from dataclasses import asdict
-from typing import Any, NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict, cast
 
 import numpy as np
 
 from simtest.geometry.camera import FOV_EXTENTS, Camera, field_of_view
-from simtest.geometry.lenses import lens_name
 from simtest.spec.toml_files import toml_tables, toml_value
-
-
-class CameraTable(TypedDict):
-    """A camera as the nested table that `CameraSpec` reads."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    skew: float
-    distortion: NotRequired[dict[str, str | float]]
-    view_mask: NotRequired[dict[str, float]]
 
 
 class CameraDescription(TypedDict):
@@ -38,14 +23,11 @@ class CameraDescription(TypedDict):
     view_mask: NotRequired[dict[str, float]]
 
 
-def camera_table(camera: Camera) -> CameraTable:
+def camera_table(camera: Camera) -> dict[str, Any]:
     """Return a camera as the nested table that `CameraSpec` reads; lens and view mask only if there are any."""
-    table: CameraTable = {
-        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
-        "cx": camera.cx, "cy": camera.cy, "skew": camera.skew,
-    }  # fmt: skip
+    table = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "skew")}
     if camera.distortion is not None:
-        table["distortion"] = {"type": lens_name(camera.distortion), **asdict(camera.distortion)}
+        table["distortion"] = {"type": camera.distortion.type, **asdict(camera.distortion)}
     if camera.view_mask is not None:
         table["view_mask"] = {name: value for name, value in asdict(camera.view_mask).items() if value is not None}
     return table
@@ -54,26 +36,19 @@ def camera_table(camera: Camera) -> CameraTable:
 def describe_camera(camera: Camera) -> CameraDescription:
     """Return a camera as simtest's JSON files describe it: size, K, and lens and view mask if there are any."""
     table = camera_table(camera)
-    described: CameraDescription = {
+    described = {
         "width": camera.width, "height": camera.height, "K": camera.K.tolist(), "pixel_centres": "integer + 0.5",
     }  # fmt: skip
-    if "distortion" in table:
-        described["distortion"] = table["distortion"]
-    if "view_mask" in table:
-        described["view_mask"] = table["view_mask"]
-    return described
+    parts = {name: table[name] for name in ("distortion", "view_mask") if name in table}
+    return cast(CameraDescription, described | parts)
 
 
 def camera_toml(camera: Camera) -> str:
     """Return a camera as the text of simtest's own TOML file."""
     table = camera_table(camera)
     inner = {key: value for key, value in table.items() if isinstance(value, dict)}
-    lens = {
-        "brown_conrady": "Brown-Conrady",
-        "kannala_brandt": "Kannala-Brandt",
-        "scaramuzza": "Scaramuzza",
-    }
-    kind = f"{lens[inner['distortion']['type']]} camera" if "distortion" in inner else "Pinhole camera"
+    lens = camera.distortion
+    kind = f"{lens.type.title().replace('_', '-')} camera" if lens is not None else "Pinhole camera"
     lines = [f"# {kind}; pixel centres at integer + 0.5."]
     lines += [f"{key} = {toml_value(value)}" for key, value in table.items() if key not in inner]
     return "\n".join([*lines, "", toml_tables(inner)] if inner else [*lines, ""])
@@ -95,7 +70,7 @@ def camera_summary(camera: Camera) -> dict[str, Any]:
     """
     return {
         **describe_camera(camera),
-        "lens": "pinhole" if camera.distortion is None else lens_name(camera.distortion),
+        "lens": "pinhole" if camera.distortion is None else camera.distortion.type,
         "fov_deg": {across: _finite(field_of_view(camera, across)) for across in FOV_EXTENTS},
         "border": [_at(camera, name, x * camera.width, y * camera.height) for name, (x, y) in PLACES.items()],
     }

@@ -5,6 +5,7 @@ name is enough where only one key of the scene ends so: ``radius_mm`` for ``surf
 """
 
 import copy
+import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -13,7 +14,7 @@ from pydantic import BaseModel
 
 from simtest.errors import InputError
 from simtest.runtime.boundary import suggestion
-from simtest.spec.spec_model import nodes_at
+from simtest.spec.spec_model import is_model, places, types_of
 from simtest.spec.toml_files import apply_settings
 
 RIVALS = {
@@ -82,11 +83,9 @@ def _at(data: Any, path: list[str]) -> Any:
 
 def _keys(model: type[BaseModel], path: list[str], kind: str) -> set[str] | None:
     """Return the keys of a type of the tagged union at a path; None where there is no such type."""
-    schema = model.model_json_schema()
-    tagged = (node for node in nodes_at(schema, path) if kind in node.get("discriminator", {}).get("mapping", {}))
-    if next(tagged, None) is None:
+    if not any(kind in types_of(place) for place, _ in places(model, path)):
         return None
-    return {key for node in nodes_at(schema, [*path, kind]) for key in node.get("properties", {})}
+    return {key for place, _ in places(model, [*path, kind]) if is_model(place) for key in place.model_fields}
 
 
 CLOSE = 3
@@ -143,19 +142,16 @@ UNITS = {"deg": "deg", "mm": "mm", "px": "px", "per_mm": "1/mm"}
 def describe_key(path: str) -> str:
     """Return the description of a scene's key, such as "sensor.noise_sigma"; empty if there is none.
 
-    If several types of a table have the key, the first one in the schema counts.
+    If several types of a table have the key, the first one counts.
     """
-    nodes = nodes_at(_schema(), path.split("."))
-    return next((str(node["description"]) for node in nodes if node.get("description")), "")
-
-
-@cache
-def _schema() -> dict[str, Any]:
-    """Return the scene's schema; making it takes a quarter of a second."""
     # Imported here: a scene is read by this module's help.
     from simtest.spec.scene import Scene
 
-    return Scene.model_json_schema()
+    texts = (
+        inspect.getdoc(place) if is_model(place) else field and field.description
+        for place, field in places(Scene, path.split("."))
+    )
+    return next((text for text in texts if text), "")
 
 
 def name_key(path: str) -> str:

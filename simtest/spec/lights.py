@@ -237,6 +237,8 @@ def is_at_camera(position_mm: npt.ArrayLike) -> bool:
 class Emission(Spec):
     """How a light emits: power colour profile(angle) edge(angle), the angle taken from `direction`."""
 
+    directions = ("direction",)
+
     colour: tuple[Gain, Gain, Gain] = Field(
         (1.0, 1.0, 1.0), description="linear RGB factor of the power; mono variants take its luminance"
     )
@@ -268,8 +270,6 @@ class Emission(Spec):
     def _usable(self) -> "Emission":
         if not any(self.colour):
             raise ValueError(f"colour = {list(self.colour)}: one of the channels must be positive")
-        if not any(self.direction):
-            raise ValueError(f"direction = {list(self.direction)}: must have a length")
         if self.spot_deg is None:
             if self.soft_edge_deg:
                 raise ValueError(f"soft_edge_deg = {self.soft_edge_deg:g}: needs spot_deg")
@@ -306,12 +306,9 @@ class Emission(Spec):
         return self.spot_deg is None and self.profile.model().is_uniform
 
     def factor(self, directions: npt.ArrayLike) -> Array:
-        """Return the emission relative to that of an isotropic light of the same power, shape (N,).
+        """Return the emission along unit directions away from the light, (N, 3), camera frame; shape (N,).
 
-        Parameters
-        ----------
-        directions : array_like, shape (N, 3)
-            Unit directions away from the light, camera frame.
+        It is relative to that of an isotropic light of the same power.
         """
         away = np.asarray(directions, dtype=float)
         cosine, sine = away @ self.axis, np.linalg.norm(np.cross(away, self.axis), axis=1)

@@ -86,6 +86,12 @@ LawName = Literal[
 """Error laws of docs/concepts/theory.md, section 4, that a page compares with measured errors."""
 
 
+def _check_order(low: float, high: float) -> None:
+    """Raise `ValueError` where the ends of a range are not in order."""
+    if low > high:
+        raise ValueError(f"low = {low:.10g} must not exceed high = {high:.10g}")
+
+
 class Uniform(Spec):
     """A uniform distribution over [low, high)."""
 
@@ -94,9 +100,12 @@ class Uniform(Spec):
 
     @model_validator(mode="after")
     def _ordered(self) -> "Uniform":
-        if self.low > self.high:
-            raise ValueError(f"low = {self.low:g} must not exceed high = {self.high:g}")
+        _check_order(self.low, self.high)
         return self
+
+
+Tables = tuple[dict[str, tuple[Any, ...]], ...]
+"""Of equally long lists by key path, which vary together."""
 
 
 class Group(Spec):
@@ -109,8 +118,8 @@ class Group(Spec):
     scene: str = Field(description="base scene: a shipped name or a path")
     label: str = Field("", max_length=80, description="name of the curve in the figures; default the surface's")
     set: dict[str, Any] = Field(default_factory=dict, description="values that replace the scene's, by key path")
-    sweep: tuple[dict[str, tuple[Any, ...]], ...] = ()
-    pool: tuple[dict[str, tuple[Any, ...]], ...] = ()
+    sweep: Tables = ()
+    pool: Tables = ()
     random: dict[str, Uniform] = Field(default_factory=dict)
     realisations: int | None = Field(None, ge=1, le=10**6, description="default the experiment's")
     laws: tuple[LawName, ...] = Field(
@@ -226,7 +235,7 @@ def check_first_parts(settings: Mapping[str, Any], scene: Iterable[str], own: It
             raise InputError(f"--set {path}: unknown key; {allowed}{suggestion(first, [*own, *scene])}")
 
 
-def still_varied(varied: Iterable[str], settings: Mapping[str, Any], what: str) -> set[str]:
+def still_varied(varied: Iterable[str], settings: Mapping[str, Any], what: str) -> list[str]:
     """Return which of the key paths that an experiment or a dataset varies stay so beside settings.
 
     A setting fixes its path, all below it and the keys that it excludes.
@@ -235,7 +244,7 @@ def still_varied(varied: Iterable[str], settings: Mapping[str, Any], what: str) 
     for path in settings:
         if whole := next((key for key in left if path.startswith(f"{key}.")), None):
             raise InputError(f"--set {path}: the {what} varies {whole} as a whole; set {whole} itself instead")
-    return {key for key in left if not _is_replaced(key, settings)}
+    return [key for key in left if not _is_replaced(key, settings)]
 
 
 def replaced(values: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -254,12 +263,17 @@ def _with_first_viewpoints(group: Group, count: object) -> Group:
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise InputError(f"--set viewpoints={count!s}: must be a whole number from 1 on")
 
-    def first(tables: tuple[dict[str, tuple[Any, ...]], ...]) -> tuple[dict[str, tuple[Any, ...]], ...]:
-        return tuple(
-            {key: values[:count] for key, values in table.items()} if VIEWPOINT in table else table for table in tables
-        )
+    return group.model_copy(
+        update={"sweep": _first(group.sweep, count, VIEWPOINT), "pool": _first(group.pool, count, VIEWPOINT)}
+    )
 
-    return group.model_copy(update={"sweep": first(group.sweep), "pool": first(group.pool)})
+
+def _first(tables: Tables, count: int, key: str = "") -> Tables:
+    """Keep the first values of tables, or of those that vary a key: each value's seed depends on its index."""
+    return tuple(
+        {name: values[:count] for name, values in table.items()} if not key or key in table else table
+        for table in tables
+    )
 
 
 def _override(group: Group, settings: Mapping[str, Any]) -> Group:
@@ -267,7 +281,7 @@ def _override(group: Group, settings: Mapping[str, Any]) -> Group:
     varied = [*group.random, *(key for table in (*group.sweep, *group.pool) for key in table)]
     kept = still_varied(varied, settings, "experiment")
 
-    def without(tables: tuple[dict[str, tuple[Any, ...]], ...]) -> tuple[dict[str, tuple[Any, ...]], ...]:
+    def without(tables: Tables) -> Tables:
         thinned = ({key: values for key, values in table.items() if key in kept} for table in tables)
         return tuple(table for table in thinned if table)
 
@@ -309,8 +323,7 @@ class Distribution(Spec):
     def _check_range(self) -> None:
         if self.low is None or self.high is None:
             raise ValueError("nothing to draw from; must have low and high, or choose = [...]")
-        if self.low > self.high:
-            raise ValueError(f"low = {self.low:g} must not exceed high = {self.high:g}")
+        _check_order(self.low, self.high)
         if self.log and self.low <= 0:
             raise ValueError(f"low = {self.low:g}: must be above 0 where log is true")
         if self.integer and (self.low % 1 or self.high % 1):
@@ -372,8 +385,7 @@ class SeedRange(Spec):
 
     @model_validator(mode="after")
     def _ordered(self) -> "SeedRange":
-        if self.low > self.high:
-            raise ValueError(f"low = {self.low} must not exceed high = {self.high}")
+        _check_order(self.low, self.high)
         return self
 
     @property
@@ -471,8 +483,7 @@ def load_dataset(name: str | Path, settings: Mapping[str, Any] | None = None) ->
 
     # A value that is set is no longer drawn.
     def left(drawn: dict[str, Distribution]) -> dict[str, Distribution]:
-        kept = still_varied(drawn, settings, "dataset")
-        return {key: value for key, value in drawn.items() if key in kept}
+        return {key: drawn[key] for key in still_varied(drawn, settings, "dataset")}
 
     families = tuple(
         family.model_copy(
@@ -561,14 +572,8 @@ def _experiment(profile: Profile, entry: ProfileEntry) -> Experiment:
         groups = tuple(group for group in groups if group.label in entry.labels)
     # the first viewpoints of each
     if entry.pool is not None:
-        groups = tuple(_with_first_pooled(group, entry.pool) for group in groups)
+        groups = tuple(group.model_copy(update={"pool": _first(group.pool, entry.pool)}) for group in groups)
     return experiment.model_copy(update={"groups": groups, "name": entry.name or experiment.name})
-
-
-def _with_first_pooled(group: Group, count: int) -> Group:
-    """Keep the first pooled values of a group: each value's seed depends on its index."""
-    pool = tuple({key: values[:count] for key, values in table.items()} for table in group.pool)
-    return group.model_copy(update={"pool": pool})
 
 
 def scene_models(experiment: Experiment) -> list[BaseModel]:

@@ -44,6 +44,8 @@ class Effort(Spec):
 class KnownSpec(Spec):
     """What estimators are told beside the picture and the camera's calibration."""
 
+    exclusive = (("distance_mm", "distance_error"),)
+
     lights: bool = Field(True, description="whether they are told the lights' nominal positions")
     lobe: bool = Field(
         True,
@@ -60,12 +62,6 @@ class KnownSpec(Spec):
     distance_sd: float = Field(
         0.0, ge=0, le=10, description="standard deviation that they are told, share of the told distance"
     )
-
-    @model_validator(mode="after")
-    def _one_way(self) -> "KnownSpec":
-        if self.distance_mm is not None and self.distance_error is not None:
-            raise ValueError("distance_mm and distance_error exclude each other; give one of them")
-        return self
 
 
 class Scene(Spec):

@@ -232,6 +232,8 @@ ResponseSpec = Annotated[LinearResponse | GammaResponse | SrgbResponse | TableRe
 class Exposure(Spec):
     """Which radiance becomes full scale: that of the brightest isolated highlight, unless one of the keys says else."""
 
+    exclusive = (("full_scale", "percentile", "average"),)
+
     full_scale: float | None = Field(None, ge=1e-12, le=1e12, description="radiance at full scale, fixed")
     percentile: float | None = Field(
         None,
@@ -247,19 +249,6 @@ class Exposure(Spec):
         "surface is seen; tissue keeps its level, and highlights clip. The mean over the encoded channels is lower",
     )
     gain: float = Field(1.0, ge=1e-6, le=1e6, description="exposure over that of the rule; 2 halves full scale")
-
-    @model_validator(mode="after")
-    def _one_way(self) -> "Exposure":
-        given = [name for name in ("full_scale", "percentile", "average") if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise ValueError(f"{' and '.join(given)} exclude each other; give one of them")
-        return self
-
-
-def _rules(exposure: Any) -> dict[str, Any]:
-    """Return what a table of exposure gives of the keys that exclude each other."""
-    given = exposure if isinstance(exposure, Mapping) else {}
-    return {name: given[name] for name in ("full_scale", "percentile", "average") if name in given}
 
 
 def _optional(model: type[Spec]) -> set[str]:
@@ -323,9 +312,10 @@ class Sensor(Spec):
         if preset is None:
             return data
         filled = with_preset(data, preset)
-        if any(value is not None for value in _rules(data.get("exposure")).values()):
+        exposure = data.get("exposure")
+        if isinstance(exposure, Mapping) and any(exposure.get(key) is not None for key in Exposure.exclusive[0]):
             # The rules of exposure exclude each other, so a given one replaces the preset's.
-            filled["exposure"] = data["exposure"]
+            filled["exposure"] = exposure
         return filled
 
     @model_validator(mode="after")

@@ -4,10 +4,11 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from types import NoneType
-from typing import Annotated, Any, TypeVar, get_args, get_origin
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, Self, TypeGuard, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from simtest.errors import InputError
@@ -31,6 +32,12 @@ Curvature = Annotated[float, Field(ge=-10, le=10)]
 class Spec(BaseModel):
     """Base of all specification models: frozen, no unknown keys, no NaN or infinity, no text where a number belongs."""
 
+    exclusive: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    """Keys of which one at most may differ from its default."""
+
+    directions: ClassVar[tuple[str, ...]] = ()
+    """Keys of vectors that must have a length."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False, defer_build=True)
 
     @model_validator(mode="before")
@@ -49,6 +56,18 @@ class Spec(BaseModel):
             if wrong:
                 raise PydanticCustomError("coerced", "must be {wrong}", {"field": name, "got": value, "wrong": wrong})
         return data
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        fields = type(self).model_fields
+        for keys in self.exclusive:
+            given = [key for key in keys if getattr(self, key) != fields[key].default]
+            if len(given) > 1:
+                raise ValueError(f"{' and '.join(given)} exclude each other; give one of them")
+        for key in self.directions:
+            if not any(getattr(self, key)):
+                raise ValueError(f"{key} = {list(getattr(self, key))}: must have a length")
+        return self
 
 
 def with_preset(data: Mapping[str, Any], preset: Mapping[str, Any]) -> dict[str, Any]:
@@ -95,10 +114,7 @@ def load(model: type[Model], path: Path, settings: Mapping[str, Any] | None = No
 def validate(model: type[Model], data: Mapping[str, Any], where: str) -> Model:
     """Validate nested tables against a model; `where` is the name of their file.
 
-    Raises
-    ------
-    InputError
-        If the data do not fit: one line with file, key path, value, what is allowed, and the number of further errors.
+    An `InputError` has one line with file, key path, value, what is allowed, and the number of further errors.
     """
     try:
         return model.model_validate(data)
@@ -190,8 +206,7 @@ def _without_tags(location: tuple[Any, ...], data: Any, missing: bool) -> list[A
 
 def _allowed_keys(location: tuple[Any, ...], model: type[BaseModel]) -> str:
     """List the keys that are allowed instead of an unknown one, the closest first."""
-    nodes = nodes_at(model.model_json_schema(), location[:-1])
-    known = list(next((node["properties"] for node in nodes if "properties" in node), ()))
+    known = list(next((place.model_fields for place, _ in places(model, location[:-1]) if is_model(place)), ()))
     close = close_names(location[-1], known, alike=0.5)
     ordered = close + [k for k in known if k not in close]
     return f"; allowed: {', '.join(ordered)}{suggestion(location[-1], known)}" if ordered else ""
@@ -199,8 +214,7 @@ def _allowed_keys(location: tuple[Any, ...], model: type[BaseModel]) -> str:
 
 def _allowed_types(location: tuple[Any, ...], model: type[BaseModel], given: object = None) -> str:
     """List the types that a tagged union allows, and the one that may be meant."""
-    nodes = nodes_at(model.model_json_schema(), location)
-    known = list(next((node["discriminator"]["mapping"] for node in nodes if "discriminator" in node), ()))
+    known = next((found for place, _ in places(model, location) if (found := types_of(place))), [])
     return ", ".join(known) + ("" if given is None else suggestion(given, known))
 
 
@@ -213,41 +227,43 @@ def _short(value: Any) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def nodes_at(schema: Mapping[str, Any], path: Sequence[str | int]) -> Iterator[Mapping[str, Any]]:
-    """Yield the nodes of a JSON schema at a path of keys and indices, through references, unions, lists and maps.
+def places(kind: Any, path: Sequence[Any], field: FieldInfo | None = None) -> Iterator[tuple[Any, Any]]:
+    """Yield the types at a path of keys and indices below a type, each with the field whose type it is, if any.
 
-    An index is a number or text. The type of a tagged union may stand in between; without it the nodes of all its
-    members are yielded.
+    An index is a number or text. The type of a tagged union may stand in between; without it the places in all its
+    members are yielded. The members of a union come before the union.
     """
-    yield from _walk(schema, schema, list(path))
-
-
-def _walk(node: Mapping[str, Any], schema: Mapping[str, Any], path: list[str | int]) -> Iterator[Mapping[str, Any]]:
-    # The same path goes on inside unions and references ...
-    for way in ("oneOf", "anyOf", "allOf"):
-        for option in node.get(way, ()):
-            yield from _walk(option, schema, path)
-    if reference := node.get("$ref"):
-        yield from _walk(_definition(reference, schema), schema, path)
+    parts, rest = get_args(kind), path[1:]
+    if is_model(kind) and path:
+        if child := kind.model_fields.get(path[0]):
+            yield from places(child.annotation, rest, child)
+        if path[0] == _type_of(kind):
+            yield from places(kind, rest, field)
+    elif get_origin(kind) is dict and path:
+        yield from places(parts[1], rest)
+    elif get_origin(kind) in (tuple, list) and path:
+        for part in parts if str(path[0]).isdigit() else ():
+            yield from places(part, rest)
+    elif get_origin(kind) is Annotated:
+        yield from places(parts[0], path, field)
+    else:
+        for part in parts if get_origin(kind) in (Union, UnionType) else ():
+            yield from places(part, path, field)
     if not path:
-        yield node
-        return
-    # ... and one part of it is used up by an index, a key, or the type of a tagged union.
-    part, rest = path[0], path[1:]
-    if isinstance(part, int) or part.isdigit():
-        for items in (node.get("items"), *node.get("prefixItems", ())):
-            if isinstance(items, Mapping):
-                yield from _walk(items, schema, rest)
-        return
-    members = node.get("discriminator", {}).get("mapping", {})
-    if isinstance(values := node.get("additionalProperties"), Mapping):
-        yield from _walk(values, schema, rest)
-    elif child := node.get("properties", {}).get(part):
-        yield from _walk(child, schema, rest)
-    elif part in members:
-        yield from _walk(_definition(members[part], schema), schema, rest)
+        yield kind, field
 
 
-def _definition(reference: str, schema: Mapping[str, Any]) -> Mapping[str, Any]:
-    found: Mapping[str, Any] = schema["$defs"][reference.rsplit("/", 1)[-1]]
-    return found
+def is_model(kind: Any) -> TypeGuard[type[BaseModel]]:
+    """Return whether a type is a model."""
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def types_of(kind: Any) -> list[str]:
+    """Return the types of a union's members that have one, in order."""
+    return sorted(name for part in get_args(kind) if (name := _type_of(part))) if not is_model(kind) else []
+
+
+def _type_of(kind: Any) -> str | None:
+    """Return what a model's key `type` must hold; None where it has none."""
+    field = kind.model_fields.get("type") if is_model(kind) else None
+    return None if field is None else str(get_args(field.annotation)[0])

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from simtest.runtime.arrays import Array
+from simtest.runtime.fitted import fitted_number
 from simtest.runtime.resources import find
 from simtest.spec.spec_model import Coordinate, Curvature, Millimetres, Share, Spec
 
@@ -18,8 +19,7 @@ MAX_HEIGHT_MM = 0.3
 MAX_DEVIATIONS = 3.0
 """Standard deviations of a gaussian height that are taken as its peak: 99.7 % of the surface stay within."""
 
-PEAK_PER_SLOPE = {"ridged": 1.33, "pits": 2.4}
-"""What 99.7 % of the heights stay within, over slope (rad) and wavelength: measured, much the same for all widths."""
+PEAK_PER_SLOPE = {"ridged": fitted_number("relief_peak.ridged"), "pits": fitted_number("relief_peak.pits")}
 
 Component = Annotated[float, Field(ge=-1e3, le=1e3)]
 Direction = tuple[Component, Component, Component]
@@ -27,6 +27,8 @@ Direction = tuple[Component, Component, Component]
 
 class ReliefBand(Spec):
     """One band of wavelengths of the relief, a random field in the space around the surface."""
+
+    directions = ("direction",)
 
     kind: Literal["gaussian", "ridged", "pits"] = Field(
         "gaussian", description="gaussian; ridged: crests and grooves; pits: a level surface with dimples"
@@ -42,12 +44,6 @@ class ReliefBand(Spec):
     direction: Direction = Field(
         (1.0, 0.0, 0.0), description="along which the relief is drawn out, model frame, any length"
     )
-
-    @model_validator(mode="after")
-    def _usable(self) -> "ReliefBand":
-        if not any(self.direction):
-            raise ValueError(f"direction = {list(self.direction)}: must have a length")
-        return self
 
 
 class Relief(Spec):
@@ -292,6 +288,8 @@ class Instrument(Spec):
     towards the camera by `tilt_deg`.
     """
 
+    exclusive = (("depth_mm", "depth_share"),)
+
     kind: Literal["shaft", "grasper"] = Field("shaft", description="a round shaft, or one with a wrist and two jaws")
     present: bool = Field(True, description="whether it is in the picture: a dataset draws in how many frames it is")
     diameter_mm: float = Field(5.0, ge=1, le=20, description="of the shaft, mm; usual are 5 and 10")
@@ -332,9 +330,7 @@ class Instrument(Spec):
     colour: tuple[Share, Share, Share] = Field((0.6, 0.52, 0.5), description="linear RGB albedo of the matt base")
 
     @model_validator(mode="after")
-    def _one_way(self) -> "Instrument":
-        if self.depth_mm is not None and self.depth_share is not None:
-            raise ValueError("depth_mm and depth_share exclude each other; give one of them")
+    def _possible(self) -> "Instrument":
         for name in _OF_GRASPERS if self.kind == "shaft" else ():
             if getattr(self, name) is not None:
                 raise ValueError(f"{name}: belongs to a grasper; must be left out where kind is shaft")

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from simtest.runtime.arrays import Array, IntArray, Mask
+from simtest.runtime.statistics import weighted_quantile
 from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh, in_rows, pack_points
 
 MIN_CLEARANCE_MM = 5.0
@@ -59,11 +60,7 @@ def vertex_areas(vertices: Array, faces: IntArray) -> Array:
 
 def area_quantile(values: Array, vertices: Array, faces: IntArray, share: float) -> float:
     """Return the value that this share of the surface lies below; values at the vertices, shape (V,), NaN ignored."""
-    weight, known = vertex_areas(vertices, faces), np.isfinite(values)
-    # Values in rising order, against the area that has at most that value
-    order = np.argsort(values[known])
-    filled = np.cumsum(weight[known][order])
-    return float(values[known][order][np.searchsorted(filled, share * filled[-1])])
+    return weighted_quantile(values, vertex_areas(vertices, faces), share)
 
 
 def isoperimetric_quotient(vertices: Array, faces: IntArray) -> float:

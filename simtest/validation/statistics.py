@@ -11,7 +11,7 @@ from simtest.conventions import ON_INSTRUMENT
 from simtest.geometry import chi_squared
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import Json
-from simtest.runtime.statistics import CONFIDENCE, Interval, mean_interval
+from simtest.runtime.statistics import CONFIDENCE, Interval, mean_interval, root_mean_square
 from simtest.validation.row_kinds import counts, row_kind
 
 FRAME = ("experiment", "setting", "realisation")
@@ -109,7 +109,7 @@ def figures(rows: pl.DataFrame) -> Figures:
         if "error_base_deg" in rows.columns
         else None,
         mean_oracle_deg=_or_none(np.mean, answered["error_oracle_deg"].to_numpy()),
-        rms_deg=_or_none(lambda e: np.sqrt(np.mean(e**2)), errors),
+        rms_deg=root_mean_square(errors),
         std_deg=float(np.std(errors, ddof=1)) if len(errors) > 1 else None,
         median_deg=_or_none(np.median, errors),
         p95_deg=_or_none(lambda e: np.percentile(e, 95), errors),

@@ -13,7 +13,8 @@ from scipy.io import savemat
 
 from simtest import BrownConrady, Camera, InputError, KannalaBrandt, ViewMask, load_camera, save_camera
 from simtest.spec import scene_from_dict
-from simtest.spec.camera_formats import matlab_struct, plain_yaml
+from simtest.spec.camera_formats import plain_yaml
+from simtest.spec.camera_formats.matlab import struct_of
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
 from tests.example_counts import examples
 
@@ -498,7 +499,7 @@ def test_damaged_matlab_files_end_neither_the_process_nor_its_memory(tmp_path, c
     index, value, fragment = DAMAGES[case]
     path = tmp_path / "c.mat"
     savemat(path, {"s": {key: value for key, value in STRUCT.items() if key != "WorldUnits"}})
-    assert matlab_struct.struct_of(str(path))["ImageSize"] == [480.0, 640.0]
+    assert struct_of(str(path))["ImageSize"] == [480.0, 640.0]
     damaged = bytearray(path.read_bytes())
     damaged[index] = value
     path.write_bytes(damaged)

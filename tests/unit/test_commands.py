@@ -323,15 +323,48 @@ def test_quiet_shows_no_progress_at_a_terminal_either(capsys, monkeypatch):
 
 def test_long_tables_are_cut_unless_asked_for(capsys, monkeypatch):
     rows = [[f"row[{i}]", "x"] for i in range(108)]
-    common.print_table(("name", "value"), rows, rest="results.csv holds them")
+    common.Table(("name", "value"), rows).print()
     output = capsys.readouterr().out
     # What looks like markup is text.
     assert "row[19]" in output
     assert "row[20]" not in output
-    assert output.splitlines()[-1] == "and 88 more; --verbose prints them all, results.csv holds them"
+    assert output.splitlines()[-1] == "and 88 more; --verbose prints them all"
+    assert common.first(rows, "results.csv holds them")[1] == [
+        "and 88 more; --verbose prints them all, results.csv holds them"
+    ]
     monkeypatch.setattr(main.MANNERS, "verbose", True)
-    common.print_table(("name", "value"), rows)
+    common.Table(("name", "value"), rows).print()
     assert "row[107]" in capsys.readouterr().out
+
+
+def test_a_command_prints_the_record_that_it_returns(capsys):
+    made = []
+
+    def data():
+        made.append("data")
+        return {"a": 1}
+
+    def parts(count):
+        made.append("parts")
+        yield f"{count} lines"
+        yield common.Table(("name",), [["cell"]])
+        yield lambda: print("by itself")
+
+    @common.command
+    def told(*, count: int = 1) -> common.Told:
+        return common.Told([Path("x")], data, parts(count), 3)
+
+    assert told(count=2) == 3
+    lines = capsys.readouterr().out.splitlines()
+    assert (lines[0], *lines[-2:]) == ("2 lines", "by itself", "x")
+    assert "│ cell │" in lines
+    assert told(as_json=True) == 3
+    assert json.loads(capsys.readouterr().out) == {"a": 1, "files": ["x"]}
+    # What is not printed is not made.
+    assert made == ["parts", "data"]
+    # Where there is nothing to tell, nothing is printed.
+    assert common.command(lambda: common.Told())(as_json=True) == 0
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize(("number", "text"), [(0, "0 frames"), (1, "1 frame"), (2, "2 frames")])
@@ -349,10 +382,10 @@ def spots(count):
 
 
 def test_many_specularities_become_a_summary(capsys, monkeypatch):
-    from simtest.cli.pictures import _print_tables
+    from simtest.cli.pictures import record_tables
 
     def printed(count):
-        _print_tables(SimpleNamespace(specularities=spots(count), reference=None))
+        common.Told(parts=record_tables(SimpleNamespace(specularities=spots(count), reference=None))).print(False)
         return capsys.readouterr().out
 
     assert printed(20).count("isolated") == 13

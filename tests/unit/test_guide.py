@@ -512,7 +512,7 @@ def test_a_run_without_true_highlights_says_so(tmp_path):
 
 
 def test_guide_json_holds_rows_and_figures_and_is_printed_with_json(tmp_path, capsys):
-    from simtest.cli.common import print_run
+    from simtest.cli.common import print_json, run_record
 
     run = make_run(tmp_path, items=0)
     write_report(run)
@@ -526,13 +526,13 @@ def test_guide_json_holds_rows_and_figures_and_is_printed_with_json(tmp_path, ca
             advice.methods[advice.best].mean_deg,
         )
         assert tuple(row["settings"]) == advice.situation.settings
-    print_run(run)
+    print_json(run_record(run))
     assert json.loads(capsys.readouterr().out)["guide"] == content
 
 
 @pytest.mark.parametrize("spoil", [lambda file: file.unlink(), lambda file: file.write_text("{")])
 def test_a_guide_that_is_missing_is_told_as_missing(tmp_path, capsys, spoil):
-    from simtest.cli.common import print_run
+    from simtest.cli.common import run_record
     from simtest.cli.runs import print_guide
 
     run = make_run(tmp_path, items=0)
@@ -542,8 +542,7 @@ def test_a_guide_that_is_missing_is_told_as_missing(tmp_path, capsys, spoil):
     said = capsys.readouterr().out
     assert "guide.json: missing" in said
     assert "No true highlight" not in said
-    print_run(run)
-    assert json.loads(capsys.readouterr().out)["guide"] is None
+    assert run_record(run)["guide"] is None
 
 
 def test_verbose_prints_every_situation(tmp_path, monkeypatch):

@@ -402,7 +402,7 @@ def test_comparison_with_a_reference(shot, tmp_path):
     ball.apply_translation([0, 0, 100])
     ball.export(tmp_path / "ball.ply")
     pose = pose_file(tmp_path / "pose.toml", np.eye(4))
-    _, files = quietly(shot, tmp_path / "out", extras=Extras(tmp_path / "ball.ply", pose))
+    _, files = quietly(shot, tmp_path / "out", extras=Extras(tmp_path / "ball.ply", camera_from_model=pose))
     document = json.loads(files[0].read_text())
     table = document["reference"]
     assert table["compared"] == 2
@@ -435,7 +435,7 @@ def test_references_without_or_with_too_much(shot, tmp_path):
     trimesh.creation.icosphere(radius=40.0).export(tmp_path / "ball.ply")
     told(lambda: by_fov(shot, tmp_path / "o", extras=Extras(tmp_path / "ball.ply")), "needs --camera-from-model")
     pose = pose_file(tmp_path / "pose.toml", np.eye(4))
-    told(lambda: by_fov(shot, tmp_path / "o", extras=Extras(pose=pose)), "needs --reference")
+    told(lambda: by_fov(shot, tmp_path / "o", extras=Extras(camera_from_model=pose)), "needs --reference")
     np.save(tmp_path / "depth.npy", np.ones((HEIGHT, WIDTH)))
     told(lambda: load_reference(tmp_path / "depth.npy", pose, CAMERA), "leave it out")
 

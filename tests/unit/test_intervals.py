@@ -13,11 +13,14 @@ from simtest.report.curves import bar
 from simtest.report.pairs import pairs
 from simtest.report.run_folder import Run
 from simtest.runtime.statistics import (
+    bootstrap_interval,
     deviation_of_mean,
     mean_interval,
     median_interval,
+    root_mean_square,
     share_interval,
     student_quantile,
+    weighted_quantile,
 )
 from simtest.validation.columns import table
 from simtest.validation.guide import guide_of
@@ -243,3 +246,30 @@ def test_each_printed_interval_counts_equal_highlights_of_a_frame_once(intervals
     once, often = (intervals(rows_of(each), tmp_path) for each in (1, 20))
     assert len(once) > 0
     np.testing.assert_allclose(sorted(often), sorted(once), rtol=allowed)
+
+
+def test_students_quantile_of_many_degrees_of_freedom_at_once():
+    freedom = np.array([1.0, 2.5, 9.0, 300.0])
+    np.testing.assert_array_equal(student_quantile(freedom), stats.t.ppf(0.975, freedom))
+    assert student_quantile(9) == stats.t.ppf(0.975, 9)
+
+
+def test_a_bootstrap_interval_of_normal_means_is_students():
+    rng = np.random.default_rng(4)
+    values = np.array([3.0, 50.0]) + stats.norm.ppf((np.arange(8) + 0.5) / 8)[:, None] * [1.0, 4.0]
+    samples = values[rng.integers(8, size=(40_000, 8))].mean(axis=1)
+    mean, half = values.mean(axis=0), student_quantile(7) * values.std(axis=0, ddof=1) / math.sqrt(8)
+    np.testing.assert_allclose(bootstrap_interval(mean, samples, 8), [mean - half, mean + half], rtol=0.01)
+
+
+def test_a_weighted_quantile_is_that_of_repeated_values():
+    values, weights = np.array([4.0, 1.0, 3.0, np.nan, 2.0]), np.array([1.0, 5.0, 2.0, 9.0, 0.0])
+    repeated = np.repeat(values[[0, 1, 2]], [1, 5, 2])
+    for share in (0.1, 0.5, 0.63, 0.87, 0.88, 0.99):
+        assert weighted_quantile(values, weights, share) == np.quantile(repeated, share, method="inverted_cdf")
+    assert math.isnan(weighted_quantile(values, np.array([0, 0, 0, 1.0, 0]), 0.5))
+
+
+def test_a_root_mean_square_of_none_is_none():
+    assert root_mean_square(np.array([3.0, -4.0])) == math.sqrt(12.5)
+    assert root_mean_square(np.empty(0)) is None

@@ -38,7 +38,8 @@ def test_wheel_holds_data_and_marker(wheel):
     assert len(shipped) >= 10
     for file in shipped:
         assert f"simtest/_data/{file.relative_to(ROOT)}" in names
-    assert {"simtest/py.typed", "simtest/report/run.html.j2", "simtest/pages/templates/parts.html.j2"} <= names
+    assert {"simtest/py.typed", "simtest/fitted.toml", "simtest/report/run.html.j2"} <= names
+    assert "simtest/pages/templates/parts.html.j2" in names
     assert not [name for name in names if name.startswith(("tests/", "docs/"))]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Uniform
-from simtest.cli.pictures import _print_assumed, _print_counts, _print_silent
+from simtest.cli.pictures import assumed_lines, count_lines, silent_lines
 from simtest.detection.blobs import Highlight, Kind
 from simtest.detection.regions import Region
 from simtest.detection.view_mask import View
@@ -93,7 +93,7 @@ def test_the_covariance_across_the_view_is_foreshortened(tmp_path):
     assert xy == pytest.approx(0, abs=1e-9)
 
 
-def test_an_empty_error_has_a_reason(tmp_path, capsys):
+def test_an_empty_error_has_a_reason(tmp_path):
     silent = replace(estimate((15, 15)), budget=None, covariance=None)
     beside = replace(silent, flags=("unresolved", "light_offset"))
     four = {
@@ -107,8 +107,8 @@ def test_an_empty_error_has_a_reason(tmp_path, capsys):
         "brightest_point": words["other"], "cone_axis": words["light_offset"],
         "circle_pose": words["circle_pose"], "mine": words["other"], "curved": "",
     }  # fmt: skip
-    _print_silent([spot(0, (15, 15), four, "brightest_point"), spot(1, (15, 15), four, "curved")])
-    assert capsys.readouterr().out == f"no ± at 1 best normal: {words['other']}\n"
+    silent = silent_lines([spot(0, (15, 15), four, "brightest_point"), spot(1, (15, 15), four, "curved")])
+    assert list(silent) == [f"no ± at 1 best normal: {words['other']}"]
 
 
 def test_numbers_of_the_overlay_stand_on_a_dark_ground():
@@ -157,21 +157,20 @@ def left_out(kind, at):
     return Highlight(region, kind, 0.2, 9, None, None, None, 1.0, 0.0, edge, np.array([at]), 0.0)
 
 
-def test_what_the_calibration_gives_stands_apart_from_what_is_assumed(tmp_path, capsys):
+def test_what_the_calibration_gives_stands_apart_from_what_is_assumed(tmp_path):
     first, *others = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None, "fine")
     record = replace(record_of(many(1)), assumed=[first, *(replace(each, given=True) for each in others)])
     write_picture_page(tmp_path / "index.html", record, np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "Given by the calibration, not exactly: distance of the tissue, focal length" in page
     assert "Assumed, because nobody gave it: light</summary>" in page
-    _print_assumed(record.assumed)
-    _, *lines = capsys.readouterr().out.splitlines()
+    _, *lines = assumed_lines(record.assumed)
     assert [line.split(": ")[:2] for line in (lines[0], lines[-1])] == [
         ["given", "distance of the tissue"], ["assumed", "light"]
     ]  # fmt: skip
 
 
-def test_counts_and_the_light_are_told_alike_on_page_and_terminal(tmp_path, capsys):
+def test_counts_and_the_light_are_told_alike_on_page_and_terminal(tmp_path):
     others = [left_out(Kind.SMALL, (40, 40)), left_out(Kind.BORDER, (80, 40)), left_out(Kind.BORDER, (90, 60))]
     spots = [*many(2), spot(2, (50, 90), {"cone_axis": Failure(Reason.CLUSTER, "two")}, None)]
     assumed = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None, "fine")
@@ -182,19 +181,16 @@ def test_counts_and_the_light_are_told_alike_on_page_and_terminal(tmp_path, caps
     assert "3 more were found and left out" in page
     assert "(2 border, 1 few pixels)" in page
     assert LIGHT_AT_CAMERA in page
-    _print_assumed(record.assumed)
-    _print_counts(record, Path("frame.png"))
-    said = capsys.readouterr().out
-    assert said.startswith(f"note: {LIGHT_AT_CAMERA}\n")
-    assert "3 specularities found in frame.png, 2 with a normal\n" in said
+    lines = [*assumed_lines(record.assumed), *count_lines(record, Path("frame.png"))]
+    said = "\n".join(lines)
+    assert lines[0] == f"note: {LIGHT_AT_CAMERA}"
+    assert "3 specularities found in frame.png, 2 with a normal" in lines
     assert "3 more highlights found and left out" in said
     assert "2 border, 1 few pixels" in said
     # Where the light is told, or all have a normal, there is nothing to say.
-    _print_assumed(assumed[1:])
-    _print_counts(record_of(many(2)), Path("frame.png"))
-    said = capsys.readouterr().out
-    assert LIGHT_AT_CAMERA not in said
-    assert "2 specularities found in frame.png\n" in said
+    lines = [*assumed_lines(assumed[1:]), *count_lines(record_of(many(2)), Path("frame.png"))]
+    assert LIGHT_AT_CAMERA not in "\n".join(lines)
+    assert "2 specularities found in frame.png" in lines
 
 
 def test_a_kind_that_is_named_as_a_flag_has_another_name_for_people(tmp_path):

@@ -88,7 +88,7 @@ def test_a_reader_that_has_gone_is_no_error(command):
 def test_a_reader_of_a_table_that_has_gone_is_no_error(tmp_path):
     (tmp_path / "table.py").write_text(
         "import sys\nfrom simtest.cli import common, main, scenes\ncommon.MOST_ROWS = 10**6\n"
-        "scenes.names_of = lambda _: common.print_table(('a',), [['x']] * 5000) or {}\n"
+        "scenes.names_of = lambda _: common.Table(('a',), [['x']] * 5000).print() or {}\n"
         "sys.argv = ['simtest', 'list']\nmain.main()\n"
     )
     done = shell(f"{sys.executable} {tmp_path}/table.py | true; echo ${{PIPESTATUS[0]}}")

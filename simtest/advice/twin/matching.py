@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.statistics import mean_interval
+from simtest.runtime.statistics import mean_interval, weighted_quantile
 
 TWINS = 40.0
 """Effective number of twins of a highlight."""
@@ -116,7 +116,7 @@ class Matcher:
         # A false detection has no normal that is its own.
         weights = _weights(np.where(self._real, squared, np.inf), self._shares, TWINS)
         near, glint = weights * self._near, weights * ~self._near
-        nearest, middle, farthest = (_quantile(weights, self._distances, share) for share in (0.1, 0.5, 0.9))
+        nearest, middle, farthest = (weighted_quantile(self._distances, weights, share) for share in (0.1, 0.5, 0.9))
         stated = weights * self._stated
         return Twins(
             rms_deg=_rms(weights, self._errors),
@@ -128,7 +128,7 @@ class Matcher:
             false=float(whole @ ~self._real / whole.sum()),
             glint_rms_deg=_rms(glint, self._errors),
             near_rms_deg=_rms(near, self._errors),
-            p95_deg=_quantile(weights, self._errors, 0.95),
+            p95_deg=weighted_quantile(self._errors, weights, 0.95),
             distance_mm=(nearest, middle, farthest),
             effective=float(weights.sum() ** 2 / np.square(weights).sum()),
             unlikeness=float(np.sqrt(weights @ np.where(self._real, squared, 0.0) / weights.sum() / len(FEATURES))),
@@ -171,13 +171,3 @@ def _rms(weights: Array, errors: Array) -> float:
     """Return a weighted root mean square; NaN without weight."""
     total = float(weights.sum())
     return float(np.sqrt(weights @ np.square(errors) / total)) if total > 0 else float("nan")
-
-
-def _quantile(weights: Array, values: Array, share: float) -> float:
-    """Return the value below which a share of the weight lies; NaN where no value is known."""
-    known = np.isfinite(values) & (weights > 0)
-    if not known.any():
-        return float("nan")
-    order = np.argsort(values[known])
-    below = np.cumsum(weights[known][order])
-    return float(values[known][order][np.searchsorted(below, share * below[-1])])

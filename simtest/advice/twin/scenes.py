@@ -185,7 +185,7 @@ def drawn_camera(camera: Camera, prior: CameraPrior, rng: np.random.Generator) -
     shift = prior.centre_sd_px * rng.standard_normal(2)
     error = prior.distortion_sd * float(rng.standard_normal())
     camera = camera.with_radial_error(error, prior.edge_reach)
-    table: dict[str, Any] = dict(camera_table(camera))
+    table: dict[str, Any] = camera_table(camera)
     table |= {"fx": camera.fx * scale, "fy": camera.fy * scale}
     return table | {"cx": camera.cx + float(shift[0]), "cy": camera.cy + float(shift[1])}
 

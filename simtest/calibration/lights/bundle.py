@@ -9,11 +9,10 @@ lights alone, whose inverse normal matrix is the covariance of the joint problem
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from simtest.calibration.lights.mirrors import Index, Mirrors
+from simtest.calibration.lights.mirrors import Mirrors
 from simtest.geometry.camera import Camera
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, Index
 
 REACH_MM = 30.0
 """A light of an endoscope lies about so far from the camera, at most. A prior of this standard deviation along each
@@ -29,21 +28,11 @@ LARGEST_STEP_MM = 20.0
 
 @dataclass(frozen=True)
 class Highlights:
-    """Measured highlights of all pictures.
+    """Measured highlights of all pictures."""
 
-    Parameters
-    ----------
-    view : ndarray of int, shape (N,)
-        Number of the picture.
-    pixels : ndarray, shape (N, 2)
-        Centres, px.
-    covariance : ndarray, shape (N, 2, 2)
-        Of the centres, px^2.
-    """
-
-    view: Index
-    pixels: Array
-    covariance: Array
+    view: Index  # (N,): number of the picture
+    pixels: Array  # (N, 2): centres, px
+    covariance: Array  # (N, 2, 2): of the centres, px^2
 
     def __len__(self) -> int:
         """Return the number of highlights."""
@@ -52,27 +41,13 @@ class Highlights:
 
 @dataclass(frozen=True)
 class Bundle:
-    """Lights that explain assigned highlights.
+    """Lights that explain assigned highlights."""
 
-    Parameters
-    ----------
-    lights : ndarray, shape (S, 3)
-        mm, camera frame.
-    covariance : ndarray, shape (3 S, 3 S)
-        mm^2, if the stated errors of highlights and mirrors hold.
-    z : ndarray, shape (V, 3)
-        Fitted errors of the mirrors, in their standard deviations.
-    chi2 : float
-        Sum of squared residuals in their standard deviations.
-    freedom : int
-        Its degrees of freedom.
-    """
-
-    lights: Array
-    covariance: Array
-    z: Array
-    chi2: float
-    freedom: int
+    lights: Array  # (S, 3): mm, camera frame
+    covariance: Array  # (3 S, 3 S): mm^2, if the stated errors of highlights and mirrors hold
+    z: Array  # (V, 3): fitted errors of the mirrors, in their standard deviations
+    chi2: float  # sum of squared residuals in their standard deviations
+    freedom: int  # its degrees of freedom
 
     def covariance_of(self, source: int) -> Array:
         """Return the covariance of one light, shape (3, 3), mm^2."""
@@ -100,9 +75,7 @@ def derivatives(camera: Camera, mirrors: Mirrors, view: Index, lights: Array, z:
     return mirrors.predict(camera, view, lights, z), along(STEP_MM, 0.0), along(0.0, STEP_Z)
 
 
-def solve(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, source: npt.NDArray[np.intp], start: Array
-) -> Bundle | None:
+def solve(camera: Camera, mirrors: Mirrors, highlights: Highlights, source: Index, start: Array) -> Bundle | None:
     """Fit lights to highlights by Gauss-Newton steps from `start`, (S, 3), mm, the mirror errors eliminated.
 
     `source`, (N,), says which light made each highlight; negative: none, it is left out. None where a step leads to
@@ -126,7 +99,7 @@ def solve(
 
 
 def _normal_equations(
-    camera: Camera, mirrors: Mirrors, highlights: Highlights, source: npt.NDArray[np.intp],
+    camera: Camera, mirrors: Mirrors, highlights: Highlights, source: Index,
     kept: Index, at: tuple[Array, Array],
 ) -> tuple[Array, Array, float, Array]:  # fmt: skip
     """Return the normal matrix and gradient in the lights, chi-squared, and the mirror errors at these lights."""

@@ -9,13 +9,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.geometry.camera import Camera
 from simtest.geometry.vectors import basis_across
-from simtest.runtime.arrays import Array
-
-Index = npt.NDArray[np.intp]
+from simtest.runtime.arrays import Array, Index
 
 NEWTON_STEPS = 8
 """From the start that is used, angles of incidence converge to rounding in at most five."""
@@ -44,21 +41,11 @@ class Mirrors(Protocol):
 
 @dataclass(frozen=True)
 class Balls:
-    """A ball in each of V pictures.
+    """A ball in each of V pictures."""
 
-    Parameters
-    ----------
-    centres : ndarray, shape (V, 3)
-        mm.
-    factors : ndarray, shape (V, 3, 3)
-        Lower Cholesky factors of the centres' covariances, mm.
-    radii : ndarray, shape (V,)
-        mm.
-    """
-
-    centres: Array
-    factors: Array
-    radii: Array
+    centres: Array  # (V, 3): mm
+    factors: Array  # (V, 3, 3): lower Cholesky factors of the centres' covariances, mm
+    radii: Array  # (V,): mm
 
     def __len__(self) -> int:
         """Return the number of pictures."""
@@ -114,20 +101,11 @@ def _incidence(t: Array, d: Array, radii: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Plates:
-    """A flat plate in each of V pictures: the plane n . x = h.
+    """A flat plate in each of V pictures: the plane n . x = h."""
 
-    Parameters
-    ----------
-    normals : ndarray, shape (V, 3)
-        Unit normals that face the camera, n . x < 0 for sightlines x that meet the plate.
-    offsets : ndarray, shape (V,)
-        h, mm; negative.
-    factors : ndarray, shape (V, 3, 3)
-        Lower Cholesky factors of the covariance of two turns about the tangent basis, rad, and of h, mm.
-    """
-
-    normals: Array
-    offsets: Array
+    normals: Array  # (V, 3): unit normals that face the camera, n . x < 0 for sightlines x that meet the plate.
+    offsets: Array  # (V,): h, mm; negative
+    # (V, 3, 3): lower Cholesky factors of the covariance of two turns about the tangent basis, rad, and of h, mm.
     factors: Array
 
     def __len__(self) -> int:

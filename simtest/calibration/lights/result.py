@@ -5,14 +5,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration.lights.bundle import REACH_MM, Bundle, Highlights, solve
 from simtest.calibration.lights.mirrors import Mirrors
 from simtest.calibration.lights.search import Found
 from simtest.geometry import chi_squared
 from simtest.geometry.camera import Camera
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, Index
 from simtest.runtime.statistics import NORMAL_QUANTILE
 
 UNLIKELY = 1e-3
@@ -32,24 +31,12 @@ FOREIGN_SURE = 3.0
 
 @dataclass(frozen=True)
 class MeasuredLight:
-    """A light.
+    """A light."""
 
-    Parameters
-    ----------
-    position_mm : ndarray, shape (3,)
-        Camera frame.
-    covariance_mm2 : ndarray, shape (3, 3)
-        Of the position, residuals and the errors of radius and camera included.
-    pictures : int
-        How many pictures show its highlight.
-    is_foreign : bool
-        Whether it lies farther from the camera than any light of an endoscope: a lamp or a window.
-    """
-
-    position_mm: Array
-    covariance_mm2: Array
-    pictures: int
-    is_foreign: bool
+    position_mm: Array  # (3,): camera frame
+    covariance_mm2: Array  # (3, 3): of the position, residuals and the errors of radius and camera included
+    pictures: int  # how many pictures show its highlight
+    is_foreign: bool  # whether it lies farther from the camera than any light of an endoscope: a lamp or a window
 
     @property
     def half_widths_mm(self) -> Array:
@@ -59,37 +46,17 @@ class MeasuredLight:
 
 @dataclass(frozen=True)
 class LightCalibration:
-    """The lights, and how well they explain the highlights.
+    """The lights, and how well they explain the highlights."""
 
-    Parameters
-    ----------
-    lights : tuple of MeasuredLight
-        By their distance from the camera.
-    source : ndarray of int, shape (N,)
-        Which light made each highlight; -1: none.
-    residuals_px : ndarray, shape (N, 2)
-        Measured less predicted centre; NaN where no light made it.
-    predicted_px : ndarray, shape (V, S, 2)
-        Where each picture should show each light.
-    chi2, freedom : float, int
-        Of the fit.
-    inflation : float
-        Factor, at least 1, by which the residuals have widened all covariances.
-    notes : tuple of str
-        What is to be known about the result.
-    problems : tuple of str
-        Why it must not be used; empty: it may be.
-    """
-
-    lights: tuple[MeasuredLight, ...]
-    source: npt.NDArray[np.intp]
-    residuals_px: Array
-    predicted_px: Array
-    chi2: float
-    freedom: int
-    inflation: float
-    notes: tuple[str, ...]
-    problems: tuple[str, ...]
+    lights: tuple[MeasuredLight, ...]  # by their distance from the camera
+    source: Index  # (N,): which light made each highlight; -1: none
+    residuals_px: Array  # (N, 2): measured less predicted centre; NaN where no light made it
+    predicted_px: Array  # (V, S, 2): where each picture should show each light
+    chi2: float  # of the fit
+    freedom: int  # of the fit
+    inflation: float  # factor, at least 1, by which the residuals have widened all covariances
+    notes: tuple[str, ...]  # what is to be known about the result
+    problems: tuple[str, ...]  # why it must not be used; empty: it may be
 
     @property
     def rms_px(self) -> float:
@@ -107,13 +74,9 @@ def judge(
 ) -> LightCalibration:
     """Return what was found, with its intervals and what is doubtful about it.
 
-    Parameters
-    ----------
-    radius_sd_share : float
-        Standard deviation of the ball's radius as a share of it. A scene and its scaled copy give the same pictures,
-        so each position is wrong by the same share, which no residual shows.
-    further : ndarray, shape (3 S, 3 S)
-        Covariance by errors that are common to all pictures (`covariance_of_variations`), mm^2.
+    `radius_sd_share` is the standard deviation of the ball's radius as a share of it: a scene and its scaled copy give
+    the same pictures, so each position is wrong by the same share, which no residual shows. `further` is from
+    `covariance_of_variations`.
     """
     bundle = found.bundle
     inflation = max(1.0, bundle.chi2 / bundle.freedom) if bundle.freedom > 0 else 1.0
@@ -214,10 +177,7 @@ def covariance_of_variations(
 ) -> Array:
     """Return the covariance of the lights by errors that are common to all pictures, shape (3 S, 3 S), mm^2.
 
-    Parameters
-    ----------
-    variations : iterable of tuple
-        Camera and mirrors as they are if one of several independent errors is one standard deviation.
+    Each variation is camera and mirrors as they are if one of several independent errors is one standard deviation.
     """
     size = found.bundle.lights.size
     total = np.zeros((size, size))

@@ -11,7 +11,6 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from simtest.calibration.lights.bundle import (
     REACH_MM,
@@ -25,10 +24,7 @@ from simtest.calibration.lights.bundle import (
 from simtest.calibration.lights.mirrors import Mirrors
 from simtest.geometry import chi_squared
 from simtest.geometry.camera import Camera
-from simtest.runtime.arrays import Array
-
-Labels = npt.NDArray[np.intp]
-Mask = npt.NDArray[np.bool_]
+from simtest.runtime.arrays import Array, Index, Mask
 
 MOST_LIGHTS = 4
 PAIRS = 24
@@ -66,24 +62,14 @@ DISTINCT = chi_squared.quantile(0.9999, 3)
 
 @dataclass(frozen=True)
 class Found:
-    """Lights, and which one made each highlight.
+    """Lights, and which one made each highlight."""
 
-    Parameters
-    ----------
-    bundle : Bundle
-        The fit.
-    source : ndarray of int, shape (N,)
-        Number of the light of each highlight; -1: none.
-    others : ndarray, shape (A, 3)
-        Positions, mm, of another set of lights that explains the highlights about as well: the result is ambiguous.
-    further : ndarray, shape (B, 3)
-        Positions, mm, that explain three or more of the highlights left, but too few for a light.
-    """
-
-    bundle: Bundle
-    source: Labels
+    bundle: Bundle  # the fit
+    source: Index  # (N,): number of the light of each highlight; -1: none
+    # (A, 3): positions, mm, of another set of lights that explains the highlights about as well: the result is
+    # ambiguous.
     others: Array
-    further: Array
+    further: Array  # (B, 3): positions, mm, that explain three or more of the highlights left, but too few for a light
 
 
 class _Views(NamedTuple):
@@ -100,7 +86,7 @@ class _Candidates:
 
     lights: Array
     covariances: Array
-    taken: Labels
+    taken: Index
     chi2: Array
 
     def only(self, kept: Mask) -> "_Candidates":
@@ -159,7 +145,7 @@ def _chosen(
     return starts
 
 
-def _without_merged(views: _Views, bundle: Bundle, source: Labels) -> Labels:
+def _without_merged(views: _Views, bundle: Bundle, source: Index) -> Index:
     """Return the assignment without highlights that lie where a light without a highlight of its own is expected too.
 
     The lights' images have merged there, and the centre is that of both. A light that would keep fewer than two
@@ -210,7 +196,7 @@ def _candidates(views: _Views) -> _Candidates:
     return _Candidates(lights, covariances, taken, chi2).only(np.isfinite(lights).all(axis=1) & (chi2 < GATE))
 
 
-def _pairs(highlights: Highlights, camera: Camera) -> tuple[Labels, Labels]:
+def _pairs(highlights: Highlights, camera: Camera) -> tuple[Index, Index]:
     """Return pairs of highlights of different pictures, of those pictures that differ most first."""
     views = np.unique(highlights.view)
     middles = {view: camera.unproject(highlights.pixels[highlights.view == view]).mean(axis=0) for view in views}
@@ -239,7 +225,7 @@ def _nearest_points(p: Array, u: Array, q: Array, v: Array) -> Array:
     return np.asarray(middle * np.minimum(1.0, 2 * REACH_MM / np.maximum(length, 1e-9)))
 
 
-def _weighted(views: _Views, lights: Array, measured: Labels) -> tuple[Array, Array, Array]:
+def _weighted(views: _Views, lights: Array, measured: Index) -> tuple[Array, Array, Array]:
     """Return residuals (N, 2), derivatives by the light (N, 2, 3) and inverse covariances (N, 2, 2) of highlights."""
     camera, mirrors, highlights = views
     predicted, J, K = derivatives(camera, mirrors, highlights.view[measured], lights, np.zeros(3))
@@ -287,12 +273,12 @@ def _grow(views: _Views, held: _Candidates) -> _Candidates:
     return held
 
 
-def _counted(candidates: _Candidates, free: Mask) -> npt.NDArray[np.intp]:
+def _counted(candidates: _Candidates, free: Mask) -> Index:
     """Return how many free highlights each candidate has taken."""
     return np.asarray(((candidates.taken >= 0) & free[candidates.taken]).sum(axis=1), np.intp)
 
 
-def _refined(views: _Views, starts: Array, free: Mask, rounds: int) -> tuple[Bundle, Labels] | None:
+def _refined(views: _Views, starts: Array, free: Mask, rounds: int) -> tuple[Bundle, Index] | None:
     """Assign highlights to lights and fit the lights, in turn, until the assignment stays."""
     bundle: Bundle | None = Bundle(starts, np.eye(starts.size), np.zeros(3), 0.0, 0)
     source = np.full(len(views.highlights), -1, dtype=np.intp)
@@ -312,7 +298,7 @@ def _refined(views: _Views, starts: Array, free: Mask, rounds: int) -> tuple[Bun
     return bundle, source
 
 
-def _assign(views: _Views, bundle: Bundle, free: Mask) -> Labels:
+def _assign(views: _Views, bundle: Bundle, free: Mask) -> Index:
     """Return which light made each highlight, one highlight a light and picture at most; -1 where none did.
 
     Of all assignments of a picture's highlights the one with the smallest sum of squared distances is taken, where a

@@ -14,7 +14,6 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators.process.core import Hello, outline_names
 from simtest.geometry import Array, Camera, Patch
-from simtest.geometry.lenses import lens_name
 
 Named = dict[str, npt.NDArray[Any]]
 Offer = Mapping[str, Callable[[], npt.NDArray[Any] | str]]
@@ -32,7 +31,7 @@ def camera_message(camera: Camera) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
         "K": camera.K.tolist(),
-        "distortion": None if lens is None else {"model": lens_name(lens), **asdict(lens)},
+        "distortion": None if lens is None else {"model": lens.type, **asdict(lens)},
         "view_mask": None if camera.view_mask is None else asdict(camera.view_mask),
     }
 

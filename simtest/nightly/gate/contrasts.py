@@ -13,11 +13,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from scipy import stats
 
 from simtest.nightly.gate.quantities import Quantity
 from simtest.runtime.arrays import Array, IntArray, Mask
-from simtest.runtime.statistics import CONFIDENCE, reach
+from simtest.runtime.statistics import reach, student_quantile
 
 UNIT = ("cell", "quantity", "realisation")
 """Number of the cell and name of the quantity, a test each, and the number of the unit."""
@@ -126,19 +125,20 @@ def _tail(estimate: Array, deviation: Array, freedom: Array) -> Array:
 
     Without variance the chance is 0 above 0, 1 below it, and a half at 0.
     """
+    from scipy.special import stdtr
+
     with np.errstate(divide="ignore", invalid="ignore"):
         statistic = np.where(
             deviation > 0, estimate / deviation, np.where(estimate > 0, np.inf, np.where(estimate < 0, -np.inf, 0.0))
         )
     usable = freedom >= 1
-    return np.where(usable, stats.t.sf(statistic, np.where(usable, freedom, 1.0)), np.nan)
+    return np.where(usable, stdtr(np.where(usable, freedom, 1.0), -statistic), np.nan)
 
 
 def _half_width(deviation: Array | float, freedom: Array) -> Array:
     """Return half of the 95 % interval's width; NaN without a degree of freedom."""
     usable = freedom >= 1
-    quantile = stats.t.ppf((1 + CONFIDENCE) / 2, np.where(usable, freedom, 1.0))
-    return np.where(usable, quantile * deviation, np.nan)
+    return np.where(usable, student_quantile(np.where(usable, freedom, 1.0)) * deviation, np.nan)
 
 
 def _interval(centre: Array, deviation: Array, third: Array, freedom: Array) -> tuple[Array, Array]:

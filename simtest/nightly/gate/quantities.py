@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from scipy import stats
 
 from simtest.conventions import MOTION, MOTION_COLUMNS, ON_INSTRUMENT
+from simtest.geometry import chi_squared
 from simtest.nightly.records import CELL, FIGURES, Cell
 from simtest.runtime.statistics import CONFIDENCE, mean_interval, share_interval
 from simtest.validation.columns import BUDGET_COLUMNS, SCHEMA
 from simtest.validation.row_kinds import is_false
 from simtest.validation.statistics import PENALTY_DEG, figures, units
 
-COVERED = float(stats.chi2.ppf(CONFIDENCE, 2))
+COVERED = chi_squared.quantile(CONFIDENCE, 2)
 """Squared Mahalanobis distance of the border of a 95 % region."""
 
 WORST_RATIO = 1.0

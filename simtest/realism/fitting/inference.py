@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.realism.distance import widened
 from simtest.realism.fitting.emulator import Emulator
 from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.statistics import bootstrap_interval
 
 REPEATS = 60
 """Repeated fits."""
@@ -129,7 +129,7 @@ def infer(
         if step:
             step(number + 1, repeats)
     centres, spreads = (np.array(part) for part in zip(*found, strict=True))
-    interval = np.clip(widened(centre, centres, len(values)).T, 0.0, 1.0)
+    interval = np.clip(bootstrap_interval(centre, centres, len(values)).T, 0.0, 1.0)
     return Fitted(centre, spread, gap, centres, spreads, interval, told)
 
 

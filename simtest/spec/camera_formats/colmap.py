@@ -27,6 +27,7 @@ from simtest.spec.camera_formats.common import (
     check_alike,
     inverse,
     json_object,
+    lens_table,
     mask_of_text,
     mask_table,
     mask_text,
@@ -138,11 +139,7 @@ def _colmap_camera(words: Sequence[str]) -> Table:
         told["fx"] = told["fy"] = told.pop("f")
     table: Table = {"width": width, "height": height}
     table |= {name: told.pop(name) for name in ("fx", "fy", "cx", "cy")}
-    if "FISHEYE" in model:
-        table["distortion"] = {"type": "kannala_brandt", **told}
-    elif any(told.values()):
-        table["distortion"] = {"type": "brown_conrady", **told}
-    return table
+    return table | {"distortion": lens_table("FISHEYE" in model, told)}
 
 
 @of_text("pose", "record_bytes")
@@ -331,12 +328,10 @@ def _nerf_lens(data: Mapping[str, Any], told: Mapping[str, float]) -> Table | No
     fisheye = bool(told_fisheye) if model is None else NERF_MODELS[model]
     if told_fisheye is not None and "is_fisheye" in data and bool(told_fisheye) != fisheye:
         raise InputError(f"is_fisheye = {told_fisheye}: does not fit camera_model = {model!r}")
-    if fisheye:
-        return {"type": "kannala_brandt", **{key: told.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")}}
-    if told.get("k4"):
+    if not fisheye and told.get("k4"):
         raise InputError(f"k4 = {told['k4']:g}: must be 0; simtest's perspective lens has no term r^8")
-    lens = {key: told[key] for key in ("k1", "k2", "p1", "p2", "k3") if told.get(key)}
-    return {"type": "brown_conrady", **lens} if lens else None
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    return lens_table(fisheye, {key: told.get(key, 0.0) for key in names})
 
 
 def transforms_file(camera: Camera, path: Path, poses: Poses | None) -> Files:

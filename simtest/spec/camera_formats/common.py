@@ -195,6 +195,13 @@ def chosen(cameras: Mapping[str, Table], wanted: str | None) -> Table:
     return tables[0]
 
 
+def lens_table(is_fisheye: bool, told: Mapping[str, float]) -> Table | None:
+    """Return a lens as the table of a `DistortionSpec`; None for a perspective lens whose coefficients are all 0."""
+    if is_fisheye:
+        return {"type": "kannala_brandt", **told}
+    return {"type": "brown_conrady", **told} if any(told.values()) else None
+
+
 def mask_text(mask: ViewMask) -> str:
     """Return a view mask as JSON, for formats that skip what they do not know."""
     return json.dumps(mask_table(mask))

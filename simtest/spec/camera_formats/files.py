@@ -24,39 +24,20 @@ from simtest.spec.toml_files import read_text
 
 @dataclass(frozen=True)
 class Format:
-    """A format of camera files.
+    """A format of camera files."""
 
-    Parameters
-    ----------
-    name : str
-        As `recognise` returns it and `write_camera` takes it.
-    title : str
-        How messages and pages call it.
-    module : str
-        Of this package, with the functions below; loaded on demand, since OpenCV and SciPy are slow to load.
-    looks_like : mapping
-        Pattern that a file holds, by its syntax: xml, json, yaml or text. Of several that fit the first row counts.
-    cameras : str
-        Function that reads the cameras of a file: tables of `CameraSpec` by id. Empty: it holds none.
-    poses : str
-        Function that reads names and world_from_camera of frames. Empty: it holds none.
-    write : str
-        Function of a camera, the file's path and poses or None that returns the `Files` to write. Empty: none is.
-    suffixes : tuple of str
-        Of the files that are written; the first format that has a suffix is its default.
-    writes_poses : bool
-        Whether poses are written too.
-    """
-
-    name: str
-    title: str
+    name: str  # as `recognise` returns it and `write_camera` takes it
+    title: str  # how messages and pages call it
+    # Of this package, with the functions below; loaded on demand, since OpenCV and SciPy are slow to load.
     module: str = ""
+    # Pattern that a file holds, by its syntax: xml, json, yaml or text. Of several that fit the first row counts.
     looks_like: Mapping[str, str] | None = None
-    cameras: str = ""
-    poses: str = ""
+    cameras: str = ""  # function that reads the cameras of a file: tables of `CameraSpec` by id. Empty: it holds none.
+    poses: str = ""  # function that reads names and world_from_camera of frames. Empty: it holds none.
+    # Function of a camera, the file's path and poses or None that returns the `Files` to write. Empty: none is.
     write: str = ""
-    suffixes: tuple[str, ...] = ()
-    writes_poses: bool = False
+    suffixes: tuple[str, ...] = ()  # of the files that are written; the first format that has a suffix is its default
+    writes_poses: bool = False  # whether poses are written too
 
     def function(self, name: str) -> Callable[..., Any]:
         """Return a function of the format's module."""
@@ -187,11 +168,6 @@ def read_poses(path: str | Path) -> Poses:
 
     Axes are OpenCV's: x right, y down, z forward. The unit of length is the file's: COLMAP's and NeRF's is arbitrary,
     Kalibr's is made mm.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or malformed, or its format holds no poses.
     """
     path, _ = split_id(path)
     form = FORMATS[recognise(path)]

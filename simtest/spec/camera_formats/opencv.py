@@ -24,6 +24,7 @@ from simtest.spec.camera_formats.common import (
     Poses,
     Table,
     inverse,
+    lens_table,
     number,
     numbers,
     of_text,
@@ -221,7 +222,7 @@ def _lens(data: Mapping[str, Any]) -> dict[str, str | float] | None:
     # Kannala-Brandt
     if fisheye:
         values = _numbers(value, name, (4,))
-        return {"type": "kannala_brandt", **dict(zip(("k1", "k2", "k3", "k4"), values, strict=True))}
+        return lens_table(fisheye, dict(zip(("k1", "k2", "k3", "k4"), values, strict=True)))
     # Brown-Conrady: which counts are possible depends on the model, if one is named.
     counts = {"plumb_bob": (4, 5), "radtan": (4, 5), "rational_polynomial": (8, 12, 14)}.get(model, (4, 5, 8, 12, 14))
     values = _numbers(value, name, counts)
@@ -230,10 +231,7 @@ def _lens(data: Mapping[str, Any]) -> dict[str, str | float] | None:
         if amount != 0:
             kind = "tilted sensor" if term.startswith("tau") else "thin prism"
             raise InputError(f"{name}: {term} = {amount:g} ({kind}): must be 0; simtest does not know that term")
-    if not any(values):
-        # All coefficients 0: a pinhole.
-        return None
-    return {"type": "brown_conrady", **dict(zip(BROWN_ORDER, values, strict=False))}
+    return lens_table(fisheye, dict(zip(BROWN_ORDER, values, strict=False)))
 
 
 def _check_no_other_lens(data: Mapping[str, Any]) -> None:
@@ -372,21 +370,19 @@ def _kalibr_camera(data: Mapping[str, Any]) -> Table:
         raise InputError(f"camera_model = {model!r:.40}: simtest lacks it; must be pinhole")
     fx, fy, cx, cy = numbers(data.get("intrinsics"), "intrinsics", 4)
     width, height = numbers(data.get("resolution"), "resolution", 2)
-    table = {
+    return {
         "width": int(number(width, "resolution", whole=True)), "fx": fx, "cx": cx + PIXEL_CENTRE,
         "height": int(number(height, "resolution", whole=True)), "fy": fy, "cy": cy + PIXEL_CENTRE,
+        "distortion": _kalibr_lens(data),
     }  # fmt: skip
-    return table | _kalibr_lens(data)
 
 
-def _kalibr_lens(data: Mapping[str, Any]) -> Table:
-    """Return the key `distortion`, or nothing for a pinhole."""
+def _kalibr_lens(data: Mapping[str, Any]) -> Table | None:
+    """Return the lens as the table of a `DistortionSpec`; None for a pinhole."""
     name = data.get("distortion_model", "none")
     if name not in LENSES:
         raise InputError(f"distortion_model = {name!r:.40}: simtest lacks it; must be one of {', '.join(LENSES)}")
-    told = [] if name == "none" else numbers(data.get("distortion_coeffs"), "distortion_coeffs", 4)
-    if name in ("equidistant", "equi"):
-        return {"distortion": {"type": "kannala_brandt", **dict(zip(("k1", "k2", "k3", "k4"), told, strict=True))}}
-    if not any(told):
-        return {}
-    return {"distortion": {"type": "brown_conrady", **dict(zip(("k1", "k2", "p1", "p2"), told, strict=True))}}
+    if name == "none":
+        return None
+    fisheye, told = name != "radtan", numbers(data.get("distortion_coeffs"), "distortion_coeffs", 4)
+    return lens_table(fisheye, dict(zip(("k1", "k2", "k3", "k4") if fisheye else BROWN_ORDER[:4], told, strict=True)))

@@ -25,21 +25,11 @@ MM_PER_M = 1000.0
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of a sequence's frames.
+    """Poses of a sequence's frames."""
 
-    Parameters
-    ----------
-    names : sequence of str
-        Of the frames' files.
-    world_from_camera : ndarray, shape (N, 4, 4)
-        Poses, mm.
-    times_s : sequence of float, optional
-        When the frames were taken, s; None where they are no sequence in time.
-    """
-
-    names: Sequence[str]
-    world_from_camera: Array
-    times_s: Sequence[float] | None = None
+    names: Sequence[str]  # of the frames' files
+    world_from_camera: Array  # (N, 4, 4): poses, mm
+    times_s: Sequence[float] | None = None  # when the frames were taken, s; None where they are no sequence in time
 
     def __post_init__(self) -> None:
         times = len(self.names) if self.times_s is None else len(self.times_s)

@@ -4,6 +4,7 @@ from typing import Literal
 
 import numpy as np
 
+from simtest.calibration.frame import MAD_TO_SIGMA
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import from_integer
@@ -27,7 +28,6 @@ TRIALS, JUDGED = 100, 2000
 MOST_PIXELS = 20_000
 """Pixels of a frame that fit its alignment, evenly spread."""
 
-MAD_TO_SIGMA = 1.4826
 LEAST_PIXELS = 3
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject
-from simtest.runtime.statistics import Interval, mean_interval, median_interval, share_interval
+from simtest.runtime.statistics import Interval, mean_interval, median_interval, root_mean_square, share_interval
 
 PENALTY = 90.0
 """An unanswered pixel counts as this angle, deg, in the penalised mean."""
@@ -34,7 +34,7 @@ def frame_figures(values: Array, below: Sequence[float], penalty: float | None =
     quantiles = np.quantile(own, [*QUANTILES.values()]).tolist() if own.size else [None] * len(QUANTILES)
     return {
         "n": n, "n_unanswered": missing,
-        "mean": float(own.mean()) if own.size else None, "rms": float(np.sqrt(np.mean(own**2))) if own.size else None,
+        "mean": float(own.mean()) if own.size else None, "rms": root_mean_square(own),
         **({} if penalty is None else {"mean_penalised": float((own.sum() + penalty * missing) / n)}),
         "share_unanswered": missing / n,
         **{f"below_{most:g}": np.count_nonzero(own < most) / n for most in below},
