@@ -1,8 +1,12 @@
 """Scenes in 3D: a surface, lights and normals, of a kept frame or of a scene, to be turned in a frame of a page."""
 
+import base64
+import json
 from dataclasses import dataclass, fields
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
+from zipfile import ZipFile
 
 import numpy as np
 
@@ -12,9 +16,6 @@ from simtest.pages.style import number
 from simtest.report.gallery import anchor
 from simtest.report.run_folder import GalleryItem, Run
 from simtest.runtime.arrays import AnyArray, Array, IntArray
-
-if TYPE_CHECKING:
-    from trimesh import Scene, Trimesh
 
 CAMERA, TRUE, TRUE_BASE = "camera", "true normal", "true normal of the base"
 SIGHTLINE, EVERYWHERE = "sightline from the camera", "true normals of the surface"
@@ -31,6 +32,7 @@ a surface of one curvature must not get the darkest one."""
 _GRID, _NORMALS = 72, 9  # samples of the surface along the longer side, and of the normals that are drawn all over it
 _OCCLUSION = 1.25  # factor between the distances of neighbouring samples beyond which there is an edge
 _THICK = 1 / 500  # radius of the thinnest line over the size of the scene
+_UNSIGNED_BYTE, _UNSIGNED_INT, _FLOAT = 5121, 5125, 5126  # component types of glTF
 _EYE = np.array([1.5, -1.14, -1.68])  # direction in which the viewer stands: behind the camera and above it
 
 
@@ -187,29 +189,32 @@ def _at_highlights(item: GalleryItem, reach: float) -> list[tuple[str, Array, Ar
 # Frames of pages -----------------------------------------------------------------------------------------------------
 
 
+class _Mesh(NamedTuple):
+    """Triangles with a colour at each vertex."""
+
+    vertices: Array  # shape (V, 3)
+    faces: IntArray  # shape (F, 3)
+    colours: Array  # sRGB from 0 to 1, shape (V, 3), or (3,) for all
+
+
 def framed(content: Content, surface: str) -> tuple[str, list[Part]]:
     """Return the HTML of a frame that turns a scene, and the parts that its page can hide.
 
     `surface` is which colours of the surface are shown first: "lit", or "curvature" where it is known.
     """
-    from trimesh import Scene
-    from trimesh.creation import icosphere
-    from trimesh.scene.cameras import Camera
-    from trimesh.viewer.notebook import scene_to_html
-
-    scene = Scene()
+    meshes: list[_Mesh] = []
     parts: list[Part] = []
 
-    def add(mesh: "Trimesh", name: str, colour: str, shown: bool = True) -> None:
+    def add(mesh: _Mesh, name: str, colour: str, shown: bool = True) -> None:
         parts.append(Part(f"part{len(parts)}", name, colour, shown))
-        scene.add_geometry(mesh, node_name=parts[-1].node, geom_name=f"mesh{len(parts)}")
+        meshes.append(mesh)
 
     is_curved = surface == "curvature" and content.curvature.size > 0
-    add(_mesh(content.vertices, content.faces, content.lit), "surface: lit", "", not is_curved)
+    add(_Mesh(content.vertices, content.faces, content.lit), "surface: lit", "", not is_curved)
     if content.curvature.size:
         limit = number(curvature_limit(content.curvature), 2)
         name = f"surface: curvature from −{limit} (blue) to {limit} (red)"
-        add(_mesh(content.vertices, content.faces, _shades(content.curvature)), name, "", is_curved)
+        add(_Mesh(content.vertices, content.faces, _shades(content.curvature)), name, "", is_curved)
     size = float(np.linalg.norm(np.ptp(content.vertices, axis=0)))
     for rank, (name, colour) in enumerate(line_colours(content).items()):
         own = content.names == name
@@ -217,25 +222,62 @@ def framed(content: Content, surface: str) -> tuple[str, list[Part]]:
         radius = size * _THICK * (1 if name in (CAMERA, SIGHTLINE, EVERYWHERE) else 1 + 0.3 * rank)
         shown = "field of view" if name == CAMERA else name
         add(_rods(content.starts[own], content.ends[own], radius, colour), shown, colour)
-    eyes = (("camera", np.zeros((1, 3)), NEUTRAL), ("light", content.lights, LIGHT))
-    for name, points, colour in eyes:
-        balls = [icosphere(1, 6 * _THICK * size).apply_translation(point) for point in points]
-        if balls:
-            vertices = np.concatenate([ball.vertices for ball in balls])
-            faces = np.concatenate([ball.faces + i * len(ball.vertices) for i, ball in enumerate(balls)])
-            add(_mesh(vertices, faces, _hexadecimal(colour)), name, colour)
-    # Named, or each frame would get a name by chance.
-    scene.camera = Camera("viewer", resolution=(800, 600), fov=(60.0, 45.0))
-    scene.camera_transform = _viewer(scene)
-    return scene_to_html(scene), parts
+    for name, points, colour in (("camera", np.zeros((1, 3)), NEUTRAL), ("light", content.lights, LIGHT)):
+        if len(points):
+            add(_balls(points, 6 * _THICK * size, colour), name, colour)
+    glb = _glb([part.node for part in parts], meshes)
+    return _viewer_page().replace("$B64GLTF", base64.b64encode(glb).decode()), parts
 
 
-def _mesh(vertices: Array, faces: IntArray, colour: Array) -> "Trimesh":
-    """Return a mesh with the colour of each vertex, 0 to 1, or of all."""
-    from trimesh import Trimesh
+def _viewer_page() -> str:
+    """Return trimesh's viewer, which holds three.js; to import trimesh for it would take 0.3 s of a page's 2."""
+    folder = Path(*find_spec("trimesh").submodule_search_locations)  # type: ignore[union-attr, misc]
+    with ZipFile(folder / "resources" / "templates" / "viewer.zip") as archive:
+        return archive.read("viewer.html.template").decode()
 
-    opaque = np.append(np.broadcast_to(colour, (len(vertices), 3)), np.ones((len(vertices), 1)), axis=1)
-    return Trimesh(vertices, faces, vertex_colors=np.rint(255 * opaque).astype(np.uint8), process=False)
+
+def _glb(names: list[str], meshes: list[_Mesh]) -> bytes:
+    """Return meshes as nodes of a binary glTF 2.0 file, with the camera that sees all of them."""
+    chunks: dict[bytes, int] = {}  # with the accessor of each
+    views: list[dict[str, int]] = []
+    accessors: list[dict[str, Any]] = []
+
+    def stored(array: AnyArray, component: int, kind: str, **more: Any) -> int:
+        """Append an array, a row an element, unless it is there already; return its accessor."""
+        data = array.tobytes()
+        if data not in chunks:
+            views.append({"buffer": 0, "byteOffset": sum(map(len, chunks)), "byteLength": len(data)})
+            chunks[data] = len(accessors)
+            accessors.append(
+                {"bufferView": chunks[data], "componentType": component, "count": len(array), "type": kind, **more}
+            )
+        return chunks[data]
+
+    def primitive(mesh: _Mesh) -> dict[str, Any]:
+        vertices = mesh.vertices.astype("<f4")
+        limits = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
+        colours = np.full((len(vertices), 4), 255, dtype=np.uint8)
+        colours[:, :3] = np.rint(255 * mesh.colours)
+        attributes = {
+            "POSITION": stored(vertices, _FLOAT, "VEC3", **limits),
+            "COLOR_0": stored(colours, _UNSIGNED_BYTE, "VEC4", normalized=True),
+        }
+        return {"attributes": attributes, "indices": stored(mesh.faces.ravel().astype("<u4"), _UNSIGNED_INT, "SCALAR")}
+
+    lens = {"type": "perspective", "perspective": {"aspectRatio": 4 / 3, "yfov": np.deg2rad(45), "znear": 0.01}}
+    # glTF keeps matrices by columns.
+    camera = {"name": "viewer", "camera": 0, "matrix": _viewer(meshes).T.ravel().tolist()}
+    content = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": list(range(len(meshes) + 1))}],
+        "nodes": [{"name": name, "mesh": i} for i, name in enumerate(names)] + [camera],
+        "meshes": [{"primitives": [primitive(mesh)]} for mesh in meshes],
+        "accessors": accessors, "bufferViews": views, "cameras": [lens],
+        "buffers": [{"byteLength": sum(map(len, chunks))}],
+    }  # fmt: skip
+    text = json.dumps(content).encode()
+    pieces = ((b"JSON", text + b" " * (-len(text) % 4)), (b"BIN\0", b"".join(chunks)))
+    body = b"".join(len(piece).to_bytes(4, "little") + kind + piece for kind, piece in pieces)
+    return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
 
 
 def _shades(curvature: Array) -> Array:
@@ -246,7 +288,17 @@ def _shades(curvature: Array) -> Array:
     return np.stack([np.interp(at, np.linspace(-1, 1, len(stops)), side) for side in stops.T], axis=1)
 
 
-def _rods(starts: Array, ends: Array, radius: float, colour: str) -> "Trimesh":
+def _balls(centres: Array, radius: float, colour: str) -> _Mesh:
+    theta, phi = np.linspace(0, np.pi, 7)[:, None], np.linspace(0, 2 * np.pi, 13)
+    one = np.stack(
+        np.broadcast_arrays(np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), axis=-1
+    )
+    vertices, faces = one.reshape(-1, 3), grid_triangles(one, _OCCLUSION)
+    every = faces + len(vertices) * np.arange(len(centres))[:, None, None]
+    return _Mesh((centres[:, None] + radius * vertices).reshape(-1, 3), every.reshape(-1, 3), _hexadecimal(colour))
+
+
+def _rods(starts: Array, ends: Array, radius: float, colour: str) -> _Mesh:
     """Return lines as six-sided rods: browsers draw lines of one px alone."""
     along = ends - starts
     along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
@@ -260,17 +312,18 @@ def _rods(starts: Array, ends: Array, radius: float, colour: str) -> "Trimesh":
     i, j = np.arange(6), (np.arange(6) + 1) % 6
     one = np.concatenate([np.stack([i, j, i + 6], axis=1), np.stack([j, j + 6, i + 6], axis=1)])
     faces = (one + 12 * np.arange(len(starts))[:, None, None]).reshape(-1, 3)
-    return _mesh(vertices.reshape(-1, 3), faces, _hexadecimal(colour))
+    return _Mesh(vertices.reshape(-1, 3), faces, _hexadecimal(colour))
 
 
-def _viewer(scene: "Scene") -> Array:
+def _viewer(meshes: list[_Mesh]) -> Array:
     """Return the pose of the viewer, who sees the whole scene, y upwards and looking along -z as in OpenGL."""
     back = _EYE / np.linalg.norm(_EYE)
     right = np.cross([0.0, -1.0, 0.0], back)
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
-    low, high = scene.bounds
+    low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
+    high = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0)
     pose[:3, 3] = (low + high) / 2 + 0.78 * np.linalg.norm(high - low) * back
     return pose
 

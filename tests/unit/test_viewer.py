@@ -1,7 +1,12 @@
 """The 3D view: what it is made of, and a picture of it where this machine can draw without a display."""
 
+import base64
+import io
+import re
+
 import numpy as np
 import pytest
+import trimesh
 
 from simtest.errors import InputError
 from simtest.report.scene3d import curvature_limit, framed
@@ -62,6 +67,37 @@ def test_the_page_of_a_scene_is_one_small_file(content, tmp_path):
         write_scene_page(content, tmp_path / "scene.png", "sphere")
     with pytest.raises(OSError, match="No such file"):
         write_scene_page(content, tmp_path / "nowhere" / "scene.html", "sphere")
+
+
+@pytest.mark.render
+def test_the_frame_of_a_page_is_glb_that_another_reader_understands(content):
+    frame, parts = framed(content, "lit")
+    encoded = max(re.findall(r"[A-Za-z0-9+/]{64,}={0,2}", frame), key=len)
+    glb = base64.b64decode(encoded)
+    scene = trimesh.load_scene(io.BytesIO(glb), file_type="glb")
+    meshes = {name: scene.geometry[scene.graph[name][1]] for name in scene.graph.nodes_geometry}
+    assert set(meshes) == {part.node for part in parts}
+    assert len(glb) % 4 == 0
+    lit = meshes["part0"]
+    np.testing.assert_allclose(lit.triangles, content.vertices[content.faces], rtol=1e-6)
+    colours = np.rint(255 * content.lit).astype(np.uint8)
+    shown = trimesh.Trimesh(content.vertices, content.faces, vertex_colors=colours, process=False)
+    np.testing.assert_array_equal(lit.visual.face_colors, shown.visual.face_colors)
+    # A rod from each start to each end, and round balls whose triangles face outwards, as viewers draw no others.
+    for part in parts[2:-2]:
+        own = content.names == {"field of view": "camera"}.get(part.name, part.name)
+        rods = meshes[part.node].vertices.reshape(own.sum(), 2, 6, 3).mean(axis=2)
+        np.testing.assert_allclose(rods, np.stack([content.starts[own], content.ends[own]], axis=1), atol=1e-5)
+    for part, centre in zip(parts[-2:], (np.zeros(3), content.lights[0]), strict=True):
+        ball = meshes[part.node]
+        np.testing.assert_allclose(ball.bounds.mean(axis=0), centre, atol=1e-5)
+        radius = np.linalg.norm(ball.vertices - centre, axis=1)
+        np.testing.assert_allclose(radius, radius[0], rtol=1e-4)
+        assert 0.85 < ball.volume / (4 / 3 * np.pi * radius[0] ** 3) < 1
+    # The viewer looks at the middle of all.
+    pose = scene.camera_transform
+    towards = scene.bounds.mean(axis=0) - pose[:3, 3]
+    np.testing.assert_allclose(-pose[:3, 2], towards / np.linalg.norm(towards), atol=1e-5)
 
 
 @pytest.mark.render

@@ -19,23 +19,22 @@ def specular_isocurve(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.A
     none (see `on_isophote_branch`). Points p, shape (..., 2), lie on the plane z = 0; L and V have shape (3,) or (...,
     3); tau is (t / c)^(1/n) on the isophote at t of a lobe c cos(beta)^n. The unit is the fourth power of the length's.
     """
-    to_mirrored, to_camera = _directions(points, light, camera)
-    product = np.sum(to_mirrored * to_camera, axis=-1)
-    lengths = np.sum(to_mirrored**2, axis=-1) * np.sum(to_camera**2, axis=-1)
-    return np.asarray(product**2 - np.asarray(tau, dtype=float) ** 2 * lengths)
+    product, mirrored, direct = _products(points, light, camera)
+    return np.asarray(product**2 - np.asarray(tau, dtype=float) ** 2 * mirrored * direct)
 
 
 def on_isophote_branch(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike) -> Mask:
     """Return which points lie where cos(beta) > 0: on the branch of the quartic that is the isophote."""
-    to_mirrored, to_camera = _directions(points, light, camera)
-    return np.asarray(np.sum(to_mirrored * to_camera, axis=-1) < 0)
+    return np.asarray(_products(points, light, camera)[0] < 0)
 
 
-def _directions(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike) -> tuple[Array, Array]:
-    """Return R - P and V - P."""
+def _products(points: npt.ArrayLike, light: npt.ArrayLike, camera: npt.ArrayLike) -> tuple[Array, Array, Array]:
+    """Return (R - P) . (V - P), abs(R - P)^2 and abs(V - P)^2."""
     p, L, V = (np.asarray(value, dtype=float) for value in (points, light, camera))
-    P = np.concatenate([p, np.zeros((*p.shape[:-1], 1))], axis=-1)
-    return L * [1.0, 1.0, -1.0] - P, V - P
+    # In the plane's coordinates; along its normal R - P is -L_Z, and V - P is V_Z.
+    rx, ry, rz = L[..., 0] - p[..., 0], L[..., 1] - p[..., 1], -L[..., 2]
+    vx, vy, vz = V[..., 0] - p[..., 0], V[..., 1] - p[..., 1], V[..., 2]
+    return rx * vx + ry * vy + rz * vz, rx**2 + ry**2 + rz**2, vx**2 + vy**2 + vz**2
 
 
 def isophote_radius(isovalue: float, exponent: float, height: float) -> float:
