@@ -19,9 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
+import scipy
 
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.spec.reflectance import Vessels
@@ -329,7 +327,7 @@ def spread_points(patch: PatternPatch, distance_mm: float, rng: np.random.Genera
 
 def thinned(points: Array, distance: float) -> Mask:
     """Return which points, shape (N, 3), to keep so that no two are nearer than a distance; earlier points win."""
-    pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(points).query_pairs(distance, output_type="ndarray")
     first, second = pairs.min(axis=1), pairs.max(axis=1)
     kept, undecided = np.zeros(len(points), dtype=bool), np.ones(len(points), dtype=bool)
     while len(first):
@@ -436,7 +434,7 @@ def _grow(patch: PatternPatch, spec: Vessels, rng: np.random.Generator) -> tuple
     return position, normal, parent, spec.smallest_mm / 2 * np.cbrt(carried)
 
 
-def _neighbours(points: Array, normals: Array, tortuosity: float, rng: np.random.Generator) -> sparse.csr_matrix:
+def _neighbours(points: Array, normals: Array, tortuosity: float, rng: np.random.Generator) -> scipy.sparse.csr_matrix:
     """Return the costs of edges between neighbouring nodes, a symmetric sparse matrix."""
     distance, other = _nearest(points)
     first, second = np.repeat(np.arange(len(points)), distance.shape[1] - 1), other[:, 1:].ravel()
@@ -448,7 +446,7 @@ def _neighbours(points: Array, normals: Array, tortuosity: float, rng: np.random
     low, high, length = low[facing], high[facing], length[facing]
     cost = length * np.exp(tortuosity * rng.standard_normal(len(length)))
     shape = (len(points), len(points))
-    whole = sparse.coo_matrix(
+    whole = scipy.sparse.coo_matrix(
         (np.concatenate([cost, cost]), (np.concatenate([low, high]), np.concatenate([high, low]))), shape=shape
     )
     return whole.tocsr()
@@ -457,7 +455,7 @@ def _neighbours(points: Array, normals: Array, tortuosity: float, rng: np.random
 def _nearest(points: Array) -> tuple[Array, IntArray]:
     """Return distances and numbers of each point's nearest ones, itself first, shape (N, K)."""
     # SciPy drops the last axis of one neighbour: a small patch may hold a single node.
-    distance, other = cKDTree(points).query(points, k=np.arange(1, min(NEIGHBOURS, len(points)) + 1))
+    distance, other = scipy.spatial.cKDTree(points).query(points, k=np.arange(1, min(NEIGHBOURS, len(points)) + 1))
     return distance, other
 
 
@@ -472,12 +470,14 @@ def _roots(points: Array, count: int, rng: np.random.Generator) -> IntArray:
     return np.unique(chosen)
 
 
-def _trees(graph: sparse.csr_matrix, roots: IntArray, ends: Mask) -> tuple[IntArray, IntArray]:
+def _trees(graph: scipy.sparse.csr_matrix, roots: IntArray, ends: Mask) -> tuple[IntArray, IntArray]:
     """Return each node's parent, -1 for roots and what is not reached, and the nodes reached, from the roots on."""
     cost = graph.copy()
     row = np.repeat(np.arange(graph.shape[0]), np.diff(graph.indptr))
     for growth in range(GROWTHS):
-        distance, parent, _ = dijkstra(cost, indices=roots, return_predecessors=True, min_only=True)
+        distance, parent, _ = scipy.sparse.csgraph.dijkstra(
+            cost, indices=roots, return_predecessors=True, min_only=True
+        )
         parent = np.where(parent >= 0, parent, -1).astype(np.int64)
         order = np.argsort(distance, kind="stable")
         order = order[np.isfinite(distance[order])]
