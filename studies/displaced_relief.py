@@ -81,7 +81,7 @@ class Patch:
         """
         position, N, t = self.base(feet)
         jets = self.field.jets(position)
-        h, along, across = share * jets.height, np.sum(t * jets.gradient, axis=1), jets.gradient[:, 1]
+        h, along, across = share * jets.value, np.sum(t * jets.gradient, axis=1), jets.gradient[:, 1]
         normal = N - (along / (1 + h / self.radius))[:, None] * t - across[:, None] * np.array([0.0, 1.0, 0.0])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         return position + h[:, None] * N, normal

@@ -64,7 +64,7 @@ class BuiltColon(BuiltMesh):
         perpendicular to T(u), in which the lumen is the disc below r(u, v).
         """
         u, v, radial = self.tube.slice_of(points)
-        free = (radial < self.tube.radius(u, v).f) & (u >= 0) & (u <= self.tube.recipe.length_mm)
+        free = (radial < self.tube.radius(u, v).value) & (u >= 0) & (u <= self.tube.recipe.length_mm)
         return np.where(free, 1.0, -1.0) * self.probe.distance(points)
 
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
@@ -203,5 +203,5 @@ class Colon(MeshedSurface):
         """Draw sites around the middle part of the centreline, shape (N, 3), mm."""
         recipe, tube, count = self._build.tube.recipe, self._build.tube, 32
         u, v = recipe.length_mm * rng.uniform(0.2, 0.8, count), rng.uniform(0, 2 * math.pi, count)
-        radial = 0.6 * np.sqrt(rng.random(count)) * tube.radius(u, v).f
+        radial = 0.6 * np.sqrt(rng.random(count)) * tube.radius(u, v).value
         return tube.centreline(u) + radial[:, None] * tube.frame(u, v)[1]

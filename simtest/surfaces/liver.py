@@ -23,6 +23,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, IntArray, Mask, kept
 from simtest.runtime.seeds import Stage, generator
+from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows
 from simtest.surfaces.poses import organ_pose
 from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
@@ -91,33 +92,22 @@ _EVENING_STEPS = 8
 _SPLITS = 3
 
 
-@dataclass(frozen=True)
-class _Value:
-    """A function with gradient and Hessian, of shapes (N,), (N, 3), and (N, 3, 3) or, if not wanted, (0, 3, 3)."""
-
-    f: Array
-    gradient: Array
-    hessian: Array
-
-
-def _soft_max(parts: list[_Value], width: float) -> _Value:
+def _soft_max(parts: list[Jet], width: float) -> Jet:
     """Return width log sum exp(part / width) with its derivatives; a negative width makes it a smooth minimum."""
     # Relative to the largest exponent, so that none overflows.
-    values = np.stack([part.f for part in parts]) / width
+    values = np.stack([part.value for part in parts]) / width
     top = values.max(axis=0)
     weights = np.exp(values - top)
     total = weights.sum(axis=0)
     weights /= total
+    value = width * (top + np.log(total))
     gradient = sum((w[:, None] * part.gradient for w, part in zip(weights, parts, strict=True)), np.zeros(()))
-    if not len(parts[0].hessian):
-        return _Value(width * (top + np.log(total)), gradient, _UNWANTED)
+    if len(parts[0].parts) < 3:
+        return Jet(value, gradient)
     hessian = -_outer(gradient) / width
     for w, part in zip(weights, parts, strict=True):
         hessian = hessian + w[:, None, None] * (part.hessian + _outer(part.gradient) / width)
-    return _Value(width * (top + np.log(total)), gradient, hessian)
-
-
-_UNWANTED = np.empty((0, 3, 3))
+    return Jet(value, gradient, hessian)
 
 
 def _outer(vectors: Array) -> Array:
@@ -184,30 +174,31 @@ class Body:
             steepest = np.maximum(steepest, own)
         return np.asarray(steepest + self.recipe.relief_mm * np.linalg.norm(self._waves, axis=1).sum())
 
-    def evaluate(self, points: Array, second: bool = True) -> _Value:
+    def evaluate(self, points: Array, second: bool = True) -> Jet:
         """Return F, mm, with gradient and, if `second`, Hessian, 1/mm, at points of shape (N, 3)."""
-        count = len(points) if second else 0
 
-        def same(matrix: Array) -> Array:
-            return np.broadcast_to(matrix, (count, 3, 3))
+        def quadratic(value: Array, gradient: Array, hessian: Array) -> Jet:
+            same = [np.broadcast_to(hessian, (len(points), 3, 3))] if second else []
+            return Jet(value, gradient, *same)
 
-        def ellipsoid(part: tuple[Array, Array, float], sign: float = 1.0) -> _Value:
+        def ellipsoid(part: tuple[Array, Array, float], sign: float = 1.0) -> Jet:
             centre, A, scale = part
             d, scale = points - centre, sign * scale
             Ad = d @ A
-            return _Value(0.5 * scale * ((Ad * d).sum(axis=1) - 1), scale * Ad, same(scale * A))
+            return quadratic(0.5 * scale * ((Ad * d).sum(axis=1) - 1), scale * Ad, scale * A)
 
         # B, V, D and G of the module's head, then the waves
-        face, gradient = self._face(points)
         lobes = _soft_max([ellipsoid(lobe) for lobe in self._lobes], -self.recipe.blend_mm)
-        visceral = _Value(face, gradient, same(-np.eye(3) / self.recipe.visceral_radius_mm))
+        visceral = quadratic(*self._face(points), -np.eye(3) / self.recipe.visceral_radius_mm)
         body = _soft_max([lobes, visceral], self.recipe.edge_mm)
         if self._fossa and self.recipe.fossa:
             body = _soft_max([body, ellipsoid(self._fossa, -1.0)], self.recipe.fossa.edge_mm)
         angle = points @ self._waves.T + self._phases
         sine, cosine = self.recipe.relief_mm * np.sin(angle), self.recipe.relief_mm * np.cos(angle)
-        hessian = body.hessian - (cosine[:count, :, None] * self._waves).transpose(0, 2, 1) @ self._waves
-        return _Value(body.f + cosine.sum(axis=1), body.gradient - sine @ self._waves, hessian)
+        waves = [cosine.sum(axis=1), -sine @ self._waves]
+        if second:
+            waves.append(-(cosine[:, :, None] * self._waves).transpose(0, 2, 1) @ self._waves)
+        return body + Jet(*waves)
 
     def _face(self, points: Array) -> tuple[Array, Array]:
         """Return V, mm, and its gradient at points of shape (N, 3)."""
@@ -225,7 +216,7 @@ class Body:
             # On a grazing ray F is nearly flat: bound the step to the mesh's neighbourhood.
             slope = np.where(np.abs(slope) < 1e-6, np.copysign(1e-6, slope), slope)
             # Newton's step along the ray; a ray that leaves the neighbourhood of its hit is given up.
-            step = np.clip(-at.f / slope, -0.5 * MAX_SHIFT_MM, 0.5 * MAX_SHIFT_MM)
+            step = np.clip(-at.value / slope, -0.5 * MAX_SHIFT_MM, 0.5 * MAX_SHIFT_MM)
             t[active] += step
             done = np.abs(step) < NEWTON_TOLERANCE_MM
             found[active[done]] = True
@@ -347,7 +338,7 @@ def _project(body: Body, points: Array, steps: int) -> Array:
     def moved(points: Array) -> Array:
         for _ in range(steps):
             at = body.evaluate(points, second=False)
-            points = points - (at.f / np.einsum("ni,ni->n", at.gradient, at.gradient))[:, None] * at.gradient
+            points = points - (at.value / np.einsum("ni,ni->n", at.gradient, at.gradient))[:, None] * at.gradient
         return points
 
     return in_blocks(moved, points)

@@ -17,6 +17,7 @@ import numpy as np
 from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.surfaces import Relief, ReliefBand
+from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import SurfacePoints, principal
 
 NODES = 96
@@ -51,15 +52,6 @@ MENISCUS = 0.1
 
 
 @dataclass(frozen=True)
-class HeightJets:
-    """Height of the relief with its first two derivatives in space."""
-
-    height: Array  # (N,): mm, towards the camera
-    gradient: Array  # (N, 3): model frame
-    hessian: Array  # (N, 3, 3): 1/mm
-
-
-@dataclass(frozen=True)
 class BandField:
     """One band: a periodic cubic B-spline."""
 
@@ -72,8 +64,8 @@ class BandField:
         """Whether diffuse light sees anything of the band."""
         return bool(self.diffused.any())
 
-    def jets(self, points: Array, diffused: bool = False) -> HeightJets:
-        """Compute the field's jets at points, shape (N, 3), model frame, mm."""
+    def jets(self, points: Array, diffused: bool = False) -> Jet:
+        """Compute the height, mm, and its derivatives at points, shape (N, 3), model frame, mm."""
         A = self.lattice_from_model
         cells = points @ A.T
         first = np.floor(cells)
@@ -93,7 +85,7 @@ class BandField:
         xx, yy, zz = derivative(2, 0, 0), derivative(0, 2, 0), derivative(0, 0, 2)
         hessian = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
         # Chain rule to the model frame.
-        return HeightJets(derivative(0, 0, 0), gradient @ A, A.T @ hessian @ A)
+        return Jet(derivative(0, 0, 0), gradient @ A, A.T @ hessian @ A)
 
 
 def _spline_weights(t: Array) -> Array:
@@ -119,28 +111,23 @@ class ReliefField:
         """Width of a pool's rim in height, mm."""
         return MENISCUS * self.deviation
 
-    def tissue_jets(self, points: Array, diffused: bool = False) -> HeightJets:
+    def tissue_jets(self, points: Array, diffused: bool = False) -> Jet:
         """Compute the jets of the tissue below the film at points, shape (N, 3), model frame, mm."""
-        parts = [_add([band.jets(some, diffused) for band in self.bands]) for some in _split(points)]
-        return HeightJets(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in ("height", "gradient", "hessian"))
-        )
+        parts = [reduce(Jet.__add__, [band.jets(some, diffused) for band in self.bands]) for some in _split(points)]
+        return Jet(*(np.concatenate(blocks) for blocks in zip(*(jet.parts for jet in parts), strict=True)))
 
-    def jets(self, points: Array) -> HeightJets:
+    def jets(self, points: Array) -> Jet:
         """Compute the jets of the surface that the film's reflection sees, at points, shape (N, 3), model frame, mm."""
         return self.fill(self.tissue_jets(points))
 
-    def fill(self, jets: HeightJets) -> HeightJets:
+    def fill(self, jets: Jet) -> Jet:
         """Fill valleys: phi(h) = level + w log(1 + exp((h - level)/w)), with w the meniscus; and its derivatives."""
         if self.level is None:
             return jets
-        x = (jets.height - self.level) / self.meniscus
+        x = (jets.value - self.level) / self.meniscus
         share = 1 / (1 + np.exp(-np.clip(x, -60.0, 60.0)))
-        height = self.level + self.meniscus * np.logaddexp(0.0, x)
         bend = share * (1 - share) / self.meniscus
-        outer = jets.gradient[:, :, None] * jets.gradient[:, None, :]
-        hessian = share[:, None, None] * jets.hessian + bend[:, None, None] * outer
-        return HeightJets(height, share[:, None] * jets.gradient, hessian)
+        return jets.chain(self.level + self.meniscus * np.logaddexp(0.0, x), share, bend)
 
     def apply(self, points: SurfacePoints) -> SurfacePoints:
         """Turn the normals and curvatures of base points, model frame, to those of the fine surface.
@@ -168,7 +155,7 @@ class ReliefField:
             whole[found] = values
             changed[name] = whole
         pool = np.zeros(len(points.valid), dtype=bool)
-        pool[found] = False if self.level is None else tissue.height < self.level
+        pool[found] = False if self.level is None else tissue.value < self.level
         return replace(points, **changed, pool=pool)
 
 
@@ -178,7 +165,7 @@ def fine_normals(normal: Array, gradient: Array) -> Array:
     return np.asarray(m / np.linalg.norm(m, axis=1, keepdims=True))
 
 
-def normal_derivative(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array]:
+def normal_derivative(N: Array, S: Array, jets: Jet) -> tuple[Array, Array]:
     """Return fine normals and their derivative along the base's tangents (see `ReliefField.apply`)."""
     G, H = jets.gradient, jets.hessian
     along = np.sum(N * G, axis=1)
@@ -191,7 +178,7 @@ def normal_derivative(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Arra
     return normal, across @ derivative / length[:, None, None]
 
 
-def fine_curvatures(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array, tuple[Array, Array]]:
+def fine_curvatures(N: Array, S: Array, jets: Jet) -> tuple[Array, Array, tuple[Array, Array]]:
     """Return fine normals, principal curvatures k_min and k_max, shape (N, 2), and unit principal directions."""
     normal, derivative = normal_derivative(N, S, jets)
     # A tangent f of the fine surface stands over the base's tangent f - N (N.f).
@@ -210,10 +197,6 @@ def _outer(weight: Array, vector: Array) -> Array:
 def _split(points: Array) -> Iterator[Array]:
     for start in range(0, max(len(points), 1), POINTS):
         yield points[start : start + POINTS]
-
-
-def _add(parts: list[HeightJets]) -> HeightJets:
-    return reduce(lambda a, b: HeightJets(a.height + b.height, a.gradient + b.gradient, a.hessian + b.hessian), parts)
 
 
 # Making the field ------------------------------------------------------------------------------------------------

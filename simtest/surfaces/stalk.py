@@ -17,85 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.runtime.arrays import Array, IntArray, Mask
-
-
-@dataclass(frozen=True)
-class Jet:
-    """A function of (u, v) with its first and second partial derivatives, each of shape (N,) or (N, 3)."""
-
-    f: Array
-    u: Array
-    v: Array
-    uu: Array
-    uv: Array
-    vv: Array
-
-    def __add__(self, other: "Jet") -> "Jet":
-        """Return the sum of two functions."""
-        return Jet(*(a + b for a, b in zip(self.parts(), other.parts(), strict=True)))
-
-    def parts(self) -> tuple[Array, ...]:
-        """Return value and derivatives: f, u, v, uu, uv, vv."""
-        return self.f, self.u, self.v, self.uu, self.uv, self.vv
-
-    def rows(self, chosen: IntArray) -> "Jet":
-        """Return the function at some of the points."""
-        return Jet(*(part[chosen] for part in self.parts()))
-
-    def with_rows(self, chosen: IntArray, other: "Jet") -> "Jet":
-        """Return the function with the values of another at some of the points."""
-        made = []
-        for part, new in zip(self.parts(), other.parts(), strict=True):
-            copy = part.copy()
-            copy[chosen] = new
-            made.append(copy)
-        return Jet(*made)
-
-    def along(self, axis: Array) -> "Jet":
-        """Return the component of a vector along a fixed one, shape (3,)."""
-        return Jet(*(part @ axis for part in self.parts()))
-
-    def chain(self, value: Array, first: Array, second: Array) -> "Jet":
-        """Return g(f) of a scalar f from g, g' and g'' at f, each of shape (N,)."""
-        return Jet(
-            f=value,
-            u=first * self.u,
-            v=first * self.v,
-            uu=second * self.u * self.u + first * self.uu,
-            uv=second * self.u * self.v + first * self.uv,
-            vv=second * self.v * self.v + first * self.vv,
-        )
-
-
-def times(a: Jet, b: Jet) -> Jet:
-    """Return the product of a scalar and a scalar or vector."""
-    A = a if b.f.ndim == 1 else Jet(*(part[:, None] for part in a.parts()))
-    return Jet(
-        f=A.f * b.f,
-        u=A.u * b.f + A.f * b.u,
-        v=A.v * b.f + A.f * b.v,
-        uu=A.uu * b.f + 2 * A.u * b.u + A.f * b.uu,
-        uv=A.uv * b.f + A.u * b.v + A.v * b.u + A.f * b.uv,
-        vv=A.vv * b.f + 2 * A.v * b.v + A.f * b.vv,
-    )
-
-
-def squared(x: Jet) -> Jet:
-    """Return the squared length of a vector."""
-
-    def dot(a: Array, b: Array) -> Array:
-        return np.asarray(np.einsum("ni,ni->n", a, b))
-
-    return Jet(
-        f=dot(x.f, x.f),
-        u=2 * dot(x.f, x.u),
-        v=2 * dot(x.f, x.v),
-        uu=2 * (dot(x.u, x.u) + dot(x.f, x.uu)),
-        uv=2 * (dot(x.u, x.v) + dot(x.f, x.uv)),
-        vv=2 * (dot(x.v, x.v) + dot(x.f, x.vv)),
-    )
-
+from simtest.runtime.arrays import Array, Mask
+from simtest.surfaces.jets import Jet
 
 NECK_AT = 0.3
 NECK_REACH = 0.3
@@ -142,7 +65,7 @@ class Stalk:
 
     def apply(self, p: Jet) -> Jet:
         """Map a surface, shape (N, 3), mm, with its derivatives."""
-        near = np.flatnonzero(self.moves(p.f))
+        near = np.flatnonzero(self.moves(p.value))
         return p.with_rows(near, self._applied(p.rows(near))) if near.size else p
 
     def moves(self, points: Array) -> Mask:
@@ -154,15 +77,14 @@ class Stalk:
 
     def _applied(self, p: Jet) -> Jet:
         # coordinates about the foot
-        from_foot = p + _constant(-self.foot, len(p.f))
+        from_foot = p.affine(1.0, -self.foot)
         z = from_foot.along(self.axis)
-        x = from_foot + times(z, _constant(-self.axis, len(p.f)))
-        q = squared(x)
+        x = from_foot + z.outer(-self.axis)
+        q = x.squared()
         # lift, then stricture
-        raised = z + times(self._bump(q), self._fading(z))
-        share = times(self._neck(raised), self._reach(q))
-        narrowed = x + times(share, x)
-        return narrowed + times(raised, _constant(self.axis, len(p.f))) + _constant(self.foot, len(p.f))
+        raised = z + self._bump(q) * self._fading(z)
+        narrowed = x + self._neck(raised) * self._reach(q) * x
+        return narrowed + raised.outer(self.axis).affine(1.0, self.foot)
 
     def undo(self, points: Array) -> Array:
         """Return where points, shape (N, 3), mm, come from, to rounding."""
@@ -177,10 +99,10 @@ class Stalk:
 
         # x' is shorter than x, by a share of at most A.
         r = _bisect(narrowed, length, length, length / (1 - self.depth) + 1e-12)
-        bump = self._bump(_scalar(r * r)).f
+        bump = self._bump(Jet(r * r)).value
 
         def raised(low: Array) -> Array:
-            return low + bump * self._fading(_scalar(low)).f
+            return low + bump * self._fading(Jet(low)).value
 
         source = _bisect(raised, z, z - self.height * bump, z)
         moved = (length > 0) & (r > 0)
@@ -195,33 +117,26 @@ class Stalk:
 
     def _bump(self, q: Jet) -> Jet:
         """Return E."""
-        scale = 1 / (2 * self.width**2)
-        tau = q.f * scale
-        e, slope = np.exp(-(tau + tau**2) / 2), -(0.5 + tau) * scale
-        return q.chain(e, e * slope, e * (slope**2 - scale**2))
+        tau = q.affine(1 / (2 * self.width**2))
+        return (tau + tau * tau).affine(-0.5).exp()
 
     def _fading(self, z: Jet) -> Jet:
         """Return h psi(z); the wall outside, z < 0, is lifted as well, which makes no two walls intersect."""
-        f, first, second = _quartic(z.f, LIFT_REACH * self.height)
-        h = self.height
-        return z.chain(h * f, h * first, h * second)
+        return _quartic(z.affine(1 / (LIFT_REACH * self.height))).affine(self.height)
 
     def _neck(self, z: Jet) -> Jet:
         """Return -A g(z)."""
-        f, first, second = _quartic(z.f - NECK_AT * self.height, NECK_REACH * self.height)
-        return z.chain(-self.depth * f, -self.depth * first, -self.depth * second)
+        return _quartic(z.affine(1 / (NECK_REACH * self.height), -NECK_AT / NECK_REACH)).affine(-self.depth)
 
     def _reach(self, q: Jet) -> Jet:
         """Return w."""
-        scale = (self.width * ACROSS) ** 4
-        w, slope = np.exp(-(q.f**2) / scale), -2 * q.f / scale
-        return q.chain(w, w * slope, w * (slope**2 - 2 / scale))
+        return (q * q).affine(-1 / (self.width * ACROSS) ** 4).exp()
 
 
-def _quartic(x: Array, reach: float) -> tuple[Array, Array, Array]:
-    """Return exp(-(x / reach)^4) and its first and second derivatives."""
-    f, slope = np.exp(-((x / reach) ** 4)), -4 * x**3 / reach**4
-    return f, f * slope, f * (slope**2 - 12 * x**2 / reach**4)
+def _quartic(x: Jet) -> Jet:
+    """Return exp(-x^4)."""
+    square = x * x
+    return (square * square).affine(-1.0).exp()
 
 
 def _widths(depth: float) -> tuple[float, float]:
@@ -244,13 +159,3 @@ def _bisect(function: Callable[[Array], Array], target: Array, low: Array, high:
         below = function(middle) < target
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     return (low + high) / 2
-
-
-def _constant(vector: Array, count: int) -> Jet:
-    zero = np.zeros((count, 3))
-    return Jet(np.broadcast_to(vector, (count, 3)), zero, zero, zero, zero, zero)
-
-
-def _scalar(values: Array) -> Jet:
-    zero = np.zeros_like(values)
-    return Jet(values, zero, zero, zero, zero, zero)

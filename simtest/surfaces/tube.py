@@ -22,8 +22,9 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import Stage, generator
+from simtest.surfaces.jets import Jet
 from simtest.surfaces.recipe import ColonRecipe
-from simtest.surfaces.stalk import Jet, Stalk
+from simtest.surfaces.stalk import Stalk
 
 NEWTON_STEPS = 12
 NEWTON_TOLERANCE_MM = 1e-10
@@ -141,7 +142,7 @@ class Tube:
     def _check(self) -> None:
         """Raise `InputError` if the folds close the lumen or the tube bends into itself."""
         u, v = np.meshgrid(np.linspace(0, self.recipe.length_mm, 200), np.linspace(0, 2 * math.pi, 180), indexing="ij")
-        r = self.radius(u.ravel(), v.ravel()).f
+        r = self.radius(u.ravel(), v.ravel()).value
         if r.min() < 0.1 * self.recipe.radius_mm:
             raise InputError(
                 f"colon recipe: folds leave a radius of {r.min():.3g} mm; at least {0.1 * self.recipe.radius_mm:.3g} "
@@ -269,7 +270,8 @@ class Tube:
             fuu -= q * q * cosine
             fuv -= q * m * cosine
             fvv -= m * m * cosine
-        return Jet(f, fu, fv, fuu, fuv, fvv)
+        parts = [f, np.stack([fu, fv], axis=1), np.stack([fuu, fuv, fuv, fvv], axis=1).reshape(-1, 2, 2)]
+        return Jet(*parts[: 3 if second else 2])
 
     def numbers(self) -> TubeNumbers:
         """Return the tube as numbers, without its pedunculated polyps."""
@@ -299,20 +301,20 @@ class Tube:
 
     def tangents(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return P, mm, P_u and P_v, three arrays of shape (N, 3)."""
-        r, bend = self.radius(u, v, second=False), self.heading(u)[1]
+        radius, bend = self.radius(u, v, second=False), self.heading(u)[1]
+        r, (ru, rv) = radius.value[:, None], radius.gradient.T[:, :, None]
         T, rho, tau = self.frame(u, v)
-        along = (1 - bend * r.f * np.cos(v))[:, None]
-        position = self.centreline(u) + r.f[:, None] * rho
-        first, second = along * T + r.u[:, None] * rho, r.v[:, None] * rho + r.f[:, None] * tau
+        position = self.centreline(u) + r * rho
+        first, second = (1 - bend[:, None] * r * np.cos(v)[:, None]) * T + ru * rho, rv * rho + r * tau
         if not self._stalks:
             return position, first, second
-        none = np.zeros_like(position)
-        moved = self._with_stalks(Jet(position, first, second, none, none, none))
-        return moved.f, moved.u, moved.v
+        moved = self._with_stalks(Jet(position, np.stack([first, second], axis=2)))
+        return moved.value, moved.gradient[..., 0], moved.gradient[..., 1]
 
     def jet(self, u: Array, v: Array) -> Jet:
         """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
-        r = self.radius(u, v)
+        radius = self.radius(u, v)
+        r, (ru, rv), (ruu, ruv, _, rvv) = radius.value, radius.gradient.T, radius.hessian.reshape(-1, 4).T
         _, bend, twist = self.heading(u)
         cv, sv = np.cos(v), np.sin(v)
         T, rho, tau = self.frame(u, v)
@@ -320,15 +322,13 @@ class Tube:
         def combine(t: Array, radial: Array, around: Array) -> Array:
             return t[:, None] * T + radial[:, None] * rho + around[:, None] * tau
 
-        along, zero = 1 - bend * r.f * cv, np.zeros_like(u)
-        wall = Jet(
-            f=self.centreline(u) + r.f[:, None] * rho,
-            u=combine(along, r.u, zero),
-            v=combine(zero, r.v, r.f),
-            uu=combine(-twist * r.f * cv - 2 * bend * r.u * cv, along * bend * cv + r.uu, -along * bend * sv),
-            uv=combine(bend * (r.f * sv - r.v * cv), r.uv, r.u),
-            vv=combine(zero, r.vv - r.f, 2 * r.v),
-        )
+        along, zero = 1 - bend * r * cv, np.zeros_like(u)
+        first = [combine(along, ru, zero), combine(zero, rv, r)]
+        uu = combine(-twist * r * cv - 2 * bend * ru * cv, along * bend * cv + ruu, -along * bend * sv)
+        uv = combine(bend * (r * sv - rv * cv), ruv, ru)
+        second = [uu, uv, uv, combine(zero, rvv - r, 2 * rv)]
+        position = self.centreline(u) + r[:, None] * rho
+        wall = Jet(position, np.stack(first, axis=2), np.stack(second, axis=2).reshape(-1, 3, 2, 2))
         return self._with_stalks(wall)
 
     @property
@@ -352,15 +352,17 @@ class Tube:
     def normal_and_shape_operator(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return the unit normal into the lumen, shape (N, 3), and S, 1/mm, shape (N, 3, 3), at u, v of shape (N,)."""
         p = self.jet(u, v)
-        normal = np.cross(p.u, p.v)
+        pu, pv = np.ascontiguousarray(np.moveaxis(p.gradient, 2, 0))
+        normal = np.cross(pu, pv)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         # First fundamental form G and second fundamental form II = -N . P_ij
-        E, F, G = (np.einsum("ni,ni->n", a, b) for a, b in ((p.u, p.u), (p.u, p.v), (p.v, p.v)))
-        L, M, N = (-np.einsum("ni,ni->n", normal, d) for d in (p.uu, p.uv, p.vv))
+        E, F, G = (np.einsum("ni,ni->n", a, b) for a, b in ((pu, pu), (pu, pv), (pv, pv)))
+        second_derivatives = np.ascontiguousarray(np.moveaxis(p.hessian.reshape(-1, 3, 4), 2, 0))
+        L, M, _, N = (-np.einsum("ni,ni->n", normal, d) for d in second_derivatives)
         # dN(P_i) . P_j = II_ij, so S = sum of II_ij d_i d_j^T with the dual tangents d = J G^-1, J = (P_u, P_v).
         det = E * G - F * F
-        first = (G / det)[:, None] * p.u - (F / det)[:, None] * p.v
-        second = (E / det)[:, None] * p.v - (F / det)[:, None] * p.u
+        first = (G / det)[:, None] * pu - (F / det)[:, None] * pv
+        second = (E / det)[:, None] * pv - (F / det)[:, None] * pu
         along, across = L[:, None] * first + M[:, None] * second, M[:, None] * first + N[:, None] * second
         return normal, first[:, :, None] * along[:, None, :] + second[:, :, None] * across[:, None, :]
 

@@ -7,9 +7,10 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.surfaces.colon import Colon, build
+from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, Polyp, load_recipe
-from simtest.surfaces.stalk import Jet, Stalk
+from simtest.surfaces.stalk import Stalk
 from simtest.surfaces.triangles import off_between
 from tests.marked import marked
 
@@ -59,7 +60,7 @@ def chosen_hits(recipe, count=4000, seed=0):
 def parameters(tube, points):
     """(u, v) of surface points, found apart from the Newton solution under test."""
     u, v, radial = tube.slice_of(points)
-    return u, v, radial - tube.radius(u, v).f
+    return u, v, radial - tube.radius(u, v).value
 
 
 def central(f, h):
@@ -75,14 +76,14 @@ def test_partial_derivatives_match_finite_differences(recipe):
     u, v = rng.uniform(0, recipe.length_mm, 3000), rng.uniform(-4, 8, 3000)
     jet = tube.jet(u, v)
     h_v = STEP / 20
-    du, duu = central(lambda h: tube.jet(u + h, v).f, STEP)
-    dv, dvv = central(lambda h: tube.jet(u, v + h).f, h_v)
-    duv, _ = central(lambda h: tube.jet(u, v + h).u, h_v)
-    np.testing.assert_allclose(jet.u, du, atol=2e-9)
-    np.testing.assert_allclose(jet.v, dv, atol=1e-7)
-    np.testing.assert_allclose(jet.uu, duu, atol=2e-6)
-    np.testing.assert_allclose(jet.uv, duv, atol=1e-7)
-    np.testing.assert_allclose(jet.vv, dvv, atol=3e-3)  # rounding: 1e-14 * 100 mm / h_v^2
+    du, duu = central(lambda h: tube.jet(u + h, v).value, STEP)
+    dv, dvv = central(lambda h: tube.jet(u, v + h).value, h_v)
+    duv, _ = central(lambda h: tube.jet(u, v + h).gradient[..., 0], h_v)
+    np.testing.assert_allclose(jet.gradient[..., 0], du, atol=2e-9)
+    np.testing.assert_allclose(jet.gradient[..., 1], dv, atol=1e-7)
+    np.testing.assert_allclose(jet.hessian[..., 0, 0], duu, atol=2e-6)
+    np.testing.assert_allclose(jet.hessian[..., 0, 1], duv, atol=1e-7)
+    np.testing.assert_allclose(jet.hessian[..., 1, 1], dvv, atol=3e-3)  # rounding: 1e-14 * 100 mm / h_v^2
 
 
 @pytest.mark.parametrize("recipe", marked(MORE, ci=["pedunculated"]), indirect=True)
@@ -96,8 +97,8 @@ def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
     assert np.abs(off).max() < 1e-9
 
     def normal(u, v):
-        pu, _ = central(lambda h: tube.jet(u + h, v).f, STEP)
-        pv, _ = central(lambda h: tube.jet(u, v + h).f, STEP / 20)
+        pu, _ = central(lambda h: tube.jet(u + h, v).value, STEP)
+        pv, _ = central(lambda h: tube.jet(u, v + h).value, STEP / 20)
         n = np.cross(pu, pv)
         return n / np.linalg.norm(n, axis=1, keepdims=True)
 
@@ -106,7 +107,7 @@ def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
     nu, _ = central(lambda h: normal(u + h, v), 0.006)
     nv, _ = central(lambda h: normal(u, v + h), 0.0003)
     jet = tube.jet(u, v)
-    J, dN = np.stack([jet.u, jet.v], axis=2), np.stack([nu, nv], axis=2)
+    J, dN = jet.gradient, np.stack([nu, nv], axis=2)
     S = dN @ np.linalg.pinv(J)
     S = (S + S.transpose(0, 2, 1)) / 2
     for k, d in ((points.k_min, points.direction_min), (points.k_max, points.direction_max)):
@@ -197,16 +198,16 @@ def test_polyps_and_relief_are_where_they_are_wanted():
     tube, plain = build(bare.model_copy(update={"polyps": POLYPS})).tube, build(bare).tube
     for polyp in POLYPS:
         u, v = np.array([polyp.along_mm]), np.radians([polyp.around_deg])
-        assert plain.radius(u, v).f - tube.radius(u, v).f == pytest.approx(polyp.height_mm, abs=1e-3)
+        assert plain.radius(u, v).value - tube.radius(u, v).value == pytest.approx(polyp.height_mm, abs=1e-3)
         half = polyp.width_mm / 2
         for du, dv in ((half, 0), (-half, 0), (0, half / 22), (0, -half / 22)):
-            rise = plain.radius(u + du, v + dv).f - tube.radius(u + du, v + dv).f
+            rise = plain.radius(u + du, v + dv).value - tube.radius(u + du, v + dv).value
             assert rise == pytest.approx(polyp.height_mm / 2, rel=0.01)
         assert np.linalg.eigvalsh(tube.normal_and_shape_operator(u, v)[1][0])[1:].min() > 0.1  # convex
     rough = build(bare.model_copy(update={"relief_mm": 0.02})).tube
     u, v = np.random.default_rng(0).uniform([0, 0], [115, 2 * np.pi], size=(5000, 2)).T
-    assert np.std(rough.radius(u, v).f) == pytest.approx(0.02 * np.sqrt(6 / 2), rel=0.1)
-    np.testing.assert_allclose(rough.radius(u, v + 2 * np.pi).f, rough.radius(u, v).f, atol=1e-12)
+    assert np.std(rough.radius(u, v).value) == pytest.approx(0.02 * np.sqrt(6 / 2), rel=0.1)
+    np.testing.assert_allclose(rough.radius(u, v + 2 * np.pi).value, rough.radius(u, v).value, atol=1e-12)
 
 
 def test_a_pedunculated_polyp_has_the_sizes_asked_for_and_its_head_overhangs_its_neck():
@@ -214,9 +215,8 @@ def test_a_pedunculated_polyp_has_the_sizes_asked_for_and_its_head_overhangs_its
     stalk = Stalk.of_size(np.zeros(3), np.array([0.0, 0, 1]), height=9.0, head=6.0, neck=2.4)
     x = np.linspace(0, 12, 20_001)
     flat = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
-    zero, along = np.zeros_like(flat), np.tile([1.0, 0, 0], (len(x), 1))
-    drawn = stalk.apply(Jet(flat, along, zero, zero, zero, zero))
-    radius, _, z = drawn.f.T
+    drawn = stalk.apply(Jet.variables(flat, 1))
+    radius, _, z = drawn.value.T
     assert z[0] == pytest.approx(9.0)
     head = np.argmax(np.where(z > 4.5, radius, 0))
     neck = np.argmin(np.where((z > 0.9) & (z < z[head]), radius, np.inf))
@@ -224,14 +224,13 @@ def test_a_pedunculated_polyp_has_the_sizes_asked_for_and_its_head_overhangs_its
     assert 2 * radius[neck] == pytest.approx(2.4, rel=1e-4)
     assert z[neck] < z[head]
     # From head to neck the radius shrinks as the height falls: under the head the wall looks down.
-    assert (drawn.u[head + 50 : neck - 50] @ [1, 0, 0] < 0).all()
+    assert (drawn.gradient[head + 50 : neck - 50, 0, 0] < 0).all()
 
 
 def test_where_a_point_of_a_polyp_came_from_is_known_and_no_two_points_meet():
     stalk = Stalk.of_size(np.array([1.0, 2, 3]), np.array([0.6, 0, 0.8]), height=8.0, head=6.0, neck=2.0)
     points = stalk.foot + np.random.default_rng(2).uniform(-15, 15, (4000, 3))
-    zero = np.zeros_like(points)
-    drawn = stalk.apply(Jet(points, zero, zero, zero, zero, zero)).f
+    drawn = stalk.apply(Jet(points)).value
     assert np.abs(drawn - points).max() > 5
     np.testing.assert_allclose(stalk.undo(drawn), points, atol=1e-12)
 

@@ -47,7 +47,7 @@ def test_gradient_and_hessian_match_finite_differences(recipe):
     body = build(recipe).body
     points = build(recipe).mesh.vertices[::37] + np.random.default_rng(0).normal(size=3)
     at = body.evaluate(points)
-    np.testing.assert_allclose(at.f, body.values(points), atol=1e-12)
+    np.testing.assert_allclose(at.value, body.values(points), atol=1e-12)
     np.testing.assert_allclose(at.gradient, gradient(body.values, points), atol=2e-7)
     np.testing.assert_allclose(at.hessian, gradient(lambda p: body.evaluate(p).gradient, points), atol=2e-7)
     np.testing.assert_allclose(at.hessian, at.hessian.transpose(0, 2, 1), atol=1e-14)
