@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import igl
 import numpy as np
@@ -39,48 +39,39 @@ LEAST_STRETCH = 0.25
 """Below this |1 + d k| there is no isolated highlight (docs/concepts/theory.md, section 6)."""
 
 
-def phong_concentration(exponent: float) -> float:
-    """Return c = -(log f)''(0) of Phong's lobe as a function of the angle between normal and view: 4 n."""
-    return 4.0 * exponent
+def concentration(exponent: float | None = None, alpha: float | None = None) -> float:
+    """Return c = -(log f)''(0) of a lobe over the angle between normal and view, with the light at the camera.
 
-
-def ggx_concentration(alpha: float) -> float:
-    """Return c = -(log f)''(0) of the GGX lobe under a light at the camera.
-
-    The half vector is the view direction, so that f ~ (alpha^2 + (1 - alpha^2) sin^2)^-2, c = 4 (1/alpha^2 - 1);
-    masking and Fresnel reflection add a term of order 1.
+    Phong's lobe of an exponent n, by default `DEFAULT_EXPONENT`, has 4 n. Of a GGX lobe of roughness alpha the half
+    vector is the view direction, so that f ~ (alpha^2 + (1 - alpha^2) sin^2)^-2 and c = 4 (1/alpha^2 - 1); masking and
+    Fresnel reflection add a term of order 1. Raises `InputError` if a value is out of range.
     """
-    return 4.0 * (1.0 / alpha**2 - 1.0)
-
-
-@overload
-def half_width(distance_mm: float, concentration: float, curvature: float) -> float: ...
-@overload
-def half_width(distance_mm: float, concentration: float, curvature: Array) -> Array: ...
-def half_width(distance_mm: float, concentration: float, curvature: float | Array) -> float | Array:
-    """Return the half-width at `ISOVALUE`, mm, of a highlight of a lobe of c: d sqrt(-2 ln t / c) / |1 + d k|."""
-    angle = math.sqrt(-2.0 * math.log(ISOVALUE) / concentration)
-    return distance_mm * angle / np.maximum(np.abs(1.0 + distance_mm * curvature), LEAST_STRETCH)
-
-
-def needed_edge(distance_mm: float, concentration: float, k_min: Array, k_max: Array) -> Array:
-    """Return the edge length that a surface needs at each of its points, mm, shape (N,); see `half_width`."""
-    narrow = np.minimum(half_width(distance_mm, concentration, k_min), half_width(distance_mm, concentration, k_max))
-    return np.asarray(narrow / EDGES_PER_HALF_WIDTH)
-
-
-def concentration(exponent: float | None, alpha: float | None) -> float:
-    """Return c of a lobe by exponent or roughness, else of `DEFAULT_EXPONENT`; `InputError` if out of range."""
     if exponent is not None and alpha is not None:
         raise InputError("--exponent and --roughness: only one of them may be given")
     if alpha is not None:
         if not 0 < alpha < 1:
             raise InputError(f"--roughness {alpha:g}: must be between 0 and 1")
-        return ggx_concentration(alpha)
+        return 4.0 * (1.0 / alpha**2 - 1.0)
     exponent = DEFAULT_EXPONENT if exponent is None else exponent
     if not 0 < exponent <= 1e5:
         raise InputError(f"--exponent {exponent:g}: must be greater than 0 and at most 100000")
-    return phong_concentration(exponent)
+    return 4.0 * exponent
+
+
+def half_width(distance_mm: float, concentration: float, curvature: Array | float) -> Array:
+    """Return the half-width at `ISOVALUE`, mm, of a highlight of a lobe of c: d sqrt(-2 ln t / c) / |1 + d k|."""
+    angle = math.sqrt(-2.0 * math.log(ISOVALUE) / concentration)
+    return distance_mm * angle / np.maximum(np.abs(1.0 + distance_mm * curvature), LEAST_STRETCH)
+
+
+def curvature_and_edge(
+    vertices: Array, faces: IntArray, lumen: bool, distance_mm: float, concentration: float
+) -> tuple[Array, Array]:
+    """Return the larger absolute curvature, 1/mm, and the edge length that a highlight needs, mm, at the vertices."""
+    # The operators are for outward normals; in a lumen the camera sees the other side.
+    k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
+    narrow = np.minimum(*(half_width(distance_mm, concentration, k) for k in (k_min, k_max)))
+    return np.maximum(np.abs(k_min), np.abs(k_max)), narrow / EDGES_PER_HALF_WIDTH
 
 
 MAX_SUBDIVIDED_FACES = 1_600_000
@@ -122,20 +113,16 @@ def fair(vertices: Array, faces: IntArray, wavelength_mm: float) -> Array:
     return np.ascontiguousarray(solver.solve(mass[:, None] * (vertices - middle)) + middle)
 
 
-def halvings(vertices: Array, faces: IntArray, edge_mm: float) -> int:
-    """Return how often edges must be halved for 95 % of them to be at most `edge_mm` long."""
-    length = float(np.quantile(edge_lengths(vertices, faces), 0.95))
+def halvings(length_mm: float, edge_mm: float) -> int:
+    """Return how often edges of a length must be halved to be at most `edge_mm` long."""
     # With a small tolerance, so that the mesh's own edge length needs no halving.
-    return max(0, math.ceil(math.log2(length / edge_mm) - 1e-6))
+    return max(0, math.ceil(math.log2(length_mm / edge_mm) - 1e-6))
 
 
 def subdivisions_within_limit(faces: int, wanted: int) -> int:
     """Return how often a mesh of so many faces may be subdivided, at most `wanted` times."""
-    allowed = wanted
     # Each subdivision makes four faces of one.
-    while allowed and faces * 4**allowed > MAX_SUBDIVIDED_FACES:
-        allowed -= 1
-    return allowed
+    return next(times for times in range(wanted, -1, -1) if not times or faces * 4**times <= MAX_SUBDIVIDED_FACES)
 
 
 def refine(vertices: Array, faces: IntArray, times: int, smoothing_mm: float) -> tuple[Array, IntArray]:
@@ -176,7 +163,7 @@ The quotient is 1 for a sphere and falls as a body gets long or folded. A tube o
 A short piece of gut is taken for an organ, and a shallow open patch for a lumen: ``kind`` of the scene corrects that.
 """
 
-AUTO_CONCENTRATION = phong_concentration(DEFAULT_EXPONENT)
+AUTO_CONCENTRATION = concentration()
 """Lobe for which ``edge_mm = "auto"`` makes the mesh fine enough: that of the shipped anatomy scene."""
 
 EDGE_QUANTILE = 0.05
@@ -231,25 +218,6 @@ class PreparedMesh(BuiltMesh):
         """Return the distances of the hits on the triangles, in double precision (see `BuiltMesh.distances`)."""
         return on_triangles(origins, directions, hits, self.mesh).distance
 
-    def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
-        """Return how points and normals move within the hit triangles (see `SurfaceModel.motion`)."""
-        faces = self.mesh.faces[hits.face]
-        corner, second, third = np.moveaxis(self.mesh.vertices[faces], 1, 0)
-        a, b, c = np.moveaxis(self.mesh.normals[faces], 1, 0)
-        first_edge, second_edge = second - corner, third - corner
-        plane = np.cross(first_edge, second_edge)
-        # The mean of the corners' normals is linear: its gradient from those of the second and third weights.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = 1 / np.einsum("ni,ni->n", plane, plane)[:, None]
-        gradient = _outer(b - a, np.cross(second_edge, plane) * scale) + _outer(
-            c - a, np.cross(plane, first_edge) * scale
-        )
-        mean = np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[faces])
-        # Turned as the points' normals are, which face the rays.
-        length = np.linalg.norm(mean, axis=1) * np.sign(np.einsum("ni,ni->n", mean, points.normal_base))
-        across = np.eye(3) - _outer(points.normal_base, points.normal_base)
-        return plane, across @ gradient / length[:, None, None]
-
 
 def _outer(a: Array, b: Array) -> Array:
     return np.asarray(a[:, :, None] * b[:, None, :])
@@ -272,45 +240,72 @@ def on_triangles(origins: Array, directions: Array, hits: RayHits, mesh: Triangl
     return RayHits(np.where(better, distance, hits.distance), hits.face, barycentric)
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """How a mesh is made smooth and fine; see `AnatomySurface` for the fields."""
+def prepare(
+    path: str | Path,
+    subdivisions: int = 1,
+    edge_mm: float | Literal["auto"] | None = None,
+    smoothing_mm: float | None = None,
+    kind: str = "auto",
+) -> PreparedMesh:
+    """Read a mesh and make it smooth and fine, as `AnatomySurface` says; the last few are cached until a file changes.
 
-    subdivisions: int = 1
-    edge_mm: float | Literal["auto"] | None = None
-    smoothing_mm: float | None = None
-
-
-def prepare(path: str | Path, refinement: Refinement | int = 1, kind: str = "auto") -> PreparedMesh:
-    """Read a mesh and prepare it; the last few are cached until their file changes.
-
-    A number in place of a `Refinement` is that of Loop subdivisions; fewer are made, with a warning, if the faces would
-    exceed `MAX_SUBDIVIDED_FACES`. Of `kind` "auto" it is a lumen if the isoperimetric quotient is below
-    `LUMEN_QUOTIENT`. Repairs are warned of, and self-intersections, around which the truth is meaningless. Raises
-    `InputError` if the file is missing or malformed.
+    There are fewer subdivisions, with a warning, if the faces would exceed `MAX_SUBDIVIDED_FACES`. Of `kind` "auto" it
+    is a lumen if the isoperimetric quotient is below `LUMEN_QUOTIENT`. Repairs are warned of, and self-intersections,
+    around which the truth is meaningless. Raises `InputError` if the file is missing or malformed.
     """
     path = Path(path).expanduser().resolve()
     state = path.stat()
-    how = Refinement(refinement) if isinstance(refinement, int) else refinement
-    return _prepare(str(path), state.st_mtime_ns, state.st_size, how, kind)
+    return _prepare((str(path), state.st_mtime_ns, state.st_size), subdivisions, edge_mm, smoothing_mm, kind)
 
 
 @lru_cache(maxsize=4)
-def _prepare(path: str, mtime_ns: int, size: int, how: Refinement, kind: str) -> PreparedMesh:
-    vertices, faces, repairs = read_mesh(path)
+def _prepare(
+    file: tuple[str, int, int],
+    subdivisions: int,
+    edge_mm: float | Literal["auto"] | None,
+    smoothing_mm: float | None,
+    kind: str,
+) -> PreparedMesh:
+    vertices, faces, repairs = read_mesh(file[0])
     lumen = is_lumen(vertices, faces, kind)
-    # smooth and fine
-    times, smoothing, reasons = _plan(vertices, faces, how, lumen)
-    for problem in (*_doubts(vertices, faces, repairs, lumen), *reasons):
-        warnings.warn(f"{path}: {problem}", stacklevel=3)
-    shortest = max(smoothing, _own_wave(vertices, faces))
+    own_wave = SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
+    # smooth, by default of what is the mesh's own, and fine
+    smoothing = smoothing_mm or (own_wave if edge_mm is not None and smoothing_mm is None else 0.0)
+    branching = int((edge_uses(faces)[1] > 2).sum())
+    problems = [*_doubts(vertices, faces, repairs, lumen)]
+    cannot = ""
+    if len(faces) > MAX_SMOOTHED_FACES:
+        cannot = f"{len(faces)} faces, at most {MAX_SMOOTHED_FACES} can be smoothed"
+    elif branching:
+        cannot = f"{branching} edges belong to more than two faces, smoothing needs a manifold"
+    if smoothing and cannot:
+        problems.append(f"{cannot}; using smoothing_mm = 0")
+        smoothing = 0.0
+    if edge_mm is not None:
+        # as many subdivisions as the edge length needs
+        edge = _automatic_edge(vertices, faces, lumen, smoothing) if edge_mm == "auto" else edge_mm
+        subdivisions = halvings(float(np.quantile(edge_lengths(vertices, faces), 0.95)), edge)
+    times = subdivisions_within_limit(len(faces), subdivisions)
+    if times < subdivisions:
+        # One subdivision more of a quarter of the limit's faces ends finer than what this mesh allows.
+        fewer = MAX_SUBDIVIDED_FACES // 4 ** (times + 1)
+        problems.append(
+            f"{subdivisions} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {times}"
+            f". Decimated to {fewer} faces it would take {times + 1} and end finer"
+        )
+    if times and branching:
+        problems.append(f"{branching} edges belong to more than two faces; Loop subdivision needs a manifold, using 0")
+        times = 0
+    for problem in problems:
+        warnings.warn(f"{file[0]}: {problem}", stacklevel=3)
     vertices, faces = refine(vertices, faces, times, smoothing)
     normals, operators = vertex_normals(vertices, faces), shape_operators(vertices, faces)
     if lumen:
         # Everything turned inward, to the camera's side
         faces, normals, operators = np.ascontiguousarray(faces[:, ::-1]), -normals, -operators
-    digest = blake2b(repr((path, mtime_ns, size, times, smoothing, lumen)).encode(), digest_size=12).hexdigest()
-    return PreparedMesh(TriangleMesh(vertices, faces, normals), f"mesh-{digest}", operators, lumen, times, shortest)
+    digest = blake2b(repr((*file, times, smoothing, lumen)).encode(), digest_size=12).hexdigest()
+    mesh = TriangleMesh(vertices, faces, normals)
+    return PreparedMesh(mesh, f"mesh-{digest}", operators, lumen, times, max(smoothing, own_wave))
 
 
 def is_lumen(vertices: Array, faces: IntArray, kind: str) -> bool:
@@ -328,51 +323,11 @@ def _doubts(vertices: Array, faces: IntArray, repairs: Repairs, lumen: bool) -> 
         yield f"{crossing} faces cut through others; normals and curvatures around them mean nothing"
 
 
-def _plan(vertices: Array, faces: IntArray, how: Refinement, lumen: bool) -> tuple[int, float, list[str]]:
-    """Return how often to subdivide, the wavelength to smooth, mm, and why either is less than asked for."""
-    branching, reasons = int((edge_uses(faces)[1] > 2).sum()), []
-    # smoothing, by default of what is the mesh's own
-    smoothing = how.smoothing_mm or 0.0
-    if how.edge_mm is not None and how.smoothing_mm is None:
-        smoothing = _own_wave(vertices, faces)
-    problem = ""
-    if len(faces) > MAX_SMOOTHED_FACES:
-        problem = f"{len(faces)} faces, at most {MAX_SMOOTHED_FACES} can be smoothed"
-    elif branching:
-        problem = f"{branching} edges belong to more than two faces, smoothing needs a manifold"
-    if smoothing and problem:
-        reasons, smoothing = [f"{problem}; using smoothing_mm = 0"], 0.0
-    # subdivisions, as many as the edge length needs
-    wanted = how.subdivisions
-    if how.edge_mm is not None:
-        edge = automatic_edge(vertices, faces, lumen, smoothing) if how.edge_mm == "auto" else how.edge_mm
-        wanted = halvings(vertices, faces, edge)
-    times = subdivisions_within_limit(len(faces), wanted)
-    if times < wanted:
-        # One subdivision more of a quarter of the limit's faces ends finer than what this mesh allows.
-        fewer = MAX_SUBDIVIDED_FACES // 4 ** (times + 1)
-        reasons.append(
-            f"{wanted} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {times}"
-            f". Decimated to {fewer} faces it would take {times + 1} and end finer"
-        )
-    if times and branching:
-        reasons.append(f"{branching} edges belong to more than two faces; Loop subdivision needs a manifold, using 0")
-        times = 0
-    return times, smoothing, reasons
-
-
-def _own_wave(vertices: Array, faces: IntArray) -> float:
-    """Return the shortest wave, mm, that a file of these edges can hold."""
-    return SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
-
-
-def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: float) -> float:
+def _automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: float) -> float:
     """Return the edge length, mm, that `AUTO_CONCENTRATION` needs on outward faces as near as a camera comes."""
     vertices, faces = refine(vertices, faces, 0, smoothing_mm)
     # The nearest camera sees the narrowest highlights.
-    distance = nearest_mm(lumen)
-    k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
-    needed = needed_edge(distance, AUTO_CONCENTRATION, k_min, k_max)
+    needed = curvature_and_edge(vertices, faces, lumen, nearest_mm(lumen), AUTO_CONCENTRATION)[1]
     return area_quantile(needed, vertices, faces, EDGE_QUANTILE)
 
 
@@ -382,20 +337,36 @@ class MeshSurface(MeshedSurface):
     faceted = True
 
     def __init__(self, spec: AnatomySurface) -> None:
-        how = Refinement(spec.subdivisions, spec.edge_mm, spec.smoothing_mm)
-        self._build = self.prepared = prepare(find(spec.path, "meshes", suffixes=MESH_SUFFIXES), how, spec.kind)
+        path = find(spec.path, "meshes", suffixes=MESH_SUFFIXES)
+        self._build = self.prepared = prepare(path, spec.subdivisions, spec.edge_mm, spec.smoothing_mm, spec.kind)
         _check_relief(spec, self.prepared.shortest_mm)
         probe, lumen = self.prepared.probe, self.prepared.lumen
-        if lumen:
-            pose = lumen_pose(spec.label, spec.viewpoint, probe.sites, probe.clearance, probe.cast)
-        else:
-            pose = organ_pose(spec.label, spec.viewpoint, probe.targets, probe.clearance, probe.cast)
+        number, clearance, cast = spec.viewpoint, probe.clearance, probe.cast
         self.solid = not lumen
-        self.model_from_camera = pose
+        if lumen:
+            self.model_from_camera = lumen_pose(spec.label, number, probe.sites, clearance, cast)
+        else:
+            self.model_from_camera = organ_pose(spec.label, number, probe.targets, clearance, cast)
 
     def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
         """Return how points and normals move within the hit triangles (see `SurfaceModel.motion`)."""
-        return self.prepared.motion(points, hits)
+        mesh = self.prepared.mesh
+        faces = mesh.faces[hits.face]
+        corner, second, third = np.moveaxis(mesh.vertices[faces], 1, 0)
+        a, b, c = np.moveaxis(mesh.normals[faces], 1, 0)
+        first_edge, second_edge = second - corner, third - corner
+        plane = np.cross(first_edge, second_edge)
+        # The mean of the corners' normals is linear: its gradient from those of the second and third weights.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = 1 / np.einsum("ni,ni->n", plane, plane)[:, None]
+        gradient = _outer(b - a, np.cross(second_edge, plane) * scale) + _outer(
+            c - a, np.cross(plane, first_edge) * scale
+        )
+        mean = np.einsum("nc,nci->ni", hits.weights, mesh.normals[faces])
+        # Turned as the points' normals are, which face the rays.
+        length = np.linalg.norm(mean, axis=1) * np.sign(np.einsum("ni,ni->n", mean, points.normal_base))
+        across = np.eye(3) - _outer(points.normal_base, points.normal_base)
+        return plane, across @ gradient / length[:, None, None]
 
 
 def _check_relief(spec: AnatomySurface, shortest_mm: float) -> None:
