@@ -92,9 +92,9 @@ class SurfacePoints:
     valid: Mask
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A triangle mesh in the model frame.
+    """A triangle mesh in the model frame; equal to itself alone.
 
     Parameters
     ----------

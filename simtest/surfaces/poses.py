@@ -168,29 +168,15 @@ class CameraPath:
         return point + (position - inside) * tangent, tangent, side / np.linalg.norm(side)
 
 
-class _Keyed:
-    """A mesh that a cache can find by its key."""
-
-    def __init__(self, key: str, mesh: TriangleMesh) -> None:
-        self.key, self.mesh = key, mesh
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Keyed) and other.key == self.key
-
-
 def camera_path(surface: SurfaceModel) -> CameraPath:
     """Find the camera path through the mesh of a lumen, closed or open at its ends; the last few are cached."""
-    shape = surface.shape()
-    assert shape.mesh is not None
-    return _camera_path(_Keyed(shape.key, shape.mesh))
+    mesh = surface.shape().mesh
+    assert mesh is not None
+    return _camera_path(mesh)
 
 
 @lru_cache(maxsize=4)
-def _camera_path(keyed: _Keyed) -> CameraPath:
-    mesh = keyed.mesh
+def _camera_path(mesh: TriangleMesh) -> CameraPath:
     # grid
     probe = MeshProbe(mesh)
     pitch = max(MIN_PITCH_MM, float(np.prod(np.ptp(mesh.vertices, axis=0)) / MAX_CELLS) ** (1 / 3))
