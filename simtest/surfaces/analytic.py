@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from simtest.geometry.vectors import projector, unit
 from simtest.runtime.arrays import Array, IntArray
 from simtest.spec.surfaces import CylinderSurface, PlaneSurface, QuadricSurface, SphereSurface
 from simtest.surfaces.model import (
@@ -132,9 +133,8 @@ class Sphere(_Round):
         """Intersect rays with the sphere; S = (I - N N^T)/R (see `SurfaceModel.points`)."""
         distance = self._distance(origins, directions, hits)
         # Renormalised, to be of unit length to rounding.
-        normal = (origins + distance[:, None] * directions - self.centre) / self.radius
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        S = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / self.radius
+        normal = unit((origins + distance[:, None] * directions - self.centre) / self.radius)
+        S = (projector(normal)) / self.radius
         return pack_points(origins, directions, distance, normal, S)
 
 
@@ -158,8 +158,7 @@ class Cylinder(_Round):
         # A cylinder is a circle for the components across its axis.
         across = self._across
         distance = self._distance(origins * across, directions * across, hits)
-        normal = (origins + distance[:, None] * directions - self.centre) * across / self.radius
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = unit((origins + distance[:, None] * directions - self.centre) * across / self.radius)
         S = (np.diag(across) - normal[:, :, None] * normal[:, None, :]) / self.radius
         return pack_points(origins, directions, distance, normal, S)
 
@@ -178,8 +177,7 @@ class Quadric(_Analytic):
         x, y = (grid.ravel() for grid in np.meshgrid(side, side))
         k1, k2, _ = self.curvatures
         vertices = np.stack([x, y, -(k1 * x**2 + k2 * y**2) / 2], axis=1)
-        normals = np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = unit(np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1))
         mesh = TriangleMesh(vertices, grid_faces(QUADRIC_CELLS, QUADRIC_CELLS), normals)
         return Shape("mesh", False, np.eye(4), mesh, f"quadric {k1!r} {k2!r} {reach!r}")
 

@@ -8,6 +8,7 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.geometry.vectors import unit
 from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
 from simtest.surfaces.model import RayHits, TriangleMesh, in_rows
 from simtest.surfaces.poses import Generator, lumen_pose
@@ -135,7 +136,7 @@ def _positions(tube: Tube, parameters: Array) -> tuple[Array, Array]:
     """Return positions, mm, and unit normals into the lumen at (u, v), each of shape (N, 3)."""
     positions, along, around = tube.tangents(parameters[:, 0], parameters[:, 1])
     normals = np.cross(along, around)
-    return positions, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return positions, unit(normals)
 
 
 def _split(
@@ -177,8 +178,7 @@ def _split(
 
 def _facing(positions: Array, normals: Array, faces: IntArray) -> Array:
     """Return the least cosine between a triangle's normal and those at its corners, shape (F,)."""
-    cross = area_vectors(positions, faces)
-    cross /= np.linalg.norm(cross, axis=1, keepdims=True)
+    cross = unit(area_vectors(positions, faces))
     return np.asarray(np.einsum("ni,nci->nc", cross, normals[faces]).min(axis=1))
 
 

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from simtest.geometry.vectors import rotation
+from simtest.geometry.vectors import projector, rotation, unit
 from simtest.runtime.arrays import Array, Mask
 from simtest.spec.surfaces import MAX_STRETCH, Breathing, Contractions, Deformation, Dent, Peristalsis
 from simtest.surfaces.jets import Jet
@@ -108,7 +108,7 @@ class _Contraction(_Part):
     """Peristalsis: u = -a w(z) r exp((1 - |r|^2/R^2)/2), a = A/R, r = P (X - c) the part across the axis."""
 
     def __init__(self, spec: Peristalsis, time_s: float) -> None:
-        self._axis, self._origin = _unit(spec.axis), np.array(spec.centre_mm)
+        self._axis, self._origin = unit(spec.axis), np.array(spec.centre_mm)
         self._across = np.eye(3) - np.outer(self._axis, self._axis)
         self._a, self._R2 = spec.amplitude_mm / spec.radius_mm, spec.radius_mm**2
         self._k, self._cycle = 2 * math.pi / spec.wavelength_mm, 2 * math.pi * spec.cycles(time_s)
@@ -164,7 +164,7 @@ def _on_curve(at: Array, nodes: Array, slopes: Array, s: float) -> tuple[Array, 
     near, far, m, n = nodes[i], nodes[i + 1], h * slopes[i], h * slopes[i + 1]
     point = (1 + 2 * t) * (1 - t) ** 2 * near + t * (1 - t) ** 2 * m + t * t * (3 - 2 * t) * far + t * t * (t - 1) * n
     change = 6 * t * (1 - t) * (far - near) + (1 - t) * (1 - 3 * t) * m + t * (3 * t - 2) * n
-    return point, _unit(change)
+    return point, unit(change)
 
 
 class _Breath(_Part):
@@ -172,10 +172,10 @@ class _Breath(_Part):
 
     def __init__(self, spec: Breathing, time_s: float) -> None:
         share = spec.share(time_s)
-        self._direction, self._amplitude, self._warp = _unit(spec.direction), spec.amplitude_mm * share, spec.warp
-        self._along, self._k = _unit(spec.along), 2 * math.pi / spec.wavelength_mm
+        self._direction, self._amplitude, self._warp = unit(spec.direction), spec.amplitude_mm * share, spec.warp
+        self._along, self._k = unit(spec.along), 2 * math.pi / spec.wavelength_mm
         self.centre = np.array(spec.centre_mm)
-        self.turn = rotation(math.radians(spec.turn_deg) * share * _unit(spec.axis))
+        self.turn = rotation(math.radians(spec.turn_deg) * share * unit(spec.axis))
 
     def displacement(self, X: Jet) -> Jet:
         cosine = X.affine(1.0, -self.centre).along(self._along).affine(self._k).cos()
@@ -186,7 +186,7 @@ class _Press(_Part):
     """Dent: u = v A s exp(-|X - c|^2/(2 w^2))."""
 
     def __init__(self, spec: Dent, time_s: float) -> None:
-        self._move = spec.amplitude_mm * spec.share(time_s) * _unit(spec.direction)
+        self._move = spec.amplitude_mm * spec.share(time_s) * unit(spec.direction)
         self._origin, self._w2 = np.array(spec.centre_mm), spec.radius_mm**2
 
     def displacement(self, X: Jet) -> Jet:
@@ -255,11 +255,6 @@ def _parts_of(spec: Deformation, time_s: float) -> list[_Part]:
             return [_Press(spec, time_s)]
         case Contractions():
             return _rings(spec, time_s)
-
-
-def _unit(vector: Sequence[float]) -> Array:
-    values = np.array(vector, dtype=float)
-    return np.asarray(values / np.linalg.norm(values))
 
 
 NEWTON_STEPS = 12
@@ -411,10 +406,9 @@ class DeformedSurface(SurfaceModel):
             return super().motion(points, hits)
         # Within a triangle at rest, carried along.
         jets = self.deformation.jets(self.deformation.at_rest(points.position))
-        normal = np.einsum("nji,nj->ni", jets.gradient, points.normal_base)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = unit(np.einsum("nji,nj->ni", jets.gradient, points.normal_base))
         plane, derivative = self.rest.motion(replace(points, normal_base=normal), hits)
         g, derivative = carry(jets, normal, derivative)
         length = np.linalg.norm(g, axis=1)
-        across = np.eye(3) - points.normal_base[:, :, None] * points.normal_base[:, None, :]
+        across = projector(points.normal_base)
         return np.einsum("nij,nj->ni", inverse_transpose(jets), plane), across @ derivative / length[:, None, None]

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from simtest.geometry.vectors import dot
 from simtest.runtime.arrays import Array, IntArray, Mask
 
 
@@ -89,7 +90,7 @@ class Jet:
 
     def squared(self) -> "Jet":
         """Return the squared length of a vector."""
-        parts = [np.einsum("ni,ni->n", self.value, self.value)]
+        parts = [dot(self.value, self.value)]
         if len(self.parts) > 1:
             parts.append(2 * np.einsum("ni,nij->nj", self.value, self.gradient))
         if len(self.parts) > 2:

@@ -21,6 +21,7 @@ from hashlib import blake2b
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, IntArray, Mask, kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
@@ -125,8 +126,7 @@ class Body:
         self._normal = normal / np.linalg.norm(normal)
         # Stage.SWEEP: the shape is part of the case, not of a realisation's rendering or noise.
         rng = generator(recipe.seed, "anatomy", "liver", 0, Stage.SWEEP)
-        directions = rng.normal(size=(_WAVES, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        directions = unit(rng.normal(size=(_WAVES, 3)))
         lengths = recipe.relief_length_mm * rng.uniform(0.8, 1.25, size=_WAVES)
         self._waves = 2 * math.pi / lengths[:, None] * directions
         self._phases = rng.uniform(0, 2 * math.pi, size=_WAVES)
@@ -141,7 +141,7 @@ class Body:
     def normals(self, points: Array) -> Array:
         """Return the unit outward normals of the level sets through points, shape (N, 3)."""
         gradient = in_blocks(lambda some: self.evaluate(some, second=False).gradient, points)
-        return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
+        return unit(gradient)
 
     def values(self, points: Array) -> Array:
         """Return F, mm, at points of shape (N, 3), without derivatives, for large grids."""
@@ -212,7 +212,7 @@ class Body:
         active = np.flatnonzero(np.isfinite(distance))
         for _ in range(NEWTON_STEPS):
             at = self.evaluate(origins[active] + t[active, None] * directions[active], second=False)
-            slope = np.einsum("ni,ni->n", at.gradient, directions[active])
+            slope = dot(at.gradient, directions[active])
             # On a grazing ray F is nearly flat: bound the step to the mesh's neighbourhood.
             slope = np.where(np.abs(slope) < 1e-6, np.copysign(1e-6, slope), slope)
             # Newton's step along the ray; a ray that leaves the neighbourhood of its hit is given up.
@@ -338,7 +338,7 @@ def _project(body: Body, points: Array, steps: int) -> Array:
     def moved(points: Array) -> Array:
         for _ in range(steps):
             at = body.evaluate(points, second=False)
-            points = points - (at.value / np.einsum("ni,ni->n", at.gradient, at.gradient))[:, None] * at.gradient
+            points = points - (at.value / dot(at.gradient, at.gradient))[:, None] * at.gradient
         return points
 
     return in_blocks(moved, points)

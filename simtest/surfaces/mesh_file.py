@@ -13,6 +13,7 @@ from typing import BinaryIO, Literal
 import numpy as np
 
 from simtest.errors import InputError, SimtestError
+from simtest.geometry.vectors import dot
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import check_limit, limit, require_plain, write_atomically
 from simtest.surfaces.model import TriangleMesh
@@ -287,7 +288,7 @@ def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
     size = np.maximum(np.bincount(piece, minlength=count), 1)
     middle = np.stack([np.bincount(piece, c, count) for c in corners.mean(axis=1).T], axis=1) / size[:, None]
     a, b, c = (corners[:, i] - middle[piece] for i in range(3))
-    volume = np.bincount(piece, np.einsum("ni,ni->n", a, np.cross(b, c)), count)
+    volume = np.bincount(piece, dot(a, np.cross(b, c)), count)
     # Pieces of negative volume are inside out.
     outward = np.where((volume[piece] < 0)[:, None], oriented[:, ::-1], oriented)
     # A face and its reverse differ by an odd permutation: compare the corner that follows the smallest.

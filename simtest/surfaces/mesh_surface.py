@@ -14,6 +14,7 @@ import numpy as np
 
 from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.errors import InputError
+from simtest.geometry.vectors import dot, projector, unit
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.resources import find
 from simtest.spec.surfaces import AnatomySurface
@@ -142,7 +143,7 @@ def refine(vertices: Array, faces: IntArray, times: int, smoothing_mm: float) ->
 def vertex_normals(vertices: Array, faces: IntArray) -> Array:
     """Return unit vertex normals, shape (V, 3): the faces' normals weighted by their angles at the vertex."""
     normals = igl.per_vertex_normals(vertices, faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
-    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    return unit(normals)
 
 
 def shape_operators(vertices: Array, faces: IntArray) -> Array:
@@ -208,11 +209,10 @@ class PreparedMesh(BuiltMesh):
         hits = on_triangles(origins, directions, hits, self.mesh)
         # Linear between the corners, as the renderer shades it
         corners = self.mesh.faces[hits.face]
-        normal = np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[corners])
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = unit(np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[corners]))
         operator = np.einsum("nc,ncij->nij", hits.weights, self.operators[corners])
-        projector = np.eye(3) - normal[:, :, None] * normal[:, None, :]
-        return hits.distance, normal, projector @ operator @ projector
+        across = projector(normal)
+        return hits.distance, normal, across @ operator @ across
 
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Return the distances of the hits on the triangles, in double precision (see `BuiltMesh.distances`)."""
@@ -228,11 +228,10 @@ def on_triangles(origins: Array, directions: Array, hits: RayHits, mesh: Triangl
     corner, second, third = np.moveaxis(mesh.vertices[mesh.faces[hits.face]], 1, 0)
     first_edge, second_edge, start = second - corner, third - corner, origins - corner
     across, along = np.cross(directions, second_edge), np.cross(start, first_edge)
-    determinant = np.einsum("ni,ni->n", first_edge, across)
+    determinant = dot(first_edge, across)
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v, distance = (
-            np.einsum("ni,ni->n", a, b) / determinant
-            for a, b in ((start, across), (directions, along), (second_edge, along))
+            dot(a, b) / determinant for a, b in ((start, across), (directions, along), (second_edge, along))
         )
         # A triangle seen edge on has no better solution.
         better = np.abs(distance - hits.distance) < SAME_HIT * hits.distance
@@ -358,14 +357,14 @@ class MeshSurface(MeshedSurface):
         plane = np.cross(first_edge, second_edge)
         # The mean of the corners' normals is linear: its gradient from those of the second and third weights.
         with np.errstate(divide="ignore", invalid="ignore"):
-            scale = 1 / np.einsum("ni,ni->n", plane, plane)[:, None]
+            scale = 1 / dot(plane, plane)[:, None]
         gradient = _outer(b - a, np.cross(second_edge, plane) * scale) + _outer(
             c - a, np.cross(plane, first_edge) * scale
         )
         mean = np.einsum("nc,nci->ni", hits.weights, mesh.normals[faces])
         # Turned as the points' normals are, which face the rays.
-        length = np.linalg.norm(mean, axis=1) * np.sign(np.einsum("ni,ni->n", mean, points.normal_base))
-        across = np.eye(3) - _outer(points.normal_base, points.normal_base)
+        length = np.linalg.norm(mean, axis=1) * np.sign(dot(mean, points.normal_base))
+        across = projector(points.normal_base)
         return plane, across @ gradient / length[:, None, None]
 
 

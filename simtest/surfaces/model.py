@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from simtest.geometry.vectors import tangent_basis
+from simtest.geometry.vectors import projector, tangent_basis
 from simtest.runtime.arrays import Array, IntArray, Mask
 
 if TYPE_CHECKING:
@@ -305,5 +305,5 @@ def implicit_shape_operator(gradient: Array, hessian: Array) -> tuple[Array, Arr
     """
     length = np.linalg.norm(gradient, axis=1)
     normal = gradient / length[:, None]
-    projector = np.eye(3) - normal[:, :, None] * normal[:, None, :]
-    return normal, projector @ hessian @ projector / length[:, None, None]
+    across = projector(normal)
+    return normal, across @ hessian @ across / length[:, None, None]

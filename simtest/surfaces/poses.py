@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage, sparse
 
 from simtest.errors import InputError
-from simtest.geometry.vectors import tangent_basis
+from simtest.geometry.vectors import tangent_basis, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.spec.surfaces import AnatomySurface
@@ -68,8 +68,7 @@ def lumen_pose(
     # Roomier sites are likelier: those at the limit show little but one patch of wall.
     site = candidates[rng.choice(allowed, p=room[allowed] / room[allowed].sum())]
     # direction
-    directions = rng.normal(size=(_DIRECTIONS, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = unit(rng.normal(size=(_DIRECTIONS, 3)))
     distance = cast(np.broadcast_to(site, directions.shape), directions)
     low, high = AXIS_RANGE_MM
     outside = np.maximum(np.maximum(low - distance, distance - high), 0.0)
@@ -195,8 +194,7 @@ def _camera_path(mesh: TriangleMesh) -> CameraPath:
             f"surface.view: a camera path of {max(length, 0):.3g} mm fits into the mesh; at least {MIN_LENGTH_MM:g} mm "
             "are needed; view = auto places single cameras"
         )
-    tangents = np.gradient(path, axis=0)
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    tangents = unit(np.gradient(path, axis=0))
     return CameraPath(path, tangents, _sides(tangents), length)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from simtest.geometry.vectors import tangent_basis
+from simtest.geometry.vectors import projector, tangent_basis, unit
 from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.surfaces import Relief, ReliefBand
 from simtest.surfaces.jets import Jet
@@ -161,7 +161,7 @@ def normal_derivative(N: Array, S: Array, jets: Jet) -> tuple[Array, Array]:
     normal = m / length[:, None]
     rest = np.einsum("ni,nij->nj", G, S) + np.einsum("ni,nij->nj", N, H)
     derivative = (1 + along)[:, None, None] * S + N[:, :, None] * rest[:, None, :] - H
-    across = np.eye(3) - normal[:, :, None] * normal[:, None, :]
+    across = projector(normal)
     return normal, across @ derivative / length[:, None, None]
 
 
@@ -297,8 +297,7 @@ def _plane_statistics(field: BandField, rng: np.random.Generator) -> tuple[float
     """
     relief = ReliefField((field,), 1.0, 1.0)
     jets = relief.tissue_jets(rng.uniform(0, NODES, (PROBES, 3)))
-    normal = rng.standard_normal((PROBES, 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = unit(rng.standard_normal((PROBES, 3)))
     # Not of the whole space: a shaped field is isotropic, but its sections' moments follow no closed form.
     along = np.einsum("ni,nij,nj->n", normal, jets.hessian, normal)
     laplace = np.trace(jets.hessian, axis1=1, axis2=2) - along

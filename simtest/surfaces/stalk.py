@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from simtest.geometry.vectors import dot
 from simtest.runtime.arrays import Array, Mask
 from simtest.surfaces.jets import Jet
 
@@ -73,7 +74,7 @@ class Stalk:
         z, x = self._split(points)
         # Of E and w the latter reaches farther, and of g and psi.
         across, along = math.sqrt(FAR) * (ACROSS * self.width) ** 2, FAR**0.25 * LIFT_REACH * self.height
-        return np.asarray((np.einsum("ni,ni->n", x, x) < across) & (np.abs(z) < along))
+        return np.asarray((dot(x, x) < across) & (np.abs(z) < along))
 
     def _applied(self, p: Jet) -> Jet:
         # coordinates about the foot

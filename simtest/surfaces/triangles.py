@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.statistics import weighted_quantile
 from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh, in_rows, pack_points
@@ -69,7 +70,7 @@ def isoperimetric_quotient(vertices: Array, faces: IntArray) -> float:
     cross = area_vectors(centred, faces)
     area = np.linalg.norm(cross, axis=1).sum() / 2
     # Sum of the signed volumes of the cones from the centroid to the faces
-    volume = np.einsum("ni,ni->n", centred[faces][:, 0], cross).sum() / 6
+    volume = dot(centred[faces][:, 0], cross).sum() / 6
     return float(36 * np.pi * volume**2 / area**3)
 
 
@@ -116,8 +117,7 @@ def off_between(ends: Array, normals: Array, share: float, limit_deg: float) -> 
     `ends`, shape (N, 2, 3), are the exact unit normals at both ends, `normals`, shape (N, 3), those at a share of the
     way from the first to the second.
     """
-    between = (1 - share) * ends[:, 0] + share * ends[:, 1]
-    between /= np.linalg.norm(between, axis=1, keepdims=True)
+    between = unit((1 - share) * ends[:, 0] + share * ends[:, 1])
     # By the chord, which grows with the angle up to 180 deg; a sine would fall again beyond 90.
     return np.asarray(np.linalg.norm(between - normals, axis=1) > 2 * math.sin(math.radians(limit_deg) / 2))
 
@@ -148,7 +148,7 @@ class MeshProbe:
         corners = self._mesh.vertices[self._mesh.faces[face]]
         weights = _barycentric(closest, corners)
         normal = np.einsum("nc,nci->ni", weights, self._mesh.normals[self._mesh.faces[face]])
-        side = np.einsum("ni,ni->n", points - closest, normal)
+        side = dot(points - closest, normal)
         return np.where(side >= 0, 1.0, -1.0) * np.sqrt(squared)
 
     def distance(self, points: Array) -> Array:
@@ -173,7 +173,7 @@ class MeshProbe:
         a, b = np.sqrt(rng.random(count)), rng.random(count)
         weights = np.stack([1 - a, a * (1 - b), a * b], axis=1)
         points = np.einsum("nc,nci->ni", weights, corners[face])
-        return points, cross[face] / np.linalg.norm(cross[face], axis=1, keepdims=True)
+        return points, unit(cross[face])
 
     def sites(self, rng: Generator) -> Array:
         """Draw points well inside a lumen, shape (N, 3): between a random point of the wall and the wall opposite."""
@@ -189,8 +189,8 @@ class MeshProbe:
 def _barycentric(points: Array, corners: Array) -> Array:
     """Return barycentric weights, shape (N, 3), of points in triangles with corners of shape (N, 3, 3)."""
     a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
-    aa, ab, bb = (np.einsum("ni,ni->n", *pair) for pair in ((a, a), (a, b), (b, b)))
-    pa, pb = np.einsum("ni,ni->n", p, a), np.einsum("ni,ni->n", p, b)
+    aa, ab, bb = (dot(*pair) for pair in ((a, a), (a, b), (b, b)))
+    pa, pb = dot(p, a), dot(p, b)
     determinant = np.maximum(aa * bb - ab * ab, np.finfo(float).tiny)
     second, third = (bb * pa - ab * pb) / determinant, (aa * pb - ab * pa) / determinant
     return np.stack([1 - second - third, second, third], axis=1)

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
@@ -353,12 +354,11 @@ class Tube:
         """Return the unit normal into the lumen, shape (N, 3), and S, 1/mm, shape (N, 3, 3), at u, v of shape (N,)."""
         p = self.jet(u, v)
         pu, pv = np.ascontiguousarray(np.moveaxis(p.gradient, 2, 0))
-        normal = np.cross(pu, pv)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = unit(np.cross(pu, pv))
         # First fundamental form G and second fundamental form II = -N . P_ij
-        E, F, G = (np.einsum("ni,ni->n", a, b) for a, b in ((pu, pu), (pu, pv), (pv, pv)))
+        E, F, G = (dot(a, b) for a, b in ((pu, pu), (pu, pv), (pv, pv)))
         second_derivatives = np.ascontiguousarray(np.moveaxis(p.hessian.reshape(-1, 3, 4), 2, 0))
-        L, M, _, N = (-np.einsum("ni,ni->n", normal, d) for d in second_derivatives)
+        L, M, _, N = (-dot(normal, d) for d in second_derivatives)
         # dN(P_i) . P_j = II_ij, so S = sum of II_ij d_i d_j^T with the dual tangents d = J G^-1, J = (P_u, P_v).
         det = E * G - F * F
         first = (G / det)[:, None] * pu - (F / det)[:, None] * pv
