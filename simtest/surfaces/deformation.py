@@ -328,8 +328,8 @@ class DeformedSurface(SurfaceModel):
 
     @property
     def at_rest(self) -> SurfaceModel:
-        """The surface before its deformation, in its closed form where it has one."""
-        return self.rest.at_rest
+        """The surface before its deformation."""
+        return self.rest
 
     @cached_property
     def vertex_jets(self) -> Jet:

@@ -15,7 +15,7 @@ from simtest.spec.surfaces import (
     SphereSurface,
     Surface,
 )
-from simtest.surfaces.analytic import Cylinder, GradedMesh, Plane, Quadric, Sphere
+from simtest.surfaces.analytic import Cylinder, Plane, Quadric, Sphere
 from simtest.surfaces.mesh_file import MESH_SUFFIXES
 from simtest.surfaces.model import SurfaceModel, TriangleMesh, principal_curvatures
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
@@ -56,7 +56,7 @@ def make_surface(
         from simtest.surfaces.deformation import DeformationAt, DeformedSurface
 
         if isinstance(surface, Plane | Sphere | Cylinder):
-            surface = GradedMesh(surface)
+            surface.as_mesh = True
         return DeformedSurface(surface, DeformationAt(deformation, time_s))
     return surface
 
