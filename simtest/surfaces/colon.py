@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from hashlib import blake2b
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.vectors import unit
 from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
-from simtest.surfaces.model import RayHits, TriangleMesh, in_rows
+from simtest.surfaces.model import RayHits, TriangleMesh, in_rows, remembered
 from simtest.surfaces.poses import Generator, lumen_pose
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.triangles import (
@@ -82,7 +81,7 @@ class BuiltColon(BuiltMesh):
         return self.tube.solve(origins, directions, hits.distance, u, v)[0]
 
 
-@lru_cache(maxsize=4)
+@remembered
 def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
     """Make the surface and the mesh of a recipe, with normals into the lumen.
 

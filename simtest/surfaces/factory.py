@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
@@ -17,8 +18,16 @@ from simtest.spec.surfaces import (
 )
 from simtest.surfaces.analytic import Cylinder, Plane, Quadric, Sphere
 from simtest.surfaces.mesh_file import MESH_SUFFIXES
-from simtest.surfaces.model import SurfaceModel, TriangleMesh, principal_curvatures
+from simtest.surfaces.model import CACHES, SurfaceModel, TriangleMesh, principal_curvatures
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
+
+ANALYTIC: dict[type, Any] = {
+    PlaneSurface: Plane,
+    SphereSurface: Sphere,
+    CylinderSurface: Cylinder,
+    QuadricSurface: Quadric,
+}
+"""The models of analytic surfaces by their descriptions."""
 
 
 def make_surface(
@@ -43,7 +52,12 @@ def make_surface(
     time_s : float
         The moment of the deformation, s.
     """
-    surface = _make_base(spec)
+    surface: SurfaceModel = _make_anatomy(spec) if isinstance(spec, AnatomySurface) else ANALYTIC[type(spec)](spec)
+    if isinstance(spec, AnatomySurface) and spec.view != "auto":
+        # Imported here, as the mesh libraries below.
+        from simtest.surfaces.poses import path_pose
+
+        surface.model_from_camera = path_pose(spec, surface)
     if moved is not None:
         surface.model_from_camera = surface.model_from_camera @ moved.pose()
     if spec.relief is not None:
@@ -61,33 +75,9 @@ def make_surface(
     return surface
 
 
-def _make_base(spec: Surface) -> SurfaceModel:
-    match spec:
-        case PlaneSurface():
-            return Plane(spec)
-        case SphereSurface():
-            return Sphere(spec)
-        case CylinderSurface():
-            return Cylinder(spec)
-        case QuadricSurface():
-            return Quadric(spec)
-        case AnatomySurface():
-            surface = _make_anatomy(spec)
-            if spec.view != "auto":
-                # Imported here, as the mesh libraries below.
-                from simtest.surfaces.poses import path_pose
-
-                surface.model_from_camera = path_pose(spec, surface)
-            return surface
-
-
 def forget_meshes() -> None:
     """Free the meshes that are cached for further scenes of the last few anatomies."""
-    from simtest.surfaces import colon, liver, mesh_surface, poses, relief_field, tissue_pattern, vessels
-
-    meshes = (poses._camera_path, colon.build, liver.build, mesh_surface._prepare)
-    reliefs, patterns = (relief_field._make_field, relief_field._unscaled), (tissue_pattern._make, tissue_pattern._bare)
-    for cached in (*meshes, *reliefs, *patterns, vessels.grow_vessels):
+    for cached in CACHES:
         cached.cache_clear()
 
 

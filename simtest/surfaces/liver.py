@@ -15,7 +15,6 @@ All are lengths in mm; F < 0 in the tissue.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from hashlib import blake2b
 
 import numpy as np
@@ -25,7 +24,7 @@ from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, IntArray, Mask, kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
-from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows
+from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows, remembered
 from simtest.surfaces.poses import organ_pose
 from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
 from simtest.surfaces.triangles import BuiltMesh, MeshedSurface, face_edges, halve, rough_edges
@@ -266,7 +265,7 @@ class BuiltLiver(BuiltMesh):
         return self.body.solve(origins, directions, hits.distance)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
     """Make the level set and the mesh of a recipe; normals outward.
 

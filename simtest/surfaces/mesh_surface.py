@@ -4,7 +4,6 @@ import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +18,7 @@ from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.resources import find
 from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import MESH_SUFFIXES, Repairs, examine, other_unit, read_mesh
-from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures
+from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures, remembered
 from simtest.surfaces.poses import lumen_pose, nearest_mm, organ_pose
 from simtest.surfaces.triangles import (
     BuiltMesh,
@@ -257,7 +256,7 @@ def prepare(
     return _prepare((str(path), state.st_mtime_ns, state.st_size), subdivisions, edge_mm, smoothing_mm, kind)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def _prepare(
     file: tuple[str, int, int],
     subdivisions: int,

@@ -1,8 +1,10 @@
 """What every surface offers: its pose relative to the camera, exact points on rays, and a shape to render."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -12,6 +14,19 @@ from simtest.runtime.arrays import Array, IntArray, Mask
 if TYPE_CHECKING:
     from simtest.surfaces.relief_field import ReliefField
     from simtest.surfaces.tube import TubeChart
+
+
+CACHES: list[Any] = []
+"""Of the functions that remember their results."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def remembered(function: Function) -> Function:
+    """Make a function keep its last four results, until `forget_meshes`."""
+    cached: Any = lru_cache(maxsize=4)(function)
+    CACHES.append(cached)
+    return cached
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ cells that are farthest apart, by the route that keeps farthest from the wall, a
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import igl
 import numpy as np
@@ -19,7 +18,7 @@ from simtest.geometry.vectors import tangent_basis, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.spec.surfaces import AnatomySurface
-from simtest.surfaces.model import SurfaceModel, TriangleMesh
+from simtest.surfaces.model import SurfaceModel, TriangleMesh, remembered
 from simtest.surfaces.triangles import MIN_CLEARANCE_MM, Generator, MeshProbe
 
 CLEARANCE_SHARE = 0.6
@@ -174,7 +173,7 @@ def camera_path(surface: SurfaceModel) -> CameraPath:
     return _camera_path(mesh)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def _camera_path(mesh: TriangleMesh) -> CameraPath:
     # grid
     probe = MeshProbe(mesh)

@@ -10,7 +10,7 @@ the gradient along the surface. A film may fill the valleys up to a level: pools
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from simtest.geometry.vectors import projector, tangent_basis, unit
 from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.surfaces import Relief, ReliefBand
 from simtest.surfaces.jets import Jet
-from simtest.surfaces.model import SurfacePoints, in_rows, principal, shape_operator
+from simtest.surfaces.model import SurfacePoints, in_rows, principal, remembered, shape_operator
 
 NODES = 96
 """Nodes of the lattice along each side; the field repeats after as many."""
@@ -186,7 +186,7 @@ def make_relief(spec: Relief, level: float | None = None) -> ReliefField:
     return field if level is None else replace(field, level=level * field.deviation)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def _make_field(spec: Relief) -> ReliefField:
     """Make the relief without a film, or read it."""
     arrays = kept("relief", spec.model_dump_json(), lambda: _packed(_drawn(spec)))
@@ -225,7 +225,7 @@ class _Unscaled:
     wave: float
 
 
-@lru_cache(maxsize=4)
+@remembered
 def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...]) -> _Unscaled:
     """Draw a band from a branch of the relief's seed; reliefs of one seed differ in their scales alone."""
     # Imported here: slow to load, and smooth scenes have no relief.

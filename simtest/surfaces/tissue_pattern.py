@@ -11,7 +11,6 @@ of the light that comes back from below the vessel's depth.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.reflectance import TissueColour
-from simtest.surfaces.model import SurfaceModel
+from simtest.surfaces.model import SurfaceModel, remembered
 from simtest.surfaces.relief_field import shell_noise
 from simtest.surfaces.vessels import (
     NO_VESSELS,
@@ -150,13 +149,13 @@ def make_pattern(surface: SurfaceModel, spec: TissueColour) -> TissuePattern:
     return _make(surface_patch(surface), spec)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def _bare(spec: TissueColour) -> TissuePattern:
     """Make the pattern without vessels."""
     return _pattern(spec, NO_VESSELS)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def _make(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
     return _unpacked(kept("tissue", f"{patch.key} {spec.model_dump_json()}", lambda: _packed(_grown(patch, spec))))
 

@@ -15,7 +15,6 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +26,7 @@ from simtest.geometry.vectors import dot, projector, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.spec.reflectance import Vessels
 from simtest.surfaces.analytic import QUADRIC_REACH, Cylinder, Plane, Quadric, Sphere
-from simtest.surfaces.model import SurfaceModel, TriangleMesh
+from simtest.surfaces.model import SurfaceModel, TriangleMesh, remembered
 from simtest.surfaces.triangles import area_vectors
 
 PRIMES = (73856093, 19349663, 83492791)
@@ -400,7 +399,7 @@ class VesselSegments:
     vein: Mask  # (S,)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def grow_vessels(patch: PatternPatch, spec: Vessels, seed: int) -> Forest:
     """Grow the vessels of a surface; the last few are cached."""
     branches = np.random.SeedSequence(seed).spawn(SYSTEMS)

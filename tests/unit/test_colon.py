@@ -10,8 +10,8 @@ from simtest.surfaces.colon import Colon, build
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, Polyp, load_recipe
-from simtest.surfaces.stalk import Stalk
 from simtest.surfaces.triangles import off_between
+from simtest.surfaces.tube import Stalk
 from tests.marked import marked
 
 ROOT = Path(__file__).resolve().parents[2]
