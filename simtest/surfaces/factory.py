@@ -83,22 +83,24 @@ def forget_meshes() -> None:
 
 def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
     # Imported here: the mesh libraries are slow to load and analytic scenes do not need them.
-    from simtest.surfaces.colon import Colon
-    from simtest.surfaces.liver import Liver
-    from simtest.surfaces.mesh_surface import MeshSurface
+    from simtest.surfaces.colon import make_colon
+    from simtest.surfaces.liver import make_liver
+    from simtest.surfaces.mesh_surface import make_mesh_surface
 
     suffix = Path(spec.path).suffix.lower()
     if suffix in MESH_SUFFIXES:
         if spec.recipe_values:
             raise InputError(f"surface.path = {spec.path!r}: a mesh has no recipe; leave out seed and recipe")
-        return MeshSurface(spec)
+        return make_mesh_surface(spec)
     if suffix not in ("", ".toml"):
         allowed = ", ".join((".toml", *MESH_SUFFIXES))
         raise InputError(
             f"surface.path = {spec.path!r}: unknown suffix {suffix}; allowed: {allowed}, or a recipe's name"
         )
     recipe = load_recipe(spec.file(), spec.recipe_values)
-    return Colon(recipe, spec.viewpoint) if isinstance(recipe, ColonRecipe) else Liver(recipe, spec.viewpoint)
+    if isinstance(recipe, ColonRecipe):
+        return make_colon(recipe, spec.viewpoint)
+    return make_liver(recipe, spec.viewpoint)
 
 
 def make_mesh(recipe: ColonRecipe | LiverRecipe, edge_mm: float | None = None) -> tuple[TriangleMesh, Array, Array]:
@@ -122,4 +124,4 @@ def make_mesh(recipe: ColonRecipe | LiverRecipe, edge_mm: float | None = None) -
     if edge_mm is not None and not 0.01 <= edge_mm <= 20:
         raise InputError(f"edge_mm = {edge_mm:g}: must be 0.01 to 20 mm")
     build = colon.build(recipe, edge_mm) if isinstance(recipe, ColonRecipe) else liver.build(recipe, edge_mm)
-    return build.mesh, *principal_curvatures(build.shape_operators)
+    return build.mesh, *principal_curvatures(build.vertex_shape_operators())

@@ -14,7 +14,6 @@ All are lengths in mm; F < 0 in the tissue.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from hashlib import blake2b
 
 import numpy as np
@@ -27,7 +26,7 @@ from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows, remembered
 from simtest.surfaces.poses import organ_pose
 from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
-from simtest.surfaces.triangles import BuiltMesh, MeshedSurface, face_edges, halve, rough_edges
+from simtest.surfaces.triangles import MeshedSurface, face_edges, halve, rough_edges
 
 SIDE = 4
 """Cells along the side of a block of the grid."""
@@ -232,15 +231,15 @@ def _lobe(lobe: LiverLobe | LiverFossa) -> tuple[Array, Array, float]:
     return np.array(lobe.centre_mm), turn @ np.diag(axes**-2.0) @ turn.T, float(np.cbrt(axes.prod()))
 
 
-@dataclass(frozen=True)
-class BuiltLiver(BuiltMesh):
-    """A recipe's level set `body` and mesh."""
+class Liver(MeshedSurface):
+    """A generated liver with the camera outside."""
 
-    body: Body
+    def __init__(self, mesh: TriangleMesh, key: str, body: Body) -> None:
+        super().__init__(mesh, key)
+        self.body = body
 
-    @property
-    def shape_operators(self) -> Array:
-        """S at the mesh's vertices by the level set, 1/mm, shape (V, 3, 3)."""
+    def vertex_shape_operators(self) -> Array:
+        """Return S by the level set (see `SurfaceModel.vertex_shape_operators`)."""
 
         def operators(points: Array) -> Array:
             at = self.body.evaluate(points)
@@ -249,24 +248,31 @@ class BuiltLiver(BuiltMesh):
         return in_blocks(operators, self.mesh.vertices)
 
     def clearance(self, points: Array) -> Array:
-        """Return the distance to the mesh, mm, with the exact sign of F; positive outside."""
+        """Return the distance to the mesh, mm, with the exact sign of F (see `SurfaceModel.clearance`)."""
         return np.where(self.body.values(points) > 0, 1.0, -1.0) * self.probe.distance(points)
 
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
         """Return exact points by Newton's method on F along the rays; a ray that only grazes the mesh has none."""
-        distance = self.body.solve(origins, directions, hits.distance)
+        distance = self.distances_at_hits(origins, directions, hits)
         good = np.flatnonzero(np.isfinite(distance))
         at = self.body.evaluate(origins[good] + distance[good, None] * directions[good])
         normals, operators = in_rows(len(distance), good, *implicit_shape_operator(at.gradient, at.hessian))
         return distance, normals, operators
 
-    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Return the distances of `at_hits` alone (see `BuiltMesh.distances`)."""
+    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return exact distances (see `MeshedSurface.distances_at_hits`)."""
         return self.body.solve(origins, directions, hits.distance)
 
 
+def make_liver(recipe: LiverRecipe, viewpoint: int) -> Liver:
+    """Return a liver with a camera at the pose numbered by `viewpoint`."""
+    liver = build(recipe)
+    probe = liver.probe
+    return liver.posed(organ_pose(recipe.type, viewpoint, probe.targets, liver.clearance, probe.cast))
+
+
 @remembered
-def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
+def build(recipe: LiverRecipe, edge_mm: float | None = None) -> Liver:
     """Make the level set and the mesh of a recipe; normals outward.
 
     `edge_mm` is the spacing of the marching cubes and about the length of the edges; default `GRID_MM`, with shorter
@@ -276,7 +282,7 @@ def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
     body, key = Body(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = kept("liver", key, lambda: vars(_mesh(body, edge_mm)))
     digest = blake2b(key.encode(), digest_size=12).hexdigest()
-    return BuiltLiver(TriangleMesh(**arrays), f"liver-{digest}", body)
+    return Liver(TriangleMesh(**arrays), f"liver-{digest}", body)
 
 
 def _mesh(body: Body, edge_mm: float | None) -> TriangleMesh:
@@ -341,12 +347,3 @@ def _project(body: Body, points: Array, steps: int) -> Array:
         return points
 
     return in_blocks(moved, points)
-
-
-class Liver(MeshedSurface):
-    """A generated liver with a camera outside, at the pose numbered by `viewpoint`."""
-
-    def __init__(self, recipe: LiverRecipe, viewpoint: int) -> None:
-        self._build = build(recipe)
-        probe = self._build.probe
-        self.model_from_camera = organ_pose(recipe.type, viewpoint, probe.targets, self._build.clearance, probe.cast)

@@ -3,7 +3,6 @@
 import math
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +20,6 @@ from simtest.surfaces.mesh_file import MESH_SUFFIXES, Repairs, examine, other_un
 from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures, remembered
 from simtest.surfaces.poses import lumen_pose, nearest_mm, organ_pose
 from simtest.surfaces.triangles import (
-    BuiltMesh,
     MeshedSurface,
     area_quantile,
     edge_lengths,
@@ -179,27 +177,31 @@ MAX_CROSSING_FACES = 250_000
 """A mesh of up to this many faces is checked for self-intersections before it is used (about a second)."""
 
 
-@dataclass(frozen=True)
-class PreparedMesh(BuiltMesh):
-    """A mesh ready for rendering and for the truth."""
+class MeshSurface(MeshedSurface):
+    """A user's mesh with a camera inside its lumen or outside the organ."""
 
-    operators: Array  # (V, 3, 3): S at the vertices, 1/mm, for the mesh's normals; NaN where the fit failed
-    lumen: bool  # Whether the camera belongs inside
-    subdivisions: int  # How often the mesh was subdivided
-    # Shortest wavelength that the mesh holds itself, mm: two of the file's median edges, or what smoothing left
-    shortest_mm: float
+    faceted = True
 
-    @property
-    def shape_operators(self) -> Array:
-        """The fitted S at the vertices, 1/mm, shape (V, 3, 3)."""
-        return self.operators
+    def __init__(
+        self, mesh: TriangleMesh, key: str, operators: Array, lumen: bool, subdivisions: int, shortest_mm: float
+    ) -> None:
+        super().__init__(mesh, key)
+        self._operators = operators  # (V, 3, 3): S at the vertices, 1/mm, for the mesh's normals; NaN: the fit failed
+        self.lumen, self.solid = lumen, not lumen
+        self.subdivisions = subdivisions  # How often the mesh was subdivided
+        # Shortest wavelength that the mesh holds itself, mm: two of the file's median edges, or what smoothing left
+        self.shortest_mm = shortest_mm
+
+    def vertex_shape_operators(self) -> Array:
+        """Return the fitted S (see `SurfaceModel.vertex_shape_operators`)."""
+        return self._operators
 
     def clearance(self, points: Array) -> Array:
-        """Return the signed distance to the mesh, mm (see `BuiltMesh.clearance`)."""
+        """Return the signed distance to the mesh (see `SurfaceModel.clearance`)."""
         return self.probe.clearance(points)
 
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return what the mesh holds at the hits themselves (see `BuiltMesh.at_hits`).
+        """Return what the mesh holds at the hits themselves (see `MeshedSurface.at_hits`).
 
         The normal is the normalised barycentric mean of the vertex normals; S is that of the vertices' tensors,
         projected on the plane perpendicular to that normal.
@@ -209,13 +211,33 @@ class PreparedMesh(BuiltMesh):
         # Linear between the corners, as the renderer shades it
         corners = self.mesh.faces[hits.face]
         normal = unit(np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[corners]))
-        operator = np.einsum("nc,ncij->nij", hits.weights, self.operators[corners])
+        operator = np.einsum("nc,ncij->nij", hits.weights, self._operators[corners])
         across = projector(normal)
         return hits.distance, normal, across @ operator @ across
 
-    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Return the distances of the hits on the triangles, in double precision (see `BuiltMesh.distances`)."""
+    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return the distances of the hits on the triangles, in double precision."""
         return on_triangles(origins, directions, hits, self.mesh).distance
+
+    def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
+        """Return how points and normals move within the hit triangles (see `SurfaceModel.motion`)."""
+        mesh = self.mesh
+        faces = mesh.faces[hits.face]
+        corner, second, third = np.moveaxis(mesh.vertices[faces], 1, 0)
+        a, b, c = np.moveaxis(mesh.normals[faces], 1, 0)
+        first_edge, second_edge = second - corner, third - corner
+        plane = np.cross(first_edge, second_edge)
+        # The mean of the corners' normals is linear: its gradient from those of the second and third weights.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = 1 / dot(plane, plane)[:, None]
+        gradient = _outer(b - a, np.cross(second_edge, plane) * scale) + _outer(
+            c - a, np.cross(plane, first_edge) * scale
+        )
+        mean = np.einsum("nc,nci->ni", hits.weights, mesh.normals[faces])
+        # Turned as the points' normals are, which face the rays.
+        length = np.linalg.norm(mean, axis=1) * np.sign(dot(mean, points.normal_base))
+        across = projector(points.normal_base)
+        return plane, across @ gradient / length[:, None, None]
 
 
 def _outer(a: Array, b: Array) -> Array:
@@ -244,7 +266,7 @@ def prepare(
     edge_mm: float | Literal["auto"] | None = None,
     smoothing_mm: float | None = None,
     kind: str = "auto",
-) -> PreparedMesh:
+) -> MeshSurface:
     """Read a mesh and make it smooth and fine, as `AnatomySurface` says; the last few are cached until a file changes.
 
     There are fewer subdivisions, with a warning, if the faces would exceed `MAX_SUBDIVIDED_FACES`. Of `kind` "auto" it
@@ -263,7 +285,7 @@ def _prepare(
     edge_mm: float | Literal["auto"] | None,
     smoothing_mm: float | None,
     kind: str,
-) -> PreparedMesh:
+) -> MeshSurface:
     vertices, faces, repairs = read_mesh(file[0])
     lumen = is_lumen(vertices, faces, kind)
     own_wave = SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
@@ -303,7 +325,7 @@ def _prepare(
         faces, normals, operators = np.ascontiguousarray(faces[:, ::-1]), -normals, -operators
     digest = blake2b(repr((*file, times, smoothing, lumen)).encode(), digest_size=12).hexdigest()
     mesh = TriangleMesh(vertices, faces, normals)
-    return PreparedMesh(mesh, f"mesh-{digest}", operators, lumen, times, max(smoothing, own_wave))
+    return MeshSurface(mesh, f"mesh-{digest}", operators, lumen, times, max(smoothing, own_wave))
 
 
 def is_lumen(vertices: Array, faces: IntArray, kind: str) -> bool:
@@ -329,42 +351,17 @@ def _automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm:
     return area_quantile(needed, vertices, faces, EDGE_QUANTILE)
 
 
-class MeshSurface(MeshedSurface):
-    """A user's mesh with a camera inside its lumen or outside the organ."""
-
-    faceted = True
-
-    def __init__(self, spec: AnatomySurface) -> None:
-        path = find(spec.path, "meshes", suffixes=MESH_SUFFIXES)
-        self._build = self.prepared = prepare(path, spec.subdivisions, spec.edge_mm, spec.smoothing_mm, spec.kind)
-        _check_relief(spec, self.prepared.shortest_mm)
-        probe, lumen = self.prepared.probe, self.prepared.lumen
-        number, clearance, cast = spec.viewpoint, probe.clearance, probe.cast
-        self.solid = not lumen
-        if lumen:
-            self.model_from_camera = lumen_pose(spec.label, number, probe.sites, clearance, cast)
-        else:
-            self.model_from_camera = organ_pose(spec.label, number, probe.targets, clearance, cast)
-
-    def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
-        """Return how points and normals move within the hit triangles (see `SurfaceModel.motion`)."""
-        mesh = self.prepared.mesh
-        faces = mesh.faces[hits.face]
-        corner, second, third = np.moveaxis(mesh.vertices[faces], 1, 0)
-        a, b, c = np.moveaxis(mesh.normals[faces], 1, 0)
-        first_edge, second_edge = second - corner, third - corner
-        plane = np.cross(first_edge, second_edge)
-        # The mean of the corners' normals is linear: its gradient from those of the second and third weights.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = 1 / dot(plane, plane)[:, None]
-        gradient = _outer(b - a, np.cross(second_edge, plane) * scale) + _outer(
-            c - a, np.cross(plane, first_edge) * scale
-        )
-        mean = np.einsum("nc,nci->ni", hits.weights, mesh.normals[faces])
-        # Turned as the points' normals are, which face the rays.
-        length = np.linalg.norm(mean, axis=1) * np.sign(dot(mean, points.normal_base))
-        across = projector(points.normal_base)
-        return plane, across @ gradient / length[:, None, None]
+def make_mesh_surface(spec: AnatomySurface) -> MeshSurface:
+    """Return a user's mesh with a camera at the pose numbered by the description's viewpoint."""
+    path = find(spec.path, "meshes", suffixes=MESH_SUFFIXES)
+    surface = prepare(path, spec.subdivisions, spec.edge_mm, spec.smoothing_mm, spec.kind)
+    _check_relief(spec, surface.shortest_mm)
+    probe = surface.probe
+    if surface.lumen:
+        pose = lumen_pose(spec.label, spec.viewpoint, probe.sites, probe.clearance, probe.cast)
+    else:
+        pose = organ_pose(spec.label, spec.viewpoint, probe.targets, probe.clearance, probe.cast)
+    return surface.posed(pose)
 
 
 def _check_relief(spec: AnatomySurface, shortest_mm: float) -> None:

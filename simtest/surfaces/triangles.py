@@ -1,10 +1,11 @@
 """Triangle meshes: edges and areas, cuts at edges' middles, and the surfaces that are rendered as such."""
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from copy import copy
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -196,60 +197,43 @@ def _barycentric(points: Array, corners: Array) -> Array:
     return np.stack([1 - second - third, second, third], axis=1)
 
 
-@dataclass(frozen=True)
-class BuiltMesh(ABC):
-    """A surface's mesh, shared by all its poses."""
+class MeshedSurface(SurfaceModel):
+    """A surface that is rendered as a mesh; it is built once, and copied for each of its poses."""
 
-    mesh: TriangleMesh  # mm; normals and winding on the camera's side
-    key: str  # Identity of recipe or file, and settings
+    def __init__(self, mesh: TriangleMesh, key: str) -> None:
+        self.mesh = mesh  # mm; normals and winding on the camera's side
+        self.key = key  # Identity of recipe or file, and settings
 
     @cached_property
     def probe(self) -> MeshProbe:
         """Distances and rays for the choice of a pose."""
         return MeshProbe(self.mesh)
 
-    @property
-    @abstractmethod
-    def shape_operators(self) -> Array:
-        """S at the mesh's vertices for its normals, 1/mm, shape (V, 3, 3)."""
+    def posed(self, model_from_camera: Array) -> Self:
+        """Return the surface with a camera's pose."""
+        surface = copy(self)
+        surface.model_from_camera = model_from_camera
+        return surface
 
-    @abstractmethod
-    def clearance(self, points: Array) -> Array:
-        """Return the signed distance of points, shape (N, 3), to the surface, mm; positive on the camera's side."""
+    def shape(self) -> Shape:
+        """Return the mesh; winding and normals on the camera's side."""
+        return Shape("mesh", False, np.eye(4), self.mesh, self.key)
 
     @abstractmethod
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
         """Return distance, normal and S of the surface on rays that hit the mesh; NaN if there is no solution."""
 
-    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+    @abstractmethod
+    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Return the distances of `at_hits` alone."""
-        return self.at_hits(origins, directions, hits)[0]
-
-
-class MeshedSurface(SurfaceModel):
-    """A surface that is rendered as a mesh."""
-
-    _build: BuiltMesh
-
-    def shape(self) -> Shape:
-        """Return the mesh; winding and normals on the camera's side."""
-        return Shape("mesh", False, np.eye(4), self._build.mesh, self._build.key)
-
-    def vertex_shape_operators(self) -> Array:
-        """Return S at the mesh's vertices (see `SurfaceModel.vertex_shape_operators`)."""
-        return self._build.shape_operators
-
-    def clearance(self, points: Array) -> Array:
-        """Return the signed distance to the surface (see `SurfaceModel.clearance`)."""
-        return self._build.clearance(points)
 
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Return how far along rays the surface lies (see `SurfaceModel.distances`)."""
         hit = np.flatnonzero(np.isfinite(hits.distance))
-        return in_rows(len(origins), hit, self._build.distances(origins[hit], directions[hit], hits.rows(hit)))[0]
+        return in_rows(len(origins), hit, self.distances_at_hits(origins[hit], directions[hit], hits.rows(hit)))[0]
 
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Return the points where rays meet the surface (see `SurfaceModel.points`)."""
         hit = np.flatnonzero(np.isfinite(hits.distance))
-        at_hits = self._build.at_hits(origins[hit], directions[hit], hits.rows(hit))
+        at_hits = self.at_hits(origins[hit], directions[hit], hits.rows(hit))
         return pack_points(origins, directions, *in_rows(len(origins), hit, *at_hits))

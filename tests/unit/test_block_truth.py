@@ -9,7 +9,7 @@ from simtest.rendering import backend, truth, tube_kernel
 from simtest.rendering.tube_kernel import TubeKernel
 from simtest.spec.surfaces import AnatomySurface, Relief, ReliefBand, SphereSurface
 from simtest.surfaces import RayHits, SurfacePoints, make_surface
-from simtest.surfaces.colon import BuiltColon, Colon
+from simtest.surfaces.colon import Colon
 from simtest.surfaces.model import pack_points
 from simtest.surfaces.recipe import ColonRecipe, Polyp
 from simtest.surfaces.tube import Tube, TubeChart
@@ -34,7 +34,7 @@ def hits_of(surface, origins, directions):
     if surface.shape().mesh is None:
         missed = np.arange(len(origins)) % 7 == 0
         return RayHits(np.where(missed, np.inf, 1.0), np.zeros(len(origins), dtype=int), np.zeros((len(origins), 2)))
-    probe = surface._build.probe
+    probe = surface.probe
     face, distance, barycentric = probe._tree.intersect_ray_first(
         probe._vertices, probe._faces, np.ascontiguousarray(origins), np.ascontiguousarray(directions)
     )
@@ -101,8 +101,8 @@ def test_the_kernel_solves_the_tube(recipe):
 def test_pedunculated_polyps_have_no_chart():
     polyp = Polyp(along_mm=60, around_deg=90, height_mm=7, width_mm=7, neck_mm=4)
     for polyps in ((), (polyp,)):
-        tube, surface = Tube(ColonRecipe(polyps=polyps)), object.__new__(Colon)
-        surface._build = BuiltColon(None, "", tube, np.zeros((1, 3, 2)))
+        tube = Tube(ColonRecipe(polyps=polyps))
+        surface = Colon(None, "", tube, np.zeros((1, 3, 2)))
         assert (surface.chart is None) == tube.has_stalks == bool(polyps)
 
 

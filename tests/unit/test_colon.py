@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.surfaces.colon import Colon, build
+from simtest.surfaces.colon import build, make_colon
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, Polyp, load_recipe
@@ -89,7 +89,7 @@ def test_partial_derivatives_match_finite_differences(recipe):
 @pytest.mark.parametrize("recipe", marked(MORE, ci=["pedunculated"]), indirect=True)
 def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
     """The normal from differenced positions; S from differenced normals, along the reported directions."""
-    colon, tube = Colon(recipe, 0), build(recipe).tube
+    colon, tube = make_colon(recipe, 0), build(recipe).tube
     origins, directions, hits, _ = chosen_hits(recipe, 2000)
     points = colon.points(origins, directions, hits)
     ok = points.valid
@@ -119,7 +119,7 @@ def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
 
 def test_newton_points_lie_on_ray_and_surface(recipe):
     origins, directions, hits, facing = chosen_hits(recipe)
-    points = Colon(recipe, 0).points(origins, directions, hits)
+    points = make_colon(recipe, 0).points(origins, directions, hits)
     assert points.valid.mean() > 0.999
     ok = points.valid
     _, _, off = parameters(build(recipe).tube, points.position[ok])
@@ -140,7 +140,7 @@ def test_points_at_the_seam_and_misses(recipe):
     distance = np.full(len(seam), 3.0)
     distance[0] = np.inf
     third = np.full((len(seam), 2), 1 / 3)
-    points = Colon(recipe, 0).points(centre + 3 * normal, -normal, RayHits(distance, seam, third))
+    points = make_colon(recipe, 0).points(centre + 3 * normal, -normal, RayHits(distance, seam, third))
     assert not points.valid[0]
     assert np.isnan(points.position[0]).all()
     assert points.valid[1:].all()
@@ -149,7 +149,7 @@ def test_points_at_the_seam_and_misses(recipe):
 
 @pytest.mark.parametrize("recipe", marked(MORE, ci=["shipped", "polyps and relief"]), indirect=True)
 def test_mesh_has_two_open_ends_and_normals_into_the_lumen(recipe):
-    shape = Colon(recipe, 0).shape()
+    shape = make_colon(recipe, 0).shape()
     mesh = shape.mesh
     assert shape.kind == "mesh"
     stalked = sum(polyp.neck_mm is not None for polyp in recipe.polyps)
@@ -174,7 +174,7 @@ def test_mesh_has_two_open_ends_and_normals_into_the_lumen(recipe):
 
 def test_folds_are_convex_and_walls_concave_towards_the_camera(recipe):
     origins, directions, hits, _ = chosen_hits(recipe)
-    points = Colon(recipe, 0).points(origins, directions, hits)
+    points = make_colon(recipe, 0).points(origins, directions, hits)
     assert np.nanmedian(points.k_min) < -1 / 40
     if not recipe.polyps:
         assert 1 / 5 < np.nanmax(points.k_max) < 1 / 2  # fold edges of 2 to 5 mm
@@ -237,7 +237,7 @@ def test_where_a_point_of_a_polyp_came_from_is_known_and_no_two_points_meet():
 
 def test_behind_the_head_of_a_polyp_there_is_lumen_and_in_it_tissue():
     recipe = ColonRecipe(fold_depth_mm=0.0, taenia_mm=0.0, polyps=(STALKED[0].model_copy(update={"height_mm": 12.0}),))
-    tube, colon = build(recipe).tube, Colon(recipe, 0)
+    tube, colon = build(recipe).tube, make_colon(recipe, 0)
     u, v = np.array([60.0]), np.radians([80.0])
     _, rho, tau = (part[0] for part in tube.frame(u, v))
     foot = tube.centreline(u)[0] + 22.0 * rho
@@ -270,7 +270,7 @@ def test_centreline_has_unit_speed_and_is_exact(recipe):
 
 
 def test_key_and_mesh_follow_the_recipe_alone(recipe):
-    a, b = Colon(recipe, 0).shape(), Colon(recipe, 5).shape()
+    a, b = make_colon(recipe, 0).shape(), make_colon(recipe, 5).shape()
     assert a.key == b.key
     assert a.mesh is b.mesh
 
@@ -278,7 +278,7 @@ def test_key_and_mesh_follow_the_recipe_alone(recipe):
 @pytest.mark.parametrize("more", ["shipped", pytest.param("pedunculated", marks=pytest.mark.slow)])
 def test_another_seed_is_another_mesh(more):
     recipe = load_recipe(ROOT / "meshes" / "colon.toml").model_copy(update=MORE[more])
-    a, other = (Colon(recipe.model_copy(update={"seed": seed}), 0).shape() for seed in (recipe.seed, 7))
+    a, other = (make_colon(recipe.model_copy(update={"seed": seed}), 0).shape() for seed in (recipe.seed, 7))
     assert a.key != other.key
     assert not np.array_equal(a.mesh.vertices, other.mesh.vertices)
 
@@ -286,7 +286,7 @@ def test_another_seed_is_another_mesh(more):
 @pytest.mark.parametrize("update", [{"bend_deg": 180.0, "length_mm": 40.0}, {"fold_spacing_mm": 5.0}])
 def test_impossible_tubes_are_refused(recipe, update):
     with pytest.raises(InputError, match="colon recipe"):
-        Colon(recipe.model_copy(update=update), 0)
+        make_colon(recipe.model_copy(update=update), 0)
 
 
 def test_recipes_load_and_refuse_what_is_malformed(tmp_path):
