@@ -22,7 +22,7 @@ from simtest.rendering.truth import trace_hits
 from simtest.runtime.arrays import Array
 from simtest.spec.surfaces import Relief, ReliefBand
 from simtest.surfaces import RayHits, Shape, TriangleMesh
-from simtest.surfaces.relief_field import ReliefField, fine_normals, make_relief
+from simtest.surfaces.relief_field import ReliefField, make_relief, normal_derivative
 
 WAVELENGTH_MM = 1.5
 EDGE_MM = WAVELENGTH_MM / 20
@@ -72,7 +72,7 @@ class Patch:
     def turned(self, feet: Array) -> tuple[Array, Array]:
         """Return base positions and the normals of the relief on them."""
         position, N, _ = self.base(feet)
-        return position, fine_normals(N, self.field.jets(position).gradient)
+        return position, normal_derivative(N, np.zeros((len(N), 3, 3)), self.field.jets(position))[0]
 
     def displaced(self, feet: Array, share: float = 1.0) -> tuple[Array, Array]:
         """Return positions displaced by a share of the height, and the normals of the surface that they make.
@@ -81,7 +81,7 @@ class Patch:
         """
         position, N, t = self.base(feet)
         jets = self.field.jets(position)
-        h, along, across = share * jets.height, np.sum(t * jets.gradient, axis=1), jets.gradient[:, 1]
+        h, along, across = share * jets.value, np.sum(t * jets.gradient, axis=1), jets.gradient[:, 1]
         normal = N - (along / (1 + h / self.radius))[:, None] * t - across[:, None] * np.array([0.0, 1.0, 0.0])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         return position + h[:, None] * N, normal

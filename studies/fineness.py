@@ -21,7 +21,7 @@ from simtest.errors import Failure
 from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry import Camera, Patch
 from simtest.surfaces.colon import build
-from simtest.surfaces.mesh_surface import half_width, phong_concentration, vertex_normals
+from simtest.surfaces.mesh_surface import concentration, half_width, vertex_normals
 from simtest.surfaces.recipe import ColonRecipe
 
 matplotlib.use("Agg")
@@ -142,7 +142,7 @@ def look(patch: Patches, edge: float, width: float, rng: np.random.Generator) ->
 
 def surfaces() -> dict[str, list[tuple[Patches, float]]]:
     """Return the patches of each kind of surface, each with the half-width of the highlight on it, mm."""
-    c = phong_concentration(EXPONENT)
+    c = concentration(EXPONENT)
 
     def narrow(*curvatures: float) -> float:
         return float(min(half_width(DISTANCE_MM, c, k) for k in curvatures))

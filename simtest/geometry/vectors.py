@@ -136,3 +136,19 @@ def quaternion_of(rotation: npt.ArrayLike) -> Array:
     q = products[int(squares.argmax())]
     q = q / np.linalg.norm(q)
     return np.asarray(-q if q[0] < 0 else q)
+
+
+def unit(vectors: npt.ArrayLike) -> Array:
+    """Return vectors, shape (..., 3), of unit length."""
+    vectors = np.asarray(vectors, dtype=float)
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def dot(first: Array, second: Array) -> Array:
+    """Return the scalar products of vectors, both of shape (N, 3)."""
+    return np.asarray(np.einsum("ni,ni->n", first, second))
+
+
+def projector(normals: Array) -> Array:
+    """Return I - N N^T, shape (N, 3, 3), of unit normals, shape (N, 3): the projection along each."""
+    return np.eye(3) - normals[:, :, None] * normals[:, None, :]

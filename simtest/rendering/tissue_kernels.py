@@ -13,7 +13,7 @@ from simtest.rendering.backend import dr, mi
 from simtest.rendering.kernel_values import channels
 from simtest.runtime.arrays import Array
 from simtest.surfaces import SurfaceModel
-from simtest.surfaces.deformation import DeformedSurface
+from simtest.surfaces.deformation import DeformedSurface, inverse_transpose
 from simtest.surfaces.relief_field import NODES, ReliefField
 from simtest.surfaces.vessels import ENDLESS, PRIMES
 
@@ -336,7 +336,7 @@ class RestMap:
         assert mesh is not None
         rows, columns = np.transpose(_UPPER)
         upper = jets.hessian[:, :, rows, columns].reshape(-1, 18)
-        parts = [mesh.vertices, jets.inverse_transpose.reshape(-1, 9), upper]
+        parts = [mesh.vertices, inverse_transpose(jets).reshape(-1, 9), upper]
         packed = np.zeros((len(mesh.vertices), PACKET * ROW), dtype=np.float32)
         packed[:, :30] = np.concatenate(parts, axis=1)
         self._rows, self._faces = mi.Float(packed.ravel()), mi.UInt32(mesh.faces.astype(np.uint32).ravel())

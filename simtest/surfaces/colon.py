@@ -1,19 +1,17 @@
 """A generated colon, seen from inside: exact points on rays, and the mesh that is rendered."""
 
 import math
-from dataclasses import dataclass
-from functools import lru_cache
 from hashlib import blake2b
 
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.geometry.vectors import unit
 from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
-from simtest.surfaces.model import RayHits, TriangleMesh, in_rows
+from simtest.surfaces.model import RayHits, TriangleMesh, in_rows, remembered
 from simtest.surfaces.poses import Generator, lumen_pose
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.triangles import (
-    BuiltMesh,
     MeshedSurface,
     area_vectors,
     face_edges,
@@ -43,46 +41,69 @@ _SPLITS = 6
 MAX_TRIANGLES = 5_000_000
 
 
-@dataclass(frozen=True)
-class BuiltColon(BuiltMesh):
-    """A recipe's surface and mesh."""
+class Colon(MeshedSurface):
+    """A generated colon, a shell with the camera inside."""
 
-    tube: Tube  # The surface
-    corners: Array  # (F, 3, 2): (u, v) of each triangle's corners
+    solid = False
+
+    def __init__(self, mesh: TriangleMesh, key: str, tube: Tube, corners: Array) -> None:
+        super().__init__(mesh, key)
+        self.tube = tube
+        self.corners = corners  # (F, 3, 2): (u, v) of each triangle's corners
 
     @property
-    def shape_operators(self) -> Array:
-        """S at the mesh's vertices by the tube's formulas, 1/mm, shape (V, 3, 3)."""
+    def chart(self) -> TubeChart | None:
+        """The tube's parameters on the mesh (see `SurfaceModel.chart`); None with pedunculated polyps."""
+        return None if self.tube.has_stalks else TubeChart(self.tube, self.corners)
+
+    def vertex_shape_operators(self) -> Array:
+        """Return S by the tube's formulas (see `SurfaceModel.vertex_shape_operators`)."""
         parameters = np.empty((len(self.mesh.vertices), 2))
         parameters[self.mesh.faces.ravel()] = self.corners.reshape(-1, 2)
         return self.tube.normal_and_shape_operator(parameters[:, 0], parameters[:, 1])[1]
 
     def clearance(self, points: Array) -> Array:
-        """Return the signed distance to the wall, mm; positive in the lumen (see `BuiltMesh.clearance`).
+        """Return the signed distance to the wall, mm; positive in the lumen (see `SurfaceModel.clearance`).
 
         The magnitude is the distance to the mesh. The sign is exact: a slice u = const is the plane through C(u)
         perpendicular to T(u), in which the lumen is the disc below r(u, v).
         """
         u, v, radial = self.tube.slice_of(points)
-        free = (radial < self.tube.radius(u, v).f) & (u >= 0) & (u <= self.tube.recipe.length_mm)
+        free = (radial < self.tube.radius(u, v).value) & (u >= 0) & (u <= self.tube.recipe.length_mm)
         return np.where(free, 1.0, -1.0) * self.probe.distance(points)
 
-    def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return exact points by Newton's method from (u, v) of the hits; a ray that only grazes the mesh has none."""
+    def _solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
+        """Solve for distance, u and v by Newton's method from the hits; a ray that only grazes the mesh has none."""
         u, v = np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
-        distance, u, v = self.tube.solve(origins, directions, hits.distance, u, v)
+        return self.tube.solve(origins, directions, hits.distance, u, v)
+
+    def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
+        """Return exact points (see `MeshedSurface.at_hits`)."""
+        distance, u, v = self._solved(origins, directions, hits)
         good = np.flatnonzero(np.isfinite(distance))
         normals, operators = in_rows(len(u), good, *self.tube.normal_and_shape_operator(u[good], v[good]))
         return distance, normals, operators
 
-    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Return the distances of `at_hits` alone (see `BuiltMesh.distances`)."""
-        u, v = np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
-        return self.tube.solve(origins, directions, hits.distance, u, v)[0]
+    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return exact distances (see `MeshedSurface.distances_at_hits`)."""
+        return self._solved(origins, directions, hits)[0]
+
+    def sites(self, rng: Generator) -> Array:
+        """Draw sites around the middle part of the centreline, shape (N, 3), mm."""
+        recipe, count = self.tube.recipe, 32
+        u, v = recipe.length_mm * rng.uniform(0.2, 0.8, count), rng.uniform(0, 2 * math.pi, count)
+        radial = 0.6 * np.sqrt(rng.random(count)) * self.tube.radius(u, v).value
+        return self.tube.centreline(u) + radial[:, None] * self.tube.frame(u, v)[1]
 
 
-@lru_cache(maxsize=4)
-def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
+def make_colon(recipe: ColonRecipe, viewpoint: int) -> Colon:
+    """Return a colon with a camera at the pose numbered by `viewpoint`."""
+    colon = build(recipe)
+    return colon.posed(lumen_pose(recipe.type, viewpoint, colon.sites, colon.clearance, colon.probe.cast))
+
+
+@remembered
+def build(recipe: ColonRecipe, edge_mm: float | None = None) -> Colon:
     """Make the surface and the mesh of a recipe, with normals into the lumen.
 
     `edge_mm` is the side of the mesh's cells on the bare tube; default about `TRIANGLES` triangles. Raises `InputError`
@@ -92,7 +113,7 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> BuiltColon:
     arrays = {**kept("colon", key, lambda: _mesh(tube, edge_mm))}
     corners = arrays.pop("corners")
     digest = blake2b(key.encode(), digest_size=12).hexdigest()
-    return BuiltColon(TriangleMesh(**arrays), f"colon-{digest}", tube, corners)
+    return Colon(TriangleMesh(**arrays), f"colon-{digest}", tube, corners)
 
 
 def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
@@ -135,7 +156,7 @@ def _positions(tube: Tube, parameters: Array) -> tuple[Array, Array]:
     """Return positions, mm, and unit normals into the lumen at (u, v), each of shape (N, 3)."""
     positions, along, around = tube.tangents(parameters[:, 0], parameters[:, 1])
     normals = np.cross(along, around)
-    return positions, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return positions, unit(normals)
 
 
 def _split(
@@ -177,31 +198,5 @@ def _split(
 
 def _facing(positions: Array, normals: Array, faces: IntArray) -> Array:
     """Return the least cosine between a triangle's normal and those at its corners, shape (F,)."""
-    cross = area_vectors(positions, faces)
-    cross /= np.linalg.norm(cross, axis=1, keepdims=True)
+    cross = unit(area_vectors(positions, faces))
     return np.asarray(np.einsum("ni,nci->nc", cross, normals[faces]).min(axis=1))
-
-
-class Colon(MeshedSurface):
-    """A generated colon with a camera inside, at the pose numbered by `viewpoint`; a shell."""
-
-    solid = False
-
-    def __init__(self, recipe: ColonRecipe, viewpoint: int) -> None:
-        self._build: BuiltColon = build(recipe)
-        self.model_from_camera = lumen_pose(
-            recipe.type, viewpoint, self._sites, self._build.clearance, self._build.probe.cast
-        )
-
-    @property
-    def chart(self) -> TubeChart | None:
-        """The tube's parameters on the mesh (see `SurfaceModel.chart`); None with pedunculated polyps."""
-        tube = self._build.tube
-        return None if tube.has_stalks else TubeChart(tube, self._build.corners)
-
-    def _sites(self, rng: Generator) -> Array:
-        """Draw sites around the middle part of the centreline, shape (N, 3), mm."""
-        recipe, tube, count = self._build.tube.recipe, self._build.tube, 32
-        u, v = recipe.length_mm * rng.uniform(0.2, 0.8, count), rng.uniform(0, 2 * math.pi, count)
-        radial = 0.6 * np.sqrt(rng.random(count)) * tube.radius(u, v).f
-        return tube.centreline(u) + radial[:, None] * tube.frame(u, v)[1]

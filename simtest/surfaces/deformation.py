@@ -8,15 +8,16 @@ operators follow from these.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from simtest.geometry.vectors import rotation
+from simtest.geometry.vectors import projector, rotation, unit
 from simtest.runtime.arrays import Array, Mask
 from simtest.spec.surfaces import MAX_STRETCH, Breathing, Contractions, Deformation, Dent, Peristalsis
+from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import (
     RayHits,
     Shape,
@@ -27,7 +28,7 @@ from simtest.surfaces.model import (
     pack_points,
     shape_operator,
 )
-from simtest.surfaces.relief_field import HeightJets, ReliefField
+from simtest.surfaces.relief_field import ReliefField
 
 CONVERGED_MM = 1e-12
 """Residual at which the inverse is found; rounding ends the steps earlier for coordinates of 1000 mm and more."""
@@ -39,28 +40,20 @@ INVERSE_STEPS = 400
 """Enough for the fixed-point iteration alone: 0.9^400 of any start."""
 
 
-@dataclass(frozen=True)
-class MapJets:
-    """A map of space at points, with its first two derivatives."""
+def inverse_transpose(jets: Jet) -> Array:
+    """Return J^-T, shape (N, 3, 3), of a map of space."""
+    return np.asarray(np.swapaxes(np.linalg.inv(jets.gradient), 1, 2))
 
-    value: Array  # (N, 3): images, mm
-    jacobian: Array  # (N, 3, 3): derivative of component i along axis j at [:, i, j]
-    hessian: Array  # (N, 3, 3, 3): second derivative of component i along axes j and k at [:, i, j, k], 1/mm
 
-    @cached_property
-    def inverse_transpose(self) -> Array:
-        """J^-T, shape (N, 3, 3)."""
-        return np.asarray(np.swapaxes(np.linalg.inv(self.jacobian), 1, 2))
+def carry(jets: Jet, gradient: Array, hessian: Array) -> tuple[Array, Array]:
+    """Return gradient, (N, 3), and Hessian, (N, 3, 3), of F o phi^-1 at the images of a map, from those of F.
 
-    def carry(self, gradient: Array, hessian: Array) -> tuple[Array, Array]:
-        """Return gradient, (N, 3), and Hessian, (N, 3, 3), of F o phi^-1 at the images, from those of F.
-
-        For a derivative of a normal field within a plane in place of a Hessian, the result is that of J^-T N.
-        """
-        K = self.inverse_transpose
-        g = np.einsum("nij,nj->ni", K, gradient)
-        bent = hessian - (g[:, None] @ self.hessian.reshape(-1, 3, 9)).reshape(-1, 3, 3)
-        return g, np.asarray(K @ bent @ np.swapaxes(K, 1, 2))
+    For a derivative of a normal field within a plane in place of a Hessian, the result is that of J^-T N.
+    """
+    K = inverse_transpose(jets)
+    g = np.einsum("nij,nj->ni", K, gradient)
+    bent = hessian - (g[:, None] @ jets.hessian.reshape(-1, 3, 9)).reshape(-1, 3, 3)
+    return g, np.asarray(K @ bent @ np.swapaxes(K, 1, 2))
 
 
 class _Part(ABC):
@@ -70,24 +63,16 @@ class _Part(ABC):
     centre: Array = np.zeros(3)
 
     @abstractmethod
-    def displacement(self, points: Array, order: int) -> tuple[Array, ...]:
-        """Return u, and its first and second derivatives up to an order, at points, shape (N, 3)."""
+    def displacement(self, X: Jet) -> Jet:
+        """Return u."""
 
-    def jets(self, points: Array) -> MapJets:
-        u, first, second = self.displacement(points, 2)
-        R = self.turn
-        second = (R @ second.reshape(-1, 3, 9)).reshape(-1, 3, 3, 3)
-        return MapJets(self._turned(points + u), R @ (np.eye(3) + first), second)
-
-    def moved(self, points: Array) -> Array:
-        return self._turned(points + self.displacement(points, 0)[0])
+    def moved(self, X: Jet) -> Jet:
+        """Return where points go."""
+        return (X + self.displacement(X)).affine(1.0, -self.centre).linear(self.turn, self.centre)
 
     def near(self, points: Array) -> Mask | None:
         """Return which points, shape (N, 3), the part moves by more than rounding; None: it may move all."""
         return None
-
-    def _turned(self, points: Array) -> Array:
-        return np.asarray((points - self.centre) @ self.turn.T + self.centre)
 
     def at_rest(self, points: Array) -> Array:
         """Invert: Newton's method, with fixed-point steps where it does not contract as these do."""
@@ -95,7 +80,7 @@ class _Part(ABC):
         X = target.copy()
         # NaN stays NaN.
         open_ = np.flatnonzero(np.isfinite(target).all(axis=1))
-        u, J = self.displacement(X[open_], 1)
+        u, J = self.displacement(Jet.variables(X[open_], 1)).parts
         residual = target[open_] - X[open_] - u
         size = np.linalg.norm(residual, axis=1)
         for _ in range(INVERSE_STEPS):
@@ -105,68 +90,35 @@ class _Part(ABC):
                 break
             step = np.linalg.solve(np.eye(3) + J, residual[..., None])[..., 0]
             tried = X[open_] + step
-            u, J = self.displacement(tried, 1)
+            u, J = self.displacement(Jet.variables(tried, 1)).parts
             left = target[open_] - tried - u
             now = np.linalg.norm(left, axis=1)
             slow = now > MAX_STRETCH * size
             if slow.any():
                 # X + residual = target - u(X): the residual shrinks by the Lipschitz bound at least.
                 tried[slow] = X[open_][slow] + residual[slow]
-                u, J[slow] = self.displacement(tried[slow], 1)
+                u, J[slow] = self.displacement(Jet.variables(tried[slow], 1)).parts
                 left[slow] = target[open_][slow] - tried[slow] - u
                 now = np.linalg.norm(left, axis=1)
             X[open_], residual, size = tried, left, now
         return X
 
 
-def _inward(P: Array, r: Array, amount: Sequence[Array]) -> tuple[Array, ...]:
-    """Return u = f r and its derivatives from f and its own; r = P (X - c), shape (N, 3), P a projection."""
-    f = amount[0]
-    parts = [f[:, None] * r]
-    if len(amount) > 1:
-        df = amount[1]
-        parts.append(f[:, None, None] * P + r[:, :, None] * df[:, None, :])
-    if len(amount) > 2:
-        # d2 u_i/dX_j dX_k = P_ij df_k + P_ik df_j + r_i Hess f_jk
-        parts.append(
-            np.einsum("ij,nk->nijk", P, df) + np.einsum("ik,nj->nijk", P, df) + np.einsum("ni,njk->nijk", r, amount[2])
-        )
-    return tuple(parts)
-
-
 class _Contraction(_Part):
     """Peristalsis: u = -a w(z) r exp((1 - |r|^2/R^2)/2), a = A/R, r = P (X - c) the part across the axis."""
 
     def __init__(self, spec: Peristalsis, time_s: float) -> None:
-        self._axis, self._origin = _unit(spec.axis), np.array(spec.centre_mm)
+        self._axis, self._origin = unit(spec.axis), np.array(spec.centre_mm)
         self._across = np.eye(3) - np.outer(self._axis, self._axis)
         self._a, self._R2 = spec.amplitude_mm / spec.radius_mm, spec.radius_mm**2
         self._k, self._cycle = 2 * math.pi / spec.wavelength_mm, 2 * math.pi * spec.cycles(time_s)
 
-    def displacement(self, points: Array, order: int) -> tuple[Array, ...]:
-        P, e, R2, k = self._across, self._axis, self._R2, self._k
-        gap = points - self._origin
-        angle = k * (gap @ e) - self._cycle
-        r = gap @ P
-        w = (1 + np.cos(angle)) / 2
-        g = -self._a * np.exp((1 - np.sum(r * r, axis=1) / R2) / 2)
-        # The scalar f = w g, u = f r; its gradient is g w' e - f r/R^2.
-        f = w * g
-        amount = [f]
-        if order:
-            along = -k / 2 * np.sin(angle) * g
-            amount.append(along[:, None] * e - f[:, None] * r / R2)
-        if order > 1:
-            # Hess f = g w'' e e^T - (w' g/R^2)(e r^T + r e^T) - f P/R^2 + f r r^T/R^4.
-            bent = -(k * k) / 2 * np.cos(angle) * g
-            er = e[None, :, None] * r[:, None, :]
-            amount.append(
-                bent[:, None, None] * np.outer(e, e)
-                - (along / R2)[:, None, None] * (er + np.swapaxes(er, 1, 2))
-                - (f / R2)[:, None, None] * P
-                + (f / R2**2)[:, None, None] * r[:, :, None] * r[:, None, :]
-            )
-        return _inward(P, r, amount)
+    def displacement(self, X: Jet) -> Jet:
+        from_centre = X.affine(1.0, -self._origin)
+        r = from_centre.linear(self._across)
+        w = from_centre.along(self._axis).affine(self._k, -self._cycle).cos().affine(0.5, 0.5)
+        g = r.squared().affine(-0.5 / self._R2, 0.5).exp().affine(-self._a)
+        return w * g * r
 
 
 class _Ring(_Part):
@@ -176,23 +128,17 @@ class _Ring(_Part):
         self._axis, self._origin = tangent, centre
         self._across = np.eye(3) - np.outer(tangent, tangent)
         self._a = amplitude_mm / spec.radius_mm
-        # The exponent is -X^T Q X/2.
-        self._Q = self._across / spec.radius_mm**2 + np.outer(tangent, tangent) / spec.width_mm**2
+        self._R2, self._width2 = spec.radius_mm**2, spec.width_mm**2
         self._reach = RING_REACH * max(spec.radius_mm, spec.width_mm)
 
     def near(self, points: Array) -> Mask:
         return np.asarray(np.linalg.norm(points - self._origin, axis=1) < self._reach)
 
-    def displacement(self, points: Array, order: int) -> tuple[Array, ...]:
-        gap = points - self._origin
-        slope = gap @ self._Q
-        f = -self._a * np.exp((1 - np.sum(gap * slope, axis=1)) / 2)
-        amount = [f]
-        if order:
-            amount.append(-f[:, None] * slope)
-        if order > 1:
-            amount.append(f[:, None, None] * (slope[:, :, None] * slope[:, None, :] - self._Q))
-        return _inward(self._across, gap @ self._across, amount)
+    def displacement(self, X: Jet) -> Jet:
+        from_centre = X.affine(1.0, -self._origin)
+        r, z = from_centre.linear(self._across), from_centre.along(self._axis)
+        exponent = r.squared().affine(-0.5 / self._R2) + (z * z).affine(-0.5 / self._width2, 0.5)
+        return exponent.exp().affine(-self._a) * r
 
 
 def _rings(spec: Contractions, time_s: float) -> list[_Part]:
@@ -218,64 +164,33 @@ def _on_curve(at: Array, nodes: Array, slopes: Array, s: float) -> tuple[Array, 
     near, far, m, n = nodes[i], nodes[i + 1], h * slopes[i], h * slopes[i + 1]
     point = (1 + 2 * t) * (1 - t) ** 2 * near + t * (1 - t) ** 2 * m + t * t * (3 - 2 * t) * far + t * t * (t - 1) * n
     change = 6 * t * (1 - t) * (far - near) + (1 - t) * (1 - 3 * t) * m + t * (3 * t - 2) * n
-    return point, _unit(change)
+    return point, unit(change)
 
 
-class _Along(_Part):
-    """A displacement along one direction: u = v f(X)."""
-
-    def __init__(self, direction: Array) -> None:
-        self._direction = direction
-
-    @abstractmethod
-    def amount(self, points: Array, order: int) -> tuple[Array, ...]:
-        """Return f, and its gradient and Hessian up to an order."""
-
-    def displacement(self, points: Array, order: int) -> tuple[Array, ...]:
-        v = self._direction
-        return tuple(np.asarray(np.multiply.outer(v, part).swapaxes(0, 1)) for part in self.amount(points, order))
-
-
-class _Breath(_Along):
-    """Breathing: f = A s (1 - warp (1 - cos(k b))/2), then a turn."""
+class _Breath(_Part):
+    """Breathing: u = v A s (1 - warp (1 - cos(k b))/2), then a turn."""
 
     def __init__(self, spec: Breathing, time_s: float) -> None:
-        super().__init__(_unit(spec.direction))
         share = spec.share(time_s)
+        self._direction, self._amplitude, self._warp = unit(spec.direction), spec.amplitude_mm * share, spec.warp
+        self._along, self._k = unit(spec.along), 2 * math.pi / spec.wavelength_mm
         self.centre = np.array(spec.centre_mm)
-        self.turn = rotation(math.radians(spec.turn_deg) * share * _unit(spec.axis))
-        self._along, self._k = _unit(spec.along), 2 * math.pi / spec.wavelength_mm
-        self._amplitude, self._warp = spec.amplitude_mm * share, spec.warp
+        self.turn = rotation(math.radians(spec.turn_deg) * share * unit(spec.axis))
 
-    def amount(self, points: Array, order: int) -> tuple[Array, ...]:
-        b, k, A, warp = self._along, self._k, self._amplitude, self._warp
-        angle = k * ((points - self.centre) @ b)
-        parts = [A * (1 - warp * (1 - np.cos(angle)) / 2)]
-        if order:
-            parts.append((-A * warp * k / 2 * np.sin(angle))[:, None] * b)
-        if order > 1:
-            parts.append((-A * warp * k * k / 2 * np.cos(angle))[:, None, None] * np.outer(b, b))
-        return tuple(parts)
+    def displacement(self, X: Jet) -> Jet:
+        cosine = X.affine(1.0, -self.centre).along(self._along).affine(self._k).cos()
+        return cosine.affine(self._warp / 2, 1 - self._warp / 2).outer(self._amplitude * self._direction)
 
 
-class _Press(_Along):
-    """Dent: f = A s exp(-|X - c|^2/(2 w^2))."""
+class _Press(_Part):
+    """Dent: u = v A s exp(-|X - c|^2/(2 w^2))."""
 
     def __init__(self, spec: Dent, time_s: float) -> None:
-        super().__init__(_unit(spec.direction))
+        self._move = spec.amplitude_mm * spec.share(time_s) * unit(spec.direction)
         self._origin, self._w2 = np.array(spec.centre_mm), spec.radius_mm**2
-        self._amplitude = spec.amplitude_mm * spec.share(time_s)
 
-    def amount(self, points: Array, order: int) -> tuple[Array, ...]:
-        gap, w2 = points - self._origin, self._w2
-        f = self._amplitude * np.exp(-np.sum(gap * gap, axis=1) / (2 * w2))
-        parts = [f]
-        if order:
-            parts.append(-f[:, None] / w2 * gap)
-        if order > 1:
-            outer = gap[:, :, None] * gap[:, None, :]
-            parts.append(f[:, None, None] * (outer / w2**2 - np.eye(3) / w2))
-        return tuple(parts)
+    def displacement(self, X: Jet) -> Jet:
+        return X.affine(1.0, -self._origin).squared().affine(-0.5 / self._w2).exp().outer(self._move)
 
 
 class DeformationAt:
@@ -303,48 +218,31 @@ class DeformationAt:
 
     def moved(self, points: Array) -> Array:
         """Return where points at rest, shape (N, 3), model frame, mm, are now."""
-        for part in self._parts:
-            points = _where_near(part, points, part.moved)
-        return points
+        return self._applied(Jet(points)).value
 
     def at_rest(self, points: Array) -> Array:
         """Return where the points that are now at `points`, shape (N, 3), model frame, mm, are at rest."""
         for part in reversed(self._parts):
-            points = _where_near(part, points, part.at_rest)
+            near = part.near(points)
+            if near is None:
+                points = part.at_rest(points)
+            elif near.any():
+                points = points.copy()
+                points[near] = part.at_rest(points[near])
         return points
 
-    def jets(self, points: Array) -> MapJets:
+    def jets(self, points: Array) -> Jet:
         """Return the map and its derivatives at points at rest, shape (N, 3), model frame, mm."""
-        count = len(points)
-        jets = MapJets(points, np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3, 3, 3)))
-        for i, part in enumerate(self._parts):
-            near = part.near(jets.value)
+        return self._applied(Jet.variables(points))
+
+    def _applied(self, X: Jet) -> Jet:
+        for part in self._parts:
+            near = part.near(X.value)
             if near is None:
-                jets = part.jets(jets.value) if i == 0 else _after(part, jets)
+                X = part.moved(X)
             elif near.any():
-                whole = MapJets(jets.value.copy(), jets.jacobian.copy(), jets.hessian.copy())
-                own = _after(part, MapJets(jets.value[near], jets.jacobian[near], jets.hessian[near]))
-                whole.value[near], whole.jacobian[near], whole.hessian[near] = own.value, own.jacobian, own.hessian
-                jets = whole
-        return jets
-
-
-def _where_near(part: _Part, points: Array, move: Callable[[Array], Array]) -> Array:
-    """Apply a part, forwards or back, to the points that it reaches."""
-    near = part.near(points)
-    if near is None:
-        return move(points)
-    moved = points.copy()
-    moved[near] = move(points[near])
-    return moved
-
-
-def _after(part: _Part, jets: MapJets) -> MapJets:
-    """Return the jets of a part applied to a map: H = J2 H1 + H2[J1, J1]."""
-    own, J = part.jets(jets.value), jets.jacobian
-    bent = (own.jacobian @ jets.hessian.reshape(-1, 3, 9)).reshape(-1, 3, 3, 3)
-    bent += np.swapaxes(J, 1, 2)[:, None] @ own.hessian @ J[:, None]
-    return MapJets(own.value, own.jacobian @ J, bent)
+                X = X.with_rows(near, part.moved(X.rows(near)))
+        return X
 
 
 def _parts_of(spec: Deformation, time_s: float) -> list[_Part]:
@@ -357,11 +255,6 @@ def _parts_of(spec: Deformation, time_s: float) -> list[_Part]:
             return [_Press(spec, time_s)]
         case Contractions():
             return _rings(spec, time_s)
-
-
-def _unit(vector: Sequence[float]) -> Array:
-    values = np.array(vector, dtype=float)
-    return np.asarray(values / np.linalg.norm(values))
 
 
 NEWTON_STEPS = 12
@@ -384,13 +277,12 @@ class DeformedRelief(ReliefField):
 
     deformation: DeformationAt | None = None  # The moment's deformation of the model frame
 
-    def tissue_jets(self, points: Array, diffused: bool = False) -> HeightJets:
+    def tissue_jets(self, points: Array, diffused: bool = False) -> Jet:
         """Compute the jets of the tissue below the film at deformed points, shape (N, 3), model frame, mm."""
         assert self.deformation is not None
         rest = self.deformation.at_rest(points)
         own = super().tissue_jets(rest, diffused)
-        gradient, hessian = self.deformation.jets(rest).carry(own.gradient, own.hessian)
-        return HeightJets(own.height, gradient, hessian)
+        return Jet(own.value, *carry(self.deformation.jets(rest), own.gradient, own.hessian))
 
 
 def stays_in_free_space(rest: SurfaceModel, parts: Sequence[Deformation], time_s: float, point: Array) -> bool:
@@ -430,17 +322,17 @@ class DeformedSurface(SurfaceModel):
         if rest.relief is not None:
             parts = {name: getattr(rest.relief, name) for name in ("bands", "deviation", "level")}
             # Where tissue is compressed its waves are shorter.
-            shortest = float(np.linalg.svd(self.vertex_jets.jacobian, compute_uv=False).min())
+            shortest = float(np.linalg.svd(self.vertex_jets.gradient, compute_uv=False).min())
             wave = rest.relief.finest_wave * min(1.0, shortest)
             self.relief = DeformedRelief(**parts, finest_wave=wave, deformation=deformation)
 
     @property
     def at_rest(self) -> SurfaceModel:
-        """The surface before its deformation, in its closed form where it has one."""
-        return self.rest.at_rest
+        """The surface before its deformation."""
+        return self.rest
 
     @cached_property
-    def vertex_jets(self) -> MapJets:
+    def vertex_jets(self) -> Jet:
         """The map at the vertices of the mesh at rest."""
         return self.deformation.jets(self._rest_mesh.vertices)
 
@@ -449,7 +341,7 @@ class DeformedSurface(SurfaceModel):
         """Normals at the deformed vertices, and shape operators for them."""
         operators = self.rest.vertex_shape_operators()
         forms = np.zeros((len(self._rest_mesh.vertices), 3, 3)) if operators is None else operators
-        normal, operators_now = implicit_shape_operator(*self.vertex_jets.carry(self._rest_mesh.normals, forms))
+        normal, operators_now = implicit_shape_operator(*carry(self.vertex_jets, self._rest_mesh.normals, forms))
         return normal, None if operators is None else operators_now
 
     @cached_property
@@ -477,12 +369,11 @@ class DeformedSurface(SurfaceModel):
         if len(found):
             own = replace(hits, distance=distance).rows(found)
             solved[found], points, jets = self._solve(origins[found], directions[found], own)
-            normal[found], operator[found] = implicit_shape_operator(
-                *jets.carry(points.normal_base, shape_operator(points))
-            )
+            carried = carry(jets, points.normal_base, shape_operator(points))
+            normal[found], operator[found] = implicit_shape_operator(*carried)
         return pack_points(origins, directions, solved, normal, operator)
 
-    def _solve(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, SurfacePoints, MapJets]:
+    def _solve(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, SurfacePoints, Jet]:
         """Return distances along rays, the points at rest that they meet there, and the map at these."""
         t = hits.distance.copy()
         # The renderer's hit lies on a flat triangle of the deformed mesh.
@@ -497,13 +388,11 @@ class DeformedSurface(SurfaceModel):
             settled = (np.abs(step) < SETTLED_MM) & (t > 0)
         return np.where(settled, t, np.nan), points, jets
 
-    def _tangent_step(
-        self, at: Array, directions: Array, hits: RayHits, t: Array
-    ) -> tuple[SurfacePoints, Array, MapJets]:
+    def _tangent_step(self, at: Array, directions: Array, hits: RayHits, t: Array) -> tuple[SurfacePoints, Array, Jet]:
         """Meet the tangents of the rays' curves at rest with the surface; return how far along the rays that is."""
         X = self.deformation.at_rest(at)
         jets = self.deformation.jets(X)
-        tangent = np.einsum("nji,nj->ni", jets.inverse_transpose, directions)
+        tangent = np.einsum("nji,nj->ni", inverse_transpose(jets), directions)
         speed = np.linalg.norm(tangent, axis=1)
         tangent /= speed[:, None]
         reach = REACH * t
@@ -517,11 +406,9 @@ class DeformedSurface(SurfaceModel):
             return super().motion(points, hits)
         # Within a triangle at rest, carried along.
         jets = self.deformation.jets(self.deformation.at_rest(points.position))
-        normal = np.einsum("nji,nj->ni", jets.jacobian, points.normal_base)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = unit(np.einsum("nji,nj->ni", jets.gradient, points.normal_base))
         plane, derivative = self.rest.motion(replace(points, normal_base=normal), hits)
-        K = jets.inverse_transpose
-        g, derivative = jets.carry(normal, derivative)
+        g, derivative = carry(jets, normal, derivative)
         length = np.linalg.norm(g, axis=1)
-        across = np.eye(3) - points.normal_base[:, :, None] * points.normal_base[:, None, :]
-        return np.einsum("nij,nj->ni", K, plane), across @ derivative / length[:, None, None]
+        across = projector(points.normal_base)
+        return np.einsum("nij,nj->ni", inverse_transpose(jets), plane), across @ derivative / length[:, None, None]

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
@@ -15,10 +16,18 @@ from simtest.spec.surfaces import (
     SphereSurface,
     Surface,
 )
-from simtest.surfaces.analytic import Cylinder, GradedMesh, Plane, Quadric, Sphere
+from simtest.surfaces.analytic import Cylinder, Plane, Quadric, Sphere
 from simtest.surfaces.mesh_file import MESH_SUFFIXES
-from simtest.surfaces.model import SurfaceModel, TriangleMesh, principal_curvatures
+from simtest.surfaces.model import CACHES, SurfaceModel, TriangleMesh, principal_curvatures
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
+
+ANALYTIC: dict[type, Any] = {
+    PlaneSurface: Plane,
+    SphereSurface: Sphere,
+    CylinderSurface: Cylinder,
+    QuadricSurface: Quadric,
+}
+"""The models of analytic surfaces by their descriptions."""
 
 
 def make_surface(
@@ -43,7 +52,12 @@ def make_surface(
     time_s : float
         The moment of the deformation, s.
     """
-    surface = _make_base(spec)
+    surface: SurfaceModel = _make_anatomy(spec) if isinstance(spec, AnatomySurface) else ANALYTIC[type(spec)](spec)
+    if isinstance(spec, AnatomySurface) and spec.view != "auto":
+        # Imported here, as the mesh libraries below.
+        from simtest.surfaces.poses import path_pose
+
+        surface.model_from_camera = path_pose(spec, surface)
     if moved is not None:
         surface.model_from_camera = surface.model_from_camera @ moved.pose()
     if spec.relief is not None:
@@ -56,59 +70,37 @@ def make_surface(
         from simtest.surfaces.deformation import DeformationAt, DeformedSurface
 
         if isinstance(surface, Plane | Sphere | Cylinder):
-            surface = GradedMesh(surface)
+            surface.as_mesh = True
         return DeformedSurface(surface, DeformationAt(deformation, time_s))
     return surface
 
 
-def _make_base(spec: Surface) -> SurfaceModel:
-    match spec:
-        case PlaneSurface():
-            return Plane(spec)
-        case SphereSurface():
-            return Sphere(spec)
-        case CylinderSurface():
-            return Cylinder(spec)
-        case QuadricSurface():
-            return Quadric(spec)
-        case AnatomySurface():
-            surface = _make_anatomy(spec)
-            if spec.view != "auto":
-                # Imported here, as the mesh libraries below.
-                from simtest.surfaces.poses import path_pose
-
-                surface.model_from_camera = path_pose(spec, surface)
-            return surface
-
-
 def forget_meshes() -> None:
     """Free the meshes that are cached for further scenes of the last few anatomies."""
-    from simtest.surfaces import colon, liver, mesh_surface, poses, relief_field, tissue_pattern, vessels
-
-    meshes = (poses._camera_path, colon.build, liver.build, mesh_surface._prepare)
-    reliefs, patterns = (relief_field._make_field, relief_field._unscaled), (tissue_pattern._make, tissue_pattern._bare)
-    for cached in (*meshes, *reliefs, *patterns, vessels.grow_vessels):
+    for cached in CACHES:
         cached.cache_clear()
 
 
 def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
     # Imported here: the mesh libraries are slow to load and analytic scenes do not need them.
-    from simtest.surfaces.colon import Colon
-    from simtest.surfaces.liver import Liver
-    from simtest.surfaces.mesh_surface import MeshSurface
+    from simtest.surfaces.colon import make_colon
+    from simtest.surfaces.liver import make_liver
+    from simtest.surfaces.mesh_surface import make_mesh_surface
 
     suffix = Path(spec.path).suffix.lower()
     if suffix in MESH_SUFFIXES:
         if spec.recipe_values:
             raise InputError(f"surface.path = {spec.path!r}: a mesh has no recipe; leave out seed and recipe")
-        return MeshSurface(spec)
+        return make_mesh_surface(spec)
     if suffix not in ("", ".toml"):
         allowed = ", ".join((".toml", *MESH_SUFFIXES))
         raise InputError(
             f"surface.path = {spec.path!r}: unknown suffix {suffix}; allowed: {allowed}, or a recipe's name"
         )
     recipe = load_recipe(spec.file(), spec.recipe_values)
-    return Colon(recipe, spec.viewpoint) if isinstance(recipe, ColonRecipe) else Liver(recipe, spec.viewpoint)
+    if isinstance(recipe, ColonRecipe):
+        return make_colon(recipe, spec.viewpoint)
+    return make_liver(recipe, spec.viewpoint)
 
 
 def make_mesh(recipe: ColonRecipe | LiverRecipe, edge_mm: float | None = None) -> tuple[TriangleMesh, Array, Array]:
@@ -132,4 +124,4 @@ def make_mesh(recipe: ColonRecipe | LiverRecipe, edge_mm: float | None = None) -
     if edge_mm is not None and not 0.01 <= edge_mm <= 20:
         raise InputError(f"edge_mm = {edge_mm:g}: must be 0.01 to 20 mm")
     build = colon.build(recipe, edge_mm) if isinstance(recipe, ColonRecipe) else liver.build(recipe, edge_mm)
-    return build.mesh, *principal_curvatures(build.shape_operators)
+    return build.mesh, *principal_curvatures(build.vertex_shape_operators())

@@ -14,19 +14,19 @@ All are lengths in mm; F < 0 in the tissue.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import lru_cache
 from hashlib import blake2b
 
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, IntArray, Mask, kept
 from simtest.runtime.seeds import Stage, generator
-from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows
+from simtest.surfaces.jets import Jet
+from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows, remembered
 from simtest.surfaces.poses import organ_pose
 from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
-from simtest.surfaces.triangles import BuiltMesh, MeshedSurface, face_edges, halve, rough_edges
+from simtest.surfaces.triangles import MeshedSurface, face_edges, halve, rough_edges
 
 SIDE = 4
 """Cells along the side of a block of the grid."""
@@ -91,33 +91,22 @@ _EVENING_STEPS = 8
 _SPLITS = 3
 
 
-@dataclass(frozen=True)
-class _Value:
-    """A function with gradient and Hessian, of shapes (N,), (N, 3), and (N, 3, 3) or, if not wanted, (0, 3, 3)."""
-
-    f: Array
-    gradient: Array
-    hessian: Array
-
-
-def _soft_max(parts: list[_Value], width: float) -> _Value:
+def _soft_max(parts: list[Jet], width: float) -> Jet:
     """Return width log sum exp(part / width) with its derivatives; a negative width makes it a smooth minimum."""
     # Relative to the largest exponent, so that none overflows.
-    values = np.stack([part.f for part in parts]) / width
+    values = np.stack([part.value for part in parts]) / width
     top = values.max(axis=0)
     weights = np.exp(values - top)
     total = weights.sum(axis=0)
     weights /= total
+    value = width * (top + np.log(total))
     gradient = sum((w[:, None] * part.gradient for w, part in zip(weights, parts, strict=True)), np.zeros(()))
-    if not len(parts[0].hessian):
-        return _Value(width * (top + np.log(total)), gradient, _UNWANTED)
+    if len(parts[0].parts) < 3:
+        return Jet(value, gradient)
     hessian = -_outer(gradient) / width
     for w, part in zip(weights, parts, strict=True):
         hessian = hessian + w[:, None, None] * (part.hessian + _outer(part.gradient) / width)
-    return _Value(width * (top + np.log(total)), gradient, hessian)
-
-
-_UNWANTED = np.empty((0, 3, 3))
+    return Jet(value, gradient, hessian)
 
 
 def _outer(vectors: Array) -> Array:
@@ -135,8 +124,7 @@ class Body:
         self._normal = normal / np.linalg.norm(normal)
         # Stage.SWEEP: the shape is part of the case, not of a realisation's rendering or noise.
         rng = generator(recipe.seed, "anatomy", "liver", 0, Stage.SWEEP)
-        directions = rng.normal(size=(_WAVES, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        directions = unit(rng.normal(size=(_WAVES, 3)))
         lengths = recipe.relief_length_mm * rng.uniform(0.8, 1.25, size=_WAVES)
         self._waves = 2 * math.pi / lengths[:, None] * directions
         self._phases = rng.uniform(0, 2 * math.pi, size=_WAVES)
@@ -151,7 +139,7 @@ class Body:
     def normals(self, points: Array) -> Array:
         """Return the unit outward normals of the level sets through points, shape (N, 3)."""
         gradient = in_blocks(lambda some: self.evaluate(some, second=False).gradient, points)
-        return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
+        return unit(gradient)
 
     def values(self, points: Array) -> Array:
         """Return F, mm, at points of shape (N, 3), without derivatives, for large grids."""
@@ -184,30 +172,31 @@ class Body:
             steepest = np.maximum(steepest, own)
         return np.asarray(steepest + self.recipe.relief_mm * np.linalg.norm(self._waves, axis=1).sum())
 
-    def evaluate(self, points: Array, second: bool = True) -> _Value:
+    def evaluate(self, points: Array, second: bool = True) -> Jet:
         """Return F, mm, with gradient and, if `second`, Hessian, 1/mm, at points of shape (N, 3)."""
-        count = len(points) if second else 0
 
-        def same(matrix: Array) -> Array:
-            return np.broadcast_to(matrix, (count, 3, 3))
+        def quadratic(value: Array, gradient: Array, hessian: Array) -> Jet:
+            same = [np.broadcast_to(hessian, (len(points), 3, 3))] if second else []
+            return Jet(value, gradient, *same)
 
-        def ellipsoid(part: tuple[Array, Array, float], sign: float = 1.0) -> _Value:
+        def ellipsoid(part: tuple[Array, Array, float], sign: float = 1.0) -> Jet:
             centre, A, scale = part
             d, scale = points - centre, sign * scale
             Ad = d @ A
-            return _Value(0.5 * scale * ((Ad * d).sum(axis=1) - 1), scale * Ad, same(scale * A))
+            return quadratic(0.5 * scale * ((Ad * d).sum(axis=1) - 1), scale * Ad, scale * A)
 
         # B, V, D and G of the module's head, then the waves
-        face, gradient = self._face(points)
         lobes = _soft_max([ellipsoid(lobe) for lobe in self._lobes], -self.recipe.blend_mm)
-        visceral = _Value(face, gradient, same(-np.eye(3) / self.recipe.visceral_radius_mm))
+        visceral = quadratic(*self._face(points), -np.eye(3) / self.recipe.visceral_radius_mm)
         body = _soft_max([lobes, visceral], self.recipe.edge_mm)
         if self._fossa and self.recipe.fossa:
             body = _soft_max([body, ellipsoid(self._fossa, -1.0)], self.recipe.fossa.edge_mm)
         angle = points @ self._waves.T + self._phases
         sine, cosine = self.recipe.relief_mm * np.sin(angle), self.recipe.relief_mm * np.cos(angle)
-        hessian = body.hessian - (cosine[:count, :, None] * self._waves).transpose(0, 2, 1) @ self._waves
-        return _Value(body.f + cosine.sum(axis=1), body.gradient - sine @ self._waves, hessian)
+        waves = [cosine.sum(axis=1), -sine @ self._waves]
+        if second:
+            waves.append(-(cosine[:, :, None] * self._waves).transpose(0, 2, 1) @ self._waves)
+        return body + Jet(*waves)
 
     def _face(self, points: Array) -> tuple[Array, Array]:
         """Return V, mm, and its gradient at points of shape (N, 3)."""
@@ -221,11 +210,11 @@ class Body:
         active = np.flatnonzero(np.isfinite(distance))
         for _ in range(NEWTON_STEPS):
             at = self.evaluate(origins[active] + t[active, None] * directions[active], second=False)
-            slope = np.einsum("ni,ni->n", at.gradient, directions[active])
+            slope = dot(at.gradient, directions[active])
             # On a grazing ray F is nearly flat: bound the step to the mesh's neighbourhood.
             slope = np.where(np.abs(slope) < 1e-6, np.copysign(1e-6, slope), slope)
             # Newton's step along the ray; a ray that leaves the neighbourhood of its hit is given up.
-            step = np.clip(-at.f / slope, -0.5 * MAX_SHIFT_MM, 0.5 * MAX_SHIFT_MM)
+            step = np.clip(-at.value / slope, -0.5 * MAX_SHIFT_MM, 0.5 * MAX_SHIFT_MM)
             t[active] += step
             done = np.abs(step) < NEWTON_TOLERANCE_MM
             found[active[done]] = True
@@ -242,15 +231,15 @@ def _lobe(lobe: LiverLobe | LiverFossa) -> tuple[Array, Array, float]:
     return np.array(lobe.centre_mm), turn @ np.diag(axes**-2.0) @ turn.T, float(np.cbrt(axes.prod()))
 
 
-@dataclass(frozen=True)
-class BuiltLiver(BuiltMesh):
-    """A recipe's level set `body` and mesh."""
+class Liver(MeshedSurface):
+    """A generated liver with the camera outside."""
 
-    body: Body
+    def __init__(self, mesh: TriangleMesh, key: str, body: Body) -> None:
+        super().__init__(mesh, key)
+        self.body = body
 
-    @property
-    def shape_operators(self) -> Array:
-        """S at the mesh's vertices by the level set, 1/mm, shape (V, 3, 3)."""
+    def vertex_shape_operators(self) -> Array:
+        """Return S by the level set (see `SurfaceModel.vertex_shape_operators`)."""
 
         def operators(points: Array) -> Array:
             at = self.body.evaluate(points)
@@ -259,24 +248,31 @@ class BuiltLiver(BuiltMesh):
         return in_blocks(operators, self.mesh.vertices)
 
     def clearance(self, points: Array) -> Array:
-        """Return the distance to the mesh, mm, with the exact sign of F; positive outside."""
+        """Return the distance to the mesh, mm, with the exact sign of F (see `SurfaceModel.clearance`)."""
         return np.where(self.body.values(points) > 0, 1.0, -1.0) * self.probe.distance(points)
 
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
         """Return exact points by Newton's method on F along the rays; a ray that only grazes the mesh has none."""
-        distance = self.body.solve(origins, directions, hits.distance)
+        distance = self.distances_at_hits(origins, directions, hits)
         good = np.flatnonzero(np.isfinite(distance))
         at = self.body.evaluate(origins[good] + distance[good, None] * directions[good])
         normals, operators = in_rows(len(distance), good, *implicit_shape_operator(at.gradient, at.hessian))
         return distance, normals, operators
 
-    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Return the distances of `at_hits` alone (see `BuiltMesh.distances`)."""
+    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return exact distances (see `MeshedSurface.distances_at_hits`)."""
         return self.body.solve(origins, directions, hits.distance)
 
 
-@lru_cache(maxsize=4)
-def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
+def make_liver(recipe: LiverRecipe, viewpoint: int) -> Liver:
+    """Return a liver with a camera at the pose numbered by `viewpoint`."""
+    liver = build(recipe)
+    probe = liver.probe
+    return liver.posed(organ_pose(recipe.type, viewpoint, probe.targets, liver.clearance, probe.cast))
+
+
+@remembered
+def build(recipe: LiverRecipe, edge_mm: float | None = None) -> Liver:
     """Make the level set and the mesh of a recipe; normals outward.
 
     `edge_mm` is the spacing of the marching cubes and about the length of the edges; default `GRID_MM`, with shorter
@@ -286,7 +282,7 @@ def build(recipe: LiverRecipe, edge_mm: float | None = None) -> BuiltLiver:
     body, key = Body(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = kept("liver", key, lambda: vars(_mesh(body, edge_mm)))
     digest = blake2b(key.encode(), digest_size=12).hexdigest()
-    return BuiltLiver(TriangleMesh(**arrays), f"liver-{digest}", body)
+    return Liver(TriangleMesh(**arrays), f"liver-{digest}", body)
 
 
 def _mesh(body: Body, edge_mm: float | None) -> TriangleMesh:
@@ -347,16 +343,7 @@ def _project(body: Body, points: Array, steps: int) -> Array:
     def moved(points: Array) -> Array:
         for _ in range(steps):
             at = body.evaluate(points, second=False)
-            points = points - (at.f / np.einsum("ni,ni->n", at.gradient, at.gradient))[:, None] * at.gradient
+            points = points - (at.value / dot(at.gradient, at.gradient))[:, None] * at.gradient
         return points
 
     return in_blocks(moved, points)
-
-
-class Liver(MeshedSurface):
-    """A generated liver with a camera outside, at the pose numbered by `viewpoint`."""
-
-    def __init__(self, recipe: LiverRecipe, viewpoint: int) -> None:
-        self._build = build(recipe)
-        probe = self._build.probe
-        self.model_from_camera = organ_pose(recipe.type, viewpoint, probe.targets, self._build.clearance, probe.cast)

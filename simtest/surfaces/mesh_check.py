@@ -10,8 +10,7 @@ import numpy as np
 from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.runtime.arrays import Array, IntArray
 from simtest.surfaces.mesh_file import MAX_CROSSING_FACES, Condition, Repairs, examine, other_unit, read_mesh
-from simtest.surfaces.mesh_surface import is_lumen, needed_edge, shape_operators
-from simtest.surfaces.model import principal_curvatures
+from simtest.surfaces.mesh_surface import curvature_and_edge, is_lumen
 from simtest.surfaces.poses import nearest_mm
 from simtest.surfaces.triangles import area_quantile, edge_lengths, edge_uses, vertex_areas
 
@@ -148,12 +147,9 @@ def check_mesh(path: str | Path, distance_mm: float | None, concentration: float
     # Curvature, and the edges that highlights need because of it
     median = p95 = needed = share = None
     if len(faces) <= MAX_CURVATURE_FACES:
-        # The operators are for outward normals; in a lumen the camera sees the other side.
-        k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
-        wanted = needed_edge(distance_mm, concentration, k_min, k_max)
+        larger, wanted = curvature_and_edge(vertices, faces, lumen, distance_mm, concentration)
         needed = area_quantile(wanted, vertices, faces, 1 - FINE_SHARE)
         share = _fine_share(wanted, vertices, faces)
-        larger = np.maximum(np.abs(k_min), np.abs(k_max))
         median, p95 = (area_quantile(larger, vertices, faces, level) for level in (0.5, 0.95))
     return MeshCheck(
         file=str(path),

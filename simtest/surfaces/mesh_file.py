@@ -1,4 +1,7 @@
-"""Mesh files: PLY, OBJ, STL and VTK read and repaired, with errors of one line; PLY, OBJ and STL written."""
+"""Mesh files: PLY, OBJ, STL and VTK read and repaired, with errors of one line; PLY, OBJ and STL written.
+
+VTK files are read in a process of their own: VTK takes the whole process with it where a file lies about its sizes.
+"""
 
 import logging
 import re
@@ -13,11 +16,12 @@ from typing import BinaryIO, Literal
 import numpy as np
 
 from simtest.errors import InputError, SimtestError
+from simtest.geometry.vectors import dot
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import check_limit, limit, require_plain, write_atomically
+from simtest.runtime.processes import call_apart
 from simtest.surfaces.model import TriangleMesh
 from simtest.surfaces.triangles import edge_uses
-from simtest.surfaces.vtk_file import check_indices, read_vtk
 
 HEADER_BYTES = 65536
 NUMPY_TYPES = {
@@ -287,7 +291,7 @@ def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
     size = np.maximum(np.bincount(piece, minlength=count), 1)
     middle = np.stack([np.bincount(piece, c, count) for c in corners.mean(axis=1).T], axis=1) / size[:, None]
     a, b, c = (corners[:, i] - middle[piece] for i in range(3))
-    volume = np.bincount(piece, np.einsum("ni,ni->n", a, np.cross(b, c)), count)
+    volume = np.bincount(piece, dot(a, np.cross(b, c)), count)
     # Pieces of negative volume are inside out.
     outward = np.where((volume[piece] < 0)[:, None], oriented[:, ::-1], oriented)
     # A face and its reverse differ by an odd permutation: compare the corner that follows the smallest.
@@ -504,6 +508,48 @@ def _load_trimesh(path: Path) -> tuple[Array, IntArray]:
         loaded = trimesh.util.concatenate(parts)
     vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
     return vertices, np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int64)
+
+
+MEMORY_BYTES, MEMORY_PER_BYTE = 4e9, 40
+"""What VTK may take, in all and for each byte of the file.
+
+A point takes at least 6 bytes of a file, and a few arrays of 24 bytes in memory; a face likewise."""
+
+
+def read_vtk(path: Path) -> tuple[Array, IntArray]:
+    """Read a PolyData or an UnstructuredGrid as triangles: vertices, in the file's unit, and faces."""
+    memory = MEMORY_BYTES + MEMORY_PER_BYTE * path.stat().st_size
+    return call_apart(_triangles, path, memory, "VTK mesh", "damaged: VTK breaks down over its points or cells")
+
+
+def _triangles(path: str) -> tuple[Array, IntArray]:
+    """Read a file in this process; raise `InputError` where its content is no mesh."""
+    import pyvista
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    # VTK fills what is missing with zeros, or leaves it as it finds it, and goes on.
+    with pyvista.VtkErrorCatcher(send_to_logging=False) as caught:
+        data = pyvista.read(path)
+    if any(event.kind == "ERROR" or "Error reading" in event.alert for event in caught.events):
+        raise InputError("holds fewer points or cells than it announces: it is cut short or damaged")
+    if isinstance(data, pyvista.UnstructuredGrid):
+        check_indices(np.asarray(data.cell_connectivity), data.n_points)
+        data = data.extract_surface(algorithm="dataset_surface")
+    if not isinstance(data, pyvista.PolyData):
+        raise InputError(f"a VTK {type(data).__name__}; allowed: PolyData, UnstructuredGrid")
+    # VTK's filters trust the indices, so they are checked first.
+    for cells in (data.GetPolys(), data.GetStrips()):
+        check_indices(pyvista.convert_array(cells.GetConnectivityArray()), data.n_points)
+    data = data.triangulate()
+    return np.array(data.points, dtype=np.float64), np.asarray(data.faces, dtype=np.int64).reshape(-1, 4)[:, 1:]
+
+
+def check_indices(indices: IntArray, count: int, where: str = "") -> None:
+    """Raise `InputError` where a corner of a face, of shape (N,), is none of `count` vertices; `where` begins it."""
+    if len(indices) and not (indices.min() >= 0 and indices.max() < count):
+        wrong = indices.max() if indices.max() >= count else indices.min()
+        raise InputError(f"{where}a face names vertex {wrong}; allowed: 0 to {count - 1}")
 
 
 def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:

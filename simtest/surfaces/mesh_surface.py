@@ -3,25 +3,23 @@
 import math
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import igl
 import numpy as np
 
 from simtest.conventions import EDGES_PER_HALF_WIDTH
 from simtest.errors import InputError
+from simtest.geometry.vectors import dot, projector, unit
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.resources import find
 from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import MESH_SUFFIXES, Repairs, examine, other_unit, read_mesh
-from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures
+from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures, remembered
 from simtest.surfaces.poses import lumen_pose, nearest_mm, organ_pose
 from simtest.surfaces.triangles import (
-    BuiltMesh,
     MeshedSurface,
     area_quantile,
     edge_lengths,
@@ -39,48 +37,39 @@ LEAST_STRETCH = 0.25
 """Below this |1 + d k| there is no isolated highlight (docs/concepts/theory.md, section 6)."""
 
 
-def phong_concentration(exponent: float) -> float:
-    """Return c = -(log f)''(0) of Phong's lobe as a function of the angle between normal and view: 4 n."""
-    return 4.0 * exponent
+def concentration(exponent: float | None = None, alpha: float | None = None) -> float:
+    """Return c = -(log f)''(0) of a lobe over the angle between normal and view, with the light at the camera.
 
-
-def ggx_concentration(alpha: float) -> float:
-    """Return c = -(log f)''(0) of the GGX lobe under a light at the camera.
-
-    The half vector is the view direction, so that f ~ (alpha^2 + (1 - alpha^2) sin^2)^-2, c = 4 (1/alpha^2 - 1);
-    masking and Fresnel reflection add a term of order 1.
+    Phong's lobe of an exponent n, by default `DEFAULT_EXPONENT`, has 4 n. Of a GGX lobe of roughness alpha the half
+    vector is the view direction, so that f ~ (alpha^2 + (1 - alpha^2) sin^2)^-2 and c = 4 (1/alpha^2 - 1); masking and
+    Fresnel reflection add a term of order 1. Raises `InputError` if a value is out of range.
     """
-    return 4.0 * (1.0 / alpha**2 - 1.0)
-
-
-@overload
-def half_width(distance_mm: float, concentration: float, curvature: float) -> float: ...
-@overload
-def half_width(distance_mm: float, concentration: float, curvature: Array) -> Array: ...
-def half_width(distance_mm: float, concentration: float, curvature: float | Array) -> float | Array:
-    """Return the half-width at `ISOVALUE`, mm, of a highlight of a lobe of c: d sqrt(-2 ln t / c) / |1 + d k|."""
-    angle = math.sqrt(-2.0 * math.log(ISOVALUE) / concentration)
-    return distance_mm * angle / np.maximum(np.abs(1.0 + distance_mm * curvature), LEAST_STRETCH)
-
-
-def needed_edge(distance_mm: float, concentration: float, k_min: Array, k_max: Array) -> Array:
-    """Return the edge length that a surface needs at each of its points, mm, shape (N,); see `half_width`."""
-    narrow = np.minimum(half_width(distance_mm, concentration, k_min), half_width(distance_mm, concentration, k_max))
-    return np.asarray(narrow / EDGES_PER_HALF_WIDTH)
-
-
-def concentration(exponent: float | None, alpha: float | None) -> float:
-    """Return c of a lobe by exponent or roughness, else of `DEFAULT_EXPONENT`; `InputError` if out of range."""
     if exponent is not None and alpha is not None:
         raise InputError("--exponent and --roughness: only one of them may be given")
     if alpha is not None:
         if not 0 < alpha < 1:
             raise InputError(f"--roughness {alpha:g}: must be between 0 and 1")
-        return ggx_concentration(alpha)
+        return 4.0 * (1.0 / alpha**2 - 1.0)
     exponent = DEFAULT_EXPONENT if exponent is None else exponent
     if not 0 < exponent <= 1e5:
         raise InputError(f"--exponent {exponent:g}: must be greater than 0 and at most 100000")
-    return phong_concentration(exponent)
+    return 4.0 * exponent
+
+
+def half_width(distance_mm: float, concentration: float, curvature: Array | float) -> Array:
+    """Return the half-width at `ISOVALUE`, mm, of a highlight of a lobe of c: d sqrt(-2 ln t / c) / |1 + d k|."""
+    angle = math.sqrt(-2.0 * math.log(ISOVALUE) / concentration)
+    return distance_mm * angle / np.maximum(np.abs(1.0 + distance_mm * curvature), LEAST_STRETCH)
+
+
+def curvature_and_edge(
+    vertices: Array, faces: IntArray, lumen: bool, distance_mm: float, concentration: float
+) -> tuple[Array, Array]:
+    """Return the larger absolute curvature, 1/mm, and the edge length that a highlight needs, mm, at the vertices."""
+    # The operators are for outward normals; in a lumen the camera sees the other side.
+    k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
+    narrow = np.minimum(*(half_width(distance_mm, concentration, k) for k in (k_min, k_max)))
+    return np.maximum(np.abs(k_min), np.abs(k_max)), narrow / EDGES_PER_HALF_WIDTH
 
 
 MAX_SUBDIVIDED_FACES = 1_600_000
@@ -122,20 +111,16 @@ def fair(vertices: Array, faces: IntArray, wavelength_mm: float) -> Array:
     return np.ascontiguousarray(solver.solve(mass[:, None] * (vertices - middle)) + middle)
 
 
-def halvings(vertices: Array, faces: IntArray, edge_mm: float) -> int:
-    """Return how often edges must be halved for 95 % of them to be at most `edge_mm` long."""
-    length = float(np.quantile(edge_lengths(vertices, faces), 0.95))
+def halvings(length_mm: float, edge_mm: float) -> int:
+    """Return how often edges of a length must be halved to be at most `edge_mm` long."""
     # With a small tolerance, so that the mesh's own edge length needs no halving.
-    return max(0, math.ceil(math.log2(length / edge_mm) - 1e-6))
+    return max(0, math.ceil(math.log2(length_mm / edge_mm) - 1e-6))
 
 
 def subdivisions_within_limit(faces: int, wanted: int) -> int:
     """Return how often a mesh of so many faces may be subdivided, at most `wanted` times."""
-    allowed = wanted
     # Each subdivision makes four faces of one.
-    while allowed and faces * 4**allowed > MAX_SUBDIVIDED_FACES:
-        allowed -= 1
-    return allowed
+    return next(times for times in range(wanted, -1, -1) if not times or faces * 4**times <= MAX_SUBDIVIDED_FACES)
 
 
 def refine(vertices: Array, faces: IntArray, times: int, smoothing_mm: float) -> tuple[Array, IntArray]:
@@ -155,7 +140,7 @@ def refine(vertices: Array, faces: IntArray, times: int, smoothing_mm: float) ->
 def vertex_normals(vertices: Array, faces: IntArray) -> Array:
     """Return unit vertex normals, shape (V, 3): the faces' normals weighted by their angles at the vertex."""
     normals = igl.per_vertex_normals(vertices, faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
-    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    return unit(normals)
 
 
 def shape_operators(vertices: Array, faces: IntArray) -> Array:
@@ -176,7 +161,7 @@ The quotient is 1 for a sphere and falls as a body gets long or folded. A tube o
 A short piece of gut is taken for an organ, and a shallow open patch for a lumen: ``kind`` of the scene corrects that.
 """
 
-AUTO_CONCENTRATION = phong_concentration(DEFAULT_EXPONENT)
+AUTO_CONCENTRATION = concentration()
 """Lobe for which ``edge_mm = "auto"`` makes the mesh fine enough: that of the shipped anatomy scene."""
 
 EDGE_QUANTILE = 0.05
@@ -192,27 +177,31 @@ MAX_CROSSING_FACES = 250_000
 """A mesh of up to this many faces is checked for self-intersections before it is used (about a second)."""
 
 
-@dataclass(frozen=True)
-class PreparedMesh(BuiltMesh):
-    """A mesh ready for rendering and for the truth."""
+class MeshSurface(MeshedSurface):
+    """A user's mesh with a camera inside its lumen or outside the organ."""
 
-    operators: Array  # (V, 3, 3): S at the vertices, 1/mm, for the mesh's normals; NaN where the fit failed
-    lumen: bool  # Whether the camera belongs inside
-    subdivisions: int  # How often the mesh was subdivided
-    # Shortest wavelength that the mesh holds itself, mm: two of the file's median edges, or what smoothing left
-    shortest_mm: float
+    faceted = True
 
-    @property
-    def shape_operators(self) -> Array:
-        """The fitted S at the vertices, 1/mm, shape (V, 3, 3)."""
-        return self.operators
+    def __init__(
+        self, mesh: TriangleMesh, key: str, operators: Array, lumen: bool, subdivisions: int, shortest_mm: float
+    ) -> None:
+        super().__init__(mesh, key)
+        self._operators = operators  # (V, 3, 3): S at the vertices, 1/mm, for the mesh's normals; NaN: the fit failed
+        self.lumen, self.solid = lumen, not lumen
+        self.subdivisions = subdivisions  # How often the mesh was subdivided
+        # Shortest wavelength that the mesh holds itself, mm: two of the file's median edges, or what smoothing left
+        self.shortest_mm = shortest_mm
+
+    def vertex_shape_operators(self) -> Array:
+        """Return the fitted S (see `SurfaceModel.vertex_shape_operators`)."""
+        return self._operators
 
     def clearance(self, points: Array) -> Array:
-        """Return the signed distance to the mesh, mm (see `BuiltMesh.clearance`)."""
+        """Return the signed distance to the mesh (see `SurfaceModel.clearance`)."""
         return self.probe.clearance(points)
 
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return what the mesh holds at the hits themselves (see `BuiltMesh.at_hits`).
+        """Return what the mesh holds at the hits themselves (see `MeshedSurface.at_hits`).
 
         The normal is the normalised barycentric mean of the vertex normals; S is that of the vertices' tensors,
         projected on the plane perpendicular to that normal.
@@ -221,33 +210,33 @@ class PreparedMesh(BuiltMesh):
         hits = on_triangles(origins, directions, hits, self.mesh)
         # Linear between the corners, as the renderer shades it
         corners = self.mesh.faces[hits.face]
-        normal = np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[corners])
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        operator = np.einsum("nc,ncij->nij", hits.weights, self.operators[corners])
-        projector = np.eye(3) - normal[:, :, None] * normal[:, None, :]
-        return hits.distance, normal, projector @ operator @ projector
+        normal = unit(np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[corners]))
+        operator = np.einsum("nc,ncij->nij", hits.weights, self._operators[corners])
+        across = projector(normal)
+        return hits.distance, normal, across @ operator @ across
 
-    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Return the distances of the hits on the triangles, in double precision (see `BuiltMesh.distances`)."""
+    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+        """Return the distances of the hits on the triangles, in double precision."""
         return on_triangles(origins, directions, hits, self.mesh).distance
 
     def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
         """Return how points and normals move within the hit triangles (see `SurfaceModel.motion`)."""
-        faces = self.mesh.faces[hits.face]
-        corner, second, third = np.moveaxis(self.mesh.vertices[faces], 1, 0)
-        a, b, c = np.moveaxis(self.mesh.normals[faces], 1, 0)
+        mesh = self.mesh
+        faces = mesh.faces[hits.face]
+        corner, second, third = np.moveaxis(mesh.vertices[faces], 1, 0)
+        a, b, c = np.moveaxis(mesh.normals[faces], 1, 0)
         first_edge, second_edge = second - corner, third - corner
         plane = np.cross(first_edge, second_edge)
         # The mean of the corners' normals is linear: its gradient from those of the second and third weights.
         with np.errstate(divide="ignore", invalid="ignore"):
-            scale = 1 / np.einsum("ni,ni->n", plane, plane)[:, None]
+            scale = 1 / dot(plane, plane)[:, None]
         gradient = _outer(b - a, np.cross(second_edge, plane) * scale) + _outer(
             c - a, np.cross(plane, first_edge) * scale
         )
-        mean = np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[faces])
+        mean = np.einsum("nc,nci->ni", hits.weights, mesh.normals[faces])
         # Turned as the points' normals are, which face the rays.
-        length = np.linalg.norm(mean, axis=1) * np.sign(np.einsum("ni,ni->n", mean, points.normal_base))
-        across = np.eye(3) - _outer(points.normal_base, points.normal_base)
+        length = np.linalg.norm(mean, axis=1) * np.sign(dot(mean, points.normal_base))
+        across = projector(points.normal_base)
         return plane, across @ gradient / length[:, None, None]
 
 
@@ -260,11 +249,10 @@ def on_triangles(origins: Array, directions: Array, hits: RayHits, mesh: Triangl
     corner, second, third = np.moveaxis(mesh.vertices[mesh.faces[hits.face]], 1, 0)
     first_edge, second_edge, start = second - corner, third - corner, origins - corner
     across, along = np.cross(directions, second_edge), np.cross(start, first_edge)
-    determinant = np.einsum("ni,ni->n", first_edge, across)
+    determinant = dot(first_edge, across)
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v, distance = (
-            np.einsum("ni,ni->n", a, b) / determinant
-            for a, b in ((start, across), (directions, along), (second_edge, along))
+            dot(a, b) / determinant for a, b in ((start, across), (directions, along), (second_edge, along))
         )
         # A triangle seen edge on has no better solution.
         better = np.abs(distance - hits.distance) < SAME_HIT * hits.distance
@@ -272,45 +260,72 @@ def on_triangles(origins: Array, directions: Array, hits: RayHits, mesh: Triangl
     return RayHits(np.where(better, distance, hits.distance), hits.face, barycentric)
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """How a mesh is made smooth and fine; see `AnatomySurface` for the fields."""
+def prepare(
+    path: str | Path,
+    subdivisions: int = 1,
+    edge_mm: float | Literal["auto"] | None = None,
+    smoothing_mm: float | None = None,
+    kind: str = "auto",
+) -> MeshSurface:
+    """Read a mesh and make it smooth and fine, as `AnatomySurface` says; the last few are cached until a file changes.
 
-    subdivisions: int = 1
-    edge_mm: float | Literal["auto"] | None = None
-    smoothing_mm: float | None = None
-
-
-def prepare(path: str | Path, refinement: Refinement | int = 1, kind: str = "auto") -> PreparedMesh:
-    """Read a mesh and prepare it; the last few are cached until their file changes.
-
-    A number in place of a `Refinement` is that of Loop subdivisions; fewer are made, with a warning, if the faces would
-    exceed `MAX_SUBDIVIDED_FACES`. Of `kind` "auto" it is a lumen if the isoperimetric quotient is below
-    `LUMEN_QUOTIENT`. Repairs are warned of, and self-intersections, around which the truth is meaningless. Raises
-    `InputError` if the file is missing or malformed.
+    There are fewer subdivisions, with a warning, if the faces would exceed `MAX_SUBDIVIDED_FACES`. Of `kind` "auto" it
+    is a lumen if the isoperimetric quotient is below `LUMEN_QUOTIENT`. Repairs are warned of, and self-intersections,
+    around which the truth is meaningless. Raises `InputError` if the file is missing or malformed.
     """
     path = Path(path).expanduser().resolve()
     state = path.stat()
-    how = Refinement(refinement) if isinstance(refinement, int) else refinement
-    return _prepare(str(path), state.st_mtime_ns, state.st_size, how, kind)
+    return _prepare((str(path), state.st_mtime_ns, state.st_size), subdivisions, edge_mm, smoothing_mm, kind)
 
 
-@lru_cache(maxsize=4)
-def _prepare(path: str, mtime_ns: int, size: int, how: Refinement, kind: str) -> PreparedMesh:
-    vertices, faces, repairs = read_mesh(path)
+@remembered
+def _prepare(
+    file: tuple[str, int, int],
+    subdivisions: int,
+    edge_mm: float | Literal["auto"] | None,
+    smoothing_mm: float | None,
+    kind: str,
+) -> MeshSurface:
+    vertices, faces, repairs = read_mesh(file[0])
     lumen = is_lumen(vertices, faces, kind)
-    # smooth and fine
-    times, smoothing, reasons = _plan(vertices, faces, how, lumen)
-    for problem in (*_doubts(vertices, faces, repairs, lumen), *reasons):
-        warnings.warn(f"{path}: {problem}", stacklevel=3)
-    shortest = max(smoothing, _own_wave(vertices, faces))
+    own_wave = SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
+    # smooth, by default of what is the mesh's own, and fine
+    smoothing = smoothing_mm or (own_wave if edge_mm is not None and smoothing_mm is None else 0.0)
+    branching = int((edge_uses(faces)[1] > 2).sum())
+    problems = [*_doubts(vertices, faces, repairs, lumen)]
+    cannot = ""
+    if len(faces) > MAX_SMOOTHED_FACES:
+        cannot = f"{len(faces)} faces, at most {MAX_SMOOTHED_FACES} can be smoothed"
+    elif branching:
+        cannot = f"{branching} edges belong to more than two faces, smoothing needs a manifold"
+    if smoothing and cannot:
+        problems.append(f"{cannot}; using smoothing_mm = 0")
+        smoothing = 0.0
+    if edge_mm is not None:
+        # as many subdivisions as the edge length needs
+        edge = _automatic_edge(vertices, faces, lumen, smoothing) if edge_mm == "auto" else edge_mm
+        subdivisions = halvings(float(np.quantile(edge_lengths(vertices, faces), 0.95)), edge)
+    times = subdivisions_within_limit(len(faces), subdivisions)
+    if times < subdivisions:
+        # One subdivision more of a quarter of the limit's faces ends finer than what this mesh allows.
+        fewer = MAX_SUBDIVIDED_FACES // 4 ** (times + 1)
+        problems.append(
+            f"{subdivisions} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {times}"
+            f". Decimated to {fewer} faces it would take {times + 1} and end finer"
+        )
+    if times and branching:
+        problems.append(f"{branching} edges belong to more than two faces; Loop subdivision needs a manifold, using 0")
+        times = 0
+    for problem in problems:
+        warnings.warn(f"{file[0]}: {problem}", stacklevel=3)
     vertices, faces = refine(vertices, faces, times, smoothing)
     normals, operators = vertex_normals(vertices, faces), shape_operators(vertices, faces)
     if lumen:
         # Everything turned inward, to the camera's side
         faces, normals, operators = np.ascontiguousarray(faces[:, ::-1]), -normals, -operators
-    digest = blake2b(repr((path, mtime_ns, size, times, smoothing, lumen)).encode(), digest_size=12).hexdigest()
-    return PreparedMesh(TriangleMesh(vertices, faces, normals), f"mesh-{digest}", operators, lumen, times, shortest)
+    digest = blake2b(repr((*file, times, smoothing, lumen)).encode(), digest_size=12).hexdigest()
+    mesh = TriangleMesh(vertices, faces, normals)
+    return MeshSurface(mesh, f"mesh-{digest}", operators, lumen, times, max(smoothing, own_wave))
 
 
 def is_lumen(vertices: Array, faces: IntArray, kind: str) -> bool:
@@ -328,74 +343,25 @@ def _doubts(vertices: Array, faces: IntArray, repairs: Repairs, lumen: bool) -> 
         yield f"{crossing} faces cut through others; normals and curvatures around them mean nothing"
 
 
-def _plan(vertices: Array, faces: IntArray, how: Refinement, lumen: bool) -> tuple[int, float, list[str]]:
-    """Return how often to subdivide, the wavelength to smooth, mm, and why either is less than asked for."""
-    branching, reasons = int((edge_uses(faces)[1] > 2).sum()), []
-    # smoothing, by default of what is the mesh's own
-    smoothing = how.smoothing_mm or 0.0
-    if how.edge_mm is not None and how.smoothing_mm is None:
-        smoothing = _own_wave(vertices, faces)
-    problem = ""
-    if len(faces) > MAX_SMOOTHED_FACES:
-        problem = f"{len(faces)} faces, at most {MAX_SMOOTHED_FACES} can be smoothed"
-    elif branching:
-        problem = f"{branching} edges belong to more than two faces, smoothing needs a manifold"
-    if smoothing and problem:
-        reasons, smoothing = [f"{problem}; using smoothing_mm = 0"], 0.0
-    # subdivisions, as many as the edge length needs
-    wanted = how.subdivisions
-    if how.edge_mm is not None:
-        edge = automatic_edge(vertices, faces, lumen, smoothing) if how.edge_mm == "auto" else how.edge_mm
-        wanted = halvings(vertices, faces, edge)
-    times = subdivisions_within_limit(len(faces), wanted)
-    if times < wanted:
-        # One subdivision more of a quarter of the limit's faces ends finer than what this mesh allows.
-        fewer = MAX_SUBDIVIDED_FACES // 4 ** (times + 1)
-        reasons.append(
-            f"{wanted} subdivisions of {len(faces)} faces would exceed {MAX_SUBDIVIDED_FACES}; using {times}"
-            f". Decimated to {fewer} faces it would take {times + 1} and end finer"
-        )
-    if times and branching:
-        reasons.append(f"{branching} edges belong to more than two faces; Loop subdivision needs a manifold, using 0")
-        times = 0
-    return times, smoothing, reasons
-
-
-def _own_wave(vertices: Array, faces: IntArray) -> float:
-    """Return the shortest wave, mm, that a file of these edges can hold."""
-    return SMOOTHING_EDGES * float(np.median(edge_lengths(vertices, faces)))
-
-
-def automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: float) -> float:
+def _automatic_edge(vertices: Array, faces: IntArray, lumen: bool, smoothing_mm: float) -> float:
     """Return the edge length, mm, that `AUTO_CONCENTRATION` needs on outward faces as near as a camera comes."""
     vertices, faces = refine(vertices, faces, 0, smoothing_mm)
     # The nearest camera sees the narrowest highlights.
-    distance = nearest_mm(lumen)
-    k_min, k_max = principal_curvatures(shape_operators(vertices, faces) * (-1.0 if lumen else 1.0))
-    needed = needed_edge(distance, AUTO_CONCENTRATION, k_min, k_max)
+    needed = curvature_and_edge(vertices, faces, lumen, nearest_mm(lumen), AUTO_CONCENTRATION)[1]
     return area_quantile(needed, vertices, faces, EDGE_QUANTILE)
 
 
-class MeshSurface(MeshedSurface):
-    """A user's mesh with a camera inside its lumen or outside the organ."""
-
-    faceted = True
-
-    def __init__(self, spec: AnatomySurface) -> None:
-        how = Refinement(spec.subdivisions, spec.edge_mm, spec.smoothing_mm)
-        self._build = self.prepared = prepare(find(spec.path, "meshes", suffixes=MESH_SUFFIXES), how, spec.kind)
-        _check_relief(spec, self.prepared.shortest_mm)
-        probe, lumen = self.prepared.probe, self.prepared.lumen
-        if lumen:
-            pose = lumen_pose(spec.label, spec.viewpoint, probe.sites, probe.clearance, probe.cast)
-        else:
-            pose = organ_pose(spec.label, spec.viewpoint, probe.targets, probe.clearance, probe.cast)
-        self.solid = not lumen
-        self.model_from_camera = pose
-
-    def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
-        """Return how points and normals move within the hit triangles (see `SurfaceModel.motion`)."""
-        return self.prepared.motion(points, hits)
+def make_mesh_surface(spec: AnatomySurface) -> MeshSurface:
+    """Return a user's mesh with a camera at the pose numbered by the description's viewpoint."""
+    path = find(spec.path, "meshes", suffixes=MESH_SUFFIXES)
+    surface = prepare(path, spec.subdivisions, spec.edge_mm, spec.smoothing_mm, spec.kind)
+    _check_relief(spec, surface.shortest_mm)
+    probe = surface.probe
+    if surface.lumen:
+        pose = lumen_pose(spec.label, spec.viewpoint, probe.sites, probe.clearance, probe.cast)
+    else:
+        pose = organ_pose(spec.label, spec.viewpoint, probe.targets, probe.clearance, probe.cast)
+    return surface.posed(pose)
 
 
 def _check_relief(spec: AnatomySurface, shortest_mm: float) -> None:

@@ -1,17 +1,32 @@
 """What every surface offers: its pose relative to the camera, exact points on rays, and a shape to render."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from simtest.geometry.vectors import tangent_basis
+from simtest.geometry.vectors import projector, tangent_basis
 from simtest.runtime.arrays import Array, IntArray, Mask
 
 if TYPE_CHECKING:
     from simtest.surfaces.relief_field import ReliefField
     from simtest.surfaces.tube import TubeChart
+
+
+CACHES: list[Any] = []
+"""Of the functions that remember their results."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def remembered(function: Function) -> Function:
+    """Make a function keep its last four results, until `forget_meshes`."""
+    cached: Any = lru_cache(maxsize=4)(function)
+    CACHES.append(cached)
+    return cached
 
 
 @dataclass(frozen=True)
@@ -92,9 +107,9 @@ class SurfacePoints:
     valid: Mask
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A triangle mesh in the model frame.
+    """A triangle mesh in the model frame; equal to itself alone.
 
     Parameters
     ----------
@@ -305,5 +320,5 @@ def implicit_shape_operator(gradient: Array, hessian: Array) -> tuple[Array, Arr
     """
     length = np.linalg.norm(gradient, axis=1)
     normal = gradient / length[:, None]
-    projector = np.eye(3) - normal[:, :, None] * normal[:, None, :]
-    return normal, projector @ hessian @ projector / length[:, None, None]
+    across = projector(normal)
+    return normal, across @ hessian @ across / length[:, None, None]

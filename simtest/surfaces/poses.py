@@ -8,18 +8,17 @@ cells that are farthest apart, by the route that keeps farthest from the wall, a
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import igl
 import numpy as np
 from scipy import ndimage, sparse
 
 from simtest.errors import InputError
-from simtest.geometry.vectors import tangent_basis
+from simtest.geometry.vectors import tangent_basis, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.spec.surfaces import AnatomySurface
-from simtest.surfaces.model import SurfaceModel, TriangleMesh
+from simtest.surfaces.model import SurfaceModel, TriangleMesh, remembered
 from simtest.surfaces.triangles import MIN_CLEARANCE_MM, Generator, MeshProbe
 
 CLEARANCE_SHARE = 0.6
@@ -68,8 +67,7 @@ def lumen_pose(
     # Roomier sites are likelier: those at the limit show little but one patch of wall.
     site = candidates[rng.choice(allowed, p=room[allowed] / room[allowed].sum())]
     # direction
-    directions = rng.normal(size=(_DIRECTIONS, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = unit(rng.normal(size=(_DIRECTIONS, 3)))
     distance = cast(np.broadcast_to(site, directions.shape), directions)
     low, high = AXIS_RANGE_MM
     outside = np.maximum(np.maximum(low - distance, distance - high), 0.0)
@@ -168,29 +166,15 @@ class CameraPath:
         return point + (position - inside) * tangent, tangent, side / np.linalg.norm(side)
 
 
-class _Keyed:
-    """A mesh that a cache can find by its key."""
-
-    def __init__(self, key: str, mesh: TriangleMesh) -> None:
-        self.key, self.mesh = key, mesh
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Keyed) and other.key == self.key
-
-
 def camera_path(surface: SurfaceModel) -> CameraPath:
     """Find the camera path through the mesh of a lumen, closed or open at its ends; the last few are cached."""
-    shape = surface.shape()
-    assert shape.mesh is not None
-    return _camera_path(_Keyed(shape.key, shape.mesh))
+    mesh = surface.shape().mesh
+    assert mesh is not None
+    return _camera_path(mesh)
 
 
-@lru_cache(maxsize=4)
-def _camera_path(keyed: _Keyed) -> CameraPath:
-    mesh = keyed.mesh
+@remembered
+def _camera_path(mesh: TriangleMesh) -> CameraPath:
     # grid
     probe = MeshProbe(mesh)
     pitch = max(MIN_PITCH_MM, float(np.prod(np.ptp(mesh.vertices, axis=0)) / MAX_CELLS) ** (1 / 3))
@@ -209,8 +193,7 @@ def _camera_path(keyed: _Keyed) -> CameraPath:
             f"surface.view: a camera path of {max(length, 0):.3g} mm fits into the mesh; at least {MIN_LENGTH_MM:g} mm "
             "are needed; view = auto places single cameras"
         )
-    tangents = np.gradient(path, axis=0)
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    tangents = unit(np.gradient(path, axis=0))
     return CameraPath(path, tangents, _sides(tangents), length)
 
 

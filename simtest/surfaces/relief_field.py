@@ -8,16 +8,18 @@ The relief turns the normal and leaves the position: the fine normal at the base
 the gradient along the surface. A film may fill the valleys up to a level: pools are smooth, crests keep their relief.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, reduce
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, reduce
+from typing import Any
 
 import numpy as np
 
-from simtest.geometry.vectors import tangent_basis
+from simtest.geometry.vectors import projector, tangent_basis, unit
 from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.surfaces import Relief, ReliefBand
-from simtest.surfaces.model import SurfacePoints, principal
+from simtest.surfaces.jets import Jet
+from simtest.surfaces.model import SurfacePoints, in_rows, principal, remembered, shape_operator
 
 NODES = 96
 """Nodes of the lattice along each side; the field repeats after as many."""
@@ -51,15 +53,6 @@ MENISCUS = 0.1
 
 
 @dataclass(frozen=True)
-class HeightJets:
-    """Height of the relief with its first two derivatives in space."""
-
-    height: Array  # (N,): mm, towards the camera
-    gradient: Array  # (N, 3): model frame
-    hessian: Array  # (N, 3, 3): 1/mm
-
-
-@dataclass(frozen=True)
 class BandField:
     """One band: a periodic cubic B-spline."""
 
@@ -72,8 +65,8 @@ class BandField:
         """Whether diffuse light sees anything of the band."""
         return bool(self.diffused.any())
 
-    def jets(self, points: Array, diffused: bool = False) -> HeightJets:
-        """Compute the field's jets at points, shape (N, 3), model frame, mm."""
+    def jets(self, points: Array, diffused: bool = False) -> Jet:
+        """Compute the height, mm, and its derivatives at points, shape (N, 3), model frame, mm."""
         A = self.lattice_from_model
         cells = points @ A.T
         first = np.floor(cells)
@@ -93,7 +86,7 @@ class BandField:
         xx, yy, zz = derivative(2, 0, 0), derivative(0, 2, 0), derivative(0, 0, 2)
         hessian = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
         # Chain rule to the model frame.
-        return HeightJets(derivative(0, 0, 0), gradient @ A, A.T @ hessian @ A)
+        return Jet(derivative(0, 0, 0), gradient @ A, A.T @ hessian @ A)
 
 
 def _spline_weights(t: Array) -> Array:
@@ -119,28 +112,26 @@ class ReliefField:
         """Width of a pool's rim in height, mm."""
         return MENISCUS * self.deviation
 
-    def tissue_jets(self, points: Array, diffused: bool = False) -> HeightJets:
+    def tissue_jets(self, points: Array, diffused: bool = False) -> Jet:
         """Compute the jets of the tissue below the film at points, shape (N, 3), model frame, mm."""
-        parts = [_add([band.jets(some, diffused) for band in self.bands]) for some in _split(points)]
-        return HeightJets(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in ("height", "gradient", "hessian"))
-        )
+        parts = [
+            reduce(Jet.__add__, [band.jets(some, diffused) for band in self.bands])
+            for some in np.split(points, range(POINTS, len(points), POINTS))
+        ]
+        return Jet(*(np.concatenate(blocks) for blocks in zip(*(jet.parts for jet in parts), strict=True)))
 
-    def jets(self, points: Array) -> HeightJets:
+    def jets(self, points: Array) -> Jet:
         """Compute the jets of the surface that the film's reflection sees, at points, shape (N, 3), model frame, mm."""
         return self.fill(self.tissue_jets(points))
 
-    def fill(self, jets: HeightJets) -> HeightJets:
+    def fill(self, jets: Jet) -> Jet:
         """Fill valleys: phi(h) = level + w log(1 + exp((h - level)/w)), with w the meniscus; and its derivatives."""
         if self.level is None:
             return jets
-        x = (jets.height - self.level) / self.meniscus
+        x = (jets.value - self.level) / self.meniscus
         share = 1 / (1 + np.exp(-np.clip(x, -60.0, 60.0)))
-        height = self.level + self.meniscus * np.logaddexp(0.0, x)
         bend = share * (1 - share) / self.meniscus
-        outer = jets.gradient[:, :, None] * jets.gradient[:, None, :]
-        hessian = share[:, None, None] * jets.hessian + bend[:, None, None] * outer
-        return HeightJets(height, share[:, None] * jets.gradient, hessian)
+        return jets.chain(self.level + self.meniscus * np.logaddexp(0.0, x), share, bend)
 
     def apply(self, points: SurfacePoints) -> SurfacePoints:
         """Turn the normals and curvatures of base points, model frame, to those of the fine surface.
@@ -152,33 +143,16 @@ class ReliefField:
         found = np.flatnonzero(points.valid)
         if not len(found):
             return points
-        N = points.normal[found]
-        first, second = points.direction_max[found], points.direction_min[found]
-        S = _outer(points.k_max[found], first) + _outer(points.k_min[found], second)
         tissue = self.tissue_jets(points.position[found])
-        jets = self.fill(tissue)
-        normal, k, directions = fine_curvatures(N, S, jets)
-        fields = {
-            "normal": normal, "k_min": k[:, 0], "k_max": k[:, 1],
-            "direction_min": directions[0], "direction_max": directions[1],
-        }  # fmt: skip
-        changed = {}
-        for name, values in fields.items():
-            whole = getattr(points, name).copy()
-            whole[found] = values
-            changed[name] = whole
+        fine = fine_curvatures(points.normal[found], shape_operator(points)[found], self.fill(tissue))
+        names = ("normal", "k_min", "k_max", "direction_min", "direction_max")
+        changed: dict[str, Any] = dict(zip(names, in_rows(len(points.valid), found, *fine), strict=True))
         pool = np.zeros(len(points.valid), dtype=bool)
-        pool[found] = False if self.level is None else tissue.height < self.level
+        pool[found] = False if self.level is None else tissue.value < self.level
         return replace(points, **changed, pool=pool)
 
 
-def fine_normals(normal: Array, gradient: Array) -> Array:
-    """Return the unit normals of the relief, shape (N, 3), over base normals, for gradients of the height."""
-    m = normal - gradient + normal * np.sum(normal * gradient, axis=1, keepdims=True)
-    return np.asarray(m / np.linalg.norm(m, axis=1, keepdims=True))
-
-
-def normal_derivative(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array]:
+def normal_derivative(N: Array, S: Array, jets: Jet) -> tuple[Array, Array]:
     """Return fine normals and their derivative along the base's tangents (see `ReliefField.apply`)."""
     G, H = jets.gradient, jets.hessian
     along = np.sum(N * G, axis=1)
@@ -187,12 +161,12 @@ def normal_derivative(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Arra
     normal = m / length[:, None]
     rest = np.einsum("ni,nij->nj", G, S) + np.einsum("ni,nij->nj", N, H)
     derivative = (1 + along)[:, None, None] * S + N[:, :, None] * rest[:, None, :] - H
-    across = np.eye(3) - normal[:, :, None] * normal[:, None, :]
+    across = projector(normal)
     return normal, across @ derivative / length[:, None, None]
 
 
-def fine_curvatures(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array, tuple[Array, Array]]:
-    """Return fine normals, principal curvatures k_min and k_max, shape (N, 2), and unit principal directions."""
+def fine_curvatures(N: Array, S: Array, jets: Jet) -> tuple[Array, ...]:
+    """Return fine normals, principal curvatures k_min and k_max, and their unit directions."""
     normal, derivative = normal_derivative(N, S, jets)
     # A tangent f of the fine surface stands over the base's tangent f - N (N.f).
     tangents = tangent_basis(normal)
@@ -200,20 +174,7 @@ def fine_curvatures(N: Array, S: Array, jets: HeightJets) -> tuple[Array, Array,
     form = [[np.einsum("ni,nij,nj->n", f, derivative, t) for t in below] for f in tangents]
     mixed = (form[0][1] + form[1][0]) / 2
     mean, half, *directions = principal(form[0][0], mixed, form[1][1], tangents)
-    return normal, np.stack([mean - half, mean + half], axis=1), (directions[0], directions[1])
-
-
-def _outer(weight: Array, vector: Array) -> Array:
-    return np.asarray(weight[:, None, None] * vector[:, :, None] * vector[:, None, :])
-
-
-def _split(points: Array) -> Iterator[Array]:
-    for start in range(0, max(len(points), 1), POINTS):
-        yield points[start : start + POINTS]
-
-
-def _add(parts: list[HeightJets]) -> HeightJets:
-    return reduce(lambda a, b: HeightJets(a.height + b.height, a.gradient + b.gradient, a.hessian + b.hessian), parts)
+    return normal, mean - half, mean + half, *directions
 
 
 # Making the field ------------------------------------------------------------------------------------------------
@@ -225,24 +186,20 @@ def make_relief(spec: Relief, level: float | None = None) -> ReliefField:
     return field if level is None else replace(field, level=level * field.deviation)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def _make_field(spec: Relief) -> ReliefField:
     """Make the relief without a film, or read it."""
     arrays = kept("relief", spec.model_dump_json(), lambda: _packed(_drawn(spec)))
-    parts = (arrays[name] for name in ("lattices_from_model", "coefficients", "diffused"))
+    parts = (arrays[part.name] for part in fields(BandField))
     bands = tuple(BandField(*band) for band in zip(*parts, strict=True))
     return ReliefField(bands, float(arrays["deviation"]), float(arrays["finest_wave"]))
 
 
 def _packed(field: ReliefField) -> dict[str, AnyArray]:
     """Return a relief as arrays by name."""
-    return {
-        "lattices_from_model": np.stack([band.lattice_from_model for band in field.bands]),
-        "coefficients": np.stack([band.coefficients for band in field.bands]),
-        "diffused": np.stack([band.diffused for band in field.bands]),
-        "deviation": np.array(field.deviation),
-        "finest_wave": np.array(field.finest_wave),
-    }
+    names = [part.name for part in fields(BandField)]
+    bands = {name: np.stack([getattr(band, name) for band in field.bands]) for name in names}
+    return {**bands, "deviation": np.array(field.deviation), "finest_wave": np.array(field.finest_wave)}
 
 
 def _drawn(spec: Relief) -> ReliefField:
@@ -268,7 +225,7 @@ class _Unscaled:
     wave: float
 
 
-@lru_cache(maxsize=4)
+@remembered
 def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...]) -> _Unscaled:
     """Draw a band from a branch of the relief's seed; reliefs of one seed differ in their scales alone."""
     # Imported here: slow to load, and smooth scenes have no relief.
@@ -278,7 +235,10 @@ def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...])
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(entropy, spawn_key=spawn_key)))
     # A uniformly random rotation; by itself, as scipy changed the name of its generator's argument.
     turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
-    nodes = _shell_noise(rng, width)
+    # The shell's radius, for which sections have about NODES_PER_WAVE nodes a wave.
+    w = width
+    k0 = 2 * np.pi / NODES_PER_WAVE * np.sqrt(1.25 * (1 + w**2) / (1 + 6 * w**2 + 3 * w**4))
+    nodes = shell_noise(rng, NODES, lambda k: np.exp(-(((k - k0) / (w * k0)) ** 2) / 4))
     if kind != "gaussian":
         nodes = _shaped(nodes, kind)
     coefficients = ndimage.spline_filter(nodes, order=3, mode="grid-wrap")
@@ -299,24 +259,24 @@ def _make_band(spec: ReliefBand, branch: np.random.SeedSequence, diffusion_mm: f
     return BandField(lattice_from_model, coefficients, _diffused(coefficients, lattice_from_model, diffusion_mm))
 
 
-def _wave_numbers() -> list[Array]:
-    """Return the lattice's wave numbers, rad per cell, along its three axes, for `numpy.fft.rfftn`."""
-    full: Array = np.asarray(2 * np.pi * np.fft.fftfreq(NODES), dtype=float)
-    half: Array = np.asarray(2 * np.pi * np.fft.rfftfreq(NODES), dtype=float)
+def _wave_numbers(nodes: int) -> list[Array]:
+    """Return the wave numbers of a periodic lattice, rad per cell, along its three axes, for `numpy.fft.rfftn`."""
+    full: Array = np.asarray(2 * np.pi * np.fft.fftfreq(nodes), dtype=float)
+    half: Array = np.asarray(2 * np.pi * np.fft.rfftfreq(nodes), dtype=float)
     return [full[:, None, None], full[None, :, None], half[None, None, :]]
 
 
-def _shell_noise(rng: np.random.Generator, width: float) -> Array:
-    """Draw a gaussian field whose power lies on a shell of wave numbers, unit deviation, at the nodes."""
-    kx, ky, kz = _wave_numbers()
+def shell_noise(rng: np.random.Generator, nodes: int, shell: Callable[[Array], Array]) -> Array:
+    """Draw a gaussian field of unit deviation at the nodes of a periodic lattice.
+
+    Its amplitude at a wave number k, rad per cell, is `shell` over k.
+    """
+    kx, ky, kz = _wave_numbers(nodes)
     k = np.sqrt(kx**2 + ky**2 + kz**2)
-    # The shell's radius, for which sections have about NODES_PER_WAVE nodes a wave.
-    w = width
-    k0 = 2 * np.pi / NODES_PER_WAVE * np.sqrt(1.25 * (1 + w**2) / (1 + 6 * w**2 + 3 * w**4))
     with np.errstate(divide="ignore"):
-        amplitude = np.where(k > 0, np.exp(-(((k - k0) / (w * k0)) ** 2) / 4) / k, 0.0)
-    noise = np.fft.rfftn(rng.standard_normal((NODES, NODES, NODES)))
-    field = np.fft.irfftn(noise * amplitude, s=(NODES, NODES, NODES), axes=(0, 1, 2))
+        amplitude = np.where(k > 0, shell(k) / k, 0.0)
+    noise = np.fft.rfftn(rng.standard_normal((nodes,) * 3))
+    field = np.fft.irfftn(noise * amplitude, s=(nodes,) * 3, axes=(0, 1, 2))
     return np.asarray(field / field.std())
 
 
@@ -337,8 +297,7 @@ def _plane_statistics(field: BandField, rng: np.random.Generator) -> tuple[float
     """
     relief = ReliefField((field,), 1.0, 1.0)
     jets = relief.tissue_jets(rng.uniform(0, NODES, (PROBES, 3)))
-    normal = rng.standard_normal((PROBES, 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = unit(rng.standard_normal((PROBES, 3)))
     # Not of the whole space: a shaped field is isotropic, but its sections' moments follow no closed form.
     along = np.einsum("ni,nij,nj->n", normal, jets.hessian, normal)
     laplace = np.trace(jets.hessian, axis1=1, axis2=2) - along
@@ -349,7 +308,7 @@ def _plane_statistics(field: BandField, rng: np.random.Generator) -> tuple[float
 
 def _diffused(coefficients: Array, lattice_from_model: Array, length: float) -> Array:
     """Smooth a field by a Gaussian of standard deviation `length`, mm, in the model frame."""
-    kx, ky, kz = _wave_numbers()
+    kx, ky, kz = _wave_numbers(NODES)
     A = lattice_from_model
     # Wave numbers in the model frame are A^T k.
     squared = sum((A[0, i] * kx + A[1, i] * ky + A[2, i] * kz) ** 2 for i in range(3))

@@ -10,17 +10,18 @@ of the light that comes back from below the vessel's depth.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.reflectance import TissueColour
-from simtest.surfaces.model import SurfaceModel
+from simtest.surfaces.model import SurfaceModel, remembered
+from simtest.surfaces.relief_field import shell_noise
 from simtest.surfaces.vessels import (
     NO_VESSELS,
     PatternPatch,
@@ -98,9 +99,6 @@ WALL = 0.1
 BLUR_PER_DEPTH = 0.4
 """Standard deviation of the blur of a vessel's edge over its depth."""
 
-_PLAIN, _LATTICES = ("base", "mottled", "netted", "absorption", "share"), ("mottling", "capillaries")
-"""Fields of `TissuePattern`: arrays, and lattices."""
-
 
 @dataclass(frozen=True)
 class Lattice:
@@ -112,16 +110,7 @@ class Lattice:
     def at(self, points: Array) -> Array:
         """Return the field at points, shape (N, 3), model frame, mm."""
         cells = points @ self.lattice_from_model.T
-        first = np.floor(cells)
-        share = cells - first
-        low = first.astype(np.int64) % NODES
-        high = (low + 1) % NODES
-        total = np.zeros(len(points))
-        for corner in np.ndindex(2, 2, 2):
-            x, y, z = ((high if up else low)[:, axis] for axis, up in enumerate(corner))
-            weight = np.prod([share[:, axis] if up else 1 - share[:, axis] for axis, up in enumerate(corner)], axis=0)
-            total += weight * self.values[x, y, z]
-        return total
+        return np.asarray(ndimage.map_coordinates(self.values, cells.T, order=1, mode="grid-wrap"))
 
 
 @dataclass(frozen=True)
@@ -148,6 +137,10 @@ class TissuePattern:
         return np.asarray(np.clip(value, 0, 1))
 
 
+_NESTED: dict[str, Any] = {"mottling": Lattice, "capillaries": Lattice, "vessels": SegmentTable}
+"""Fields of a pattern that are records themselves."""
+
+
 def make_pattern(surface: SurfaceModel, spec: TissueColour) -> TissuePattern:
     """Make the pattern of a surface; the last few are cached."""
     if not spec.vessels.strength:
@@ -156,34 +149,32 @@ def make_pattern(surface: SurfaceModel, spec: TissueColour) -> TissuePattern:
     return _make(surface_patch(surface), spec)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def _bare(spec: TissueColour) -> TissuePattern:
     """Make the pattern without vessels."""
     return _pattern(spec, NO_VESSELS)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def _make(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
     return _unpacked(kept("tissue", f"{patch.key} {spec.model_dump_json()}", lambda: _packed(_grown(patch, spec))))
 
 
 def _packed(pattern: TissuePattern) -> dict[str, AnyArray]:
     """Return a pattern as arrays by name."""
-    plain = {name: getattr(pattern, name) for name in _PLAIN}
-    fields = {f"{name}_{part}": value for name in _LATTICES for part, value in vars(getattr(pattern, name)).items()}
-    table = {f"vessels_{part}": np.asarray(value) for part, value in vars(pattern.vessels).items()}
-    return {**plain, **fields, **table}
+    arrays: dict[str, Any] = {}
+    for name, value in vars(pattern).items():
+        arrays |= {f"{name}.{part}": each for part, each in vars(value).items()} if name in _NESTED else {name: value}
+    return {name: np.asarray(value) for name, value in arrays.items()}
 
 
 def _unpacked(arrays: Mapping[str, AnyArray]) -> TissuePattern:
     """Return the pattern of `_packed`."""
-    mottling, capillaries = (
-        Lattice(arrays[f"{name}_lattice_from_model"], arrays[f"{name}_values"]) for name in _LATTICES
-    )
-    cell, *table = (arrays[f"vessels_{part}"] for part in ("cell_mm", "first", "rows", "half_mm"))
-    vessels = SegmentTable(float(cell), *table)
-    plain: dict[str, Any] = {name: arrays[name] for name in _PLAIN}
-    return TissuePattern(mottling=mottling, capillaries=capillaries, vessels=vessels, **plain)
+    values: dict[str, Any] = {name: array for name, array in arrays.items() if "." not in name}
+    for name, kind in _NESTED.items():
+        parts = [arrays[f"{name}.{part.name}"] for part in fields(kind)]
+        values[name] = kind(*(part if part.ndim else float(part) for part in parts))
+    return TissuePattern(**values)
 
 
 def _grown(patch: PatternPatch, spec: TissueColour) -> TissuePattern:
@@ -215,13 +206,9 @@ def _pattern(spec: TissueColour, table: SegmentTable) -> TissuePattern:
 
 def _mottling(wavelength: float, rng: np.random.Generator) -> Lattice:
     """Draw a gaussian field of unit deviation, with power on a shell of wave numbers."""
-    full, half = 2 * np.pi * np.fft.fftfreq(NODES), 2 * np.pi * np.fft.rfftfreq(NODES)
-    k = np.sqrt(full[:, None, None] ** 2 + full[None, :, None] ** 2 + half[None, None, :] ** 2)
     k0 = 2 * np.pi / MOTTLING_NODES
-    with np.errstate(divide="ignore"):
-        amplitude = np.where(k > 0, np.exp(-(((k / k0 - 1) / MOTTLING_WIDTH) ** 2) / 4) / k, 0.0)
-    field = np.fft.irfftn(np.fft.rfftn(rng.standard_normal((NODES,) * 3)) * amplitude, s=(NODES,) * 3, axes=(0, 1, 2))
-    field = np.clip(field / field.std(), -MOTTLING_LIMIT, MOTTLING_LIMIT)
+    field = shell_noise(rng, NODES, lambda k: np.exp(-(((k / k0 - 1) / MOTTLING_WIDTH) ** 2) / 4))
+    field = np.clip(field, -MOTTLING_LIMIT, MOTTLING_LIMIT)
     turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
     return Lattice(turn * (MOTTLING_NODES / wavelength), _float32(field))
 

@@ -1,13 +1,15 @@
 """Triangle meshes: edges and areas, cuts at edges' middles, and the surfaces that are rendered as such."""
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from copy import copy
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
+from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.statistics import weighted_quantile
 from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, TriangleMesh, in_rows, pack_points
@@ -69,7 +71,7 @@ def isoperimetric_quotient(vertices: Array, faces: IntArray) -> float:
     cross = area_vectors(centred, faces)
     area = np.linalg.norm(cross, axis=1).sum() / 2
     # Sum of the signed volumes of the cones from the centroid to the faces
-    volume = np.einsum("ni,ni->n", centred[faces][:, 0], cross).sum() / 6
+    volume = dot(centred[faces][:, 0], cross).sum() / 6
     return float(36 * np.pi * volume**2 / area**3)
 
 
@@ -116,8 +118,7 @@ def off_between(ends: Array, normals: Array, share: float, limit_deg: float) -> 
     `ends`, shape (N, 2, 3), are the exact unit normals at both ends, `normals`, shape (N, 3), those at a share of the
     way from the first to the second.
     """
-    between = (1 - share) * ends[:, 0] + share * ends[:, 1]
-    between /= np.linalg.norm(between, axis=1, keepdims=True)
+    between = unit((1 - share) * ends[:, 0] + share * ends[:, 1])
     # By the chord, which grows with the angle up to 180 deg; a sine would fall again beyond 90.
     return np.asarray(np.linalg.norm(between - normals, axis=1) > 2 * math.sin(math.radians(limit_deg) / 2))
 
@@ -148,7 +149,7 @@ class MeshProbe:
         corners = self._mesh.vertices[self._mesh.faces[face]]
         weights = _barycentric(closest, corners)
         normal = np.einsum("nc,nci->ni", weights, self._mesh.normals[self._mesh.faces[face]])
-        side = np.einsum("ni,ni->n", points - closest, normal)
+        side = dot(points - closest, normal)
         return np.where(side >= 0, 1.0, -1.0) * np.sqrt(squared)
 
     def distance(self, points: Array) -> Array:
@@ -173,7 +174,7 @@ class MeshProbe:
         a, b = np.sqrt(rng.random(count)), rng.random(count)
         weights = np.stack([1 - a, a * (1 - b), a * b], axis=1)
         points = np.einsum("nc,nci->ni", weights, corners[face])
-        return points, cross[face] / np.linalg.norm(cross[face], axis=1, keepdims=True)
+        return points, unit(cross[face])
 
     def sites(self, rng: Generator) -> Array:
         """Draw points well inside a lumen, shape (N, 3): between a random point of the wall and the wall opposite."""
@@ -189,67 +190,50 @@ class MeshProbe:
 def _barycentric(points: Array, corners: Array) -> Array:
     """Return barycentric weights, shape (N, 3), of points in triangles with corners of shape (N, 3, 3)."""
     a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
-    aa, ab, bb = (np.einsum("ni,ni->n", *pair) for pair in ((a, a), (a, b), (b, b)))
-    pa, pb = np.einsum("ni,ni->n", p, a), np.einsum("ni,ni->n", p, b)
+    aa, ab, bb = (dot(*pair) for pair in ((a, a), (a, b), (b, b)))
+    pa, pb = dot(p, a), dot(p, b)
     determinant = np.maximum(aa * bb - ab * ab, np.finfo(float).tiny)
     second, third = (bb * pa - ab * pb) / determinant, (aa * pb - ab * pa) / determinant
     return np.stack([1 - second - third, second, third], axis=1)
 
 
-@dataclass(frozen=True)
-class BuiltMesh(ABC):
-    """A surface's mesh, shared by all its poses."""
+class MeshedSurface(SurfaceModel):
+    """A surface that is rendered as a mesh; it is built once, and copied for each of its poses."""
 
-    mesh: TriangleMesh  # mm; normals and winding on the camera's side
-    key: str  # Identity of recipe or file, and settings
+    def __init__(self, mesh: TriangleMesh, key: str) -> None:
+        self.mesh = mesh  # mm; normals and winding on the camera's side
+        self.key = key  # Identity of recipe or file, and settings
 
     @cached_property
     def probe(self) -> MeshProbe:
         """Distances and rays for the choice of a pose."""
         return MeshProbe(self.mesh)
 
-    @property
-    @abstractmethod
-    def shape_operators(self) -> Array:
-        """S at the mesh's vertices for its normals, 1/mm, shape (V, 3, 3)."""
+    def posed(self, model_from_camera: Array) -> Self:
+        """Return the surface with a camera's pose."""
+        surface = copy(self)
+        surface.model_from_camera = model_from_camera
+        return surface
 
-    @abstractmethod
-    def clearance(self, points: Array) -> Array:
-        """Return the signed distance of points, shape (N, 3), to the surface, mm; positive on the camera's side."""
+    def shape(self) -> Shape:
+        """Return the mesh; winding and normals on the camera's side."""
+        return Shape("mesh", False, np.eye(4), self.mesh, self.key)
 
     @abstractmethod
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
         """Return distance, normal and S of the surface on rays that hit the mesh; NaN if there is no solution."""
 
-    def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
+    @abstractmethod
+    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Return the distances of `at_hits` alone."""
-        return self.at_hits(origins, directions, hits)[0]
-
-
-class MeshedSurface(SurfaceModel):
-    """A surface that is rendered as a mesh."""
-
-    _build: BuiltMesh
-
-    def shape(self) -> Shape:
-        """Return the mesh; winding and normals on the camera's side."""
-        return Shape("mesh", False, np.eye(4), self._build.mesh, self._build.key)
-
-    def vertex_shape_operators(self) -> Array:
-        """Return S at the mesh's vertices (see `SurfaceModel.vertex_shape_operators`)."""
-        return self._build.shape_operators
-
-    def clearance(self, points: Array) -> Array:
-        """Return the signed distance to the surface (see `SurfaceModel.clearance`)."""
-        return self._build.clearance(points)
 
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Return how far along rays the surface lies (see `SurfaceModel.distances`)."""
         hit = np.flatnonzero(np.isfinite(hits.distance))
-        return in_rows(len(origins), hit, self._build.distances(origins[hit], directions[hit], hits.rows(hit)))[0]
+        return in_rows(len(origins), hit, self.distances_at_hits(origins[hit], directions[hit], hits.rows(hit)))[0]
 
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Return the points where rays meet the surface (see `SurfaceModel.points`)."""
         hit = np.flatnonzero(np.isfinite(hits.distance))
-        at_hits = self._build.at_hits(origins[hit], directions[hit], hits.rows(hit))
+        at_hits = self.at_hits(origins[hit], directions[hit], hits.rows(hit))
         return pack_points(origins, directions, *in_rows(len(origins), hit, *at_hits))

@@ -15,16 +15,16 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
+from simtest.geometry.vectors import dot, projector, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.spec.reflectance import Vessels
 from simtest.surfaces.analytic import QUADRIC_REACH, Cylinder, Plane, Quadric, Sphere
-from simtest.surfaces.model import SurfaceModel, TriangleMesh
+from simtest.surfaces.model import SurfaceModel, TriangleMesh, remembered
 from simtest.surfaces.triangles import area_vectors
 
 PRIMES = (73856093, 19349663, 83492791)
@@ -172,7 +172,7 @@ def _cells_of(segments: "VesselSegments", width: Array, cell_mm: float, some: sl
     nearest = np.full(len(owner), np.inf, dtype=np.float32)
     for i in range(STEPS):
         outside = np.maximum(np.abs(gaps - ((i + 0.5) / STEPS) * along[owner]) - 0.5, 0)
-        np.minimum(nearest, np.einsum("ni,ni->n", outside, outside), out=nearest)
+        np.minimum(nearest, dot(outside, outside), out=nearest)
     reached = nearest < ((reach[:, 0] + np.linalg.norm(along, axis=1) / (2 * STEPS)) ** 2)[owner]
     owner, kept = owner[reached], kept[reached]
     cell = low[owner] + np.stack([step[kept] for step in steps], axis=1)
@@ -277,7 +277,7 @@ def _quadric(surface: Quadric) -> PatternPatch:
         x, y = np.concatenate(rows)[:count].T
         normal = np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1)
         points = np.stack([x, y, -(k1 * x**2 + k2 * y**2) / 2], axis=1)
-        return points, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        return points, unit(normal)
 
     # The area by a midpoint rule.
     side = (np.arange(200) + 0.5) / 100 * half - half
@@ -299,7 +299,7 @@ def _mesh(mesh: TriangleMesh, key: str) -> PatternPatch:
         corners = mesh.faces[face]
         points = np.einsum("nc,nci->ni", weights, mesh.vertices[corners])
         normals = np.einsum("nc,nci->ni", weights, mesh.normals[corners])
-        return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        return points, unit(normals)
 
     return PatternPatch(f"mesh {key}", float(total[-1]), draw)
 
@@ -397,7 +397,7 @@ class VesselSegments:
     vein: Mask  # (S,)
 
 
-@lru_cache(maxsize=4)
+@remembered
 def grow_vessels(patch: PatternPatch, spec: Vessels, seed: int) -> Forest:
     """Grow the vessels of a surface; the last few are cached."""
     branches = np.random.SeedSequence(seed).spawn(SYSTEMS)
@@ -442,7 +442,7 @@ def _neighbours(points: Array, normals: Array, tortuosity: float, rng: np.random
     # Each edge once
     _, once = np.unique(low * len(points) + high, return_index=True)
     low, high, length = low[once], high[once], distance[:, 1:].ravel()[once]
-    facing = np.einsum("ni,ni->n", normals[low], normals[high]) > FACING
+    facing = dot(normals[low], normals[high]) > FACING
     low, high, length = low[facing], high[facing], length[facing]
     cost = length * np.exp(tortuosity * rng.standard_normal(len(length)))
     shape = (len(points), len(points))
@@ -526,7 +526,7 @@ def _straightened(points: Array, normals: Array, parent: IntArray, carried: Arra
         sag = np.sum(along * turned, axis=1, keepdims=True) / 2
         position[inner] = start[inner] + along - N * sag
         normal[inner] = N + turned
-    return position, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    return position, unit(normal)
 
 
 def _shape_operators(points: Array, normals: Array) -> Array:
@@ -540,8 +540,8 @@ def _shape_operators(points: Array, normals: Array) -> Array:
     scale = np.trace(moment, axis1=1, axis2=2)[:, None, None] + np.finfo(float).tiny
     damped = moment + scale * (normals[:, :, None] * normals[:, None, :] + 1e-6 * np.eye(3))
     S = np.einsum("nki,nkj->nij", turn, gap) @ np.linalg.inv(damped)
-    projector = np.eye(3) - normals[:, :, None] * normals[:, None, :]
-    S = projector @ S @ projector
+    across = projector(normals)
+    S = across @ S @ across
     return np.asarray((S + S.transpose(0, 2, 1)) / 2)
 
 
@@ -569,8 +569,7 @@ def segments(forest: Forest) -> VesselSegments:
         + (3 * t**2 - 2 * t**3) * position[joined]
         + (t**3 - t**2) * second
     )
-    normals = (1 - t[:-1]) * normal[above] + t[:-1] * normal[joined]
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    normals = unit((1 - t[:-1]) * normal[above] + t[:-1] * normal[joined])
     return VesselSegments(
         curve[:-1].reshape(-1, 3),
         curve[1:].reshape(-1, 3),

@@ -1,6 +1,5 @@
 """What `simtest mesh check` says of the mesh files that an experiment runs on."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,7 +69,7 @@ def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
     from simtest.surfaces.mesh_check import check_mesh
     from simtest.surfaces.mesh_surface import concentration
 
-    lobe = concentration(None, None) if curvature is None else curvature
+    lobe = concentration() if curvature is None else curvature
     found = check_mesh(surface.file(), None, lobe, surface.kind)
     # At the distance of the nearest viewpoints, which see the narrowest highlights.
     needed, fine, at = found.needed_edge_mm, found.fine, f" at {found.distance_mm:g} mm"
@@ -94,7 +93,7 @@ def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
 
 def _refined_edge(found: "MeshCheck", target_mm: float) -> float:
     """Return the length, mm, that 95 % of the edges do not exceed once the mesh is refined as far as it may be."""
-    from simtest.surfaces.mesh_surface import subdivisions_within_limit
+    from simtest.surfaces.mesh_surface import halvings, subdivisions_within_limit
 
-    wanted = max(0, math.ceil(math.log2(found.edge_p95_mm / target_mm) - 1e-6))
+    wanted = halvings(found.edge_p95_mm, target_mm)
     return float(found.edge_p95_mm / 2 ** subdivisions_within_limit(found.faces, wanted))

@@ -50,7 +50,7 @@ def _section(described: dict[str, Any]) -> tuple[float, float]:
     step = 0.02 * WAVE_MM
 
     def height(offset: Array) -> Array:
-        return field.jets(points + offset).height
+        return field.jets(points + offset).value
 
     here, sides = height(np.zeros(3)), [(height(step * axis), height(-step * axis)) for axis in (first, second)]
     slopes = [(a - b) / (2 * step) for a, b in sides]
@@ -69,8 +69,8 @@ def _fine_normals(session: Session) -> Law:
     step = 1e-3
 
     def slope(axis: Array) -> Array:
-        return (field.jets(session.to_model(points + step * axis)).height
-                - field.jets(session.to_model(points - step * axis)).height) / (2 * step)  # fmt: skip
+        return (field.jets(session.to_model(points + step * axis)).value
+                - field.jets(session.to_model(points - step * axis)).value) / (2 * step)  # fmt: skip
 
     x, y = slope(np.array([1.0, 0, 0])), slope(np.array([0, 1.0, 0]))
     # Height counts towards the camera, along -z: where it rises the normal leans back.

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.surfaces.colon import Colon, build
+from simtest.surfaces.colon import build, make_colon
+from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, Polyp, load_recipe
-from simtest.surfaces.stalk import Jet, Stalk
 from simtest.surfaces.triangles import off_between
+from simtest.surfaces.tube import Stalk
 from tests.marked import marked
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,7 +60,7 @@ def chosen_hits(recipe, count=4000, seed=0):
 def parameters(tube, points):
     """(u, v) of surface points, found apart from the Newton solution under test."""
     u, v, radial = tube.slice_of(points)
-    return u, v, radial - tube.radius(u, v).f
+    return u, v, radial - tube.radius(u, v).value
 
 
 def central(f, h):
@@ -75,20 +76,20 @@ def test_partial_derivatives_match_finite_differences(recipe):
     u, v = rng.uniform(0, recipe.length_mm, 3000), rng.uniform(-4, 8, 3000)
     jet = tube.jet(u, v)
     h_v = STEP / 20
-    du, duu = central(lambda h: tube.jet(u + h, v).f, STEP)
-    dv, dvv = central(lambda h: tube.jet(u, v + h).f, h_v)
-    duv, _ = central(lambda h: tube.jet(u, v + h).u, h_v)
-    np.testing.assert_allclose(jet.u, du, atol=2e-9)
-    np.testing.assert_allclose(jet.v, dv, atol=1e-7)
-    np.testing.assert_allclose(jet.uu, duu, atol=2e-6)
-    np.testing.assert_allclose(jet.uv, duv, atol=1e-7)
-    np.testing.assert_allclose(jet.vv, dvv, atol=3e-3)  # rounding: 1e-14 * 100 mm / h_v^2
+    du, duu = central(lambda h: tube.jet(u + h, v).value, STEP)
+    dv, dvv = central(lambda h: tube.jet(u, v + h).value, h_v)
+    duv, _ = central(lambda h: tube.jet(u, v + h).gradient[..., 0], h_v)
+    np.testing.assert_allclose(jet.gradient[..., 0], du, atol=2e-9)
+    np.testing.assert_allclose(jet.gradient[..., 1], dv, atol=1e-7)
+    np.testing.assert_allclose(jet.hessian[..., 0, 0], duu, atol=2e-6)
+    np.testing.assert_allclose(jet.hessian[..., 0, 1], duv, atol=1e-7)
+    np.testing.assert_allclose(jet.hessian[..., 1, 1], dvv, atol=3e-3)  # rounding: 1e-14 * 100 mm / h_v^2
 
 
 @pytest.mark.parametrize("recipe", marked(MORE, ci=["pedunculated"]), indirect=True)
 def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
     """The normal from differenced positions; S from differenced normals, along the reported directions."""
-    colon, tube = Colon(recipe, 0), build(recipe).tube
+    colon, tube = make_colon(recipe, 0), build(recipe).tube
     origins, directions, hits, _ = chosen_hits(recipe, 2000)
     points = colon.points(origins, directions, hits)
     ok = points.valid
@@ -96,8 +97,8 @@ def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
     assert np.abs(off).max() < 1e-9
 
     def normal(u, v):
-        pu, _ = central(lambda h: tube.jet(u + h, v).f, STEP)
-        pv, _ = central(lambda h: tube.jet(u, v + h).f, STEP / 20)
+        pu, _ = central(lambda h: tube.jet(u + h, v).value, STEP)
+        pv, _ = central(lambda h: tube.jet(u, v + h).value, STEP / 20)
         n = np.cross(pu, pv)
         return n / np.linalg.norm(n, axis=1, keepdims=True)
 
@@ -106,7 +107,7 @@ def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
     nu, _ = central(lambda h: normal(u + h, v), 0.006)
     nv, _ = central(lambda h: normal(u, v + h), 0.0003)
     jet = tube.jet(u, v)
-    J, dN = np.stack([jet.u, jet.v], axis=2), np.stack([nu, nv], axis=2)
+    J, dN = jet.gradient, np.stack([nu, nv], axis=2)
     S = dN @ np.linalg.pinv(J)
     S = (S + S.transpose(0, 2, 1)) / 2
     for k, d in ((points.k_min, points.direction_min), (points.k_max, points.direction_max)):
@@ -118,7 +119,7 @@ def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
 
 def test_newton_points_lie_on_ray_and_surface(recipe):
     origins, directions, hits, facing = chosen_hits(recipe)
-    points = Colon(recipe, 0).points(origins, directions, hits)
+    points = make_colon(recipe, 0).points(origins, directions, hits)
     assert points.valid.mean() > 0.999
     ok = points.valid
     _, _, off = parameters(build(recipe).tube, points.position[ok])
@@ -139,7 +140,7 @@ def test_points_at_the_seam_and_misses(recipe):
     distance = np.full(len(seam), 3.0)
     distance[0] = np.inf
     third = np.full((len(seam), 2), 1 / 3)
-    points = Colon(recipe, 0).points(centre + 3 * normal, -normal, RayHits(distance, seam, third))
+    points = make_colon(recipe, 0).points(centre + 3 * normal, -normal, RayHits(distance, seam, third))
     assert not points.valid[0]
     assert np.isnan(points.position[0]).all()
     assert points.valid[1:].all()
@@ -148,7 +149,7 @@ def test_points_at_the_seam_and_misses(recipe):
 
 @pytest.mark.parametrize("recipe", marked(MORE, ci=["shipped", "polyps and relief"]), indirect=True)
 def test_mesh_has_two_open_ends_and_normals_into_the_lumen(recipe):
-    shape = Colon(recipe, 0).shape()
+    shape = make_colon(recipe, 0).shape()
     mesh = shape.mesh
     assert shape.kind == "mesh"
     stalked = sum(polyp.neck_mm is not None for polyp in recipe.polyps)
@@ -173,7 +174,7 @@ def test_mesh_has_two_open_ends_and_normals_into_the_lumen(recipe):
 
 def test_folds_are_convex_and_walls_concave_towards_the_camera(recipe):
     origins, directions, hits, _ = chosen_hits(recipe)
-    points = Colon(recipe, 0).points(origins, directions, hits)
+    points = make_colon(recipe, 0).points(origins, directions, hits)
     assert np.nanmedian(points.k_min) < -1 / 40
     if not recipe.polyps:
         assert 1 / 5 < np.nanmax(points.k_max) < 1 / 2  # fold edges of 2 to 5 mm
@@ -197,16 +198,16 @@ def test_polyps_and_relief_are_where_they_are_wanted():
     tube, plain = build(bare.model_copy(update={"polyps": POLYPS})).tube, build(bare).tube
     for polyp in POLYPS:
         u, v = np.array([polyp.along_mm]), np.radians([polyp.around_deg])
-        assert plain.radius(u, v).f - tube.radius(u, v).f == pytest.approx(polyp.height_mm, abs=1e-3)
+        assert plain.radius(u, v).value - tube.radius(u, v).value == pytest.approx(polyp.height_mm, abs=1e-3)
         half = polyp.width_mm / 2
         for du, dv in ((half, 0), (-half, 0), (0, half / 22), (0, -half / 22)):
-            rise = plain.radius(u + du, v + dv).f - tube.radius(u + du, v + dv).f
+            rise = plain.radius(u + du, v + dv).value - tube.radius(u + du, v + dv).value
             assert rise == pytest.approx(polyp.height_mm / 2, rel=0.01)
         assert np.linalg.eigvalsh(tube.normal_and_shape_operator(u, v)[1][0])[1:].min() > 0.1  # convex
     rough = build(bare.model_copy(update={"relief_mm": 0.02})).tube
     u, v = np.random.default_rng(0).uniform([0, 0], [115, 2 * np.pi], size=(5000, 2)).T
-    assert np.std(rough.radius(u, v).f) == pytest.approx(0.02 * np.sqrt(6 / 2), rel=0.1)
-    np.testing.assert_allclose(rough.radius(u, v + 2 * np.pi).f, rough.radius(u, v).f, atol=1e-12)
+    assert np.std(rough.radius(u, v).value) == pytest.approx(0.02 * np.sqrt(6 / 2), rel=0.1)
+    np.testing.assert_allclose(rough.radius(u, v + 2 * np.pi).value, rough.radius(u, v).value, atol=1e-12)
 
 
 def test_a_pedunculated_polyp_has_the_sizes_asked_for_and_its_head_overhangs_its_neck():
@@ -214,9 +215,8 @@ def test_a_pedunculated_polyp_has_the_sizes_asked_for_and_its_head_overhangs_its
     stalk = Stalk.of_size(np.zeros(3), np.array([0.0, 0, 1]), height=9.0, head=6.0, neck=2.4)
     x = np.linspace(0, 12, 20_001)
     flat = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
-    zero, along = np.zeros_like(flat), np.tile([1.0, 0, 0], (len(x), 1))
-    drawn = stalk.apply(Jet(flat, along, zero, zero, zero, zero))
-    radius, _, z = drawn.f.T
+    drawn = stalk.apply(Jet.variables(flat, 1))
+    radius, _, z = drawn.value.T
     assert z[0] == pytest.approx(9.0)
     head = np.argmax(np.where(z > 4.5, radius, 0))
     neck = np.argmin(np.where((z > 0.9) & (z < z[head]), radius, np.inf))
@@ -224,21 +224,20 @@ def test_a_pedunculated_polyp_has_the_sizes_asked_for_and_its_head_overhangs_its
     assert 2 * radius[neck] == pytest.approx(2.4, rel=1e-4)
     assert z[neck] < z[head]
     # From head to neck the radius shrinks as the height falls: under the head the wall looks down.
-    assert (drawn.u[head + 50 : neck - 50] @ [1, 0, 0] < 0).all()
+    assert (drawn.gradient[head + 50 : neck - 50, 0, 0] < 0).all()
 
 
 def test_where_a_point_of_a_polyp_came_from_is_known_and_no_two_points_meet():
     stalk = Stalk.of_size(np.array([1.0, 2, 3]), np.array([0.6, 0, 0.8]), height=8.0, head=6.0, neck=2.0)
     points = stalk.foot + np.random.default_rng(2).uniform(-15, 15, (4000, 3))
-    zero = np.zeros_like(points)
-    drawn = stalk.apply(Jet(points, zero, zero, zero, zero, zero)).f
+    drawn = stalk.apply(Jet(points)).value
     assert np.abs(drawn - points).max() > 5
     np.testing.assert_allclose(stalk.undo(drawn), points, atol=1e-12)
 
 
 def test_behind_the_head_of_a_polyp_there_is_lumen_and_in_it_tissue():
     recipe = ColonRecipe(fold_depth_mm=0.0, taenia_mm=0.0, polyps=(STALKED[0].model_copy(update={"height_mm": 12.0}),))
-    tube, colon = build(recipe).tube, Colon(recipe, 0)
+    tube, colon = build(recipe).tube, make_colon(recipe, 0)
     u, v = np.array([60.0]), np.radians([80.0])
     _, rho, tau = (part[0] for part in tube.frame(u, v))
     foot = tube.centreline(u)[0] + 22.0 * rho
@@ -271,7 +270,7 @@ def test_centreline_has_unit_speed_and_is_exact(recipe):
 
 
 def test_key_and_mesh_follow_the_recipe_alone(recipe):
-    a, b = Colon(recipe, 0).shape(), Colon(recipe, 5).shape()
+    a, b = make_colon(recipe, 0).shape(), make_colon(recipe, 5).shape()
     assert a.key == b.key
     assert a.mesh is b.mesh
 
@@ -279,7 +278,7 @@ def test_key_and_mesh_follow_the_recipe_alone(recipe):
 @pytest.mark.parametrize("more", ["shipped", pytest.param("pedunculated", marks=pytest.mark.slow)])
 def test_another_seed_is_another_mesh(more):
     recipe = load_recipe(ROOT / "meshes" / "colon.toml").model_copy(update=MORE[more])
-    a, other = (Colon(recipe.model_copy(update={"seed": seed}), 0).shape() for seed in (recipe.seed, 7))
+    a, other = (make_colon(recipe.model_copy(update={"seed": seed}), 0).shape() for seed in (recipe.seed, 7))
     assert a.key != other.key
     assert not np.array_equal(a.mesh.vertices, other.mesh.vertices)
 
@@ -287,7 +286,7 @@ def test_another_seed_is_another_mesh(more):
 @pytest.mark.parametrize("update", [{"bend_deg": 180.0, "length_mm": 40.0}, {"fold_spacing_mm": 5.0}])
 def test_impossible_tubes_are_refused(recipe, update):
     with pytest.raises(InputError, match="colon recipe"):
-        Colon(recipe.model_copy(update=update), 0)
+        make_colon(recipe.model_copy(update=update), 0)
 
 
 def test_recipes_load_and_refuse_what_is_malformed(tmp_path):

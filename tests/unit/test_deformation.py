@@ -50,8 +50,8 @@ def test_derivatives_are_those_of_the_map(case, points):
     at = DeformationAt(CASES[case], TIME)
     jets = at.jets(points)
     assert np.array_equal(jets.value, at.moved(points))
-    assert np.abs(differences(at.moved, points) - jets.jacobian).max() < 1e-10
-    assert np.abs(differences(lambda x: at.jets(x).jacobian, points) - jets.hessian).max() < 1e-10
+    assert np.abs(differences(at.moved, points) - jets.gradient).max() < 1e-10
+    assert np.abs(differences(lambda x: at.jets(x).gradient, points) - jets.hessian).max() < 1e-10
     assert np.abs(jets.hessian).max() > 1e-4
 
 
@@ -86,7 +86,7 @@ def test_stretch_bounds_the_derivative_and_is_no_idle_bound(kind):
     # The turn is rigid and no part of the displacement.
     rigid = {"turn_deg": 0.0} if kind == "breathing" else {}
     norms = [
-        np.linalg.norm(DeformationAt([spec.model_copy(update=rigid)], t).jets(points).jacobian - np.eye(3), 2, (1, 2))
+        np.linalg.norm(DeformationAt([spec.model_copy(update=rigid)], t).jets(points).gradient - np.eye(3), 2, (1, 2))
         for t in np.linspace(0, spec.period_s, 5)
     ]
     assert 0.5 * spec.stretch < np.max(norms) <= spec.stretch
@@ -95,7 +95,7 @@ def test_stretch_bounds_the_derivative_and_is_no_idle_bound(kind):
 def test_at_rest_nothing_moves(points):
     at = DeformationAt([BREATHING, DENT], 0.0)
     assert np.array_equal(at.moved(points), points)
-    assert np.array_equal(at.jets(points).jacobian, np.broadcast_to(np.eye(3), (len(points), 3, 3)))
+    assert np.array_equal(at.jets(points).gradient, np.broadcast_to(np.eye(3), (len(points), 3, 3)))
 
 
 QUADRIC = {"type": "quadric", "k1_per_mm": 0.03, "k2_per_mm": -0.02}
@@ -185,8 +185,8 @@ def test_normals_are_those_of_differences(cast):
     assert np.linalg.norm(np.cross(normal, points.normal), axis=1).max() < 1e-8
     # Control: normals that are carried as tangents are, by J, are wrong by degrees.
     jets = surface.deformation.jets(surface.deformation.at_rest(points.position))
-    wrong = np.einsum("nji,nj->ni", jets.jacobian, normal)
-    wrong = np.einsum("nij,nj->ni", jets.jacobian, wrong)
+    wrong = np.einsum("nji,nj->ni", jets.gradient, normal)
+    wrong = np.einsum("nij,nj->ni", jets.gradient, wrong)
     wrong /= np.linalg.norm(wrong, axis=1, keepdims=True)
     assert np.median(np.linalg.norm(np.cross(normal, wrong), axis=1)) > 0.03
 
@@ -225,8 +225,8 @@ def test_relief_rides_on_the_tissue():
     X = np.random.default_rng(7).uniform(-5, 5, (200, 3))
     Y = deformed.deformation.moved(X)
     jets = deformed.relief.jets(Y)
-    assert jets.height == pytest.approx(rest.relief.jets(X).height, abs=1e-11)
-    gaps = np.abs(jets.gradient - differences(lambda y: deformed.relief.jets(y).height, Y))
+    assert jets.value == pytest.approx(rest.relief.jets(X).value, abs=1e-11)
+    gaps = np.abs(jets.gradient - differences(lambda y: deformed.relief.jets(y).value, Y))
     # A cubic spline has third derivatives that jump at its nodes: there, differences are less exact.
     assert np.median(gaps) < 1e-10
     assert gaps.max() < 1e-6

@@ -37,7 +37,7 @@ def test_seen_straight_on_only_the_base_curvature_turns_normals():
     # slope x height x curvature
     position, _, t = patch.base(feet)
     jets = patch.field.jets(position)
-    expected = np.degrees(np.abs(np.sum(t * jets.gradient, axis=1) * jets.height) / 15)
+    expected = np.degrees(np.abs(np.sum(t * jets.gradient, axis=1) * jets.value) / 15)
     assert np.allclose(off, expected, rtol=0.1, atol=1e-3)
     assert off.max() < 0.5
 

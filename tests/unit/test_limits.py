@@ -22,8 +22,7 @@ from simtest.runtime.processes import call_apart, check_workers
 from simtest.spec import load_experiment, load_scene
 from simtest.spec.toml_files import apply_settings, parse_settings
 from simtest.surfaces import mesh_file
-from simtest.surfaces.mesh_file import check_ply, read_mesh
-from simtest.surfaces.vtk_file import read_vtk
+from simtest.surfaces.mesh_file import check_ply, read_mesh, read_vtk
 from simtest.validation import run_folder
 from simtest.validation.cases import check_effort
 from simtest.validation.depth_maps import read_depth

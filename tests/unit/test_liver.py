@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.surfaces.liver import Liver, _project, build
+from simtest.surfaces.liver import _project, build, make_liver
 from simtest.surfaces.model import RayHits
 from simtest.surfaces.recipe import LiverRecipe, load_recipe
 
@@ -47,7 +47,7 @@ def test_gradient_and_hessian_match_finite_differences(recipe):
     body = build(recipe).body
     points = build(recipe).mesh.vertices[::37] + np.random.default_rng(0).normal(size=3)
     at = body.evaluate(points)
-    np.testing.assert_allclose(at.f, body.values(points), atol=1e-12)
+    np.testing.assert_allclose(at.value, body.values(points), atol=1e-12)
     np.testing.assert_allclose(at.gradient, gradient(body.values, points), atol=2e-7)
     np.testing.assert_allclose(at.hessian, gradient(lambda p: body.evaluate(p).gradient, points), atol=2e-7)
     np.testing.assert_allclose(at.hessian, at.hessian.transpose(0, 2, 1), atol=1e-14)
@@ -57,7 +57,7 @@ def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
     """The surface as a height over its tangent plane: heights by bisection of F, differenced for normal and S."""
     body = build(recipe).body
     origins, directions, hits, _ = chosen_hits(recipe, 300)
-    points = Liver(recipe, 0).points(origins, directions, hits)
+    points = make_liver(recipe, 0).points(origins, directions, hits)
     ok = points.valid
     p, n = points.position[ok], points.normal[ok]
     first, second = points.direction_min[ok], points.direction_max[ok]
@@ -85,7 +85,7 @@ def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
 def test_newton_points_lie_on_ray_and_surface(recipe):
     origins, directions, hits, _ = chosen_hits(recipe)
     hits.distance[0] = np.inf
-    points = Liver(recipe, 0).points(origins, directions, hits)
+    points = make_liver(recipe, 0).points(origins, directions, hits)
     assert not points.valid[0]
     assert np.isnan(points.normal[0]).all()
     assert points.valid.mean() > 0.998
@@ -101,7 +101,7 @@ def test_newton_points_lie_on_ray_and_surface(recipe):
 def test_mesh_is_closed_even_and_on_the_surface(recipe):
     import trimesh
 
-    shape = Liver(recipe, 0).shape()
+    shape = make_liver(recipe, 0).shape()
     mesh = trimesh.Trimesh(shape.mesh.vertices, shape.mesh.faces, process=False)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
@@ -122,24 +122,24 @@ def test_mesh_is_closed_even_and_on_the_surface(recipe):
 
 def test_outside_is_convex_and_the_inferior_edge_sharp(recipe):
     origins, directions, hits, _ = chosen_hits(recipe)
-    points = Liver(recipe, 0).points(origins, directions, hits)
+    points = make_liver(recipe, 0).points(origins, directions, hits)
     assert np.nanmedian(points.k_max) > 1 / 100
     assert 0.1 < np.nanmax(points.k_max) < 0.6
     assert np.nanmin(points.k_min) < 0  # the hollow of the visceral face
 
 
 def test_key_and_mesh_follow_the_recipe_alone(recipe):
-    a, b = Liver(recipe, 0).shape(), Liver(recipe, 5).shape()
+    a, b = make_liver(recipe, 0).shape(), make_liver(recipe, 5).shape()
     assert a.key == b.key
     assert a.mesh is b.mesh
 
 
 def test_impossible_bodies_are_refused(recipe):
     with pytest.raises(InputError, match="visceral"):
-        Liver(recipe.model_copy(update={"visceral_offset_mm": -100.0, "visceral_radius_mm": 1e4}), 0)
+        make_liver(recipe.model_copy(update={"visceral_offset_mm": -100.0, "visceral_radius_mm": 1e4}), 0)
     lobe = recipe.lobes[0].model_copy(update={"semi_axes_mm": (200.0, 200.0, 200.0)})
     with pytest.raises(InputError, match="cells"):
-        Liver(recipe.model_copy(update={"lobes": (lobe,)}), 0)
+        make_liver(recipe.model_copy(update={"lobes": (lobe,)}), 0)
 
 
 def test_interpolated_normals_are_those_of_the_surface(recipe):

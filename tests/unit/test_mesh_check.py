@@ -12,13 +12,11 @@ from simtest.surfaces.mesh_file import examine, read_mesh, repair
 from simtest.surfaces.mesh_surface import (
     EDGES_PER_HALF_WIDTH,
     concentration,
-    ggx_concentration,
     half_width,
-    phong_concentration,
     prepare,
 )
 
-C = phong_concentration(10.0)
+C = concentration(10.0)
 
 
 def ball(level=3, radius=40.0):
@@ -154,12 +152,12 @@ def test_large_meshes_are_not_searched_and_it_is_said(tmp_path, monkeypatch):
 def test_half_width_is_that_of_the_theory():
     # Phong on a plane: cos^n(2 theta) = 1/2 at theta = half-width / d.
     theta = 0.5 * math.acos(0.5 ** (1 / 500.0))
-    assert half_width(30.0, phong_concentration(500.0), 0.0) == pytest.approx(30 * math.tan(theta), rel=2e-3)
+    assert half_width(30.0, concentration(500.0), 0.0) == pytest.approx(30 * math.tan(theta), rel=2e-3)
     assert half_width(30.0, C, 1 / 30) == pytest.approx(half_width(30.0, C, 0.0) / 2)
     # GGX with light at the camera: D ~ (alpha^2 + (1 - alpha^2) sin^2)^-2.
     alpha, h = 0.2, 1e-4
     log = [-2 * math.log(alpha**2 + (1 - alpha**2) * math.sin(x) ** 2) for x in (-h, 0.0, h)]
-    assert ggx_concentration(alpha) == pytest.approx(-(log[0] - 2 * log[1] + log[2]) / h**2, rel=1e-4)
+    assert concentration(None, alpha) == pytest.approx(-(log[0] - 2 * log[1] + log[2]) / h**2, rel=1e-4)
 
 
 def test_the_verdict_follows_the_edges(tmp_path):

@@ -13,9 +13,8 @@ from simtest.cli.runs import validate
 from simtest.errors import InputError
 from simtest.spec import Experiment, Group
 from simtest.surfaces.mesh_check import check_mesh
-from simtest.surfaces.mesh_file import read_mesh, read_mixed_polygons
+from simtest.surfaces.mesh_file import _triangles, read_mesh, read_mixed_polygons
 from simtest.surfaces.mesh_surface import concentration
-from simtest.surfaces.vtk_file import _triangles
 from simtest.validation.mesh_verdicts import MeshVerdict, mesh_verdicts
 from tests.refusals import refused
 

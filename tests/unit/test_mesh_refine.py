@@ -6,7 +6,7 @@ import trimesh
 
 from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import read_mesh
-from simtest.surfaces.mesh_surface import Refinement, fair, halvings, prepare, refine, shape_operators, vertex_normals
+from simtest.surfaces.mesh_surface import fair, halvings, prepare, refine, shape_operators, vertex_normals
 from simtest.surfaces.model import principal_curvatures
 from simtest.surfaces.triangles import edge_lengths, edge_uses
 
@@ -97,7 +97,7 @@ def test_edges_are_halved_until_they_are_short_enough():
     ball = trimesh.creation.icosphere(3, radius=10.0)
     vertices, faces = np.array(ball.vertices), np.array(ball.faces)
     longest = np.quantile(edge_lengths(vertices, faces), 0.95)
-    assert [halvings(vertices, faces, longest * share) for share in (2.0, 1.0, 0.9, 0.5, 0.49)] == [0, 0, 1, 1, 2]
+    assert [halvings(longest, longest * share) for share in (2.0, 1.0, 0.9, 0.5, 0.49)] == [0, 0, 1, 1, 2]
     fine, _ = refine(vertices, faces, 2, 0.0)
     assert len(fine) == 10 * 4**5 + 2
 
@@ -105,12 +105,12 @@ def test_edges_are_halved_until_they_are_short_enough():
 def test_a_scene_may_ask_for_an_edge_length(tmp_path, monkeypatch):
     path = tmp_path / "ball.ply"
     trimesh.creation.icosphere(3, radius=15.0).export(path)
-    prepared = prepare(path, Refinement(edge_mm=1.5))
+    prepared = prepare(path, edge_mm=1.5)
     assert prepared.subdivisions == 1
     radius = np.linalg.norm(prepared.mesh.vertices, axis=1)
     assert radius.mean() == pytest.approx(15, rel=0.01)  # fair smoothing hardly shrinks
     monkeypatch.setattr("simtest.surfaces.mesh_surface.AUTO_CONCENTRATION", 40.0)  # a wide lobe: fewer faces
-    automatic = prepare(path, Refinement(edge_mm="auto"))
+    automatic = prepare(path, edge_mm="auto")
     assert automatic.subdivisions == 2  # 40 mm sqrt(2 ln 2 / 40) / (1 + 40/15) / 2 = 1.0 mm
     assert automatic.key != prepared.key
     with pytest.raises(ValueError, match=r"subdivisions = 2 and edge_mm = 0\.5: only one of them"):
@@ -129,7 +129,7 @@ def test_smoothing_is_left_out_with_a_warning_where_it_cannot_be(tmp_path, monke
     trimesh.creation.icosphere(3, radius=15.0).export(path)
     monkeypatch.setattr("simtest.surfaces.mesh_surface.MAX_SMOOTHED_FACES", 1000)
     with pytest.warns(UserWarning, match="1280 faces, at most 1000 can be smoothed; using smoothing_mm = 0"):
-        prepare(path, Refinement(0, smoothing_mm=3.0))
+        prepare(path, 0, smoothing_mm=3.0)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import trimesh
 from simtest.errors import InputError
 from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import read_mesh
-from simtest.surfaces.mesh_surface import LUMEN_QUOTIENT, MeshSurface, prepare
+from simtest.surfaces.mesh_surface import LUMEN_QUOTIENT, make_mesh_surface, prepare
 from simtest.surfaces.model import RayHits
 from simtest.surfaces.triangles import isoperimetric_quotient
 from tests.marked import marked
@@ -37,7 +37,7 @@ def save(mesh, path):
 
 
 def surface(path, **settings):
-    return MeshSurface(AnatomySurface(path=str(path), **settings))
+    return make_mesh_surface(AnatomySurface(path=str(path), **settings))
 
 
 def hits_of(mesh, count=500, seed=0, height=5.0):
@@ -132,7 +132,7 @@ def test_curvature_of_a_sphere_is_positive_outside_and_negative_inside(tmp_path)
     for kind, sign in (("auto", 1), ("lumen", -1)):
         model = surface(path, kind=kind, subdivisions=0)
         mesh = model.shape().mesh
-        assert model.prepared.lumen == (kind == "lumen")
+        assert model.lumen == (kind == "lumen")
         origins, directions, hits = hits_of(mesh)
         points = model.points(origins, directions, hits)
         assert points.valid.all()
@@ -219,12 +219,12 @@ def test_quotient_tells_a_tube_from_a_ball():
 @needs_meshes
 def test_reference_meshes_are_told_apart():
     liver = surface(LIVER, subdivisions=1)
-    assert not liver.prepared.lumen
+    assert not liver.lumen
     assert len(liver.shape().mesh.faces) == 80_000
-    assert np.median(np.trace(liver.prepared.shape_operators, axis1=1, axis2=2)) > 0
+    assert np.median(np.trace(liver.vertex_shape_operators(), axis1=1, axis2=2)) > 0
     colon = surface(COLON, subdivisions=0)
-    assert colon.prepared.lumen
-    assert np.median(np.trace(colon.prepared.shape_operators, axis1=1, axis2=2)) < 0
+    assert colon.lumen
+    assert np.median(np.trace(colon.vertex_shape_operators(), axis1=1, axis2=2)) < 0
     for model in (liver, colon):
         mesh = trimesh.Trimesh(model.shape().mesh.vertices, model.shape().mesh.faces, process=False)
         assert mesh.is_watertight

@@ -13,7 +13,8 @@ from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 from simtest.spec.surfaces import MAX_HEIGHT_MM, Relief
 from simtest.surfaces import forget_meshes
-from simtest.surfaces.relief_field import NODES, HeightJets, fine_normals, make_relief
+from simtest.surfaces.jets import Jet
+from simtest.surfaces.relief_field import NODES, make_relief, normal_derivative
 from tests.example_counts import examples
 from tests.marked import marked
 
@@ -95,7 +96,7 @@ def by_differences(session, pixels, step):
     pose = session.surface.model_from_camera
 
     def heights(points):
-        return session.surface.relief.jets(points.position @ pose[:3, :3].T + pose[:3, 3]).height
+        return session.surface.relief.jets(points.position @ pose[:3, :3].T + pose[:3, 3]).value
 
     points = session.cast(pixels)[0]
     J, dn, dh = np.zeros((len(pixels), 3, 2)), np.zeros((len(pixels), 3, 2)), np.zeros((len(pixels), 2))
@@ -164,7 +165,7 @@ def test_on_a_plane_the_relief_is_the_graph_of_its_height():
     def h(x, y):
         # The plane faces the camera: its height points along -z.
         moved = points.position + np.array([x, y, 0.0])
-        return height(moved @ pose[:3, :3].T + pose[:3, 3]).height
+        return height(moved @ pose[:3, :3].T + pose[:3, 3]).value
 
     hx, hy = (sum(w * h(*(k * step * np.eye(2)[i])) for k, w in STENCIL) / step for i in range(2))
     wide = 1e-3
@@ -207,7 +208,7 @@ def test_on_a_users_mesh_the_base_is_its_interpolated_normal_and_operator():
         J = np.stack([u - ku * a * N, v - kv * b * N], axis=2)
         steps = [[at(a + k * step * i, b + k * step * (1 - i)) for k, _ in STENCIL] for i in (1, 0)]
         weights = [w / step for _, w in STENCIL]
-        dh = np.stack([np.dot(weights, [relief.jets(x).height for x in points]) for points in steps], axis=1)
+        dh = np.stack([np.dot(weights, [relief.jets(x).value for x in points]) for points in steps], axis=1)
         return J, normals(J, dh, -N)[1]
 
     J, normal = fine_normal(0.0, 0.0)
@@ -231,10 +232,10 @@ def plane_heights(field, normal, along, count=40_000, seed=1):
     y = np.cross(normal, x)
     u, v = rng.uniform(-400, 400, (2, count))
     P = 3.1 * normal + u[:, None] * x + v[:, None] * y
-    e, h0 = 1e-3, field.jets(P).height
+    e, h0 = 1e-3, field.jets(P).value
     first, second = [], []
     for axis in (x, y):
-        plus, minus = field.jets(P + e * axis).height, field.jets(P - e * axis).height
+        plus, minus = field.jets(P + e * axis).value, field.jets(P - e * axis).value
         first.append((plus - minus) / (2 * e))
         second.append((plus - 2 * h0 + minus) / e**2)
     return h0, first, second
@@ -306,23 +307,23 @@ def test_seamless_around_a_tube_and_across_the_lattices_borders():
     for path in (around, line):
         jets, step = field.jets(path), np.linalg.norm(np.diff(path, axis=0), axis=1)
         steepest = np.linalg.norm(jets.gradient, axis=1).max()
-        assert (np.abs(np.diff(jets.height)) <= steepest * step * 1.01 + 1e-15).all()
+        assert (np.abs(np.diff(jets.value)) <= steepest * step * 1.01 + 1e-15).all()
         bent = np.abs(np.linalg.eigvalsh(jets.hessian)).max()
         assert (np.linalg.norm(np.diff(jets.gradient, axis=0), axis=1) <= bent * step * 1.01 + 1e-14).all()
 
 
 def test_seeds_and_bands_differ_and_repeat():
     points = np.random.default_rng(0).uniform(-50, 50, (20_000, 3))
-    height = make(seed=1).jets(points).height
+    height = make(seed=1).jets(points).value
     forget_meshes()
-    assert np.array_equal(make(seed=1).jets(points).height, height)
-    other = make(seed=2).jets(points).height
+    assert np.array_equal(make(seed=1).jets(points).value, height)
+    other = make(seed=2).jets(points).value
     assert abs(np.corrcoef(height, other)[0, 1]) < 0.05
     two = make_relief(Relief(bands=(BAND, BAND), seed=1))
-    first, second = (band.jets(points).height for band in two.bands)
+    first, second = (band.jets(points).value for band in two.bands)
     assert abs(np.corrcoef(first, second)[0, 1]) < 0.05
     # Another level is the same field.
-    assert np.array_equal(make(seed=1, level=0.0).tissue_jets(points).height, height)
+    assert np.array_equal(make(seed=1, level=0.0).tissue_jets(points).value, height)
 
 
 def test_reliefs_of_one_seed_differ_in_scale_alone():
@@ -335,9 +336,9 @@ def test_reliefs_of_one_seed_differ_in_scale_alone():
     forget_meshes()
     one, other = relief(2.0, 1.5), relief(3.0, 3.0)
     # Twice the wavelength and 1.5 times the slope are three times the height.
-    assert other.jets(2 * points).height == pytest.approx(3 * one.jets(points).height, rel=1e-9, abs=1e-12)
+    assert other.jets(2 * points).value == pytest.approx(3 * one.jets(points).value, rel=1e-9, abs=1e-12)
     forget_meshes()
-    assert np.array_equal(relief(3.0, 3.0).jets(points).height, other.jets(points).height)
+    assert np.array_equal(relief(3.0, 3.0).jets(points).value, other.jets(points).value)
 
 
 @pytest.mark.slow
@@ -368,17 +369,17 @@ def test_film_fills_valleys_smoothly(height, level, gradient):
     field = make(level=0.0)
     field = replace(field, level=level * field.deviation)
     G = np.array([gradient])
-    jets = HeightJets(np.array([height]), G, np.zeros((1, 3, 3)))
+    jets = Jet(np.array([height]), G, np.zeros((1, 3, 3)))
     filled = field.fill(jets)
     surface = max(height, field.level)
-    assert surface - 1e-15 <= filled.height[0] <= surface + np.log(2) * field.meniscus + 1e-15
+    assert surface - 1e-15 <= filled.value[0] <= surface + np.log(2) * field.meniscus + 1e-15
     # phi' from differences of phi
     e = 1e-6
-    near = [field.fill(replace(jets, height=jets.height + k * e)).height for k, _ in STENCIL]
+    near = [field.fill(Jet(jets.value + k * e, *jets.parts[1:])).value for k, _ in STENCIL]
     share = sum(w * value for (_, w), value in zip(STENCIL, near, strict=True)) / e
     assert np.allclose(filled.gradient, share[:, None] * G, atol=1e-8)
     # and phi'' from those of phi'
-    steps = [field.fill(replace(jets, height=jets.height + k * e)).gradient for k, _ in STENCIL]
+    steps = [field.fill(Jet(jets.value + k * e, *jets.parts[1:])).gradient for k, _ in STENCIL]
     bend = sum(w * value for (_, w), value in zip(STENCIL, steps, strict=True)) / e
     assert np.allclose(filled.hessian[0], np.outer(bend[0], G[0]), atol=1e-5 * (1 + np.abs(filled.hessian).max()))
 
@@ -392,7 +393,7 @@ def test_pools_are_smooth_and_crests_keep_their_relief():
     session.surface.relief = make_relief(session.scene.surface.relief, 0.3)
     wet, field = session.cast(pixels)[0], session.surface.relief
     pose = session.surface.model_from_camera
-    height = field.tissue_jets(wet.position @ pose[:3, :3].T + pose[:3, 3]).height
+    height = field.tissue_jets(wet.position @ pose[:3, :3].T + pose[:3, 3]).value
     assert np.array_equal(wet.pool, height < field.level)
     # Of a gaussian field 62 % lie below 0.3 deviations.
     assert wet.pool.mean() == pytest.approx(0.618, abs=0.08)
@@ -441,7 +442,7 @@ def test_the_kernel_computes_the_same(level):
     assert np.abs(np.array(jets.gradient).T - exact.gradient).max() < 1e-5
     assert np.abs(np.array(jets.diffused).T - diffused.gradient).max() < 1e-5
     tissue = field.tissue_jets(points.astype(float))
-    assert np.abs(np.array(jets.height) - tissue.height).max() < 1e-5 * field.deviation * 10
+    assert np.abs(np.array(jets.height) - tissue.value).max() < 1e-5 * field.deviation * 10
     six = exact.hessian[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T
     assert np.abs(np.array(jets.hessian) - six).max() < 1e-4 * np.abs(six).max()
 
@@ -480,10 +481,10 @@ def test_fine_normals_are_unit_and_see_the_tangent_gradient_only(direction, grad
     if np.linalg.norm(N) < 1e-3:
         N = np.array([[0.0, 0.0, 1.0]])
     N /= np.linalg.norm(N)
-    G = np.array([gradient])
-    found = fine_normals(N, G)
+    G, flat = np.array([gradient]), np.zeros((1, 3, 3))
+    found, other = (normal_derivative(N, flat, Jet(np.zeros(1), g, flat))[0] for g in (G, G + 0.7 * N))
     assert np.allclose(np.linalg.norm(found, axis=1), 1)
-    assert np.allclose(found, fine_normals(N, G + 0.7 * N), atol=1e-12)
+    assert np.allclose(found, other, atol=1e-12)
     # Its slope against the base is the gradient's length along the surface.
     along = G - N * np.sum(G * N)
     assert np.arccos(np.clip(np.sum(found * N), -1, 1)) == pytest.approx(np.arctan(np.linalg.norm(along)), abs=1e-7)

@@ -8,9 +8,9 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.spec.surfaces import AnatomySurface
-from simtest.surfaces.colon import Colon
-from simtest.surfaces.liver import Liver
-from simtest.surfaces.mesh_surface import MeshSurface
+from simtest.surfaces.colon import make_colon
+from simtest.surfaces.liver import make_liver
+from simtest.surfaces.mesh_surface import make_mesh_surface
 from simtest.surfaces.poses import AXIS_RANGE_MM, MeshProbe, lumen_pose, organ_pose
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
 from tests.marked import marked
@@ -24,13 +24,13 @@ def make(name, viewpoint):
     if (shipped := ROOT / "meshes" / f"{name}.toml").is_file():
         recipe = load_recipe(shipped)
         if isinstance(recipe, ColonRecipe):
-            return Colon(recipe, viewpoint)
+            return make_colon(recipe, viewpoint)
         assert isinstance(recipe, LiverRecipe)
-        return Liver(recipe, viewpoint)
+        return make_liver(recipe, viewpoint)
     path = MESHES / f"{name}.ply"
     if not path.is_file():
         pytest.skip(f"no reference mesh {path}")
-    return MeshSurface(AnatomySurface(path=str(path), viewpoint=viewpoint, subdivisions=0))
+    return make_mesh_surface(AnatomySurface(path=str(path), viewpoint=viewpoint, subdivisions=0))
 
 
 @pytest.mark.parametrize("name", SURFACES)
@@ -73,8 +73,8 @@ def test_clearance_has_the_sign_of_the_side(name):
         room = model.clearance(points)
         u_ok = np.ones(len(pick), dtype=bool)
         if name == "colon":  # at an open end the slice decides, not the wall
-            u, _, _ = model._build.tube.slice_of(points)
-            u_ok = (u > 2) & (u < model._build.tube.recipe.length_mm - 2)
+            u, _, _ = model.tube.slice_of(points)
+            u_ok = (u > 2) & (u < model.tube.recipe.length_mm - 2)
         assert (np.sign(room[u_ok]) == np.sign(height)).all()
         assert (np.abs(room[u_ok]) < 0.6).all()
         np.testing.assert_allclose(np.abs(room[u_ok]), 0.5, atol=0.15)
