@@ -21,7 +21,7 @@ from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance
 from simtest.rendering.instruments import Cover, InstrumentKernel, cover_of, place, shade
 from simtest.rendering.kernel_values import to_kernel
 from simtest.rendering.lighting import Material
-from simtest.rendering.misfits import MisfitGrid, trace_grid, trace_misfits, trace_tiles
+from simtest.rendering.misfits import trace_misfits, trace_tiles
 from simtest.rendering.placement_checks import check_camera, check_lights, check_motion
 from simtest.rendering.rays import HitRefinement, Sightlines
 from simtest.rendering.reflectances import compiled_form
@@ -30,7 +30,6 @@ from simtest.rendering.trace import Bounces, Progress, Tracer, as_radiance, eval
 from simtest.rendering.truth import ShapeLabels, as_hits, as_labels
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.spec.camera import Motion
-from simtest.spec.lights import is_at_camera
 from simtest.spec.reflectance import Translucency
 from simtest.spec.scene import Scene
 from simtest.surfaces import RayHits, SurfaceModel, SurfacePoints, make_surface
@@ -351,16 +350,15 @@ class Session:
         return truth.trace_starts(self._built.scene, origins, directions)
 
     @_at_its_variant
-    def misfit_grid(self, stride: int) -> MisfitGrid:
-        """Return the misfits of all lights, without the relief, at the centres of every `stride`-th pixel."""
-        lights = self.to_model(self.scene.rig.true_mm())
-        return trace_grid(self._built.scene, self.sightlines, lights, stride)
+    def misfits(self, stride: int = 1) -> MisfitMaps:
+        """Return the misfits of all lights at every `stride`-th pixel; of all pixels they are kept while these stay.
 
-    @_at_its_variant
-    def misfits(self) -> MisfitMaps:
-        """Return the misfits of all lights at the centres of pixels; they are kept while surface, camera, rig stay."""
+        They depend on surface, camera and rig alone.
+        """
+        if stride > 1:
+            return trace_misfits(self._tracer(), self.scene.rig.true_mm(), stride)
         if self._misfits is None:
-            self._misfits = trace_misfits(self._tracer(), self.scene.rig.true_mm())
+            self._misfits = trace_misfits(self._tracer(), self.scene.rig.true_mm(), 1)
         return self._misfits
 
     @_at_its_variant
@@ -406,24 +404,6 @@ class Session:
     def blocked(self, origins: Array, directions: Array, reach: Array) -> Mask:
         """Return which rays, shape (N, 3), model frame, meet the rendered shape before `reach`, shape (N,), mm."""
         return truth.trace_blocked(self._built.scene, origins, directions, reach)
-
-    @_at_its_variant
-    def lit(self, positions: Array, light: int) -> Any:
-        """Return which points, shape (N, 3), camera frame, mm, a light emits towards and reaches unblocked."""
-        source = self.scene.rig.true_mm()[light]
-        towards = positions - source
-        distance = np.linalg.norm(towards, axis=1)
-        directions = towards / distance[:, None]
-        emitted = self.scene.rig.lights[light].factor(directions) > 0
-        # A light at the camera reaches all that is seen.
-        if is_at_camera(source):
-            return emitted
-        # Shadow rays from the light.
-        pose = self.surface.model_from_camera
-        origins = np.broadcast_to(self.to_model(source[None]), positions.shape)
-        hits = self.exact_hits(origins, directions @ pose[:3, :3].T)
-        # A blocker stands clearly in front of the point; the point's own triangle does not count.
-        return emitted & (hits.distance > distance * (1 - 1e-3))
 
     @_at_its_variant
     def lobe_at(self, points: Sequence[HighlightPoint]) -> Array:

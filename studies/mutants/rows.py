@@ -272,8 +272,8 @@ ROWS = (
         "rig"),
     row("light moved 1 mm", "light sign", "rendering.built_scene:BuiltScene.place_lights", "rig.true_mm()",
         "(rig.true_mm() + np.array([1.0, 0.0, 0.0]))", "closed_form"),
-    row("highlight found half a pixel aside", "pixel centre", "rendering.highlights:describe", "bp_px=solutions[i],",
-        "bp_px=solutions[i] + 0.5,", "render"),
+    row("highlight found half a pixel aside", "pixel centre", "rendering.highlights:describe", "bp_px=pixels[i],",
+        "bp_px=pixels[i] + 0.5,", "render"),
     # inverse
     row("normal's step has the wrong sign", "light sign", "inverse.patch:RenderedQuadric.moved",
         "self.sightline + step[:2] @ self.turning", "self.sightline - step[:2] @ self.turning", "inverse_rendering"),
