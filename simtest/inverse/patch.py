@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.estimators.bisector import bisect
 from simtest.geometry import Array
-from simtest.rendering import backend, reflectances
+from simtest.rendering import backend, elements
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.kernel_values import channel_mean
 from simtest.rendering.lighting import Material
@@ -30,13 +30,13 @@ class PatchRenderer:
 
     def __init__(self, rays: Array) -> None:
         backend.load(None)
-        plugin = reflectances.register_phong(str(mi.variant()))
+        elements.register(str(mi.variant()))
         self.count = len(rays)
         # Gathered: a kernel keeps the length of an array of shape (n, 3), and whether its address is aligned.
         self._rays = [mi.Float(np.ascontiguousarray(part, dtype=np.float32)) for part in rays.T]
         # Lobe and base of unit strength: their factors are differentiated outside of the BSDF.
         self._bsdf = mi.load_dict(
-            {"type": plugin, "specular": 1.0, "diffuse_reflectance": {"type": "rgb", "value": [1.0] * 3}}
+            {"type": "simtest_phong", "specular": 1.0, "diffuse_reflectance": {"type": "rgb", "value": [1.0] * 3}}
         )
 
     def radiance(self, patch: "RenderedQuadric", kept: list[bool]) -> tuple[Array, Array]:

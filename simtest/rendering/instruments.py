@@ -14,11 +14,11 @@ import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.rendering.backend import dr, mi
+from simtest.rendering.elements.base import facet_density, visible_over_cosine
 from simtest.rendering.frames import HighlightPoint, Maps, Real
 from simtest.rendering.kernel_values import channels, spectrum
 from simtest.rendering.placement_checks import check_instruments
 from simtest.rendering.rays import Hit
-from simtest.rendering.reflectances import facet_density, visible_over_cosine
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.spec.lights import is_at_camera
 from simtest.spec.surfaces import DEFAULT_DEPTH_SHARE, Instrument

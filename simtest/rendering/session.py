@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.rendering import adaptive, backend, highlights, lighting, reflectances, truth
+from simtest.rendering import adaptive, backend, elements, highlights, truth
 from simtest.rendering.adaptive import MeshEdges
 from simtest.rendering.backend import mi
 from simtest.rendering.built_scene import BuiltScene, build
+from simtest.rendering.elements.lights import kind_of
 from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance, TruthMaps
 from simtest.rendering.instruments import Cover, InstrumentKernel, cover_of, place, shade
 from simtest.rendering.kernel_values import to_kernel
@@ -24,7 +25,6 @@ from simtest.rendering.lighting import Material
 from simtest.rendering.misfits import trace_misfits, trace_tiles
 from simtest.rendering.placement_checks import check_camera, check_lights, check_motion
 from simtest.rendering.rays import HitRefinement, Sightlines
-from simtest.rendering.reflectances import compiled_form
 from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel, rest_map
 from simtest.rendering.trace import Bounces, Progress, Tracer, as_radiance, evaluate, mean_over
 from simtest.rendering.truth import ShapeLabels, as_hits, as_labels
@@ -74,9 +74,7 @@ class Session:
     def __init__(self, scene: Scene, variant: str | None = None, labelled: bool = False) -> None:
         loaded = backend.load(backend.requested_variant(variant, coloured=scene.is_coloured))
         self.variant = str(loaded.variant())
-        self.plugin = reflectances.register_phong(self.variant)
-        reflectances.register_tissue(self.variant)
-        lighting.register_light(self.variant)
+        elements.register(self.variant)
         self.rebuilds = 0
         self._instruments: InstrumentKernel | None = None
         self._cover: Cover | None = None
@@ -172,14 +170,13 @@ class Session:
 
     def _structure(self) -> tuple[Any, ...]:
         """Return everything of the scene that is compiled into the kernels."""
-        material = compiled_form(self.scene.reflectance)
         relief = None if self._relief is None else self._relief.key
-        lights = tuple(lighting.kind_of(light) for light in self.scene.rig.lights)
-        return self._shape.key, relief, material, self._pattern is not None, lights
+        lights = tuple(kind_of(light) for light in self.scene.rig.lights)
+        return self._shape.key, relief, self.scene.reflectance.compiled, self._pattern is not None, lights
 
     def _build(self, key: tuple[Any, ...]) -> BuiltScene:
         self.rebuilds += 1
-        return build(key, self._shape, self.scene.reflectance, self.scene.rig.lights, self.plugin)
+        return build(key, self._shape, self.scene.reflectance, self.scene.rig.lights)
 
     def _write_values(self) -> None:
         """Write the values that may differ between scenes of one structure into the Mitsuba scene."""
