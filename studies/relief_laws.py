@@ -109,7 +109,7 @@ class Glints:
 def glints_of(session: Session) -> Glints:
     """Find the glints of a frame of the first light."""
     pixels = highlights.find_zeros(session, True)[0]
-    points = session.cast(pixels)[0]
+    points = session.exact_points(pixels)
     cosine = np.clip(np.sum(points.normal * points.normal_base, axis=1), -1, 1)
     pose = session.surface.model_from_camera
     position = points.position @ pose[:3, :3].T + pose[:3, 3]
@@ -324,7 +324,7 @@ def shown(case: Case, wanted: int) -> dict[str, list[float]]:
         peaks = [spot.peak_px for spot in view.visible_highlights if spot.peak_snr >= 10]
         if peaks:
             # Someone who takes the sightline of the peak for the normal, as a scanned model would judge it.
-            base = session.cast(np.array(peaks))[0]
+            base = session.exact_points(np.array(peaks))
             cosine = -np.sum(base.normal_base * session.camera.unproject(np.array(peaks)), axis=1)
             angles["visible"] += (np.arccos(np.clip(cosine, -1, 1)) / law).tolist()
         if len(angles["isolated"]) >= wanted:

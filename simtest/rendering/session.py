@@ -319,23 +319,6 @@ class Session:
         return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
     @_at_its_variant
-    def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays through pixel positions, shape (N, 2), onto the exact surface.
-
-        Returns the exact points and the shading and geometric normals of the rendered shape, shape (N, 3), without its
-        relief; in the camera frame, NaN where the ray misses.
-        """
-        return self._cast(*self.sightlines.in_model(points_px), None)
-
-    def _cast(
-        self, origins: Array, directions: Array, relief: ReliefKernel | None
-    ) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays of the model frame (see `cast`); with a `relief` the shading normals follow it."""
-        hits, shading, geometric = truth.trace_hits(self._built.scene, self._shape, origins, directions, relief)
-        rotation = self.surface.model_from_camera[:3, :3]
-        return truth.solve(self.surface, origins, directions, hits), shading @ rotation, geometric @ rotation
-
-    @_at_its_variant
     def exact_points(self, points_px: Array, fine: bool = True) -> SurfacePoints:
         """Return the exact points at pixel positions, shape (N, 2), camera frame, of the fine surface or the base."""
         rays = self.sightlines.in_model(points_px)
@@ -367,20 +350,16 @@ class Session:
     def truth(self, stride: int = 1) -> TruthMaps:
         """Return the truth at the centre of every `stride`-th pixel along both axes; of all pixels it is kept."""
         if stride == 1 and self._truth is None:
-            self._truth = self._cast_maps(1)
+            self._truth = self._solve_maps(1)
         maps = self._truth if stride == 1 else None
-        maps, cover = maps or self._cast_maps(stride), self.cover()
+        maps, cover = maps or self._solve_maps(stride), self.cover()
         return maps if cover is None else cover.every(stride).over(maps)
 
-    def _cast_maps(self, stride: int) -> TruthMaps:
+    def _solve_maps(self, stride: int) -> TruthMaps:
+        # Hits like those of a frame's labels: the truth must not depend on whether a frame was rendered before.
         centres = self.camera.pixel_centres()[::stride, ::stride]
-        pixels = centres.reshape(-1, 2)
-        if stride == 1:
-            # Hits like those of a frame's labels: the truth must not depend on whether a frame was rendered before.
-            hits, shading, geometric = as_hits(self._centre_hits())
-            points = truth.solve_frame(self.surface, *self.sightlines.in_view(pixels), hits)
-        else:
-            points, shading, geometric = self._cast(*self.sightlines.in_view(pixels), self._relief)
+        hits, shading, geometric = as_hits([channel[::stride, ::stride] for channel in self._centre_hits()])
+        points = truth.solve_frame(self.surface, *self.sightlines.in_view(centres.reshape(-1, 2)), hits)
         return truth.truth_maps(points, shading, geometric, centres.shape[:2])
 
     @_at_its_variant

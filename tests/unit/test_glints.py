@@ -40,7 +40,7 @@ def glints_in(session):
 
 def off_zero(session, pixels, light):
     """Angle between fine normal and bisector, rad, from the points alone."""
-    points = session.cast(pixels)[0]
+    points = session.exact_points(pixels)
     to_camera = -points.position / np.linalg.norm(points.position, axis=1, keepdims=True)
     to_light = light - points.position
     to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
@@ -142,7 +142,7 @@ def boxed_zeros(session, size=0.25):
     """Find the pixels near which both components of the misfit change sign round the border of a cell: winding 1."""
     y, x = np.mgrid[1 : CAMERA["height"] - 1 : size, 1 : CAMERA["width"] - 1 : size]
     corners = np.stack([x, y], axis=-1)
-    points = session.cast(corners.reshape(-1, 2))[0]
+    points = session.exact_points(corners.reshape(-1, 2))
     to_camera = -points.position / np.linalg.norm(points.position, axis=1, keepdims=True)
     gap = (points.normal - to_camera)[:, :2].reshape(*x.shape, 2)
     angle = np.arctan2(gap[..., 1], gap[..., 0])

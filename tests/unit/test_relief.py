@@ -97,11 +97,11 @@ def by_differences(session, pixels, step):
     def heights(points):
         return session.surface.relief.jets(points.position @ pose[:3, :3].T + pose[:3, 3]).height
 
-    points = session.cast(pixels)[0]
+    points = session.exact_points(pixels)
     J, dn, dh = np.zeros((len(pixels), 3, 2)), np.zeros((len(pixels), 3, 2)), np.zeros((len(pixels), 2))
     for axis in range(2):
         for k, weight in STENCIL:
-            near = session.cast(pixels + k * step * np.eye(2)[axis])[0]
+            near = session.exact_points(pixels + k * step * np.eye(2)[axis])
             J[:, :, axis] += weight / step * near.position
             dn[:, :, axis] += weight / step * near.normal
             dh[:, axis] += weight / step * np.nan_to_num(heights(replace(near, position=np.nan_to_num(near.position))))
@@ -145,7 +145,7 @@ def test_fine_normals_and_curvatures_are_those_of_the_height(name, level):
 def test_principal_directions_of_the_fine_surface():
     session = Session(scene(SURFACES["inside of a cylinder"], RELIEF))
     pixels = np.random.default_rng(5).uniform([4, 4], [60, 44], (200, 2))
-    points = session.cast(pixels)[0]
+    points = session.exact_points(pixels)
     for direction in (points.direction_min, points.direction_max):
         assert np.abs(np.sum(direction * points.normal, axis=1)).max() < 1e-12
         assert np.allclose(np.linalg.norm(direction, axis=1), 1)
@@ -156,7 +156,7 @@ def test_principal_directions_of_the_fine_surface():
 def test_on_a_plane_the_relief_is_the_graph_of_its_height():
     """The closed form of a graph's normal and curvature, from differences of the height in the plane alone."""
     session = Session(scene({"type": "plane", "distance_mm": 20}, RELIEF))
-    points = session.cast(np.random.default_rng(2).uniform([4, 4], [60, 44], (300, 2)))[0]
+    points = session.exact_points(np.random.default_rng(2).uniform([4, 4], [60, 44], (300, 2)))
     height = session.surface.relief.jets
     pose = session.surface.model_from_camera
     step = 1e-4
@@ -387,10 +387,10 @@ def test_pools_are_smooth_and_crests_keep_their_relief():
     relief = {**RELIEF, "bands": RELIEF["bands"][:1]}
     session = Session(scene(SURFACES["plane"], relief))
     pixels = session.camera.pixel_centres().reshape(-1, 2)
-    rough = session.cast(pixels)[0]
+    rough = session.exact_points(pixels)
     assert not rough.pool.any()
     session.surface.relief = make_relief(session.scene.surface.relief, 0.3)
-    wet, field = session.cast(pixels)[0], session.surface.relief
+    wet, field = session.exact_points(pixels), session.surface.relief
     pose = session.surface.model_from_camera
     height = field.tissue_jets(wet.position @ pose[:3, :3].T + pose[:3, 3]).height
     assert np.array_equal(wet.pool, height < field.level)
