@@ -356,22 +356,17 @@ class BackendReport:
         return {**asdict(self), "can_render": self.can_render}
 
 
-def library_report(variant: str | None = None) -> BackendReport:
-    """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered."""
-    versions = {package: importlib.metadata.version(package) for package in ("mitsuba", "drjit")}
-    name = requested_variant(variant)
-    chosen, tried = choose_library() if needs_llvm(name) else (None, [])
-    problem = no_library_message(tried) if needs_llvm(name) and chosen is None else None
-    return BackendReport(name, chosen.path if chosen else None, tried, versions, problem)
-
-
 RENDER_TIMEOUT_S = 180
 
 
 def examine(variant: str | None = None) -> BackendReport:
     """Examine the rendering backend (see `simtest.rendering.backend.requested_variant`); this process loads nothing."""
-    report = library_report(variant)
-    return replace(report, problem=_try_rendering(report.variant)) if report.can_render else report
+    versions = {package: importlib.metadata.version(package) for package in ("mitsuba", "drjit")}
+    name = requested_variant(variant)
+    chosen, tried = choose_library() if needs_llvm(name) else (None, [])
+    lacking = needs_llvm(name) and chosen is None
+    problem = no_library_message(tried) if lacking else _try_rendering(name)
+    return BackendReport(name, chosen.path if chosen else None, tried, versions, problem)
 
 
 def _try_rendering(variant: str) -> str | None:

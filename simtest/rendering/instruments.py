@@ -5,7 +5,6 @@ which of both is nearer, and shadow rays ask both. Here is also which pixels the
 """
 
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -43,10 +42,6 @@ class Metal:
     share: Any
     metal: Any
     matt: Any
-
-    def painted(self, hit: Hit) -> AbstractContextManager[None]:
-        """Metal has no pattern."""
-        return nullcontext()
 
     def towards(self, hit: Hit, direction: Any, active: Any) -> tuple[Any, Any]:
         """Compute f cos(theta) of the lobe and of the matt base towards a direction of the model frame."""

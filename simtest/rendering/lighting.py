@@ -1,7 +1,7 @@
 """The direct light that a surface reflects, in closed form, and which points of its sources are asked for."""
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -85,9 +85,6 @@ class Drawer:
 class Reflecting(Protocol):
     """What direct light is reflected by: `Material`, or the metal of instruments."""
 
-    def painted(self, hit: Hit) -> AbstractContextManager[None]:
-        """Let the base have its albedo at a hit, computed once for all lights."""
-
     def towards(self, hit: Hit, direction: Any, active: Any) -> tuple[Any, Any]:
         """Compute f cos(theta) of the lobe and of the base towards a direction of the model frame."""
 
@@ -104,7 +101,7 @@ class Material:
 
     @contextmanager
     def painted(self, hit: Hit) -> Iterator[None]:
-        """Let the BSDF's base have the albedo of tissue at a hit; nothing where the albedo is the BSDF's own."""
+        """Let the base have the albedo of tissue at a hit, computed once for all lights; else its own."""
         if self.albedo is None:
             yield
             return
@@ -157,10 +154,6 @@ class DirectLight:
 
     def radiance(self, scene: Any, material: Reflecting, hit: Hit, draw: LightDraw | None) -> tuple[Any, Any]:
         """Compute the radiance off lobe and base at surface points; `draw` chooses points of finite sources."""
-        with material.painted(hit):
-            return self._of_lights(scene, material, hit, draw)
-
-    def _of_lights(self, scene: Any, material: Reflecting, hit: Hit, draw: LightDraw | None) -> tuple[Any, Any]:
         specular, diffuse = mi.Spectrum(0), mi.Spectrum(0)
         for i, kind in enumerate(self.kinds):
             if kind.source == "point":

@@ -25,7 +25,7 @@ from simtest.rendering.lighting import Material
 from simtest.rendering.misfits import trace_misfits, trace_tiles
 from simtest.rendering.placement_checks import check_camera, check_lights, check_motion
 from simtest.rendering.rays import HitRefinement, Sightlines
-from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel, rest_map
+from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel, RestMap
 from simtest.rendering.trace import Bounces, Progress, Tracer, as_radiance, evaluate, mean_over
 from simtest.rendering.truth import ShapeLabels, as_hits, as_labels
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
@@ -33,6 +33,7 @@ from simtest.spec.camera import Motion
 from simtest.spec.reflectance import Translucency
 from simtest.spec.scene import Scene
 from simtest.surfaces import RayHits, SurfaceModel, SurfacePoints, make_surface
+from simtest.surfaces.deformation import DeformedSurface
 
 if TYPE_CHECKING:
     from simtest.surfaces.tissue_pattern import TissuePattern
@@ -137,7 +138,7 @@ class Session:
         check_motion(scene, surface)
         self._shape = surface.shape()
         # Relief and colour are looked up where the tissue is at rest.
-        self._rest = rest_map(surface)
+        self._rest = RestMap(surface) if isinstance(surface, DeformedSurface) else None
         self._relief = None if surface.relief is None else ReliefKernel(surface.relief, self._rest)
         self.surface: SurfaceModel = surface
         self._set_tissue(scene)
@@ -239,7 +240,7 @@ class Session:
         elif effort.samples_per_pixel == 1:
             parts, channels = tracer.centres(bounces, True, labels, progress)
         elif adaptive.applies(self.scene):
-            parts, self._centre = self._adaptive(tracer).render(progress)
+            parts, self._centre = self._adaptive(tracer, progress)
             channels = tracer.relabelled(self._centre, labels) if labels else []
         else:
             parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
@@ -270,12 +271,12 @@ class Session:
         finally:
             self._place_lights(middle)
 
-    def _adaptive(self, tracer: Tracer) -> adaptive.Adaptive:
+    def _adaptive(self, tracer: Tracer, progress: Progress | None) -> tuple[list[Image], list[Image]]:
         built, mesh = self._built, self._shape.mesh
         if built.edges is None and mesh is not None:
             built.edges = MeshEdges(built.scene, mesh)
         labels = ShapeLabels(built.scene.shapes()[0], None, curved=False)
-        return adaptive.Adaptive(tracer, self.scene, labels, self._shape, built.edges)
+        return adaptive.render(tracer, self.scene, labels, self._shape, built.edges, progress)
 
     def _translucent(self, radiance: Radiance, channels: list[Image], spec: Translucency) -> Radiance:
         """Return radiance whose diffuse part has spread below the surface."""

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.kernel_values import channels
 from simtest.runtime.arrays import Array
-from simtest.surfaces import SurfaceModel
 from simtest.surfaces.deformation import DeformedSurface
 from simtest.surfaces.relief_field import NODES, ReliefField
 from simtest.surfaces.vessels import ENDLESS, PRIMES
@@ -150,7 +149,8 @@ def _band(band: _Band, p: Any, active: Any, bent: bool) -> KernelJets:
         diffused = back @ _gradient(_contract(band.diffused, nodes, weights, active, 1))
     hessian = None
     if bent:
-        rows = [[fine[_order(i, j)] for j in range(3)] for i in range(3)]
+        orders = [[tuple((axis == i) + (axis == j) for axis in range(3)) for j in range(3)] for i in range(3)]
+        rows = [[fine[order] for order in row] for row in orders]
         whole = back @ mi.Matrix3f(*rows[0], *rows[1], *rows[2]) @ band.lattice
         hessian = tuple(whole[i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
     return KernelJets(fine[0, 0, 0], back @ _gradient(fine), diffused, hessian)
@@ -165,7 +165,8 @@ def _contract(pairs: Any, nodes: Any, weights: Any, active: Any, order: int) -> 
         for b in range(4):
             row = (nodes[0][a] * NODES + nodes[1][b]) * NODES
             read = (dr.gather(mi.UInt64, pairs, row + nodes[2][z], active) for z in (0, 2))
-            packet = mi.Vector4f(*(half for pair in read for half in _halves(pair)))
+            halves = (mi.UInt32(half) for pair in read for half in (pair, pair >> 32))
+            packet = mi.Vector4f(*(dr.reinterpret_array(mi.Float, half) for half in halves))
             for k in range(order + 1):
                 along = dr.dot(packet, depths[k])
                 for j in range(order + 1 - k):
@@ -176,18 +177,8 @@ def _contract(pairs: Any, nodes: Any, weights: Any, active: Any, order: int) -> 
     return totals
 
 
-def _halves(pair: Any) -> list[Any]:
-    """Return the two numbers that one of 64 bits holds."""
-    return [dr.reinterpret_array(mi.Float, mi.UInt32(half)) for half in (pair, pair >> 32)]
-
-
 def _gradient(derivatives: dict[Order, Any]) -> Any:
     return mi.Vector3f(derivatives[1, 0, 0], derivatives[0, 1, 0], derivatives[0, 0, 1])
-
-
-def _order(i: int, j: int) -> Order:
-    """Return the orders of derivative along x, y, z of the derivative along axes i and j."""
-    return tuple((axis == i) + (axis == j) for axis in range(3))
 
 
 CHANNELS = 3
@@ -373,8 +364,3 @@ class RestMap:
                     packets[which] = dr.gather(mi.Vector4f, self._rows, row + which, active)
                 totals[n - first] = dr.fma(weight, packets[which][part], totals[n - first])
         return totals
-
-
-def rest_map(surface: SurfaceModel) -> RestMap | None:
-    """Return the map of a deformed surface; None of any other."""
-    return RestMap(surface) if isinstance(surface, DeformedSurface) else None

@@ -113,13 +113,13 @@ class Tracer:
 
     def _direct(self, rays: Rays, hit: Hit, draw: LightDraw | None) -> list[Any]:
         """Compute the channels of direct light off lobe and base, then of metal; each is 0 behind the other."""
+        blockers = self.scene if self.instruments is None else self.instruments.before(self.scene)
+        with self.material.painted(hit):
+            tissue = self.light.radiance(blockers, self.material, hit, draw)
         if self.instruments is None:
-            specular, diffuse = self.light.radiance(self.scene, self.material, hit, draw)
-            return [*specular, *diffuse]
-        blockers = self.instruments.before(self.scene)
+            return [channel for part in tissue for channel in part]
         ahead, metal = self.instruments.hit(rays)
         in_front = ahead.base.t < hit.base.t
-        tissue = self.light.radiance(blockers, self.material, hit, draw)
 
         def shine(specular: Any, diffuse: Any) -> tuple[Any, Any]:
             return self.light.radiance(blockers, metal, ahead, draw)
@@ -332,11 +332,6 @@ TracerAt = Callable[[Array], Tracer]
 """Returns a tracer whose camera and lights stand at a pose, middle_from_moment."""
 
 
-def samples_per_step(effort: Effort, motion: Motion) -> int:
-    """Return the samples of a pixel at each step: as many at all steps, so that each moment has the same weight."""
-    return -(-effort.samples_per_pixel // motion.steps)
-
-
 def mean_over(
     motion: Motion, effort: Effort, tracer_at: TracerAt, bounces: Bounces | None, progress: Progress | None
 ) -> list[Image]:
@@ -345,7 +340,8 @@ def mean_over(
     With one sample a pixel each step traces the rays through the pixels' centres; no noise is added. `progress` is
     called after each launch.
     """
-    each = samples_per_step(effort, motion)
+    # As many samples at all steps, so that each moment has the same weight.
+    each = -(-effort.samples_per_pixel // motion.steps)
     sums: list[Array] = []
     for step, pose in enumerate(motion.poses()):
         tracer, told = tracer_at(pose), _part(progress, step, motion.steps)

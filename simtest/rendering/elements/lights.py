@@ -28,11 +28,6 @@ SLICES = 160
 """Slices of a crescent, of about equal area; each pair of fixed points lies in the middle of five of them."""
 
 
-def source_kind(source: Source | None) -> str:
-    """Return which form of source is compiled into the kernel."""
-    return "point" if source is None else source.type
-
-
 def source_parameters(source: Source, centroid: Array, across: Array) -> MitsubaDict:
     """Return a source's parameters by name, from its centroid and the axes of its plane, model frame, mm."""
     centre = centroid - source.centroid_mm @ across
@@ -112,7 +107,7 @@ class LightPose:
 
 def kind_of(light: LightSpec) -> LightKind:
     """Return the kind of a light."""
-    source = source_kind(light.source)
+    source = "point" if light.source is None else light.source.type
     plain = light.is_isotropic and len(set(light.colour)) == 1 and source == "point"
     match light.profile:
         case TableProfile():
