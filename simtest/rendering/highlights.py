@@ -187,11 +187,11 @@ def grid_seeds(w: Image, first: IntArray, least_slope: float = 0.0) -> Array:
     is_stepped = np.arange(len(seeds)) >= len(crossing[0])
     if least_slope > 0:
         a, b, c, d = corners
-        along = [
-            np.concatenate([(b - a + d - c) / 2, np.stack([part[short] for part in along_x])], axis=1),
-            np.concatenate([(c - a + d - b) / 2, np.stack([part[short] for part in along_y])], axis=1),
-        ]
-        steep = np.linalg.svd(np.stack(along).transpose(2, 0, 1), compute_uv=False)[:, 1] > least_slope
+        x = np.concatenate([(b - a + d - c) / 2, np.stack([part[short] for part in along_x])], axis=1)
+        y = np.concatenate([(c - a + d - b) / 2, np.stack([part[short] for part in along_y])], axis=1)
+        # The smaller singular value, without cancellation.
+        area, squares = np.abs(x[0] * y[1] - x[1] * y[0]), np.sum(x**2 + y**2, axis=0)
+        steep = area * np.sqrt(2 / (squares + np.sqrt(np.maximum(squares**2 - 4 * area**2, 0)))) > least_slope
         seeds, is_stepped = seeds[steep], is_stepped[steep]
     # Row by row, whatever the grids; cells that hold a zero come before those near one.
     order = np.lexsort((*seeds.T, is_stepped))
