@@ -426,26 +426,6 @@ def test_short_waves_are_not_seen_by_diffuse_light_and_long_ones_are():
 # The kernel ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("level", [None, 0.2])
-def test_the_kernel_computes_the_same(level):
-    session = Session(scene(SURFACES["plane"], RELIEF))
-    import drjit as dr
-
-    from simtest.rendering.tissue_kernels import ReliefKernel
-
-    mi, field = session.mi, make_relief(session.scene.surface.relief, level)
-    points = np.random.default_rng(9).uniform(-40, 40, (5000, 3)).astype(np.float32)
-    jets = ReliefKernel(field).jets(mi.Point3f(points.T.copy()), True, bent=True)
-    dr.eval(jets.height, jets.gradient, jets.diffused, jets.hessian)
-    exact, diffused = field.jets(points.astype(float)), field.tissue_jets(points.astype(float), diffused=True)
-    assert np.abs(np.array(jets.gradient).T - exact.gradient).max() < 1e-5
-    assert np.abs(np.array(jets.diffused).T - diffused.gradient).max() < 1e-5
-    tissue = field.tissue_jets(points.astype(float))
-    assert np.abs(np.array(jets.height) - tissue.height).max() < 1e-5 * field.deviation * 10
-    six = exact.hessian[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T
-    assert np.abs(np.array(jets.hessian) - six).max() < 1e-4 * np.abs(six).max()
-
-
 def test_the_kernel_finds_the_lattices_nodes():
     """In single precision, at whole numbers of cells far from the origin too."""
     session = Session(scene(SURFACES["plane"], RELIEF))
