@@ -115,7 +115,11 @@ def find_zeros(session: "Session", fine: bool) -> tuple[Array, IntArray]:
     else:
         maps = session.misfits(1 if session.surface.relief is not None else SMOOTH_STRIDE_PX)
         least = MIN_GAIN * maps.stride / max(session.camera.fx, session.camera.fy)
-        seeds = [maps.pixels(grid_seeds(w[:, None], np.zeros((1, 2), dtype=np.int64), least)) for w in maps.base]
+        thin = _thin_parts(maps.distance)
+        seeds = [
+            maps.pixels(np.concatenate([grid_seeds(w[:, None], np.zeros((1, 2), dtype=np.int64), least), thin]))
+            for w in maps.base
+        ]
     zeros, lights = refine(session, np.concatenate(seeds), np.repeat(np.arange(count), list(map(len, seeds))), fine)
     # Whatever the steps taken, the points stand light by light and row by row.
     inside = np.flatnonzero(session.camera.contains(zeros))
@@ -196,6 +200,13 @@ def grid_seeds(w: Image, first: IntArray, least_slope: float = 0.0) -> Array:
     # Row by row, whatever the grids; cells that hold a zero come before those near one.
     order = np.lexsort((*seeds.T, is_stepped))
     return seeds[order][first_of_each(seeds[order], SAME_SEED)]
+
+
+def _thin_parts(distance: Image) -> IntArray:
+    """Return columns and rows, shape (N, 2), of the cells of a surface that is too small there for differences."""
+    seen = np.isfinite(distance).astype(np.uint8)
+    rows, columns = np.nonzero(seen > cv2.morphologyEx(seen, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
+    return np.stack([columns, rows], axis=1)
 
 
 def _places(cells: tuple[IntArray, ...], first: IntArray) -> IntArray:

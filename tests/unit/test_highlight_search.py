@@ -120,6 +120,17 @@ def test_seeds_beside_the_surface_find_nothing():
     assert owners.shape == (0,)
 
 
+@pytest.mark.parametrize("radius", [0.15, 0.2, 0.3])
+def test_beads_of_three_to_six_pixels_have_both_highlights_wherever_they_stand(radius):
+    bead, session = {"type": "sphere", "distance_mm": 20, "radius_mm": radius}, None
+    for step in range(6):
+        camera = {**CAMERA, "cx": 100.0 + 0.53 * step, "cy": 80.0 + 0.29 * step}
+        placed = scene_from_dict({"surface": bead, "camera": camera, "rig": RIG})
+        session = session or Session(placed)
+        session.update(placed)
+        assert sorted(h.light for h in session.highlights()) == [0, 1], step
+
+
 def test_a_streak_is_no_point():
     """Inside a cylinder whose axis is at the camera's height every point of a line bisects: nothing is isolated."""
     tables = {"surface": {"type": "cylinder", "distance_mm": 20, "radius_mm": 20, "side": "inside"}, "camera": CAMERA}
