@@ -52,7 +52,7 @@ class PatchRenderer:
 
     def _parameters(self, patch: "RenderedQuadric", kept: list[bool], which: Any) -> list[Any]:
         """Return the seven parameters; each kept one has gradient 1 in its own copy of the pixels."""
-        made, lane = [], 0
+        parameters, lane = [], 0
         values = [0.0, 0.0, *patch.stretch, patch.log_scale, patch.base]
         for value, is_kept in zip(values, kept, strict=True):
             parameter = dr.zeros(mi.Float, dr.width(which)) + self._opaque(value)
@@ -60,8 +60,8 @@ class PatchRenderer:
                 dr.enable_grad(parameter)
                 dr.set_grad(parameter, dr.select(which == lane, mi.Float(1), mi.Float(0)))
                 lane += 1
-            made.append(parameter)
-        return made
+            parameters.append(parameter)
+        return parameters
 
     def _evaluated(self, radiance: Any) -> tuple[Array, Array]:
         """Return the values of all lanes and their derivatives by the parameter that varies in each."""
@@ -79,9 +79,9 @@ class PatchRenderer:
 
     def _opaque(self, value: Any, kind: Any = None) -> Any:
         """Return a value that the kernel reads from memory, so that changing it compiles nothing."""
-        held = (kind or mi.Float)(value)
-        dr.make_opaque(held)
-        return held
+        opaque = (kind or mi.Float)(value)
+        dr.make_opaque(opaque)
+        return opaque
 
 
 class _Surface:

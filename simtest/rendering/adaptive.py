@@ -344,10 +344,10 @@ def choose(parts: list[Image], depth: Image, gaps: list[Image], scale: Image, ha
     with np.errstate(invalid="ignore"):
         chosen |= scale < LEAST_SCALE_PX
         for first in range(0, len(gaps), 3):
-            own = np.stack(gaps[first : first + 3])
+            gap = np.stack(gaps[first : first + 3])
             # From each pixel to the next; the pixels around follow below.
-            chosen[:, 1:] |= np.square(np.diff(own, axis=2)).sum(axis=0) > half_width**2
-            chosen[1:] |= np.square(np.diff(own, axis=1)).sum(axis=0) > half_width**2
+            chosen[:, 1:] |= np.square(np.diff(gap, axis=2)).sum(axis=0) > half_width**2
+            chosen[1:] |= np.square(np.diff(gap, axis=1)).sum(axis=0) > half_width**2
     chosen = cv2.dilate(chosen.astype(np.uint8), _AROUND) > 0
     chosen[:BORDER_PX] = chosen[-BORDER_PX:] = True
     chosen[:, :BORDER_PX] = chosen[:, -BORDER_PX:] = True

@@ -112,13 +112,13 @@ def needs_llvm(variant: str | None = None) -> bool:
 def candidates() -> list[Candidate]:
     """List the libraries in the order they are tried: the variable, the pip package's, the system's newest."""
     # The user's choice, then the tested package, then whatever the system has.
-    found = []
+    libraries = []
     if variable := os.environ.get(LIBRARY_VARIABLE):
-        found.append(Candidate(LIBRARY_VARIABLE, variable))
+        libraries.append(Candidate(LIBRARY_VARIABLE, variable))
     if packaged := _packaged_library():
-        found.append(Candidate(f"pip package {PIP_PACKAGE}", packaged))
-    found += [Candidate("system", path) for path in _system_libraries()]
-    return found
+        libraries.append(Candidate(f"pip package {PIP_PACKAGE}", packaged))
+    libraries += [Candidate("system", path) for path in _system_libraries()]
+    return libraries
 
 
 def _packaged_library() -> str | None:

@@ -36,15 +36,15 @@ def make_shape(shape: Shape, bsdf: MitsubaDict) -> Any:
 def _make_mesh(mesh: TriangleMesh, bsdf: MitsubaDict) -> Any:
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(bsdf)
-    made = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, props=properties)
-    parameters = mi.traverse(made)
+    rendered = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, props=properties)
+    parameters = mi.traverse(rendered)
     parameters["vertex_positions"] = flat(mesh.vertices, np.float32)
     parameters["faces"] = flat(mesh.faces, np.uint32)
     parameters.update()
     # Mitsuba recomputes the normals from the triangles when positions change, so the exact ones are set afterwards.
     parameters["vertex_normals"] = flat(mesh.normals, np.float32)
     parameters.update()
-    return made
+    return rendered
 
 
 def flat(values: Any, dtype: Any) -> Any:
@@ -111,8 +111,8 @@ class BuiltScene:
     def let_bounces_find(self, albedo: AlbedoKernel) -> None:
         """Let bounced light find the albedo of tissue by its own points."""
         # Weak: what a BSDF holds, Mitsuba holds, and Python could not free it at its end.
-        found = weakref.proxy(albedo)
-        self.scene.shapes()[0].bsdf().albedo_at = lambda si, active: found.of(si, active)
+        kernel = weakref.proxy(albedo)
+        self.scene.shapes()[0].bsdf().albedo_at = lambda si, active: kernel.of(si, active)
 
     def _set(self, suffix: str, value: Any) -> None:
         """Assign the one parameter whose path ends in `suffix`; Mitsuba names paths by its own rules."""

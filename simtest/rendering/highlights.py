@@ -300,8 +300,9 @@ def _is_lit(session: "Session", positions: Array, lights: IntArray) -> Mask:
     reached = hits.distance > distance * (1 - 1e-3)
     lit = np.zeros(len(lights), dtype=bool)
     for light in np.unique(lights):
-        own = lights == light
-        lit[own] = (rig.lights[light].factor(directions[own]) > 0) & (reached[own] | is_at_camera(sources[light]))
+        of_light = lights == light
+        emitted = rig.lights[light].factor(directions[of_light]) > 0
+        lit[of_light] = emitted & (reached[of_light] | is_at_camera(sources[light]))
     return lit
 
 
@@ -317,18 +318,18 @@ def radii_px(session: "Session", highlights: Sequence[HighlightPoint], half_widt
     if relief is not None and not resolved:
         half_width = math.hypot(half_width, HALF_WIDTH * math.radians(relief.slope_deg))
     for index, (light, place) in enumerate(zip(rig.lights, rig.true_mm(), strict=True)):
-        own = [i for i, highlight in enumerate(highlights) if highlight.light == index]
-        if own:
-            state = exact_misfit(session, np.array([highlights[i].bp_px for i in own]), place, fine=resolved)
-            widths = np.full(len(own), half_width)
+        of_light = [i for i, highlight in enumerate(highlights) if highlight.light == index]
+        if of_light:
+            state = exact_misfit(session, np.array([highlights[i].bp_px for i in of_light]), place, fine=resolved)
+            widths = np.full(len(of_light), half_width)
             if light.source is not None:
                 # The disc of the source's area, as the highlight points see it; the half-angle turns half as far.
-                away = np.array([highlights[i].position for i in own]) - place
+                away = np.array([highlights[i].position for i in of_light]) - place
                 reach = np.linalg.norm(away, axis=1)
                 seen = light.source.area_mm2 / np.pi * np.abs(away @ light.axis) / reach
                 widths = widened(half_width, np.sqrt(seen) / (2 * reach))
             with np.errstate(divide="ignore"):
-                radii[own] = widths / np.sqrt(np.abs(np.linalg.det(state.jacobian)))
+                radii[of_light] = widths / np.sqrt(np.abs(np.linalg.det(state.jacobian)))
     return radii
 
 

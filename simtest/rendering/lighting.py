@@ -105,12 +105,12 @@ class Material:
         if self.albedo is None:
             yield
             return
-        albedo, own = self.albedo.of(hit.base, hit.base.is_valid()), self.bsdf.albedo_at
+        albedo, before = self.albedo.of(hit.base, hit.base.is_valid()), self.bsdf.albedo_at
         self.bsdf.albedo_at = lambda si, active: albedo
         try:
             yield
         finally:
-            self.bsdf.albedo_at = own
+            self.bsdf.albedo_at = before
 
     def parts(self, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
         """Compute f cos(theta) of the lobe and of the base."""

@@ -115,8 +115,8 @@ def crossed(w: Image) -> tuple[tuple[IntArray, ...], list[Image]]:
         signs = np.stack([u[0] * v[1] - u[1] * v[0] for u, v in ((p, q), (q, r), (r, p))])
         return np.asarray((signs >= 0).all(axis=0) | (signs <= 0).all(axis=0))
 
-    held = inside(a, b, c) | inside(b, d, c)
-    return tuple(index[held] for index in cells), [corner[:, held] for corner in corners]
+    holds_zero = inside(a, b, c) | inside(b, d, c)
+    return tuple(index[holds_zero] for index in cells), [corner[:, holds_zero] for corner in corners]
 
 
 MARGIN = 2
@@ -155,17 +155,17 @@ def trace_tiles(tracer: Tracer, light: Array, division: int, corners: IntArray, 
     dr.make_opaque(source, width, cells)
     step, pieces = max(1, LANES // across**2), []
     for first in range(0, len(corners), step):
-        own = corners[first : first + step]
-        count = len(own) * across**2
+        chosen = corners[first : first + step]
+        count = len(chosen) * across**2
         index = dr.arange(mi.UInt32, count)
         line = index // width
         tile = line // width
         within = (index - line * width, line - tile * width)
-        starts = (mi.Float(np.ascontiguousarray(axis, dtype=np.float32)) for axis in own.T)
+        starts = (mi.Float(np.ascontiguousarray(axis, dtype=np.float32)) for axis in chosen.T)
         x, y = (dr.gather(mi.Float, start, tile) + (mi.Float(cell) + (PIXEL_CENTRE - 1)) / cells
                 for start, cell in zip(starts, within, strict=True))  # fmt: skip
         channels = evaluate(_misfits_at(tracer, x, y, [source], base=False)[1:], count)
-        pieces.append(np.stack(channels).reshape(2, len(own), across, across))
+        pieces.append(np.stack(channels).reshape(2, len(chosen), across, across))
     return np.concatenate(pieces, axis=1)
 
 

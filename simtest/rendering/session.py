@@ -245,13 +245,13 @@ class Session:
         else:
             parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
             channels = tracer.centres(None, False, labels)[1] if labels else []
-        own = len(parts) // tracer.layers
-        radiance = as_radiance(parts[:own])
+        per_layer = len(parts) // tracer.layers
+        radiance = as_radiance(parts[:per_layer])
         if self.scene.translucency is not None:
             radiance = self._translucent(radiance, channels, self.scene.translucency)
         if self._instruments is not None:
             # Metal in front of the surface; nothing spreads below it.
-            metal = as_radiance(parts[own:])
+            metal = as_radiance(parts[per_layer:])
             radiance = replace(
                 radiance, specular=radiance.specular + metal.specular, diffuse=radiance.diffuse + metal.diffuse
             )
@@ -428,7 +428,7 @@ class Session:
         """Return the highlight points of the base or of the fine surface, searched for once."""
         if base not in self._highlights:
             self._highlights[base] = highlights.search(self, base)
-        found = self._highlights[base]
+        points = self._highlights[base]
         if self._instruments is not None:
-            found = shade(self, self._instruments, found)
-        return list(found) if radiance is None else highlights.lit_by(radiance, found)
+            points = shade(self, self._instruments, points)
+        return list(points) if radiance is None else highlights.lit_by(radiance, points)

@@ -101,7 +101,7 @@ class ReliefKernel:
         if hessian is not None:
             bend, g = share * (1 - share) / meniscus, jets.gradient
             outer = (g.x * g.x, g.x * g.y, g.x * g.z, g.y * g.y, g.y * g.z, g.z * g.z)
-            hessian = tuple(share * own + bend * product for own, product in zip(hessian, outer, strict=True))
+            hessian = tuple(share * second + bend * product for second, product in zip(hessian, outer, strict=True))
         return KernelJets(jets.height, share * jets.gradient, jets.diffused, hessian)
 
 
@@ -117,8 +117,8 @@ def turned(si: Any, gradient: Any) -> Any:
 
 def _stored(coefficients: Array) -> Any:
     """Store coefficients, mitsuba.UInt64: each node's own and the next along z in one number, for fewer reads."""
-    own = coefficients.astype(np.float32)
-    return mi.UInt64(np.stack([own, np.roll(own, -1, axis=2)], axis=-1).view(np.uint64).ravel())
+    nodes = coefficients.astype(np.float32)
+    return mi.UInt64(np.stack([nodes, np.roll(nodes, -1, axis=2)], axis=-1).view(np.uint64).ravel())
 
 
 def _modulo(cell: Any) -> Any:
@@ -343,8 +343,8 @@ class RestMap:
         if hessian is not None:
             second = self._numbers(si, active, 12, 30)
             # H - sum_i g_i Hess phi_i, by its upper triangle.
-            own = [h - sum(gradient[i] * second[6 * i + n] for i in range(3)) for n, h in enumerate(hessian)]
-            xx, xy, xz, yy, yz, zz = own
+            upper = [h - sum(gradient[i] * second[6 * i + n] for i in range(3)) for n, h in enumerate(hessian)]
+            xx, xy, xz, yy, yz, zz = upper
             whole = K @ mi.Matrix3f(xx, xy, xz, xy, yy, yz, xz, yz, zz) @ K.T
             hessian = tuple(whole[i, j] for i, j in _UPPER)
         return KernelJets(jets.height, gradient, K @ jets.diffused, hessian)

@@ -313,8 +313,8 @@ def _in_blocks(solver: Solver, block: int, origins: Array, directions: Array, hi
 def _of_numpy(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> dict[str, Array]:
     """Return the fields of a block's points; without a relief the base has none of its own."""
     points = solve(surface, origins, directions, hits)
-    own = [field.name for field in fields(SurfacePoints) if surface.relief is not None or field.name not in _OF_BASE]
-    return {name: getattr(points, name) for name in own}
+    names = [field.name for field in fields(SurfacePoints) if surface.relief is not None or field.name not in _OF_BASE]
+    return {name: getattr(points, name) for name in names}
 
 
 def _of_kernel(
