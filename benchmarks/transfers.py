@@ -112,7 +112,7 @@ def steps(session: Session) -> dict[str, Callable[[], object]]:
         "radiance": session.radiance,
         "labelled frame": session.frame,
         "search for highlights": search,
-        "cast of one ray": lambda: session.cast(middle),
+        "cast of one ray": lambda: session.exact_points(middle),
     }
 
 

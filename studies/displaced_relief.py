@@ -18,7 +18,7 @@ import numpy as np
 from simtest.geometry.vectors import angle_deg
 from simtest.rendering import backend
 from simtest.rendering.built_scene import make_shape
-from simtest.rendering.truth import trace_hits
+from simtest.rendering.truth import trace_starts
 from simtest.runtime.arrays import Array
 from simtest.spec.surfaces import Relief, ReliefBand
 from simtest.surfaces import RayHits, Shape, TriangleMesh
@@ -119,7 +119,7 @@ class TracedPatch:
     def trace(self, origins: Array, direction: Array) -> RayHits:
         """Trace parallel rays."""
         directions = np.broadcast_to(direction, origins.shape)
-        return trace_hits(self.scene, self.shape, origins, directions, None)[0]
+        return trace_starts(self.scene, origins, directions)
 
     def judge(self, view_deg: float) -> tuple[Array, float, float]:
         """View the patch's middle under an angle to the base's normal.

@@ -145,7 +145,7 @@ def _judge(score: Score, session: Session, view: RenderedView, seed: int) -> Non
         for name, result in found[i].estimates.items():
             if isinstance(result, Failure) or not np.isfinite(result.look_px).all():
                 continue
-            point = session.cast(result.look_px[None])[0]
+            point = session.exact_points(result.look_px[None])
             if point.valid[0]:
                 _add(score.near_answers[name], result, point.normal[0])
 

@@ -108,8 +108,8 @@ class Glints:
 
 def glints_of(session: Session) -> Glints:
     """Find the glints of a frame of the first light."""
-    pixels = highlights.search_glints(session, 0)
-    points = session.cast(pixels)[0]
+    pixels = highlights.find_zeros(session, True)[0]
+    points = session.exact_points(pixels)
     cosine = np.clip(np.sum(points.normal * points.normal_base, axis=1), -1, 1)
     pose = session.surface.model_from_camera
     position = points.position @ pose[:3, :3].T + pose[:3, 3]
@@ -186,7 +186,7 @@ def count(case: Case, wanted: int, least_frames: int = 12) -> tuple[float, float
     """Return the mean number of glints, its standard error, the law's, and the number of frames."""
     numbers: list[int] = []
     for session in frames(case):
-        numbers.append(len(highlights.search_glints(session, 0)))
+        numbers.append(len(highlights.find_zeros(session, True)[0]))
         if sum(numbers) >= wanted and len(numbers) >= least_frames:
             break
     expected = laws.glint_count(case.slope, case.wavelength_mm, case.distance_mm, case.gains)
@@ -247,7 +247,7 @@ def centroid_errors(case: Case, wanted: int) -> tuple[Array, Array]:
     errors: list[float] = []
     numbers: list[int] = []
     for session in frames(case):
-        pixels = highlights.search_glints(session, 0)
+        pixels = highlights.find_zeros(session, True)[0]
         if len(pixels):
             mean = session.camera.unproject(pixels).mean(axis=0)
             # The base faces the camera, which lies on the surface's axis.
@@ -324,7 +324,7 @@ def shown(case: Case, wanted: int) -> dict[str, list[float]]:
         peaks = [spot.peak_px for spot in view.visible_highlights if spot.peak_snr >= 10]
         if peaks:
             # Someone who takes the sightline of the peak for the normal, as a scanned model would judge it.
-            base = session.cast(np.array(peaks))[0]
+            base = session.exact_points(np.array(peaks))
             cosine = -np.sum(base.normal_base * session.camera.unproject(np.array(peaks)), axis=1)
             angles["visible"] += (np.arccos(np.clip(cosine, -1, 1)) / law).tolist()
         if len(angles["isolated"]) >= wanted:
@@ -366,8 +366,9 @@ def exhaustive(session: Session) -> Array:
         may = ((corners.min(axis=0) <= 0) & (corners.max(axis=0) >= 0)).all(axis=0)
     own, below, right = np.nonzero(may)
     seeds = blocks[own] + np.stack([right, below], axis=1) / FINER
-    found = highlights._glint_zeros(session, seeds, session.scene.rig.true_mm()[0])
-    return highlights.distinct(found[session.camera.contains(found)], highlights.SAME_GLINT_PX)
+    found, _ = highlights.refine(session, seeds, np.zeros(len(seeds), dtype=np.int64), True)
+    found = found[session.camera.contains(found)]
+    return found[highlights.first_of_each(found, highlights.SAME_PX["fine"])]
 
 
 def search(name: str, seed: int, slope_deg: float, wavelength_mm: float) -> tuple[int, int, float]:
@@ -375,7 +376,7 @@ def search(name: str, seed: int, slope_deg: float, wavelength_mm: float) -> tupl
     relief = {"bands": [{"slope_deg": slope_deg, "wavelength_mm": wavelength_mm}], "seed": seed}
     camera = {"width": 320, "height": 240, "fx": 300.0, "fy": 300.0, "cx": 160.0, "cy": 120.0}
     session = Session(scene_from_dict({"surface": {**SEARCHED[name], "relief": relief}, "camera": camera}))
-    found, whole = highlights.search_glints(session, 0), exhaustive(session)
+    found, whole = highlights.find_zeros(session, True)[0], exhaustive(session)
     if not len(found):
         return len(whole), 0, 0.0
     near = cKDTree(found).query(whole)[0] < SAME_PX if len(whole) else np.empty(0)

@@ -82,19 +82,19 @@ class InverseRendering:
         fitted = _fitted(_start(start, patch, priors, own, PatchRenderer(pixels.rays), self.base), pixels)
         if fitted is None:
             return Failure(Reason.NOT_CONVERGED, "the fit of a rendered patch did not converge")
-        found = fitted.model
-        gains = 1 + np.linalg.eigvalsh(found.shape)
+        model = fitted.model
+        gains = 1 + np.linalg.eigvalsh(model.shape)
         covariance = pixels.correlation(fitted) * pixels.covariance(fitted)
-        budget = {**_budget(found, covariance, _of_light(priors, own)), **beyond_noise(family)}
+        budget = {**_budget(model, covariance, _of_light(priors, own)), **beyond_noise(family)}
         estimate = Estimate(
-            normal=found.normal,
-            candidates=found.normal[None],
-            look_px=camera.project(found.sightline),
+            normal=model.normal,
+            candidates=model.normal[None],
+            look_px=camera.project(model.sightline),
             axis_ratio=float(np.abs(gains).min() / np.abs(gains).max()),
             isophotes=start.isophotes,
             budget=None if pixels.noise is None else budget,
             flags=start.flags,
-            curvature=_curvature(found, priors),
+            curvature=_curvature(model, priors),
         )
         return add_common_parts(estimate, camera, priors, family)
 
@@ -158,8 +158,8 @@ def _budget(model: RenderedQuadric, covariance: Array, priors: Priors) -> Budget
     noise = J @ covariance[:2, :2] @ J.T
     if not priors.lights_mm:
         return {"noise": noise, "light_offset": light_offset_part(model.normal, priors)}
-    told = mean_light_part(model.normal, priors)
-    known = {"noise": noise} if told is None else {"noise": noise, "light_offset": told}
+    by_light = mean_light_part(model.normal, priors)
+    known = {"noise": noise} if by_light is None else {"noise": noise, "light_offset": by_light}
     distances = priors.distance.quantile(DISTANCES)
     if is_narrow(priors.distance):
         distances = model.distance * np.array([1.0, 1 + STEP])

@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.estimators.bisector import bisect
 from simtest.geometry import Array
-from simtest.rendering import backend, reflectances
+from simtest.rendering import backend, elements
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.kernel_values import channel_mean
 from simtest.rendering.lighting import Material
@@ -30,13 +30,13 @@ class PatchRenderer:
 
     def __init__(self, rays: Array) -> None:
         backend.load(None)
-        plugin = reflectances.register_phong(str(mi.variant()))
+        elements.register(str(mi.variant()))
         self.count = len(rays)
         # Gathered: a kernel keeps the length of an array of shape (n, 3), and whether its address is aligned.
         self._rays = [mi.Float(np.ascontiguousarray(part, dtype=np.float32)) for part in rays.T]
         # Lobe and base of unit strength: their factors are differentiated outside of the BSDF.
         self._bsdf = mi.load_dict(
-            {"type": plugin, "specular": 1.0, "diffuse_reflectance": {"type": "rgb", "value": [1.0] * 3}}
+            {"type": "simtest_phong", "specular": 1.0, "diffuse_reflectance": {"type": "rgb", "value": [1.0] * 3}}
         )
 
     def radiance(self, patch: "RenderedQuadric", kept: list[bool]) -> tuple[Array, Array]:
@@ -52,7 +52,7 @@ class PatchRenderer:
 
     def _parameters(self, patch: "RenderedQuadric", kept: list[bool], which: Any) -> list[Any]:
         """Return the seven parameters; each kept one has gradient 1 in its own copy of the pixels."""
-        made, lane = [], 0
+        parameters, lane = [], 0
         values = [0.0, 0.0, *patch.stretch, patch.log_scale, patch.base]
         for value, is_kept in zip(values, kept, strict=True):
             parameter = dr.zeros(mi.Float, dr.width(which)) + self._opaque(value)
@@ -60,8 +60,8 @@ class PatchRenderer:
                 dr.enable_grad(parameter)
                 dr.set_grad(parameter, dr.select(which == lane, mi.Float(1), mi.Float(0)))
                 lane += 1
-            made.append(parameter)
-        return made
+            parameters.append(parameter)
+        return parameters
 
     def _evaluated(self, radiance: Any) -> tuple[Array, Array]:
         """Return the values of all lanes and their derivatives by the parameter that varies in each."""
@@ -79,9 +79,9 @@ class PatchRenderer:
 
     def _opaque(self, value: Any, kind: Any = None) -> Any:
         """Return a value that the kernel reads from memory, so that changing it compiles nothing."""
-        held = (kind or mi.Float)(value)
-        dr.make_opaque(held)
-        return held
+        opaque = (kind or mi.Float)(value)
+        dr.make_opaque(opaque)
+        return opaque
 
 
 class _Surface:

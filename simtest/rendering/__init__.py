@@ -1,9 +1,10 @@
 """The only package that imports Mitsuba.
 
-`backend` chooses libLLVM and variant. `session` holds the scene: a `built_scene` of surface, `reflectances` and
-`lighting`, with `tissue_kernels` and `instruments`. `rays`, `trace` and `adaptive` render its radiance. `truth` is of
-the rendered shape and of the smooth surface (a colon's by `tube_kernel`); `highlights` are the points where the normal
-bisects light and camera, `misfits` how far it is from that. `frames` defines the records.
+`backend` chooses libLLVM and variant. `session` holds the scene: a `built_scene` of surface, reflectance and lights
+(`elements` has those that Mitsuba lacks), with `tissue_kernels` and `instruments`. `rays`, `lighting`, `trace` and
+`adaptive` render its radiance. `truth` is of the rendered shape and of the smooth surface (a colon's by `tube_kernel`);
+`highlights` are the points where the normal bisects light and camera, `misfits` how far it is from that. `frames`
+defines the records.
 """
 
 from typing import TYPE_CHECKING

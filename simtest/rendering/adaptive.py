@@ -24,7 +24,7 @@ from simtest.rendering.backend import dr, mi
 from simtest.rendering.kernel_values import vectors_to_kernel
 from simtest.rendering.rays import Hit, Rays, in_tiles
 from simtest.rendering.tissue_kernels import ReliefKernel
-from simtest.rendering.trace import Progress, Tracer
+from simtest.rendering.trace import Progress, Tell, Tracer
 from simtest.rendering.truth import CHANNELS, ShapeLabels
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.spec.lights import CosineProfile, LightSpec, is_at_camera
@@ -344,10 +344,10 @@ def choose(parts: list[Image], depth: Image, gaps: list[Image], scale: Image, ha
     with np.errstate(invalid="ignore"):
         chosen |= scale < LEAST_SCALE_PX
         for first in range(0, len(gaps), 3):
-            own = np.stack(gaps[first : first + 3])
+            gap = np.stack(gaps[first : first + 3])
             # From each pixel to the next; the pixels around follow below.
-            chosen[:, 1:] |= np.square(np.diff(own, axis=2)).sum(axis=0) > half_width**2
-            chosen[1:] |= np.square(np.diff(own, axis=1)).sum(axis=0) > half_width**2
+            chosen[:, 1:] |= np.square(np.diff(gap, axis=2)).sum(axis=0) > half_width**2
+            chosen[1:] |= np.square(np.diff(gap, axis=1)).sum(axis=0) > half_width**2
     chosen = cv2.dilate(chosen.astype(np.uint8), _AROUND) > 0
     chosen[:BORDER_PX] = chosen[-BORDER_PX:] = True
     chosen[:, :BORDER_PX] = chosen[:, -BORDER_PX:] = True
@@ -388,74 +388,49 @@ def beam(light: LightSpec) -> float:
     return min(angles)
 
 
-@dataclass(frozen=True)
-class Adaptive:
-    """Renders the frames of one scene."""
+def render(
+    tracer: Tracer, scene: Scene, labels: ShapeLabels, shape: Shape, edges: MeshEdges | None, progress: Progress | None
+) -> tuple[list[Image], list[Image]]:
+    """Return the channels of the mean radiance, and of the labels without curvatures, shape (H, W) each.
 
-    tracer: Tracer  # Of the scene
-    scene: Scene  # The scene, for which `applies` is true
-    labels: ShapeLabels  # Of its shape, without curvatures
-    shape: Shape  # The shape
-    edges: MeshEdges | None  # Of a mesh
-
-    def render(self, progress: Progress | None) -> tuple[list[Image], list[Image]]:
-        """Return the channels of the mean radiance, and of the labels without curvatures, shape (H, W) each."""
-        effort, camera = self.scene.render, self.tracer.sightlines.camera
-        pixels = camera.width * camera.height
-        total = pixels * effort.samples_per_pixel
-
-        def begun(done: int, _: int, what: str) -> None:
-            assert progress is not None
-            progress(done, total, what)
-
-        # The rays through the centres.
-        clues = Clues(
-            self.labels,
-            self.scene.rig.true_mm(),
-            [beam(light) for light in self.scene.rig.lights],
-            pixels_per_rad(camera),
-        )
-        parts, channels = self.tracer.centres(None, True, clues, begun if progress else None)
-        labels, gaps, scale = clues.split(channels)
-        # What follows from them, and which pixels need more.
-        chosen = self._chosen(parts, labels, gaps, scale, clues.px_per_rad)
-        means = [mean_of_pixel(part) for part in parts]
-        numbers = in_tiles(chosen)
-        if len(numbers):
-
-            def went_on(traced: int) -> None:
-                assert progress is not None
-                share = traced / (len(numbers) * effort.samples_per_pixel)
-                progress(pixels + round((total - pixels) * share), total, "rendering")
-
-            sampled = self.tracer.means_at(
-                numbers, effort.samples_per_pixel, effort.seed, went_on if progress else None
-            )
-            for mean, channel in zip(means, sampled, strict=True):
-                mean.ravel()[numbers] = channel
-        return means, labels
-
-    def _chosen(
-        self, parts: list[Image], labels: list[Image], gaps: list[Image], scale: Image, px_per_rad: float
-    ) -> Mask:
-        """Return the pixels that need samples."""
-        camera, pose = self.tracer.sightlines.camera, self.tracer.sightlines.pose
-        depth, width = labels[CHANNELS.index("depth")], self.scene.reflectance.half_width
-        if self._is_small(px_per_rad):
-            return np.ones(depth.shape, dtype=bool)
+    `applies` is true for the scene; `labels` are of its shape, `edges` of a mesh.
+    """
+    effort, camera = scene.render, tracer.sightlines.camera
+    pixels = camera.width * camera.height
+    total = pixels * effort.samples_per_pixel
+    # The rays through the centres.
+    beams = [beam(light) for light in scene.rig.lights]
+    clues = Clues(labels, scene.rig.true_mm(), beams, pixels_per_rad(camera))
+    begun: Progress | None = progress and (lambda done, _, what: progress(done, total, what))
+    parts, channels = tracer.centres(None, True, clues, begun)
+    centres, gaps, scale = clues.split(channels)
+    # What follows from them, and which pixels need more.
+    depth, width = centres[CHANNELS.index("depth")], scene.reflectance.half_width
+    if _is_small(shape, tracer.sightlines.pose, clues.px_per_rad):
+        chosen = np.ones(depth.shape, dtype=bool)
+    else:
         chosen = choose(parts, depth, gaps, scale, width)
-        if self.edges is not None:
-            lights = [place for place in self.scene.rig.true_mm() if not is_at_camera(place)]
-            chosen |= self.edges.marks(camera, pose, np.reshape(lights, (-1, 3)), depth, width, px_per_rad)
-        return chosen
+        if edges is not None:
+            lights = np.reshape([place for place in scene.rig.true_mm() if not is_at_camera(place)], (-1, 3))
+            chosen |= edges.marks(camera, tracer.sightlines.pose, lights, depth, width, clues.px_per_rad)
+    means = [mean_of_pixel(part) for part in parts]
+    numbers = in_tiles(chosen)
+    if len(numbers):
+        share = (total - pixels) / (len(numbers) * effort.samples_per_pixel)
+        went_on: Tell | None = progress and (
+            lambda traced: progress(pixels + round(share * traced), total, "rendering")
+        )
+        sampled = tracer.means_at(numbers, effort.samples_per_pixel, effort.seed, went_on)
+        for mean, channel in zip(means, sampled, strict=True):
+            mean.ravel()[numbers] = channel
+    return means, centres
 
-    def _is_small(self, px_per_rad: float) -> bool:
-        """Return whether an analytic shape looks so small that centres may miss it."""
-        if self.shape.kind not in ("sphere", "cylinder"):
-            return False
-        pose, matrix = self.tracer.sightlines.pose, self.shape.to_model
-        radius = float(np.linalg.norm(matrix[:3, 0]))
-        offset = np.linalg.inv(matrix)[:3] @ pose[:, 3]
-        rounded = offset[: 3 if self.shape.kind == "sphere" else 2]
-        distance = radius * float(np.linalg.norm(rounded))
-        return radius * px_per_rad < LEAST_RADIUS_PX * distance
+
+def _is_small(shape: Shape, pose: Array, px_per_rad: float) -> bool:
+    """Return whether an analytic shape looks so small from a pose that centres may miss it."""
+    if shape.kind not in ("sphere", "cylinder"):
+        return False
+    radius = float(np.linalg.norm(shape.to_model[:3, 0]))
+    offset = np.linalg.inv(shape.to_model)[:3] @ pose[:, 3]
+    distance = radius * float(np.linalg.norm(offset[: 3 if shape.kind == "sphere" else 2]))
+    return radius * px_per_rad < LEAST_RADIUS_PX * distance

@@ -112,13 +112,13 @@ def needs_llvm(variant: str | None = None) -> bool:
 def candidates() -> list[Candidate]:
     """List the libraries in the order they are tried: the variable, the pip package's, the system's newest."""
     # The user's choice, then the tested package, then whatever the system has.
-    found = []
+    libraries = []
     if variable := os.environ.get(LIBRARY_VARIABLE):
-        found.append(Candidate(LIBRARY_VARIABLE, variable))
+        libraries.append(Candidate(LIBRARY_VARIABLE, variable))
     if packaged := _packaged_library():
-        found.append(Candidate(f"pip package {PIP_PACKAGE}", packaged))
-    found += [Candidate("system", path) for path in _system_libraries()]
-    return found
+        libraries.append(Candidate(f"pip package {PIP_PACKAGE}", packaged))
+    libraries += [Candidate("system", path) for path in _system_libraries()]
+    return libraries
 
 
 def _packaged_library() -> str | None:
@@ -356,22 +356,17 @@ class BackendReport:
         return {**asdict(self), "can_render": self.can_render}
 
 
-def library_report(variant: str | None = None) -> BackendReport:
-    """Choose a library for a variant (see `requested_variant`) and report on it; nothing is rendered."""
-    versions = {package: importlib.metadata.version(package) for package in ("mitsuba", "drjit")}
-    name = requested_variant(variant)
-    chosen, tried = choose_library() if needs_llvm(name) else (None, [])
-    problem = no_library_message(tried) if needs_llvm(name) and chosen is None else None
-    return BackendReport(name, chosen.path if chosen else None, tried, versions, problem)
-
-
 RENDER_TIMEOUT_S = 180
 
 
 def examine(variant: str | None = None) -> BackendReport:
     """Examine the rendering backend (see `simtest.rendering.backend.requested_variant`); this process loads nothing."""
-    report = library_report(variant)
-    return replace(report, problem=_try_rendering(report.variant)) if report.can_render else report
+    versions = {package: importlib.metadata.version(package) for package in ("mitsuba", "drjit")}
+    name = requested_variant(variant)
+    chosen, tried = choose_library() if needs_llvm(name) else (None, [])
+    lacking = needs_llvm(name) and chosen is None
+    problem = no_library_message(tried) if lacking else _try_rendering(name)
+    return BackendReport(name, chosen.path if chosen else None, tried, versions, problem)
 
 
 def _try_rendering(variant: str) -> str | None:

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from simtest.rendering import lighting
 from simtest.rendering.adaptive import MeshEdges
 from simtest.rendering.backend import mi
-from simtest.rendering.kernel_values import MitsubaDict
+from simtest.rendering.elements import lights as light_elements
+from simtest.rendering.kernel_values import MitsubaDict, spectrum
 from simtest.rendering.lighting import DirectLight
-from simtest.rendering.reflectances import bsdf_dict, parameter_updates, parts_alone
 from simtest.rendering.tissue_kernels import AlbedoKernel
 from simtest.rendering.truth import ShapeLabels
 from simtest.runtime.arrays import Array
@@ -37,15 +36,15 @@ def make_shape(shape: Shape, bsdf: MitsubaDict) -> Any:
 def _make_mesh(mesh: TriangleMesh, bsdf: MitsubaDict) -> Any:
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(bsdf)
-    made = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, props=properties)
-    parameters = mi.traverse(made)
+    rendered = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, props=properties)
+    parameters = mi.traverse(rendered)
     parameters["vertex_positions"] = flat(mesh.vertices, np.float32)
     parameters["faces"] = flat(mesh.faces, np.uint32)
     parameters.update()
     # Mitsuba recomputes the normals from the triangles when positions change, so the exact ones are set afterwards.
     parameters["vertex_normals"] = flat(mesh.normals, np.float32)
     parameters.update()
-    return made
+    return rendered
 
 
 def flat(values: Any, dtype: Any) -> Any:
@@ -77,7 +76,8 @@ class BuiltScene:
         elif not _same(shape.mesh, self.mesh):
             self._deform(shape.mesh)
         # Material: the whole and its base alone.
-        for name, value in parameter_updates(reflectance).items():
+        for name, given in reflectance.updates.items():
+            value = spectrum(given) if isinstance(given, list) else given
             self._set(f"bsdf.{name}", value)
             if self.base is not None:
                 self.base_parameters[name] = value
@@ -99,11 +99,11 @@ class BuiltScene:
         positions = rig.true_mm() @ rotation.T + model_from_camera[:3, 3]
         axes = np.array([light.axis for light in lights]) @ rotation.T
         poses = [
-            lighting.LightPose(position, axis, light.across @ rotation.T)
+            light_elements.LightPose(position, axis, light.across @ rotation.T)
             for light, position, axis in zip(lights, positions, axes, strict=True)
         ]
         for i, light in enumerate(lights):
-            for name, value in lighting.emitter_values(light, poses[i]).items():
+            for name, value in light_elements.emitter_values(light, poses[i]).items():
                 self._set(f"light_{i}.{name}", value)
         self.parameters.update()
         return DirectLight(rig, poses)
@@ -111,8 +111,8 @@ class BuiltScene:
     def let_bounces_find(self, albedo: AlbedoKernel) -> None:
         """Let bounced light find the albedo of tissue by its own points."""
         # Weak: what a BSDF holds, Mitsuba holds, and Python could not free it at its end.
-        found = weakref.proxy(albedo)
-        self.scene.shapes()[0].bsdf().albedo_at = lambda si, active: found.of(si, active)
+        kernel = weakref.proxy(albedo)
+        self.scene.shapes()[0].bsdf().albedo_at = lambda si, active: kernel.of(si, active)
 
     def _set(self, suffix: str, value: Any) -> None:
         """Assign the one parameter whose path ends in `suffix`; Mitsuba names paths by its own rules."""
@@ -121,19 +121,15 @@ class BuiltScene:
         self.parameters[paths[0]] = value
 
 
-def build(
-    key: tuple[Any, ...], shape: Shape, reflectance: Reflectance, lights: Sequence[LightSpec], plugin: str
-) -> BuiltScene:
-    """Build the Mitsuba scene of a structure; `plugin` is the name of the Phong BSDF."""
-    surface = make_shape(shape, bsdf_dict(reflectance, plugin, diffuse_only=False))
-    emitters = {f"light_{i}": lighting.emitter_dict(lighting.kind_of(light)) for i, light in enumerate(lights)}
+def build(key: tuple[Any, ...], shape: Shape, reflectance: Reflectance, lights: Sequence[LightSpec]) -> BuiltScene:
+    """Build the Mitsuba scene of a structure."""
+    surface = make_shape(shape, reflectance.kernel)
+    kinds = [light_elements.kind_of(light) for light in lights]
+    emitters = {f"light_{i}": light_elements.emitter_dict(kind) for i, kind in enumerate(kinds)}
     # Without optimize=False Mitsuba merges equal objects: two lights of one power, or a light and a texture,
     # would share a parameter, and an update of one would change both.
     scene = mi.load_dict({"type": "scene", "surface": surface, **emitters}, optimize=False)
-    # The base alone, where the BSDF cannot evaluate its parts separately.
-    base = None
-    if not parts_alone(reflectance):
-        base = mi.load_dict(bsdf_dict(reflectance, plugin, diffuse_only=True), optimize=False)
+    base = reflectance.base_kernel and mi.load_dict(reflectance.base_kernel, optimize=False)
     return BuiltScene(key, scene, mi.traverse(scene), base, base and mi.traverse(base), mesh=shape.mesh)
 
 

@@ -6,6 +6,7 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from simtest.conventions import PIXEL_CENTRE
 from simtest.runtime.arrays import Array, Image, Mask, short_repr
 
 
@@ -136,7 +137,8 @@ class Frame:
 class MisfitMaps:
     """Normal minus bisector across the sightline (see `exact_misfit`) of the rendered shape, a map for each light.
 
-    The maps reach beyond the frame, so that a zero next to its border lies between pixels too.
+    They are known at the centres of every `stride`-th pixel, from half a stride on, and reach beyond the frame, so that
+    a zero next to its border lies between cells too.
     """
 
     distance: Image  # (h, w): distance along the ray, mm; NaN where there is no surface
@@ -144,8 +146,13 @@ class MisfitMaps:
     fine: Image
     base: Image
     margin: int  # Cells beyond the frame on each side
+    stride: int  # px
 
     __repr__ = short_repr
+
+    def pixels(self, cells: Array) -> Array:
+        """Return the pixel positions, shape (N, 2), of columns and rows of the maps, whole or not."""
+        return (cells - self.margin) * self.stride + (self.stride // 2 + PIXEL_CENTRE)
 
 
 @dataclass(frozen=True)

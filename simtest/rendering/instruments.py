@@ -5,7 +5,6 @@ which of both is nearer, and shadow rays ask both. Here is also which pixels the
 """
 
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +13,11 @@ import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.rendering.backend import dr, mi
+from simtest.rendering.elements.base import facet_density, visible_over_cosine
 from simtest.rendering.frames import HighlightPoint, Maps, Real
 from simtest.rendering.kernel_values import channels, spectrum
 from simtest.rendering.placement_checks import check_instruments
 from simtest.rendering.rays import Hit
-from simtest.rendering.reflectances import facet_density, visible_over_cosine
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.spec.lights import is_at_camera
 from simtest.spec.surfaces import DEFAULT_DEPTH_SHARE, Instrument
@@ -43,10 +42,6 @@ class Metal:
     share: Any
     metal: Any
     matt: Any
-
-    def painted(self, hit: Hit) -> AbstractContextManager[None]:
-        """Metal has no pattern."""
-        return nullcontext()
 
     def towards(self, hit: Hit, direction: Any, active: Any) -> tuple[Any, Any]:
         """Compute f cos(theta) of the lobe and of the matt base towards a direction of the model frame."""
@@ -101,15 +96,15 @@ class InstrumentKernel:
     def first(self, origin: Any, direction: Any, active: Any) -> tuple[Any, Any]:
         """Return the distance to the first cone on rays, mitsuba.Vector3d, unit; inf without; and the cone's number."""
 
-        def step(part: Any, nearest: Any, found: Any) -> tuple[Any, Any, Any]:
+        def step(part: Any, nearest: Any, nearest_part: Any) -> tuple[Any, Any, Any]:
             for root, valid in self._roots(part, origin, direction, active):
                 closer = valid & (root > 0) & (root < nearest)
-                nearest, found = dr.select(closer, root, nearest), dr.select(closer, part, found)
-            return part + 1, nearest, found
+                nearest, nearest_part = dr.select(closer, root, nearest), dr.select(closer, part, nearest_part)
+            return part + 1, nearest, nearest_part
 
         start = (mi.UInt32(0), mi.Float64(dr.inf), mi.UInt32(0))
-        _, nearest, found = dr.while_loop(start, lambda part, *_: active & (part < self._count), step)
-        return nearest, found
+        _, nearest, nearest_part = dr.while_loop(start, lambda part, *_: active & (part < self._count), step)
+        return nearest, nearest_part
 
     def blocked(self, ray: Any, active: Any) -> Any:
         """Return which rays, mitsuba.Ray3f of unit directions, meet a cone before their end; in single precision."""
@@ -175,14 +170,14 @@ class InstrumentKernel:
     def hit(self, rays: Any) -> tuple[Hit, Metal]:
         """Return the first points of instruments on a launch's rays (`Rays`), and their metal."""
         distance, part = self.first(rays.origin, rays.direction, rays.active)
-        found = rays.active & dr.isfinite(distance)
-        position = mi.Vector3d(rays.origin + rays.direction * dr.select(found, distance, 1))
-        normal = mi.Normal3f(self.normal(position, part, found))
+        is_hit = rays.active & dr.isfinite(distance)
+        position = mi.Vector3d(rays.origin + rays.direction * dr.select(is_hit, distance, 1))
+        normal = mi.Normal3f(self.normal(position, part, is_hit))
         si = dr.zeros(mi.SurfaceInteraction3f)
-        si.t = dr.select(found, mi.Float(distance), mi.Float(dr.inf))
+        si.t = dr.select(is_hit, mi.Float(distance), mi.Float(dr.inf))
         si.p, si.n, si.sh_frame = mi.Point3f(position), normal, mi.Frame3f(normal)
         si.wi = si.to_local(-mi.Vector3f(rays.direction))
-        return Hit(si, si, si), self._metal(part, found)
+        return Hit(si, si, si), self._metal(part, is_hit)
 
     def _metal(self, part: Any, active: Any) -> Metal:
         owner = mi.UInt32(self._number(part * PER_PART + PER_PART - 1, active))
@@ -216,12 +211,12 @@ class InstrumentKernel:
         o = mi.Vector3d(np.ascontiguousarray(np.broadcast_to(origins, whole.shape).T))
         d, active = mi.Vector3d(np.ascontiguousarray(whole.T)), mi.Bool(asked)
         distance, part = self.first(o, d, active)
-        found = active & dr.isfinite(distance)
-        normal = self.normal(o + d * dr.select(found, distance, 1), part, found)
-        dr.eval(distance, part, normal, found)
-        met = np.array(found)
-        owner = self.cones.owners[np.where(met, np.array(part), 0)]
-        return np.where(met, np.array(distance), np.inf), np.array(normal).T, np.where(met, owner, -1)
+        is_hit = active & dr.isfinite(distance)
+        normal = self.normal(o + d * dr.select(is_hit, distance, 1), part, is_hit)
+        dr.eval(distance, part, normal, is_hit)
+        hit = np.array(is_hit)
+        owner = self.cones.owners[np.where(hit, np.array(part), 0)]
+        return np.where(hit, np.array(distance), np.inf), np.array(normal).T, np.where(hit, owner, -1)
 
 
 SEARCH_PX = 16
@@ -330,9 +325,9 @@ def shade(session: "Session", kernel: InstrumentKernel, points: list[HighlightPo
     shaded = np.zeros(len(points), dtype=bool)
     lights = np.array([point.light for point in points])
     for index, source in enumerate(session.scene.rig.true_mm()):
-        own = lights == index
-        if own.any() and not is_at_camera(source):
-            shaded[own] = _blocked(session, kernel, source, positions[own])
+        of_light = lights == index
+        if of_light.any() and not is_at_camera(source):
+            shaded[of_light] = _blocked(session, kernel, source, positions[of_light])
     return [
         replace(point, lit=point.lit and not (behind or dark), hidden=bool(behind))
         for point, behind, dark in zip(points, hidden.tolist(), shaded.tolist(), strict=True)

@@ -12,17 +12,15 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
-from simtest.rendering import backend, reflectances
+from simtest.rendering import backend, elements
 from simtest.rendering.backend import mi
 from simtest.rendering.built_scene import make_shape
 from simtest.rendering.kernel_values import MitsubaDict
-from simtest.rendering.reflectances import bsdf_dict
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.spec import Scene
 from simtest.spec.lights import CosineProfile, DiscSource, LightSpec
-from simtest.spec.reflectance import PhongReflectance, TissueReflectance
 from simtest.spec.spec_model import Spec
 from simtest.surfaces import Shape, SurfaceModel, make_surface
 
@@ -61,11 +59,10 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
     for key, value, why in _inexpressible(scene):
         raise InputError(f"scene {scene.name}: {key} = {value!r}: cannot be exported; {why}")
     backend.load(variant)
-    plugin = reflectances.register_phong(str(mi.variant()))
-    reflectances.register_tissue(str(mi.variant()))
+    elements.register(str(mi.variant()))
     surface = make_surface(scene.surface, None, scene.camera.moved, scene.deformation, scene.time_s)
     shape = _cut_to_view(surface.shape(), surface, scene.camera.model())
-    text = _xml(scene, surface, shape, plugin)
+    text = _xml(scene, surface, shape)
     make_folder(out)
     files = [out / SCENE_FILE]
     if shape.mesh:
@@ -231,9 +228,9 @@ def _disc_pose(light: LightSpec, position_mm: Array, surface: SurfaceModel) -> A
     return np.asarray(surface.model_from_camera @ local)
 
 
-def _xml(scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str) -> str:
+def _xml(scene: Scene, surface: SurfaceModel, shape: Shape) -> str:
     # Describe.
-    bsdf = bsdf_dict(scene.reflectance, plugin, diffuse_only=False)
+    bsdf = scene.reflectance.kernel
     effort = scene.render
     described = {
         "type": "scene",
@@ -245,7 +242,7 @@ def _xml(scene: Scene, surface: SurfaceModel, shape: Shape, plugin: str) -> str:
     # Let Mitsuba write its XML.
     state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), described)
     for node in state.nodes:
-        if node.props.plugin_name() in (plugin, reflectances.TISSUE):
+        if node.props.plugin_name() in elements.REFLECTANCES:
             # Mitsuba does not know the kind of a plugin written in Python.
             node.type = mi.ObjectType.BSDF
     written = mi.parser.write_string(state, add_section_headers=True)
@@ -280,8 +277,7 @@ def _head(scene: Scene) -> str:
         f'Scene "{scene.name}", written by simtest {provenance.version()}. World: model frame of the surface, mm.',
         "Without the sensor: no noise, no exposure, linear radiance.",
     ]
-    if isinstance(scene.reflectance, PhongReflectance | TissueReflectance):
-        name = reflectances.PHONG if isinstance(scene.reflectance, PhongReflectance) else reflectances.TISSUE
+    if (name := scene.reflectance.kernel["type"]) in elements.REFLECTANCES:
         lines += [
             f'The reflectance "{name}" is a plugin of simtest. After mitsuba.set_variant and before loading:',
             "    from simtest.rendering.plugins import register; register()",

@@ -18,10 +18,10 @@ RIM_COPIES = (1.0, 0.75, 0.5, 0.25)
 def check_camera(scene: Scene, surface: SurfaceModel) -> None:
     """Raise `InputError` where the camera lies in the wall, or a wall that deforms has passed over it."""
     camera = surface.model_from_camera[:3, 3]
-    own = float(surface.at_rest.clearance(camera[None])[0])
-    if not own > 0:
+    at_rest = float(surface.at_rest.clearance(camera[None])[0])
+    if not at_rest > 0:
         raise InputError(
-            f"scene {scene.name}: surface: the camera lies {-own:.3g} mm inside the wall; it must be in free "
+            f"scene {scene.name}: surface: the camera lies {-at_rest:.3g} mm inside the wall; it must be in free "
             "space: change surface.distance_mm, surface.tilt_deg or the curvature"
         )
     if not isinstance(surface, DeformedSurface):
@@ -92,9 +92,9 @@ def check_motion(scene: Scene, surface: SurfaceModel) -> None:
     positions = scene.rig.true_mm()
     for i, light in enumerate(scene.rig.lights):
         rim = np.zeros((0, 3)) if light.source is None else _rim_points(light, positions[i])
-        own = np.concatenate([positions[i : i + 1] if surface.solid else rim[:0], rim])
-        names += [f"rig.lights.{i}"] * len(own)
-        points.append(own)
+        kept_free = np.concatenate([positions[i : i + 1] if surface.solid else rim[:0], rim])
+        names += [f"rig.lights.{i}"] * len(kept_free)
+        points.append(kept_free)
     # Camera and rig at each moment, in the camera frame of the middle.
     poses, still = motion.poses(), np.concatenate(points)
     moved = np.einsum("kij,nj->kni", poses[:, :3, :3], still) + poses[:, None, :3, 3]

@@ -6,7 +6,7 @@ One line before `mi.load_file` or `mi.load_dict`, after `mi.set_variant`::
 """
 
 from simtest.errors import BackendError
-from simtest.rendering import lighting, reflectances
+from simtest.rendering import elements
 
 
 def register() -> None:
@@ -16,6 +16,4 @@ def register() -> None:
     variant = mitsuba.variant()
     if variant is None:
         raise BackendError("no Mitsuba variant is set; call mitsuba.set_variant before register")
-    reflectances.register_phong(variant)
-    reflectances.register_tissue(variant)
-    lighting.register_light(variant)
+    elements.register(variant)

@@ -260,11 +260,11 @@ class HitRefinement:
         # Normals transform by the inverse transpose.
         normal = dr.normalize(self._normals @ gradient) * (-1.0 if self.shape.flip else 1.0)
         # Replace Mitsuba's values where the solution is the same hit.
-        found = si.is_valid() & dr.isfinite(t) & (dr.abs(mi.Float(t) - si.t) < SAME_HIT * si.t)
+        same = si.is_valid() & dr.isfinite(t) & (dr.abs(mi.Float(t) - si.t) < SAME_HIT * si.t)
         position = origin + t * direction
-        si.p = dr.select(found, mi.Point3f(position), si.p)
-        si.n = dr.select(found, mi.Normal3f(normal), si.n)
-        si.sh_frame = mi.Frame3f(dr.select(found, mi.Normal3f(normal), si.sh_frame.n))
+        si.p = dr.select(same, mi.Point3f(position), si.p)
+        si.n = dr.select(same, mi.Normal3f(normal), si.n)
+        si.sh_frame = mi.Frame3f(dr.select(same, mi.Normal3f(normal), si.sh_frame.n))
         si.wi = si.to_local(-mi.Vector3f(direction))
 
     def _root(self, weights: Any, o: Any, d: Any, near: Any) -> Any:

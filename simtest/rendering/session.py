@@ -13,27 +13,27 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.rendering import adaptive, backend, highlights, lighting, reflectances, truth
+from simtest.rendering import adaptive, backend, elements, highlights, truth
 from simtest.rendering.adaptive import MeshEdges
 from simtest.rendering.backend import mi
 from simtest.rendering.built_scene import BuiltScene, build
+from simtest.rendering.elements.lights import kind_of
 from simtest.rendering.frames import Frame, HighlightPoint, MisfitMaps, Radiance, TruthMaps
 from simtest.rendering.instruments import Cover, InstrumentKernel, cover_of, place, shade
 from simtest.rendering.kernel_values import to_kernel
 from simtest.rendering.lighting import Material
-from simtest.rendering.misfits import MisfitGrid, trace_grid, trace_misfits, trace_tiles
+from simtest.rendering.misfits import trace_misfits, trace_tiles
 from simtest.rendering.placement_checks import check_camera, check_lights, check_motion
 from simtest.rendering.rays import HitRefinement, Sightlines
-from simtest.rendering.reflectances import compiled_form
-from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel, rest_map
+from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel, RestMap
 from simtest.rendering.trace import Bounces, Progress, Tracer, as_radiance, evaluate, mean_over
 from simtest.rendering.truth import ShapeLabels, as_hits, as_labels
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
 from simtest.spec.camera import Motion
-from simtest.spec.lights import is_at_camera
 from simtest.spec.reflectance import Translucency
 from simtest.spec.scene import Scene
 from simtest.surfaces import RayHits, SurfaceModel, SurfacePoints, make_surface
+from simtest.surfaces.deformation import DeformedSurface
 
 if TYPE_CHECKING:
     from simtest.surfaces.tissue_pattern import TissuePattern
@@ -75,9 +75,7 @@ class Session:
     def __init__(self, scene: Scene, variant: str | None = None, labelled: bool = False) -> None:
         loaded = backend.load(backend.requested_variant(variant, coloured=scene.is_coloured))
         self.variant = str(loaded.variant())
-        self.plugin = reflectances.register_phong(self.variant)
-        reflectances.register_tissue(self.variant)
-        lighting.register_light(self.variant)
+        elements.register(self.variant)
         self.rebuilds = 0
         self._instruments: InstrumentKernel | None = None
         self._cover: Cover | None = None
@@ -140,7 +138,7 @@ class Session:
         check_motion(scene, surface)
         self._shape = surface.shape()
         # Relief and colour are looked up where the tissue is at rest.
-        self._rest = rest_map(surface)
+        self._rest = RestMap(surface) if isinstance(surface, DeformedSurface) else None
         self._relief = None if surface.relief is None else ReliefKernel(surface.relief, self._rest)
         self.surface: SurfaceModel = surface
         self._set_tissue(scene)
@@ -173,14 +171,13 @@ class Session:
 
     def _structure(self) -> tuple[Any, ...]:
         """Return everything of the scene that is compiled into the kernels."""
-        material = compiled_form(self.scene.reflectance)
         relief = None if self._relief is None else self._relief.key
-        lights = tuple(lighting.kind_of(light) for light in self.scene.rig.lights)
-        return self._shape.key, relief, material, self._pattern is not None, lights
+        lights = tuple(kind_of(light) for light in self.scene.rig.lights)
+        return self._shape.key, relief, self.scene.reflectance.compiled, self._pattern is not None, lights
 
     def _build(self, key: tuple[Any, ...]) -> BuiltScene:
         self.rebuilds += 1
-        return build(key, self._shape, self.scene.reflectance, self.scene.rig.lights, self.plugin)
+        return build(key, self._shape, self.scene.reflectance, self.scene.rig.lights)
 
     def _write_values(self) -> None:
         """Write the values that may differ between scenes of one structure into the Mitsuba scene."""
@@ -243,18 +240,18 @@ class Session:
         elif effort.samples_per_pixel == 1:
             parts, channels = tracer.centres(bounces, True, labels, progress)
         elif adaptive.applies(self.scene):
-            parts, self._centre = self._adaptive(tracer).render(progress)
+            parts, self._centre = self._adaptive(tracer, progress)
             channels = tracer.relabelled(self._centre, labels) if labels else []
         else:
             parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
             channels = tracer.centres(None, False, labels)[1] if labels else []
-        own = len(parts) // tracer.layers
-        radiance = as_radiance(parts[:own])
+        per_layer = len(parts) // tracer.layers
+        radiance = as_radiance(parts[:per_layer])
         if self.scene.translucency is not None:
             radiance = self._translucent(radiance, channels, self.scene.translucency)
         if self._instruments is not None:
             # Metal in front of the surface; nothing spreads below it.
-            metal = as_radiance(parts[own:])
+            metal = as_radiance(parts[per_layer:])
             radiance = replace(
                 radiance, specular=radiance.specular + metal.specular, diffuse=radiance.diffuse + metal.diffuse
             )
@@ -274,12 +271,12 @@ class Session:
         finally:
             self._place_lights(middle)
 
-    def _adaptive(self, tracer: Tracer) -> adaptive.Adaptive:
+    def _adaptive(self, tracer: Tracer, progress: Progress | None) -> tuple[list[Image], list[Image]]:
         built, mesh = self._built, self._shape.mesh
         if built.edges is None and mesh is not None:
             built.edges = MeshEdges(built.scene, mesh)
         labels = ShapeLabels(built.scene.shapes()[0], None, curved=False)
-        return adaptive.Adaptive(tracer, self.scene, labels, self._shape, built.edges)
+        return adaptive.render(tracer, self.scene, labels, self._shape, built.edges, progress)
 
     def _translucent(self, radiance: Radiance, channels: list[Image], spec: Translucency) -> Radiance:
         """Return radiance whose diffuse part has spread below the surface."""
@@ -323,23 +320,6 @@ class Session:
         return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
     @_at_its_variant
-    def cast(self, points_px: Array) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays through pixel positions, shape (N, 2), onto the exact surface.
-
-        Returns the exact points and the shading and geometric normals of the rendered shape, shape (N, 3), without its
-        relief; in the camera frame, NaN where the ray misses.
-        """
-        return self._cast(*self.sightlines.in_model(points_px), None)
-
-    def _cast(
-        self, origins: Array, directions: Array, relief: ReliefKernel | None
-    ) -> tuple[SurfacePoints, Array, Array]:
-        """Cast rays of the model frame (see `cast`); with a `relief` the shading normals follow it."""
-        hits, shading, geometric = truth.trace_hits(self._built.scene, self._shape, origins, directions, relief)
-        rotation = self.surface.model_from_camera[:3, :3]
-        return truth.solve(self.surface, origins, directions, hits), shading @ rotation, geometric @ rotation
-
-    @_at_its_variant
     def exact_points(self, points_px: Array, fine: bool = True) -> SurfacePoints:
         """Return the exact points at pixel positions, shape (N, 2), camera frame, of the fine surface or the base."""
         rays = self.sightlines.in_model(points_px)
@@ -351,16 +331,15 @@ class Session:
         return truth.trace_starts(self._built.scene, origins, directions)
 
     @_at_its_variant
-    def misfit_grid(self, stride: int) -> MisfitGrid:
-        """Return the misfits of all lights, without the relief, at the centres of every `stride`-th pixel."""
-        lights = self.to_model(self.scene.rig.true_mm())
-        return trace_grid(self._built.scene, self.sightlines, lights, stride)
+    def misfits(self, stride: int = 1) -> MisfitMaps:
+        """Return the misfits of all lights at every `stride`-th pixel; of all pixels they are kept while these stay.
 
-    @_at_its_variant
-    def misfits(self) -> MisfitMaps:
-        """Return the misfits of all lights at the centres of pixels; they are kept while surface, camera, rig stay."""
+        They depend on surface, camera and rig alone.
+        """
+        if stride > 1:
+            return trace_misfits(self._tracer(), self.scene.rig.true_mm(), stride)
         if self._misfits is None:
-            self._misfits = trace_misfits(self._tracer(), self.scene.rig.true_mm())
+            self._misfits = trace_misfits(self._tracer(), self.scene.rig.true_mm(), 1)
         return self._misfits
 
     @_at_its_variant
@@ -372,20 +351,16 @@ class Session:
     def truth(self, stride: int = 1) -> TruthMaps:
         """Return the truth at the centre of every `stride`-th pixel along both axes; of all pixels it is kept."""
         if stride == 1 and self._truth is None:
-            self._truth = self._cast_maps(1)
+            self._truth = self._solve_maps(1)
         maps = self._truth if stride == 1 else None
-        maps, cover = maps or self._cast_maps(stride), self.cover()
+        maps, cover = maps or self._solve_maps(stride), self.cover()
         return maps if cover is None else cover.every(stride).over(maps)
 
-    def _cast_maps(self, stride: int) -> TruthMaps:
+    def _solve_maps(self, stride: int) -> TruthMaps:
+        # Hits like those of a frame's labels: the truth must not depend on whether a frame was rendered before.
         centres = self.camera.pixel_centres()[::stride, ::stride]
-        pixels = centres.reshape(-1, 2)
-        if stride == 1:
-            # Hits like those of a frame's labels: the truth must not depend on whether a frame was rendered before.
-            hits, shading, geometric = as_hits(self._centre_hits())
-            points = truth.solve_frame(self.surface, *self.sightlines.in_view(pixels), hits)
-        else:
-            points, shading, geometric = self._cast(*self.sightlines.in_view(pixels), self._relief)
+        hits, shading, geometric = as_hits([channel[::stride, ::stride] for channel in self._centre_hits()])
+        points = truth.solve_frame(self.surface, *self.sightlines.in_view(centres.reshape(-1, 2)), hits)
         return truth.truth_maps(points, shading, geometric, centres.shape[:2])
 
     @_at_its_variant
@@ -406,24 +381,6 @@ class Session:
     def blocked(self, origins: Array, directions: Array, reach: Array) -> Mask:
         """Return which rays, shape (N, 3), model frame, meet the rendered shape before `reach`, shape (N,), mm."""
         return truth.trace_blocked(self._built.scene, origins, directions, reach)
-
-    @_at_its_variant
-    def lit(self, positions: Array, light: int) -> Any:
-        """Return which points, shape (N, 3), camera frame, mm, a light emits towards and reaches unblocked."""
-        source = self.scene.rig.true_mm()[light]
-        towards = positions - source
-        distance = np.linalg.norm(towards, axis=1)
-        directions = towards / distance[:, None]
-        emitted = self.scene.rig.lights[light].factor(directions) > 0
-        # A light at the camera reaches all that is seen.
-        if is_at_camera(source):
-            return emitted
-        # Shadow rays from the light.
-        pose = self.surface.model_from_camera
-        origins = np.broadcast_to(self.to_model(source[None]), positions.shape)
-        hits = self.exact_hits(origins, directions @ pose[:3, :3].T)
-        # A blocker stands clearly in front of the point; the point's own triangle does not count.
-        return emitted & (hits.distance > distance * (1 - 1e-3))
 
     @_at_its_variant
     def lobe_at(self, points: Sequence[HighlightPoint]) -> Array:
@@ -471,7 +428,7 @@ class Session:
         """Return the highlight points of the base or of the fine surface, searched for once."""
         if base not in self._highlights:
             self._highlights[base] = highlights.search(self, base)
-        found = self._highlights[base]
+        points = self._highlights[base]
         if self._instruments is not None:
-            found = shade(self, self._instruments, found)
-        return list(found) if radiance is None else highlights.lit_by(radiance, found)
+            points = shade(self, self._instruments, points)
+        return list(points) if radiance is None else highlights.lit_by(radiance, points)

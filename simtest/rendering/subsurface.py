@@ -156,8 +156,8 @@ def _fitted(spec: Translucency, channels: int, first: int, last: int) -> Array:
         gaussians = np.exp(-np.square(waves[:, None] * widths) / 2)
         # Long waves, which tell the width, fall little: they count as much as what falls.
         rows = [1 / np.sqrt(1e-3 + 1 - curve) for curve in wanted]
-        own = [nnls(gaussians * row[:, None], curve * row)[0] for curve, row in zip(wanted, rows, strict=True)]
-        fits.append(np.stack(own, axis=1))
+        by_channel = [nnls(gaussians * row[:, None], curve * row)[0] for curve, row in zip(wanted, rows, strict=True)]
+        fits.append(np.stack(by_channel, axis=1))
     weights = np.array(fits)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float32)
 
@@ -195,8 +195,8 @@ def _blend(packed: Image, depth: Image, weights: list[Image]) -> Image:
         else:
             # Each pixel sees its own layers of depth.
             blurred = np.zeros_like(packed)
-            for share, own, box in layers:
-                blurred[box] += share[box] * _level(own, level)[box]
+            for share, layer, box in layers:
+                blurred[box] += share[box] * _level(layer, level)[box]
         *lights, areas = cv2.split(blurred)
         for c, part in enumerate(cv2.split(weight)):
             light[c] += part * lights[c]
@@ -207,7 +207,7 @@ def _blend(packed: Image, depth: Image, weights: list[Image]) -> Image:
 def _box(share: Image) -> tuple[slice, slice]:
     """Return the rows and columns that hold all that is not 0."""
     spans = (np.flatnonzero(share.any(axis=axis)) for axis in (1, 0))
-    return tuple(slice(found[0], found[-1] + 1) if len(found) else slice(0) for found in spans)  # type: ignore[return-value]
+    return tuple(slice(filled[0], filled[-1] + 1) if len(filled) else slice(0) for filled in spans)  # type: ignore[return-value]
 
 
 def _layers(depth: Image) -> list[Image]:

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.kernel_values import channels
 from simtest.runtime.arrays import Array
-from simtest.surfaces import SurfaceModel
 from simtest.surfaces.deformation import DeformedSurface, inverse_transpose
 from simtest.surfaces.relief_field import NODES, ReliefField
 from simtest.surfaces.vessels import ENDLESS, PRIMES
@@ -102,7 +101,7 @@ class ReliefKernel:
         if hessian is not None:
             bend, g = share * (1 - share) / meniscus, jets.gradient
             outer = (g.x * g.x, g.x * g.y, g.x * g.z, g.y * g.y, g.y * g.z, g.z * g.z)
-            hessian = tuple(share * own + bend * product for own, product in zip(hessian, outer, strict=True))
+            hessian = tuple(share * second + bend * product for second, product in zip(hessian, outer, strict=True))
         return KernelJets(jets.height, share * jets.gradient, jets.diffused, hessian)
 
 
@@ -118,8 +117,8 @@ def turned(si: Any, gradient: Any) -> Any:
 
 def _stored(coefficients: Array) -> Any:
     """Store coefficients, mitsuba.UInt64: each node's own and the next along z in one number, for fewer reads."""
-    own = coefficients.astype(np.float32)
-    return mi.UInt64(np.stack([own, np.roll(own, -1, axis=2)], axis=-1).view(np.uint64).ravel())
+    nodes = coefficients.astype(np.float32)
+    return mi.UInt64(np.stack([nodes, np.roll(nodes, -1, axis=2)], axis=-1).view(np.uint64).ravel())
 
 
 def _modulo(cell: Any) -> Any:
@@ -150,7 +149,8 @@ def _band(band: _Band, p: Any, active: Any, bent: bool) -> KernelJets:
         diffused = back @ _gradient(_contract(band.diffused, nodes, weights, active, 1))
     hessian = None
     if bent:
-        rows = [[fine[_order(i, j)] for j in range(3)] for i in range(3)]
+        orders = [[tuple((axis == i) + (axis == j) for axis in range(3)) for j in range(3)] for i in range(3)]
+        rows = [[fine[order] for order in row] for row in orders]
         whole = back @ mi.Matrix3f(*rows[0], *rows[1], *rows[2]) @ band.lattice
         hessian = tuple(whole[i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
     return KernelJets(fine[0, 0, 0], back @ _gradient(fine), diffused, hessian)
@@ -165,7 +165,8 @@ def _contract(pairs: Any, nodes: Any, weights: Any, active: Any, order: int) -> 
         for b in range(4):
             row = (nodes[0][a] * NODES + nodes[1][b]) * NODES
             read = (dr.gather(mi.UInt64, pairs, row + nodes[2][z], active) for z in (0, 2))
-            packet = mi.Vector4f(*(half for pair in read for half in _halves(pair)))
+            halves = (mi.UInt32(half) for pair in read for half in (pair, pair >> 32))
+            packet = mi.Vector4f(*(dr.reinterpret_array(mi.Float, half) for half in halves))
             for k in range(order + 1):
                 along = dr.dot(packet, depths[k])
                 for j in range(order + 1 - k):
@@ -176,18 +177,8 @@ def _contract(pairs: Any, nodes: Any, weights: Any, active: Any, order: int) -> 
     return totals
 
 
-def _halves(pair: Any) -> list[Any]:
-    """Return the two numbers that one of 64 bits holds."""
-    return [dr.reinterpret_array(mi.Float, mi.UInt32(half)) for half in (pair, pair >> 32)]
-
-
 def _gradient(derivatives: dict[Order, Any]) -> Any:
     return mi.Vector3f(derivatives[1, 0, 0], derivatives[0, 1, 0], derivatives[0, 0, 1])
-
-
-def _order(i: int, j: int) -> Order:
-    """Return the orders of derivative along x, y, z of the derivative along axes i and j."""
-    return tuple((axis == i) + (axis == j) for axis in range(3))
 
 
 CHANNELS = 3
@@ -352,8 +343,8 @@ class RestMap:
         if hessian is not None:
             second = self._numbers(si, active, 12, 30)
             # H - sum_i g_i Hess phi_i, by its upper triangle.
-            own = [h - sum(gradient[i] * second[6 * i + n] for i in range(3)) for n, h in enumerate(hessian)]
-            xx, xy, xz, yy, yz, zz = own
+            upper = [h - sum(gradient[i] * second[6 * i + n] for i in range(3)) for n, h in enumerate(hessian)]
+            xx, xy, xz, yy, yz, zz = upper
             whole = K @ mi.Matrix3f(xx, xy, xz, xy, yy, yz, xz, yz, zz) @ K.T
             hessian = tuple(whole[i, j] for i, j in _UPPER)
         return KernelJets(jets.height, gradient, K @ jets.diffused, hessian)
@@ -373,8 +364,3 @@ class RestMap:
                     packets[which] = dr.gather(mi.Vector4f, self._rows, row + which, active)
                 totals[n - first] = dr.fma(weight, packets[which][part], totals[n - first])
         return totals
-
-
-def rest_map(surface: SurfaceModel) -> RestMap | None:
-    """Return the map of a deformed surface; None of any other."""
-    return RestMap(surface) if isinstance(surface, DeformedSurface) else None

@@ -113,13 +113,13 @@ class Tracer:
 
     def _direct(self, rays: Rays, hit: Hit, draw: LightDraw | None) -> list[Any]:
         """Compute the channels of direct light off lobe and base, then of metal; each is 0 behind the other."""
+        blockers = self.scene if self.instruments is None else self.instruments.before(self.scene)
+        with self.material.painted(hit):
+            tissue = self.light.radiance(blockers, self.material, hit, draw)
         if self.instruments is None:
-            specular, diffuse = self.light.radiance(self.scene, self.material, hit, draw)
-            return [*specular, *diffuse]
-        blockers = self.instruments.before(self.scene)
+            return [channel for part in tissue for channel in part]
         ahead, metal = self.instruments.hit(rays)
         in_front = ahead.base.t < hit.base.t
-        tissue = self.light.radiance(blockers, self.material, hit, draw)
 
         def shine(specular: Any, diffuse: Any) -> tuple[Any, Any]:
             return self.light.radiance(blockers, metal, ahead, draw)
@@ -188,11 +188,11 @@ class Tracer:
         depth, face, *place = (channels[CHANNELS.index(name)].ravel() for name in ("depth", "face", "second", "third"))
         rows: list[list[Image]] = []
         for first, count in blocks_of(camera.width * camera.height):
-            own = slice(first, first + count)
+            launch = slice(first, first + count)
             preliminary = dr.zeros(mi.PreliminaryIntersection3f, count)
-            preliminary.t = to_kernel(mi.Float, np.nan_to_num(depth[own], nan=np.inf), np.float32)
-            preliminary.prim_index = to_kernel(mi.UInt32, face[own].view(np.uint32), np.uint32)
-            preliminary.prim_uv = mi.Point2f(*(to_kernel(mi.Float, share[own], np.float32) for share in place))
+            preliminary.t = to_kernel(mi.Float, np.nan_to_num(depth[launch], nan=np.inf), np.float32)
+            preliminary.prim_index = to_kernel(mi.UInt32, face[launch].view(np.uint32), np.uint32)
+            preliminary.prim_uv = mi.Point2f(*(to_kernel(mi.Float, share[launch], np.float32) for share in place))
             preliminary.shape, preliminary.valid = mi.ShapePtr(self.scene.shapes()[0]), preliminary.t < dr.inf
             rays = self.sightlines.rays(*self.sightlines.centre(self.sightlines.lanes(first, count, False, 0)))
             hit = self._points(rays, preliminary, True)
@@ -214,20 +214,20 @@ class Tracer:
         seed: int,
         bounces: Bounces | None,
         progress: Progress | None = None,
-        own: range | None = None,
+        numbers: range | None = None,
     ) -> list[Image]:
         """Compute the channels, shape (H, W) each, of the mean radiance over the pixels' area.
 
         `samples` is the number for each pixel, `seed` draws their positions; `progress` is called after each launch.
-        `own` are the numbers of those that are traced, one after the other; default all.
+        `numbers` are those of the samples that are traced, one after the other; default all.
         """
-        own = range(samples) if own is None else own
+        numbers = range(samples) if numbers is None else numbers
         height, width = self.sightlines.tiled_size
         camera = self.sightlines.camera
         # Trace: sums over the samples of each block of pixels.
         blocks = list(blocks_of(height * width))
         lanes = ((self.sightlines.lanes(first, count, True, seed), count) for first, count in blocks)
-        channels = self._means(lanes, samples, own, bounces, _share_of(progress, height * width * len(own)))
+        channels = self._means(lanes, samples, numbers, bounces, _share_of(progress, height * width * len(numbers)))
         # Arrange: from tiles to rows, without what lies beyond the frame.
         maps = untile(channels, (height, width))
         return [np.ascontiguousarray(channel[: camera.height, : camera.width]) for channel in maps]
@@ -239,7 +239,12 @@ class Tracer:
         return self._means(blocks, samples, range(samples), None, tell)
 
     def _means(
-        self, blocks: Iterable[tuple[Lanes, int]], samples: int, own: range, bounces: Bounces | None, tell: Tell | None
+        self,
+        blocks: Iterable[tuple[Lanes, int]],
+        samples: int,
+        numbers: range,
+        bounces: Bounces | None,
+        tell: Tell | None,
     ) -> Image:
         """Compute channels, shape (C, N), of the mean over samples, by number of `samples`, of blocks of lanes."""
         means: list[Image] = []
@@ -247,7 +252,7 @@ class Tracer:
         for block, (lanes, count) in enumerate(blocks):
             drawer = self.light.drawer(lanes, samples)
             sums: Sums | None = None
-            for start, stop in self._runs(own, count, bounces):
+            for start, stop in self._runs(numbers, count, bounces):
                 if bounces is None and self.sightlines.in_kernel:
                     parts = self._looped(lanes, drawer, start, stop)
                 else:
@@ -258,16 +263,16 @@ class Tracer:
                 if tell:
                     tell(traced)
             assert sums is not None
-            means.append((sums / len(own)).astype(np.float32))
+            means.append((sums / len(numbers)).astype(np.float32))
         return np.concatenate(means, axis=1)
 
-    def _runs(self, own: range, count: int, bounces: Bounces | None) -> Iterator[tuple[int, int]]:
+    def _runs(self, numbers: range, count: int, bounces: Bounces | None) -> Iterator[tuple[int, int]]:
         """Split the numbers of a pixel's samples into the runs of single launches."""
         # Bounces draw new random numbers for each sample, other cameras unproject on the host: one sample a launch.
         looped = bounces is None and self.sightlines.in_kernel
         step = max(1, min(SUMMED, RAYS // count)) if looped else 1
-        for start in range(own.start, own.stop, step):
-            yield start, min(start + step, own.stop)
+        for start in range(numbers.start, numbers.stop, step):
+            yield start, min(start + step, numbers.stop)
 
     def _looped(self, lanes: Lanes, drawer: Drawer | None, start: int, stop: int) -> list[Any]:
         """Sum direct light over samples by a loop inside the kernel."""
@@ -317,24 +322,19 @@ def as_radiance(parts: list[Image]) -> Radiance:
     width = 1 if len(parts) in (2, 3) else 3
 
     def image(first: int) -> Image:
-        own = parts[first * width : (first + 1) * width]
-        if not own:
-            own = [np.zeros_like(parts[0])] * width
-        made = own[0] if width == 1 else np.stack(own, axis=-1)
+        planes = parts[first * width : (first + 1) * width]
+        if not planes:
+            planes = [np.zeros_like(parts[0])] * width
+        pixels = planes[0] if width == 1 else np.stack(planes, axis=-1)
         # Dr.Jit's own threads flush subnormal numbers to 0, a process of one thread does not. Left in the frame, they
         # make its noise depend on the number of threads: a Poisson count of mean 0 draws nothing.
-        return np.where(np.abs(made) < SMALLEST_NORMAL, np.float32(0), made)
+        return np.where(np.abs(pixels) < SMALLEST_NORMAL, np.float32(0), pixels)
 
     return Radiance(image(0), image(1), image(2))
 
 
 TracerAt = Callable[[Array], Tracer]
 """Returns a tracer whose camera and lights stand at a pose, middle_from_moment."""
-
-
-def samples_per_step(effort: Effort, motion: Motion) -> int:
-    """Return the samples of a pixel at each step: as many at all steps, so that each moment has the same weight."""
-    return -(-effort.samples_per_pixel // motion.steps)
 
 
 def mean_over(
@@ -345,15 +345,16 @@ def mean_over(
     With one sample a pixel each step traces the rays through the pixels' centres; no noise is added. `progress` is
     called after each launch.
     """
-    each = samples_per_step(effort, motion)
+    # As many samples at all steps, so that each moment has the same weight.
+    each = -(-effort.samples_per_pixel // motion.steps)
     sums: list[Array] = []
     for step, pose in enumerate(motion.poses()):
         tracer, told = tracer_at(pose), _part(progress, step, motion.steps)
         if effort.samples_per_pixel == 1:
             parts, _ = tracer.centres(bounces, True, None, told, sample=step)
         else:
-            own = range(step * each, (step + 1) * each)
-            parts = tracer.mean(each * motion.steps, effort.seed, bounces, told, own)
+            numbers = range(step * each, (step + 1) * each)
+            parts = tracer.mean(each * motion.steps, effort.seed, bounces, told, numbers)
         # In double precision, so that the mean of equal frames is that frame.
         sums = sums or [np.zeros(part.shape) for part in parts]
         for total, part in zip(sums, parts, strict=True):

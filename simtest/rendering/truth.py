@@ -19,11 +19,11 @@ from simtest.rendering import tube_kernel
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.frames import Labels, TruthMaps
 from simtest.rendering.kernel_values import to_kernel, vectors_from_kernel, vectors_to_kernel
-from simtest.rendering.rays import Hit, Rays, make_hit, tangents_and_turns
+from simtest.rendering.rays import Hit, Rays, tangents_and_turns
 from simtest.rendering.tissue_kernels import ReliefKernel
 from simtest.rendering.tube_kernel import TubeKernel
 from simtest.runtime.arrays import Array, Image, Mask
-from simtest.surfaces import RayHits, Shape, SurfaceModel, SurfacePoints
+from simtest.surfaces import RayHits, SurfaceModel, SurfacePoints
 
 _OF_POINTS = (
     "position", "normal", "k_min", "k_max", "direction_min", "direction_max",
@@ -32,46 +32,10 @@ _OF_POINTS = (
 """Truth maps that are named as in `SurfacePoints`."""
 
 
-def trace_hits(
-    scene: Any, shape: Shape, origins: Array, directions: Array, relief: ReliefKernel | None
-) -> tuple[RayHits, Array, Array]:
-    """Trace rays, shape (N, 3), model frame, mm, against the rendered shape, the scene's only surface.
-
-    Directions are unit, NaN where there is no ray. Returns the hits, and shading and geometric normals of the rendered
-    shape, shape (N, 3), model frame, NaN where the ray misses; with a `relief` the former are those of the fine
-    surface.
-    """
+def trace_starts(scene: Any, origins: Array, directions: Array) -> RayHits:
+    """Trace rays, shape (N, 3), model frame, mm, against the scene's only surface; NaN directions are no rays."""
     if not len(origins):
         # Dr.Jit ends the process on a kernel without rays.
-        none = np.empty((0, 3))
-        return RayHits(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2))), none, none
-    ray, asked = _rays(origins, directions)
-    # Hits: what the exact solution starts from, and the normals of the rendered shape.
-    preliminary = scene.ray_intersect_preliminary(ray, False, asked)
-    si = preliminary.compute_surface_interaction(ray, mi.RayFlags.All, asked)
-    valid = si.is_valid()
-    normals = (mi.Vector3f(make_hit(si, relief).fine.sh_frame.n), mi.Vector3f(si.n))
-    dr.eval(preliminary.t, preliminary.prim_uv, preliminary.prim_index, *normals, valid)
-    # Back to arrays; a miss becomes NaN.
-    missed = ~np.array(valid)
-    hits = pack_hits(
-        np.where(missed, np.nan, np.array(preliminary.t)),
-        np.array(preliminary.prim_index),
-        vectors_from_kernel(preliminary.prim_uv, np.float32),
-    )
-    shading, geometric = (vectors_from_kernel(n, np.float64) for n in normals)
-    if shape.kind == "mesh":
-        # A triangle may be seen from behind.
-        with np.errstate(invalid="ignore"):
-            geometric = geometric * np.where(np.einsum("ij,ij->i", geometric, directions) > 0, -1.0, 1.0)[:, None]
-    for normal in (shading, geometric):
-        normal[missed] = np.nan
-    return hits, shading, geometric
-
-
-def trace_starts(scene: Any, origins: Array, directions: Array) -> RayHits:
-    """Trace rays as `trace_hits` does, without the normals: the same hits in a fraction of the time."""
-    if not len(origins):
         return RayHits(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 2)))
     ray, asked = _rays(origins, directions)
     preliminary = scene.ray_intersect_preliminary(ray, False, asked)
@@ -349,8 +313,8 @@ def _in_blocks(solver: Solver, block: int, origins: Array, directions: Array, hi
 def _of_numpy(surface: SurfaceModel, origins: Array, directions: Array, hits: RayHits) -> dict[str, Array]:
     """Return the fields of a block's points; without a relief the base has none of its own."""
     points = solve(surface, origins, directions, hits)
-    own = [field.name for field in fields(SurfacePoints) if surface.relief is not None or field.name not in _OF_BASE]
-    return {name: getattr(points, name) for name in own}
+    names = [field.name for field in fields(SurfacePoints) if surface.relief is not None or field.name not in _OF_BASE]
+    return {name: getattr(points, name) for name in names}
 
 
 def _of_kernel(

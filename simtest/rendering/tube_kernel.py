@@ -92,18 +92,18 @@ class TubeKernel:
         if not len(origins):
             # Dr.Jit ends the process on a kernel without rays.
             return {name: np.empty((0, *shape), dtype=kind) for name, (shape, kind) in _FIELDS.items()}
-        origin, direction, t, u, v, found = self._solved(origins, directions, hits)
-        return self._described(origin, direction, t, u, v, found, model_from_camera)
+        origin, direction, t, u, v, solved = self._solved(origins, directions, hits)
+        return self._described(origin, direction, t, u, v, solved, model_from_camera)
 
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Compute the distances of `solve` alone, shape (N,), mm; NaN where a ray has no point."""
         if not len(origins):
             return np.empty(0)
-        t, _, _, found = self._solved(origins, directions, hits)[2:]
-        return np.array(dr.select(found & dr.isfinite(t), t, dr.nan))
+        t, _, _, solved = self._solved(origins, directions, hits)[2:]
+        return np.array(dr.select(solved & dr.isfinite(t), t, dr.nan))
 
     def _solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Any, ...]:
-        """Return rays as lanes of a kernel, and their solutions: distance, u, v and which are found."""
+        """Return rays as lanes of a kernel, and their solutions: distance, u, v and which are solved."""
         origin, direction = (
             vectors_to_kernel(mi.Vector3d, mi.Float64, rays, np.float64) for rays in (origins, directions)
         )
@@ -115,14 +115,14 @@ class TubeKernel:
         corners = [self._corners.row(3 * face + i, valid) for i in range(3)]
         shares = (1 - second - third, second, third)
         u, v = (sum((s * c[i] for s, c in zip(shares, corners, strict=True)), mi.Float64(0)) for i in range(2))
-        t, u, v, found = self._newton(origin, direction, start, u, v, valid)
-        found &= (u >= -END_MM) & (u <= self._n["length"] + END_MM)
-        return origin, direction, t, u, v, found
+        t, u, v, solved = self._newton(origin, direction, start, u, v, valid)
+        solved &= (u >= -END_MM) & (u <= self._n["length"] + END_MM)
+        return origin, direction, t, u, v, solved
 
     def _newton(self, origin: Any, direction: Any, start: Any, u: Any, v: Any, valid: Any) -> tuple[Any, ...]:
-        """Solve P(u, v) = origin + t direction (see `Tube.solve`); return t, u, v and which are found."""
+        """Solve P(u, v) = origin + t direction (see `Tube.solve`); return t, u, v and which are solved."""
 
-        def body(t: Any, u: Any, v: Any, active: Any, found: Any, step: Any) -> tuple[Any, ...]:
+        def body(t: Any, u: Any, v: Any, active: Any, solved: Any, step: Any) -> tuple[Any, ...]:
             frame, r = self._frame(u, v), self._radius(u, v, second=False)
             along = 1 - frame.bend * r.f * frame.cosine
             miss = frame.centre + r.f * frame.rho - origin - t * direction
@@ -136,25 +136,25 @@ class TubeKernel:
             done = dr.squared_norm(miss) < NEWTON_TOLERANCE_MM**2
             # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
             scale = dr.minimum(1, MAX_SHIFT_MM / dr.maximum(dr.abs(dt), _TINY))
-            found |= active & done
+            solved |= active & done
             scale = dr.select(active & ~done, scale, 0)
             # 0 times the NaN of a singular matrix is NaN: such a ray is given up.
             u, v, t = u - scale * du, v - scale * dv, t + scale * dt
             # A ray that leaves the neighbourhood of its hit is given up.
             active &= ~done & (dr.abs(t - start) <= MAX_SHIFT_MM)
             step += 1
-            return t, u, v, active, found, step
+            return t, u, v, active, solved, step
 
-        t, u, v, _, found, _ = dr.while_loop(
+        t, u, v, _, solved, _ = dr.while_loop(
             state=(mi.Float64(start), u, v, mi.Bool(valid), mi.Bool(False), mi.UInt32(0)),
-            cond=lambda t, u, v, active, found, step: active & (step < NEWTON_STEPS),
+            cond=lambda t, u, v, active, solved, step: active & (step < NEWTON_STEPS),
             body=body,
-            labels=("t", "u", "v", "active", "found", "step"),
+            labels=("t", "u", "v", "active", "solved", "step"),
         )
-        return t, u, v, found
+        return t, u, v, solved
 
     def _described(
-        self, origin: Any, direction: Any, t: Any, u: Any, v: Any, found: Any, model_from_camera: Array
+        self, origin: Any, direction: Any, t: Any, u: Any, v: Any, solved: Any, model_from_camera: Array
     ) -> dict[str, Array]:
         """Evaluate normals and curvatures at solutions, and turn all to the camera frame (see `pack_points`)."""
         frame, r = self._frame(u, v), self._radius(u, v, second=True)
@@ -184,7 +184,7 @@ class TubeKernel:
         )
         mean, half = (a + c) / 2, dr.sqrt(dr.square((a - c) / 2) + dr.square(b))
         turned_sine, turned_cosine = dr.sincos(dr.atan2(b, (a - c) / 2) / 2)
-        found &= dr.isfinite(mean) & dr.isfinite(t) & dr.all(dr.isfinite(normal))
+        solved &= dr.isfinite(mean) & dr.isfinite(t) & dr.all(dr.isfinite(normal))
         rotation = mi.Matrix3d(model_from_camera[:3, :3].T.tolist())
         centre = mi.Vector3d(*model_from_camera[:3, 3].tolist())
         dr.make_opaque(rotation, centre)
@@ -197,7 +197,7 @@ class TubeKernel:
             "direction_min": rotation @ (turned_cosine * other - turned_sine * tangent),
             "direction_max": rotation @ (turned_cosine * tangent + turned_sine * other),
         }
-        return _arrays(values, found)
+        return _arrays(values, solved)
 
     @staticmethod
     def _in_model(frame: _Frame, local: Any) -> Any:
@@ -281,11 +281,11 @@ def _tangent_basis(normal: Any) -> tuple[Any, Any]:
     return first, mi.Vector3d(b, sign + dr.square(normal.y) * a, -normal.y)
 
 
-def _arrays(values: dict[str, Any], found: Any) -> dict[str, Array]:
+def _arrays(values: dict[str, Any], solved: Any) -> dict[str, Array]:
     """Return lanes as arrays of double precision, NaN where there is no point."""
-    kept = {name: dr.select(found, value, dr.nan) for name, value in values.items()}
-    dr.eval(kept, found)
-    arrays: dict[str, Array] = {"valid": np.array(found), "pool": np.zeros(len(found), dtype=bool)}
+    kept = {name: dr.select(solved, value, dr.nan) for name, value in values.items()}
+    dr.eval(kept, solved)
+    arrays: dict[str, Array] = {"valid": np.array(solved), "pool": np.zeros(len(solved), dtype=bool)}
     for name, value in kept.items():
         arrays[name] = vectors_from_kernel(value, np.float64) if dr.depth_v(value) > 1 else np.array(value)
     return arrays

@@ -141,9 +141,41 @@ def ggx_half_width(alpha: float) -> float:
     return math.atan(alpha * math.sqrt(math.sqrt(2) - 1))
 
 
+KernelTable = dict[str, Any]
+"""A description for `mitsuba.load_dict`, or values by Mitsuba's path below the BSDF; three numbers are a colour."""
+
+
 class _Reflectance(Spec):
+    """What the renderer takes of a reflectance beside its parameters is `kernel`, `updates`, `compiled`, `base_kernel`.
+
+    Each class gives `kernel`, its description, and `updates`, the values that change without a rebuild.
+    """
+
     diffuse: Share = Field(0.0, description="share of the diffuse base, its albedo")
     colour: tuple[Share, Share, Share] = Field((1.0, 1.0, 1.0), description="linear RGB colour of the diffuse base")
+
+    @property
+    def compiled(self) -> tuple[object, ...]:
+        """What of the reflectance is compiled into the kernels."""
+        return (self.type,)  # type: ignore[attr-defined]
+
+    @property
+    def base_kernel(self) -> KernelTable | None:
+        """Description without the lobe; None where components 0 and 1 of the BSDF are lobe and base."""
+        return None
+
+    @property
+    def _base(self) -> list[float]:
+        """Linear RGB albedo of the diffuse base."""
+        return [self.diffuse * c for c in self.colour]
+
+
+def _rgb(colour: list[float]) -> KernelTable:
+    return {"type": "rgb", "value": colour}
+
+
+def _grey(value: float) -> KernelTable:
+    return {"type": "uniform", "value": value}
 
 
 class _Painted(_Reflectance):
@@ -186,6 +218,22 @@ class PhongReflectance(_Painted):
         return self
 
     @property
+    def compiled(self) -> tuple[object, ...]:
+        """What of the reflectance is compiled into the kernels."""
+        return self.type, self.normalised
+
+    @property
+    def kernel(self) -> KernelTable:
+        """Description for `mitsuba.load_dict`."""
+        lobe = {"exponent": self.exponent, "specular": self.specular, "normalised": self.normalised}
+        return {"type": "simtest_phong", **lobe, "diffuse_reflectance": _rgb(self._base)}
+
+    @property
+    def updates(self) -> KernelTable:
+        """Values that change without a rebuild."""
+        return {"exponent": self.exponent, "specular": self.specular, "diffuse_reflectance.value": self._base}
+
+    @property
     def lobe_curvature(self) -> float:
         """Curvature -(log f)''(0) of the lobe: 4 n as published, one more with the cosine of the normalised form."""
         return 4 * self.exponent + (1.0 if self.normalised else 0.0)
@@ -204,6 +252,17 @@ class RoughPlasticReflectance(_Reflectance):
     diffuse: Share = Field(0.5, description="share of the diffuse base, its albedo")
 
     @property
+    def kernel(self) -> KernelTable:
+        """Description for `mitsuba.load_dict`."""
+        lobe = {"distribution": "ggx", "alpha": self.alpha, "specular_reflectance": _grey(1.0)}
+        return {"type": "roughplastic", **lobe, "diffuse_reflectance": _rgb(self._base)}
+
+    @property
+    def updates(self) -> KernelTable:
+        """Values that change without a rebuild."""
+        return {"alpha": self.alpha, "diffuse_reflectance.value": self._base}
+
+    @property
     def half_width(self) -> float:
         """Half-angle at which the lobe falls to half, rad (`ggx_half_width`)."""
         return ggx_half_width(self.alpha)
@@ -217,6 +276,22 @@ class PrincipledReflectance(_Reflectance):
     diffuse: Share = Field(0.5, description="share of the diffuse base, its albedo")
 
     @property
+    def kernel(self) -> KernelTable:
+        """Description for `mitsuba.load_dict`."""
+        lobe = {"roughness": _grey(self.roughness), "specular": 0.5}
+        return {"type": "principled", "base_color": _rgb(self._base), **lobe}
+
+    @property
+    def base_kernel(self) -> KernelTable:
+        """Description without the lobe: Mitsuba's material evaluates no component alone."""
+        return {**self.kernel, "specular": 0.0}
+
+    @property
+    def updates(self) -> KernelTable:
+        """Values that change without a rebuild."""
+        return {"roughness.value": self.roughness, "base_color.value": self._base}
+
+    @property
     def half_width(self) -> float:
         """Half-angle at which the lobe falls to half, rad (`ggx_half_width`)."""
         return ggx_half_width(self.roughness**2)
@@ -227,6 +302,19 @@ class RoughConductorReflectance(_Reflectance):
 
     type: Literal["rough_conductor"] = "rough_conductor"
     alpha: float = Field(0.2, gt=0, le=1, description="GGX roughness")
+
+    @property
+    def kernel(self) -> KernelTable:
+        """Description for `mitsuba.load_dict`: a rough conductor has no base, a matt one is blended in."""
+        lobe = {"material": "none", "distribution": "ggx", "alpha": self.alpha, "specular_reflectance": _grey(1.0)}
+        matt = {"type": "diffuse", "reflectance": _rgb(list(self.colour))}
+        return {"type": "blendbsdf", "weight": self.diffuse, "glossy": {"type": "roughconductor", **lobe}, "matt": matt}
+
+    @property
+    def updates(self) -> KernelTable:
+        """Values that change without a rebuild."""
+        matt = {"bsdf_1.reflectance.value": list(self.colour)}
+        return {"weight.value": self.diffuse, "bsdf_0.alpha.value": self.alpha, **matt}
 
     @property
     def half_width(self) -> float:
@@ -258,6 +346,22 @@ class TissueReflectance(_Painted):
     translucency: Translucency | None = Field(
         None, description="how the diffuse light spreads below the surface; default: it leaves where it entered"
     )
+
+    @property
+    def compiled(self) -> tuple[object, ...]:
+        """What of the reflectance is compiled into the kernels."""
+        return self.type, self.film.distribution
+
+    @property
+    def kernel(self) -> KernelTable:
+        """Description for `mitsuba.load_dict`."""
+        film = self.film.model_dump(include={"alpha", "index", "distribution"})
+        return {"type": "simtest_tissue", **film, "diffuse_reflectance": _rgb(self._base)}
+
+    @property
+    def updates(self) -> KernelTable:
+        """Values that change without a rebuild."""
+        return {"alpha": self.film.alpha, "index": self.film.index, "diffuse_reflectance.value": self._base}
 
     @property
     def lobe_curvature(self) -> float | None:

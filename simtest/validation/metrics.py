@@ -167,7 +167,7 @@ def _look_normals(
     }
     if not looks:
         return {}
-    found = session.cast(np.stack(list(looks.values())))[0]
+    found = session.exact_points(np.stack(list(looks.values())))
     return {key: found.normal[n] for n, key in enumerate(looks) if found.valid[n]}
 
 

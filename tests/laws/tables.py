@@ -207,12 +207,12 @@ class _Still:
     def __init__(self, made: Realisation) -> None:
         self.scene = made.view.scene
 
-    def cast(self, points: Array) -> tuple[object]:
+    def exact_points(self, points: Array) -> object:
         class Nothing:
             valid = np.zeros(len(points), dtype=bool)
             normal = np.full((len(points), 3), np.nan)
 
-        return (Nothing(),)
+        return Nothing()
 
 
 def _of_protocol() -> list[Law]:

@@ -115,14 +115,14 @@ def test_all_looks_are_cast_at_once_and_each_finds_its_own_normal(monkeypatch):
     looks = {"a": estimate(40.0, 30.0), "b": estimate(43.5, 27.25), "beside": estimate(1.0, 1.0),
              "none": estimate(np.nan, np.nan), "failed": Failure(Reason.NOT_AN_ELLIPSE)}  # fmt: skip
     specularities = [SimpleNamespace(estimates=looks), SimpleNamespace(estimates={"a": estimate(38.0, 31.0)})] * 2
-    cast, calls = session.cast, []
-    monkeypatch.setattr(session, "cast", lambda points: calls.append(len(points)) or cast(points))
+    points_at, calls = session.exact_points, []
+    monkeypatch.setattr(session, "exact_points", lambda points: calls.append(len(points)) or points_at(points))
     found = _look_normals(session, specularities, {0: 1, 1: 0, 3: 2})
     # A false detection has no look, nor has an estimate that failed.
     assert calls == [5]
     assert set(found) == {(0, "a"), (0, "b"), (1, "a"), (3, "a")}
     for (i, name), normal in found.items():
-        alone = cast(specularities[i].estimates[name].look_px[None])[0].normal[0]
+        alone = points_at(specularities[i].estimates[name].look_px[None]).normal[0]
         np.testing.assert_allclose(normal, alone, rtol=0, atol=1e-12)
     assert _look_normals(session, specularities, {}) == {}
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simtest.rendering import backend, reflectances
+from simtest.rendering import backend, elements
 from tests.hypothesis_tests import ALPHA, chi_square, rejected
 
 pytestmark = pytest.mark.render
@@ -28,7 +28,7 @@ AROUND, FINE = 8, 24
 @pytest.fixture(scope="module")
 def mi():
     mi = backend.load()
-    reflectances.register_phong(mi.variant())
+    elements.register(mi.variant())
     return mi
 
 
@@ -36,7 +36,7 @@ def material(mi, exponent, albedo, normalised=False, specular=None):
     scale = specular if specular is not None else (1 - albedo if normalised else 1.0)
     base = {"type": "uniform", "value": albedo}
     description = {"exponent": exponent, "specular": scale, "normalised": normalised, "diffuse_reflectance": base}
-    return mi.load_dict({"type": reflectances.PHONG, **description})
+    return mi.load_dict({"type": "simtest_phong", **description})
 
 
 def incidence(angle_deg):

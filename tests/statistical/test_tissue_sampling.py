@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from scipy.special import erf
 
-from simtest.rendering import backend, reflectances
+from simtest.rendering import backend, elements
 from tests.hypothesis_tests import ALPHA, chi_square, rejected
 
 pytestmark = pytest.mark.render
@@ -34,14 +34,14 @@ AROUND, FINE = 8, 24
 @pytest.fixture(scope="module")
 def mi():
     mi = backend.load()
-    reflectances.register_tissue(mi.variant())
+    elements.register(mi.variant())
     return mi
 
 
 def material(mi, alpha, kind, albedo):
     base = {"type": "uniform", "value": albedo}
     film = {"alpha": alpha, "index": INDEX, "distribution": kind}
-    return mi.load_dict({"type": reflectances.TISSUE, **film, "diffuse_reflectance": base})
+    return mi.load_dict({"type": "simtest_tissue", **film, "diffuse_reflectance": base})
 
 
 def incidence(angle_deg):

@@ -61,7 +61,7 @@ def test_a_finer_grid_of_seeds_finds_nothing_more(monkeypatch):
         return np.array(sorted(pixels))
 
     quick = found()
-    monkeypatch.setattr(highlights, "FINE_STRIDE_PX", 1)
+    monkeypatch.setattr(highlights, "SMOOTH_STRIDE_PX", 1)
     monkeypatch.setattr(highlights, "NEAR_CELLS", 12.0)
     full = found()
     assert len(quick) >= 8

@@ -115,9 +115,9 @@ def scene(tilt):
 def all_of(session):
     frame = session.frame()
     found = session.highlights(frame.radiance)
-    cast, _, _ = session.cast(np.array([[16.0, 12.0]]))
+    points = session.exact_points(np.array([[16.0, 12.0]]))
     arrays = [session.radiance().total, frame.radiance.total, frame.labels.depth, session.truth().normal,
-              found[0].bp_px, cast.position]
+              found[0].bp_px, points.position]
     return [array.tobytes() for array in arrays]
 mono = Session(scene(5.0), "llvm_ad_mono")
 alone = all_of(mono)

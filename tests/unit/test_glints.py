@@ -33,9 +33,14 @@ def sessions():
     return {name: Session(scene(name)) for name in SURFACES}
 
 
+def glints_in(session):
+    """Pixels of the glints of the only light."""
+    return highlights.find_zeros(session, True)[0]
+
+
 def off_zero(session, pixels, light):
     """Angle between fine normal and bisector, rad, from the points alone."""
-    points = session.cast(pixels)[0]
+    points = session.exact_points(pixels)
     to_camera = -points.position / np.linalg.norm(points.position, axis=1, keepdims=True)
     to_light = light - points.position
     to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
@@ -47,7 +52,7 @@ def off_zero(session, pixels, light):
 @pytest.mark.parametrize("surface", SURFACES)
 def test_every_glint_is_a_zero(sessions, surface):
     session = sessions[surface]
-    pixels = highlights.search_glints(session, 0)
+    pixels = glints_in(session)
     assert len(pixels) >= 5
     assert off_zero(session, pixels, np.zeros(3)).max() < 1e-8
     assert off_zero(session, pixels + 0.5, np.zeros(3)).max() > 1e-3
@@ -59,7 +64,7 @@ def test_every_glint_is_a_zero(sessions, surface):
 def test_search_finds_what_an_exhaustive_one_finds(sessions, surface):
     """Every sign change of the misfit on a grid of quarter pixels, followed by bisection of boxes, is a found glint."""
     session = sessions[surface]
-    found = highlights.search_glints(session, 0)
+    found = glints_in(session)
     missing = [zero for zero in boxed_zeros(session) if np.linalg.norm(found - zero, axis=1).min() > 0.3]
     assert missing == []
 
@@ -73,10 +78,10 @@ PITS = {"bands": [{"kind": "ridged", "slope_deg": 5.5, "wavelength_mm": 2.0},
 def test_creases_hide_no_glint_that_a_grid_twice_as_fine_finds(relief, monkeypatch):
     """The normal turns fastest at ridges and at the rims of pits; the glints there are the smallest."""
     session = Session(scene("inside", relief))
-    found = highlights.search_glints(session, 0)
+    found = glints_in(session)
     for name in ("GRID_WAVE", "MAX_DIVISION"):
         monkeypatch.setattr(highlights, name, 2 * getattr(highlights, name))
-    finer = highlights.search_glints(session, 0)
+    finer = glints_in(session)
     assert len(finer) > 100
     assert cKDTree(found).query(finer)[0].max() < 0.05
     assert cKDTree(finer).query(found)[0].max() < 0.05
@@ -92,16 +97,16 @@ def divided():
 
 
 def test_search_by_tiles_is_that_of_the_whole_divided_frame(divided, monkeypatch):
-    found = highlights.search_glints(divided, 0)
+    found = glints_in(divided)
     tiles = highlights.tiles_near_zeros(divided.misfits().fine[0])
     assert len(found) > 50
     assert 0 < len(tiles) < 0.7 * (CAMERA["width"] / 4 + 1) * (CAMERA["height"] / 4 + 1)
     monkeypatch.setattr(highlights, "VARIES", np.inf)
     assert len(highlights.tiles_near_zeros(divided.misfits().fine[0])) == 51 * 41
-    assert highlights.search_glints(divided, 0).tobytes() == found.tobytes()
+    assert glints_in(divided).tobytes() == found.tobytes()
     # Too strict a choice loses some.
     monkeypatch.setattr(highlights, "VARIES", -0.4)
-    assert len(highlights.search_glints(divided, 0)) < len(found)
+    assert len(glints_in(divided)) < len(found)
 
 
 def test_tiles_hold_the_frames_own_misfits(divided):
@@ -137,7 +142,7 @@ def boxed_zeros(session, size=0.25):
     """Find the pixels near which both components of the misfit change sign round the border of a cell: winding 1."""
     y, x = np.mgrid[1 : CAMERA["height"] - 1 : size, 1 : CAMERA["width"] - 1 : size]
     corners = np.stack([x, y], axis=-1)
-    points = session.cast(corners.reshape(-1, 2))[0]
+    points = session.exact_points(corners.reshape(-1, 2))
     to_camera = -points.position / np.linalg.norm(points.position, axis=1, keepdims=True)
     gap = (points.normal - to_camera)[:, :2].reshape(*x.shape, 2)
     angle = np.arctan2(gap[..., 1], gap[..., 0])
@@ -149,7 +154,7 @@ def boxed_zeros(session, size=0.25):
 
 def test_jacobian_is_the_misfits_derivative(sessions):
     session = sessions["sphere"]
-    pixels = highlights.search_glints(session, 0)[:10] + 0.3
+    pixels = glints_in(session)[:10] + 0.3
     state = highlights.exact_misfit(session, pixels, np.zeros(3))
     step = 1e-4
     for axis in range(2):
@@ -198,7 +203,7 @@ def test_a_smooth_highlight_is_its_own_cloud():
 def test_unresolved_relief_has_no_list_of_glints():
     relief = {"bands": [{"slope_deg": 3.0, "wavelength_mm": 0.05}]}
     session = Session(scene("plane", relief))
-    assert len(highlights.search_glints(session, 0)) == 0
+    assert len(glints_in(session)) == 0
     # It acts as roughness: the highlight is the base's, and its fine normal is anyone's.
     (point,) = session.highlights(session.radiance())
     sightline = session.camera.unproject(point.bp_px[None])[0]
@@ -210,7 +215,7 @@ def test_unresolved_relief_has_no_list_of_glints():
 def test_a_fine_band_without_slope_hides_no_glints():
     bands = [{"slope_deg": 4.0, "wavelength_mm": 2.0}, {"slope_deg": 0.1, "wavelength_mm": 0.1}]
     both, alone = (
-        len(highlights.search_glints(Session(scene("plane", {"bands": bands[:n], "seed": 3})), 0)) for n in (2, 1)
+        len(glints_in(Session(scene("plane", {"bands": bands[:n], "seed": 3})))) for n in (2, 1)
     )  # fmt: skip
     assert both >= alone > 5
 
@@ -223,7 +228,7 @@ def test_glints_on_a_users_mesh():
         pytest.skip(f"no {path.name}: reference data is not part of the repository")
     surface = {"type": "anatomy", "path": str(path), "relief": {"bands": [{"slope_deg": 4.0, "wavelength_mm": 1.5}]}}
     session = Session(scene_from_dict({"surface": surface, "camera": CAMERA}))
-    found = highlights.search_glints(session, 0)
+    found = glints_in(session)
     assert len(found) >= 10
     assert off_zero(session, found, np.zeros(3)).max() < 1e-8
     zeros = boxed_zeros(session)

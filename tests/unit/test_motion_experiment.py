@@ -54,18 +54,18 @@ def test_a_moved_camera_sees_the_same_surface_from_elsewhere():
     moved = {"translation_mm": [0.4, -0.2, 0.1], "rotation_deg": [2.0, -3.0, 5.0]}
     elsewhere = scene_from_dict({"surface": SADDLE, "camera": {**camera, "moved": moved}})
     session = Session(still)
-    first = session.cast(np.array([[32.0, 32.0], [40.0, 20.0]]))[0].position
+    first = session.exact_points(np.array([[32.0, 32.0], [40.0, 20.0]])).position
     session.update(elsewhere)
     # The same points, seen by the moved camera: where its rays through their pixels hit the surface.
     T = np.linalg.inv(Moved(**moved).pose())
     expected = first @ T[:3, :3].T + T[:3, 3]
-    found = session.cast(session.camera.project(expected))[0].position
+    found = session.exact_points(session.camera.project(expected)).position
     np.testing.assert_allclose(found, expected, atol=1e-9)
     # The light moves with the camera: its highlight is where the normal points at the new place.
     (truth,) = [h for h in session.highlights(session.radiance()) if h.lit][:1]
     np.testing.assert_allclose(truth.normal, -truth.position / truth.distance, atol=1e-9)
     session.update(still)
-    np.testing.assert_array_equal(session.cast(np.array([[32.0, 32.0], [40.0, 20.0]]))[0].position, first)
+    np.testing.assert_array_equal(session.exact_points(np.array([[32.0, 32.0], [40.0, 20.0]])).position, first)
 
 
 def test_scenes_without_views_are_written_as_before():

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from simtest.rendering import backend, reflectances
+from simtest.rendering import backend, elements
 
 pytestmark = pytest.mark.render
 
@@ -15,14 +15,14 @@ pytestmark = pytest.mark.render
 @pytest.fixture(scope="module")
 def mi():
     mi = backend.load()
-    reflectances.register_phong(mi.variant())
+    elements.register(mi.variant())
     return mi
 
 
 def material(mi, exponent=50.0, specular=0.6, albedo=0.4, normalised=False):
     base = {"type": "uniform", "value": albedo}
     description = {"exponent": exponent, "specular": specular, "normalised": normalised, "diffuse_reflectance": base}
-    return mi.load_dict({"type": reflectances.PHONG, **description})
+    return mi.load_dict({"type": "simtest_phong", **description})
 
 
 def directions(count, seed):

@@ -98,11 +98,11 @@ def by_differences(session, pixels, step):
     def heights(points):
         return session.surface.relief.jets(points.position @ pose[:3, :3].T + pose[:3, 3]).value
 
-    points = session.cast(pixels)[0]
+    points = session.exact_points(pixels)
     J, dn, dh = np.zeros((len(pixels), 3, 2)), np.zeros((len(pixels), 3, 2)), np.zeros((len(pixels), 2))
     for axis in range(2):
         for k, weight in STENCIL:
-            near = session.cast(pixels + k * step * np.eye(2)[axis])[0]
+            near = session.exact_points(pixels + k * step * np.eye(2)[axis])
             J[:, :, axis] += weight / step * near.position
             dn[:, :, axis] += weight / step * near.normal
             dh[:, axis] += weight / step * np.nan_to_num(heights(replace(near, position=np.nan_to_num(near.position))))
@@ -146,7 +146,7 @@ def test_fine_normals_and_curvatures_are_those_of_the_height(name, level):
 def test_principal_directions_of_the_fine_surface():
     session = Session(scene(SURFACES["inside of a cylinder"], RELIEF))
     pixels = np.random.default_rng(5).uniform([4, 4], [60, 44], (200, 2))
-    points = session.cast(pixels)[0]
+    points = session.exact_points(pixels)
     for direction in (points.direction_min, points.direction_max):
         assert np.abs(np.sum(direction * points.normal, axis=1)).max() < 1e-12
         assert np.allclose(np.linalg.norm(direction, axis=1), 1)
@@ -157,7 +157,7 @@ def test_principal_directions_of_the_fine_surface():
 def test_on_a_plane_the_relief_is_the_graph_of_its_height():
     """The closed form of a graph's normal and curvature, from differences of the height in the plane alone."""
     session = Session(scene({"type": "plane", "distance_mm": 20}, RELIEF))
-    points = session.cast(np.random.default_rng(2).uniform([4, 4], [60, 44], (300, 2)))[0]
+    points = session.exact_points(np.random.default_rng(2).uniform([4, 4], [60, 44], (300, 2)))
     height = session.surface.relief.jets
     pose = session.surface.model_from_camera
     step = 1e-4
@@ -388,10 +388,10 @@ def test_pools_are_smooth_and_crests_keep_their_relief():
     relief = {**RELIEF, "bands": RELIEF["bands"][:1]}
     session = Session(scene(SURFACES["plane"], relief))
     pixels = session.camera.pixel_centres().reshape(-1, 2)
-    rough = session.cast(pixels)[0]
+    rough = session.exact_points(pixels)
     assert not rough.pool.any()
     session.surface.relief = make_relief(session.scene.surface.relief, 0.3)
-    wet, field = session.cast(pixels)[0], session.surface.relief
+    wet, field = session.exact_points(pixels), session.surface.relief
     pose = session.surface.model_from_camera
     height = field.tissue_jets(wet.position @ pose[:3, :3].T + pose[:3, 3]).value
     assert np.array_equal(wet.pool, height < field.level)
@@ -425,26 +425,6 @@ def test_short_waves_are_not_seen_by_diffuse_light_and_long_ones_are():
 
 
 # The kernel ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("level", [None, 0.2])
-def test_the_kernel_computes_the_same(level):
-    session = Session(scene(SURFACES["plane"], RELIEF))
-    import drjit as dr
-
-    from simtest.rendering.tissue_kernels import ReliefKernel
-
-    mi, field = session.mi, make_relief(session.scene.surface.relief, level)
-    points = np.random.default_rng(9).uniform(-40, 40, (5000, 3)).astype(np.float32)
-    jets = ReliefKernel(field).jets(mi.Point3f(points.T.copy()), True, bent=True)
-    dr.eval(jets.height, jets.gradient, jets.diffused, jets.hessian)
-    exact, diffused = field.jets(points.astype(float)), field.tissue_jets(points.astype(float), diffused=True)
-    assert np.abs(np.array(jets.gradient).T - exact.gradient).max() < 1e-5
-    assert np.abs(np.array(jets.diffused).T - diffused.gradient).max() < 1e-5
-    tissue = field.tissue_jets(points.astype(float))
-    assert np.abs(np.array(jets.height) - tissue.value).max() < 1e-5 * field.deviation * 10
-    six = exact.hessian[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T
-    assert np.abs(np.array(jets.hessian) - six).max() < 1e-4 * np.abs(six).max()
 
 
 def test_the_kernel_finds_the_lattices_nodes():

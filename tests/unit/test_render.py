@@ -5,7 +5,6 @@ import pytest
 
 from simtest.rendering import Session
 from simtest.rendering.built_scene import make_shape
-from simtest.rendering.reflectances import bsdf_dict
 from simtest.spec import scene_from_dict
 from simtest.surfaces import Shape, TriangleMesh
 from tests.marked import marked
@@ -351,7 +350,7 @@ def test_phong_samples_have_the_density_they_claim(session):
     mi = session.mi
     settings = {"exponent": 12.0, "specular": 0.4, "diffuse": 0.6, "normalised": True}
     reflectance = scene({}, reflectance=settings).reflectance
-    bsdf = mi.load_dict(bsdf_dict(reflectance, session.plugin, diffuse_only=False))
+    bsdf = mi.load_dict(reflectance.kernel)
     count = 200_000
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.wi = mi.Vector3f(float(np.sin(0.6)), 0.0, float(np.cos(0.6)))

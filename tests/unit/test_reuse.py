@@ -1,5 +1,7 @@
 """What a session keeps between frames: the results are those of a session that keeps nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -83,13 +85,13 @@ def test_highlights_that_get_their_radiance_later_stand_as_if_found_with_it(surf
     # Before the frame's own radiance, the session has seen others, in which many points are equally dark.
     session.highlights()
     found = session.highlights(radiance)
-    if surface is ROUGH:
-        assert highlights.is_resolved(session)
-        wanted = highlights.find_glints(session, radiance)
-    else:
-        wanted = highlights.find_smooth(session, radiance, stride=highlights.FINE_STRIDE_PX)
+    assert highlights.is_resolved(session) if surface is ROUGH else session.surface.relief is None
     assert len(found) > 1
-    assert described(found) == described(wanted)
+    direct = radiance.specular + radiance.diffuse
+    assert all(point.radiance == direct[int(point.bp_px[1]), int(point.bp_px[0])] for point in found)
+    searched = highlights.search(session, base=False)
+    wanted = [replace(point, radiance=float(direct[int(point.bp_px[1]), int(point.bp_px[0])])) for point in searched]
+    assert described(found) == described(sorted(wanted, key=lambda point: -point.radiance))
     assert all(point.radiance == 0 for point in session.highlights())
 
 

@@ -359,33 +359,6 @@ def test_a_ball_has_vessels_all_around():
 
 
 @pytest.mark.render
-@pytest.mark.parametrize(
-    ("name", "variant"),
-    [
-        ("plane", "llvm_ad_rgb"),
-        ("sphere", "llvm_ad_mono"),
-        pytest.param("plane", "llvm_ad_mono", marks=pytest.mark.ci),
-        pytest.param("sphere", "llvm_ad_rgb", marks=pytest.mark.ci),
-        pytest.param("colon", "llvm_ad_rgb", marks=pytest.mark.ci),
-        pytest.param("colon", "llvm_ad_mono", marks=pytest.mark.ci),
-    ],
-)
-def test_the_kernel_is_the_reference(name, variant):
-    session = Session(scene(name), variant)
-    mi = session.mi
-    points, _ = surface_patch(session.surface).draw(np.random.default_rng(2), 3000)
-    # Beyond the borders, too.
-    points[::2] *= {"plane": 3.0}.get(name, 1.0)
-    rounded = points.astype(np.float32)
-    found = np.array(session._albedo.at(mi.Point3f(rounded.T), mi.Bool(True))).T
-    expected = make_pattern(session.surface, TissueColour()).albedo(rounded.astype(float))
-    if variant.endswith("mono"):
-        # Rec. 709 luminance
-        expected = expected @ [[0.212671], [0.715160], [0.072169]]
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-@pytest.mark.render
 @pytest.mark.parametrize("lights", [1, 2])
 def test_a_frame_shows_the_albedo(lights):
     data = {

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from simtest.rendering import backend, reflectances
+from simtest.rendering import backend, elements
 
 pytestmark = pytest.mark.render
 
@@ -21,14 +21,14 @@ FILMS = [
 @pytest.fixture(scope="module")
 def mi():
     mi = backend.load()
-    reflectances.register_tissue(mi.variant())
+    elements.register(mi.variant())
     return mi
 
 
 def material(mi, alpha=0.03, index=1.36, distribution="beckmann", albedo=0.5):
     base = {"type": "uniform", "value": albedo}
     film = {"alpha": alpha, "index": index, "distribution": distribution}
-    return mi.load_dict({"type": reflectances.TISSUE, **film, "diffuse_reflectance": base})
+    return mi.load_dict({"type": "simtest_tissue", **film, "diffuse_reflectance": base})
 
 
 @cache

@@ -109,6 +109,6 @@ def _estimates(session: Session, seen: RenderedView) -> list[tuple[str, Array, A
     ]
     if not found:
         return []
-    points = session.cast(np.array([estimate.look_px for _, estimate in found]))[0].position
+    points = session.exact_points(np.array([estimate.look_px for _, estimate in found])).position
     hits = zip(found, points, strict=True)
     return [(name, point, estimate.normal) for (name, estimate), point in hits if np.isfinite(point).all()]

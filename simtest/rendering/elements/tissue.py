@@ -1,0 +1,135 @@
+"""The reflectance of wet tissue, as a plugin: a film's rough reflection over a diffuse base."""
+
+from functools import cache
+from typing import Any
+
+from simtest.rendering.backend import dr, mi
+from simtest.rendering.elements.base import facet_density, lobe_over_base, visible_over_cosine
+from simtest.rendering.kernel_values import channel_mean
+
+MARGIN = 1 / 40
+"""Share of the light through the film that is given up per unit of alpha.
+
+The film's rough surface reflects a little more than the smooth one, of which the light through it is taken: less than
+this in any direction for alpha up to 0.1 and an index from 1.33 to 1.40, so that no more is reflected than arrives.
+"""
+
+
+def external_reflectance(index: Any) -> Any:
+    """Compute the share of diffuse light that a smooth surface of an index above 1 reflects, from outside.
+
+    The integral of 2 F(mu) mu over the cosine mu, in closed form [Duntley 1942].
+    """
+    n, n2 = index, index * index
+    n4 = n2 * n2
+    return (
+        0.5
+        + (n - 1) * (3 * n + 1) / (6 * (n + 1) * (n + 1))
+        + n2 * (n2 - 1) * (n2 - 1) / ((n2 + 1) * (n2 + 1) * (n2 + 1)) * dr.log((n - 1) / (n + 1))
+        - 2 * n2 * n * (n2 + 2 * n - 1) / ((n2 + 1) * (n4 - 1))
+        + 8 * n4 * (n4 + 1) / ((n2 + 1) * (n4 - 1) * (n4 - 1)) * dr.log(n)
+    )
+
+
+def _lift(bsdf: Any, albedo: Any) -> Any:
+    """Compute the base's share of the light within the film that leaves it upwards, times eta^2."""
+    return albedo / (1 - albedo * bsdf.returned)
+
+
+def _film(bsdf: Any, wi: Any, wo: Any) -> tuple[Any, Any]:
+    """Compute f cos(theta) and the sampling density of the film's reflection, of directions above it."""
+    # Slope and Fresnel's cosine from the sum of both directions: a cosine of the facet's angle would lose the
+    # digits that matter next to 1.
+    both = wi + wo
+    squared = (dr.square(both.x) + dr.square(both.y)) / dr.square(both.z)
+    facing = dr.minimum(dr.norm(both) / 2, 1)
+    seen, lit = visible_over_cosine(wi, bsdf.alpha, bsdf.ggx), visible_over_cosine(wo, bsdf.alpha, bsdf.ggx)
+    density = facet_density(squared, bsdf.alpha, bsdf.ggx) * seen / 4
+    # Gradients must not flow through the choice of samples.
+    return density * lit * wo.z * mi.fresnel(facing, bsdf.index)[0], dr.detach(density)
+
+
+def _values(bsdf: Any, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
+    """Compute f cos(theta) and the sampling density of the enabled parts."""
+    active &= (si.wi.z > 0) & (wo.z > 0)
+    # Other lanes compute with a direction of their own, so that no derivative is NaN.
+    wi, wo = dr.select(active, si.wi, mi.Vector3f(0, 0, 1)), dr.select(active, wo, mi.Vector3f(0, 0, 1))
+    value, density = mi.Spectrum(0), mi.Float(0)
+    share = bsdf._share(ctx, si, wi, active)
+    glossy, diffuse = bsdf._enabled(ctx)
+    if glossy:
+        film, drawn = bsdf._film(wi, wo)
+        value += film
+        density += share * drawn
+    if diffuse:
+        through = (1 - mi.fresnel(wi.z, bsdf.index)[0]) * (1 - mi.fresnel(wo.z, bsdf.index)[0])
+        value += bsdf._lift(bsdf._albedo(si, active)) * (through * bsdf.passage * wo.z * dr.inv_pi)
+        density += (1 - share) * dr.inv_pi * wo.z
+    return dr.select(active, value, 0), dr.select(active, density, 0)
+
+
+def _share(bsdf: Any, ctx: Any, si: Any, wi: Any, active: Any) -> Any:
+    """Return the share of samples for the film's reflection: its part of what is reflected, about."""
+    glossy, diffuse = bsdf._enabled(ctx)
+    if not (glossy and diffuse):
+        return mi.Float(float(glossy))
+    film = mi.fresnel(wi.z, bsdf.index)[0]
+    base = (1 - film) * (1 - bsdf.returned) * channel_mean(bsdf._lift(bsdf._albedo(si, active)))
+    return dr.detach(film / (film + base))
+
+
+def _draw(bsdf: Any, ctx: Any, si: Any, sample2: Any, active: Any) -> tuple[Any, Any, Any]:
+    active &= si.wi.z > 0
+    wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
+    # The normals of the facets that are seen from the direction of incidence.
+    kind = mi.MicrofacetType.GGX if bsdf.ggx else mi.MicrofacetType.Beckmann
+    facet, _ = mi.MicrofacetDistribution(kind, dr.detach(bsdf.alpha)).sample(wi, sample2)
+    return mi.reflect(wi, facet), bsdf._share(ctx, si, wi, active), active
+
+
+@cache
+def make_tissue(variant: str) -> Any:
+    """Return the plugin's class of a variant."""
+
+    class Tissue(lobe_over_base(variant)):  # type: ignore[misc]
+        """A film's rough dielectric reflection D G F / (4 cos_i cos_o) over a diffuse base below the film.
+
+        D is Beckmann's or GGX's, G = G1(i) G1(o) Smith's, F Fresnel's for unpolarised light at the facet. What is not
+        reflected passes the film, is reflected diffusely, and passes it again or is reflected back from within:
+        T(i) T(o) / eta^2 albedo/pi / (1 - albedo r), with T = 1 - F of the smooth film, less a margin (see `MARGIN`),
+        and r the share of diffuse light that the film reflects from within. Both parts are reciprocal, and together
+        they reflect at most what arrives.
+
+        Parameters: `alpha`, `index` (of the film, above 1), `distribution` ("beckmann" or "ggx") and
+        `diffuse_reflectance`, the base's albedo. Components: 0 the film's reflection, 1 the base.
+        """
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props, 0.5)
+            self.alpha = mi.Float(props.get("alpha", 0.03))
+            self.index = mi.Float(props.get("index", 1.33))
+            distribution = props.get("distribution", "beckmann")
+            if distribution not in ("beckmann", "ggx"):
+                raise ValueError(f"distribution = {distribution!r}: unknown; allowed: beckmann, ggx")
+            self.ggx = distribution == "ggx"
+            self.parameters_changed()
+
+        def traverse(self, callback: Any) -> None:
+            callback.put("alpha", self.alpha, mi.ParamFlags.Differentiable)
+            callback.put("index", self.index, mi.ParamFlags.Differentiable)
+            super().traverse(callback)
+
+        def parameters_changed(self, keys: Any = ()) -> None:
+            # Literal parameters would be baked into the kernel, and each change would recompile it.
+            dr.make_opaque(self.alpha, self.index)
+            passed = (1 - external_reflectance(self.index)) / dr.square(self.index)
+            # Reflected back from within, and the factor of both passages.
+            self.returned, self.passage = 1 - passed, (1 - MARGIN * self.alpha) / dr.square(self.index)
+            dr.make_opaque(self.returned, self.passage)
+
+        _lift, _film, _values, _share, _draw = _lift, _film, _values, _share, _draw
+
+        def to_string(self) -> str:
+            return f"Tissue[alpha={self.alpha}, index={self.index}, ggx={self.ggx}]"
+
+    return Tissue
