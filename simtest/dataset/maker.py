@@ -15,7 +15,7 @@ from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta,
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample import Sample, sample_key
 from simtest.dataset.sample_calibration import calibration_of_picture, stored_picture
-from simtest.detection.regions import Component
+from simtest.detection.peaks import Component
 from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.process.naming import forgive_cores

@@ -14,7 +14,7 @@ from simtest.conventions import (
     PIXEL_CENTRE,
 )
 from simtest.detection import contrast, half_height_component
-from simtest.detection.regions import Component, component_above
+from simtest.detection.peaks import Component, component_above
 from simtest.geometry import smooth
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
@@ -200,10 +200,10 @@ def _examined(
         return None, "hidden by an instrument" if point.hidden else "in shadow"
     component = half_height_component(smoothed, *peak, seen) if owns_peak else None
     # Uphill may lead far: to another highlight, or to where the base is brightest.
-    if component is None or not component.holds(point.bp_px):
+    if component is None or not component.holds(point.bp_px[None]).all():
         return None, "part of a brighter one"
     height = contrast(smoothed, component, float(smoothed[peak]), seen)
-    if _holds_any(component, others):
+    if component.holds(others).any():
         return height, "holds several glints"
     # Shape, frame, noise: in the order of theory.md section 6.
     if point.min_gain <= HIGHLIGHT_MIN_GAIN:
@@ -211,14 +211,6 @@ def _examined(
     if not component.closed:
         return height, "isophote at t = 0.5 leaves the frame"
     return height, ""
-
-
-def _holds_any(component: Component, pixels: IntArray) -> bool:
-    """Return whether any of the pixels, columns and rows, shape (N, 2), belongs to a component."""
-    columns, rows = (pixels - [component.x, component.y]).T
-    height, width = component.mask.shape
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    return bool(component.mask[rows[inside], columns[inside]].any())
 
 
 def _peak_pixel(smoothed: Image, point: HighlightPoint) -> Pixel:

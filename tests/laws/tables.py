@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from simtest.detection.regions import detect, half_height_component
+from simtest.detection.peaks import detect, half_height_component
 from simtest.estimators import Estimate, load_estimators
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array

@@ -4,10 +4,10 @@ import pytest
 
 from simtest.calibration import Calibration, srgb_decode, srgb_encode
 from simtest.detection import colour as colour_detection
-from simtest.detection.blobs import Kind, _around
-from simtest.detection.light_split import SplitLight, fill, split_light
-from simtest.detection.spots import Spot
-from simtest.detection.view_mask import find_view
+from simtest.detection.classify import _around
+from simtest.detection.detector import Kind
+from simtest.detection.spots import ColourPicture, SplitLight, Spot, fill, split_light
+from simtest.detection.view import find_view
 from simtest.errors import InputError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
@@ -104,8 +104,8 @@ def test_a_dark_background_is_no_texture():
     # an organ, and a background of two kinds that is darker than what was filled in
     specular = np.array([0.0, -0.049, -0.012], dtype=np.float32)[third] * np.ones((HEIGHT, 1), dtype=np.float32)
     specular += np.random.default_rng(7).normal(0, 0.0005, tissue.shape).astype(np.float32)
-    clipped = np.zeros(tissue.shape, dtype=bool)
-    assert colour_detection._texture(specular, tissue, clipped, None) < 0.02
+    inside = np.ones(tissue.shape, dtype=bool)
+    assert colour_detection._texture(specular, tissue, inside) < 0.02
 
 
 def test_light_that_met_tissue_before_is_no_isolated_highlight():
@@ -235,7 +235,9 @@ def test_the_dark_outside_the_view_is_no_tissue_around_a_highlight():
         linear[~seen] = outside
         spot = Spot(np.array([[160, 24]]), 0.5, (155, 19), specular[19:30, 155:166] > 0.25, False, False)
         light = SplitLight(np.where(seen, specular, 0).astype(np.float32), linear.mean(axis=2), 0.004)
-        told.append(_around(spot, (140, 4, 41, 41), linear, specular > 0.05, light, seen))
+        none = np.zeros(seen.shape, dtype=bool)
+        shown = ColourPicture(linear, light, none, none, none, seen)
+        told.append(_around(spot, (140, 4, 41, 41), shown, specular > 0.05))
     assert told[0] == told[1]
 
 

@@ -5,8 +5,8 @@ import pytest
 
 from simtest import Camera, InputError
 from simtest.calibration.calibration import brightest_channel, mean_channel
-from simtest.detection.basins import _numbered
-from simtest.detection.view_mask import _row_ends
+from simtest.detection.spots import _numbered
+from simtest.detection.view import _row_ends
 from simtest.geometry.vectors import basis_across, tangent_basis
 from simtest.reconstruction.picture_values import check_frame
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.detection.regions import contrast, detect, half_height_component
+from simtest.detection.peaks import contrast, detect, half_height_component
 
 SIGMA, PLACE = 6.0, (70, 45)
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
-from simtest.detection.blobs import Highlight
+from simtest.detection.detector import Highlight
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import chi_squared
