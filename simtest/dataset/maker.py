@@ -23,7 +23,6 @@ from simtest.geometry import ellipse_of_conic, fit_ellipse
 from simtest.reconstruction.found import Specularity
 from simtest.rendering import Frame, Session, backend
 from simtest.runtime.arrays import AnyArray, Image, only_reading
-from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.clouds import cloud_json
 from simtest.simulation.rendered_view import (
     RenderedView,
@@ -33,6 +32,7 @@ from simtest.simulation.rendered_view import (
     render_view,
     shows_isolated,
 )
+from simtest.simulation.sensor import to_uint8
 from simtest.simulation.true_highlights import TrueHighlight, lobe_region
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes

@@ -8,8 +8,8 @@ from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
 from simtest.runtime.arrays import Array, Image, short_repr
-from simtest.simulation.coding import check_codec
 from simtest.simulation.rendered_view import render_view
+from simtest.simulation.sensor import check_codec
 from simtest.simulation.true_highlights import TrueHighlight
 from simtest.simulation.visible_highlights import VisibleHighlight
 from simtest.spec import Scene

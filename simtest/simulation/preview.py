@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.runtime.arrays import Array, Image, Mask
-from simtest.simulation.camera_chain import to_uint8
 from simtest.simulation.labelled_frame import LabelledFrame
+from simtest.simulation.sensor import to_uint8
 
 TISSUE = np.array([0.55, 0.27, 0.22], dtype=np.float32)
 """Colour of a surface that has none of its own, linear."""

@@ -16,9 +16,7 @@ from simtest.rendering.highlights import radii_px
 from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.seeds import from_integer
 from simtest.simulation import clouds as glint_clouds
-from simtest.simulation.camera_chain import capture, collect, full_scale_of_average
-from simtest.simulation.chain_noise import noise_at
-from simtest.simulation.coding import check_codec
+from simtest.simulation.sensor import capture, check_codec, collect, full_scale_of_average, noise_at
 from simtest.simulation.true_highlights import TrueHighlight, examine, may_be_isolated, verdicts
 from simtest.simulation.visible_highlights import Spots, VisibleHighlight, describe, find_spots
 from simtest.spec import Scene

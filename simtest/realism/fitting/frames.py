@@ -11,8 +11,8 @@ from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image, only_reading
 from simtest.runtime.seeds import Stage, generator, integer
-from simtest.simulation.camera_chain import displayed
 from simtest.simulation.rendered_view import expose_picture
+from simtest.simulation.sensor import displayed
 from simtest.spec import Scene, apply_settings
 from simtest.spec.recipes import Dataset
 from simtest.spec.sensor import Sensor
