@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from simtest.reconstruction.picture import Options
     from simtest.report.run_results import RunResults
     from simtest.runtime.processes import Engine
-    from simtest.simulation.labelled_frame import LabelledFrame
+    from simtest.simulation.frame import LabelledFrame
     from simtest.simulation.viewpoints import SampledViews
     from simtest.spec import Experiment, Scene
     from simtest.validation.runner import Progress
@@ -88,7 +88,7 @@ def render(
     >>> frame.image.shape, [truth.isolated for truth in frame.highlights]
     ((96, 96), [True])
     """
-    from simtest.simulation.labelled_frame import make_frame
+    from simtest.simulation.frame import make_frame
 
     return make_frame(_scene(scene, settings, overrides), variant, progress)
 

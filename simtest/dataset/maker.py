@@ -23,8 +23,7 @@ from simtest.geometry import ellipse_of_conic, fit_ellipse
 from simtest.reconstruction.found import Specularity
 from simtest.rendering import Frame, Session, backend
 from simtest.runtime.arrays import AnyArray, Image, only_reading
-from simtest.simulation.clouds import cloud_json
-from simtest.simulation.rendered_view import (
+from simtest.simulation.frame import (
     RenderedView,
     brightest_mm,
     has_quick_look,
@@ -32,8 +31,8 @@ from simtest.simulation.rendered_view import (
     render_view,
     shows_isolated,
 )
+from simtest.simulation.highlights import TrueHighlight, cloud_json, lobe_region
 from simtest.simulation.sensor import to_uint8
-from simtest.simulation.true_highlights import TrueHighlight, lobe_region
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
 from simtest.validation.cloud_rows import of_clouds

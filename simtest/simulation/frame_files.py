@@ -13,9 +13,8 @@ from simtest.rendering.bitmap import write_exr
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image, write_arrays
 from simtest.runtime.files import Json, make_folder, write_atomically, write_json
-from simtest.simulation.clouds import cloud_json
-from simtest.simulation.labelled_frame import LabelledFrame
-from simtest.simulation.preview import preview
+from simtest.simulation.frame import LabelledFrame, preview
+from simtest.simulation.highlights import cloud_json
 from simtest.simulation.sensor import to_uint8
 from simtest.spec import Scene, calibration_toml, camera_toml, describe_camera
 from simtest.spec.sensor import Sensor

@@ -169,7 +169,7 @@ def encode(frame: Image, sensor: Sensor, seen: Mask | None = None) -> Image:
     return np.asarray(cv2.LUT(coded, LEVELS))
 
 
-def _quantised(values: Image, bits: int | None) -> Image:
+def _quantised(values: npt.NDArray[np.floating], bits: int | None) -> Image:
     """Return encoded values in the steps of so many bits; None: as they are."""
     if bits is None:
         return values.astype(np.float32)

@@ -12,7 +12,7 @@ from simtest.runtime.arrays import Array, Picture, write_arrays
 from simtest.runtime.files import write_atomically
 from simtest.simulation.flow import SeenSurface, flow_between, hides, moved_between
 from simtest.simulation.flow_picture import flow_picture
-from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.frame import RenderedView
 from simtest.simulation.view_files import thumbnail, write_sheet
 from simtest.spec import Scene
 

@@ -10,8 +10,8 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.runtime.arrays import Picture
 from simtest.runtime.files import write_atomically
+from simtest.simulation.frame import RenderedView
 from simtest.simulation.frame_files import encoded_png
-from simtest.simulation.rendered_view import RenderedView
 from simtest.simulation.sensor import to_uint8
 from simtest.simulation.viewpoints import WrittenView
 

@@ -12,7 +12,7 @@ from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import Json
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec import AnatomySurface, Scene
 from simtest.surfaces import make_surface
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy import ndimage, stats
 
 from simtest.errors import InputError
-from simtest.simulation import labelled_frame
 from simtest.simulation import sensor as camera_chain
+from simtest.simulation.frame import make_frame
 from simtest.spec.scene import scene_from_dict
 from simtest.spec.sensor import (
     Box,
@@ -300,9 +300,9 @@ def test_a_missing_codec_is_named(monkeypatch):
         camera_chain.code(np.zeros((8, 8), np.uint8), H264Coding())
     # Before anything is rendered: there is no session to render with.
     told = {"surface": {"type": "plane"}, "sensor": {"bits": 8, "coding": {"type": "h264"}}}
-    monkeypatch.setattr(labelled_frame, "Session", None)
+    monkeypatch.setattr("simtest.simulation.frame.Session", None)
     with pytest.raises(InputError, match="needs the package av"):
-        labelled_frame.make_frame(scene_from_dict(told))
+        make_frame(scene_from_dict(told))
 
 
 def test_coding_needs_8_bits():

@@ -10,8 +10,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from simtest.rendering import Session, highlights
-from simtest.simulation.rendered_view import render_view
-from simtest.simulation.visible_highlights import find_spots, glints_of, shape_of
+from simtest.simulation.frame import render_view
+from simtest.simulation.highlights import describe, find_spots, glints_of
 from simtest.spec.scene import scene_from_dict
 
 CAMERA = {"width": 200, "height": 160, "fx": 200.0, "fy": 200.0, "cx": 100.0, "cy": 80.0}
@@ -263,14 +263,13 @@ def test_a_dark_frame_has_no_spots():
 def test_spot_shape():
     y, x = np.mgrid[:80, :100]
     lobe = np.exp(-((x - 50.25) ** 2 / (2 * 8.0**2) + (y - 40.0) ** 2 / (2 * 4.0**2)))
-    spots = find_spots(lobe, lobe)
-    shape = shape_of(spots, 0, lobe)
+    (shape,) = describe(find_spots(lobe, lobe), lobe, lobe, np.zeros(1), [])
     assert shape.area_px == pytest.approx(2 * np.pi * np.log(2) * 32, rel=0.03)
     assert shape.centroid_px == pytest.approx([50.75, 40.5], abs=0.05)
     assert shape.axis_ratio == pytest.approx(0.5, rel=0.02)
     assert shape.whole
-    cut = find_spots(lobe[:, 50:], lobe[:, 50:])
-    assert not shape_of(cut, 0, lobe[:, 50:]).whole
+    cut = lobe[:, 50:]
+    assert not describe(find_spots(cut, cut), cut, cut, np.zeros(1), [])[0].whole
 
 
 def test_spots_hold_the_glints_in_them(sessions):

@@ -6,7 +6,7 @@ import pytest
 from simtest.dataset.maker import Maker, colour_variant
 from simtest.dataset.plan import Plan
 from simtest.rendering import Session, highlights, lighting
-from simtest.simulation.rendered_view import DEAR_SAMPLES, has_quick_look, render_view, shows_isolated
+from simtest.simulation.frame import DEAR_SAMPLES, has_quick_look, render_view, shows_isolated
 from simtest.spec import scene_from_dict
 from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate

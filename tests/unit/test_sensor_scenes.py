@@ -16,8 +16,8 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
+from simtest.simulation.frame import render_view
 from simtest.simulation.frame_files import write_frame
-from simtest.simulation.rendered_view import render_view
 from simtest.spec import Experiment, load_calibration, scene_from_dict
 from simtest.validation import laws
 from simtest.validation.predicted import unknown_falloff

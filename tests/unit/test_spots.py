@@ -14,7 +14,7 @@ from simtest.detection.view import find_foreign, find_view
 from simtest.errors import Failure, Reason
 from simtest.geometry import Camera
 from simtest.reconstruction import detect_in_picture, reconstruct_colour
-from simtest.simulation.visible_highlights import find_spots as visible_spots
+from simtest.simulation.highlights import find_spots as visible_spots
 
 WIDTH, HEIGHT = 240, 180
 TISSUE = np.array([0.40, 0.20, 0.16])

@@ -17,7 +17,7 @@ from simtest.reconstruction.found import Reconstruction, Specularity
 from simtest.reconstruction.ranking import best_of
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
-from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.frame import RenderedView
 from simtest.validation.matching import match, on_instruments, peak_px
 from simtest.validation.metrics import mahalanobis2
 

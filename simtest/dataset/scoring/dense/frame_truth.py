@@ -14,7 +14,7 @@ from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
 
 if TYPE_CHECKING:
     from simtest.rendering import Session, TruthMaps
-    from simtest.simulation.rendered_view import RenderedView
+    from simtest.simulation.frame import RenderedView
 
 Progress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and the frame's name."""
