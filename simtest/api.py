@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from simtest.report.run_results import RunResults
     from simtest.runtime.processes import Engine
     from simtest.simulation.frame import LabelledFrame
-    from simtest.simulation.viewpoints import SampledViews
+    from simtest.simulation.views import SampledViews
     from simtest.spec import Experiment, Scene
     from simtest.validation.runner import Progress
 
@@ -156,8 +156,7 @@ def sample_views(
     co-visibility where `labels`. The folder gets views.json, pictures, sheet.png, and the poses for other programs.
     """
     from simtest.runtime.locks import exclusive_folder
-    from simtest.simulation.view_folder import sample_into
-    from simtest.simulation.viewpoints import along_path, candidates
+    from simtest.simulation.views import along_path, candidates, sample_into
 
     check_count(count, "count", MOST_VIEWS)
     described = _scene(scene, settings, {})

@@ -1,4 +1,4 @@
-"""Writes a labelled frame: picture, radiance, ground truth, and what reconstruction may know of it."""
+"""Writes a labelled frame: picture, radiance, truth, and what reconstruction may know of it; sheets of pictures."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from simtest.calibration import Calibration, Response
 from simtest.rendering.bitmap import write_exr
 from simtest.runtime import provenance
-from simtest.runtime.arrays import Image, write_arrays
+from simtest.runtime.arrays import Image, Picture, write_arrays
 from simtest.runtime.files import Json, make_folder, write_atomically, write_json
 from simtest.simulation.frame import LabelledFrame, preview
 from simtest.simulation.highlights import cloud_json
@@ -57,6 +57,9 @@ INSTRUMENT_FIELDS = {
     "highlight of the surface",
 }
 """Further fields of a scene with instruments."""
+
+SHEET_WIDTH, SHEET_COLUMNS = 1600, 10
+"""Of a sheet of pictures: its width, px, and how many stand side by side."""
 
 FILES = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml", "preview.jpg")
 """What a labelled frame is written as."""
@@ -188,3 +191,20 @@ def _description(frame: LabelledFrame) -> Json:
     described["visible_highlights"] = [spot.to_json() for spot in frame.visible_highlights]
     origin = cast("dict[str, Json]", provenance.environment())
     return {**described, "fields": fields, "provenance": {**origin, "variant": frame.variant}}
+
+
+def thumbnail(picture: Picture) -> Picture:
+    """Return a picture, shape (H, W, 3), at the size it has on a sheet."""
+    width = SHEET_WIDTH // SHEET_COLUMNS
+    size = (width, round(width * picture.shape[0] / picture.shape[1]))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def write_sheet(path: Path, pictures: list[Picture]) -> None:
+    """Write pictures of one size, blue first, in rows, in order, as one picture."""
+    columns = min(SHEET_COLUMNS, len(pictures))
+    filled = [*pictures, *[np.zeros_like(pictures[0])] * (-len(pictures) % columns)]
+    rows = [np.hstack(filled[first : first + columns]) for first in range(0, len(filled), columns)]
+    ok, data = cv2.imencode(".png", np.vstack(rows))
+    assert ok
+    write_atomically(path, lambda part: part.write_bytes(bytes(data)))

@@ -10,10 +10,9 @@ import numpy.typing as npt
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Picture, write_arrays
 from simtest.runtime.files import write_atomically
-from simtest.simulation.flow import SeenSurface, flow_between, hides, moved_between
-from simtest.simulation.flow_picture import flow_picture
+from simtest.simulation.flow import SeenSurface, flow_between, flow_picture, hides, moved_between
 from simtest.simulation.frame import RenderedView
-from simtest.simulation.view_files import thumbnail, write_sheet
+from simtest.simulation.frame_files import thumbnail, write_sheet
 from simtest.spec import Scene
 
 STRIDE_PX = 16
