@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry import Camera
+from simtest.geometry.patch import dilated
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Mask, Picture
 from simtest.surfaces.deformation import DeformationAt, DeformedSurface
@@ -63,18 +64,10 @@ def moved_between(session: Session, first_s: float, second_s: float) -> Moved | 
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """What a frame sees of the surface.
+    """What a frame sees of the surface, world frame, mm.
 
-    Parameters
-    ----------
-    camera : Camera
-        Its camera.
-    world_from_camera : ndarray, shape (4, 4)
-        The camera's pose, mm.
-    position : ndarray, shape (H, W, 3)
-        Surface point at each pixel's centre, world frame, mm; NaN where there is none.
-    instrument : ndarray of uint8, shape (H, W), or None
-        Not 0 where an instrument is seen; None: nowhere.
+    `position`, shape (H, W, 3), is the surface point at each pixel's centre, NaN where there is none, also behind an
+    instrument; `instrument` is not 0 where one is seen, None: nowhere.
     """
 
     camera: Camera
@@ -115,13 +108,9 @@ class SeenSurface:
 class Flow:
     """Flow from one frame to another.
 
-    Parameters
-    ----------
-    flow_px : ndarray, shape (H, W, 2)
-        Where the surface point at each pixel's centre lies in the other frame, less that centre, px; also where the
-        other frame does not see it. NaN where there is no surface point or the other camera images none.
-    state : ndarray of uint8, shape (H, W)
-        Index in `STATES`.
+    `flow_px`, shape (H, W, 2), is where the surface point at each pixel's centre lies in the other frame, less that
+    centre, also where the other frame does not see it; NaN where there is no surface point or the other camera images
+    none. `state`, shape (H, W), is an index in `STATES`.
     """
 
     flow_px: Array
@@ -136,21 +125,10 @@ class Flow:
 
 
 def flow_between(session: Session, first: SeenSurface, second: SeenSurface, moved: Moved | None = None) -> Flow:
-    """Compute the flow from the first frame to the second.
+    """Compute the flow from the first frame to the second, in either order of time.
 
-    Parameters
-    ----------
-    session : Session
-        At a scene whose surface has the form of the second frame's moment.
-    first, second : SeenSurface
-        The frames, in either order of time.
-    moved : callable, optional
-        See `Moved`, from the first frame's moment to the second's; default points stay.
-
-    Returns
-    -------
-    Flow
-        At the pixels of the first frame.
+    The session is at a scene whose surface has the form of the second frame's moment, and `moved` leads there from the
+    first's (see `Moved`); default: points stay.
     """
     size = first.position.shape[:2]
     points = first.position.reshape(-1, 3)
@@ -217,8 +195,7 @@ def _not_shown(session: Session, centre: Array, points: Array) -> Mask:
 def _edges(state: npt.NDArray[np.uint8], frame: SeenSurface) -> Mask:
     """Return which pixels that both frames see lie beside one that they do not, or at a jump of the distance."""
     seen = state == SEEN
-    gone = ((state == NONE) | (state == HIDDEN)).astype(np.uint8)
-    beside = cv2.dilate(gone, _NEIGHBOURS) > 0
+    beside = dilated((state == NONE) | (state == HIDDEN))
     distance = np.linalg.norm(frame.position - frame.world_from_camera[:3, 3], axis=-1).astype(np.float32)
     far = cv2.dilate(np.nan_to_num(distance, nan=0.0), _NEIGHBOURS)
     near = cv2.erode(np.nan_to_num(distance, nan=np.inf), _NEIGHBOURS)
@@ -236,12 +213,7 @@ def _at(image: npt.NDArray[np.uint8], points_px: Array) -> npt.NDArray[np.uint8]
 def flow_picture(flow: Flow, full_px: float | None = None) -> Picture:
     """Return flow as a picture, shape (H, W, 3), uint8, blue first, with a wheel as its key.
 
-    Parameters
-    ----------
-    flow : Flow
-        What to show.
-    full_px : float, optional
-        Length of full colour, px; default the percentile `PERCENTILE` of the flow's own.
+    Full colour has the length `full_px`, default the percentile `PERCENTILE` of the flow's own.
     """
     known = np.isfinite(flow.flow_px).all(axis=-1)
     if full_px is None:

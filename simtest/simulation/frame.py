@@ -368,19 +368,11 @@ def preview(frame: LabelledFrame) -> npt.NDArray[np.uint8]:
 
 
 def expose_for_eye(specular: Image, own: Image, matt: Image, mask: Mask) -> Image:
-    """Return linear light for the eye, in which the surface is lit.
+    """Return linear light for the eye, shape (..., 3), in which the surface, where `mask` is, is lit.
 
-    A surface with diffuse or bounced light is exposed as a whole. One without gets the light of a matt surface of
-    `TISSUE`, to which the specular light is added, with its brightest point at full scale.
-
-    Parameters
-    ----------
-    specular, own : ndarray, shape (..., 3)
-        Specular light, and diffuse and bounced light.
-    matt : ndarray, shape (...)
-        Light of a white matt surface there (`matt_light`).
-    mask : ndarray of bool, shape (...)
-        Where there is a surface.
+    A surface whose `own`, diffuse and bounced light is not black beside the specular one is exposed as a whole. Else it
+    gets the light of a matt surface of `TISSUE`, by that of a white one (`matt_light`), to which the specular light is
+    added with its brightest point at full scale.
     """
     peak = float(specular.max())
     is_black = float(own.max()) <= BLACK_SHARE * peak

@@ -143,27 +143,23 @@ def encoded_png(image: Image, sensor: Sensor) -> bytes:
 
 
 def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
+    """Return the arrays of truth.npz."""
     truth, radiance = frame.truth, frame.radiance
-    assert truth.direction_min is not None
-    assert truth.direction_max is not None
-    of_instruments = {"instrument": truth.instrument} if frame.scene.shown_instruments else {}
+    vectors = ("normal", "normal_base", "shading_normal", "geometric_normal")
+    maps = {
+        "depth_mm": truth.depth,
+        "position_mm": truth.position,
+        **{name: getattr(truth, name) for name in vectors},
+        "curvature": np.stack([truth.k_min, truth.k_max], axis=-1),
+        "curvature_base": np.stack([truth.k_min_base, truth.k_max_base], axis=-1),
+        **{name: getattr(truth, name) for name in ("direction_min", "direction_max")},
+    }
     return {
-        "depth_mm": truth.depth.astype(np.float32),
-        "position_mm": truth.position.astype(np.float32),
-        "normal": truth.normal.astype(np.float32),
-        "normal_base": truth.normal_base.astype(np.float32),
-        "shading_normal": truth.shading_normal.astype(np.float32),
-        "geometric_normal": truth.geometric_normal.astype(np.float32),
-        "curvature": np.stack([truth.k_min, truth.k_max], axis=-1).astype(np.float32),
-        "curvature_base": np.stack([truth.k_min_base, truth.k_max_base], axis=-1).astype(np.float32),
-        "direction_min": truth.direction_min.astype(np.float32),
-        "direction_max": truth.direction_max.astype(np.float32),
-        "radiance_specular": radiance.specular,
-        "radiance_diffuse": radiance.diffuse,
-        "radiance_indirect": radiance.indirect,
+        **{name: values.astype(np.float32) for name, values in maps.items()},
+        **{f"radiance_{part}": getattr(radiance, part) for part in ("specular", "diffuse", "indirect")},
         "pool": truth.pool,
         "mask": truth.mask,
-        **of_instruments,
+        **({"instrument": truth.instrument} if frame.scene.shown_instruments else {}),
     }
 
 

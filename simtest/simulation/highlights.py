@@ -455,20 +455,10 @@ def describe(
 ) -> list[VisibleHighlight]:  # fmt: skip
     """Describe the spots of a frame, the brightest first.
 
-    Parameters
-    ----------
-    spots : Spots
-        Of `find_spots`, for the same `light`, `specular` and `seen`.
-    light, specular : ndarray, shape (H, W)
-        As there.
-    sigma : ndarray, shape (N,)
-        Noise at each peak, radiance.
-    glints : list of TrueHighlight
-        All of the frame. A spot's light and cloud are those of its brightest glint, or else of the nearest lit one.
-    instruments : ndarray of uint8, shape (H, W), optional
-        1 + the index of the instrument that is seen, 0 where none is.
-    clip : float
-        Radiance at which the sensor's values end.
+    `light`, `specular` and `seen` are those of `find_spots`, `sigma`, shape (N,), is the noise at each peak, radiance.
+    Of the `glints`, all of the frame, the brightest that a spot holds gives its light and cloud, or else the nearest
+    lit one. `instruments`, shape (H, W), is 1 + the index of the instrument that is seen, 0 where none is; `clip` the
+    radiance at which the sensor's values end.
     """
     lit = [number for number, glint in enumerate(glints) if glint.lit]
     at = np.array([glints[number].bp_px for number in lit]).reshape(-1, 2)

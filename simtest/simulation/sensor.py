@@ -226,15 +226,10 @@ def poisson(mean: Image, rng: np.random.Generator) -> Image:
 
 
 def expose(radiance: Image, full_scale: float, noise_sigma: float, rng: np.random.Generator | None) -> Image:
-    """Scale radiance to full scale 1 and add white Gaussian noise.
+    """Scale radiance to full scale 1 and add white Gaussian noise; the frame is not clipped.
 
     Where the full scale is not positive no light reached the sensor, and the signal is 0. `noise_sigma` is a share of
-    full scale (theory.md section 0); `rng` may be None where there is no noise. The frame is not clipped.
-
-    Raises
-    ------
-    ValueError
-        If noise is asked for without a generator.
+    full scale (theory.md section 0); `rng` may be None where there is no noise: `ValueError` is raised where there is.
     """
     if full_scale == 1:
         frame = radiance
@@ -316,19 +311,9 @@ def behind_filters(frame: Image, mosaic: Mosaic) -> Image:
 
 
 def demosaic(plane: Image, mosaic: Mosaic) -> Image:
-    """Fill in the colours that the pixels did not measure.
+    """Fill in the colours that the pixels of a linear plane, shape (H, W), did not measure; return (H, W, 3) in [0, 1].
 
-    Parameters
-    ----------
-    plane : ndarray of float32, shape (H, W)
-        Linear values; those outside [0, 1] are clipped, as by a converter.
-    mosaic : Mosaic
-        Pattern and method.
-
-    Returns
-    -------
-    ndarray of float32, shape (H, W, 3)
-        In [0, 1], in steps of 1/65535; with "vng" in steps of 1/255 of the square root.
+    Values outside [0, 1] are clipped, as by a converter. Steps are 1/65535, with "vng" 1/255 of the square root.
     """
     pattern, clipped = mosaic.pattern.upper(), np.clip(plane, 0.0, 1.0)
     if mosaic.demosaicing == "vng":
@@ -476,21 +461,9 @@ def noise_at(light: Image, full_scale: float, sensor: Sensor, rows: IntArray, co
     """Return the standard deviation, radiance, of the mean of the frame's channels at pixels, shape (N,).
 
     Where a sensor has no stage that mixes pixels or channels, or draws no noise, the noise model has it in closed form.
-    Else the light around each pixel goes through the chain `draws` times, and the deviation is that over the 3 x 3
-    pixels around it, linear again. That of clipped light is the one below the clip.
-
-    Parameters
-    ----------
-    light : ndarray, shape (H, W) or (H, W, 3)
-        Noise-free radiance behind the lens.
-    full_scale : float
-        Radiance that becomes 1; where it is 0 there is no noise.
-    sensor : Sensor
-        The sensor.
-    rows, columns : ndarray of int, shape (N,)
-        The pixels.
-    draws : int
-        At least 2.
+    Else the noise-free radiance `light` behind the lens around each pixel goes through the chain `draws` times, at
+    least 2, and the deviation is that over the 3 x 3 pixels around it, linear again. That of clipped light is the one
+    below the clip. Where the full scale is 0 there is no noise.
     """
     if full_scale <= 0 or not len(rows):
         return np.zeros(len(rows))

@@ -144,27 +144,11 @@ def sample_views(
 ) -> SampledViews:
     """Try viewpoints one after the other until `count` of them show an isolated highlight, or none is left.
 
-    Parameters
-    ----------
-    scene : Scene
-        Of an anatomy; its noise and lights matter too, since they decide what is isolated.
-    count : int
-        Views wanted, >= 1.
-    viewpoints : iterable
-        Numbers, or shares of the camera path where ``surface.view`` is not auto.
-    variant : str, optional
-        Mitsuba variant.
-    progress : callable, optional
-        Called with views found, views wanted, and what was tried last.
-    fps : float, optional
-        Frames a second of a sequence: every view is kept, whatever it shows.
-    write : callable, optional
-        Writes a view that is kept, at whose scene the session is; returns its picture's name and the noise's seed.
-
-    Raises
-    ------
-    InputError
-        If the surface is no anatomy, it has no such view, or no viewpoint has room; of a sequence, if one has none.
+    Noise and lights of the scene matter too, since they decide what is isolated. In a sequence, of `fps` frames a
+    second, every view is kept, whatever it shows. `progress` is called with views found, views wanted, and what was
+    tried last. `write` writes a view that is kept, at whose scene the session is; it returns the name of its picture
+    and the seed of its noise. `InputError` is raised if the surface is no anatomy, it has no such view, or no viewpoint
+    has room; of a sequence, if one has none.
     """
     key = viewpoint_key(scene)
     name = key.removeprefix("surface.")
