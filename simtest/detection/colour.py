@@ -92,16 +92,8 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
 
     In a highlight's pixels the specular light is at least the tissue's, at least 10 % of the highlight's peak, and more
     than noise. Both parts follow from the tissue's own colour around each pixel (`split_light`), so there is no global
-    threshold.
-
-    Parameters
-    ----------
-    linear : ndarray of float32, shape (H, W, 3)
-        Linear values, share of full scale; white-balanced: light mirrored by the surface is grey.
-    clipped : ndarray of bool, shape (H, W)
-        Where a channel is clipped.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the view; default all.
+    threshold. `linear`, shape (H, W, 3), is white-balanced, share of full scale: light mirrored by the surface is grey.
+    `clipped`, shape (H, W), is where a channel is clipped, `seen` are the pixels inside the view, default all.
     """
     picture = ColourPicture.of(linear, clipped, seen)
     light, shape = picture.light, clipped.shape

@@ -54,8 +54,8 @@ RISE = 0.85
 """Clipped light is taken to rise by this power of 1 + the distance from the rim, px: so the shape of a clipped patch
 tells the highlights that have melted in it apart."""
 
-_NEIGHBOURS = ((0, 1), (1, -1), (1, 0), (1, 1))
-"""Half of the eight neighbours, row and column: each pair of pixels is met once."""
+_NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
+"""The eight neighbours, row and column."""
 
 
 @dataclass(frozen=True)
@@ -197,18 +197,11 @@ def fill(values: Image, known: Mask) -> Image:
 
 @dataclass(frozen=True)
 class Basins:
-    """The summits of a frame, the brightest first.
+    """The summits of a frame, the brightest first: their pixels, and the number of each pixel's summit.
 
-    Parameters
-    ----------
-    rows, columns : ndarray of int, shape (N,)
-        The summits' pixels.
-    labels : ndarray of int, shape (H, W)
-        Number of the summit that a pixel belongs to, from 1; 0 outside the mask.
-    pairs : ndarray of int, shape (K, 2)
-        Summits, from 0, whose basins touch, the brighter first; each pair once.
-    saddles : ndarray of int, shape (K, 2)
-        Row and column of the lowest pixel of the highest way from one to the other directly.
+    `labels`, shape (H, W), count from 1 and are 0 outside the mask. `pairs`, shape (K, 2), are the summits, from 0,
+    whose basins touch, the brighter first, each pair once; `saddles`, shape (K, 2), row and column of the lowest pixel
+    of the highest way from one to the other directly.
     """
 
     rows: Index
@@ -224,108 +217,68 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     A summit stays where its saddle to a brighter one is below the share `keep` of it, both with the `base` below them,
     shape (H, W), and lower than it by more than `noise`.
     """
+    # Pixels are numbered by height, and equal ones in their order, so that a plateau has a way up too.
+    rows, columns = rows_and_columns(mask)
+    by_height = np.argsort(values[rows, columns], kind="stable")
+    rows, columns = rows[by_height], columns[by_height]
+    pixels = np.arange(len(rows))
     # a margin of one pixel spares the borders
     number = np.full((mask.shape[0] + 2, mask.shape[1] + 2), -1, dtype=np.int64)
-    rows, columns = rows_and_columns(mask)
-    count = len(rows)
-    pixels = np.arange(count)
     number[rows + 1, columns + 1] = pixels
-    ends = [number[rows + 1 + down, columns + 1 + right] for down, right in _NEIGHBOURS]
-    height = values[rows, columns].astype(np.float64)
-    # A strict order, so that a plateau has a way up too.
-    order = np.empty(count, dtype=np.int64)
-    order[np.argsort(height, kind="stable")] = pixels
+    neighbours = [number[rows + 1 + down, columns + 1 + right] for down, right in _NEIGHBOURS]
     # steepest ascent, and then each pixel's summit
-    up = _highest_neighbour(order, pixels, ends)
+    up = np.maximum.reduce([pixels, *neighbours])
     while not np.array_equal(further := up[up], up):
         up = further
-    tops, basin = _numbered(up, count)
-    labels = np.zeros(values.shape, dtype=np.int64)
-    if not len(tops):
-        none, no_pair = np.empty(0, dtype=np.int64), np.empty((0, 2), np.int64)
-        return Basins(none, none, labels, no_pair, no_pair)
-    first, second, saddle = _saddles(basin, order, pixels, ends, len(tops))
-    total = height + base[rows, columns]
-    owner = _merged(
-        order[tops], (height[tops], total[tops]), (first, second, height[saddle], total[saddle]), keep, noise
-    )
+    tops = np.flatnonzero(up == pixels)
+    tops = tops[np.argsort(by_height[tops])]
+    index = np.empty(len(rows), dtype=np.int64)
+    index[tops] = np.arange(len(tops))
+    basin = index[up]
+    # the highest saddle of each pair of basins that touch: of two neighbours the lower one is on the way
+    low = np.concatenate([np.flatnonzero(above > pixels) for above in neighbours])
+    high = np.concatenate([above[above > pixels] for above in neighbours])
+    pairs, saddle = _highest_of_pairs(basin[low], basin[high], low, len(tops))
+    height = values[rows, columns].astype(np.float64)
+    owner = _merged(tops, pairs, saddle, height, height + base[rows, columns], keep, noise)
     # summits that stay, the brightest first
-    kept, _ = _numbered(owner, len(tops))
-    kept = kept[np.argsort(-order[tops[kept]], kind="stable")]
+    kept = np.flatnonzero(np.bincount(owner))
+    kept = kept[np.argsort(-tops[kept])]
     rank = np.full(len(tops), -1)
     rank[kept] = np.arange(len(kept))
     mine = rank[owner]
+    labels = np.zeros(values.shape, dtype=np.int64)
     labels[rows, columns] = mine[basin] + 1
-    pairs, low = _highest_of_pairs(mine[first], mine[second], saddle, order, len(kept))
-    return Basins(rows[tops[kept]], columns[tops[kept]], labels, pairs, np.stack([rows[low], columns[low]], axis=1))
+    pairs, saddle = _highest_of_pairs(mine[pairs[:, 0]], mine[pairs[:, 1]], saddle, len(kept))
+    return Basins(rows[tops[kept]], columns[tops[kept]], labels, pairs, np.stack([rows[saddle], columns[saddle]], 1))
 
 
-def _numbered(values: Index, count: int) -> tuple[Index, Index]:
-    """Return the different ones of whole numbers from 0 to below `count`, rising, and which of them each one is.
-
-    `np.unique` sorts for it, and loads `numpy.ma`.
-    """
-    present = np.zeros(count, dtype=bool)
-    present[values] = True
-    return np.flatnonzero(present), (np.cumsum(present) - 1)[values]
-
-
-def _highest_neighbour(order: Index, pixels: Index, ends: list[Index]) -> Index:
-    """Return for each pixel the highest of itself and its neighbours."""
-    up, best = pixels.copy(), order.copy()
-    for end in ends:
-        here = np.flatnonzero(end >= 0)
-        there = end[here]
-        for start, stop in ((here, there), (there, here)):
-            higher = order[stop] > best[start]
-            best[start[higher]], up[start[higher]] = order[stop[higher]], stop[higher]
-    return up
-
-
-def _saddles(basin: Index, order: Index, pixels: Index, ends: list[Index], count: int) -> tuple[Index, Index, Index]:
-    """Return pairs of basins that touch, and the pixel of the highest saddle of each."""
-    starts, stops = [], []
-    for end in ends:
-        here = pixels[end >= 0]
-        there = end[end >= 0]
-        apart = basin[here] != basin[there]
-        starts.append(here[apart])
-        stops.append(there[apart])
-    start, stop = np.concatenate(starts), np.concatenate(stops)
-    low = np.where(order[start] <= order[stop], start, stop)
-    pairs, low = _highest_of_pairs(basin[start], basin[stop], low, order, count)
-    return pairs[:, 0], pairs[:, 1], low
-
-
-def _highest_of_pairs(first: Index, second: Index, low: Index, order: Index, count: int) -> tuple[Index, Index]:
+def _highest_of_pairs(first: Index, second: Index, low: Index, count: int) -> tuple[Index, Index]:
     """Return the pairs of different basins, the lower number first, and the highest of the pixels given for each."""
     apart = first != second
     key = np.minimum(first, second)[apart] * count + np.maximum(first, second)[apart]
     low = low[apart]
-    ranked = np.lexsort((-order[low], key))
+    ranked = np.lexsort((-low, key))
     key, low = key[ranked], low[ranked]
     head = np.append(True, key[1:] != key[:-1])[: len(key)]
-    return np.stack([key[head] // count, key[head] % count], axis=1), low[head]
+    return np.stack([key[head] // max(count, 1), key[head] % max(count, 1)], axis=1), low[head]
 
 
-def _merged(
-    order: Index, summits: tuple[Array, Array], saddles: tuple[Index, Index, Array, Array], keep: float, noise: float
-) -> Index:
+def _merged(tops: Index, pairs: Index, saddle: Index, height: Array, total: Array, keep: float, noise: float) -> Index:
     """Return for each summit the one that it belongs to, flooding from the highest saddle down.
 
-    Summits and saddles are given as heights without and with their base.
+    Summits and saddles are pixels, numbered by height; `total` is the height with its base.
     """
-    first, second, level, total = saddles
-    owner = list(range(len(order)))
-    flooded = list(range(len(order)))
-    for k in np.argsort(-level, kind="stable").tolist():
-        a, b = int(first[k]), int(second[k])
+    owner, flooded = list(range(len(tops))), list(range(len(tops)))
+    for k in np.argsort(-height[saddle], kind="stable").tolist():
+        a, b = int(pairs[k, 0]), int(pairs[k, 1])
         top_a, top_b = _root(flooded, a), _root(flooded, b)
         if top_a == top_b:
             continue
-        if order[top_a] < order[top_b]:
+        if tops[top_a] < tops[top_b]:
             a, b, top_a, top_b = b, a, top_b, top_a
-        if total[k] >= keep * summits[1][top_b] or summits[0][top_b] - level[k] <= noise:
+        top, between = tops[top_b], saddle[k]
+        if total[between] >= keep * total[top] or height[top] - height[between] <= noise:
             owner[_root(owner, top_b)] = _root(owner, a)
         flooded[top_b] = top_a
     return np.array([_root(owner, i) for i in range(len(owner))], dtype=np.int64)
@@ -343,20 +296,10 @@ def _root(of: list[int], i: int) -> int:
 class Spot:
     """Connected pixels of one highlight, or of several that touch.
 
-    Parameters
-    ----------
-    peaks : ndarray of int, shape (N, 2)
-        Column and row of each highlight's brightest pixel, the brightest first.
-    value : float
-        Specular light of the brightest.
-    corner : tuple of int
-        Column and row of the mask's first pixel in the frame.
-    mask : ndarray of bool, shape (h, w)
-        Its pixels above half height.
-    touches : bool
-        Whether it is the shoulder of a brighter one: its isophote at half height runs into that.
-    melted : bool
-        Whether its several peaks are told apart by the outline of clipped light alone.
+    `peaks`, shape (N, 2), are column and row of each highlight's brightest pixel, the brightest first, and `value` the
+    specular light of that; `mask` its pixels above half height, whose first is at `corner`, (column, row). One that
+    `touches` is the shoulder of a brighter one: its isophote at half height runs into that. Of a `melted` one several
+    peaks are told apart by the outline of clipped light alone.
     """
 
     peaks: Index
@@ -382,20 +325,9 @@ class Spot:
 def find_spots(specular: Image, tissue: Image, mask: Mask, least: Image, noise: float, flat: Mask) -> list[Spot]:
     """Find the spots among the pixels of a mask, the brightest first.
 
-    Basins that the isophote at half height joins are one cluster.
-
-    Parameters
-    ----------
-    specular, tissue : ndarray, shape (H, W)
-        The two parts of the light, smoothed.
-    mask : ndarray of bool, shape (H, W)
-        Pixels that may show a highlight.
-    least : ndarray, shape (H, W)
-        A highlight's peak has at least so much specular light.
-    noise : float
-        Standard deviation of the smoothed specular light.
-    flat : ndarray of bool, shape (H, W)
-        Pixels where all channels are clipped.
+    Basins that the isophote at half height joins are one cluster. `specular` and `tissue` are the two parts of the
+    light, smoothed, `noise` the standard deviation of the first; a highlight's peak has at least `least` specular
+    light. Where all channels are clipped, `flat`, light is taken to rise. All arrays have the shape (H, W).
     """
     rise: Image | float = 1.0
     if flat.any():

@@ -63,7 +63,7 @@ GAP = 1.6
 STROKE = 0.2
 """Largest half-width of a stroke over the character's height."""
 
-FILLED = 0.75
+STROKES = 0.75
 """Largest share of a character's box that its strokes fill."""
 
 STREAK_LENGTH = 0.045
@@ -259,17 +259,9 @@ def _is_polygon(inside: Mask, filled: Mask, hull: npt.NDArray[np.int32]) -> bool
 
 
 def find_foreign(bright: Mask) -> Mask:
-    """Find what is no tissue among bright pixels.
+    """Return the areas of text and instruments, shape (H, W), where what shines is no highlight.
 
-    Parameters
-    ----------
-    bright : ndarray of bool, shape (H, W)
-        Pixels above half of the height of what shines there.
-
-    Returns
-    -------
-    ndarray of bool, shape (H, W)
-        Areas of text and instruments; what shines there is no highlight.
+    `bright`, shape (H, W), are the pixels above half of the height of what shines there.
     """
     count, labels, stats, centres = cv2.connectedComponentsWithStats(bright.astype(np.uint8), connectivity=8)
     area = np.zeros(bright.shape, dtype=np.uint8)
@@ -285,7 +277,7 @@ def _text_lines(labels: np.ndarray, stats: np.ndarray) -> list[tuple[int, int, i
     """Return the boxes of lines of text: left, top, right, bottom."""
     left, top, width, height, area = stats.T
     low, high = CHARACTER_PX
-    fitting = (height >= low) & (height <= high) & (width <= 1.5 * height) & (area <= FILLED * width * height)
+    fitting = (height >= low) & (height <= high) & (width <= 1.5 * height) & (area <= STROKES * width * height)
     # A thin stroke, as that of the 1, may fill its box.
     fitting |= (height >= low) & (height <= high) & (width <= 0.35 * height)
     characters = [i for i in np.flatnonzero(fitting).tolist() if _is_thin(labels, stats[i], i + 1)]

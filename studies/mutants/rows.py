@@ -335,7 +335,7 @@ ROWS = (
     row("open highlights count as closed", "thresholds", "detection.peaks:component_above",
         "closed=not touched and not cut", "closed=not cut", "regions"),
     row("a saddle 10 % higher still parts two spots", "thresholds", "detection.spots:_merged",
-        "keep * summits[1][top_b]", "1.1 * keep * summits[1][top_b]", "spots"),
+        "keep * total[top]", "1.1 * keep * total[top]", "spots"),
     row("logarithm of the tissue's factor not undone", "units", "detection.spots:_tissue_colour",
         "return np.exp(maps[0]), maps[1]", "return maps[0], maps[1]", "colour_detection"),
     # estimators
