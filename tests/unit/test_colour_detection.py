@@ -4,7 +4,7 @@ import pytest
 
 from simtest.calibration import Calibration, srgb_decode, srgb_encode
 from simtest.detection import colour as colour_detection
-from simtest.detection.classify import _around
+from simtest.detection.classify import _around, _isophotes
 from simtest.detection.detector import Kind
 from simtest.detection.spots import ColourPicture, SplitLight, Spot, fill, split_light
 from simtest.detection.view import find_view
@@ -124,6 +124,38 @@ def test_the_split_gives_the_specular_light_whatever_the_shading():
     light = split_light(linear, np.zeros(linear.shape[:2], dtype=bool))
     assert np.sqrt(np.mean((light.specular - specular) ** 2)) < 0.006
     np.testing.assert_allclose(light.specular + light.tissue, linear.mean(axis=2), atol=1e-6)
+
+
+def test_specular_light_is_in_all_channels_also_where_one_is_clipped():
+    """Tissue so bright that red is clipped looks greyer than it is, and its part is filled in from darker tissue."""
+    x, y = places()
+    shading = np.where(np.hypot(x - 160, y - 120) < 12, 2.5, 0.4)
+    linear = np.clip(shading[..., None] * np.array([0.5, 0.2, 0.15]), 0, 1).astype(np.float32)
+    light = split_light(linear, linear.max(axis=2) >= 1)
+    weakest = linear.min(axis=2)
+    assert (linear.mean(axis=2) - weakest)[120, 160] > light.tissue[0, 0]
+    assert (light.specular <= weakest + 1e-6).all()
+
+
+def test_an_isophote_that_holds_another_bump_is_not_the_spot_s_own():
+    values = (lobe(160, 120, 8.0) + 0.7 * lobe(180, 120, 6.0)).astype(np.float32)
+    above = values > 0.5
+    none = np.zeros(above.shape, dtype=bool)
+    shown = ColourPicture(np.zeros((HEIGHT, WIDTH, 3)), SplitLight(values, values, 0.0), none, none, none, None)
+    (left, top, right, bottom), (x, _) = (145, 105, 195, 135), places()
+    for own in (above, above & (x < 170)):
+        spot = Spot(np.array([[160, 119]]), 1.0, (left, top), own[top:bottom, left:right], False, False)
+        traced = _isophotes(spot, (120, 80, 110, 80), values, shown)
+        assert (traced[0] is None) == (own is not above)
+
+
+def test_text_is_looked_for_before_spots_go_that_do_not_stand_out(monkeypatch):
+    """It is known by whole lines."""
+    asked = []
+    monkeypatch.setattr(colour_detection, "_stands_out", lambda *_: False)
+    monkeypatch.setattr(colour_detection, "find_foreign", lambda bright: asked.append(bright) or np.zeros_like(bright))
+    assert kinds(lobe(160, 120, 6.0)) == []
+    assert asked[0][120, 160]
 
 
 def test_fill_keeps_what_is_known_and_is_smooth_between():

@@ -256,6 +256,14 @@ def test_spots_shine():
     assert abs(np.sum(spots.regions == 1) - 2 * np.pi * np.log(2) * 9) < 6
 
 
+def test_equal_spots_are_numbered_row_by_row():
+    shape = (60, 120)
+    lobe = bump(shape, 40, 20, 3) + bump(shape, 12, 90, 3) + bump(shape, 12, 30, 3)
+    spots = find_spots(lobe, lobe)
+    assert [(int(r), int(c)) for r, c in zip(spots.rows, spots.columns, strict=True)] == [(12, 30), (12, 90), (40, 20)]
+    assert [int(spots.regions[r, c]) for r, c in zip(spots.rows, spots.columns, strict=True)] == [1, 2, 3]
+
+
 def test_a_dark_frame_has_no_spots():
     assert len(find_spots(np.zeros((20, 20)), np.zeros((20, 20))).rows) == 0
 

@@ -1,5 +1,7 @@
 """H.264 among the stages of a camera."""
 
+import os
+
 import numpy as np
 import pytest
 from test_camera_stages import picture
@@ -23,3 +25,14 @@ def test_h264_keeps_the_picture_and_loses_with_crf(shape):
         errors.append(float(np.sqrt(np.square(luma - expected).mean())))
     assert errors == sorted(errors)
     assert errors[0] < 4 < errors[-1]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processors cannot be chosen here")
+def test_the_number_of_processors_changes_no_byte():
+    frame, cores = (255 * picture((480, 640, 3), smooth=1.5)).astype(np.uint8), os.sched_getaffinity(0)
+    try:
+        os.sched_setaffinity(0, {min(cores)})
+        alone = camera_chain.code(frame, H264Coding(crf=28, frames=3))
+    finally:
+        os.sched_setaffinity(0, cores)
+    np.testing.assert_array_equal(camera_chain.code(frame, H264Coding(crf=28, frames=3)), alone)
