@@ -207,7 +207,7 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
     if radiance is None:
         radiance = session.radiance()
     light = collect(radiance.total, scene.sensor, session.camera)
-    highlights, full_scale = _judged(session, radiance, light)
+    highlights, full_scale = _judged(session, scene, radiance, light)
     highlights, clouds = _placed(session, radiance, highlights)
     # What reconstruction is told may include the distance of the brightest highlight.
     calibration = scene.calibration(brightest_mm(highlights))
@@ -234,7 +234,7 @@ def render_picture(session: Session, scene: Scene, radiance: Radiance | None = N
     light, seen = collect(radiance.total, scene.sensor, session.camera), session.camera.seen
     full_scale = _metered(scene, _mean(light), seen)
     if full_scale is None:
-        full_scale = _judged(session, radiance, light)[1]
+        full_scale = _judged(session, scene, radiance, light)[1]
     return capture(light, full_scale, scene.sensor, from_integer(scene.sensor.seed), seen)
 
 
@@ -266,7 +266,7 @@ def shows_isolated(session: Session, scene: Scene, least: int) -> bool:
     if not may_show(session, scene, least):
         return False
     radiance = session.labelled_radiance()
-    highlights, _ = _judged(session, radiance, collect(radiance.total, scene.sensor, session.camera))
+    highlights, _ = _judged(session, scene, radiance, collect(radiance.total, scene.sensor, session.camera))
     return sum(highlight.isolated for highlight in highlights) >= least
 
 
@@ -280,9 +280,12 @@ def _direct(radiance: Radiance, light: Image, scene: Scene, camera: Camera) -> I
     return collect(radiance.specular + radiance.diffuse, scene.sensor, camera)
 
 
-def _judged(session: Session, radiance: Radiance, light: Image) -> tuple[list[TrueHighlight], float]:
-    """Judge a frame's highlights by its direct light behind the lens; return them and the full scale."""
-    scene, camera = session.scene, session.camera
+def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) -> tuple[list[TrueHighlight], float]:
+    """Judge a frame's highlights by its direct light behind the lens; return them and the full scale.
+
+    The session is at the scene, or at one that differs from it in nothing but its sensor.
+    """
+    camera = session.camera
     direct = _direct(radiance, light, scene, camera)
     points, rough = session.highlights(radiance), session.surface.relief is not None
     examined = examine(points, _mean(direct), camera.seen, single=rough)
