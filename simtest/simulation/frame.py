@@ -238,33 +238,30 @@ def render_picture(session: Session, scene: Scene, radiance: Radiance | None = N
     return capture(light, full_scale, scene.sensor, from_integer(scene.sensor.seed), seen)
 
 
-def has_quick_look(scene: Scene) -> bool:
-    """Return whether a scene's frame of one sample a pixel and direct light is cheaper than its own.
+def quick_look(scene: Scene) -> Scene | None:
+    """Return a scene with one sample a pixel and direct light; None where its frame is no cheaper than the scene's.
 
     It is not where a source of finite size is sampled by as many points at each centre as in the whole pixel: then the
     frame that is kept is judged itself.
     """
     effort = scene.render
     wide = any(light.source is not None for light in scene.rig.lights)
-    return effort.path_depth > 2 or not wide or effort.samples_per_pixel > DEAR_SAMPLES
+    if effort.path_depth <= 2 and wide and effort.samples_per_pixel <= DEAR_SAMPLES:
+        return None
+    return scene.model_copy(update={"render": effort.model_copy(update={"samples_per_pixel": 1, "path_depth": 2})})
 
 
-def may_show(session: Session, scene: Scene, least: int) -> bool:
-    """Move a session to a scene, and return whether so many of its highlight points may be isolated at all.
-
-    Nothing is rendered: no frame of a scene for which this is false shows as many.
-    """
-    session.update(scene)
-    return sum(may_be_isolated(point) for point in session.highlights()) >= least
-
-
-def shows_isolated(session: Session, scene: Scene, least: int) -> bool:
+def shows_isolated(session: Session, scene: Scene, least: int, rendered: bool = True) -> bool:
     """Move a session to a scene, and return whether its frame shows at least so many isolated highlights.
 
-    The frame is rendered, with its labels, only where so many highlight points may be isolated at all.
+    The frame is rendered, with its labels, only where so many highlight points may be isolated at all; where it is not
+    to be `rendered`, that is the answer, and no frame of a scene for which it is false shows as many.
     """
-    if not may_show(session, scene, least):
+    session.update(scene)
+    if sum(may_be_isolated(point) for point in session.highlights()) < least:
         return False
+    if not rendered:
+        return True
     radiance = session.labelled_radiance()
     highlights, _ = _judged(session, scene, radiance, collect(radiance.total, scene.sensor, session.camera))
     return sum(highlight.isolated for highlight in highlights) >= least
