@@ -47,7 +47,8 @@ FIELDS = {
     "one that fails",
     "clouds": "frame.json: the same points of the base, without the relief; on a smooth surface the highlights",
     "visible_highlights": "frame.json: spots of the noise-free frame; value and specular are radiance, glints indices "
-    "in highlights, area_px the pixels above half of the lobe's peak, light and cloud those of the nearest lit glint",
+    "in highlights, area_px the pixels above half of the lobe's peak, light and cloud those of its brightest glint, or "
+    "else of the nearest lit one",
 }
 
 INSTRUMENT_FIELDS = {

@@ -217,11 +217,15 @@ def verdicts(
         # Without a maximum of its own it has no SNR.
         snr = 0.0
         if each.height is not None:
-            height = min(each.level, clip) - min(each.level - each.height, clip)
-            snr = height / sigma if sigma > 0 else np.inf if height > 0 else 0.0
+            snr = _snr(min(each.level, clip) - min(each.level - each.height, clip), sigma)
         faint = f"peak below {HIGHLIGHT_CONTRAST_SIGMA:g} sigma" if snr < HIGHLIGHT_CONTRAST_SIGMA else ""
         highlights.append(TrueHighlight(**vars(point), peak_snr=snr, why_not=each.why_not or faint))
     return highlights
+
+
+def _snr(height: float, sigma: float) -> float:
+    """Return a height over the noise, 0 without both."""
+    return height / sigma if sigma > 0 else math.inf if height > 0 else 0.0
 
 
 def may_be_isolated(point: HighlightPoint) -> bool:
@@ -484,7 +488,7 @@ def describe(
                 peak_px=peak,
                 value=value,
                 specular=lobe,
-                peak_snr=shown / sigma[number] if sigma[number] > 0 else np.inf,
+                peak_snr=_snr(shown, sigma[number]),
                 area_px=len(pixels[number]),
                 centroid_px=centroid,
                 axis_ratio=axis_ratio,

@@ -280,6 +280,16 @@ def test_spot_shape():
     assert not describe(find_spots(cut, cut), cut, cut, np.zeros(1), [])[0].whole
 
 
+@pytest.mark.parametrize(("sigma", "snr"), [(0.0, np.inf), (0.1, 10.0)])
+def test_a_spot_on_clipped_light_stands_above_nothing(sigma, snr):
+    """Its pixels and those around have the value at which the sensor's end, with noise or without."""
+    lobe = bump((60, 80), 30, 40, 5)
+    spots = find_spots(1 + lobe, lobe)
+    for clip, expected in ((3.0, snr), (1.0, 0.0)):
+        (spot,) = describe(spots, 1 + lobe, lobe, np.array([sigma]), [], clip=clip)
+        assert spot.peak_snr == pytest.approx(expected)
+
+
 def test_spots_hold_the_glints_in_them(sessions):
     session = sessions["inside"]
     view = render_view(session, session.scene)
