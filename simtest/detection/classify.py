@@ -15,7 +15,7 @@ from simtest.calibration.frame import median
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection.detector import SINGLE, Highlight, Kind, Region
 from simtest.detection.peaks import Box, grown_box
-from simtest.detection.spots import BLOCKS, NEIGHBOURHOOD, ColourPicture, Spot
+from simtest.detection.spots import BLOCKS, NEIGHBOURHOOD, ColourPicture, SpecularSpot
 from simtest.errors import Failure
 from simtest.geometry import Array, FittedConic, Image, Mask, fit_ellipses
 from simtest.geometry.level_sets import LevelSet, crossings, level_set_around
@@ -109,7 +109,7 @@ class Measured:
         Light of its surroundings over its own.
     """
 
-    spot: Spot
+    spot: SpecularSpot
     box: Box
     half: LevelSet | None
     axis_ratio: float | None
@@ -128,7 +128,7 @@ class Measured:
         return self.spot.area_px >= MIN_SHAPE_PX
 
 
-def classify(spots: list[Spot], picture: ColourPicture, bright: Mask) -> list[Highlight | None]:
+def classify(spots: list[SpecularSpot], picture: ColourPicture, bright: Mask) -> list[Highlight | None]:
     """Classify the spots of a picture, whose pixels are `bright`, shape (H, W); None where one is pale tissue."""
     smoothed = picture.smoothed(picture.light.specular, SHAPE_PX)
     boxes = [grown_box(spot.corner, spot.mask.shape[::-1], smoothed.shape) for spot in spots]
@@ -146,7 +146,7 @@ def classify(spots: list[Spot], picture: ColourPicture, bright: Mask) -> list[Hi
     return judged
 
 
-def _isophotes(spot: Spot, box: Box, smoothed: Image, picture: ColourPicture) -> tuple[LevelSet | None, ...]:
+def _isophotes(spot: SpecularSpot, box: Box, smoothed: Image, picture: ColourPicture) -> tuple[LevelSet | None, ...]:
     """Trace a spot's isophotes in its region; None where open, and for a cluster or a shoulder, which has none."""
     none = (None,) * len(NESTED_ISOVALUES)
     if spot.touches or (len(spot.peaks) > 1 and not spot.melted):
@@ -251,7 +251,7 @@ def border_of(mask: Mask) -> Array:
     return corners[np.append(True, (corners[1:] != corners[:-1]).any(axis=1))]
 
 
-def _at_border(spot: Spot, picture: ColourPicture) -> bool:
+def _at_border(spot: SpecularSpot, picture: ColourPicture) -> bool:
     """Return whether the picture's edge or the view's border may cut a spot."""
     (x, y), (height, width), seen = spot.corner, spot.mask.shape, picture.inside
     if x <= 0 or y <= 0 or x + width >= seen.shape[1] or y + height >= seen.shape[0]:
@@ -276,7 +276,7 @@ def _shape(fits: list[_Contour]) -> tuple[float | None, float | None, float | No
     return float(np.sqrt(low / high)), float(np.mean(residuals)), float(wander)
 
 
-def _around(spot: Spot, box: Box, picture: ColourPicture, bright: Mask) -> tuple[float, float, float]:
+def _around(spot: SpecularSpot, box: Box, picture: ColourPicture, bright: Mask) -> tuple[float, float, float]:
     """Return tint and clutter of a highlight (see `Highlight`), and the light of its surroundings over its own.
 
     The channels are ranked by the tissue around it.

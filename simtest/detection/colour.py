@@ -10,7 +10,7 @@ from simtest.calibration.frame import MAD_TO_SIGMA, median
 from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
 from simtest.detection.classify import MIN_SHAPE_PX, classify
 from simtest.detection.detector import SINGLE, Detection, Highlight, Kind
-from simtest.detection.spots import ColourPicture, SplitLight, Spot, fill, find_spots
+from simtest.detection.spots import ColourPicture, SpecularSpot, SplitLight, fill, find_spots
 from simtest.detection.view import find_foreign, view_of
 from simtest.errors import InputError
 from simtest.geometry import Camera, Image, Mask
@@ -138,7 +138,7 @@ def _texture(specular: Image, tissue: Image, inside: Mask) -> float:
     return MAD_TO_SIGMA * float(median(np.abs(values - middle)))
 
 
-def _brighter_than_around(spots: list[Spot], total: Image, bare: Mask, ratio: float) -> list[Spot]:
+def _brighter_than_around(spots: list[SpecularSpot], total: Image, bare: Mask, ratio: float) -> list[SpecularSpot]:
     """Leave out spots that are paler than the bare tissue around, but no brighter."""
     if not spots:
         return spots
@@ -152,7 +152,7 @@ def _brighter_than_around(spots: list[Spot], total: Image, bare: Mask, ratio: fl
     ]
 
 
-def _stands_out(spot: Spot, total: Image, bare: Mask) -> bool:
+def _stands_out(spot: SpecularSpot, total: Image, bare: Mask) -> bool:
     """Return whether no bare tissue beside a spot comes near to its light; a wide one needs not be asked."""
     if spot.area_px > NARROW_PX:
         return True
@@ -163,7 +163,7 @@ def _stands_out(spot: Spot, total: Image, bare: Mask) -> bool:
     return bool(total[beside].max(where=bare[beside], initial=0) <= STANDS_OUT * total[row, column])
 
 
-def _pixels(spots: list[Spot], shape: tuple[int, ...]) -> Mask:
+def _pixels(spots: list[SpecularSpot], shape: tuple[int, ...]) -> Mask:
     """Return the pixels of spots."""
     mask = np.zeros(shape, dtype=bool)
     for spot in spots:
@@ -183,7 +183,7 @@ def _with_dim_marked(highlights: list[Highlight], light: SplitLight) -> list[Hig
     ]
 
 
-def _feet(spots: list[Spot], mask: Mask, specular: Image, more: Mask) -> Mask:
+def _feet(spots: list[SpecularSpot], mask: Mask, specular: Image, more: Mask) -> Mask:
     """Return which of more pixels belong to the nearest spot: near it, and not far below its peak."""
     if not spots:
         return mask

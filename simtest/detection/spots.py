@@ -293,7 +293,7 @@ def _root(of: list[int], i: int) -> int:
 
 
 @dataclass(frozen=True)
-class Spot:
+class SpecularSpot:
     """Connected pixels of one highlight, or of several that touch.
 
     `peaks`, shape (N, 2), are column and row of each highlight's brightest pixel, the brightest first, and `value` the
@@ -322,7 +322,9 @@ class Spot:
         return slice(y, y + height), slice(x, x + width)
 
 
-def find_spots(specular: Image, tissue: Image, mask: Mask, least: Image, noise: float, flat: Mask) -> list[Spot]:
+def find_spots(
+    specular: Image, tissue: Image, mask: Mask, least: Image, noise: float, flat: Mask
+) -> list[SpecularSpot]:
     """Find the spots among the pixels of a mask, the brightest first.
 
     Basins that the isophote at half height joins are one cluster. `specular` and `tissue` are the two parts of the
@@ -361,7 +363,7 @@ def find_spots(specular: Image, tissue: Image, mask: Mask, least: Image, noise: 
         inside[y - top, x - left] = True
         peaks = np.stack([basins.columns[group], basins.rows[group]], axis=1)
         several = melted[i] and len(group) > 1
-        spots.append(Spot(peaks, float(specular[at_peak]), (left, top), inside, touching[i], several))
+        spots.append(SpecularSpot(peaks, float(specular[at_peak]), (left, top), inside, touching[i], several))
     return spots
 
 

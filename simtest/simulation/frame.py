@@ -22,9 +22,9 @@ from simtest.rendering.highlights import radii_px
 from simtest.runtime.arrays import Array, Image, Mask, short_repr
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.highlights import (
-    Spots,
     TrueHighlight,
     VisibleHighlight,
+    VisibleSpots,
     assign_clouds,
     describe,
     examine,
@@ -121,7 +121,7 @@ class RenderedView:
         return _direct(self.radiance, self.light, self.scene, self.camera)
 
     @cached_property
-    def spots(self) -> Spots:
+    def spots(self) -> VisibleSpots:
         """The pixels of the spots that can be seen in the noise-free frame, also of those on instruments."""
         return find_spots(_mean(self._judged_light), self._specular, self.camera.seen)
 

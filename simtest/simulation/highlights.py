@@ -379,7 +379,7 @@ def _ends(size: Image) -> IntArray:
 
 
 @dataclass(frozen=True)
-class Spots:
+class VisibleSpots:
     """Maxima of a frame, the brightest first, and the pixels of each.
 
     `rows` and `columns`, shape (N,), are those of the peaks; `regions`, shape (H, W), the number of the maximum whose
@@ -391,7 +391,7 @@ class Spots:
     regions: IntArray
 
 
-def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Spots:
+def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> VisibleSpots:
     """Find the maxima of a noise-free frame that are highlights.
 
     `light` is the radiance behind the lens, `specular` the part that comes directly off the lobe, both of shape (H, W),
@@ -404,7 +404,8 @@ def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Spots
     light = np.where(np.isfinite(light), light, 0.0).astype(np.float64)
     if seen is not None:
         light = np.where(seen, light, 0.0)
-    empty = Spots(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.zeros(light.shape, dtype=np.int64))
+    none = np.empty(0, dtype=np.int64)
+    empty = VisibleSpots(none, none, np.zeros(light.shape, dtype=np.int64))
     if light.max() <= 0:
         return empty
     # Maxima: in logarithms the ratio of saddle and peak is a height, and these are the h-maxima.
@@ -433,10 +434,10 @@ def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Spots
     held = np.zeros(pieces.max() + 1, dtype=np.int64)
     held[pieces[rows, columns]] = np.arange(1, len(peaks) + 1)
     held[0] = 0
-    return Spots(np.asarray(rows), np.asarray(columns), held[pieces])
+    return VisibleSpots(np.asarray(rows), np.asarray(columns), held[pieces])
 
 
-def glints_of(spots: Spots, glints: list[TrueHighlight]) -> list[tuple[int, ...]]:
+def glints_of(spots: VisibleSpots, glints: list[TrueHighlight]) -> list[tuple[int, ...]]:
     """Return which lit glints, by index, each spot holds, or has next to its pixels."""
     from skimage.segmentation import expand_labels
 
@@ -454,8 +455,8 @@ def glints_of(spots: Spots, glints: list[TrueHighlight]) -> list[tuple[int, ...]
 
 
 def describe(
-    spots: Spots, light: Image, specular: Image, sigma: Array, glints: list[TrueHighlight], seen: Mask | None = None,
-    instruments: npt.NDArray[np.uint8] | None = None, clip: float = np.inf,
+    spots: VisibleSpots, light: Image, specular: Image, sigma: Array, glints: list[TrueHighlight],
+    seen: Mask | None = None, instruments: npt.NDArray[np.uint8] | None = None, clip: float = np.inf,
 ) -> list[VisibleHighlight]:  # fmt: skip
     """Describe the spots of a frame, the brightest first.
 

@@ -6,7 +6,7 @@ from simtest.calibration import Calibration, srgb_decode, srgb_encode
 from simtest.detection import colour as colour_detection
 from simtest.detection.classify import _around, _isophotes
 from simtest.detection.detector import Kind
-from simtest.detection.spots import ColourPicture, SplitLight, Spot, fill, split_light
+from simtest.detection.spots import ColourPicture, SpecularSpot, SplitLight, fill, split_light
 from simtest.detection.view import find_view
 from simtest.errors import InputError
 from simtest.estimators import Estimate
@@ -91,7 +91,7 @@ def test_a_pale_edge_is_no_highlight(from_edge, size, expected):
     total = np.where(x < 160, 0.35, 0.09).astype(np.float32)
     crop = np.s_[120 : 120 + size, 160 + from_edge : 160 + from_edge + size]
     total[crop] = 0.2
-    spot = Spot(np.array([[160 + from_edge, 120]]), 0.11, (160 + from_edge, 120), total[crop] > 0, False, False)
+    spot = SpecularSpot(np.array([[160 + from_edge, 120]]), 0.11, (160 + from_edge, 120), total[crop] > 0, False, False)
     bare = np.ones(total.shape, dtype=bool)
     bare[crop] = False
     assert colour_detection._stands_out(spot, total, bare) is expected
@@ -144,7 +144,7 @@ def test_an_isophote_that_holds_another_bump_is_not_the_spot_s_own():
     shown = ColourPicture(np.zeros((HEIGHT, WIDTH, 3)), SplitLight(values, values, 0.0), none, none, none, None)
     (left, top, right, bottom), (x, _) = (145, 105, 195, 135), places()
     for own in (above, above & (x < 170)):
-        spot = Spot(np.array([[160, 119]]), 1.0, (left, top), own[top:bottom, left:right], False, False)
+        spot = SpecularSpot(np.array([[160, 119]]), 1.0, (left, top), own[top:bottom, left:right], False, False)
         traced = _isophotes(spot, (120, 80, 110, 80), values, shown)
         assert (traced[0] is None) == (own is not above)
 
@@ -265,7 +265,7 @@ def test_the_dark_outside_the_view_is_no_tissue_around_a_highlight():
     for outside in (0.0, 1.0):
         linear = srgb_decode(frame)
         linear[~seen] = outside
-        spot = Spot(np.array([[160, 24]]), 0.5, (155, 19), specular[19:30, 155:166] > 0.25, False, False)
+        spot = SpecularSpot(np.array([[160, 24]]), 0.5, (155, 19), specular[19:30, 155:166] > 0.25, False, False)
         light = SplitLight(np.where(seen, specular, 0).astype(np.float32), linear.mean(axis=2), 0.004)
         none = np.zeros(seen.shape, dtype=bool)
         shown = ColourPicture(linear, light, none, none, none, seen)
