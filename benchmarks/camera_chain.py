@@ -15,7 +15,7 @@ from benchmarks.timing import times_in_turns
 from simtest.calibration import Response
 from simtest.geometry import Camera, ViewMask, smooth
 from simtest.runtime.arrays import Image
-from simtest.simulation import camera_chain, mosaic, video_processor
+from simtest.simulation import sensor as camera_chain
 from simtest.spec.sensor import PRESETS, Sensor
 
 WIDTH, HEIGHT = 640, 480
@@ -26,15 +26,15 @@ LIMIT_MS, LIMIT_BLURS = 60.0, 25.0
 STAGES: dict[str, tuple[Any, str]] = {
     "lens": (camera_chain, "collect"),
     "exposure": (camera_chain, "full_scale_of_average"),
-    "sensor's colours": (video_processor, "as_seen_by_sensor"),
-    "mosaic": (mosaic, "sample"),
+    "sensor's colours": (camera_chain, "as_seen_by_sensor"),
+    "mosaic": (camera_chain, "behind_filters"),
     "noise": (camera_chain, "_electrons"),
-    "demosaicing": (mosaic, "demosaic"),
-    "colour": (video_processor, "develop"),
+    "demosaicing": (camera_chain, "demosaic"),
+    "colour": (camera_chain, "develop"),
     "response": (Response, "encode_picture"),
-    "sharpening": (video_processor, "sharpen"),
-    "scaling": (video_processor, "rescale"),
-    "overlay": (video_processor, "draw"),
+    "sharpening": (camera_chain, "sharpen"),
+    "scaling": (camera_chain, "rescale"),
+    "overlay": (camera_chain, "draw"),
     "coding": (camera_chain, "code"),
 }
 """The functions of the chain's stages."""

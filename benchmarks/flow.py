@@ -15,7 +15,7 @@ from benchmarks.measuring import Figure
 from benchmarks.timing import times_in_turns
 from simtest.rendering import Session
 from simtest.simulation.flow import SEEN, Flow, SeenSurface, flow_between
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import Scene, load_scene
 
 ROUNDS = 5

@@ -23,7 +23,7 @@ from simtest.rendering import Session, backend
 from simtest.report import write_report
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.rendered_view import expose_picture
+from simtest.simulation.frame import render_picture
 from simtest.spec import Scene, load_experiment
 from simtest.spec.sensor import Sensor
 from simtest.surfaces import forget_meshes
@@ -145,7 +145,7 @@ def _seen(session: Session) -> Callable[[], object]:
     """Pass a frame through the whole chain of a colonoscope: mosaic, noise, sharpening and JPEG."""
     radiance = session.radiance()
     scene = session.scene.model_copy(update={"sensor": Sensor.model_validate({"preset": "colonoscope_hd"})})
-    return lambda: expose_picture(session, scene, radiance)
+    return lambda: render_picture(session, scene, radiance)
 
 
 _OF_A_VIEW = {

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from simtest.reconstruction.picture import Options
     from simtest.report.run_results import RunResults
     from simtest.runtime.processes import Engine
-    from simtest.simulation.labelled_frame import LabelledFrame
-    from simtest.simulation.viewpoints import SampledViews
+    from simtest.simulation.frame import LabelledFrame
+    from simtest.simulation.views import SampledViews
     from simtest.spec import Experiment, Scene
     from simtest.validation.runner import Progress
 
@@ -88,7 +88,7 @@ def render(
     >>> frame.image.shape, [truth.isolated for truth in frame.highlights]
     ((96, 96), [True])
     """
-    from simtest.simulation.labelled_frame import make_frame
+    from simtest.simulation.frame import make_frame
 
     return make_frame(_scene(scene, settings, overrides), variant, progress)
 
@@ -156,8 +156,7 @@ def sample_views(
     co-visibility where `labels`. The folder gets views.json, pictures, sheet.png, and the poses for other programs.
     """
     from simtest.runtime.locks import exclusive_folder
-    from simtest.simulation.view_folder import sample_into
-    from simtest.simulation.viewpoints import along_path, candidates
+    from simtest.simulation.views import along_path, candidates, sample_into
 
     check_count(count, "count", MOST_VIEWS)
     described = _scene(scene, settings, {})

@@ -21,7 +21,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import Stage, generator
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec import Scene, scene_from_dict
 from simtest.spec.toml_files import read_toml
 from simtest.surfaces.factory import make_mesh

@@ -23,8 +23,8 @@ from simtest.geometry import Patch
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import render_view
-from simtest.simulation.true_highlights import TrueHighlight
+from simtest.simulation.frame import render_view
+from simtest.simulation.highlights import TrueHighlight
 from simtest.spec import load_scene
 from simtest.validation.matching import match
 from simtest.validation.metrics import mahalanobis2

@@ -21,7 +21,7 @@ from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, reconstruct
 from simtest.reconstruction.ranking import best_of
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import load_scene
 from simtest.validation.matching import match
 from simtest.validation.metrics import mahalanobis2

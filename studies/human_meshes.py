@@ -24,7 +24,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, Specularity, run_pipeline
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec import load_scene
 from simtest.validation.matching import match, peak_px
 from simtest.validation.metrics import mahalanobis2

@@ -28,7 +28,7 @@ from simtest.reconstruction.pipeline import reconstruct
 from simtest.reconstruction.ranking import best_of
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Mask
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import Scene, load_scene
 from simtest.validation.depth_maps import depth_normals
 from studies.depth_completion import CoarseError, complete

@@ -37,7 +37,7 @@ from simtest.reconstruction.pipeline import Reconstruction, default_estimators, 
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.frame import RenderedView
 from simtest.spec.recipes import load_dataset
 from simtest.validation.cloud_rows import match_cloud
 from simtest.validation.metrics import mahalanobis2

@@ -27,7 +27,7 @@ import numpy as np
 
 from simtest.cli.commands import APP
 from simtest.detection import Region
-from simtest.detection.blobs import Highlight
+from simtest.detection.detector import Highlight
 from simtest.estimators import Estimate
 from simtest.geometry import Patch
 from simtest.reconstruction import Specularity

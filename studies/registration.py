@@ -19,7 +19,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, generator
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import scene_from_dict
 from simtest.spec.toml_files import toml_value
 from simtest.surfaces.factory import make_mesh

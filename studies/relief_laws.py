@@ -20,7 +20,7 @@ from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session, highlights
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import key
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec.scene import Scene, load_scene, scene_from_dict
 from simtest.validation import relief_laws as laws
 from simtest.validation.matching import match

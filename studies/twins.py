@@ -42,7 +42,7 @@ from simtest.reconstruction.pipeline import run_picture
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image, IntArray
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec.recipes import load_dataset
 
 SEED = 7720

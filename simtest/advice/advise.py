@@ -16,8 +16,8 @@ from simtest.errors import InputError
 from simtest.pages.pixels import Pixels
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.runtime.processes import make_engine
-from simtest.simulation.camera_chain import displayed
-from simtest.simulation.labelled_frame import make_frame
+from simtest.simulation.frame import make_frame
+from simtest.simulation.sensor import displayed
 from simtest.spec import Experiment, load_scene
 from simtest.spec.toml_files import toml_tables
 from simtest.validation.runner import run_experiments

@@ -34,8 +34,8 @@ from simtest.runtime.arrays import Image
 from simtest.runtime.files import are_nested, write_atomically, write_json
 from simtest.runtime.locks import LOCK, exclusive_folder
 from simtest.runtime.processes import Engine, OnStep
-from simtest.simulation.camera_chain import displayed
 from simtest.simulation.frame_files import encoded_png
+from simtest.simulation.sensor import displayed
 from simtest.spec import Experiment, calibration_toml, camera_table
 from simtest.spec.sensor import Sensor
 from simtest.validation.cases import expand

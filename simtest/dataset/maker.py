@@ -15,7 +15,7 @@ from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta,
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.dataset.sample import Sample, sample_key
 from simtest.dataset.sample_calibration import calibration_of_picture, stored_picture
-from simtest.detection.regions import Component
+from simtest.detection.peaks import Component
 from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.process.naming import forgive_cores
@@ -23,17 +23,9 @@ from simtest.geometry import ellipse_of_conic, fit_ellipse
 from simtest.reconstruction.found import Specularity
 from simtest.rendering import Frame, Session, backend
 from simtest.runtime.arrays import AnyArray, Image, only_reading
-from simtest.simulation.camera_chain import to_uint8
-from simtest.simulation.clouds import cloud_json
-from simtest.simulation.rendered_view import (
-    RenderedView,
-    brightest_mm,
-    has_quick_look,
-    may_show,
-    render_view,
-    shows_isolated,
-)
-from simtest.simulation.true_highlights import TrueHighlight, lobe_region
+from simtest.simulation.frame import RenderedView, brightest_mm, quick_look, render_view, shows_isolated
+from simtest.simulation.highlights import TrueHighlight, cloud_json, lobe_region
+from simtest.simulation.sensor import to_uint8
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
 from simtest.validation.cloud_rows import of_clouds
@@ -156,16 +148,15 @@ class Maker:
         told = calibration_of_picture(drawn.scene, brightest_mm(view.highlights))
         view = replace(view, calibration=told)
         least = self.plan.dataset.highlights
-        return (drawn, view, frame) if is_last or has_quick_look(drawn.scene) or view.isolated >= least else None
+        judged = is_last or quick_look(drawn.scene) is not None
+        return (drawn, view, frame) if judged or view.isolated >= least else None
 
     def _promises(self, drawn: Drawn) -> bool:
         """Return whether a draw is worth its frame: by a quick look, or, where that saves nothing, by geometry."""
-        least = self.plan.dataset.highlights
-        if not has_quick_look(drawn.scene):
-            return may_show(self._at(drawn), drawn.scene, least)
-        quick = drawn.scene.render.model_copy(update={"samples_per_pixel": 1, "path_depth": 2})
-        scene = drawn.scene.model_copy(update={"render": quick})
-        return shows_isolated(self._at(replace(drawn, scene=scene)), scene, least)
+        quick = quick_look(drawn.scene)
+        scene = drawn.scene if quick is None else quick
+        session = self._at(replace(drawn, scene=scene))
+        return shows_isolated(session, scene, self.plan.dataset.highlights, rendered=quick is not None)
 
     def _at(self, drawn: Drawn) -> Session:
         """Return the session, updated to a scene."""

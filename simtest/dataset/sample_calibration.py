@@ -5,7 +5,7 @@ import numpy as np
 from simtest.calibration import Calibration
 from simtest.dataset.metadata import SampleMeta
 from simtest.runtime.arrays import Image, Picture
-from simtest.simulation.camera_chain import to_uint8
+from simtest.simulation.sensor import to_uint8
 from simtest.spec import Scene
 from simtest.spec.sensor import Sensor, SrgbResponse
 

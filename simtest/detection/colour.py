@@ -1,19 +1,20 @@
 """`colour`: highlights of a colour frame by the tissue's own colour, and which of them are isolated."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.calibration.frame import MAD_TO_SIGMA, median
-from simtest.detection.detector import Detection
-from simtest.detection.judging import ColourDetection, detection_of, judge_spots, plateaus, tissue_spots
-from simtest.detection.light_split import SplitLight, fill, split_light
-from simtest.detection.spots import Spot, find_spots
-from simtest.detection.view_mask import view_of
+from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
+from simtest.detection.classify import MIN_SHAPE_PX, classify
+from simtest.detection.detector import SINGLE, Detection, Highlight, Kind
+from simtest.detection.spots import ColourPicture, SpecularSpot, SplitLight, fill, find_spots
+from simtest.detection.view import find_foreign, view_of
 from simtest.errors import InputError
-from simtest.geometry import Camera, Image, Mask, smooth
+from simtest.geometry import Camera, Image, Mask
+from simtest.geometry.patch import dilated, rows_and_columns
 
 SMOOTHING_PX = 0.35
 """Smoothing before highlights are told apart; a wider one melts small ones."""
@@ -51,13 +52,39 @@ BESIDE_PX, NARROW_PX = 6, 64
 """Tissue is beside a highlight within this distance of the box of its pixels. With more pixels than the second number a
 spot is no edge, and so wide that shading matters."""
 
-_WIDE = np.ones((5, 5), dtype=np.uint8)
-
 FOOT = 0.4
 """A highlight's pixels are searched for down to this share of what its peak must have."""
 
 LEAST_SPECULAR = 0.02
 """Least specular light, share of full scale: two steps of an 8-bit sRGB picture at mid tones."""
+
+DIM, CLEARLY_CLIPPED = 0.8, 0.1
+"""Where the normal bisects light and camera, one lobe is as bright at every distance, over the tissue beside it. So
+where more than the second share of one highlight is clipped, a resolved one below the first share of its light is
+dim."""
+
+FOOT_REACH = 0.8
+"""A highlight's foot reaches this share of its radius at half height beyond that: a Gaussian's at a tenth of it."""
+
+ON_FOREIGN = 0.5
+"""A spot of which more than this share lies on text or an instrument is none of the tissue's."""
+
+
+@dataclass(frozen=True)
+class ColourDetection:
+    """The light of a colour frame in its two parts, the pixels of highlights of every kind, shape (H, W), and these.
+
+    The highlights come brightest first.
+    """
+
+    light: SplitLight
+    mask: Mask
+    highlights: list[Highlight]
+
+    @property
+    def isolated(self) -> list[Highlight]:
+        """The highlights that may carry one normal."""
+        return [highlight for highlight in self.highlights if highlight.is_isolated]
 
 
 def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> ColourDetection:
@@ -65,70 +92,45 @@ def detect_colour(linear: Image, clipped: Mask, seen: Mask | None = None) -> Col
 
     In a highlight's pixels the specular light is at least the tissue's, at least 10 % of the highlight's peak, and more
     than noise. Both parts follow from the tissue's own colour around each pixel (`split_light`), so there is no global
-    threshold.
-
-    Parameters
-    ----------
-    linear : ndarray of float32, shape (H, W, 3)
-        Linear values, share of full scale; white-balanced: light mirrored by the surface is grey.
-    clipped : ndarray of bool, shape (H, W)
-        Where a channel is clipped.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the view; default all.
+    threshold. `linear`, shape (H, W, 3), is white-balanced, share of full scale: light mirrored by the surface is grey.
+    `clipped`, shape (H, W), is where a channel is clipped, `seen` are the pixels inside the view, default all.
     """
-    light = split_light(linear, clipped, seen)
-    flat, white = plateaus(linear, clipped)
-    spots, candidates, bare = colour_spots(light, clipped, flat, seen)
-    spots, bright, foreign = tissue_spots(spots, candidates.shape)
-    # Only now: text is known by whole lines.
-    total = smooth(light.specular, SMOOTHING_PX, seen) + smooth(light.tissue, SMOOTHING_PX, seen)
-    spots = [spot for spot in spots if _stands_out(spot, total, bare)]
-    return judge_spots(spots, light, linear, bright, (flat, white), candidates & ~foreign, seen)
-
-
-def colour_spots(
-    light: SplitLight, clipped: Mask, flat: Mask, seen: Mask | None = None
-) -> tuple[list[Spot], Mask, Mask]:
-    """Find what shines in a frame, on tissue or not.
-
-    Parameters
-    ----------
-    light : SplitLight
-        The frame's two parts.
-    clipped, flat : ndarray of bool, shape (H, W)
-        Where a channel is clipped, and where all are.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the view; default all.
-
-    Returns
-    -------
-    list of Spot
-        The brightest first.
-    candidates, bare : ndarray of bool, shape (H, W)
-        Pixels that may belong to a highlight, and those away from all these.
-    """
-    smoothed = smooth(light.specular, SMOOTHING_PX, seen)
-    tissue = smooth(light.tissue, SMOOTHING_PX, seen)
+    picture = ColourPicture.of(linear, clipped, seen)
+    light, shape = picture.light, clipped.shape
+    specular, tissue = (picture.smoothed(part, SMOOTHING_PX) for part in (light.specular, light.tissue))
     noise = NOISE_LEFT * light.noise
     # candidates: pixels that may belong to a highlight, and what its peak must have
-    ratio = max(FAINT_RATIO, TEXTURE_FACTOR * _texture(smoothed, tissue, clipped, seen))
-    candidates = smoothed >= np.maximum(max(FOOT * LEAST_SPECULAR, NOISE_FACTOR * noise), FOOT * ratio * tissue)
-    if seen is not None:
-        candidates &= seen
+    ratio = max(FAINT_RATIO, TEXTURE_FACTOR * _texture(specular, tissue, ~clipped & picture.inside))
+    candidates = specular >= np.maximum(max(FOOT * LEAST_SPECULAR, NOISE_FACTOR * noise), FOOT * ratio * tissue)
+    candidates &= picture.inside
     least = np.maximum(max(LEAST_SPECULAR, PEAK_NOISE * noise), ratio * tissue)
-    spots = find_spots(smoothed, tissue, candidates, least, noise, flat)
-    bare = cv2.dilate(candidates.astype(np.uint8), _WIDE) == 0
-    if seen is not None:
-        bare &= seen
-    return _brighter_than_around(spots, smoothed + tissue, bare, ratio), candidates, bare
+    # what shines, on tissue or not
+    total, bare = specular + tissue, ~dilated(candidates, 2) & picture.inside
+    spots = find_spots(specular, tissue, candidates, least, noise, picture.flat)
+    spots = _brighter_than_around(spots, total, bare, ratio)
+    bright = _pixels(spots, shape)
+    foreign = find_foreign(bright)
+    spots = [spot for spot in spots if not foreign[spot.crop][spot.mask].mean() > ON_FOREIGN]
+    # Only now: text is known by whole lines.
+    spots = [spot for spot in spots if _stands_out(spot, total, bare)]
+    judged = [
+        (spot, highlight)
+        for spot, highlight in zip(spots, classify(spots, picture, bright), strict=True)
+        if highlight is not None
+    ]
+    spots = [spot for spot, _ in judged]
+    # pixels that show a highlight
+    mask = _pixels(spots, shape)
+    mask |= _feet(
+        spots, mask, light.specular, (light.specular >= SPECULAR_DIFFUSE_RATIO * light.tissue) & candidates & ~foreign
+    )
+    return ColourDetection(light, mask, _with_dim_marked([highlight for _, highlight in judged], light))
 
 
-def _texture(specular: Image, tissue: Image, clipped: Mask, seen: Mask | None) -> float:
+def _texture(specular: Image, tissue: Image, inside: Mask) -> float:
     """Return the robust spread of specular light over the tissue's, where the tissue's colour varies by itself."""
     # By all light: the tissue's part is filled in from around where a pixel has no colour, as a dark background has.
-    sound = ~clipped & (specular + tissue > TEXTURE_LIGHT) & (tissue > 0)
-    if seen is not None:
-        sound &= seen
+    sound = inside & (specular + tissue > TEXTURE_LIGHT) & (tissue > 0)
     values = specular[::2, ::2][sound[::2, ::2]] / tissue[::2, ::2][sound[::2, ::2]]
     if len(values) < MIN_TEXTURE_PX:
         return 0.0
@@ -136,7 +138,7 @@ def _texture(specular: Image, tissue: Image, clipped: Mask, seen: Mask | None) -
     return MAD_TO_SIGMA * float(median(np.abs(values - middle)))
 
 
-def _brighter_than_around(spots: list[Spot], total: Image, bare: Mask, ratio: float) -> list[Spot]:
+def _brighter_than_around(spots: list[SpecularSpot], total: Image, bare: Mask, ratio: float) -> list[SpecularSpot]:
     """Leave out spots that are paler than the bare tissue around, but no brighter."""
     if not spots:
         return spots
@@ -150,7 +152,7 @@ def _brighter_than_around(spots: list[Spot], total: Image, bare: Mask, ratio: fl
     ]
 
 
-def _stands_out(spot: Spot, total: Image, bare: Mask) -> bool:
+def _stands_out(spot: SpecularSpot, total: Image, bare: Mask) -> bool:
     """Return whether no bare tissue beside a spot comes near to its light; a wide one needs not be asked."""
     if spot.area_px > NARROW_PX:
         return True
@@ -159,6 +161,52 @@ def _stands_out(spot: Spot, total: Image, bare: Mask) -> bool:
     beside = np.s_[top : y + height + BESIDE_PX, left : x + width + BESIDE_PX]
     column, row = spot.peaks[0]
     return bool(total[beside].max(where=bare[beside], initial=0) <= STANDS_OUT * total[row, column])
+
+
+def _pixels(spots: list[SpecularSpot], shape: tuple[int, ...]) -> Mask:
+    """Return the pixels of spots."""
+    mask = np.zeros(shape, dtype=bool)
+    for spot in spots:
+        mask[spot.crop] |= spot.mask
+    return mask
+
+
+def _with_dim_marked(highlights: list[Highlight], light: SplitLight) -> list[Highlight]:
+    """Return highlights of which those are marked that are dim beside clipped ones."""
+    pixels = [highlight.region.peak[::-1] for highlight in highlights]
+    total = [float(light.specular[pixel]) + float(light.tissue[pixel]) for pixel in pixels]
+    shining = [own for own, each in zip(total, highlights, strict=True) if each.clipped > CLEARLY_CLIPPED]
+    least = DIM * max(shining, default=0.0)
+    return [
+        replace(each, dim=True) if each.area_px >= MIN_SHAPE_PX and own < least else each
+        for own, each in zip(total, highlights, strict=True)
+    ]
+
+
+def _feet(spots: list[SpecularSpot], mask: Mask, specular: Image, more: Mask) -> Mask:
+    """Return which of more pixels belong to the nearest spot: near it, and not far below its peak."""
+    if not spots:
+        return mask
+    number = np.zeros(mask.shape, dtype=np.int32)
+    for i, spot in enumerate(spots):
+        number[spot.crop][spot.mask] = i
+    # Ways between pixels stay inside the box around all of them.
+    x, y, width, height = cv2.boundingRect((mask | more).view(np.uint8))
+    box = np.s_[y : y + height, x : x + width]
+    away, nearest = cv2.distanceTransformWithLabels(
+        (~mask[box]).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    owner = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
+    owner[nearest[mask[box]]] = number[mask]
+    down, right = rows_and_columns((more & ~mask)[box])
+    rows, columns = down + y, right + x
+    mine = owner[nearest[down, right]]
+    reach = np.array([FOOT_REACH * np.sqrt(spot.area_px / np.pi) + 1 for spot in spots])
+    peak = np.array([spot.value for spot in spots])
+    near = (away[down, right] <= reach[mine]) & (specular[rows, columns] >= SPECULAR_PEAK_SHARE * peak[mine])
+    feet = np.zeros(mask.shape, dtype=bool)
+    feet[rows[near], columns[near]] = True
+    return feet
 
 
 @dataclass(frozen=True)
@@ -181,7 +229,11 @@ class ColourDetector:
             raise InputError(f"frame has shape {frame.encoded.shape}: detection by colour takes (H, W, 3)")
         view = view_of(frame)
         found = detect_colour(frame.channels, frame.clipped, view.seen)
-        return detection_of(found, frame, view, self.isolated)
+        kinds = (*SINGLE, Kind.CLUSTER) if self.isolated else tuple(Kind)
+        taken = tuple(highlight for highlight in found.highlights if highlight.kind in kinds)
+        others = tuple(highlight for highlight in found.highlights if highlight.kind not in kinds)
+        specular = replace(frame, seen=view.seen, light=found.light.specular)
+        return Detection(tuple(highlight.region for highlight in taken), specular, taken, others, view)
 
 
 colour = ColourDetector()

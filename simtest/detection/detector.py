@@ -1,23 +1,113 @@
-"""Detector protocol, and detectors by name through the entry-point group ``simtest.detectors``."""
+"""What a detector is and returns, and detectors by name through the entry-point group ``simtest.detectors``."""
 
 import contextlib
 import operator
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from simtest.calibration import Frame, Priors
-from simtest.detection.blobs import Highlight
-from simtest.detection.regions import Region
-from simtest.detection.view_mask import WHOLE, View
+from simtest.detection.view import View
 from simtest.errors import Failure, InputError
 from simtest.geometry import Camera
-from simtest.runtime.arrays import short_repr
+from simtest.runtime.arrays import Array, Index, short_repr
 from simtest.runtime.resources import EntryPointGroup
 
 DETECTORS = EntryPointGroup("simtest.detectors", "detector")
+
+
+@dataclass(frozen=True)
+class Region:
+    """The region of interest of a specularity.
+
+    Parameters
+    ----------
+    box : tuple of int
+        Column, row, width, height, px.
+    peak : tuple of int
+        Column and row of the brightest smoothed pixel.
+    contrast : float or None
+        Peak above its surroundings, frame units; None for a region that was given, not detected.
+    """
+
+    box: tuple[int, int, int, int]
+    peak: tuple[int, int]
+    contrast: float | None
+
+
+class Kind(StrEnum):
+    """Kinds of highlights; isolated, clipped and small ones may carry one normal."""
+
+    ISOLATED = "isolated"
+    CLIPPED = "clipped"
+    SMALL = "small"
+    CLUSTER = "cluster"
+    ELONGATED = "elongated"
+    MERGED = "merged"
+    BORDER = "border"
+    INTER_REFLECTION = "inter_reflection"
+    UNCLEAR = "unclear"
+
+
+SINGLE = frozenset({Kind.ISOLATED, Kind.CLIPPED, Kind.SMALL})
+"""Kinds that may carry one normal."""
+
+
+@dataclass(frozen=True)
+class Highlight:
+    """A highlight of a colour frame, or several that touch.
+
+    Parameters
+    ----------
+    region : Region
+        Region of interest; its contrast is the specular light at the peak, share of full scale.
+    kind : Kind
+        Its kind.
+    score : float
+        In [0, 1]: likeness of shape, colour and height to an isolated highlight's.
+    area_px : int
+        Pixels above half of its peak, a cluster's above half of its peaks and the saddles between them.
+    axis_ratio, residual, wander : float or None
+        Of its ellipse at half height; RMS distance from it, and largest distance between the nested ellipses' centres,
+        as shares of its radius; None where no ellipse fits.
+    tint : float
+        Gain of the weakest channel over the tissue around, over that of the strongest: 1 for grey light.
+    clutter : float
+        Specular light of the surroundings, over the peak's.
+    outline : ndarray, shape (N, 2)
+        Its isophote at half height, px, closed; the border of its pixels where that is open or holds other highlights.
+    peaks : ndarray of int, shape (P, 2)
+        Column and row of each highlight in it, the brightest first; one but for clusters.
+    clipped : float
+        Share of its pixels that are clipped.
+    dim : bool
+        Whether it is resolved and darker than clipped highlights of the frame: the normal may only come near the
+        bisector there (theory.md 7.1b).
+    """
+
+    region: Region
+    kind: Kind
+    score: float
+    area_px: int
+    axis_ratio: float | None
+    residual: float | None
+    wander: float | None
+    tint: float
+    clutter: float
+    outline: Array
+    peaks: Index = field(default_factory=lambda: np.empty((0, 2), dtype=np.intp))
+    clipped: float = 0.0
+    dim: bool = False
+
+    __repr__ = short_repr
+
+    @property
+    def is_isolated(self) -> bool:
+        """Whether it may carry one normal."""
+        return self.kind in SINGLE
 
 
 @dataclass(frozen=True)
@@ -42,7 +132,7 @@ class Detection:
     frame: Frame
     highlights: tuple[Highlight, ...] = ()
     others: tuple[Highlight, ...] = ()
-    view: View = WHOLE
+    view: View = field(default_factory=View)
     refusal: Failure | None = None
 
     __repr__ = short_repr

@@ -402,9 +402,9 @@ def connected(mask: Mask, diagonally: bool = False) -> npt.NDArray[np.int32]:
     return np.asarray(labels, dtype=np.int32)
 
 
-def dilated(mask: Mask) -> Mask:
-    """Return a mask, shape (H, W), with the eight neighbours of its pixels."""
-    return np.asarray(cv2.dilate(_bytes(mask), _SQUARE), dtype=bool)
+def dilated(mask: Mask, by_px: int = 1) -> Mask:
+    """Return a mask, shape (H, W), with the square of so many pixels to each side around each of its pixels."""
+    return np.asarray(cv2.dilate(_bytes(mask), np.ones((2 * by_px + 1, 2 * by_px + 1), np.uint8)), dtype=bool)
 
 
 def closed(mask: Mask) -> Mask:

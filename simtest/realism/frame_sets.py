@@ -175,8 +175,8 @@ class _Rendered:
         # Imported here: sets of files need no renderer.
         from simtest.dataset.maker import colour_variant
         from simtest.rendering import Session
-        from simtest.simulation.camera_chain import displayed
-        from simtest.simulation.rendered_view import render_picture
+        from simtest.simulation.frame import render_picture
+        from simtest.simulation.sensor import displayed
 
         scene = varied(self.base, number)
         # Each frame has a relief of its own: none is kept in the user's cache.

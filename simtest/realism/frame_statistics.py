@@ -13,8 +13,8 @@ import numpy as np
 
 from simtest.calibration import Calibration, Frame, Response
 from simtest.conventions import DEFAULT_SMOOTHING_PX
-from simtest.detection.blobs import Highlight
 from simtest.detection.colour import ColourDetector
+from simtest.detection.detector import Highlight
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction.picture_values import is_coloured

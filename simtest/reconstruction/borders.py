@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from simtest.detection.view_mask import DARK, View
+from simtest.detection.view import DARK, View
 
 BORDERED = "the picture has dark borders"
 """How the note about borders begins."""

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from simtest.conventions import PIXEL_CENTRE
-from simtest.detection.blobs import Highlight
-from simtest.detection.view_mask import View
+from simtest.detection.detector import Highlight
+from simtest.detection.view import View
 from simtest.errors import Failure, Reason
 from simtest.estimators.protocol import Estimate, EstimatedCurvature, Target, drawable
 from simtest.geometry import Camera

@@ -4,7 +4,7 @@ import numpy as np
 
 from simtest.calibration import Calibration, Frame
 from simtest.detection.detector import Detector, load_detector, run_detector
-from simtest.detection.view_mask import find_view
+from simtest.detection.view import find_view
 from simtest.errors import Failure
 from simtest.estimators.learned_dense import DenseMaps, LearnedDense, learned_dense
 from simtest.geometry import Array

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from simtest.calibration import Calibration
 from simtest.detection.detector import load_detector
-from simtest.detection.view_mask import find_view
+from simtest.detection.view import find_view
 from simtest.errors import InputError
 from simtest.estimators.protocol import Target
 from simtest.reconstruction.assumptions import Extent, calibration_of_round_view, calibration_of_view

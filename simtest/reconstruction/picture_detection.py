@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from simtest.calibration import Calibration, Frame, Response
 from simtest.detection.colour import ColourDetection, detect_colour
-from simtest.detection.view_mask import View, find_view
+from simtest.detection.view import View, find_view
 from simtest.geometry import Camera
 from simtest.reconstruction.choices import SMOOTHING_BY_COLOUR_PX
 from simtest.runtime.arrays import Image, Mask

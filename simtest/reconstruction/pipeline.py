@@ -11,9 +11,8 @@ from simtest.calibration import Calibration, Frame, Priors
 from simtest.calibration.frame import Box
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
-from simtest.detection.blobs import Kind
 from simtest.detection.colour import ColourDetector
-from simtest.detection.detector import Detection, Detector, load_detector, run_detector
+from simtest.detection.detector import Detection, Detector, Kind, load_detector, run_detector
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import prepare, run_in_frame

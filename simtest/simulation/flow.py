@@ -1,9 +1,10 @@
-"""Optical flow between two frames of a sequence, and which surface points both of them see.
+"""Optical flow between two frames of a sequence, which surface points both of them see, and flow as a picture.
 
 The flow at a pixel's centre is exact: the surface point on its ray, moved to the other frame's moment, and projected by
 the other frame's camera. It needs no search for matches, so it is true where a highlight slides over the surface, too.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.geometry import Camera
+from simtest.geometry.patch import dilated
 from simtest.rendering import Session
-from simtest.runtime.arrays import Array, Mask
+from simtest.runtime.arrays import Array, Mask, Picture
 from simtest.surfaces.deformation import DeformationAt, DeformedSurface
 
 NONE, SEEN, OUT, HIDDEN, INSTRUMENT = range(5)
@@ -36,6 +38,15 @@ EXACT = 1e-9
 JUMP = 0.02
 """Where the distances of neighbours differ by more than this share there is an edge."""
 
+PERCENTILE = 99.0
+"""Of the flow's lengths: it and longer ones have full colour."""
+
+WHEEL_SHARE = 0.2
+"""Diameter of the key's wheel over the picture's height."""
+
+HIDDEN_VALUE = 0.45
+"""Brightness of what the other frame does not see; what has no flow is black."""
+
 _NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 
 Moved = Callable[[Array], Array]
@@ -53,18 +64,10 @@ def moved_between(session: Session, first_s: float, second_s: float) -> Moved | 
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """What a frame sees of the surface.
+    """What a frame sees of the surface, world frame, mm.
 
-    Parameters
-    ----------
-    camera : Camera
-        Its camera.
-    world_from_camera : ndarray, shape (4, 4)
-        The camera's pose, mm.
-    position : ndarray, shape (H, W, 3)
-        Surface point at each pixel's centre, world frame, mm; NaN where there is none.
-    instrument : ndarray of uint8, shape (H, W), or None
-        Not 0 where an instrument is seen; None: nowhere.
+    `position`, shape (H, W, 3), is the surface point at each pixel's centre, NaN where there is none, also behind an
+    instrument; `instrument` is not 0 where one is seen, None: nowhere.
     """
 
     camera: Camera
@@ -105,13 +108,9 @@ class SeenSurface:
 class Flow:
     """Flow from one frame to another.
 
-    Parameters
-    ----------
-    flow_px : ndarray, shape (H, W, 2)
-        Where the surface point at each pixel's centre lies in the other frame, less that centre, px; also where the
-        other frame does not see it. NaN where there is no surface point or the other camera images none.
-    state : ndarray of uint8, shape (H, W)
-        Index in `STATES`.
+    `flow_px`, shape (H, W, 2), is where the surface point at each pixel's centre lies in the other frame, less that
+    centre, also where the other frame does not see it; NaN where there is no surface point or the other camera images
+    none. `state`, shape (H, W), is an index in `STATES`.
     """
 
     flow_px: Array
@@ -126,21 +125,10 @@ class Flow:
 
 
 def flow_between(session: Session, first: SeenSurface, second: SeenSurface, moved: Moved | None = None) -> Flow:
-    """Compute the flow from the first frame to the second.
+    """Compute the flow from the first frame to the second, in either order of time.
 
-    Parameters
-    ----------
-    session : Session
-        At a scene whose surface has the form of the second frame's moment.
-    first, second : SeenSurface
-        The frames, in either order of time.
-    moved : callable, optional
-        See `Moved`, from the first frame's moment to the second's; default points stay.
-
-    Returns
-    -------
-    Flow
-        At the pixels of the first frame.
+    The session is at a scene whose surface has the form of the second frame's moment, and `moved` leads there from the
+    first's (see `Moved`); default: points stay.
     """
     size = first.position.shape[:2]
     points = first.position.reshape(-1, 3)
@@ -207,8 +195,7 @@ def _not_shown(session: Session, centre: Array, points: Array) -> Mask:
 def _edges(state: npt.NDArray[np.uint8], frame: SeenSurface) -> Mask:
     """Return which pixels that both frames see lie beside one that they do not, or at a jump of the distance."""
     seen = state == SEEN
-    gone = ((state == NONE) | (state == HIDDEN)).astype(np.uint8)
-    beside = cv2.dilate(gone, _NEIGHBOURS) > 0
+    beside = dilated((state == NONE) | (state == HIDDEN))
     distance = np.linalg.norm(frame.position - frame.world_from_camera[:3, 3], axis=-1).astype(np.float32)
     far = cv2.dilate(np.nan_to_num(distance, nan=0.0), _NEIGHBOURS)
     near = cv2.erode(np.nan_to_num(distance, nan=np.inf), _NEIGHBOURS)
@@ -221,3 +208,47 @@ def _at(image: npt.NDArray[np.uint8], points_px: Array) -> npt.NDArray[np.uint8]
     columns = np.clip(points_px[:, 0].astype(np.int64), 0, width - 1)
     rows = np.clip(points_px[:, 1].astype(np.int64), 0, height - 1)
     return image[rows, columns]
+
+
+def flow_picture(flow: Flow, full_px: float | None = None) -> Picture:
+    """Return flow as a picture, shape (H, W, 3), uint8, blue first, with a wheel as its key.
+
+    Full colour has the length `full_px`, default the percentile `PERCENTILE` of the flow's own.
+    """
+    known = np.isfinite(flow.flow_px).all(axis=-1)
+    if full_px is None:
+        lengths = np.hypot(*flow.flow_px[known].T)
+        full_px = float(np.percentile(lengths, PERCENTILE)) if len(lengths) else 1.0
+    value = np.where(flow.state == SEEN, 1.0, HIDDEN_VALUE) * known
+    picture = _coloured(np.nan_to_num(flow.flow_px), value, full_px)
+    _draw_key(picture, full_px)
+    return picture
+
+
+def _coloured(flow_px: Array, value: Array, full_px: float) -> Picture:
+    """Return the colours, blue first, of flow, shape (H, W, 2), with a brightness, shape (H, W), in [0, 1]."""
+    x, y = flow_px[..., 0], flow_px[..., 1]
+    # OpenCV's hue of 8 bits counts 2 deg; right is red, down is yellow-green.
+    hue = np.degrees(np.arctan2(y, x)) % 360 / 2
+    length = np.minimum(np.hypot(x, y) / max(full_px, 1e-12), 1.0)
+    hsv = np.stack([hue, 255 * length, 255 * value], axis=-1).astype(np.uint8)
+    return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR), dtype=np.uint8)
+
+
+def _draw_key(picture: Picture, full_px: float) -> None:
+    """Draw the wheel in the lower right corner: a point's colour is that of the flow from the centre to it."""
+    height, width = picture.shape[:2]
+    size = min(math.ceil(WHEEL_SHARE * height), width)
+    radius = size / 2
+    axis = (np.arange(size) + 0.5 - radius) / radius
+    pairs = np.stack(np.meshgrid(axis, axis), axis=-1)
+    inside = np.hypot(pairs[..., 0], pairs[..., 1]) <= 1
+    wheel = _coloured(pairs, np.ones(pairs.shape[:2]), 1.0)
+    corner = picture[height - size :, width - size :]
+    corner[inside] = wheel[inside]
+    label, scale = f"{full_px:.3g} px", max(size / 200, 0.3)
+    (text_width, text_height), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    at = (width - text_width - 2, height - size - max(text_height // 2, 2))
+    # A dark border: the picture below may have any colour.
+    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(picture, label, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thickness, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""Writes a labelled frame: picture, radiance, ground truth, and what reconstruction may know of it."""
+"""Writes a labelled frame: picture, radiance, truth, and what reconstruction may know of it; sheets of pictures."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +11,11 @@ import numpy.typing as npt
 from simtest.calibration import Calibration, Response
 from simtest.rendering.bitmap import write_exr
 from simtest.runtime import provenance
-from simtest.runtime.arrays import Image, write_arrays
+from simtest.runtime.arrays import Image, Picture, write_arrays
 from simtest.runtime.files import Json, make_folder, write_atomically, write_json
-from simtest.simulation.camera_chain import to_uint8
-from simtest.simulation.clouds import cloud_json
-from simtest.simulation.labelled_frame import LabelledFrame
-from simtest.simulation.preview import preview
+from simtest.simulation.frame import LabelledFrame, preview
+from simtest.simulation.highlights import cloud_json
+from simtest.simulation.sensor import to_uint8
 from simtest.spec import Scene, calibration_toml, camera_toml, describe_camera
 from simtest.spec.sensor import Sensor
 
@@ -48,7 +47,8 @@ FIELDS = {
     "one that fails",
     "clouds": "frame.json: the same points of the base, without the relief; on a smooth surface the highlights",
     "visible_highlights": "frame.json: spots of the noise-free frame; value and specular are radiance, glints indices "
-    "in highlights, area_px the pixels above half of the lobe's peak, light and cloud those of the nearest lit glint",
+    "in highlights, area_px the pixels above half of the lobe's peak, light and cloud those of its brightest glint, or "
+    "else of the nearest lit one",
 }
 
 INSTRUMENT_FIELDS = {
@@ -58,6 +58,9 @@ INSTRUMENT_FIELDS = {
     "highlight of the surface",
 }
 """Further fields of a scene with instruments."""
+
+SHEET_WIDTH, SHEET_COLUMNS = 1600, 10
+"""Of a sheet of pictures: its width, px, and how many stand side by side."""
 
 FILES = ("frame.png", "radiance.exr", "truth.npz", "frame.json", "camera.toml", "calibration.toml", "preview.jpg")
 """What a labelled frame is written as."""
@@ -141,27 +144,23 @@ def encoded_png(image: Image, sensor: Sensor) -> bytes:
 
 
 def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
+    """Return the arrays of truth.npz."""
     truth, radiance = frame.truth, frame.radiance
-    assert truth.direction_min is not None
-    assert truth.direction_max is not None
-    of_instruments = {"instrument": truth.instrument} if frame.scene.shown_instruments else {}
+    vectors = ("normal", "normal_base", "shading_normal", "geometric_normal")
+    maps = {
+        "depth_mm": truth.depth,
+        "position_mm": truth.position,
+        **{name: getattr(truth, name) for name in vectors},
+        "curvature": np.stack([truth.k_min, truth.k_max], axis=-1),
+        "curvature_base": np.stack([truth.k_min_base, truth.k_max_base], axis=-1),
+        **{name: getattr(truth, name) for name in ("direction_min", "direction_max")},
+    }
     return {
-        "depth_mm": truth.depth.astype(np.float32),
-        "position_mm": truth.position.astype(np.float32),
-        "normal": truth.normal.astype(np.float32),
-        "normal_base": truth.normal_base.astype(np.float32),
-        "shading_normal": truth.shading_normal.astype(np.float32),
-        "geometric_normal": truth.geometric_normal.astype(np.float32),
-        "curvature": np.stack([truth.k_min, truth.k_max], axis=-1).astype(np.float32),
-        "curvature_base": np.stack([truth.k_min_base, truth.k_max_base], axis=-1).astype(np.float32),
-        "direction_min": truth.direction_min.astype(np.float32),
-        "direction_max": truth.direction_max.astype(np.float32),
-        "radiance_specular": radiance.specular,
-        "radiance_diffuse": radiance.diffuse,
-        "radiance_indirect": radiance.indirect,
+        **{name: values.astype(np.float32) for name, values in maps.items()},
+        **{f"radiance_{part}": getattr(radiance, part) for part in ("specular", "diffuse", "indirect")},
         "pool": truth.pool,
         "mask": truth.mask,
-        **of_instruments,
+        **({"instrument": truth.instrument} if frame.scene.shown_instruments else {}),
     }
 
 
@@ -189,3 +188,20 @@ def _description(frame: LabelledFrame) -> Json:
     described["visible_highlights"] = [spot.to_json() for spot in frame.visible_highlights]
     origin = cast("dict[str, Json]", provenance.environment())
     return {**described, "fields": fields, "provenance": {**origin, "variant": frame.variant}}
+
+
+def thumbnail(picture: Picture) -> Picture:
+    """Return a picture, shape (H, W, 3), at the size it has on a sheet."""
+    width = SHEET_WIDTH // SHEET_COLUMNS
+    size = (width, round(width * picture.shape[0] / picture.shape[1]))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def write_sheet(path: Path, pictures: list[Picture]) -> None:
+    """Write pictures of one size, blue first, in rows, in order, as one picture."""
+    columns = min(SHEET_COLUMNS, len(pictures))
+    filled = [*pictures, *[np.zeros_like(pictures[0])] * (-len(pictures) % columns)]
+    rows = [np.hstack(filled[first : first + columns]) for first in range(0, len(filled), columns)]
+    ok, data = cv2.imencode(".png", np.vstack(rows))
+    assert ok
+    write_atomically(path, lambda part: part.write_bytes(bytes(data)))

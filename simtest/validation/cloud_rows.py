@@ -12,8 +12,8 @@ from simtest.estimators.protocol import CloudEstimator
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import Specularity
 from simtest.rendering import HighlightPoint, Session
-from simtest.simulation import clouds as regions
-from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.frame import RenderedView
+from simtest.simulation.highlights import assign_clouds
 from simtest.validation.columns import Row
 from simtest.validation.metrics import MISSED, estimate_columns, mahalanobis2, scene_columns
 from simtest.validation.rough_truth import Cloud, cloud_columns
@@ -69,7 +69,7 @@ def match_cloud(session: Session, view: RenderedView, estimate: Estimate) -> lis
     points, centres = estimate.cloud.points_px, list(view.clouds)
     votes: dict[int, int] = {}
     for light in sorted({centre.light for centre in centres}):
-        owners = regions.assign(session, np.full(len(points), light), points, centres)
+        owners = assign_clouds(session, np.full(len(points), light), points, centres)
         counts = Counter(n for n in owners if n is not None)
         if counts:
             best = [n for n, count in counts.items() if count == max(counts.values())]

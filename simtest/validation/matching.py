@@ -9,7 +9,7 @@ from simtest.errors import Failure
 from simtest.geometry.patch import encloses
 from simtest.reconstruction.pipeline import Specularity
 from simtest.runtime.arrays import Array
-from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.frame import RenderedView
 
 
 def match(specularities: Sequence[Specularity], points_px: Sequence[Array]) -> dict[int, int]:

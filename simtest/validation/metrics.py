@@ -15,7 +15,7 @@ from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import Specularity
 from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.arrays import Array
-from simtest.simulation.true_highlights import TrueHighlight
+from simtest.simulation.highlights import TrueHighlight
 from simtest.spec.scene import Scene
 from simtest.validation import laws
 from simtest.validation.columns import Row

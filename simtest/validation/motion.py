@@ -18,7 +18,7 @@ from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import Stage, generator
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec import Experiment, Scene
 from simtest.spec.camera import Moved, Views
 from simtest.validation.cases import Case

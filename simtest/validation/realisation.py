@@ -10,8 +10,8 @@ from simtest.estimators.protocol import laws_of
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image, Picture, only_reading
-from simtest.simulation.rendered_view import RenderedView, render_view
-from simtest.simulation.true_highlights import TrueHighlight
+from simtest.simulation.frame import RenderedView, render_view
+from simtest.simulation.highlights import TrueHighlight
 from simtest.spec import Experiment
 from simtest.validation.cases import Case
 from simtest.validation.cloud_rows import apart, cloud_rows, of_clouds

@@ -21,7 +21,7 @@ from simtest.reconstruction import Specularities, reconstruct
 from simtest.rendering import Frame, HighlightPoint, Session, TruthMaps
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.processes import make_engine
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec import Scene, load_dataset
 from simtest.spec.scene import scene_from_dict
 from studies.corners import formulas

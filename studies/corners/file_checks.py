@@ -18,8 +18,8 @@ from simtest.errors import Failure
 from simtest.reconstruction import Specularity, reconstruct
 from simtest.reconstruction.picture import Options
 from simtest.simulation.flow import HIDDEN, OUT, SEEN
+from simtest.simulation.frame import make_frame
 from simtest.simulation.frame_files import write_frame
-from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import load_calibration
 from simtest.spec.recipes import Experiment, Group
 from studies.corners import formulas

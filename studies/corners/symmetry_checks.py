@@ -13,7 +13,7 @@ from simtest.geometry import BrownConrady, Camera
 from simtest.reconstruction import reconstruct
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array
-from simtest.simulation.true_highlights import TrueHighlight
+from simtest.simulation.highlights import TrueHighlight
 from studies.corners import formulas
 from studies.corners.case import ESTIMATORS, TURN, Case, Faults, View, mean
 

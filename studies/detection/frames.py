@@ -17,7 +17,7 @@ from simtest.geometry import Camera
 from simtest.rendering import Radiance, Session
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.runtime.seeds import Stage, generator
-from simtest.simulation.camera_chain import capture, collect
+from simtest.simulation.sensor import capture, collect
 from simtest.spec import Scene, scene_from_dict
 from simtest.spec.toml_files import toml_value
 from simtest.surfaces.recipe import load_anatomy

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.detection.blobs import Highlight
+from simtest.detection.detector import Highlight
 from simtest.reconstruction import detect_in_picture
 from simtest.reconstruction.image_io import read_picture
 from simtest.reconstruction.picture_detection import PictureDetection

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, PIXEL_CENTRE
-from simtest.detection.blobs import Highlight, Kind
+from simtest.detection.detector import Highlight, Kind
 from simtest.geometry.patch import encloses
 from simtest.reconstruction import detect_in_picture
 from studies.detection.tissue_frames import TISSUES, TissueFrame, tissue_frames

@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from simtest.rendering import Session
 from simtest.runtime.files import make_folder, write_atomically
-from simtest.simulation.camera_chain import displayed
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.frame import RenderedView, render_view
+from simtest.simulation.sensor import displayed
 from simtest.spec import load_scene
 from studies.kept import of_this_code
 
@@ -81,8 +81,8 @@ def _settings(tissue: str, seed: int) -> dict[str, int]:
 
 
 def _frame(name: str, view: RenderedView, seed: int) -> TissueFrame:
-    from simtest.simulation.camera_chain import collect
-    from simtest.simulation.visible_highlights import find_spots
+    from simtest.simulation.highlights import find_spots
+    from simtest.simulation.sensor import collect
 
     picture = np.rint(255 * displayed(view.frame(seed), view.scene.sensor)).astype(np.uint8)
     light = view.light if view.light.ndim == 2 else view.light.mean(axis=2)

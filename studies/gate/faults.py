@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from simtest.geometry import ellipse_fit, patch
-from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.frame import RenderedView
 from studies.mutants.planting import Mutation, planted
 from studies.mutants.rows import BY_NAME
 

@@ -16,8 +16,8 @@ from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, Specularity,
 from simtest.rendering import Radiance, Session
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import key as hashed
-from simtest.simulation.rendered_view import RenderedView, render_view
-from simtest.simulation.true_highlights import TrueHighlight
+from simtest.simulation.frame import RenderedView, render_view
+from simtest.simulation.highlights import TrueHighlight
 from simtest.validation.matching import match, peak_px
 from simtest.validation.metrics import mahalanobis2
 from studies.hard.cases import Case, calibration_of, scene_of

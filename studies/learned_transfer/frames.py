@@ -23,8 +23,8 @@ from simtest.errors import InputError, SimtestError
 from simtest.runtime.arrays import AnyArray, Array, Image
 from simtest.runtime.files import make_folder, write_atomically
 from simtest.runtime.seeds import key as hashed
-from simtest.simulation.camera_chain import displayed
-from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.frame import RenderedView
+from simtest.simulation.sensor import displayed
 from studies.hard.cases import scene_of
 from studies.hard.measure import Frames
 from studies.hard.rows import PICTURE, Row, lit_from, moving, plain, vessels, wide, with_relief

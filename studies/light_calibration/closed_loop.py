@@ -26,7 +26,7 @@ from simtest.reconstruction.light_calibration.run import Ball, calibrate_lights,
 from simtest.reconstruction.light_calibration.write import write_calibration
 from simtest.reconstruction.pipeline import run_picture
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import RenderedView, render_view
+from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec import Scene, load_scene
 from simtest.spec.calibration_file import load_calibration, save_calibration
 from studies.light_calibration.plantings import plant

@@ -28,7 +28,7 @@ from simtest.estimators.isophote_family import MEAN_RIPPLES, PEAK_RIPPLES, Isoph
 from simtest.geometry import Array, Camera, Mask, Patch, chi_squared
 from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, run_pipeline
 from simtest.runtime.seeds import Stage, generator
-from simtest.simulation.camera_chain import capture, collect
+from simtest.simulation.sensor import capture, collect
 from simtest.spec.sensor import Sensor
 from studies.ripples_fit.fields import HEIGHT, WIDTH, Field, draw
 

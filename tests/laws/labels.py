@@ -14,8 +14,8 @@ from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
 from simtest.rendering import Session
 from simtest.runtime.arrays import AnyArray, Array
+from simtest.simulation.frame import make_frame
 from simtest.simulation.frame_files import encoded_png, write_frame
-from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import scene_from_dict
 from simtest.spec.recipes import Dataset
 from simtest.spec.sensor import Sensor

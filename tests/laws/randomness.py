@@ -6,7 +6,7 @@ import numpy as np
 
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import Experiment, scene_from_dict
 from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import expand

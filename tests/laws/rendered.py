@@ -8,7 +8,7 @@ import numpy as np
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import Experiment, Scene, scene_from_dict
 from simtest.validation.cases import expand
 from simtest.validation.realisation import Realisation, realise

@@ -13,7 +13,7 @@ from simtest.calibration.photometry import AngularProfile
 from simtest.geometry import Camera, smooth
 from simtest.geometry.patch import share_of_noise
 from simtest.runtime.arrays import Array, Image
-from simtest.simulation.camera_chain import capture, collect, to_uint8
+from simtest.simulation.sensor import capture, collect, to_uint8
 from simtest.spec.sensor import Sensor
 from tests.laws import by_hand
 from tests.laws.law import Law, law

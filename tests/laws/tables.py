@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from simtest.detection.regions import detect, half_height_component
+from simtest.detection.peaks import detect, half_height_component
 from simtest.estimators import Estimate, load_estimators
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
-from simtest.simulation.rendered_view import render_view
-from simtest.simulation.true_highlights import Examined, verdicts
+from simtest.simulation.frame import render_view
+from simtest.simulation.highlights import Examined, verdicts
 from simtest.spec import Experiment
 from simtest.spec.recipes import PaperSetting
 from simtest.validation import laws

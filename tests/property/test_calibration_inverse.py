@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from simtest.calibration import Calibration, NoiseModel, Response
 from simtest.calibration.photometry import AngularProfile
 from simtest.geometry import Camera
-from simtest.simulation.camera_chain import capture, collect
+from simtest.simulation.sensor import capture, collect
 from simtest.spec.sensor import Sensor
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 14.0, 13.0)

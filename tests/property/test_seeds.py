@@ -19,7 +19,7 @@ from simtest.realism.fitting.frames import FrameMaker
 from simtest.realism.frame_statistics import COLUMNS
 from simtest.runtime.resources import data_root
 from simtest.runtime.seeds import Stage, from_integer, generator, integer
-from simtest.simulation.camera_chain import capture
+from simtest.simulation.sensor import capture
 from simtest.spec import Experiment, load_dataset, scene_from_dict
 from simtest.spec.lights import Rig
 from simtest.spec.reflectance import TissueColour

@@ -12,7 +12,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, generator
-from simtest.simulation.camera_chain import expose
+from simtest.simulation.sensor import expose
 from simtest.spec import scene_from_dict
 from simtest.validation import laws
 from tests.marked import marked

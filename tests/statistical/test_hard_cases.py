@@ -18,7 +18,7 @@ from simtest.geometry import Camera, ViewMask
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import load_scene, scene_from_dict
 from simtest.validation.matching import match
 from simtest.validation.metrics import mahalanobis2

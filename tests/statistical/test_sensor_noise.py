@@ -6,7 +6,7 @@ from scipy import stats
 
 from simtest.calibration import NoiseModel
 from simtest.runtime.seeds import Stage, generator
-from simtest.simulation.camera_chain import capture
+from simtest.simulation.sensor import capture
 from simtest.spec.sensor import Sensor
 
 ALPHA = 0.01

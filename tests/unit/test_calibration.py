@@ -17,7 +17,7 @@ from simtest.estimators.clipping import plateau_area_px
 from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
 from simtest.reconstruction.pipeline import reconstruct, run_pipeline
-from simtest.simulation.camera_chain import capture, collect
+from simtest.simulation.sensor import capture, collect
 from simtest.spec import load_calibration, load_camera, save_calibration
 from simtest.spec.sensor import Sensor
 

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy import ndimage, stats
 
 from simtest.errors import InputError
-from simtest.simulation import camera_chain, coding, labelled_frame, mosaic, shot_noise, video_processor
+from simtest.simulation import sensor as camera_chain
+from simtest.simulation.frame import make_frame
 from simtest.spec.scene import scene_from_dict
 from simtest.spec.sensor import (
     Box,
@@ -45,7 +46,7 @@ def colour_at(pattern, row, column):
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_each_pixel_measures_the_colour_of_its_filter(pattern):
     frame = picture((5, 7, 3))
-    plane = mosaic.sample(frame, Mosaic(pattern=pattern))
+    plane = camera_chain.behind_filters(frame, Mosaic(pattern=pattern))
     expected = [[frame[i, j, colour_at(pattern, i, j)] for j in range(7)] for i in range(5)]
     np.testing.assert_array_equal(plane, np.array(expected))
 
@@ -83,8 +84,8 @@ def edge_aware(plane, pattern):
 @pytest.mark.parametrize(("method", "reference"), [("bilinear", bilinear), ("edge_aware", edge_aware)])
 def test_demosaicing_equals_a_plain_reference_to_rounding(pattern, method, reference):
     spec = Mosaic(pattern=pattern, demosaicing=method)
-    plane = mosaic.sample(picture((24, 30, 3), smooth=1.0), spec)
-    found = mosaic.demosaic(plane, spec)
+    plane = camera_chain.behind_filters(picture((24, 30, 3), smooth=1.0), spec)
+    found = camera_chain.demosaic(plane, spec)
     inside = np.s_[2:-2, 2:-2]
     gap = np.abs(found[inside] - reference(plane, pattern)[inside])
     # Red and blue of the edge-aware method differ in how they are rounded and, at edges, filled.
@@ -100,12 +101,12 @@ def test_demosaicing_keeps_a_constant_and_the_measured_values(method):
     spec = Mosaic(demosaicing=method)
     constant = np.broadcast_to(np.float32([0.2, 0.5, 0.7]), (16, 16, 3))
     step = 1 / 65535 if method != "vng" else 2 / 255
-    found = mosaic.demosaic(mosaic.sample(constant, spec), spec)
+    found = camera_chain.demosaic(camera_chain.behind_filters(constant, spec), spec)
     np.testing.assert_allclose(found, constant, atol=step)
     frame = picture(seed=3)
-    found = mosaic.demosaic(mosaic.sample(frame, spec), spec)[4:-4, 4:-4]
-    again = mosaic.sample(found, spec)
-    np.testing.assert_allclose(again, mosaic.sample(frame[4:-4, 4:-4], spec), atol=step)
+    found = camera_chain.demosaic(camera_chain.behind_filters(frame, spec), spec)[4:-4, 4:-4]
+    again = camera_chain.behind_filters(found, spec)
+    np.testing.assert_allclose(again, camera_chain.behind_filters(frame[4:-4, 4:-4], spec), atol=step)
 
 
 def test_vng_follows_slopes_and_edges():
@@ -114,13 +115,16 @@ def test_vng_follows_slopes_and_edges():
     for slopes in [(0.006, 0.0), (0.0, 0.006), (0.003, -0.004)]:
         root = 0.4 + slopes[0] * x + slopes[1] * y
         white = np.repeat(np.square(root).astype(np.float32)[..., None], 3, axis=2)
-        found = mosaic.demosaic(mosaic.sample(white, Mosaic()), Mosaic(demosaicing="vng"))
+        found = camera_chain.demosaic(camera_chain.behind_filters(white, Mosaic()), Mosaic(demosaicing="vng"))
         gap = np.sqrt(found[4:-4, 4:-4]) - root[4:-4, 4:-4, None]
         # Sums of codes are divided in whole numbers, each by less than one code.
         assert np.abs(gap).max() < 2 / 255
     edge = np.repeat(np.where(x > 22, 0.6, 0.1).astype(np.float32)[..., None], 3, axis=2)
     tint = [
-        np.ptp(mosaic.demosaic(mosaic.sample(edge, Mosaic()), Mosaic(demosaicing=way))[4:-4, 4:-4], axis=2).mean()
+        np.ptp(
+            camera_chain.demosaic(camera_chain.behind_filters(edge, Mosaic()), Mosaic(demosaicing=way))[4:-4, 4:-4],
+            axis=2,
+        ).mean()
         for way in ("vng", "bilinear")
     ]
     assert tint[0] < 0.85 * tint[1]
@@ -188,7 +192,7 @@ def test_bad_colours_are_named(colour, words):
 def test_sharpening_equals_direct_convolution():
     frame = picture((40, 50, 3))
     spec = Sharpening(radius_px=1.3, amount=0.9)
-    found = video_processor.sharpen(frame, spec)
+    found = camera_chain.sharpen(frame, spec)
     value = frame @ np.float32([0.299, 0.587, 0.114])
     # OpenCV takes the Gaussian of floats out to 4 sigma.
     radius = (round(1.3 * 4 * 2 + 1) | 1) // 2
@@ -202,7 +206,7 @@ def test_halo_of_a_step_has_its_closed_form(amount):
     low, high, sigma = 0.3, 0.8, 2.0
     edge = np.where(np.arange(64) < 32, low, high).astype(np.float32)
     frame = np.repeat(edge[None, :], 16, axis=0)
-    found = video_processor.sharpen(frame, Sharpening(radius_px=sigma, amount=amount))
+    found = camera_chain.sharpen(frame, Sharpening(radius_px=sigma, amount=amount))
     depth = low - found[8, 31]
     assert depth == pytest.approx(amount * (high - low) * stats.norm.sf(0.5 / sigma), abs=2e-3)
     assert (depth > 0.01) == (amount > 0)
@@ -212,7 +216,7 @@ def test_halo_of_a_step_has_its_closed_form(amount):
 @settings(max_examples=20, deadline=None)
 def test_scaling_keeps_size_and_mean_and_loses_detail(factor, method):
     frame = picture((40, 60), seed=1, smooth=1.0)
-    found = video_processor.rescale(frame, Scaling(factor=factor, method=method))
+    found = camera_chain.rescale(frame, Scaling(factor=factor, method=method))
     assert found.shape == frame.shape
     assert found.mean() == pytest.approx(frame.mean(), abs=0.01)
     assert np.abs(np.diff(found)).mean() < np.abs(np.diff(frame)).mean()
@@ -220,7 +224,7 @@ def test_scaling_keeps_size_and_mean_and_loses_detail(factor, method):
 
 def test_scaling_by_half_averages_areas():
     frame = picture((32, 48), smooth=0.5)
-    found = video_processor.rescale(frame, Scaling(factor=0.5, method="area"))
+    found = camera_chain.rescale(frame, Scaling(factor=0.5, method="area"))
     halves = frame.reshape(16, 2, 24, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(found, halves.repeat(2, axis=0).repeat(2, axis=1), atol=1e-6)
 
@@ -234,7 +238,7 @@ def test_overlay_blanks_paints_and_writes():
     seen[:, :50] = False
     box = Box(x=0.5, y=0.1, width=0.25, height=0.2, colour=(0.0, 0.0, 1.0))
     text = Caption(text="15/03/2012", x=0.3, y=0.9, height_px=14, colour=(1.0, 1.0, 0.0))
-    found = video_processor.draw(frame, Overlay(boxes=(box,), captions=(text,)), seen)
+    found = camera_chain.draw(frame, Overlay(boxes=(box,), captions=(text,)), seen)
     assert (found[:, :50] == 0).all()
     np.testing.assert_array_equal(found[10:30, 100:150], np.broadcast_to([0.0, 0.0, 1.0], (20, 50, 3)))
     rows, columns = np.nonzero((found[..., 0] > 0.9) & (found[..., 2] < 0.1))
@@ -251,7 +255,7 @@ def test_overlay_blanks_paints_and_writes():
 
 def test_overlay_of_a_grey_picture_takes_the_lumas():
     frame = np.full((40, 40), 0.4, np.float32)
-    found = video_processor.draw(frame, Overlay(boxes=(Box(x=0, y=0, width=0.5, height=1, colour=(0, 1, 0)),)), None)
+    found = camera_chain.draw(frame, Overlay(boxes=(Box(x=0, y=0, width=0.5, height=1, colour=(0, 1, 0)),)), None)
     assert found[0, 0] == pytest.approx(0.587)
     assert found[0, -1] == np.float32(0.4)
 
@@ -263,7 +267,7 @@ def test_overlay_of_a_grey_picture_takes_the_lumas():
 def test_jpeg_quality_shows_in_the_blocks(quality):
     """The mean of a coded 8 x 8 block is a multiple of the table's first entry over 8; of another's it is not."""
     values = (255 * picture((64, 64), seed=2)).astype(np.uint8)
-    coded = coding.code(values, JpegCoding(quality=quality)).astype(float)
+    coded = camera_chain.code(values, JpegCoding(quality=quality)).astype(float)
     means = coded.reshape(8, 8, 8, 8).mean(axis=(1, 3)) - 128
 
     def residue(step):
@@ -278,27 +282,27 @@ def test_jpeg_quality_shows_in_the_blocks(quality):
 def test_jpeg_of_colours_blurs_chroma_at_420_only():
     frame = np.zeros((32, 32, 3), np.uint8)
     frame[:, 15:, 0] = 255
-    sharp = coding.code(frame, JpegCoding(quality=98, chroma="4:4:4")).astype(int)
-    soft = coding.code(frame, JpegCoding(quality=98, chroma="4:2:0")).astype(int)
+    sharp = camera_chain.code(frame, JpegCoding(quality=98, chroma="4:4:4")).astype(int)
+    soft = camera_chain.code(frame, JpegCoding(quality=98, chroma="4:2:0")).astype(int)
     assert np.abs(sharp - frame).max() < 20
     assert np.abs(soft - frame)[:, 13:17].max() > 40
 
 
 def test_every_generation_loses():
     frame = (255 * picture(seed=4, smooth=0.7)).astype(np.uint8)
-    once, often = (coding.code(frame, JpegCoding(quality=60, generations=n)).astype(float) for n in (1, 8))
+    once, often = (camera_chain.code(frame, JpegCoding(quality=60, generations=n)).astype(float) for n in (1, 8))
     assert np.square(often - frame).mean() >= np.square(once - frame).mean() > 1
 
 
 def test_a_missing_codec_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(InputError, match=r"needs the package av; install simtest\[video\]"):
-        coding.code(np.zeros((8, 8), np.uint8), H264Coding())
+        camera_chain.code(np.zeros((8, 8), np.uint8), H264Coding())
     # Before anything is rendered: there is no session to render with.
     told = {"surface": {"type": "plane"}, "sensor": {"bits": 8, "coding": {"type": "h264"}}}
-    monkeypatch.setattr(labelled_frame, "Session", None)
+    monkeypatch.setattr("simtest.simulation.frame.Session", None)
     with pytest.raises(InputError, match="needs the package av"):
-        labelled_frame.make_frame(scene_from_dict(told))
+        make_frame(scene_from_dict(told))
 
 
 def test_coding_needs_8_bits():
@@ -352,17 +356,17 @@ def test_stages_come_in_physical_order():
     found = camera_chain.capture(light, 2.0, told, np.random.default_rng(7))
     # One by one.
     rng = np.random.default_rng(7)
-    own = video_processor.as_seen_by_sensor(light / np.float32(2), told.colour)
-    plane = mosaic.sample(own, told.mosaic)
-    share = shot_noise.poisson(plane * np.float32(4000), rng) * np.float32(1 / 4000)
+    own = camera_chain.as_seen_by_sensor(light / np.float32(2), told.colour)
+    plane = camera_chain.behind_filters(own, told.mosaic)
+    share = camera_chain.poisson(plane * np.float32(4000), rng) * np.float32(1 / 4000)
     plane = share + np.float32(3.0 / 4000) * rng.standard_normal(plane.shape, dtype=np.float32)
     plane = plane + np.float32(0.005) * rng.standard_normal(plane.shape, dtype=np.float32)
-    linear = video_processor.develop(mosaic.demosaic(plane, told.mosaic), told.colour, True)
+    linear = camera_chain.develop(camera_chain.demosaic(plane, told.mosaic), told.colour, True)
     values = told.response.model().encode_picture(np.clip(linear, 0, 1))
-    values = np.clip(video_processor.sharpen(values, told.sharpening), 0, 1)
-    values = np.clip(video_processor.rescale(values, told.scaling), 0, 1)
-    values = video_processor.draw(values, told.overlay, None)
-    expected = coding.code(np.rint(values * 255).astype(np.uint8), told.coding)
+    values = np.clip(camera_chain.sharpen(values, told.sharpening), 0, 1)
+    values = np.clip(camera_chain.rescale(values, told.scaling), 0, 1)
+    values = camera_chain.draw(values, told.overlay, None)
+    expected = camera_chain.code(np.rint(values * 255).astype(np.uint8), told.coding)
     np.testing.assert_array_equal(np.rint(found * 255).astype(np.uint8), expected)
     assert found.dtype == np.float32
 
@@ -370,6 +374,6 @@ def test_stages_come_in_physical_order():
 @pytest.mark.parametrize("height", [8.0, 12.0, 20.0, 40.0])
 def test_captions_have_the_asked_height(height):
     overlay = Overlay(captions=(Caption(text="H", x=0.1, y=0.8, height_px=height),))
-    found = video_processor.draw(np.zeros((100, 100), np.float32), overlay, None)
+    found = camera_chain.draw(np.zeros((100, 100), np.float32), overlay, None)
     rows = np.nonzero(found.max(axis=1) > 0.5)[0]
     assert np.ptp(rows) + 1 == pytest.approx(height, abs=1)

@@ -8,7 +8,7 @@ from scipy import ndimage, stats
 
 from simtest.calibration import Response
 from simtest.geometry import Camera
-from simtest.simulation import camera_chain, shot_noise, video_processor
+from simtest.simulation import sensor as camera_chain
 from simtest.spec.sensor import Scaling, Sensor
 
 # Point spread ---------------------------------------------------------------------------------------------------------
@@ -37,7 +37,7 @@ def chi_square(numbers, mean):
 
 @pytest.mark.parametrize("mean", [3.0, 51.0, 400.0, 20000.0])
 def test_electrons_are_poisson(mean):
-    numbers = shot_noise.poisson(np.full(400_000, mean, np.float32), np.random.default_rng(3)).astype(float)
+    numbers = camera_chain.poisson(np.full(400_000, mean, np.float32), np.random.default_rng(3)).astype(float)
     assert (numbers == np.rint(numbers)).all()
     assert numbers.min() >= 0
     assert chi_square(numbers, mean) > 1e-3
@@ -48,7 +48,7 @@ def test_electrons_are_poisson(mean):
 
 def test_the_expansion_keeps_to_its_bound():
     """Its distribution function, the quantile function inverted, against that of SciPy at the least mean."""
-    mean = shot_noise.LEAST_MEAN
+    mean = camera_chain.LEAST_MEAN
     normal = np.linspace(-6, 6, 2_000_001)
     quantile = mean + np.sqrt(mean) * normal + (2 + normal**2) * (1 / 6 - normal / (72 * np.sqrt(mean)))
     assert (np.diff(quantile) > 0).all()
@@ -60,16 +60,16 @@ def test_the_expansion_keeps_to_its_bound():
 
 def test_pixels_of_one_picture_have_numbers_of_their_own():
     mean = np.repeat(np.float32([0.0, 10.0, 100.0, 1e9]), 5000)
-    numbers = shot_noise.poisson(mean, np.random.default_rng(0))
-    np.testing.assert_array_equal(numbers, shot_noise.poisson(mean, np.random.default_rng(0)))
-    assert not np.array_equal(numbers, shot_noise.poisson(mean, np.random.default_rng(1)))
+    numbers = camera_chain.poisson(mean, np.random.default_rng(0))
+    np.testing.assert_array_equal(numbers, camera_chain.poisson(mean, np.random.default_rng(0)))
+    assert not np.array_equal(numbers, camera_chain.poisson(mean, np.random.default_rng(1)))
     for first, level in zip(range(0, 20000, 5000), [0.0, 10.0, 100.0, 1e9], strict=True):
         own = numbers[first : first + 5000].astype(float)
         assert own.mean() == pytest.approx(level, abs=5 * np.sqrt(level / 5000))
     # A pixel that darkens changes no other that is bright.
     darker = mean.copy()
     darker[-1] = 5.0
-    np.testing.assert_array_equal(shot_noise.poisson(darker, np.random.default_rng(0))[5000:-1], numbers[5000:-1])
+    np.testing.assert_array_equal(camera_chain.poisson(darker, np.random.default_rng(0))[5000:-1], numbers[5000:-1])
 
 
 @pytest.mark.parametrize("read_noise", [0.0, 12.0])
@@ -139,7 +139,7 @@ def between(size, count):
 def test_scaling_equals_plain_matrices(factor):
     """Smaller: areas are averaged, then lines are drawn between the centres; larger: the other way round."""
     frame = np.random.default_rng(0).uniform(0, 1, (30, 48)).astype(np.float32)
-    found = video_processor.rescale(frame, Scaling(factor=factor, method="linear"))
+    found = camera_chain.rescale(frame, Scaling(factor=factor, method="linear"))
     there, back = (overlaps, between) if factor < 1 else (between, overlaps)
     expected = frame
     for _ in range(2):

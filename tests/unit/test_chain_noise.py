@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from simtest.rendering import Session
-from simtest.simulation.chain_noise import noise_at
-from simtest.simulation.rendered_view import render_view
-from simtest.simulation.true_highlights import examine
+from simtest.simulation.frame import render_view
+from simtest.simulation.highlights import examine
+from simtest.simulation.sensor import noise_at
 from simtest.spec import load_scene
 from simtest.spec.sensor import PRESETS, Sensor
 

@@ -10,7 +10,6 @@ from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry.vectors import angle_deg
 from simtest.pages.style import degrees
 from simtest.report.run_folder import read_item
-from simtest.simulation import clouds as regions
 from simtest.spec import Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
@@ -95,5 +94,5 @@ def test_a_cloud_belongs_to_the_point_of_most_of_its_spots_also_where_an_instrum
     estimate = SimpleNamespace(cloud=SimpleNamespace(points_px=points), look_px=np.array([50.0, 50.0]))
     view = SimpleNamespace(clouds=centres)
     for owners, expected in (([0] * 25 + [1], [0]), ([0] * 12 + [1] * 14, [1]), ([None] * 26, [])):
-        monkeypatch.setattr(regions, "assign", lambda *_, owners=owners: owners)
+        monkeypatch.setattr("simtest.validation.cloud_rows.assign_clouds", lambda *_, owners=owners: owners)
         assert match_cloud(None, view, estimate) == expected

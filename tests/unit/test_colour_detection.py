@@ -4,10 +4,10 @@ import pytest
 
 from simtest.calibration import Calibration, srgb_decode, srgb_encode
 from simtest.detection import colour as colour_detection
-from simtest.detection.blobs import Kind, _around
-from simtest.detection.light_split import SplitLight, fill, split_light
-from simtest.detection.spots import Spot
-from simtest.detection.view_mask import find_view
+from simtest.detection.classify import _around, _isophotes
+from simtest.detection.detector import Kind
+from simtest.detection.spots import ColourPicture, SpecularSpot, SplitLight, fill, split_light
+from simtest.detection.view import find_view
 from simtest.errors import InputError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
@@ -91,7 +91,7 @@ def test_a_pale_edge_is_no_highlight(from_edge, size, expected):
     total = np.where(x < 160, 0.35, 0.09).astype(np.float32)
     crop = np.s_[120 : 120 + size, 160 + from_edge : 160 + from_edge + size]
     total[crop] = 0.2
-    spot = Spot(np.array([[160 + from_edge, 120]]), 0.11, (160 + from_edge, 120), total[crop] > 0, False, False)
+    spot = SpecularSpot(np.array([[160 + from_edge, 120]]), 0.11, (160 + from_edge, 120), total[crop] > 0, False, False)
     bare = np.ones(total.shape, dtype=bool)
     bare[crop] = False
     assert colour_detection._stands_out(spot, total, bare) is expected
@@ -104,8 +104,8 @@ def test_a_dark_background_is_no_texture():
     # an organ, and a background of two kinds that is darker than what was filled in
     specular = np.array([0.0, -0.049, -0.012], dtype=np.float32)[third] * np.ones((HEIGHT, 1), dtype=np.float32)
     specular += np.random.default_rng(7).normal(0, 0.0005, tissue.shape).astype(np.float32)
-    clipped = np.zeros(tissue.shape, dtype=bool)
-    assert colour_detection._texture(specular, tissue, clipped, None) < 0.02
+    inside = np.ones(tissue.shape, dtype=bool)
+    assert colour_detection._texture(specular, tissue, inside) < 0.02
 
 
 def test_light_that_met_tissue_before_is_no_isolated_highlight():
@@ -124,6 +124,38 @@ def test_the_split_gives_the_specular_light_whatever_the_shading():
     light = split_light(linear, np.zeros(linear.shape[:2], dtype=bool))
     assert np.sqrt(np.mean((light.specular - specular) ** 2)) < 0.006
     np.testing.assert_allclose(light.specular + light.tissue, linear.mean(axis=2), atol=1e-6)
+
+
+def test_specular_light_is_in_all_channels_also_where_one_is_clipped():
+    """Tissue so bright that red is clipped looks greyer than it is, and its part is filled in from darker tissue."""
+    x, y = places()
+    shading = np.where(np.hypot(x - 160, y - 120) < 12, 2.5, 0.4)
+    linear = np.clip(shading[..., None] * np.array([0.5, 0.2, 0.15]), 0, 1).astype(np.float32)
+    light = split_light(linear, linear.max(axis=2) >= 1)
+    weakest = linear.min(axis=2)
+    assert (linear.mean(axis=2) - weakest)[120, 160] > light.tissue[0, 0]
+    assert (light.specular <= weakest + 1e-6).all()
+
+
+def test_an_isophote_that_holds_another_bump_is_not_the_spot_s_own():
+    values = (lobe(160, 120, 8.0) + 0.7 * lobe(180, 120, 6.0)).astype(np.float32)
+    above = values > 0.5
+    none = np.zeros(above.shape, dtype=bool)
+    shown = ColourPicture(np.zeros((HEIGHT, WIDTH, 3)), SplitLight(values, values, 0.0), none, none, none, None)
+    (left, top, right, bottom), (x, _) = (145, 105, 195, 135), places()
+    for own in (above, above & (x < 170)):
+        spot = SpecularSpot(np.array([[160, 119]]), 1.0, (left, top), own[top:bottom, left:right], False, False)
+        traced = _isophotes(spot, (120, 80, 110, 80), values, shown)
+        assert (traced[0] is None) == (own is not above)
+
+
+def test_text_is_looked_for_before_spots_go_that_do_not_stand_out(monkeypatch):
+    """It is known by whole lines."""
+    asked = []
+    monkeypatch.setattr(colour_detection, "_stands_out", lambda *_: False)
+    monkeypatch.setattr(colour_detection, "find_foreign", lambda bright: asked.append(bright) or np.zeros_like(bright))
+    assert kinds(lobe(160, 120, 6.0)) == []
+    assert asked[0][120, 160]
 
 
 def test_fill_keeps_what_is_known_and_is_smooth_between():
@@ -233,15 +265,19 @@ def test_the_dark_outside_the_view_is_no_tissue_around_a_highlight():
     for outside in (0.0, 1.0):
         linear = srgb_decode(frame)
         linear[~seen] = outside
-        spot = Spot(np.array([[160, 24]]), 0.5, (155, 19), specular[19:30, 155:166] > 0.25, False, False)
+        spot = SpecularSpot(np.array([[160, 24]]), 0.5, (155, 19), specular[19:30, 155:166] > 0.25, False, False)
         light = SplitLight(np.where(seen, specular, 0).astype(np.float32), linear.mean(axis=2), 0.004)
-        told.append(_around(spot, (140, 4, 41, 41), linear, specular > 0.05, light, seen))
+        none = np.zeros(seen.shape, dtype=bool)
+        shown = ColourPicture(linear, light, none, none, none, seen)
+        told.append(_around(spot, (140, 4, 41, 41), shown, specular > 0.05))
     assert told[0] == told[1]
 
 
-def test_cut_corners_are_found():
+# The larger ones leave 69 % of the picture: at least 60 % must be lit.
+@pytest.mark.parametrize("cut", [50, 110])
+def test_cut_corners_are_found(cut):
     x, y = places()
-    inside = np.minimum(x, WIDTH - x) + np.minimum(y, HEIGHT - y) > 50
+    inside = np.minimum(x, WIDTH - x) + np.minimum(y, HEIGHT - y) > cut
     view = find_view(framed(inside))
     assert view.circle is None
     assert not (view.seen & ~inside).any()

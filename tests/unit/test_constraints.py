@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Response, exactly
-from simtest.detection.view_mask import View
+from simtest.detection.view import View
 from simtest.estimators import Estimate
 from simtest.geometry import Camera, chi_squared
 from simtest.reconstruction.constraints import constraints_arrays

@@ -12,7 +12,7 @@ from simtest.dataset.sample import decode
 from simtest.errors import Failure
 from simtest.estimators import load_estimators
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import Experiment, load_dataset
 from simtest.spec.recipes import Dataset, Family
 from simtest.spec.spec_model import validate

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Calibration, srgb_encode
-from simtest.detection.blobs import Kind
+from simtest.detection.detector import Kind
 from simtest.reconstruction import reconstruct_colour
 from simtest.rendering import Session
 from simtest.spec import load_scene

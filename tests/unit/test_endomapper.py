@@ -10,7 +10,7 @@ from simtest.calibration import NO_PRIORS
 from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.rendering import Session
-from simtest.simulation.camera_chain import capture, collect
+from simtest.simulation.sensor import capture, collect
 from simtest.spec import camera_table, scene_from_dict
 
 GAMMA, POWER, MU = 2.2, 2.5, 2.767302

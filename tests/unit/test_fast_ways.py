@@ -5,8 +5,7 @@ import pytest
 
 from simtest import Camera, InputError
 from simtest.calibration.calibration import brightest_channel, mean_channel
-from simtest.detection.basins import _numbered
-from simtest.detection.view_mask import _row_ends
+from simtest.detection.view import _row_ends
 from simtest.geometry.vectors import basis_across, tangent_basis
 from simtest.reconstruction.picture_values import check_frame
 
@@ -49,14 +48,6 @@ def test_channels_whose_sum_overflows_are_refused_and_large_ones_are_not():
         check_frame(frame, CAMERA)
     frame[1, 1] = 2e38, -2e38, 0
     assert check_frame(frame, CAMERA)[0][1, 1, 0] == np.float32(2e38)
-
-
-def test_numbers_are_those_of_a_sorted_list():
-    values = np.random.default_rng(1).integers(0, 50, 30)
-    kept, which = _numbered(values, 50)
-    wanted, wanted_which = np.unique(values, return_inverse=True)
-    assert np.array_equal(kept, wanted)
-    assert np.array_equal(which, wanted_which)
 
 
 def test_ends_of_rows_are_those_of_each():

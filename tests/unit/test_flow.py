@@ -7,8 +7,8 @@ import pytest
 
 from simtest.rendering import Session
 from simtest.simulation.flow import HIDDEN, INSTRUMENT, NONE, OUT, SEEN, Flow, SeenSurface, flow_between
-from simtest.simulation.rendered_view import render_view
-from simtest.simulation.sequence_labels import STRIDE_PX, SequenceLabels
+from simtest.simulation.frame import render_view
+from simtest.simulation.sequences import STRIDE_PX, SequenceLabels
 from simtest.spec import scene_from_dict
 from simtest.spec.camera import Moved
 from tests.marked import marked

@@ -10,8 +10,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from simtest.rendering import Session, highlights
-from simtest.simulation.rendered_view import render_view
-from simtest.simulation.visible_highlights import find_spots, glints_of, shape_of
+from simtest.simulation.frame import render_view
+from simtest.simulation.highlights import describe, find_spots, glints_of
 from simtest.spec.scene import scene_from_dict
 
 CAMERA = {"width": 200, "height": 160, "fx": 200.0, "fy": 200.0, "cx": 100.0, "cy": 80.0}
@@ -261,6 +261,14 @@ def test_spots_shine():
     assert abs(np.sum(spots.regions == 1) - 2 * np.pi * np.log(2) * 9) < 6
 
 
+def test_equal_spots_are_numbered_row_by_row():
+    shape = (60, 120)
+    lobe = bump(shape, 40, 20, 3) + bump(shape, 12, 90, 3) + bump(shape, 12, 30, 3)
+    spots = find_spots(lobe, lobe)
+    assert [(int(r), int(c)) for r, c in zip(spots.rows, spots.columns, strict=True)] == [(12, 30), (12, 90), (40, 20)]
+    assert [int(spots.regions[r, c]) for r, c in zip(spots.rows, spots.columns, strict=True)] == [1, 2, 3]
+
+
 def test_a_dark_frame_has_no_spots():
     assert len(find_spots(np.zeros((20, 20)), np.zeros((20, 20))).rows) == 0
 
@@ -268,14 +276,23 @@ def test_a_dark_frame_has_no_spots():
 def test_spot_shape():
     y, x = np.mgrid[:80, :100]
     lobe = np.exp(-((x - 50.25) ** 2 / (2 * 8.0**2) + (y - 40.0) ** 2 / (2 * 4.0**2)))
-    spots = find_spots(lobe, lobe)
-    shape = shape_of(spots, 0, lobe)
+    (shape,) = describe(find_spots(lobe, lobe), lobe, lobe, np.zeros(1), [])
     assert shape.area_px == pytest.approx(2 * np.pi * np.log(2) * 32, rel=0.03)
     assert shape.centroid_px == pytest.approx([50.75, 40.5], abs=0.05)
     assert shape.axis_ratio == pytest.approx(0.5, rel=0.02)
     assert shape.whole
-    cut = find_spots(lobe[:, 50:], lobe[:, 50:])
-    assert not shape_of(cut, 0, lobe[:, 50:]).whole
+    cut = lobe[:, 50:]
+    assert not describe(find_spots(cut, cut), cut, cut, np.zeros(1), [])[0].whole
+
+
+@pytest.mark.parametrize(("sigma", "snr"), [(0.0, np.inf), (0.1, 10.0)])
+def test_a_spot_on_clipped_light_stands_above_nothing(sigma, snr):
+    """Its pixels and those around have the value at which the sensor's end, with noise or without."""
+    lobe = bump((60, 80), 30, 40, 5)
+    spots = find_spots(1 + lobe, lobe)
+    for clip, expected in ((3.0, snr), (1.0, 0.0)):
+        (spot,) = describe(spots, 1 + lobe, lobe, np.array([sigma]), [], clip=clip)
+        assert spot.peak_snr == pytest.approx(expected)
 
 
 def test_spots_hold_the_glints_in_them(sessions):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from simtest.detection.blobs import Kind
+from simtest.detection.detector import Kind
 from simtest.estimators.budget import PARTS
 
 ROOT = Path(__file__).parents[2]

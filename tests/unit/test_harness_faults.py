@@ -18,9 +18,9 @@ from simtest.geometry.vectors import tangent_basis, tangent_coordinates
 from simtest.reconstruction.picture import Options
 from simtest.rendering import HighlightPoint, Session
 from simtest.report import write_report
+from simtest.simulation.frame import render_view
 from simtest.simulation.frame_files import write_frame
-from simtest.simulation.rendered_view import render_view
-from simtest.simulation.true_highlights import examine, verdicts
+from simtest.simulation.highlights import examine, verdicts
 from simtest.spec import Experiment, load_experiment, parse_settings, scene_from_dict
 from simtest.validation.cases import expand
 from simtest.validation.metrics import mahalanobis2

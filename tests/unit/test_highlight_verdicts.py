@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.rendering import HighlightPoint, Session
-from simtest.simulation.rendered_view import render_view
-from simtest.simulation.true_highlights import Examined, examine, verdicts
+from simtest.simulation.frame import render_view
+from simtest.simulation.highlights import Examined, examine, verdicts
 from simtest.spec import load_scene, scene_from_dict
 
 NORMAL = np.array([0.0, 0.0, -1.0])

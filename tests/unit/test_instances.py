@@ -8,7 +8,7 @@ from simtest.dataset.fields import BY_NAME
 from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import scene_from_dict
 from simtest.spec.recipes import Dataset
 

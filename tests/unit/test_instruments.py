@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 import simtest
 from simtest.errors import InputError
 from simtest.rendering import Session
+from simtest.simulation.frame import make_frame
 from simtest.simulation.frame_files import write_frame
-from simtest.simulation.labelled_frame import make_frame
 from simtest.spec.scene import scene_from_dict
 from simtest.spec.surfaces import Instrument
 from simtest.surfaces.instrument import round_cones

@@ -18,7 +18,7 @@ from simtest.inverse.patch import PatchRenderer, RenderedQuadric
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import scene_from_dict
 from simtest.validation.metrics import curvature_errors, mahalanobis2
 from tests.marked import marked

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from simtest.detection.regions import Region
+from simtest.detection.detector import Region
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
 from simtest.geometry import Patch

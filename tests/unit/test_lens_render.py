@@ -15,8 +15,8 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.camera_chain import expose
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
+from simtest.simulation.sensor import expose
 from simtest.spec import scene_from_dict
 
 # A 140 degree fisheye: 70 deg from the axis lie 320 px away.

@@ -13,7 +13,7 @@ from simtest.errors import InputError
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.sequence import reconstruct_sequence
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import scene_from_dict
 from tests.marked import marked
 

@@ -28,7 +28,7 @@ from simtest.reconstruction.found import Reconstruction
 from simtest.reconstruction.pipeline import reconstruct, run_picture
 from simtest.reconstruction.ranking import best_of
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import load_scene
 from tests.unit.core_helpers import PATCH
 

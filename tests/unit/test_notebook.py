@@ -18,8 +18,8 @@ from simtest.pages.notebook import normal_html, picture_html, table_html
 from simtest.rendering.frames import Radiance
 from simtest.report.run_results import RunResults
 from simtest.runtime.arrays import LONGEST, short
-from simtest.simulation.camera_chain import to_uint8
-from simtest.simulation.preview import SURFACE_LEVEL, preview
+from simtest.simulation.frame import SURFACE_LEVEL, preview
+from simtest.simulation.sensor import to_uint8
 from simtest.spec.keys import full_keys
 from simtest.spec.recipes import scene_models
 from simtest.validation.cases import expand

@@ -11,9 +11,8 @@ import pytest
 
 from simtest.calibration import Uniform
 from simtest.cli.pictures import assumed_lines, count_lines, silent_lines
-from simtest.detection.blobs import Highlight, Kind
-from simtest.detection.regions import Region
-from simtest.detection.view_mask import View
+from simtest.detection.detector import Highlight, Kind, Region
+from simtest.detection.view import View
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import PARTS
 from simtest.estimators.cloud_shape import CloudShape, Slope

@@ -25,7 +25,7 @@ PUBLIC = {
     "InputError": "simtest.errors",
     "KannalaBrandt": "simtest.geometry.lenses",
     "Scaramuzza": "simtest.geometry.lenses",
-    "LabelledFrame": "simtest.simulation.labelled_frame",
+    "LabelledFrame": "simtest.simulation.frame",
     "Patch": "simtest.geometry.patch",
     "Reason": "simtest.errors",
     "RunResults": "simtest.report.run_results",

@@ -5,8 +5,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from simtest.detection.blobs import Highlight, Kind
-from simtest.detection.regions import Region
+from simtest.detection.detector import Highlight, Kind, Region
 from studies.detection.real_frames import inside_outlines, outlined_frames, score_frame
 from studies.detection.tissue import Counts, detected_peaks, size_class
 from studies.detection.tissue import score_frame as score_tissue

@@ -11,8 +11,8 @@ from simtest.realism.distance import distances
 from simtest.realism.frame_sets import open_frames, open_generated, rendered_frames, varied
 from simtest.runtime.processes import make_engine
 from simtest.runtime.resources import data_root
-from simtest.simulation.camera_chain import to_uint8
-from simtest.simulation.labelled_frame import make_frame
+from simtest.simulation.frame import make_frame
+from simtest.simulation.sensor import to_uint8
 from simtest.spec import load_dataset, load_scene
 
 COLONOSCOPY = (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.detection.regions import contrast, detect, half_height_component
+from simtest.detection.peaks import MAX_PEAKS, contrast, detect, half_height_component
 
 SIGMA, PLACE = 6.0, (70, 45)
 
@@ -52,3 +52,11 @@ def test_a_region_that_the_border_cuts_is_open():
     assert not half_height_component(image, 45, 2).closed
     assert not detect(image, 0.001)
     assert len(detect(image, 0.001, isolated=False)) == 1
+
+
+def test_a_clipped_plateau_does_not_crowd_out_other_peaks():
+    """Each of its 3,000 pixels is a local maximum, and only so many are examined."""
+    image = spot(0.8)
+    image[5:35, 5:105] = 1.0
+    assert image[5:35, 5:105].size > MAX_PEAKS
+    assert [region.peak for region in detect(image, 0.001)] == [(5, 5), PLACE]

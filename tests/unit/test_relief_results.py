@@ -155,7 +155,7 @@ def test_rows_hold_both_errors(relief):
 def test_rows_of_truths_that_nothing_found_have_a_target_and_no_error():
     session = Session(scene_from_dict({"surface": {"type": "plane", "relief": RELIEF}}))
     view = session.highlights(session.radiance())
-    from simtest.simulation.true_highlights import TrueHighlight
+    from simtest.simulation.highlights import TrueHighlight
 
     truths = [TrueHighlight(**vars(point), peak_snr=50.0, why_not="") for point in view[:2]]
     made = rows(session, dict(experiment="e", setting="s"), [], truths, {}, {"cone_axis": ()})

@@ -8,7 +8,7 @@ import pytest
 from simtest.dataset.maker import Maker, colour_variant
 from simtest.dataset.plan import Plan
 from simtest.rendering import Session, highlights, lighting
-from simtest.simulation.rendered_view import DEAR_SAMPLES, has_quick_look, render_view, shows_isolated
+from simtest.simulation.frame import DEAR_SAMPLES, quick_look, render_view, shows_isolated
 from simtest.spec import scene_from_dict
 from simtest.spec.recipes import Dataset
 from simtest.spec.spec_model import validate
@@ -187,7 +187,7 @@ DISC = {"source": {"type": "disc", "radius_mm": 0.5}}
 def test_a_quick_look_is_taken_where_it_costs_less_than_the_frame(samples, depth, light, quick):
     drawn = scene(ROUGH, lights=[{**LIGHTS[0], **light}], samples=samples)
     effort = drawn.render.model_copy(update={"path_depth": depth})
-    assert has_quick_look(drawn.model_copy(update={"render": effort})) is quick
+    assert (quick_look(drawn.model_copy(update={"render": effort})) is not None) is quick
 
 
 def test_the_quick_look_of_a_wide_source_takes_as_many_points_as_that_many_samples():
@@ -203,7 +203,12 @@ def test_wide_sources_are_judged_by_the_frame_that_is_kept(tries, monkeypatch):
     described = {"name": "wide", "samples": 2, "seed": 1, "tries": tries, "estimators": ["cone_axis"]}
     described["families"] = [{"scene": "sphere", "set": SET | wide, "per_sample": tilts}]
     plan = Plan(validate(Dataset, described | {"splits": {"train": 1, "validation": 0, "test": 0}}, "wide"))
-    monkeypatch.setattr("simtest.dataset.maker.shows_isolated", lambda *_: pytest.fail("looked at twice"))
+
+    def by_geometry(*asked, rendered):
+        assert not rendered, "looked at twice"
+        return shows_isolated(*asked, rendered=False)
+
+    monkeypatch.setattr("simtest.dataset.maker.shows_isolated", by_geometry)
     maker, session, attempts = Maker(plan), Session(plan.draw(0).scene, colour_variant()), []
     for index in range(2):
         sample = maker.make(index)

@@ -10,7 +10,7 @@ import pytest
 from simtest import api
 from simtest.errors import InputError
 from simtest.rendering.placement_checks import check_lights
-from simtest.simulation.viewpoints import NO_HIGHLIGHT, NO_ROOM, along_path, candidates, sample_views
+from simtest.simulation.views import NO_HIGHLIGHT, NO_ROOM, along_path, candidates, sample_views
 from simtest.spec import load_scene
 from simtest.surfaces import make_surface
 

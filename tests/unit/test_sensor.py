@@ -7,7 +7,7 @@ from simtest.calibration import Response, srgb_decode, srgb_encode
 from simtest.errors import InputError
 from simtest.geometry import Camera, smooth
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.camera_chain import capture, collect, expose
+from simtest.simulation.sensor import capture, collect, expose
 from simtest.spec import scene_from_dict
 from simtest.spec.sensor import Sensor
 

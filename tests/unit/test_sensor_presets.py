@@ -6,7 +6,7 @@ import pytest
 from simtest.api import _scene
 from simtest.errors import InputError
 from simtest.runtime.files import write_json
-from simtest.simulation.camera_chain import capture
+from simtest.simulation.sensor import capture
 from simtest.spec import load_scene
 from simtest.spec.scene import scene_from_dict
 from simtest.spec.sensor import PRESETS, Sensor

@@ -16,8 +16,8 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.picture import Options
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
+from simtest.simulation.frame import render_picture, render_view
 from simtest.simulation.frame_files import write_frame
-from simtest.simulation.rendered_view import render_view
 from simtest.spec import Experiment, load_calibration, scene_from_dict
 from simtest.validation import laws
 from simtest.validation.predicted import unknown_falloff
@@ -197,6 +197,15 @@ def test_full_scale_is_fixed_or_a_percentile_or_the_highlights(session):
     # The highlight's nearest pixel; the brightest is at most the next.
     assert full_scale({}) == pytest.approx(float(light.max()), rel=1e-3)
     assert full_scale({"gain": 2.0}) == full_scale({}) / 2
+
+
+@pytest.mark.parametrize("sensor", [{"exposure": {"gain": 2.0}}, {"noise_sigma": 0.01, "point_spread_px": 1.5}])
+@pytest.mark.parametrize("before", [{}, {"exposure": {"percentile": 90.0}}])
+def test_a_radiance_is_exposed_by_the_sensor_that_is_given(session, sensor, before):
+    """Not by that of the scene at which it was rendered, as where `simtest fit` draws several sensors of a scene."""
+    session.update(scene(before))
+    shared = render_picture(session, scene(sensor), session.radiance())
+    np.testing.assert_array_equal(shared, render_picture(session, scene(sensor)))
 
 
 def test_a_percentile_without_light_falls_back_on_the_maximum(session):

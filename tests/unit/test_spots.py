@@ -7,14 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.calibration import Calibration, srgb_encode
-from simtest.detection.basins import find_basins
-from simtest.detection.blobs import Kind, border_of
-from simtest.detection.foreign import find_foreign
-from simtest.detection.view_mask import find_view
+from simtest.detection.classify import border_of
+from simtest.detection.detector import Kind
+from simtest.detection.spots import find_basins
+from simtest.detection.view import find_foreign, find_view
 from simtest.errors import Failure, Reason
 from simtest.geometry import Camera
 from simtest.reconstruction import detect_in_picture, reconstruct_colour
-from simtest.simulation.visible_highlights import find_spots as visible_spots
+from simtest.simulation.highlights import find_spots as visible_spots
 
 WIDTH, HEIGHT = 240, 180
 TISSUE = np.array([0.40, 0.20, 0.16])

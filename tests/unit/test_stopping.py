@@ -15,7 +15,7 @@ from simtest.cli.main import INTERRUPTED, TERMINATED, main
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.boundary import plain
 from simtest.runtime.files import make_folder
-from simtest.simulation import view_folder
+from simtest.simulation import views
 from tests.refusals import refused
 
 MAIN = "from simtest.cli.main import main; main()"
@@ -172,15 +172,15 @@ def test_standard_input_is_a_pipe(tmp_path):
 def test_a_stopped_film_leaves_no_half_of_it(tmp_path, monkeypatch):
     """The list of an earlier call's views goes too, since their pictures have gone."""
 
-    def stopped(scene, count, viewpoints, variant, progress, write, rate, label):
+    def stopped(scene, count, viewpoints, variant, progress, rate, write):
         write.__self__._write(np.zeros((48, 64, 3), np.uint8), rate)
         assert [path.suffix for path in tmp_path.iterdir()] == [".avi"]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(view_folder, "sample_views", stopped)
+    monkeypatch.setattr(views, "sample_views", stopped)
     (tmp_path / "views.json").write_text("{}")
     with pytest.raises(KeyboardInterrupt):
-        view_folder.sample_into(tmp_path, None, 3, [0.1], None, None, sequence=True)
+        views.sample_into(tmp_path, None, 3, [0.1], None, None, sequence=True)
     assert not list(tmp_path.iterdir())
 
 

@@ -10,7 +10,7 @@ import pytest
 CODE = """
 import hashlib, json
 from simtest.rendering import Session
-from simtest.simulation.rendered_view import render_view
+from simtest.simulation.frame import render_view
 from simtest.spec import load_scene
 settings = {"camera.width": 96, "camera.height": 80, "camera.fx": 90.0, "camera.fy": 90.0, "surface.radius_mm": 11.731,
             "surface.tilt_deg": 5.4321, "sensor.noise_sigma": 0.0, "sensor.full_well": 8000.0}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from simtest.rendering import Session
+from simtest.simulation.frame import make_frame
 from simtest.simulation.frame_files import write_frame
-from simtest.simulation.labelled_frame import make_frame
 from simtest.spec import scene_from_dict
 from tests.marked import marked
 

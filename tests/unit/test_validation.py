@@ -17,8 +17,8 @@ from simtest.geometry.vectors import angle_deg, tangent_basis
 from simtest.reconstruction.pipeline import Specularity, reconstruct, run_pipeline
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, from_integer, generator, integer, key, sequence
-from simtest.simulation.rendered_view import render_view
-from simtest.simulation.true_highlights import TrueHighlight
+from simtest.simulation.frame import render_view
+from simtest.simulation.highlights import TrueHighlight
 from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example
 from simtest.validation.columns import SCHEMA, swept_columns, table

@@ -9,8 +9,7 @@ import pytest
 from simtest import api
 from simtest.errors import InputError
 from simtest.reconstruction.poses import read_poses
-from simtest.simulation.flow import STATES, Flow
-from simtest.simulation.flow_picture import flow_picture
+from simtest.simulation.flow import STATES, Flow, flow_picture
 from simtest.spec import load_scene
 from simtest.surfaces import make_surface
 

@@ -15,8 +15,8 @@ from simtest.reconstruction.found import Reconstruction
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image, Mask, Picture, only_reading
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.rendered_view import RenderedView, render_view
-from simtest.simulation.video_processor import luma
+from simtest.simulation.frame import RenderedView, render_view
+from simtest.simulation.sensor import luma
 
 USUAL_PX = 640 * 480
 FRAMES, FEWEST_FRAMES = 48, 12

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
-from simtest.detection.blobs import Highlight
+from simtest.detection.detector import Highlight
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import chi_squared
@@ -17,7 +17,7 @@ from simtest.reconstruction.found import Reconstruction, Specularity
 from simtest.reconstruction.ranking import best_of
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
-from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.frame import RenderedView
 from simtest.validation.matching import match, on_instruments, peak_px
 from simtest.validation.metrics import mahalanobis2
 

@@ -8,7 +8,7 @@ from simtest.dataset.scoring.record import Record, Source, check_frame, open_sou
 from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
-from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.frame import RenderedView
 from simtest.validation.columns import Value
 
 

@@ -13,7 +13,7 @@ from simtest.errors import InputError
 from simtest.reconstruction.pipeline import Specularity
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
-from simtest.simulation.rendered_view import RenderedView
+from simtest.simulation.frame import RenderedView
 from simtest.spec import Experiment
 from simtest.spec.recipes import Dataset
 from simtest.spec.sensor import Sensor

@@ -11,8 +11,8 @@ from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image, only_reading
 from simtest.runtime.seeds import Stage, generator, integer
-from simtest.simulation.camera_chain import displayed
-from simtest.simulation.rendered_view import expose_picture
+from simtest.simulation.frame import render_picture
+from simtest.simulation.sensor import displayed
 from simtest.spec import Scene, apply_settings
 from simtest.spec.recipes import Dataset
 from simtest.spec.sensor import Sensor
@@ -77,7 +77,7 @@ class FrameMaker:
         radiance = session.radiance()
         for chain in range(chains):
             values, scene = (drawn.values, drawn.scene) if chain == 0 else self._redrawn(index, chain, drawn)
-            picture = displayed(expose_picture(session, scene, radiance), scene.sensor)
+            picture = displayed(render_picture(session, scene, radiance), scene.sensor)
             yield DrawnFrame(index, chain, drawn.anatomy, values, picture)
 
     def _redrawn(self, index: int, chain: int, drawn: Drawn) -> tuple[dict[str, JsonValue], Scene]:

@@ -9,9 +9,8 @@ from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.report.scene3d import CAMERA, TRUE, TRUE_BASE, Content, grid_triangles
 from simtest.runtime.arrays import Array, IntArray
-from simtest.simulation.preview import coloured, expose, matt_light
-from simtest.simulation.rendered_view import RenderedView, render_view
-from simtest.simulation.true_highlights import TrueHighlight
+from simtest.simulation.frame import RenderedView, coloured, expose_for_eye, matt_light, render_view
+from simtest.simulation.highlights import TrueHighlight
 from simtest.spec import Scene
 
 GRID = 240  # samples of the visible surface along the longer side of the frame
@@ -95,7 +94,7 @@ def _lit(session: Session, seen: RenderedView, points: Array, normals: Array) ->
     at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
     specular, own = seen.radiance.specular, seen.radiance.diffuse + seen.radiance.indirect
     matt = matt_light(points, normals, np.asarray(seen.scene.rig.true_mm(), dtype=float))
-    seen_light = expose(coloured(specular)[at], coloured(own)[at], matt, np.ones(len(points), dtype=bool))
+    seen_light = expose_for_eye(coloured(specular)[at], coloured(own)[at], matt, np.ones(len(points), dtype=bool))
     return srgb_encode(np.clip(np.asarray(seen_light, float), 0, 1))
 
 

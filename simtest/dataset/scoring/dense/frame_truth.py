@@ -14,7 +14,7 @@ from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
 
 if TYPE_CHECKING:
     from simtest.rendering import Session, TruthMaps
-    from simtest.simulation.rendered_view import RenderedView
+    from simtest.simulation.frame import RenderedView
 
 Progress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and the frame's name."""
@@ -90,7 +90,7 @@ def frame_truth(
     name: str, maps: "TruthMaps", camera: Camera, eps: float, regions: IntArray, image: Image | None = None,
     calibration: Calibration | None = None, setting: str = "", swept: Mapping[str, object] | None = None,
 ) -> FrameTruth:  # fmt: skip
-    """Return the truth of a frame from its maps and the regions of its visible highlights (`Spots.regions`)."""
+    """Return the truth of a frame from its maps and the regions of its visible highlights (`VisibleSpots.regions`)."""
     metal = maps.instrument > 0
     seen = np.ones(maps.mask.shape, dtype=bool) if camera.seen is None else camera.seen
     bare = ~maps.mask | ~np.isfinite(maps.normal).all(axis=-1) | ~np.isfinite(maps.normal_base).all(axis=-1)

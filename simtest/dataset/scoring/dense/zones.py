@@ -22,7 +22,7 @@ def zones(regions: IntArray) -> npt.NDArray[np.uint8]:
     Parameters
     ----------
     regions : ndarray of int, shape (H, W)
-        Number of the highlight whose pixel it is, from 1; 0 where there is none (`Spots.regions`).
+        Number of the highlight whose pixel it is, from 1; 0 where there is none (`VisibleSpots.regions`).
     """
     nearness = _radii_away(regions)
     numbers = np.searchsorted(RINGS, nearness, side="left") + 1

@@ -10,10 +10,9 @@ import numpy.typing as npt
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Picture, write_arrays
 from simtest.runtime.files import write_atomically
-from simtest.simulation.flow import SeenSurface, flow_between, hides, moved_between
-from simtest.simulation.flow_picture import flow_picture
-from simtest.simulation.rendered_view import RenderedView
-from simtest.simulation.view_files import thumbnail, write_sheet
+from simtest.simulation.flow import SeenSurface, flow_between, flow_picture, hides, moved_between
+from simtest.simulation.frame import RenderedView
+from simtest.simulation.frame_files import thumbnail, write_sheet
 from simtest.spec import Scene
 
 STRIDE_PX = 16
@@ -29,7 +28,7 @@ FILES = ("flow_*.npz", COVISIBILITY, FLOW_SHEET)
 
 
 @dataclass(frozen=True)
-class _Frame:
+class _LabelledMoment:
     """What is kept of a frame for those that follow: its points on the stride's pixels, without instruments."""
 
     number: int
@@ -39,17 +38,11 @@ class _Frame:
 
 
 class SequenceLabels:
-    """Writes the labels of a sequence whose frames are added in order.
-
-    Parameters
-    ----------
-    folder : Path
-        An existing folder.
-    """
+    """Writes the labels of a sequence, whose frames are added in order, into an existing folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._frames: deque[_Frame] = deque(maxlen=MOST_APART)
+        self._frames: deque[_LabelledMoment] = deque(maxlen=MOST_APART)
         self._count = 0
         self._shares: dict[tuple[int, int], float] = {}
         self._pictures: list[Picture] = []
@@ -58,7 +51,7 @@ class SequenceLabels:
         """Add the next frame: the session is at its scene."""
         seen = SeenSurface.of(session)
         points = seen.tissue[STRIDE_PX // 2 :: STRIDE_PX, STRIDE_PX // 2 :: STRIDE_PX].reshape(-1, 3)
-        frame = _Frame(self._count, view.scene, seen, points[np.isfinite(points[:, 0])])
+        frame = _LabelledMoment(self._count, view.scene, seen, points[np.isfinite(points[:, 0])])
         if self._frames:
             last = self._frames.pop()
             self._write_flow(session, last, frame)
@@ -68,7 +61,7 @@ class SequenceLabels:
         self._frames.append(frame)
         self._count += 1
 
-    def _write_flow(self, session: Session, last: _Frame, new: _Frame) -> None:
+    def _write_flow(self, session: Session, last: _LabelledMoment, new: _LabelledMoment) -> None:
         times = last.scene.time_s, new.scene.time_s
         there, back = moved_between(session, *times), moved_between(session, *times[::-1])
         forward = flow_between(session, last.seen, new.seen, there)
@@ -88,7 +81,7 @@ class SequenceLabels:
         path = self._folder / f"flow_{last.number:04d}.npz"
         write_atomically(path, lambda part: write_arrays(part, arrays))
 
-    def _compare(self, session: Session, new: _Frame) -> None:
+    def _compare(self, session: Session, new: _LabelledMoment) -> None:
         """Compare the newest frame with those before it, both ways, on sparse points."""
         pairs = [(old, new) for old in self._frames]
         if not session.scene.deformation:

@@ -1,29 +1,41 @@
-"""A rendered scene with its true highlights, exposed and ready for the camera's noise."""
+"""A rendered scene with its true highlights, exposed and ready for the camera's noise; with its truth a labelled frame.
+
+The sensor's frame is data: its exposure puts the brightest highlight at full scale, and a surface without a diffuse
+part is black beside it. The preview is no data: the lit surface under its highlights, as an endoscope's automatic
+exposure would show it.
+"""
 
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration
+from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.rendering import HighlightPoint, Radiance, Session
+from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
 from simtest.rendering.highlights import radii_px
-from simtest.runtime.arrays import Array, Image, Mask
+from simtest.runtime.arrays import Array, Image, Mask, short_repr
 from simtest.runtime.seeds import from_integer
-from simtest.simulation import clouds as glint_clouds
-from simtest.simulation.camera_chain import capture, collect, full_scale_of_average
-from simtest.simulation.chain_noise import noise_at
-from simtest.simulation.coding import check_codec
-from simtest.simulation.true_highlights import TrueHighlight, examine, may_be_isolated, verdicts
-from simtest.simulation.visible_highlights import Spots, VisibleHighlight, describe, find_spots
+from simtest.simulation.highlights import (
+    TrueHighlight,
+    VisibleHighlight,
+    VisibleSpots,
+    assign_clouds,
+    describe,
+    examine,
+    find_spots,
+    may_be_isolated,
+    verdicts,
+)
+from simtest.simulation.sensor import capture, check_codec, collect, full_scale_of_average, noise_at, to_uint8
 from simtest.spec import Scene
 
-LEAST_SHARE = 1e-12
+DARK_SHARE = 1e-12
 """A percentile of the radiance that is no more than this share of its maximum is darkness, and sets no exposure."""
 
 DRAWS, FEW_DRAWS = 32, 4
@@ -32,6 +44,15 @@ DRAWS, FEW_DRAWS = 32, 4
 DEAR_SAMPLES = 16
 """With so many samples a pixel or fewer, a frame with a source of finite size costs no more than its quick look. A part
 of what a dataset's seed means: another number keeps other draws."""
+
+TISSUE = np.array([0.55, 0.27, 0.22], dtype=np.float32)
+"""Colour of a surface that has none of its own, linear."""
+
+SURFACE_LEVEL, BRIGHT_QUANTILE = 0.3, 0.9
+"""Where the surface's light at this quantile lies, share of full scale."""
+
+BLACK_SHARE = 1e-3
+"""With less diffuse light than this share of the brightest highlight a surface counts as black."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +88,13 @@ class RenderedView:
     calibration: Calibration
     instruments: npt.NDArray[np.uint8] | None = None
 
+    __repr__ = short_repr
+
+    @property
+    def camera(self) -> Camera:
+        """The camera's calibration."""
+        return self.calibration.camera
+
     @property
     def is_rough(self) -> bool:
         """Whether the surface carries a relief."""
@@ -85,17 +113,17 @@ class RenderedView:
     @cached_property
     def _specular(self) -> Image:
         """Mean of the channels of the lobe's light behind the lens, shape (H, W)."""
-        return _mean(collect(self.radiance.specular, self.scene.sensor, self.calibration.camera))
+        return _mean(collect(self.radiance.specular, self.scene.sensor, self.camera))
 
     @cached_property
     def _judged_light(self) -> Image:
         """The light behind the lens that labels are judged by (`_direct`), shape (H, W) or (H, W, 3)."""
-        return _direct(self.radiance, self.light, self.scene, self.calibration.camera)
+        return _direct(self.radiance, self.light, self.scene, self.camera)
 
     @cached_property
-    def spots(self) -> Spots:
+    def spots(self) -> VisibleSpots:
         """The pixels of the spots that can be seen in the noise-free frame, also of those on instruments."""
-        return find_spots(_mean(self._judged_light), self._specular, self.calibration.camera.seen)
+        return find_spots(_mean(self._judged_light), self._specular, self.camera.seen)
 
     @cached_property
     def visible_highlights(self) -> list[VisibleHighlight]:
@@ -103,12 +131,73 @@ class RenderedView:
         light, spots, sensor = self._judged_light, self.spots, self.scene.sensor
         sigma = noise_at(light, self.full_scale, sensor, spots.rows, spots.columns, FEW_DRAWS)
         clip = self.full_scale if sensor.clips else math.inf
-        seen = self.calibration.camera.seen
+        seen = self.camera.seen
         return describe(spots, _mean(light), self._specular, sigma, self.highlights, seen, self.instruments, clip)
 
     def frame(self, seed: int) -> Image:
         """Return the sensor's frame with the noise of a seed."""
-        return capture(self.light, self.full_scale, self.scene.sensor, from_integer(seed), self.calibration.camera.seen)
+        return capture(self.light, self.full_scale, self.scene.sensor, from_integer(seed), self.camera.seen)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class LabelledFrame(RenderedView):
+    """A rendered frame with its ground truth: a `RenderedView` with the sensor's frame and the truth of each pixel.
+
+    Parameters
+    ----------
+    image : ndarray of float32, shape (H, W) or (H, W, 3)
+        The sensor's frame, full scale 1, as encoded by the sensor's response.
+    truth : TruthMaps
+        At each pixel's centre, camera frame.
+    world_from_camera : ndarray, shape (4, 4)
+        The camera's pose, mm; the world is the surface's own frame.
+    variant : str
+        Mitsuba variant.
+
+    Examples
+    --------
+    >>> import simtest
+    >>> frame = simtest.render("sphere", width=96, height=96)
+    >>> found = simtest.reconstruct(frame.image, frame.calibration)
+    >>> float(found[0].estimates["cone_axis"].normal @ frame.highlights[0].normal) > 0.999
+    True
+    """
+
+    image: Image
+    truth: TruthMaps
+    world_from_camera: Array
+    variant: str
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the lit surface with its highlights, and what was rendered."""
+        from simtest.pages.notebook import note_html, picture_html
+
+        what = "isolated highlight" if self.isolated == 1 else "isolated highlights"
+        text = (
+            f"{self.scene.name}: {self.scene.surface.type}, {self.scene.reflectance.type}; "
+            f"{self.camera.width} x {self.camera.height} px; {self.isolated} {what}. "
+            "Exposed for the eye; `image` holds the data."
+        )
+        return picture_html(preview(self), text) + note_html(text)
+
+
+def make_frame(scene: Scene, variant: str | None = None, progress: Progress | None = None) -> LabelledFrame:
+    """Render a labelled frame (see `simtest.render`)."""
+    check_codec(scene.sensor.coding)
+    session = Session(scene, variant, labelled=True)
+    # The frame's labels are not used, but the truth starts from their hits.
+    radiance = session.frame(progress).radiance
+    truth = session.truth()
+    if not truth.mask.any():
+        raise InputError(f"scene {scene.name}: no pixel sees the surface; move it, or widen the field of view")
+    view = render_view(session, scene, radiance)
+    return LabelledFrame(
+        **{field.name: getattr(view, field.name) for field in fields(view)},
+        image=view.frame(scene.sensor.seed),
+        truth=truth,
+        world_from_camera=session.surface.model_from_camera,
+        variant=session.variant,
+    )
 
 
 def render_view(session: Session, scene: Scene, radiance: Radiance | None = None) -> RenderedView:
@@ -118,7 +207,7 @@ def render_view(session: Session, scene: Scene, radiance: Radiance | None = None
     if radiance is None:
         radiance = session.radiance()
     light = collect(radiance.total, scene.sensor, session.camera)
-    highlights, full_scale = _judged(session, radiance, light)
+    highlights, full_scale = _judged(session, scene, radiance, light)
     highlights, clouds = _placed(session, radiance, highlights)
     # What reconstruction is told may include the distance of the brightest highlight.
     calibration = scene.calibration(brightest_mm(highlights))
@@ -133,54 +222,48 @@ def brightest_mm(highlights: Sequence[TrueHighlight]) -> float | None:
     return max(lit, key=lambda highlight: highlight.radiance).distance if lit else None
 
 
-def render_picture(session: Session, scene: Scene) -> Image:
-    """Move a session to a scene and return the sensor's frame: that of `render_view`, without its highlights."""
-    session.update(scene)
-    return expose_picture(session, scene, session.radiance())
+def render_picture(session: Session, scene: Scene, radiance: Radiance | None = None) -> Image:
+    """Return the sensor's frame of a scene: that of `render_view`, without its highlights.
 
-
-def expose_picture(session: Session, scene: Scene, radiance: Radiance) -> Image:
-    """Return the sensor's frame of a radiance.
-
-    The session stands at a scene that differs from this one in nothing but its sensor. Highlights are searched only
-    where they set the exposure.
+    They are searched only where they set the exposure. With a `radiance` the session stands at a scene that differs
+    from this one in nothing but its sensor; else it is moved there.
     """
+    if radiance is None:
+        session.update(scene)
+        radiance = session.radiance()
     light, seen = collect(radiance.total, scene.sensor, session.camera), session.camera.seen
     full_scale = _metered(scene, _mean(light), seen)
     if full_scale is None:
-        full_scale = _judged(session, radiance, light)[1]
+        full_scale = _judged(session, scene, radiance, light)[1]
     return capture(light, full_scale, scene.sensor, from_integer(scene.sensor.seed), seen)
 
 
-def has_quick_look(scene: Scene) -> bool:
-    """Return whether a scene's frame of one sample a pixel and direct light is cheaper than its own.
+def quick_look(scene: Scene) -> Scene | None:
+    """Return a scene with one sample a pixel and direct light; None where its frame is no cheaper than the scene's.
 
     It is not where a source of finite size is sampled by as many points at each centre as in the whole pixel: then the
     frame that is kept is judged itself.
     """
     effort = scene.render
     wide = any(light.source is not None for light in scene.rig.lights)
-    return effort.path_depth > 2 or not wide or effort.samples_per_pixel > DEAR_SAMPLES
+    if effort.path_depth <= 2 and wide and effort.samples_per_pixel <= DEAR_SAMPLES:
+        return None
+    return scene.model_copy(update={"render": effort.model_copy(update={"samples_per_pixel": 1, "path_depth": 2})})
 
 
-def may_show(session: Session, scene: Scene, least: int) -> bool:
-    """Move a session to a scene, and return whether so many of its highlight points may be isolated at all.
-
-    Nothing is rendered: no frame of a scene for which this is false shows as many.
-    """
-    session.update(scene)
-    return sum(may_be_isolated(point) for point in session.highlights()) >= least
-
-
-def shows_isolated(session: Session, scene: Scene, least: int) -> bool:
+def shows_isolated(session: Session, scene: Scene, least: int, rendered: bool = True) -> bool:
     """Move a session to a scene, and return whether its frame shows at least so many isolated highlights.
 
-    The frame is rendered, with its labels, only where so many highlight points may be isolated at all.
+    The frame is rendered, with its labels, only where so many highlight points may be isolated at all; where it is not
+    to be `rendered`, that is the answer, and no frame of a scene for which it is false shows as many.
     """
-    if not may_show(session, scene, least):
+    session.update(scene)
+    if sum(may_be_isolated(point) for point in session.highlights()) < least:
         return False
+    if not rendered:
+        return True
     radiance = session.labelled_radiance()
-    highlights, _ = _judged(session, radiance, collect(radiance.total, scene.sensor, session.camera))
+    highlights, _ = _judged(session, scene, radiance, collect(radiance.total, scene.sensor, session.camera))
     return sum(highlight.isolated for highlight in highlights) >= least
 
 
@@ -194,9 +277,12 @@ def _direct(radiance: Radiance, light: Image, scene: Scene, camera: Camera) -> I
     return collect(radiance.specular + radiance.diffuse, scene.sensor, camera)
 
 
-def _judged(session: Session, radiance: Radiance, light: Image) -> tuple[list[TrueHighlight], float]:
-    """Judge a frame's highlights by its direct light behind the lens; return them and the full scale."""
-    scene, camera = session.scene, session.camera
+def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) -> tuple[list[TrueHighlight], float]:
+    """Judge a frame's highlights by its direct light behind the lens; return them and the full scale.
+
+    The session is at the scene, or at one that differs from it in nothing but its sensor.
+    """
+    camera = session.camera
     direct = _direct(radiance, light, scene, camera)
     points, rough = session.highlights(radiance), session.surface.relief is not None
     examined = examine(points, _mean(direct), camera.seen, single=rough)
@@ -227,7 +313,7 @@ def _placed(
         return own, own
     centres = session.base_highlights(radiance)
     lights, pixels = np.array([h.light for h in highlights], dtype=int), [h.bp_px for h in highlights]
-    numbers = glint_clouds.assign(session, lights, np.array(pixels).reshape(-1, 2), centres)
+    numbers = assign_clouds(session, lights, np.array(pixels).reshape(-1, 2), centres)
     placed = [
         replace(h, radius_px=float(radius), cloud=number)
         for h, radius, number in zip(highlights, radii, numbers, strict=True)
@@ -255,10 +341,10 @@ def _metered(scene: Scene, light: Image, seen: Mask | None) -> float | None:
         radiance = full_scale_of_average(light if seen is None else light[seen], exposure.average, scene.sensor)
     elif exposure.percentile is not None:
         radiance = float(np.percentile(light if seen is None else light[seen], exposure.percentile))
-        if radiance <= LEAST_SHARE * peak:
+        if radiance <= DARK_SHARE * peak:
             warnings.warn(
                 f"scene {scene.name}: sensor.exposure.percentile = {exposure.percentile:g}: that of the radiance is "
-                f"{radiance:g}, {LEAST_SHARE:g} of its maximum or less; the frame's maximum becomes full scale",
+                f"{radiance:g}, {DARK_SHARE:g} of its maximum or less; the frame's maximum becomes full scale",
                 stacklevel=4,
             )
             radiance = peak
@@ -271,3 +357,45 @@ def _light_at(light: Image, point_px: Array) -> float:
     """Return the light of the pixel that a point, px, lies in."""
     column, row = (min(int(v), size - 1) for v, size in zip(point_px, light.shape[::-1], strict=True))
     return float(light[row, column])
+
+
+def preview(frame: LabelledFrame) -> npt.NDArray[np.uint8]:
+    """Return a frame for the eye, sRGB of 8 bits, shape (H, W, 3) (see `expose_for_eye`)."""
+    radiance, truth = frame.radiance, frame.truth
+    matt = matt_light(truth.position, truth.normal_base, np.asarray(frame.scene.rig.true_mm(), dtype=float))
+    own = coloured(radiance.diffuse + radiance.indirect)
+    return to_uint8(expose_for_eye(coloured(radiance.specular), own, matt, truth.mask))
+
+
+def expose_for_eye(specular: Image, own: Image, matt: Image, mask: Mask) -> Image:
+    """Return linear light for the eye, shape (..., 3), in which the surface, where `mask` is, is lit.
+
+    A surface whose `own`, diffuse and bounced light is not black beside the specular one is exposed as a whole. Else it
+    gets the light of a matt surface of `TISSUE`, by that of a white one (`matt_light`), to which the specular light is
+    added with its brightest point at full scale.
+    """
+    peak = float(specular.max())
+    is_black = float(own.max()) <= BLACK_SHARE * peak
+    surface = matt[..., None] * TISSUE if is_black else own
+    lit = surface.mean(axis=-1)[mask]
+    level = float(np.quantile(lit, BRIGHT_QUANTILE)) if lit.size else 0.0
+    exposure = SURFACE_LEVEL / level if level > 0 else 1.0
+    return np.asarray(exposure * surface + specular * (1 / max(peak, 1e-30) if is_black else exposure), np.float32)
+
+
+def matt_light(position: Array, normal: Array, lights: Array) -> Image:
+    """Return the light of a white matt surface under lights, shape (L, 3), mm: relative, shape (...).
+
+    It is Lambert's cosine over the squared distance; 0 where there is no surface.
+    """
+    total = np.zeros(position.shape[:-1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for light in lights:
+            way = light - position
+            total += np.maximum((normal * way).sum(axis=-1), 0) / np.linalg.norm(way, axis=-1) ** 3
+    return np.nan_to_num(total).astype(np.float32)
+
+
+def coloured(values: Image) -> Image:
+    """Return light with three channels, shape (H, W, 3)."""
+    return np.repeat(values[:, :, None], 3, axis=2) if values.ndim == 2 else values

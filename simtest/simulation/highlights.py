@@ -1,0 +1,519 @@
+"""True highlights of a noise-free frame (theory.md sections 6 and 7.1b).
+
+Which of a surface's highlight points are isolated, visible highlights; which cloud each belongs to, around a highlight
+point of the base; and which spots can be seen. On a relief the highlight points, glints, melt, and minima of the misfit
+above 0 shine too: a visible spot may hold several glints or none. It is a local maximum of the light behind the lens
+whose saddle to any brighter one is below 0.8 of it, found by another algorithm than the detector's (detection.spots):
+the truth shares no code with what it judges.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from simtest.conventions import (
+    DEFAULT_SMOOTHING_PX,
+    HIGHLIGHT_CONTRAST_SIGMA,
+    HIGHLIGHT_ISOVALUE,
+    HIGHLIGHT_MIN_GAIN,
+    PIXEL_CENTRE,
+)
+from simtest.detection import contrast, half_height_component
+from simtest.detection.peaks import Component, component_above
+from simtest.geometry import smooth
+from simtest.rendering import HighlightPoint, Session
+from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
+from simtest.runtime.files import Json
+
+SADDLE = 0.8
+"""A maximum counts if its saddle to any brighter one is below this share of it."""
+
+LEAST_SPECULAR = 1 - SADDLE
+"""So the lobe must give at least this share of the light at the maximum: the rest is no highlight."""
+
+DARK = 1e-6
+"""Light below this share of the frame's maximum is darkness."""
+
+REACH_PX = 4.0
+"""A descent that ends farther than this from all highlight points of the base belongs to none in view."""
+
+Pixel = tuple[int, int]
+"""Row and column."""
+
+_UNITS = {"position": "position_mm", "distance": "distance_mm"}
+"""Names in files, where they are not those of the fields."""
+
+_TRUE = (
+    "light", "bp_px", "position", "normal", "direction_min", "distance", "kd_min", "kd_max", "normal_base",
+    "kd_min_base", "kd_max_base", "pool", "radius_px", "cloud", "lit", "hidden", "peak_snr", "isolated", "why_not",
+)  # fmt: skip
+_CLOUD = ("light", "bp_px", "position", "normal_base", "distance", "kd_min_base", "kd_max_base", "lit")
+_VISIBLE = (
+    "peak_px", "value", "specular", "peak_snr", "area_px", "centroid_px", "axis_ratio", "whole", "light", "cloud",
+    "glints",
+)  # fmt: skip
+"""What files hold of a highlight, of a cloud's centre and of a visible highlight."""
+
+
+def _record(highlight: object, names: Sequence[str]) -> dict[str, Json]:
+    """Return fields of a highlight as JSON; null stands for an empty text and for a number that is not finite."""
+    record: dict[str, Json] = {}
+    for name in names:
+        value = getattr(highlight, name)
+        if isinstance(value, np.ndarray | tuple):
+            value = np.asarray(value).tolist()
+        elif value == "" or (isinstance(value, float) and not math.isfinite(value)):
+            value = None
+        record[_UNITS.get(name, name)] = value
+    return record
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrueHighlight(HighlightPoint):
+    """A highlight point with the verdict on whether it is a true isolated highlight.
+
+    Parameters
+    ----------
+    peak_snr : float
+        Peak above its surroundings, up to where the sensor clips, over the standard deviation of the noise there
+        (`noise_at`); inf without noise, 0 where it has no closed isophote.
+    why_not : str
+        Empty for a true isolated highlight, else the first condition that it fails.
+    radius_px : float
+        Of the circle that has the highlight's area above half height, from its shape alone (theory.md 7.3), px; NaN
+        where it was not computed.
+    cloud : int or None
+        Number of its cloud, an index in `RenderedView.clouds`; None where its cloud's centre is not in view.
+    """
+
+    peak_snr: float
+    why_not: str
+    radius_px: float = math.nan
+    cloud: int | None = None
+
+    __repr__ = short_repr
+
+    @property
+    def isolated(self) -> bool:
+        """Whether it is a true isolated highlight."""
+        return not self.why_not
+
+    def to_json(self) -> dict[str, Json]:
+        """Return position, normal and curvature of the fine surface and of the base, and verdict."""
+        return _record(self, _TRUE)
+
+
+def cloud_json(centre: HighlightPoint) -> dict[str, Json]:
+    """Describe a highlight point of the base, with its normal and curvatures."""
+    return _record(centre, _CLOUD)
+
+
+@dataclass(frozen=True)
+class VisibleHighlight:
+    """A spot that can be seen.
+
+    Parameters
+    ----------
+    peak_px : ndarray, shape (2,)
+        Centre of its brightest pixel, px.
+    value : float
+        Direct light behind the lens at the peak, radiance.
+    specular : float
+        The part of it that comes off the lobe.
+    peak_snr : float
+        The specular part, up to where the sensor clips, over the noise at the peak; inf without noise.
+    area_px : int
+        Pixels above half of the lobe's peak, without those of brighter neighbours.
+    centroid_px : ndarray, shape (2,)
+        Of these pixels, weighted by the lobe's light, px.
+    axis_ratio : float
+        Minor over major axis of their second moments.
+    whole : bool
+        Whether they stay clear of the frame's border and of the view mask.
+    light, cloud : int or None
+        Index of the light and number of the cloud of its brightest glint, or else of the nearest lit one.
+    glints : tuple of int
+        Indices of the lit glints in it, the brightest first.
+    instrument : int or None
+        Index of the instrument on which its peak lies; it is no highlight of the surface then, and has no light, cloud
+        or glints.
+    """
+
+    peak_px: Array
+    value: float
+    specular: float
+    peak_snr: float
+    area_px: int
+    centroid_px: Array
+    axis_ratio: float
+    whole: bool
+    light: int | None
+    cloud: int | None
+    glints: tuple[int, ...]
+    instrument: int | None = None
+
+    __repr__ = short_repr
+
+    @property
+    def radius_px(self) -> float:
+        """Radius of the circle of its area, px."""
+        return float(np.sqrt(self.area_px / np.pi))
+
+    def to_json(self) -> dict[str, Json]:
+        """Return the fields as JSON; the instrument only where there is one."""
+        return _record(self, _VISIBLE if self.instrument is None else (*_VISIBLE, "instrument"))
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What a highlight point makes of the noise-free frame, whatever the noise.
+
+    Row and column of the maximum that it makes, the smoothed light there, its height above its surroundings (None where
+    it has no closed region of its own), and why it is not isolated even if it stands above the noise; empty: it is.
+    """
+
+    peak: Pixel
+    level: float
+    height: float | None
+    why_not: str
+
+
+def examine(
+    points: Sequence[HighlightPoint], light: Image, seen: Mask | None = None, single: bool = False
+) -> list[Examined]:
+    """Examine each highlight point in the noise-free frame.
+
+    `light`, shape (H, W), is the noise-free radiance behind the lens, mean of the channels; `seen` the pixels inside
+    the camera's view mask, default all. With `single` an isolated highlight holds one lit highlight point alone: on a
+    relief, where glints melt.
+    """
+    # The maximum that each point makes in the frame as detectors see it, and whose it is.
+    smoothed = smooth(light, DEFAULT_SMOOTHING_PX, seen)
+    peaks = [_peak_pixel(smoothed, point) for point in points]
+    owners = _owners(points, peaks)
+    lit = [point for point in points if point.lit] if single else []
+    pixels = np.array([point.bp_px for point in lit]).reshape(-1, 2).astype(int)
+    examined = []
+    for point, peak in zip(points, peaks, strict=True):
+        others = pixels[[own is not point for own in lit]] if single and owners.get(peak) is point else pixels[:0]
+        height, why_not = _examined(point, smoothed, seen, peak, owners.get(peak) is point, others)
+        examined.append(Examined(peak, float(smoothed[peak]), height, why_not))
+    return examined
+
+
+def verdicts(
+    points: Sequence[HighlightPoint], examined: Sequence[Examined], sigmas: Array, clip: float = math.inf
+) -> list[TrueHighlight]:
+    """Judge highlight points that were examined.
+
+    `sigmas`, shape (N,), is the noise at each one's peak, radiance, 0 without noise; `clip` the radiance at which the
+    sensor's values end.
+    """
+    highlights = []
+    for point, each, sigma in zip(points, examined, sigmas.tolist(), strict=True):
+        # Without a maximum of its own it has no SNR.
+        snr = 0.0
+        if each.height is not None:
+            snr = _snr(min(each.level, clip) - min(each.level - each.height, clip), sigma)
+        faint = f"peak below {HIGHLIGHT_CONTRAST_SIGMA:g} sigma" if snr < HIGHLIGHT_CONTRAST_SIGMA else ""
+        highlights.append(TrueHighlight(**vars(point), peak_snr=snr, why_not=each.why_not or faint))
+    return highlights
+
+
+def _snr(height: float, sigma: float) -> float:
+    """Return a height over the noise, 0 without both."""
+    return height / sigma if sigma > 0 else math.inf if height > 0 else 0.0
+
+
+def may_be_isolated(point: HighlightPoint) -> bool:
+    """Return whether a highlight point may be isolated: by light and shape alone, whatever the frame."""
+    return point.lit and not point.min_gain <= HIGHLIGHT_MIN_GAIN
+
+
+def lobe_region(point: HighlightPoint, specular: Image, at_point: float) -> tuple[float, Component | None]:
+    """Return the peak that a highlight point makes in the lobe's light, and the connected pixels above half of it.
+
+    The peak is the brightest pixel uphill from the point, or the light `at_point` (`Session.lobe_at`) where that is
+    more: a highlight smaller than a pixel has none that reaches half of it, and no region. `specular` is the lobe's
+    noise-free light before the lens, shape (H, W).
+    """
+    row, column = _peak_pixel(specular, point)
+    brightest = float(specular[row, column])
+    peak = max(at_point, brightest)
+    level = HIGHLIGHT_ISOVALUE * peak
+    return peak, component_above(specular, row, column, level) if brightest >= level > 0 else None
+
+
+def _owners(points: Sequence[HighlightPoint], peaks: list[Pixel]) -> dict[Pixel, HighlightPoint]:
+    """Assign each maximum of the smoothed frame to the nearest lit BP: smoothing may merge several highlights."""
+    owners: dict[Pixel, HighlightPoint] = {}
+    for point, peak in zip(points, peaks, strict=True):
+        if not point.lit:
+            continue
+        centre = np.array([peak[1] + PIXEL_CENTRE, peak[0] + PIXEL_CENTRE])
+        rival = owners.setdefault(peak, point)
+        if np.hypot(*(point.bp_px - centre)) < np.hypot(*(rival.bp_px - centre)):
+            owners[peak] = point
+    return owners
+
+
+def _examined(
+    point: HighlightPoint, smoothed: Image, seen: Mask | None, peak: Pixel, owns_peak: bool, others: IntArray
+) -> tuple[float | None, str]:
+    """Return the height of a highlight point's maximum and the first condition but that of noise that it fails.
+
+    `others` are columns and rows, shape (N, 2), of the points that may not lie in its half-height region.
+    """
+    if not point.lit:
+        return None, "hidden by an instrument" if point.hidden else "in shadow"
+    component = half_height_component(smoothed, *peak, seen) if owns_peak else None
+    # Uphill may lead far: to another highlight, or to where the base is brightest.
+    if component is None or not component.holds(point.bp_px[None]).all():
+        return None, "part of a brighter one"
+    height = contrast(smoothed, component, float(smoothed[peak]), seen)
+    if component.holds(others).any():
+        return height, "holds several glints"
+    # Shape, frame, noise: in the order of theory.md section 6.
+    if point.min_gain <= HIGHLIGHT_MIN_GAIN:
+        return height, f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}"
+    if not component.closed:
+        return height, "isophote at t = 0.5 leaves the frame"
+    return height, ""
+
+
+def _peak_pixel(smoothed: Image, point: HighlightPoint) -> Pixel:
+    """Climb from the true BP to the local maximum."""
+    column, row = (int(v) for v in point.bp_px)
+    row, column = min(row, smoothed.shape[0] - 1), min(column, smoothed.shape[1] - 1)
+    while True:
+        top, left = max(row - 1, 0), max(column - 1, 0)
+        window = smoothed[top : row + 2, left : column + 2]
+        step = divmod(int(window.argmax()), window.shape[1])
+        if (step[0] + top, step[1] + left) == (row, column):
+            return row, column
+        row, column = step[0] + top, step[1] + left
+
+
+def assign_clouds(
+    session: Session, lights: IntArray, points_px: Array, centres: list[HighlightPoint]
+) -> list[int | None]:
+    """Assign image points to the clouds around the base's highlight points.
+
+    `lights`, shape (N,), are those of the points, shape (N, 2), px; `centres` the base's of all lights in view. Returns
+    an index in them, of one with the same light; None where the descent leaves the view, or ends at a fold.
+    """
+    clouds: list[int | None] = [None] * len(points_px)
+    for light in np.unique(lights):
+        own, _, regions = _regions(session, light, centres)
+        height, width = regions.shape
+        for i in np.flatnonzero(lights == light):
+            column, row = (min(int(v), size - 1) for v, size in zip(points_px[i], (width, height), strict=True))
+            if regions[row, column] >= 0:
+                clouds[i] = own[regions[row, column]]
+    return clouds
+
+
+def cloud_edges(session: Session, centres: Sequence[HighlightPoint]) -> list[float]:
+    """Return the least misfit of the base at the edge of each cloud's region: the sine of the angle to the bisector.
+
+    A region is what belongs to the cloud (`assign_clouds`). It ends at the frame's border, at the view mask, where the
+    surface ends, and next to another cloud. A glint lies where the base's misfit is the relief's slope, so a cloud is
+    as good as wholly in view where the misfit at the edge is several slopes.
+    """
+    least, seen = np.zeros(len(centres)), session.camera.seen
+    for light in {centre.light for centre in centres}:
+        own, size, regions = _regions(session, light, centres)
+        regions = np.where(np.isfinite(size) & (True if seen is None else seen), regions, -1)
+        around = np.pad(regions, 1, constant_values=-1)
+        beside = (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])
+        edge = np.logical_or.reduce([regions != other for other in beside])
+        for i, number in enumerate(own):
+            least[number] = size[edge & (regions == i)].min(initial=np.inf)
+    return np.where(np.isfinite(least), least, 0.0).tolist()
+
+
+def _regions(session: Session, light: int, centres: Sequence[HighlightPoint]) -> tuple[list[int], Image, IntArray]:
+    """Return the indices of a light's centres, the base's misfit, and where each pixel belongs, shape (H, W).
+
+    The latter is an index in the first, or -1 for none.
+    """
+    own = [number for number, centre in enumerate(centres) if centre.light == light]
+    maps = session.misfits()
+    inside = slice(maps.margin, -maps.margin)
+    w = maps.base[light][:, inside, inside]
+    size = np.hypot(w[0], w[1])
+    height, width = size.shape
+    if not own:
+        return own, size, np.full((height, width), -1)
+    # Where descents end, and which centre is near.
+    target = _ends(size)
+    bottoms = np.flatnonzero((target == np.arange(target.size)) & np.isfinite(size.ravel()))
+    at = np.stack([bottoms % width, bottoms // width], axis=1) + PIXEL_CENTRE
+    gap = np.linalg.norm(at[:, None] - np.array([centres[number].bp_px for number in own]), axis=2)
+    nearest = np.full(target.size, -1)
+    nearest[bottoms] = np.where(gap.min(axis=1) < REACH_PX, gap.argmin(axis=1), -1)
+    return own, size, nearest[target].reshape(height, width)
+
+
+def _ends(size: Image) -> IntArray:
+    """Return the pixel, by its number row by row, at which the steepest descent from each ends, shape (H * W,)."""
+    height, width = size.shape
+    padded = np.pad(np.where(np.isfinite(size), size, np.inf), 1, constant_values=np.inf)
+    # Each pixel points at the lowest of itself and its neighbours.
+    lowest, target = padded[1:-1, 1:-1].copy(), np.arange(height * width).reshape(height, width)
+    index = np.pad(target, 1)
+    for down in range(3):
+        for right in range(3):
+            value = padded[down : down + height, right : right + width]
+            lower = value < lowest
+            lowest[lower] = value[lower]
+            target[lower] = index[down : down + height, right : right + width][lower]
+    # Follow the pointers, twice as far each time.
+    flat = target.ravel()
+    while not np.array_equal(farther := flat[flat], flat):
+        flat = farther
+    return flat
+
+
+@dataclass(frozen=True)
+class VisibleSpots:
+    """Maxima of a frame, the brightest first, and the pixels of each.
+
+    `rows` and `columns`, shape (N,), are those of the peaks; `regions`, shape (H, W), the number of the maximum whose
+    pixel each is, from 1; 0 where none.
+    """
+
+    rows: IntArray
+    columns: IntArray
+    regions: IntArray
+
+
+def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> VisibleSpots:
+    """Find the maxima of a noise-free frame that are highlights.
+
+    `light` is the radiance behind the lens, `specular` the part that comes directly off the lobe, both of shape (H, W),
+    `seen` the pixels inside the view mask, default all.
+    """
+    from skimage.measure import label
+    from skimage.morphology import local_maxima, reconstruction
+    from skimage.segmentation import watershed
+
+    light = np.where(np.isfinite(light), light, 0.0).astype(np.float64)
+    if seen is not None:
+        light = np.where(seen, light, 0.0)
+    none = np.empty(0, dtype=np.int64)
+    empty = VisibleSpots(none, none, np.zeros(light.shape, dtype=np.int64))
+    if light.max() <= 0:
+        return empty
+    # Maxima: in logarithms the ratio of saddle and peak is a height, and these are the h-maxima.
+    log = np.log(np.maximum(light, DARK * light.max()))
+    flooded = reconstruction(log + np.log(SADDLE), log, method="dilation")
+    summits, count = label(local_maxima(flooded), connectivity=2, return_num=True)
+    if count == 0:
+        return empty
+    # The brightest pixel of each; only those that shine.
+    order = np.argsort(-light, axis=None, kind="stable")
+    order = order[summits.ravel()[order] > 0]
+    _, first = np.unique(summits.ravel()[order], return_index=True)
+    peaks = order[np.sort(first)]
+    peaks = peaks[specular.ravel()[peaks] >= LEAST_SPECULAR * light.ravel()[peaks]]
+    if not len(peaks):
+        return empty
+    rows, columns = np.unravel_index(peaks, light.shape)
+    # Pixels: above half of the lobe's peak, shared out by watershed, connected to the peak.
+    markers = np.zeros(light.shape, dtype=np.int32)
+    markers[rows, columns] = np.arange(1, len(peaks) + 1)
+    half = specular[rows, columns] / 2
+    owners = watershed(-specular, markers, mask=specular >= half.min())
+    owners[specular < np.concatenate([[np.inf], half])[owners]] = 0
+    pieces = label(owners, background=0, connectivity=1)
+    # A component keeps its number only if it holds its own peak.
+    held = np.zeros(pieces.max() + 1, dtype=np.int64)
+    held[pieces[rows, columns]] = np.arange(1, len(peaks) + 1)
+    held[0] = 0
+    return VisibleSpots(np.asarray(rows), np.asarray(columns), held[pieces])
+
+
+def glints_of(spots: VisibleSpots, glints: list[TrueHighlight]) -> list[tuple[int, ...]]:
+    """Return which lit glints, by index, each spot holds, or has next to its pixels."""
+    from skimage.segmentation import expand_labels
+
+    held: list[list[int]] = [[] for _ in spots.rows]
+    if not len(spots.rows):
+        return []
+    # A glint lies up to a pixel beside the light that it makes.
+    around = expand_labels(spots.regions, distance=1)
+    height, width = around.shape
+    for number, glint in enumerate(glints):
+        column, row = min(int(glint.bp_px[0]), width - 1), min(int(glint.bp_px[1]), height - 1)
+        if glint.lit and around[row, column]:
+            held[around[row, column] - 1].append(number)
+    return [tuple(numbers) for numbers in held]
+
+
+def describe(
+    spots: VisibleSpots, light: Image, specular: Image, sigma: Array, glints: list[TrueHighlight],
+    seen: Mask | None = None, instruments: npt.NDArray[np.uint8] | None = None, clip: float = np.inf,
+) -> list[VisibleHighlight]:  # fmt: skip
+    """Describe the spots of a frame, the brightest first.
+
+    `light`, `specular` and `seen` are those of `find_spots`, `sigma`, shape (N,), is the noise at each peak, radiance.
+    Of the `glints`, all of the frame, the brightest that a spot holds gives its light and cloud, or else the nearest
+    lit one. `instruments`, shape (H, W), is 1 + the index of the instrument that is seen, 0 where none is; `clip` the
+    radiance at which the sensor's values end.
+    """
+    lit = [number for number, glint in enumerate(glints) if glint.lit]
+    at = np.array([glints[number].bp_px for number in lit]).reshape(-1, 2)
+    # the pixels of each spot, row by row
+    flat = np.flatnonzero(spots.regions)
+    number_of = spots.regions.ravel()[flat]
+    ends = np.cumsum(np.bincount(number_of, minlength=len(spots.rows) + 1)[1:])
+    pixels = np.split(flat[np.argsort(number_of, kind="stable")], ends[:-1])
+    described = []
+    for number, held in enumerate(glints_of(spots, glints)):
+        row, column = int(spots.rows[number]), int(spots.columns[number])
+        peak = np.array([column, row]) + PIXEL_CENTRE
+        owner = 0 if instruments is None else int(instruments[row, column])
+        held = () if owner else held
+        nearest = held[0] if held else None
+        if not (held or owner) and lit:
+            nearest = lit[int(np.linalg.norm(at - peak, axis=1).argmin())]
+        value, lobe = float(light[row, column]), float(specular[row, column])
+        shown = min(value, clip) - min(value - lobe, clip)
+        centroid, axis_ratio, whole = _shape(*np.divmod(pixels[number], light.shape[1]), specular, seen)
+        described.append(
+            VisibleHighlight(
+                peak_px=peak,
+                value=value,
+                specular=lobe,
+                peak_snr=_snr(shown, sigma[number]),
+                area_px=len(pixels[number]),
+                centroid_px=centroid,
+                axis_ratio=axis_ratio,
+                whole=whole,
+                light=None if nearest is None else glints[nearest].light,
+                cloud=None if nearest is None else glints[nearest].cloud,
+                glints=held,
+                instrument=owner - 1 if owner else None,
+            )
+        )
+    return described
+
+
+def _shape(rows: IntArray, columns: IntArray, specular: Image, seen: Mask | None) -> tuple[Array, float, bool]:
+    """Return centroid, axis ratio and wholeness (see `VisibleHighlight`) of a spot's pixels, by the lobe's light."""
+    weight = specular[rows, columns].astype(np.float64)
+    points = np.stack([columns, rows], axis=1) + PIXEL_CENTRE
+    centroid = weight @ points / weight.sum()
+    gap = points - centroid
+    # A pixel has a moment of its own.
+    moments = np.einsum("n,ni,nj->ij", weight, gap, gap) / weight.sum() + np.eye(2) / 12
+    small, large = np.linalg.eigvalsh(moments)
+    height, width = specular.shape
+    whole = rows.min() > 0 and columns.min() > 0 and rows.max() < height - 1 and columns.max() < width - 1
+    if whole and seen is not None:
+        whole = all(seen[rows + down, columns + right].all() for down in (-1, 1) for right in (-1, 1))
+    return centroid, float(np.sqrt(small / large)), bool(whole)
