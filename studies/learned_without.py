@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from simtest.cli.progress import progress_bar
-from simtest.estimators.learned_spot import LearnedSpot, _Network, log_deviation
-from simtest.estimators.spot_inputs import ROTATION_SCALE, SURFACES, normal_of
+from simtest.estimators.learned import normal_of
+from simtest.estimators.learned_spot import ROTATION_SCALE, SURFACES, LearnedSpot, _Network, log_deviation
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.arrays import AnyArray, Array

@@ -10,9 +10,8 @@ from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES, HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
-from simtest.estimators.family_fit import fit_isophote_family
-from simtest.estimators.highlight_fit import Fitted, fit_highlight, fit_highlights, fit_small
-from simtest.estimators.isophote_family import IsophoteFamily
+from simtest.estimators.family import IsophoteFamily, fit_isophote_family
+from simtest.estimators.highlight import Fitted, fit_highlight, fit_highlights, fit_small
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, Law
 from simtest.geometry import Array, Camera, Patch

@@ -7,7 +7,7 @@ from typing import ClassVar
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
-from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
+from simtest.estimators.highlight import fit_highlight, fit_highlights
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, Law
 from simtest.geometry import Camera, Patch
@@ -39,7 +39,7 @@ class ConeAxis:
         flagged ``missing_isovalues``; with fewer than 2 left it fails for the first one's reason. The covariance is
         that of the noise and, where the axis drifts with the isovalue by more than noise, of the drift. A highlight
         too small for isophotes gets the normal of its centre, without axis ratio, flagged ``unresolved``
-        (`simtest.estimators.small_spot`).
+        (`simtest.estimators.small_spots`).
         """
         family = fit_highlight(patch, camera, self.isovalues)
         if isinstance(family, Failure):

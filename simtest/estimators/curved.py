@@ -10,11 +10,11 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
-from simtest.estimators.isophote_family import STREAK_RATIO, IsophoteFamily
+from simtest.estimators.family import STREAK_RATIO, IsophoteFamily
+from simtest.estimators.highlight import fit_highlight, fit_highlights
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, EstimatedCurvature, Law
-from simtest.estimators.small_spot import SmallSpot
+from simtest.estimators.small_spots import SmallSpot
 from simtest.geometry import Array, Camera, Patch
 
 STREAK_GAIN = 0.1

@@ -22,9 +22,9 @@ from simtest.calibration import Calibration
 from simtest.calibration.photometry import NoiseModel
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.detection.colour import ColourDetector
-from simtest.estimators.bends import MEAN_BENDS, PEAK_BENDS
-from simtest.estimators.highlight_fit import fit_highlight
-from simtest.estimators.isophote_family import MEAN_RIPPLES, PEAK_RIPPLES, IsophoteFamily
+from simtest.estimators.budget import MEAN_BENDS, PEAK_BENDS
+from simtest.estimators.family import MEAN_RIPPLES, PEAK_RIPPLES, IsophoteFamily
+from simtest.estimators.highlight import fit_highlight
 from simtest.geometry import Array, Camera, Mask, Patch, chi_squared
 from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, run_pipeline
 from simtest.runtime.seeds import Stage, generator

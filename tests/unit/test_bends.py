@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from simtest.calibration import LIGHT_AT_CAMERA
 from simtest.conventions import CONE_AXIS_ISOVALUES
-from simtest.estimators.bends import MEAN_BENDS, MELTED, MELTED_RESIDUAL, PEAK_BENDS, bend_variance
+from simtest.estimators.budget import MEAN_BENDS, MELTED, MELTED_RESIDUAL, PEAK_BENDS, bend_variance
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
-from simtest.estimators.family_fit import fit_isophote_family
+from simtest.estimators.family import fit_isophote_family
 from simtest.geometry import Camera, Patch, chi_squared, smooth
 from simtest.geometry.vectors import tangent_coordinates
 

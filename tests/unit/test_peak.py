@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
-from simtest.estimators.family_fit import fit_isophote_family
-from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_PX2, MEAN_SHARE, MEAN_SIZE, PEAK_PX2, SUSPECT_CHI2
+from simtest.estimators.family import (
+    DRIFT_CHI2,
+    MEAN_PX2,
+    MEAN_SHARE,
+    MEAN_SIZE,
+    PEAK_PX2,
+    SUSPECT_CHI2,
+    fit_isophote_family,
+)
+from simtest.estimators.isophotes import weights_at_zero, weights_of_axes
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.lenses import KannalaBrandt
 from simtest.geometry.vectors import angle_deg

@@ -7,9 +7,8 @@ import pytest
 from simtest.bench.run import core_record
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
-from simtest.estimators.installed import ESTIMATORS
 from simtest.estimators.learned_spot import SHIPPED
-from simtest.estimators.process.naming import absolute_names, core_hashes, core_records, short_names
+from simtest.estimators.names import ESTIMATORS, absolute_names, core_hashes, core_records, short_names
 from simtest.runtime.provenance import file_hash
 from simtest.runtime.resources import data_root
 

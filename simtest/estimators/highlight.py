@@ -4,10 +4,9 @@ from collections.abc import Hashable, Sequence
 
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
-from simtest.estimators.family_fit import fit_isophote_families
-from simtest.estimators.isophote_family import IsophoteFamily
-from simtest.estimators.isophote_fit import FittedIsophote, fit_isophote_of_each
-from simtest.estimators.small_spot import SmallSpot, fit_small_spots, is_small
+from simtest.estimators.family import IsophoteFamily, fit_isophote_families
+from simtest.estimators.isophotes import FittedIsophote, fit_isophote_of_each
+from simtest.estimators.small_spots import SmallSpot, fit_small_spots, is_small
 from simtest.geometry import Camera, Patch
 
 HighlightAxis = IsophoteFamily | SmallSpot
