@@ -2,7 +2,7 @@
 
 `protocol` declares what an estimator is and returns, `names` finds it, `dispatch` runs it. Each estimator is a file of
 its name: `cone_axis`, `brightest_point`, `circle_pose`, `curved`, `bisector`, `photometric`, `cloud`, and the networks
-`learned_spot` and `learned_dense`. Those of single highlights share what `highlight` fits: an ellipse each (`isophotes`),
+`learned_spot` and `learned_dense`. Those of single highlights share what `highlight` fits: ellipses (`isophotes`),
 these together, extrapolated to the peak (`family`), or the centre of a spot of a few pixels (`small_spots`).
 """
 

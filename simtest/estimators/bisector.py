@@ -10,12 +10,12 @@ from typing import ClassVar, TypeGuard
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Distribution, Normal, Priors
-from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget, line_covariance
-from simtest.estimators.highlight import HighlightAxis, fit_highlight, fit_highlights
+from simtest.estimators.highlight import OfHighlight
 from simtest.estimators.prior_parts import add_common_parts, told_light_part
 from simtest.estimators.protocol import Estimate, Law
+from simtest.estimators.small_spots import HighlightAxis
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
 
@@ -105,7 +105,7 @@ DISTANCES = (np.arange(32) + 0.5) / 32
 
 
 @dataclass(frozen=True)
-class Bisector:
+class Bisector(OfHighlight):
     """The bisector of the directions to the light and to the camera at P = d s (theory.md section 3, item 1).
 
     s is the sightline of the BP: the cones' axis followed to t -> 1, less the shift of the radiance's peak by the
@@ -119,60 +119,46 @@ class Bisector:
     surface is nearer than twice the median, which for a uniform distribution is everywhere. The mean of the normals
     would follow the few near distances, and be worse than no correction beyond 55 of 5 to 80 mm.
 
-    Parameters
-    ----------
-    isovalues : tuple of float
-        Each t in (0, 1).
+    The candidates are those of the lights that may have made the highlight, the proposed one first. With several
+    lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
+    lights' mean position is used, flagged ``ambiguous_light``, and the part ``light_offset`` of the budget is the
+    mean square of what the single lights would give, over the distances. Fails with ``not_known`` without lights.
     """
 
-    isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
     laws: ClassVar[tuple[Law, ...]] = ("bisector", "axis_ratio_seen")
 
-    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
-        """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
-        fit_highlights(patches, camera, self.isovalues)
-
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
-        """Estimate the normal (see `simtest.estimators.Estimator`); the lights must be told.
-
-        The candidates are those of the lights that may have made the highlight, the proposed one first. With several
-        lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
-        lights' mean position is used, flagged ``ambiguous_light``, and the part ``light_offset`` of the budget is the
-        mean square of what the single lights would give, over the distances.
-
-        Fails as `cone_axis` does, and with ``not_known`` without lights. In a highlight too small for isophotes s is
-        the sightline of its centre, flagged ``unresolved``, and no axis ratio is stated.
-        """
+        """Estimate the normal (see `simtest.estimators.Estimator`); the lights must be told."""
         if not priors.lights_mm:
             return Failure(Reason.NOT_KNOWN, "needs the lights' positions")
-        family = fit_highlight(patch, camera, self.isovalues)
-        if isinstance(family, Failure):
-            return family
-        lights, flags = priors.lights, family.flags
-        own = light_of_highlight(family, priors)
+        return super().estimate(patch, camera, priors)
+
+    def of(self, highlight: HighlightAxis, priors: Priors) -> Estimate:
+        """Estimate the normal at a fitted highlight."""
+        lights, flags = priors.lights, highlight.flags
+        own = light_of_highlight(highlight, priors)
         order = [*lights] if own is None else [lights[own]]
         if own is None:
             # What is seen is then usually the lights' common lobe.
             order.insert(0, lights.mean(axis=0))
             flags = (*flags, "ambiguous_light")
-        found = [_normal(family, light, priors.distance) for light in order]
+        found = [_normal(highlight, light, priors.distance) for light in order]
         normal, sightline = found[0]
-        candidates = np.array([candidate for candidate, _ in found])
-        budget = _budget(family, order[0], priors.distance, normal)
+        budget = _budget(highlight, order[0], priors.distance, normal)
         if budget is not None and own is None:
-            budget = {**budget, "light_offset": _light_part(family, order, priors.distance, normal)}
+            budget = {**budget, "light_offset": _light_part(highlight, order, priors.distance, normal)}
         if budget is not None and priors.lights_covariance is not None:
             budget = _with_light_error(budget, found[0], order[0], own, priors)
         estimate = Estimate(
             normal=normal,
-            candidates=candidates,
-            look_px=camera.project(sightline),
-            axis_ratio=family.axis_ratio,
-            isophotes=family.isophotes,
+            candidates=np.array([candidate for candidate, _ in found]),
+            look_px=highlight.camera.project(sightline),
+            axis_ratio=highlight.axis_ratio,
+            isophotes=highlight.isophotes,
             budget=budget,
             flags=flags,
         )
-        return add_common_parts(estimate, camera, priors, family)
+        return add_common_parts(estimate, highlight.camera, priors, highlight)
 
 
 bisector = Bisector()

@@ -361,7 +361,6 @@ def _cosines() -> Array:
     return np.cos(np.outer(np.append(1, HARMONICS), _ANGLES))
 
 
-MEAN_BENDS, PEAK_BENDS = fitted_number("bends.mean"), fitted_number("bends.peak")
 MELTED, MELTED_RESIDUAL = fitted_number("bends.melted"), fitted_number("bends.melted_residual")
 STEEPNESS = fitted_number("bends.steepness")
 
@@ -379,7 +378,7 @@ def bend_variance(residuals: Array, by_noise: Array, moments: Array, slope: floa
     moments : ndarray, shape (2, 2)
         Second moments of the highlight, rad^2.
     slope : float
-        `MEAN_BENDS` or `PEAK_BENDS`.
+        Of the axis (`simtest.estimators.family.AxisErrors`).
     """
     bend = float(np.sqrt(np.maximum(residuals**2 - by_noise**2, 0.0)).min())
     share = max(

@@ -34,14 +34,14 @@ def pose_region(patch: Patch, camera: Camera, isophote: FittedIsophote) -> PoseR
     if patch.noise is None or isinstance(pose, Failure):
         return None
     try:
-        return _region(IsophoteFamily(patch, camera, (isophote,), (pose,), ()))
+        return _region(IsophoteFamily.of(patch, camera, [isophote], [pose]))
     except np.linalg.LinAlgError:
         # The crossings do not determine the conic.
         return None
 
 
 def _region(family: IsophoteFamily) -> PoseRegion | None:
-    conic, noise = family.conic(0), family.conic_covariance(0)  # as seen, after smoothing
+    conic, noise = family.conics[0], family.conic_covariance(0)  # as seen, after smoothing
     # the ellipse before smoothing: same centre, smaller moments
     shrink = np.append(np.zeros(2), -family.widening()[np.triu_indices(2)])
     ellipse, turn = _ellipse(conic), _jacobian(_ellipse, conic)

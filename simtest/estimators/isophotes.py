@@ -1,12 +1,8 @@
-"""Fitting steps that estimators share: from a patch's isophotes to ellipses and the cones of their sightlines.
+"""The isophotes of one highlight: contours, ellipses and cones, and how they lie and move across a common axis.
 
-Linear extrapolation of the isophotes' properties to the peak, as weights of the single isophotes.
-
-The peak value of a lobe, from all pixels around the peak instead of the highest one alone.
-
-The crossings of a highlight's isophotes in a basis across its axis, their conics there, and how noise moves them.
-
-All isophotes are processed at once: a call for each would cost more than the work.
+From a patch's contours to ellipses and the cones of their sightlines; the peak value from all pixels around the peak
+instead of the highest one alone; the weights that extrapolate to the peak; the crossings in a basis across the axis,
+their conics there, and how noise moves them.
 """
 
 from collections.abc import Sequence
@@ -316,25 +312,17 @@ _CIRCLE = np.array([np.cos(_OUTLINE), np.sin(_OUTLINE)])
 
 
 @dataclass(frozen=True)
-class FamilyCrossings:
-    """The points of K isophotes, N in all, one isophote after the other.
+class IsophotesAcross:
+    """K isophotes of one patch, at least one and each the cone of an ellipse, in a basis across their axis.
 
-    Parameters
-    ----------
-    patch : Patch
-        Region of interest.
-    camera : Camera
-        Calibration.
-    isophotes : tuple of FittedIsophote
-        Each the cone of an ellipse.
-    frame : ndarray, shape (3, 3)
-        Two unit vectors across the axis, and the axis.
+    All are processed at once, their N points one isophote after the other: a call for each would cost more than the
+    work.
     """
 
     patch: Patch
     camera: Camera
     isophotes: tuple[FittedIsophote, ...]
-    frame: Array
+    frame: Array  # (3, 3): two unit vectors across the axis, and the axis
 
     @cached_property
     def isovalues(self) -> Array:
@@ -361,7 +349,7 @@ class FamilyCrossings:
         # a x^2 + ... = 1 is a real ellipse where det A > 0, and A has the sign of the right side about its centre.
         return np.asarray((determinant > 0) & (a * size > 0))
 
-    def tangents(self, points: Array) -> Array:
+    def _across(self, points: Array) -> Array:
         """Return the tangents of pixels' angles from the axis, in the basis, shapes (M, 2) and (2, M)."""
         if self.camera.distortion is None:
             return self._pinhole(points)[0]
@@ -412,7 +400,7 @@ class FamilyCrossings:
         x1, y1 = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
         doubled = x * y1 - x1 * y
         moments = np.array([((x + x1) * doubled).sum(axis=1), ((y + y1) * doubled).sum(axis=1)])
-        return np.asarray(self.tangents((moments / (3 * doubled.sum(axis=1))).T + middle).T)
+        return np.asarray(self._across((moments / (3 * doubled.sum(axis=1))).T + middle).T)
 
     @cached_property
     def ripples(self) -> AnyArray:
@@ -473,7 +461,7 @@ class FamilyCrossings:
     @cached_property
     def _point_tangents(self) -> Array:
         """Their tangents, shape (2, N)."""
-        return self.tangents(self._points)
+        return self._across(self._points)
 
     def _steps(self, vertical: Mask) -> Array:
         """Return how the tangents change as each point moves along its line, per px, shape (2, N)."""
@@ -482,7 +470,7 @@ class FamilyCrossings:
             along = self._from_image.take(vertical.astype(np.intp), axis=1)
             return np.asarray((along[:2] - tangents * along[2]) / depth)
         step, count = STEP_PX * np.array([~vertical, vertical]).T, len(vertical)
-        moved = self.tangents(np.concatenate([self._points + step, self._points - step]))
+        moved = self._across(np.concatenate([self._points + step, self._points - step]))
         return np.asarray((moved[:, :count] - moved[:, count:]) / (2 * STEP_PX))
 
     @cached_property

@@ -4,23 +4,20 @@ Goodness of a lobe's fit: whether it explains its pixels, and how far the normal
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
 
-from simtest.calibration import NO_PRIORS, Priors
+from simtest.calibration import Priors
 from simtest.calibration.frame import COLOURED
-from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
 from simtest.estimators.family import IsophoteFamily
-from simtest.estimators.highlight import fit_highlight, fit_highlights
+from simtest.estimators.highlight import OfHighlight, along, of_spot
 from simtest.estimators.least_squares import LobeFit, Model, fit_lobe
-from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, Law
-from simtest.estimators.small_spots import SmallSpot
+from simtest.estimators.small_spots import HighlightAxis, SmallSpot
 from simtest.geometry import Array, Camera, Mask, Patch, chi_squared
 from simtest.geometry.vectors import basis_across, tangent_coordinates
 from simtest.runtime.arrays import Index
@@ -268,42 +265,31 @@ class HighlightPixels:
 
 
 @dataclass(frozen=True)
-class Photometric:
-    """A quadric patch with a co-located light, fitted to the pixels from `cone_axis` as start.
+class Photometric(OfHighlight):
+    """A quadric patch with a co-located light, fitted to the pixels from `cone_axis` as start (see `OfHighlight`).
 
     N = -s with s the sightline of the BP. The shape d S and the lobe's scale are fitted too; its exponent, all but
     degenerate with the shape, is held. Under white noise this is the maximum-likelihood estimate; where coding or
     demosaicing has correlated the noise, the covariance is that of noise so correlated. Clipped pixels count
     as "at least this bright". Pixels are those before smoothing where the patch has them.
 
-    What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
+    The estimate has one candidate and looks at the fitted BP. It is flagged ``misfit`` where the residuals hold more
+    structure than the frame's noise and the stated error is larger by half or more for it: the covariance then includes
+    how far the normal moves when only the pixels around the peak are fitted. It also includes the drift of the
+    isophotes' axis where that is more than noise. Where the patch does not know its noise no uncertainty is stated.
     """
 
     laws: ClassVar[tuple[Law, ...]] = ("sightline",)
 
-    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
-        """Fit the isophotes of several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
-        fit_highlights(patches, camera, CONE_AXIS_ISOVALUES)
-
-    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
-        """Estimate the normal (see `simtest.estimators.Estimator`).
-
-        The estimate has one candidate with its covariance and looks at the fitted BP. Flags are those of `cone_axis`,
-        and ``misfit`` where the residuals hold more structure than the frame's noise and the stated error is larger by
-        half or more for it: the covariance then includes how far the normal moves when only the pixels around the peak
-        are fitted. It also includes the drift of the isophotes' axis where that is more than noise. A highlight too
-        small for isophotes gets the normal of its centre, flagged ``unresolved``. Where the patch does not know its
-        noise no uncertainty is stated, as by the estimators of isophotes.
-        """
-        family = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
-        if isinstance(family, Failure):
-            return family
-        if isinstance(family, SmallSpot):
-            return add_untold_parts(family.estimate(), camera, priors, family)
-        pixels = highlight_pixels(patch, camera, any(isophote.cut for isophote in family.isophotes), family.least)
+    def of(self, highlight: HighlightAxis, priors: Priors) -> Estimate | Failure:
+        """Estimate the normal at a fitted highlight."""
+        if isinstance(highlight, SmallSpot):
+            return of_spot(highlight, priors)
+        patch, camera = highlight.patch, highlight.camera
+        pixels = highlight_pixels(patch, camera, any(isophote.cut for isophote in highlight.isophotes), highlight.least)
         if isinstance(pixels, Failure):
             return pixels
-        fitted = fit_lobe(_quadric(family, pixels.rays), pixels.observed, pixels.clipped)
+        fitted = fit_lobe(_quadric(highlight, pixels.rays), pixels.observed, pixels.clipped)
         if fitted is None:
             return Failure(Reason.NOT_CONVERGED, "the fit of a quadric did not converge")
         e, f, s = fitted.model.frame
@@ -314,19 +300,12 @@ class Photometric:
             excess = excess_of_misfit(fitted, pixels.observed, pixels.clipped)
         else:
             covariance = covariance * pixels.correlation(fitted)
-        budget = {"noise": covariance, **beyond_noise(family, excess)}
-        estimate = Estimate(
-            normal=fitted.model.normal,
-            candidates=fitted.model.normal[None],
-            look_px=camera.project(s),
-            axis_ratio=_axis_ratio(fitted.model),
-            isophotes=family.isophotes,
-            budget=None if pixels.noise is None else budget,
-            flags=family.flags,
+        budget = {"noise": covariance, **beyond_noise(highlight, excess)}
+        estimate = along(
+            highlight, s, None if pixels.noise is None else budget, priors, axis_ratio=_axis_ratio(fitted.model)
         )
-        estimate = add_untold_parts(estimate, camera, priors, family)
         # A bend of the isophotes and the residuals of the fit show the same structure.
-        added = float(np.trace(budget["shape"] - family.drift_error))
+        added = float(np.trace(budget["shape"] - highlight.drift_error))
         return _with_misfit_told(estimate, added) if misfit else estimate
 
 

@@ -34,8 +34,8 @@ import numpy as np
 from simtest.calibration import CameraPrior, Distribution, Normal, Priors
 from simtest.calibration.priors import AT_CAMERA_MM
 from simtest.estimators.budget import Budget, equivalent_covariance
-from simtest.estimators.highlight import HighlightAxis
 from simtest.estimators.protocol import Estimate
+from simtest.estimators.small_spots import HighlightAxis
 from simtest.geometry import Array, Camera, Patch, chi_squared
 from simtest.geometry.lenses import undistort_with_errors
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates

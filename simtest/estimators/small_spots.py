@@ -20,8 +20,8 @@ import numpy as np
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget, clipped_pixels
+from simtest.estimators.family import IsophoteFamily
 from simtest.estimators.isophotes import FittedIsophote
-from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.fitted import fitted_number
@@ -301,20 +301,14 @@ class SmallSpot:
             Reason.UNRESOLVED, f"a radius of {radius:.1f} px; isophotes carry shape above {RESOLVED_PX:g} px"
         )
 
-    def estimate(self) -> Estimate:
-        """Return the reversed sightline of the centre as an estimate."""
-        return Estimate(
-            normal=-self.axis,
-            candidates=-self.axis[None],
-            look_px=self.centre_px,
-            budget=self.axis_budget,
-            flags=self.flags,
-        )
-
     def tangents(self, points: Array) -> Array:
         """Return the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
         rays = self.camera.unproject(points)
         return np.asarray((rays @ self.basis.T) / (rays @ self.axis)[:, None])
+
+
+HighlightAxis = IsophoteFamily | SmallSpot
+"""What states a highlight's axis, with its moments and its budget."""
 
 
 def radius_before_smoothing_px(patch: Patch) -> float | None:
