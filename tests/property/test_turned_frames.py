@@ -186,7 +186,9 @@ def test_covariances_are_turned_out_of_another_basis(seed):
     assert np.allclose(covariance_across(normal, COVARIANCE), in_space(normal, COVARIANCE)[:2, :2], atol=1e-15)
     # A core states its basis with the covariance.
     fields = {"covariance": COVARIANCE.tolist(), "basis": basis.tolist()}
-    assert np.allclose(in_space(normal, messages._uncertainty(fields, normal)["covariance"]), wanted, atol=1e-12)
+    assert np.allclose(
+        in_space(normal, messages.Answer(normal=normal, **fields).uncertainty(normal)["covariance"]), wanted, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))

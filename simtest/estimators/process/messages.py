@@ -1,16 +1,27 @@
-"""What a core answers: messages as estimates and failures; what they hold, `estimate_check` judges.
+"""The messages between simtest and a core: its greeting and its answers as models, and what a request tells it.
 
-What a core is told of a highlight or a frame: the header and the arrays of a request.
+What an answer holds is read here, and judged where all estimates are (`simtest.estimators.protocol.check`).
 """
 
 import itertools
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, fields, replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationError,
+    ValidationInfo,
+)
+from pydantic.dataclasses import dataclass
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.calibration.priors import Distribution, LogUniform, Normal
@@ -32,33 +43,31 @@ OUTLINES = ("isophote_", "isophote_rays_")
 MAX_ISOPHOTES = 16
 
 
-@dataclass(frozen=True)
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError
+    return text
+
+
+Name = Annotated[str, Field(max_length=80), AfterValidator(_printable)]
+Level = Annotated[float, Field(gt=0, lt=1)]
+FROM_LIST = BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given)
+
+
+@dataclass(frozen=True, config=ConfigDict(strict=True))
 class Hello:
-    """A core's greeting: what it is and what it wants.
+    """A core's greeting: what it is and what it wants."""
 
-    Parameters
-    ----------
-    name, version : str
-        What the core calls itself.
-    kind : {"patch", "frame"}
-        Whether it takes single highlights or whole frames.
-    transport : {"stream", "files"}
-        How arrays are handed over.
-    arrays : tuple of str
-        Names of the arrays that it wants.
-    isophotes : tuple of float
-        Isovalues of the isophotes that it wants.
-    target : {"fine", "base"}
-        Which surface's normals it states where an estimate does not say so.
-    """
-
-    name: str
-    version: str
-    kind: Literal["patch", "frame"]
-    transport: Literal["stream", "files"] = "stream"
-    arrays: tuple[str, ...] = ()
-    isophotes: tuple[float, ...] = ()
-    target: Literal["fine", "base"] = "fine"
+    name: Annotated[Name, Field(min_length=1, description="text of 1 to 80 characters")]
+    version: Annotated[Name, Field(description="text of at most 80 characters")]
+    kind: Annotated[Literal["patch", "frame"], Field(description="patch or frame")]
+    transport: Annotated[Literal["stream", "files"], Field(description="stream or files")] = "stream"
+    arrays: Annotated[tuple[str, ...], FROM_LIST, Field(description="a list of names")] = ()
+    isophotes: Annotated[
+        tuple[Level, ...], Field(max_length=MAX_ISOPHOTES), FROM_LIST,
+        Field(description=f"at most {MAX_ISOPHOTES} numbers in (0, 1)"),
+    ] = ()  # fmt: skip
+    target: Annotated[Target, Field(description="fine or base")] = "fine"  # of estimates that do not say which
 
 
 def outline_names(level: float) -> tuple[str, str]:
@@ -72,51 +81,173 @@ def hello_of(header: Mapping[str, Any]) -> Hello:
         raise broken(f"the first line is of type {told(header.get('type'))}; must be hello")
     if header.get("protocol") != PROTOCOL or isinstance(header.get("protocol"), bool):
         raise broken(f"hello: protocol {told(header.get('protocol'))}; simtest speaks {PROTOCOL}")
-    name, version = header.get("name"), header.get("version", "")
-    if not isinstance(name, str) or not 0 < len(name) <= 80 or not name.isprintable():
-        raise broken(f"hello: name {told(name)}; must be text of 1 to 80 characters")
-    if not isinstance(version, str | int | float) or len(str(version)) > 80 or not str(version).isprintable():
-        raise broken(f"hello: version {told(version)}; must be text of at most 80 characters")
-    kind = header.get("kind")
-    if kind not in ("patch", "frame"):
-        raise broken(f"hello: kind {told(kind)}; must be patch or frame")
-    transport = header.get("transport", "stream")
-    if transport not in ("stream", "files"):
-        raise broken(f"hello: transport {told(transport)}; must be stream or files")
-    target = header.get("target", "fine")
-    if target not in ("fine", "base"):
-        raise broken(f"hello: target {told(target)}; must be fine or base")
-    levels = _levels(header.get("isophotes", []), kind)
-    return Hello(name, str(version), kind, transport, _wanted(header.get("arrays"), kind, levels), levels, target)
+    is_patch = header.get("kind") == "patch"
+    given = {"version": ""} | {field.name: header[field.name] for field in fields(Hello) if field.name in header}
+    if isinstance(given["version"], int | float):
+        given["version"] = str(given["version"])
+    if given.get("arrays") is None:
+        given["arrays"] = ["values" if is_patch else "intensity"]
+    if header.get("kind") == "frame" and given.get("isophotes"):
+        raise broken(f"hello: isophotes {told(given['isophotes'])}; must be none, since a frame has no peak")
+    try:
+        hello = Hello(**given)
+    except ValidationError as error:
+        raise broken(f"hello: {_malformed(error, given, Hello)}") from None
+    # An isovalue of which no array is named gets both of its own.
+    outlines = [outline_names(level) for level in hello.isophotes]
+    if len(set(outlines)) < len(set(hello.isophotes)):
+        must = "must differ in their first six digits, by which arrays are named"
+        raise broken(f"hello: isophotes {told(given['isophotes'])}; {must}")
+    offered = (*(PATCH_ARRAYS if is_patch else FRAME_ARRAYS), *itertools.chain.from_iterable(outlines))
+    if unknown := next((name for name in hello.arrays if name not in offered), None):
+        raise broken(f"hello: array {told(unknown)}; must be one of {', '.join(offered)}")
+    unnamed = [name for pair in outlines if not set(pair) & set(hello.arrays) for name in pair]
+    return replace(hello, arrays=tuple(dict.fromkeys([*hello.arrays, *unnamed])))
 
 
-def _levels(given: object, kind: str) -> tuple[float, ...]:
-    """Return the isovalues of a greeting."""
-    listed: list[Any] = given if isinstance(given, list) else [None]
-    good = all(isinstance(t, int | float) and not isinstance(t, bool) and 0 < t < 1 for t in listed)
-    if not good or len(listed) > MAX_ISOPHOTES or (listed and kind == "frame"):
-        allowed = "none, since a frame has no peak" if kind == "frame" else f"at most {MAX_ISOPHOTES} numbers in (0, 1)"
-        raise broken(f"hello: isophotes {told(given)}; must be {allowed}")
-    if len({outline_names(level) for level in listed}) < len(set(listed)):
-        raise broken(
-            f"hello: isophotes {told(given)}; must differ in their first six digits, by which arrays are named"
+def _malformed(error: ValidationError, given: Mapping[str, Any], model: type) -> str:
+    """Return name and value of a message's first malformed field, and what it must be, as the field says."""
+    name = str(error.errors(include_url=False, include_input=False)[0]["loc"][0])
+    value = told(given[name]) if name in given else "missing"
+    return f"{name} {value}; must be {model.__pydantic_fields__[name].description}"  # type: ignore[attr-defined]
+
+
+def _only_numbers(given: object) -> object:
+    """Return nested lists of numbers as they are; raise `TypeError` where they hold text, true or false."""
+    if isinstance(given, list):
+        for each in given:
+            _only_numbers(each)
+    elif isinstance(given, bool) or not isinstance(given, int | float):
+        raise TypeError
+    return given
+
+
+def _numbers(*shape: int | None) -> PlainValidator:
+    """Read a field as an array of finite numbers of this shape, None standing for any length, () for a number."""
+    wanted = f"numbers of shape ({', '.join('n' if n is None else str(n) for n in shape)})" if shape else "a number"
+
+    def read(given: Any, info: ValidationInfo) -> Array | float:
+        name = info.field_name
+        is_array = isinstance(given, np.ndarray | np.generic)
+        try:
+            values = given if is_array else np.array(_only_numbers(given), dtype=float)
+        except (TypeError, ValueError, OverflowError, RecursionError):
+            raise Refused(f"{name}: {told(given)}; must be {wanted}") from None
+        if values.dtype.kind == "b":
+            raise Refused(f"{name}: holds true or false; must be {wanted}")
+        if values.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, values.shape, strict=True)):
+            raise Refused(f"{name}: {told(given)}; must be {wanted}")
+        numbers: Array = np.array(values, dtype=float)
+        # `Refused` is no ValueError: pydantic lets it pass with its reason.
+        if not np.isfinite(numbers).all():
+            raise Refused(f"{name} holds NaN or infinity", Reason.NOT_FINITE)
+        return numbers if shape else float(numbers)
+
+    return PlainValidator(read)
+
+
+Number = Annotated[float, _numbers()]
+Pair = Annotated[Array, _numbers(2)]
+Vector = Annotated[Array, _numbers(3)]
+Square = Annotated[Array, _numbers(2, 2)]
+Directions = Annotated[Array, _numbers(2, 3)]
+
+
+class Isophote(BaseModel):
+    """An isophote that an estimate says it was made of: isovalue and cone of sightlines."""
+
+    isovalue: Number
+    cone: Annotated[Array, _numbers(3, 3)]
+    sightline: Vector
+
+    def fitted(self) -> FittedIsophote:
+        """Return the isophote as a fitted one; raise `Refused` where it is none."""
+        if not 0 < self.isovalue < 1:
+            raise Refused(f"isovalue {self.isovalue:g}: must be in (0, 1)")
+        sightline = unit_vector(self.sightline, "sightline")
+        made = FittedIsophote(self.isovalue, np.empty((0, 2)), None, self.cone, sightline)
+        asymmetry = np.abs(self.cone - self.cone.T).max()
+        if asymmetry > ROUNDED * np.abs(self.cone).max() or isinstance(made.pose(), Failure):
+            raise Refused("cone: must be symmetric, and an elliptic cone about the sightline")
+        return made
+
+
+class Curvature(BaseModel):
+    """The surface's curvature (see `simtest.estimators.EstimatedCurvature`)."""
+
+    directions: Directions
+    axis_ratio: Number
+    hypotheses: Annotated[Array, _numbers(None, 2)] | None = None
+
+    def estimated(self) -> EstimatedCurvature:
+        """Return the curvature of an estimate."""
+        return EstimatedCurvature(self.directions, self.axis_ratio, self.hypotheses)
+
+
+class Answer(BaseModel):
+    """What a core answers of one highlight: an `Estimate`, in the basis that it names."""
+
+    model_config = ConfigDict(strict=True)
+
+    normal: Vector = Field(description="numbers of shape (3)")
+    candidates: Annotated[Array, _numbers(None, 3)] | None = None
+    look_px: Pair | None = None
+    look_ray: Vector | None = None
+    basis: Directions | None = None
+    covariance: Square | None = None
+    budget: dict[str, Square] | None = Field(None, description="an object of covariances")
+    axis_ratio: Number | None = None
+    axis_ratio_deviation: Number | None = None
+    choice_margin: Number | None = None
+    isophotes: list[Isophote] | None = Field(
+        None, max_length=MAX_ISOPHOTES,
+        description=f"at most {MAX_ISOPHOTES} objects of isovalue, cone and sightline",
+    )  # fmt: skip
+    flags: list[Annotated[str, Field(pattern="^[^ ]*$")]] | None = Field(None, description="a list of words")
+    curvature: Curvature | None = Field(None, description="an object of directions and axis_ratio")
+    target: Any = None  # `check` judges it
+
+    def estimate(self, camera: Camera, target: Target) -> Estimate:
+        """Return the estimate; raise `Refused` at the first part that is none."""
+        normal = unit_vector(self.normal, "normal")
+        return Estimate(
+            normal,
+            normal[None] if self.candidates is None else self.candidates,
+            self._look(camera),
+            axis_ratio=self.axis_ratio,
+            axis_ratio_deviation=self.axis_ratio_deviation,
+            isophotes=tuple(each.fitted() for each in self.isophotes or ()),
+            choice_margin=self.choice_margin,
+            flags=tuple(self.flags or ()),
+            curvature=None if self.curvature is None else self.curvature.estimated(),
+            target=target if self.target is None else self.target,
+            **self.uncertainty(normal),
         )
-    return tuple(float(t) for t in listed)
 
+    def _look(self, camera: Camera) -> Array:
+        """Return the pixel at which the estimate is stated."""
+        if self.look_px is not None:
+            return self.look_px
+        if self.look_ray is None:
+            raise Refused("look_px or look_ray: missing; an estimate must say where it looks")
+        look = camera.project(self.look_ray)
+        if not np.isfinite(look).all():
+            raise Refused("look_ray: the camera images no such direction")
+        return look
 
-def _wanted(given: object, kind: str, levels: tuple[float, ...]) -> tuple[str, ...]:
-    """Return the names of the wanted arrays; an isovalue of which none is named gets both of its own."""
-    offered = PATCH_ARRAYS if kind == "patch" else FRAME_ARRAYS
-    outlines = [outline_names(level) for level in levels]
-    allowed = (*offered, *itertools.chain.from_iterable(outlines))
-    if given is None:
-        given = ["values" if kind == "patch" else "intensity"]
-    if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
-        raise broken(f"hello: arrays {told(given)}; must be a list of names")
-    if unknown := next((name for name in given if name not in allowed), None):
-        raise broken(f"hello: array {told(unknown)}; must be one of {', '.join(allowed)}")
-    unnamed = [name for pair in outlines if not set(pair) & set(given) for name in pair]
-    return tuple(dict.fromkeys([*given, *unnamed]))
+    def uncertainty(self, normal: Array) -> dict[str, Any]:
+        """Return the covariance, or the budget, in the basis that simtest states them in."""
+        turn = np.eye(2)
+        if self.basis is not None:
+            frame = np.concatenate([self.basis, normal[None]])
+            if np.abs(frame @ frame.T - np.eye(3)).max() > 2 * ROUNDED:
+                raise Refused("basis: must be two unit vectors across each other and the normal")
+            turn = basis_across(normal) @ self.basis.T
+        parts = {"": self.covariance} if self.budget is None and self.covariance is not None else self.budget
+        if parts is None:
+            return {}
+        turned = {name: turn @ part @ turn.T for name, part in parts.items()}
+        return {"covariance": turned[""]} if self.budget is None else {"budget": turned}
 
 
 MAX_ESTIMATES = 10_000
@@ -139,17 +270,19 @@ def estimates_of(answer: Message, camera: Camera, hello: Hello) -> list[Estimate
     if answer.header["type"] == "failure":
         return _failure(answer.header)
     try:
-        return [_read(fields, camera, hello) for fields in _listed(answer)]
+        return [_read(each, camera, hello) for each in _listed(answer)]
     except Refused as refused:
         return refused.failure
 
 
-def _read(fields: Mapping[str, Any], camera: Camera, hello: Hello) -> Estimate | Failure:
+def _read(given: Mapping[str, Any], camera: Camera, hello: Hello) -> Estimate | Failure:
     """Return an estimate of its fields, or what is wrong with the first that cannot be read."""
     try:
-        return _estimate(fields, camera, hello.target)
+        return Answer.model_validate(given).estimate(camera, hello.target)
     except Refused as refused:
         return refused.failure
+    except ValidationError as error:
+        return Failure(Reason.ESTIMATOR_ERROR, _malformed(error, given, Answer))
 
 
 def _listed(answer: Message) -> list[dict[str, Any]]:
@@ -176,144 +309,6 @@ def _failure(header: Mapping[str, Any]) -> Failure:
         return Failure(Reason(reason), shown)
     named = excerpt(reason.encode("utf-8", "replace"), 60)
     return Failure(Reason.NO_ESTIMATE, ": ".join(part for part in (named, shown) if part))
-
-
-def _estimate(fields: Mapping[str, Any], camera: Camera, target: Target) -> Estimate:
-    """Return an estimate of its fields; raise `Refused` at the first that cannot be read."""
-    normal = unit_vector(_numbers(fields, "normal", (3,)), "normal")
-    stated = fields.get("target")
-    return Estimate(
-        normal,
-        normal[None] if fields.get("candidates") is None else _numbers(fields, "candidates", (None, 3)),
-        _look(fields, camera),
-        axis_ratio=_number(fields, "axis_ratio"),
-        axis_ratio_deviation=_number(fields, "axis_ratio_deviation"),
-        isophotes=_isophotes(fields.get("isophotes")),
-        choice_margin=_number(fields, "choice_margin"),
-        flags=_flags(fields.get("flags")),
-        curvature=_curvature(fields.get("curvature")),
-        target=target if stated is None else stated,
-        **_uncertainty(fields, normal),
-    )
-
-
-def _look(fields: Mapping[str, Any], camera: Camera) -> Array:
-    """Return the pixel at which an estimate is stated."""
-    if fields.get("look_px") is not None:
-        return _numbers(fields, "look_px", (2,))
-    if fields.get("look_ray") is None:
-        raise Refused("look_px or look_ray: missing; an estimate must say where it looks")
-    look = camera.project(_numbers(fields, "look_ray", (3,)))
-    if not np.isfinite(look).all():
-        raise Refused("look_ray: the camera images no such direction")
-    return look
-
-
-def _uncertainty(fields: Mapping[str, Any], normal: Array) -> dict[str, Any]:
-    """Return the covariance, or the budget, in the basis that simtest states them in."""
-    turn = _turn(fields, normal)
-    parts = fields.get("budget")
-    if parts is None:
-        if fields.get("covariance") is None:
-            return {}
-        return {"covariance": _covariance(fields, "covariance", turn)}
-    if not isinstance(parts, Mapping):
-        raise Refused(f"budget: {told(parts)}; must be an object")
-    return {"budget": {name: _covariance(parts, name, turn) for name in parts}}
-
-
-def _turn(fields: Mapping[str, Any], normal: Array) -> Array:
-    """Return the matrix, shape (2, 2), from the core's basis of the tangent plane to ours."""
-    if fields.get("basis") is None:
-        return np.eye(2)
-    basis = _numbers(fields, "basis", (2, 3))
-    frame = np.concatenate([basis, normal[None]])
-    if np.abs(frame @ frame.T - np.eye(3)).max() > 2 * ROUNDED:
-        raise Refused("basis: must be two unit vectors across each other and the normal")
-    return np.asarray(basis_across(normal) @ basis.T)
-
-
-def _covariance(fields: Mapping[str, Any], name: str, turn: Array) -> Array:
-    """Return a covariance, rad^2, in our basis."""
-    return np.asarray(turn @ _numbers(fields, name, (2, 2)) @ turn.T)
-
-
-def _isophotes(given: object) -> tuple[FittedIsophote, ...]:
-    """Return the isophotes that an estimate says it was made of: isovalue and cone of sightlines of each."""
-    listed = [] if given is None else given
-    if not isinstance(listed, list) or len(listed) > MAX_ISOPHOTES or not all(isinstance(i, Mapping) for i in listed):
-        raise Refused(f"isophotes: {told(given)}; must be at most {MAX_ISOPHOTES} objects")
-    return tuple(_isophote(each) for each in listed)
-
-
-def _isophote(given: Mapping[str, Any]) -> FittedIsophote:
-    isovalue = float(_numbers(given, "isovalue", ()))
-    cone, sightline = _numbers(given, "cone", (3, 3)), unit_vector(_numbers(given, "sightline", (3,)), "sightline")
-    if not 0 < isovalue < 1:
-        raise Refused(f"isovalue {isovalue:g}: must be in (0, 1)")
-    made = FittedIsophote(isovalue, np.empty((0, 2)), None, cone, sightline)
-    if np.abs(cone - cone.T).max() > ROUNDED * np.abs(cone).max() or isinstance(made.pose(), Failure):
-        raise Refused("cone: must be symmetric, and an elliptic cone about the sightline")
-    return made
-
-
-def _curvature(given: object) -> EstimatedCurvature | None:
-    if given is None:
-        return None
-    if not isinstance(given, Mapping):
-        raise Refused(f"curvature: {told(given)}; must be an object")
-    if (ratio := _number(given, "axis_ratio")) is None:
-        raise Refused("curvature axis_ratio: missing")
-    hypotheses = None if given.get("hypotheses") is None else _numbers(given, "hypotheses", (None, 2))
-    return EstimatedCurvature(_numbers(given, "directions", (2, 3)), ratio, hypotheses)
-
-
-def _flags(given: object) -> tuple[str, ...]:
-    if given is None:
-        return ()
-    if not isinstance(given, list) or not all(isinstance(flag, str) and " " not in flag for flag in given):
-        raise Refused(f"flags: {told(given)}; must be a list of words")
-    return tuple(given)
-
-
-def _number(fields: Mapping[str, Any], name: str) -> float | None:
-    return None if fields.get(name) is None else float(_numbers(fields, name, ()))
-
-
-def _numbers(fields: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Array:
-    """Return a field as an array of this shape, None standing for any length; raise `Refused` if it is another."""
-    given = fields.get(name)
-    if given is None:
-        raise Refused(f"{name}: missing")
-    wanted = "a number" if not shape else f"numbers of shape ({', '.join('n' if n is None else str(n) for n in shape)})"
-    try:
-        values = given if isinstance(given, np.ndarray | np.generic) else np.array(_only_numbers(given), dtype=float)
-    except (TypeError, ValueError, OverflowError, RecursionError):
-        raise Refused(f"{name}: {told(given)}; must be {wanted}") from None
-    if values.dtype.kind == "b":
-        raise Refused(f"{name}: holds true or false; must be {wanted}")
-    fits = len(values.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True))
-    if not fits:
-        raise Refused(f"{name}: {told(given)}; must be {wanted}")
-    numbers: npt.NDArray[np.float64] = np.array(values, dtype=float)
-    if not np.isfinite(numbers).all():
-        raise Refused(f"{name} holds NaN or infinity", Reason.NOT_FINITE)
-    return numbers
-
-
-def _only_numbers(given: object) -> object:
-    """Return nested lists of numbers as they are; raise `TypeError` where they hold text, true or false."""
-    if isinstance(given, list):
-        for each in given:
-            _only_numbers(each)
-    elif isinstance(given, bool) or not isinstance(given, int | float):
-        raise TypeError
-    return given
-
-
-def told(value: object) -> str:
-    """Return the beginning of a value's text, for a message."""
-    return excerpt(repr(value).encode("utf-8", "replace"), 60)
 
 
 Named = dict[str, npt.NDArray[Any]]
@@ -476,3 +471,8 @@ def _outline(patch: Patch, level: float, camera: Camera | None = None) -> npt.ND
     if isinstance(points, Failure):
         return str(points)
     return points if camera is None else camera.unproject(points)
+
+
+def told(value: object) -> str:
+    """Return the beginning of a value's text, for a message."""
+    return excerpt(repr(value).encode("utf-8", "replace"), 60)
