@@ -22,14 +22,12 @@ from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget, clipped_pixels
 from simtest.estimators.family import IsophoteFamily
 from simtest.estimators.isophotes import FittedIsophote
-from simtest.geometry import Array, Camera, Mask, Patch
+from simtest.estimators.least_squares import Descent, Equations, minimise
+from simtest.geometry import Array, Camera, Index, Mask, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.fitted import fitted_number
 
-MAX_STEPS = 40
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-9, 1e8
-CONVERGED = 1e-9
-"""A fit has converged when the sum of squares falls by less than this share."""
+OF_SPOTS = Descent(1e-2, 1e-9, 1e8, 40, 1e-9, ridge=(1e-12, 1e-30))
 
 EXACT = 1e-20
 """Sum of squares, over the peak squared, that rounding alone leaves."""
@@ -109,32 +107,16 @@ def fit_spots(windows: SpotWindows, centres: Array, variances: Array, levels: Ar
     p[:, XX] = p[:, YY] = 1 / np.maximum(variances, 2 * LEAST_VARIANCE_PX2)
     p[:, LEVEL] = levels
     reach = float(np.abs(windows.offsets).max())
-    damping, active = np.full(count, FIRST_DAMPING), np.ones(count, dtype=bool)
+
+    def equations(p: Array, at: Index) -> Equations:
+        part = SpotWindows(windows.values[at], windows.used[at], windows.clipped[at], windows.offsets)
+        squares, normal, gradient = _equations(part, p)
+        return squares, normal, gradient, np.isfinite(squares) & _is_spot(p, reach)
+
     # A step too far overflows, and is then not taken.
     with np.errstate(all="ignore"):
-        squares, normal, gradient = _equations(windows, p)
-        for _ in range(MAX_STEPS):
-            if not active.any():
-                break
-            # trial step of all that have not converged
-            diagonal = np.diagonal(normal, axis1=1, axis2=2)
-            damped = normal + np.eye(9) * ((damping[:, None] + 1e-12) * diagonal + 1e-30)[:, None, :]
-            at = np.flatnonzero(active)
-            step = np.zeros_like(p)
-            step[at] = np.linalg.solve(damped[at], gradient[at][:, :, None])[:, :, 0]
-            trial = p + step
-            part = SpotWindows(windows.values[at], windows.used[at], windows.clipped[at], windows.offsets)
-            new_squares, new_normal, new_gradient = _equations(part, trial[at])
-            falls = new_squares < squares[at]
-            accepted = falls & np.isfinite(new_squares) & _is_spot(trial[at], reach)
-            # rejected: more damping; accepted: less
-            fall = np.where(accepted, (squares[at] - new_squares) / squares[at], 1.0)
-            damping[at] = np.where(accepted, np.maximum(damping[at] / 10, LEAST_DAMPING), damping[at] * 10)
-            taken = at[accepted]
-            p[taken], squares[taken] = trial[taken], new_squares[accepted]
-            normal[taken], gradient[taken] = new_normal[accepted], new_gradient[accepted]
-            active[at] = ~((fall < CONVERGED) | (squares[at] < EXACT) | (damping[at] > MOST_DAMPING))
-        return _stated(windows, p, squares, normal, ~active & _is_spot(p, reach))
+        p, squares, normal, has_ended = minimise(p, equations, np.add, OF_SPOTS, EXACT)
+        return _stated(windows, p, squares, normal, has_ended & _is_spot(p, reach))
 
 
 def _equations(windows: SpotWindows, p: Array) -> tuple[Array, Array, Array]:
