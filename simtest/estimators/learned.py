@@ -1,29 +1,30 @@
-"""The range that a network was taught, from its metadata: a learned core refuses what lies outside.
+"""What the networks that state normals share: their files, the range that they were taught, and what they state.
 
-Factor by which a learned core multiplies the covariances that its network states.
-
-A trained network as an ONNX file with metadata, run by ONNX Runtime: what all learned cores share.
-
-The package onnxruntime (extra ``onnx``) is imported when a network is loaded, not before.
-
-Normals with covariances, from the rotations that a network states.
-
-Whether normals at highlights agree with the law of reflection: a test of a method that needs no truth.
+A network is an ONNX file with metadata, run by ONNX Runtime; the package onnxruntime (extra ``onnx``) is imported when
+one is loaded, not before. It refuses what lies outside its range. What it states are rotations from the direction to
+the camera with covariances, which are scaled by what a validation split showed. `reflection_distances` says whether
+normals at highlights agree with the law of reflection: a test of a method that needs no truth.
 """
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from simtest.calibration import Frame, Priors
 from simtest.errors import Failure, InputError, Reason
+from simtest.estimators.protocol import Estimate
+from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import tangent_basis
 from simtest.runtime.arrays import AnyArray, Array, Image
 from simtest.runtime.files import JsonObject, require_plain
 from simtest.runtime.fitted import fitted_number
+from simtest.runtime.resources import data_root
 
 LEAST_LIT, BRIGHT_PERCENT = 0.05, 95.0
 """Pixels with less than this share of the light at this percentile count as unlit (`median_of_lit`)."""
@@ -230,6 +231,9 @@ class CovarianceScale:
 METADATA = "simtest"
 """Key of the metadata, a JSON object, in the file."""
 
+WEIGHTS = ("learning", "weights")
+"""Where networks lie below the shipped scenes."""
+
 LARGEST_MODEL_BYTES = 256 * 2**20
 
 
@@ -405,3 +409,75 @@ def _across(basis: Array, normals: Array, others: Array) -> Array:
     sine = np.linalg.norm(across, axis=1)
     angle = np.arctan2(sine, np.sum(normals * others, axis=1))
     return np.asarray(across * (angle / np.maximum(sine, 1e-12))[:, None])
+
+
+class Network:
+    """A network in ONNX Runtime, with the range that it was taught and the scales of what it states."""
+
+    def __init__(self, path: Path, form: str, core: str, inputs: Sequence[str], scales: Mapping[str, Sequence[str]]):
+        self._model = OnnxModel(path, form, core)
+        with self._model.reading():
+            content = self._model.content
+            self._scales = {
+                kind: {name: CovarianceScale.read(content[kind][name]) for name in names}
+                for kind, names in scales.items()
+            }
+            self._range = TrainingRange.read(content, inputs)
+            self._usual = read_usual(content)
+        self.scales = self._scales["scales"]
+
+
+@dataclass(frozen=True)
+class LearnedNormals:
+    """What networks that state normals share as estimators.
+
+    They answer for each detection, and need the lights told. They refuse with ``no_estimate`` what lies outside the
+    range that they were taught.
+
+    Parameters
+    ----------
+    model : str or Path, optional
+        The file model.onnx. Default: the shipped network.
+    """
+
+    model: str | Path | None = None
+    shipped: ClassVar[str]  # name of the file beside which its card lies
+
+    def check(self) -> None:
+        """Load the network; raise `InputError` where it cannot be used."""
+        _ = self._network
+
+    def with_model(self, model: Path) -> Self:
+        """Return the estimator with another network, loaded; raise `InputError` where it cannot be used."""
+        made = replace(self, model=model)
+        made.check()
+        return made
+
+    @cached_property
+    def _network(self) -> Any:
+        return self._load(Path(self.model or data_root("scenes").joinpath(*WEIGHTS, self.shipped)))
+
+    def _load(self, path: Path) -> Network:
+        """Return the network of a file."""
+        raise NotImplementedError
+
+    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Failure:
+        """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
+        return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
+
+    def estimate_regions(
+        self, frame: Frame, patches: Sequence[Patch | Failure], /
+    ) -> tuple[Sequence[Estimate | Failure | None], Sequence[Estimate]]:
+        """Return an estimate or a failure for each patch (see `simtest.estimators.protocol.RegionEstimator`)."""
+        peaks = np.array([patch.peak_px for patch in patches if not isinstance(patch, Failure)], dtype=float)
+        found: Sequence[Estimate | Failure] | Failure = []
+        if not frame.calibration.priors.lights_mm:
+            found = Failure(Reason.NOT_KNOWN, "needs the lights' positions")
+        elif len(peaks):
+            found = self._at(frame, peaks)
+        made = iter([found] * len(peaks) if isinstance(found, Failure) else found)
+        return [patch if isinstance(patch, Failure) else next(made) for patch in patches], []
+
+    def _at(self, frame: Frame, peaks: Array) -> Sequence[Estimate | Failure] | Failure:
+        """Return an estimate or a failure for each peak of a frame whose lights are told, or why there is none."""
+        raise NotImplementedError

@@ -8,32 +8,29 @@ Directions are in the tangent basis of the direction to the camera that is align
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
 
-from simtest.calibration import Calibration, Frame, Priors
+from simtest.calibration import Calibration, Frame
 from simtest.errors import Failure, Reason
 from simtest.estimators.learned import (
     LIGHT_SCALE_MM,
     LOG_RANGE,
-    CovarianceScale,
-    OnnxModel,
-    TrainingRange,
+    LearnedNormals,
+    Network,
     image_basis,
     inflation,
     median_of_lit,
-    read_usual,
     reflection_distances,
     turned_normals,
 )
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Array, Camera, Mask, Patch
+from simtest.geometry import Array, Camera, Mask
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import data_root
 
 GRID = (96, 128)
 """Rows and columns of the planes."""
@@ -186,9 +183,6 @@ def _centred(values: Image, lit: Mask) -> Image:
 
 FORMAT = "simtest dense_normals, version 2"
 
-SHIPPED = ("learning", "weights", "learned_dense.onnx")
-"""Below the shipped scenes; its card lies beside it."""
-
 ASPECTS = (1.0, 1.9)
 """Width over height: what the training's cut views cover."""
 
@@ -229,7 +223,7 @@ class DenseMaps:
 
 
 @dataclass(frozen=True)
-class LearnedDense:
+class LearnedDense(LearnedNormals):
     """A network that states normals all over a frame (`studies.networks.dense`) as an estimator.
 
     It sees the whole frame on a coarse grid, the sightlines and the lights. It states the base's normal and the
@@ -246,27 +240,16 @@ class LearnedDense:
         The file model.onnx. Default: the shipped network.
     """
 
-    model: str | Path | None = None
-
-    def check(self) -> None:
-        """Load the network; raise `InputError` where it cannot be used."""
-        _ = self._network
-
-    def with_model(self, model: Path) -> "LearnedDense":
-        """Return the estimator with another network, loaded; raise `InputError` where it cannot be used."""
-        made = replace(self, model=model)
-        made.check()
-        return made
+    shipped: ClassVar[str] = "learned_dense.onnx"
 
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
-        network = str(self.model or SHIPPED[-1])
+        network = str(self.model or self.shipped)
         return f"The normal of the base surface at each highlight, by the network {network} of the whole frame."
 
-    @cached_property
-    def _network(self) -> "_Network":
-        return _Network(Path(self.model) if self.model else data_root("scenes").joinpath(*SHIPPED))
+    def _load(self, path: Path) -> "_Network":
+        return _Network(path)
 
     def maps(
         self, values: Image, calibration: Calibration, highlights_px: Array | None = None, seen: Mask | None = None
@@ -314,34 +297,18 @@ class LearnedDense:
         made = self.stated(frame, points_px)
         return made if isinstance(made, Failure) else _contradictions(made, frame, points_px)
 
-    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
-        """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
-        return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
-
-    def estimate_regions(
-        self, frame: Frame, patches: Sequence[Patch | Failure], /
-    ) -> tuple[Sequence[Estimate | Failure | None], Sequence[Estimate]]:
-        """Return an estimate or a failure for each patch (see `simtest.estimators.protocol.RegionEstimator`)."""
-        peaks = [patch.peak_px for patch in patches if not isinstance(patch, Failure)]
-        made = iter(self._at(frame, peaks))
-        return [patch if isinstance(patch, Failure) else next(made) for patch in patches], []
-
-    def _at(self, frame: Frame, peaks: Sequence[Array]) -> list[Estimate | Failure]:
-        """Return an estimate or a failure for each peak of a frame."""
-        if not peaks:
-            return []
+    def _at(self, frame: Frame, peaks: Array) -> Sequence[Estimate | Failure] | Failure:
         outputs = self._outputs(frame)
         if isinstance(outputs, Failure):
-            return [outputs] * len(peaks)
-        points = np.asarray(peaks, dtype=float)
-        stated = self._stated(*outputs, frame.camera, points)
-        squared = _contradictions(stated, frame, points)
+            return outputs
+        stated = self._stated(*outputs, frame.camera, peaks)
+        squared = _contradictions(stated, frame, peaks)
         if refused := _contradicts(squared):
-            return [refused] * len(points)
+            return refused
         return [
             _refused_highlight(off)
             or Estimate(normal=normal, candidates=normal[None], look_px=point, covariance=covariance, target="base")
-            for normal, covariance, point, off in zip(*stated[:2], points, squared.tolist(), strict=True)
+            for normal, covariance, point, off in zip(*stated[:2], peaks, squared.tolist(), strict=True)
         ]
 
     def _outputs(self, frame: Frame) -> tuple[Array, float] | Failure:
@@ -424,16 +391,11 @@ def _unfit(frame: Frame) -> Failure | None:
     return Failure(Reason.NO_ESTIMATE, f"outside the network's training: {told}") if told else None
 
 
-class _Network:
-    """A network in ONNX Runtime, with the range that it was taught."""
+class _Network(Network):
+    """A network of whole frames."""
 
     def __init__(self, path: Path) -> None:
-        self._model = OnnxModel(path, FORMAT, "learned_dense")
-        with self._model.reading():
-            content = self._model.content
-            self.scales = {name: CovarianceScale.read(content["scales"][name]) for name in ("base", "distance")}
-            self._range = TrainingRange.read(content, CAMERA)
-            self._usual = read_usual(content)
+        super().__init__(path, FORMAT, "learned_dense", CAMERA, {"scales": ("base", "distance")})
 
     def run(self, frame: Frame) -> tuple[Array, float] | Failure:
         """Return the outputs of a frame, shape (7, 48, 64), and the covariances' factor, or why it is refused."""

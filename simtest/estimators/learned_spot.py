@@ -7,32 +7,29 @@ basis of the direction to the camera that is aligned with the crops' axes (`imag
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
 
-from simtest.calibration import Frame, Priors
+from simtest.calibration import Frame
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.learned import (
     LIGHT_SCALE_MM,
     LOG_RANGE,
-    CovarianceScale,
-    OnnxModel,
-    TrainingRange,
+    LearnedNormals,
+    Network,
     image_basis,
     inflation,
     median_of_lit,
     normal_of,
-    read_usual,
 )
 from simtest.estimators.protocol import Estimate, Target
-from simtest.geometry import Array, Camera, Patch
+from simtest.geometry import Array, Camera
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import data_root
 
 SIDE = 32
 """Side of a crop, px of the crop."""
@@ -141,9 +138,6 @@ _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 STEP = 1e-5
 """Step of the differences of the normal, rad."""
 
-SHIPPED = ("learning", "weights", "learned_spot.onnx")
-"""Below the shipped scenes; its card lies beside it."""
-
 
 def log_deviation(outputs: Array) -> Array:
     """Return the mean logarithm of the two stated deviations for the outputs of one surface, shape (..., 7)."""
@@ -151,7 +145,7 @@ def log_deviation(outputs: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class LearnedSpot:
+class LearnedSpot(LearnedNormals):
     """A network that states the normal at one highlight (`studies.networks.spots`) as an estimator.
 
     It sees three crops around each highlight and the lights' positions, and answers for each detection on its own. It
@@ -166,59 +160,29 @@ class LearnedSpot:
         Which surface's normals are stated.
     """
 
-    model: str | Path | None = None
     target: Target = "base"
+    shipped: ClassVar[str] = "learned_spot.onnx"
 
     def __post_init__(self) -> None:
         if self.target not in SURFACES:
             raise InputError(f"target = {self.target}: must be base or fine")
 
-    def with_model(self, model: Path) -> "LearnedSpot":
-        """Return the estimator with another network, which is read (see `simtest.runtime.resources`)."""
-        made = replace(self, model=model)
-        made.check()
-        return made
-
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
-        network = str(self.model or SHIPPED[-1])
+        network = str(self.model or self.shipped)
         return f"The normal of the {self.target} surface at each highlight, by the network {network}."
 
-    def check(self) -> None:
-        """Load the network; raise `InputError` where it cannot be used."""
-        _ = self._network
+    def _load(self, path: Path) -> "_Network":
+        return _Network(path)
 
-    @cached_property
-    def _network(self) -> "_Network":
-        return _Network(Path(self.model) if self.model else data_root("scenes").joinpath(*SHIPPED))
-
-    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
-        """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
-        return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
-
-    def estimate_regions(
-        self, frame: Frame, patches: Sequence[Patch | Failure], /
-    ) -> tuple[Sequence[Estimate | Failure | None], Sequence[Estimate]]:
-        """Return an estimate or a failure for each patch (see `simtest.estimators.protocol.RegionEstimator`)."""
-        if not frame.calibration.priors.lights_mm:
-            missing = Failure(Reason.NOT_KNOWN, "needs the lights' positions")
-            return [patch if isinstance(patch, Failure) else missing for patch in patches], []
-        peaks = [patch.peak_px for patch in patches if not isinstance(patch, Failure)]
-        made = iter(self._at(frame, peaks))
-        return [patch if isinstance(patch, Failure) else next(made) for patch in patches], []
-
-    def _at(self, frame: Frame, peaks: Sequence[Array]) -> list[Estimate | Failure]:
-        """Return an estimate or a failure for each peak of a frame whose lights are told."""
-        if not peaks:
-            return []
+    def _at(self, frame: Frame, peaks: Array) -> Sequence[Estimate | Failure] | Failure:
         if frame.camera.distortion is not None:
             # Checked before the network is loaded: it would not help.
-            refused = Failure(Reason.NO_ESTIMATE, "outside the network's training: a lens with distortion")
-            return [refused] * len(peaks)
+            return Failure(Reason.NO_ESTIMATE, "outside the network's training: a lens with distortion")
         crops, extras = spot_inputs(frame, peaks)
         outputs, inflations, refusals = self._network.run(crops, extras)
-        rays, number = rays_of(frame.camera, np.asarray(peaks)), SURFACES.index(self.target)
+        rays, number = rays_of(frame.camera, peaks), SURFACES.index(self.target)
         rows = zip(rays, peaks, outputs[:, number], inflations, refusals, strict=True)
         return [refusal or self._estimate(*row) for *row, refusal in rows]
 
@@ -240,23 +204,19 @@ class LearnedSpot:
         sure = float(np.clip(made[RATIO_DEVIATION], *LOG_RANGE))
         deviation = np.exp(sure) * np.sqrt(self._network.ratio_scales[self.target].at(sure) * inflated)
         return Estimate(
-            normal=normals[0], candidates=normals[:1], look_px=np.asarray(peak, dtype=float),
+            normal=normals[0], candidates=normals[:1], look_px=peak,
             axis_ratio=float(1 / (1 + np.exp(-made[5]))), covariance=covariance, target=self.target,
             axis_ratio_deviation=float(deviation),
         )  # fmt: skip
 
 
-class _Network:
-    """A network in ONNX Runtime, with the range that it was taught."""
+class _Network(Network):
+    """A network of single highlights."""
 
     def __init__(self, path: Path) -> None:
-        self._model = OnnxModel(path, FORMAT, "learned_spot")
-        with self._model.reading():
-            content = self._model.content
-            self.scales = {surface: CovarianceScale.read(content["scales"][surface]) for surface in SURFACES}
-            self.ratio_scales = {name: CovarianceScale.read(content["ratio_scales"][name]) for name in SURFACES}
-            self._range = TrainingRange.read(content, EXTRAS)
-            self._usual = read_usual(content)
+        kinds = {"scales": SURFACES, "ratio_scales": SURFACES}
+        super().__init__(path, FORMAT, "learned_spot", EXTRAS, kinds)
+        self.ratio_scales = self._scales["ratio_scales"]
         self._shapes = {"outputs": (None, len(SURFACES), len(OUTPUTS)), "features": (None, len(self._range.mean))}
 
     def run(self, crops: Image, extras: Image) -> tuple[Array, Array, list[Failure | None]]:
