@@ -168,19 +168,10 @@ def conics_by_crossings(
     To first order a fit to points near an ellipse moves as the linear fit does, where a gradient-weighted fit weights
     each point by the conic's gradient.
 
-    Parameters
-    ----------
-    tangents, gradient, steps : ndarray, shape (2, N)
-        The points of all conics, the conic's gradient there, and the motion of each point per unit along its line.
-    parts : sequence of slice
-        The points of each conic.
-    weighted : sequence of bool
-        Whether each fit is gradient-weighted.
-
-    Returns
-    -------
-    by_moment, moments : ndarray, shapes (K, 5, 5) and (5, N)
-        Conic k moves by by_moment[k] @ moments[:, parts[k]] as its points move.
+    `tangents`, `gradient`, `steps`, (2, N): the points of all conics, the conic's gradient there, and the motion of
+    each point per unit along its line; `parts`: the points of each conic; `weighted`: whether each fit is
+    gradient-weighted. Returns `by_moment`, `moments`, (K, 5, 5) and (5, N): conic k moves by by_moment[k] @ moments[:,
+    parts[k]] as its points move.
     """
     (x, y), (by_x, by_y) = tangents, gradient
     design = np.array([x * x, x * y, y * y, x, y])
@@ -202,14 +193,9 @@ def raw_moves(pixels: Index, moves: Array, width: int, noise: float | Image, smo
     The transpose of smoothing carries derivatives by smoothed pixels to raw pixels, whose noise is independent. The
     product of the result with its transpose is therefore the quantities' covariance.
 
-    Parameters
-    ----------
-    pixels : ndarray of int, shape (N,)
-        Indices in the flattened patch, whose rows are `width` long; each may occur several times.
-    moves : ndarray, shape (K, N)
-        Change of each quantity per unit of intensity there.
-    noise : float, or ndarray of float32, shape (h, w)
-        Standard deviation before smoothing by a Gaussian of `smoothing_px`.
+    `pixels`, (N,): indices in the flattened patch, whose rows are `width` long; each may occur several times; `moves`,
+    (K, N): change of each quantity per unit of intensity there; `noise`, (h, w): standard deviation before smoothing by
+    a Gaussian of `smoothing_px`.
     """
     # box around the pixels, with a margin of the kernel's half-width
     rows = pixels // width
@@ -269,19 +255,9 @@ _ANGLES = (np.arange(256) + 0.5) * np.pi / 256
 def ripples(tangents: Array, conics: Array, counts: Index) -> AnyArray:
     """Return the harmonics of isophotes' radii about their ellipses, relative to these, shape (K, 3), complex.
 
-    Parameters
-    ----------
-    tangents : ndarray, shape (2, N)
-        Points of all isophotes, one after the other.
-    conics : ndarray, shape (K, 5)
-        (a, b, c, d, e) of each isophote's a x^2 + b x y + c y^2 + d x + e y = 1.
-    counts : ndarray of int, shape (K,)
-        Points of each.
-
-    Returns
-    -------
-    ndarray of complex, shape (K, 3)
-        c - i s of the terms c cos(m phi) + s sin(m phi), m = 4, 5, 6.
+    `tangents`, (2, N): points of all isophotes, one after the other; `conics`, (K, 5): (a, b, c, d, e) of each
+    isophote's a x^2 + b x y + c y^2 + d x + e y = 1; `counts`, (K,): points of each. Returns (K, 3): c - i s of the
+    terms c cos(m phi) + s sin(m phi), m = 4, 5, 6.
     """
     a, b, c, d, e = conics.T
     h, determinant = b / 2, a * c - b * b / 4
@@ -318,20 +294,9 @@ def excess(
 ) -> float:
     """Return the variance of a combined centre that ripples beyond noise stand for, relative to the mean ellipse.
 
-    Parameters
-    ----------
-    each : ndarray of complex, shape (K, 3)
-        Of `ripples`.
-    weights : ndarray, shape (K,)
-        Of the isophotes' centres in the combined one.
-    levels : ndarray, shape (K,)
-        -ln t of each.
-    by_noise : float
-        Variance of the combined centre by the sensor's noise, relative to the mean ellipse.
-    size_px2 : float
-        Squared mean radius of the mean ellipse, px^2.
-    smoothing_px : float
-        Standard deviation of the smoothing, px.
+    `each`, (K, 3): of `ripples`; `weights`, (K,): of the isophotes' centres in the combined one; `levels`, (K,): -ln t
+    of each; `by_noise`: variance of the combined centre by the sensor's noise, relative to the mean ellipse;
+    `size_px2`: squared mean radius of the mean ellipse, px^2; `smoothing_px`: standard deviation of the smoothing, px.
     """
     # A contour's radius is relative to its own ellipse, whose size goes with the root of the level.
     share = np.sqrt(np.maximum(levels / levels.mean(), 0.0))
@@ -368,17 +333,10 @@ STEEPNESS = fitted_number("bends.steepness")
 def bend_variance(residuals: Array, by_noise: Array, moments: Array, slope: float) -> float:
     """Return the variance of a highlight's centre along each axis, by the bend of its isophotes, rad^2.
 
-    Parameters
-    ----------
-    residuals : ndarray, shape (K,)
-        RMS distance of each isophote from its ellipse, over its radius. The least counts: outer isophotes may bend
-        towards neighbours that do not reach the peak.
-    by_noise : ndarray, shape (K,)
-        What of it may be noise.
-    moments : ndarray, shape (2, 2)
-        Second moments of the highlight, rad^2.
-    slope : float
-        Of the axis (`simtest.estimators.family.AxisErrors`).
+    `residuals`, (K,): RMS distance of each isophote from its ellipse, over its radius. The least counts: outer
+    isophotes may bend towards neighbours that do not reach the peak; `by_noise`, (K,): what of it may be noise;
+    `moments`, (2, 2): second moments of the highlight, rad^2; `slope`: of the axis
+    (`simtest.estimators.family.AxisErrors`).
     """
     bend = float(np.sqrt(np.maximum(residuals**2 - by_noise**2, 0.0)).min())
     share = max(
@@ -420,16 +378,9 @@ def hidden_peak_moments(area_px: int, moments: Array, px2: Array, residual: floa
 
     The peak lies somewhere on the clipped plateau, which has the isophotes' shape.
 
-    Parameters
-    ----------
-    area_px : int
-        Pixels of the plateau.
-    moments : ndarray, shape (2, 2)
-        Second moments of the isophotes, rad^2, of any scale.
-    px2 : ndarray, shape (2, 2)
-        1 px^2 in squared tangents.
-    residual : float
-        RMS distance of the innermost isophote from its ellipse, over its radius.
+    `area_px`: pixels of the plateau; `moments`, (2, 2): second moments of the isophotes, rad^2, of any scale; `px2`,
+    (2, 2): 1 px^2 in squared tangents; `residual`: RMS distance of the innermost isophote from its ellipse, over its
+    radius.
     """
     # a uniform ellipse of area A has moments of determinant (A / 4 pi)^2
     scale = area_px / (4 * math.pi) * math.sqrt(max(float(np.linalg.det(px2)), 0.0))

@@ -102,21 +102,11 @@ MIN_SEPARATION = 0.35
 
 @dataclass(frozen=True)
 class _Choice:
-    """Which candidate each of N highlights prefers.
+    """Which candidate each of N highlights prefers."""
 
-    Parameters
-    ----------
-    lead : ndarray, shape (N,)
-        How much nearer to the peak N+'s projected centre is than N-'s, px.
-    apart : ndarray, shape (N,)
-        Distance of the two centres, px.
-    deviation : ndarray, shape (N,)
-        Standard deviation of the lead, px; NaN where the noise is not known.
-    """
-
-    lead: Array
-    apart: Array
-    deviation: Array
+    lead: Array  # (N,): how much nearer to the peak N+'s projected centre is than N-'s, px
+    apart: Array  # (N,): distance of the two centres, px
+    deviation: Array  # (N,): standard deviation of the lead, px; NaN where the noise is not known
 
     @property
     def margin(self) -> Array:

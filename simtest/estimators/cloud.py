@@ -45,30 +45,16 @@ REFUSED, DOUBTED = 0.95, 0.68
 
 @dataclass(frozen=True)
 class BaseEvidence:
-    """What the diffuse light says of a cloud, in ``basis_across(cloud.centre)``.
+    """What the diffuse light says of a cloud, in ``basis_across(cloud.centre)``."""
 
-    Parameters
-    ----------
-    shows : bool
-        Whether the frame shows diffuse light: the base is tissue.
-    statistic : float
-        Chi-squared with 2 degrees of freedom where the cloud's centre is at a highlight point; 0 where nothing is told.
-    misfit : float
-        Turn of the base at the cloud's centre from where it would face the lights, rad.
-    told : bool
-        Whether the misfit is known to about `MOST_MISFIT`.
-    information : ndarray, shape (2, 2)
-        Inverse covariance of `shift`, rad^-2; zero where nothing is told.
-    shift : ndarray, shape (2,)
-        From the cloud's centre to the highlight point.
-    """
-
-    shows: bool
+    shows: bool  # whether the frame shows diffuse light: the base is tissue
+    # Chi-squared with 2 degrees of freedom where the cloud's centre is at a highlight point; 0 where nothing is told.
     statistic: float = 0.0
-    misfit: float = 0.0
-    told: bool = False
+    misfit: float = 0.0  # turn of the base at the cloud's centre from where it would face the lights, rad
+    told: bool = False  # whether the misfit is known to about `MOST_MISFIT`
+    # (2, 2): inverse covariance of `shift`, rad^-2; zero where nothing is told.
     information: Array = field(default_factory=lambda: np.zeros((2, 2)))
-    shift: Array = field(default_factory=lambda: np.zeros(2))
+    shift: Array = field(default_factory=lambda: np.zeros(2))  # (2,): from the cloud's centre to the highlight point
 
     @property
     def refutes(self) -> bool:
@@ -84,16 +70,8 @@ class BaseEvidence:
 def evidence_of(cloud: Cloud, light: DiffuseLight, sampling: Array, priors: Priors) -> BaseEvidence:
     """Return what the diffuse light says of a cloud.
 
-    Parameters
-    ----------
-    cloud : Cloud
-        As the spots tell it.
-    light : DiffuseLight
-        Of its frame.
-    sampling : ndarray, shape (2, 2)
-        Covariance of its centre by the number of its spots, in ``basis_across(cloud.centre)``, rad^2.
-    priors : Priors
-        What is told of the lights and the falloff.
+    `cloud`: as the spots tell it; `light`: of its frame; `sampling`, (2, 2): covariance of its centre by the number of
+    its spots, in ``basis_across(cloud.centre)``, rad^2; `priors`: what is told of the lights and the falloff.
     """
     fits = light.around(cloud.sightline, cloud.covariance) if light.shows else None
     if fits is None:

@@ -61,21 +61,11 @@ BACKGROUND_SCALE = 8
 
 @dataclass(frozen=True)
 class Spots:
-    """The bright spots of a frame, the brightest first.
+    """The bright spots of a frame, the brightest first."""
 
-    Parameters
-    ----------
-    points_px : ndarray, shape (N, 2)
-        Centroid of each spot's pixels, px.
-    areas_px : ndarray, shape (N,)
-        Number of pixels above half of its peak, or above the saddle where that is higher.
-    peaks : ndarray, shape (N,)
-        Light at the peak above the background, frame units.
-    """
-
-    points_px: Array
-    areas_px: Array
-    peaks: Array
+    points_px: Array  # (N, 2): centroid of each spot's pixels, px
+    areas_px: Array  # (N,): number of pixels above half of its peak, or above the saddle where that is higher
+    peaks: Array  # (N,): light at the peak above the background, frame units
 
 
 def find_spots(frame: Frame) -> Spots:
@@ -257,21 +247,12 @@ SECTORS = 8
 
 @dataclass(frozen=True)
 class Shading:
-    """What the diffuse light tells of the base at a sightline, in ``basis_across(sightline)``.
+    """What the diffuse light tells of the base at a sightline, in ``basis_across(sightline)``."""
 
-    Parameters
-    ----------
-    gradient : ndarray, shape (2,)
-        grad ln L = -(2 + J) w, w the turn of the base's normal from the direction to the light, per rad.
-    covariance : ndarray, shape (2, 2)
-        Of `gradient`, by the jackknife over sectors.
-    gains : ndarray, shape (2, 2)
-        I + dS of the base. A gain g below -1 makes the same light as -2 - g, which is given for it.
-    """
-
+    # (2,): grad ln L = -(2 + J) w, w the turn of the base's normal from the direction to the light, per rad.
     gradient: Array
-    covariance: Array
-    gains: Array
+    covariance: Array  # (2, 2): of `gradient`, by the jackknife over sectors
+    gains: Array  # (2, 2): I + dS of the base. A gain g below -1 makes the same light as -2 - g, which is given for it.
 
     @property
     def steepness(self) -> Array:
@@ -281,15 +262,9 @@ class Shading:
 
 @dataclass(frozen=True)
 class DiffuseLight:
-    """The light of a frame between its spots.
+    """The light of a frame between its spots."""
 
-    Parameters
-    ----------
-    frame : Frame
-        The frame. Falloffs that its calibration knows are undone.
-    """
-
-    frame: Frame
+    frame: Frame  # falloffs that its calibration knows are undone
 
     @cached_property
     def _logs(self) -> tuple[Array, Mask, Mask]:
@@ -326,17 +301,8 @@ class DiffuseLight:
 
         The first is steadier; the second knows that the gains change.
 
-        Parameters
-        ----------
-        sightline : ndarray, shape (3,)
-            Unit.
-        covariance : ndarray, shape (2, 2)
-            Of the cloud in the plane across the sightline at unit distance, in its basis, rad^2.
-
-        Returns
-        -------
-        tuple of Shading or None
-            None where too little is seen between the spots.
+        `sightline`, (3,): unit; `covariance`, (2, 2): of the cloud in the plane across the sightline at unit distance,
+        in its basis, rad^2. Returns none where too little is seen between the spots.
         """
         cosine = self._sightlines @ sightline
         points = self._sightlines @ basis_across(sightline).T / np.where(cosine > FRONT, cosine, np.nan)[:, None]

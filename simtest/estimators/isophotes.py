@@ -181,16 +181,8 @@ def weights_of_axes(conics: Array, isovalues: Array, px2: Array, smoothing_px: f
     between the lobe's axes, by an amount between both, usually near that of the longer axis. The line is therefore
     followed that far beyond area 0.
 
-    Parameters
-    ----------
-    conics : ndarray, shape (K, 5)
-        (a, b, c, d, e) of each isophote's a x^2 + b x y + c y^2 + d x + e y = 1, tangents across the axis.
-    isovalues : ndarray, shape (K,)
-        t of each.
-    px2 : ndarray, shape (2, 2)
-        1 px^2 in squared tangents.
-    smoothing_px : float
-        s, px.
+    `conics`, (K, 5): (a, b, c, d, e) of each isophote's a x^2 + b x y + c y^2 + d x + e y = 1, tangents across the
+    axis; `isovalues`, (K,): t of each; `px2`, (2, 2): 1 px^2 in squared tangents; `smoothing_px`: s, px.
     """
     a, b, c = conics.T[:3]
     smoothing = smoothing_px**2 + LINEAR_INTERPOLATION_PX2
@@ -223,21 +215,11 @@ MIN_PIXELS = 12
 
 @dataclass(frozen=True)
 class PeakValue:
-    """The peak value of a lobe and how it moves with the patch's pixels.
+    """The peak value of a lobe and how it moves with the patch's pixels."""
 
-    Parameters
-    ----------
-    value : float
-        Intensity.
-    pixels : ndarray of int, shape (N,)
-        Indices in the flattened patch.
-    weights : ndarray, shape (N,)
-        Change of log(value) per unit of intensity of each.
-    """
-
-    value: float
-    pixels: Index
-    weights: Array
+    value: float  # intensity
+    pixels: Index  # (N,): indices in the flattened patch
+    weights: Array  # (N,): change of log(value) per unit of intensity of each
 
 
 def fit_peak_value(patch: Patch) -> PeakValue:
@@ -413,13 +395,9 @@ class IsophotesAcross:
         A crossing depends on three pixels, the two beside it and the peak's; the ellipse and what follows from it
         depend on its crossings. All is summed by smoothed pixel, then carried to the raw ones. The noise must be known.
 
-        Parameters
-        ----------
-        by_conic : ndarray, shape (K, Q, 5)
-            Derivatives of the quantities by each isophote's conic.
-        by_level : tuple of ndarray, shape (Q,), and PeakValue, optional
-            Their derivatives by a common shift of all -ln t, and the peak value that t is relative to: it moves the
-            levels one way, the peak's pixel the other.
+        `by_conic`, (K, Q, 5): derivatives of the quantities by each isophote's conic; `by_level`, (Q,), and PeakValue,
+        optional: their derivatives by a common shift of all -ln t, and the peak value that t is relative to: it moves
+        the levels one way, the peak's pixel the other.
         """
         noise, crossings = self.patch.noise, self._crossings
         assert noise is not None

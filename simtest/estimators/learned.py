@@ -78,34 +78,20 @@ MARGIN = 0.05
 
 @dataclass(frozen=True)
 class TrainingRange:
-    """Ranges of named inputs on the train split, and the distribution of the network's inner features there.
+    """Ranges of named inputs on the train split, and the distribution of the network's inner features there."""
 
-    Parameters
-    ----------
-    low, high : dict of str to float
-        Smallest and largest value of each input.
-    mean : ndarray, shape (F,)
-        Mean of the features.
-    precision : ndarray, shape (F, F)
-        Inverse of their covariance.
-    limit : float
-        Squared Mahalanobis distance of features beyond which the network refuses.
-    """
-
+    # low, high: smallest and largest value of each input.
     low: dict[str, float]
     high: dict[str, float]
-    mean: Array
-    precision: Array
-    limit: float
+    mean: Array  # (F,): mean of the features
+    precision: Array  # (F, F): inverse of their covariance
+    limit: float  # squared Mahalanobis distance of features beyond which the network refuses
 
     @staticmethod
     def read(content: JsonObject, names: Sequence[str]) -> "TrainingRange":
         """Return the range in a network's metadata (`written`).
 
-        Raises
-        ------
-        KeyError, TypeError, ValueError
-            If it is malformed, or a name is missing.
+        Raises `KeyError`, `TypeError`, `ValueError` if it is malformed, or a name is missing.
         """
         low, high = ({name: float(content[key][name]) for name in names} for key in ("low", "high"))
         mean = np.array(content["feature_mean"], dtype=float)
@@ -152,10 +138,7 @@ class TrainingRange:
 def read_usual(content: JsonObject) -> float:
     """Return the usual squared distance of a network's metadata (`inflation`).
 
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If it is missing or not a number above 0.
+    Raises `KeyError`, `TypeError`, `ValueError` if it is missing or not a number above 0.
     """
     usual = float(content["feature_usual"])
     if not 0 < usual < np.inf:
@@ -193,18 +176,10 @@ def _symmetric(upper: Array, size: int) -> Array:
 
 @dataclass(frozen=True)
 class CovarianceScale:
-    """Factor of a covariance, as it hangs on how sure the network states to be.
+    """Factor of a covariance, as it hangs on how sure the network states to be."""
 
-    Parameters
-    ----------
-    log_deviation : tuple of float
-        Mean logarithm of the two stated deviations, ascending; constant beyond the ends.
-    factor : tuple of float
-        Factor of the covariance there; its logarithm is interpolated.
-    """
-
-    log_deviation: tuple[float, ...]
-    factor: tuple[float, ...]
+    log_deviation: tuple[float, ...]  # mean logarithm of the two stated deviations, ascending; constant beyond the ends
+    factor: tuple[float, ...]  # factor of the covariance there; its logarithm is interpolated
 
     def __post_init__(self) -> None:
         if not len(self.log_deviation) == len(self.factor) >= 1:
@@ -291,12 +266,8 @@ class OnnxModel:
     def run(self, inputs: Mapping[str, AnyArray], shapes: Mapping[str, tuple[int | None, ...]]) -> list[AnyArray]:
         """Return outputs of the network by name.
 
-        Parameters
-        ----------
-        inputs : mapping
-            Arrays of float32 by name.
-        shapes : mapping
-            Names of the wanted outputs with their shapes; None stands for any number.
+        `inputs`: arrays of float32 by name; `shapes`: names of the wanted outputs with their shapes; None stands for
+        any number.
         """
         try:
             made = [np.asarray(each) for each in self._session.run(list(shapes), dict(inputs))]
@@ -335,21 +306,10 @@ STEP = 1e-5
 def turned_normals(rays: Array, rotation: Array, root: Array) -> tuple[Array, Array]:
     """Return normals and their covariances, to first order.
 
-    Parameters
-    ----------
-    rays : ndarray, shape (N, 3)
-        Unit sightlines.
-    rotation : ndarray, shape (N, 2)
-        From the direction to the camera to the normal, rad in `simtest.estimators.learned_spot.image_basis`.
-    root : ndarray, shape (N, 2, 2)
-        Factor L of the rotation's covariance L L^T, rad.
-
-    Returns
-    -------
-    normals : ndarray, shape (N, 3)
-        Unit, camera frame.
-    covariances : ndarray, shape (N, 2, 2)
-        rad^2 in `simtest.geometry.vectors.tangent_basis` of the normals.
+    `rays`, (N, 3): unit sightlines; `rotation`, (N, 2): from the direction to the camera to the normal, rad in
+    `simtest.estimators.learned.image_basis`; `root`, (N, 2, 2): factor L of the rotation's covariance L L^T, rad.
+    Returns `normals`, (N, 3): unit, camera frame; `covariances`, (N, 2, 2): rad^2 in
+    `simtest.geometry.vectors.tangent_basis` of the normals.
     """
     normals = normal_of(rays, rotation)
     basis = np.stack(tangent_basis(normals), axis=1)
@@ -371,18 +331,9 @@ def reflection_distances(
     slopes of it. The result is the squared Mahalanobis distance between the base's normal and the bisector, of the
     nearest light each: 2 on average where they differ as much as they may.
 
-    Parameters
-    ----------
-    normals : ndarray, shape (N, 3)
-        Unit normals of the base.
-    covariances : ndarray, shape (N, 2, 2)
-        In `simtest.geometry.vectors.tangent_basis` of them, rad^2.
-    rays : ndarray, shape (N, 3)
-        Unit sightlines.
-    distance_mm, share : ndarray, shape (N,)
-        Distances along them, and deviations of their logarithms.
-    lights_mm : ndarray, shape (L, 3)
-        Positions, camera frame.
+    `normals`, (N, 3): unit normals of the base; `covariances`, (N, 2, 2): in `simtest.geometry.vectors.tangent_basis`
+    of them, rad^2; `rays`, (N, 3): unit sightlines; `distance_mm`, `share`, (N,): distances along them, and deviations
+    of their logarithms; `lights_mm`, (L, 3): positions, camera frame.
     """
     basis = np.stack(tangent_basis(normals), axis=1)
     nearest = np.full(len(normals), np.inf)

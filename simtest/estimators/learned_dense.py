@@ -4,7 +4,7 @@ What a dense network sees of a frame, and returns: planes on a coarse grid, of l
 
 The frame lies in the middle of a grid of 4:3, whole; a frame of another aspect leaves cells empty, as a view mask does.
 Directions are in the tangent basis of the direction to the camera that is aligned with the frame
-(`simtest.estimators.learned_spot.image_basis`).
+(`simtest.estimators.learned.image_basis`).
 """
 
 from collections.abc import Sequence
@@ -82,18 +82,12 @@ DISTANCE_MM, DISTANCE_SCALE = 30.0, 0.5
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a frame lies on the grid.
+    """Where a frame lies on the grid."""
 
-    Parameters
-    ----------
-    columns, rows : int
-        Of the grid that the frame covers.
-    left, top : int
-        Cells before it.
-    """
-
+    # columns, rows: of the grid that the frame covers.
     columns: int
     rows: int
+    # left, top: cells before it.
     left: int
     top: int
 

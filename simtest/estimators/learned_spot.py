@@ -67,19 +67,9 @@ RATIO, RATIO_DEVIATION = 5, 6
 def spot_inputs(frame: Frame, peaks_px: Sequence[Array] | Array) -> tuple[Image, Image]:
     """Return the inputs of a network at peaks of a frame.
 
-    Parameters
-    ----------
-    frame : Frame
-        Encoded values and calibration, whose lights must be told.
-    peaks_px : array_like, shape (N, 2)
-        Positions, px.
-
-    Returns
-    -------
-    crops : ndarray of float32, shape (N, 3, 32, 32)
-        Logarithm of the linear light over the median of the frame's lit pixels, the smallest step first.
-    extras : ndarray of float32, shape (N, 11)
-        See `EXTRAS`.
+    `frame`: encoded values and calibration, whose lights must be told; `peaks_px`, (N, 2): positions, px. Returns
+    `crops`, (N, 3, 32, 32): logarithm of the linear light over the median of the frame's lit pixels, the smallest step
+    first; `extras`, (N, 11): see `EXTRAS`.
     """
     peaks = np.asarray(peaks_px, dtype=float).reshape(-1, 2)
     light = frame.channels if frame.channels.ndim == 2 else frame.channels.mean(axis=2, dtype=np.float32)

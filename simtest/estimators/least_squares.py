@@ -85,24 +85,12 @@ Model = TypeVar("Model", bound=LobeModel)
 
 @dataclass(frozen=True)
 class LobeFit(Generic[Model]):
-    """A fitted model.
+    """A fitted model."""
 
-    Parameters
-    ----------
-    model : LobeModel
-        At the minimum.
-    covariance : ndarray, shape (p, p)
-        Of its parameters, from the residual's variance.
-    sigma : float
-        Standard deviation of the residual.
-    chi2 : float
-        Sum of squared residuals.
-    """
-
-    model: Model
-    covariance: Array
-    sigma: float
-    chi2: float
+    model: Model  # at the minimum
+    covariance: Array  # (p, p): of its parameters, from the residual's variance
+    sigma: float  # standard deviation of the residual
+    chi2: float  # sum of squared residuals
 
 
 def fit_lobe(
@@ -113,14 +101,9 @@ def fit_lobe(
     The start must be near the minimum. None where the fit does not converge, or the pixels do not determine a
     parameter.
 
-    Parameters
-    ----------
-    observed : ndarray, shape (m,)
-        Intensities of the model's pixels.
-    clipped : ndarray of bool, shape (m,), optional
-        Censored pixels: the intensity is at least what was observed, so a model above it leaves no residual.
-    rounding : float
-        Relative error of the sum of squares by the model's rounding: a change by no more than that ends the fit.
+    `observed`, (m,): intensities of the model's pixels; `clipped`, (m,), optional: censored pixels: the intensity is at
+    least what was observed, so a model above it leaves no residual; `rounding`: relative error of the sum of squares by
+    the model's rounding: a change by no more than that ends the fit.
     """
 
     def equations(states: AnyArray, _: Index) -> Equations:

@@ -33,24 +33,12 @@ MOST_TURN = 0.5
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a patch shows to a camera at another position.
+    """What a patch shows to a camera at another position."""
 
-    Parameters
-    ----------
-    position : ndarray, shape (3,)
-        Of the camera, mm, first camera's frame.
-    normal : ndarray, shape (3,)
-        That points at it, unit, first camera's frame.
-    place : ndarray, shape (2,)
-        Of its point along the principal directions, in units of the first picture's distance.
-    curvatures : ndarray, shape (2,)
-        d k of the patch.
-    """
-
-    position: Array
-    normal: Array
-    place: Array
-    curvatures: Array
+    position: Array  # (3,): of the camera, mm, first camera's frame
+    normal: Array  # (3,): that points at it, unit, first camera's frame
+    place: Array  # (2,): of its point along the principal directions, in units of the first picture's distance
+    curvatures: Array  # (2,): d k of the patch
 
     def shape_sd(self, change_sd: float) -> float:
         """Return how far a surface's normal may be from the patch's at the predicted place, rad per axis.
@@ -64,21 +52,11 @@ class Prediction:
 
 @dataclass(frozen=True)
 class FirstPicture:
-    """The first picture's highlight under one hypothesis.
+    """The first picture's highlight under one hypothesis."""
 
-    Parameters
-    ----------
-    first : Estimate
-        With curvature.
-    distance : float
-        Of the surface, mm.
-    gains : ndarray, shape (2,)
-        1 + d k along its principal directions.
-    """
-
-    first: Estimate
-    distance: float
-    gains: Array
+    first: Estimate  # with curvature
+    distance: float  # of the surface, mm
+    gains: Array  # (2,): 1 + d k along its principal directions
 
     def predict(self, position: Array) -> Prediction | None:
         """Solve for the patch's normal that points at a position; None where Newton's method finds none."""

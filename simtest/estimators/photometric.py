@@ -35,26 +35,13 @@ class ColocatedQuadric:
     plane, z = (x, y) K (x, y)^T / 2, K = d S. The radiance is c max(0, cos 2 theta)^n over the squared distance.
     Parameters: rotation of s in its tangent plane (2), K11, K12, K22, log c. n is held, because beside the three of K
     it is all but undetermined.
-
-    Parameters
-    ----------
-    rays : ndarray, shape (m, 3)
-        Sightlines of the pixels.
-    frame : ndarray, shape (3, 3)
-        Rows e, f, s: tangent basis and sightline of the BP, camera frame.
-    K : ndarray, shape (3,)
-        K11, K12, K22 in the basis e, f.
-    log_scale : float
-        log c.
-    exponent : float
-        n.
     """
 
-    rays: Array
-    frame: Array
-    K: Array
-    log_scale: float
-    exponent: float
+    rays: Array  # (m, 3): sightlines of the pixels
+    frame: Array  # (3, 3): rows e, f, s: tangent basis and sightline of the BP, camera frame
+    K: Array  # (3,): K11, K12, K22 in the basis e, f
+    log_scale: float  # log c
+    exponent: float  # n
 
     @property
     def normal(self) -> Array:

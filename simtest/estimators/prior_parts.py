@@ -54,14 +54,9 @@ GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 @dataclass(frozen=True)
 class LightTable:
-    """Equivalent variances of the moves over the sightline's angle from the optical axis.
+    """Equivalent variances of the moves over the sightline's angle from the optical axis."""
 
-    Parameters
-    ----------
-    along, across : ndarray, shape (A,)
-        Variance towards the optical axis and perpendicular to it, rad^2, at each of `ANGLES`.
-    """
-
+    # along, across: (A,): variance towards the optical axis and perpendicular to it, rad^2, at each of `ANGLES`.
     along: Array
     across: Array
 
@@ -137,18 +132,9 @@ def near_miss_parts(patch: Patch, priors: Priors) -> Budget:
 def near_miss_variance(patch: Patch, lights: int) -> float:
     """Return the variance of a highlight's normal along each axis by the chance that it is a near miss, rad^2.
 
-    Parameters
-    ----------
-    patch : Patch
-        The highlight, with the frame's other ones.
-    lights : int
-        How many lights there are, at least 1.
-
-    Returns
-    -------
-    float
-        0 in a frame that does not show more than `CROWD` highlights for each light; where the patch does not know the
-        frame's others, that of the usual number.
+    `patch`: the highlight, with the frame's other ones; `lights`: how many lights there are, at least 1. Returns 0 in a
+    frame that does not show more than `CROWD` highlights for each light; where the patch does not know the frame's
+    others, that of the usual number.
     """
     count = USUAL if patch.others_px is None else (len(patch.others_px) + 1) / min(lights, APART)
     if count <= CROWD:
@@ -273,19 +259,10 @@ def told_light_part(sightline: Array, normal: Array, light: Array, covariance: A
 
     The normal turns by half the angle by which the light moves, as seen from the surface (theory.md section 3, item 1).
 
-    Parameters
-    ----------
-    sightline, normal, light : ndarray, shape (3,)
-        Unit sightline and unit normal, camera frame; nominal position of the light, mm.
-    covariance : ndarray, shape (3, 3)
-        Of the light's position, mm^2.
-    distances : ndarray, shape (D,)
-        Distances of the surface along the sightline, mm, each as likely; the part is the mean over them.
-
-    Returns
-    -------
-    ndarray, shape (2, 2)
-        rad^2, in the basis ``tangent_basis(normal)``.
+    `sightline`, `normal`, `light`, (3,): unit sightline and unit normal, camera frame; nominal position of the light,
+    mm; `covariance`, (3, 3): of the light's position, mm^2; `distances`, (D,): distances of the surface along the
+    sightline, mm, each as likely; the part is the mean over them. Returns (2, 2): rad^2, in the basis
+    ``tangent_basis(normal)``.
     """
     across = basis_across(normal)
     position = distances[:, None] * sightline

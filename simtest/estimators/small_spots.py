@@ -48,57 +48,30 @@ HEIGHT, X, Y, XX, XY, YY, LEVEL, RIGHT, DOWN = range(9)
 
 @dataclass(frozen=True)
 class SpotWindows:
-    """The pixels of N spots, each in a square window around its peak's pixel, its m pixels in one row.
+    """The pixels of N spots, each in a square window around its peak's pixel, its m pixels in one row."""
 
-    Parameters
-    ----------
-    values : ndarray, shape (N, m)
-        Unsmoothed intensities over the spot's height; 0 where not used.
-    used, clipped : ndarray of bool, shape (N, m)
-        Pixels that are fitted, and those of them whose intensity is at least the value.
-    offsets : ndarray, shape (2, m)
-        Each pixel's centre from the centre of the window, px.
-    """
-
-    values: Array
+    values: Array  # (N, m): unsmoothed intensities over the spot's height; 0 where not used
+    # used, clipped: (N, m): pixels that are fitted, and those of them whose intensity is at least the value.
     used: Mask
     clipped: Mask
-    offsets: Array
+    offsets: Array  # (2, m): each pixel's centre from the centre of the window, px
 
 
 @dataclass(frozen=True)
 class SpotFits:
-    """Fitted spots.
+    """Fitted spots."""
 
-    Parameters
-    ----------
-    parameters : ndarray, shape (N, 9)
-        At the minimum; see `HEIGHT` and the others.
-    covariance : ndarray, shape (N, 2, 2)
-        Of the centre, px^2, for residuals of variance 1; NaN where it is not determined.
-    residual : ndarray, shape (N,)
-        Standard deviation of the residuals, in the values' unit.
-    sound : ndarray of bool, shape (N,)
-        Whether the fit converged to a spot inside its window.
-    """
-
-    parameters: Array
-    covariance: Array
-    residual: Array
-    sound: Mask
+    parameters: Array  # (N, 9): at the minimum; see `HEIGHT` and the others
+    covariance: Array  # (N, 2, 2): of the centre, px^2, for residuals of variance 1; NaN where it is not determined
+    residual: Array  # (N,): standard deviation of the residuals, in the values' unit
+    sound: Mask  # (N,): whether the fit converged to a spot inside its window
 
 
 def fit_spots(windows: SpotWindows, centres: Array, variances: Array, levels: Array) -> SpotFits:
     """Fit spots by Levenberg and Marquardt's method, all at once.
 
-    Parameters
-    ----------
-    windows : SpotWindows
-        Their pixels.
-    centres : ndarray, shape (N, 2)
-        Where to start, px from the centre of the window.
-    variances, levels : ndarray, shape (N,)
-        Variance of each spot, px^2, and level of its background to start with.
+    `windows`: their pixels; `centres`, (N, 2): where to start, px from the centre of the window; `variances`, `levels`,
+    (N,): variance of each spot, px^2, and level of its background to start with.
     """
     count = len(centres)
     p = np.zeros((count, 9))
@@ -205,26 +178,14 @@ UNRESOLVED = "unresolved"
 
 @dataclass(frozen=True)
 class SmallSpot:
-    """The fitted centre of a small highlight; it stands in where an `IsophoteFamily` is asked for its axis.
-
-    Parameters
-    ----------
-    patch : Patch
-        Region of interest.
-    camera : Camera
-        Calibration.
-    centre_px : ndarray, shape (2,)
-        Centre, px.
-    variance_px2 : ndarray, shape (2, 2)
-        Second moments of the fitted spot as its pixels show it, px^2.
-    by_noise_px2, by_shape_px2 : ndarray, shape (2, 2)
-        Covariance of the centre by noise, and by everything that makes the spot no Gaussian, px^2.
-    """
+    """The fitted centre of a small highlight; it stands in where an `IsophoteFamily` is asked for its axis."""
 
     patch: Patch
     camera: Camera
     centre_px: Array
-    variance_px2: Array
+    variance_px2: Array  # (2, 2): second moments of the fitted spot as its pixels show it, px^2
+    # by_noise_px2, by_shape_px2: (2, 2): covariance of the centre by noise, and by everything that makes the spot no
+    # Gaussian, px^2.
     by_noise_px2: Array
     by_shape_px2: Array
 

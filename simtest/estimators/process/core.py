@@ -78,34 +78,18 @@ class CoreFile(Spec):
 
 @dataclass(frozen=True)
 class CoreCommand:
-    """How a core is started.
+    """How a core is started."""
 
-    Parameters
-    ----------
-    text : str
-        As the user named it.
-    name : str
-        Of the estimator.
-    arguments : tuple of str
-        Program and arguments; those that name files are absolute.
-    files : tuple of Path
-        The program and the files that arguments name, and those of the TOML file and itself, if any.
-    time_limit_s, start_limit_s : float
-        For a request, and for the start.
-    environment : tuple of str
-        Names of environment variables that are passed on beside `PASSED`.
-    kind : {"patch", "frame"}, optional
-        What the core must be.
-    """
-
-    text: str
-    name: str
-    arguments: tuple[str, ...]
+    text: str  # as the user named it
+    name: str  # of the estimator
+    arguments: tuple[str, ...]  # program and arguments; those that name files are absolute
+    # The program and the files that arguments name, and those of the TOML file and itself, if any.
     files: tuple[Path, ...]
+    # time_limit_s, start_limit_s: for a request, and for the start.
     time_limit_s: float = TIME_LIMIT_S
     start_limit_s: float = START_LIMIT_S
-    environment: tuple[str, ...] = ()
-    kind: Literal["patch", "frame"] | None = None
+    environment: tuple[str, ...] = ()  # names of environment variables that are passed on beside `PASSED`
+    kind: Literal["patch", "frame"] | None = None  # what the core must be
 
     @property
     def absolute(self) -> str:
@@ -259,10 +243,7 @@ class Core:
     def start(self) -> Hello:
         """Start the core, if it does not run, and return its greeting.
 
-        Raises
-        ------
-        CoreFault
-            If it does not start, or greets otherwise than it must.
+        Raises `CoreFault` if it does not start, or greets otherwise than it must.
         """
         with self._lock:
             if self._child is not None and self._child.owner == os.getpid():
@@ -289,10 +270,8 @@ class Core:
     def ask(self, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> Message:
         """Send a request, which gets a number of its own, and return the answer to it.
 
-        Raises
-        ------
-        CoreFault
-            If the core breaks down or breaks the protocol. It has been ended then, and the next request starts it anew.
+        Raises `CoreFault` if the core breaks down or breaks the protocol. It has been ended then, and the next request
+        starts it anew.
         """
         with self._lock:
             if self._faults >= MAX_FAULTS and self._last is not None:
@@ -415,15 +394,9 @@ def forgive_cores() -> None:
 
 @dataclass(frozen=True)
 class _Process:
-    """What both kinds share.
+    """What both kinds share."""
 
-    Parameters
-    ----------
-    core : Core
-        Started once at least, so that its greeting is known.
-    """
-
-    core: Core = field(repr=False)
+    core: Core = field(repr=False)  # started once at least, so that its greeting is known
 
     @property
     def description(self) -> str:

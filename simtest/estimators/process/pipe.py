@@ -66,18 +66,10 @@ def broken(detail: str) -> CoreFault:
 
 @dataclass(frozen=True)
 class Message:
-    """A message.
+    """A message."""
 
-    Parameters
-    ----------
-    header : dict
-        The JSON object, without ``arrays``.
-    arrays : dict of str to ndarray
-        By name.
-    """
-
-    header: dict[str, Any]
-    arrays: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
+    header: dict[str, Any]  # the JSON object, without ``arrays``
+    arrays: dict[str, npt.NDArray[Any]] = field(default_factory=dict)  # by name
 
 
 def encode(header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> list[memoryview]:
@@ -147,11 +139,8 @@ class MessageReader:
     def feed(self, data: bytes) -> Message | None:
         """Take more bytes; return the message where they complete it.
 
-        Raises
-        ------
-        CoreFault
-            If a line is too long or no JSON object, lists malformed or too large arrays, or is followed by bytes that
-            belong to no message.
+        Raises `CoreFault` if a line is too long or no JSON object, lists malformed or too large arrays, or is followed
+        by bytes that belong to no message.
         """
         self._buffer += data
         if self._header is None:
@@ -232,24 +221,12 @@ of this process: a cluster kills those of its workers with them."""
 
 @dataclass
 class Child:
-    """A running core, whose outputs two threads read.
+    """A running core, whose outputs two threads read."""
 
-    Parameters
-    ----------
-    folder : str
-        Its own temporary folder, in which it runs.
-    process : Popen
-        The core, leader of its process group.
-    guard : file
-        Input of the shell that watches over it.
-    owner : int
-        Process that started it; a fork of that one must not use its pipes.
-    """
-
-    folder: str
-    process: "subprocess.Popen[bytes]"
-    guard: IO[bytes]
-    owner: int = field(default_factory=os.getpid)
+    folder: str  # its own temporary folder, in which it runs
+    process: "subprocess.Popen[bytes]"  # the core, leader of its process group
+    guard: IO[bytes]  # input of the shell that watches over it
+    owner: int = field(default_factory=os.getpid)  # process that started it; a fork of that one must not use its pipes
 
     def __post_init__(self) -> None:
         self._reader, self._said = MessageReader(), SimpleQueue[Message | CoreFault | str]()
@@ -287,11 +264,8 @@ class Child:
     def exchange(self, parts: Sequence[memoryview], limit_s: float) -> Message:
         """Write a request and read its answer, the two at once, so that neither side can block the other.
 
-        Raises
-        ------
-        CoreFault
-            If the answer is malformed or late, or the process ends. The process must then be ended: its pipes may hold
-            a part of a message.
+        Raises `CoreFault` if the answer is malformed or late, or the process ends. The process must then be ended: its
+        pipes may hold a part of a message.
         """
         deadline, self._is_asked = time.monotonic() + limit_s, True
         writer = self._write(parts)
@@ -479,10 +453,7 @@ def exchange_files(
 ) -> Message:
     """Write a request's files, send a line that names their folder, and read the answer's files.
 
-    Raises
-    ------
-    CoreFault
-        If the core breaks down, or its answer is malformed or missing.
+    Raises `CoreFault` if the core breaks down, or its answer is malformed or missing.
     """
     number = request["id"]
     folder = Path(child.folder) / f"request-{number}"
