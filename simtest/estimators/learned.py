@@ -362,7 +362,7 @@ def _across(basis: Array, normals: Array, others: Array) -> Array:
     return np.asarray(across * (angle / np.maximum(sine, 1e-12))[:, None])
 
 
-class Network:
+class TaughtNetwork:
     """A network in ONNX Runtime, with the range that it was taught and the scales of what it states."""
 
     def __init__(self, path: Path, form: str, core: str, inputs: Sequence[str], scales: Mapping[str, Sequence[str]]):
@@ -408,7 +408,7 @@ class LearnedNormals:
     def _network(self) -> Any:
         return self._load(Path(self.model or data_root("scenes").joinpath(*WEIGHTS, self.shipped)))
 
-    def _load(self, path: Path) -> Network:
+    def _load(self, path: Path) -> TaughtNetwork:
         """Return the network of a file."""
         raise NotImplementedError
 

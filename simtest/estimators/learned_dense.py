@@ -21,7 +21,7 @@ from simtest.estimators.learned import (
     LIGHT_SCALE_MM,
     LOG_RANGE,
     LearnedNormals,
-    Network,
+    TaughtNetwork,
     image_basis,
     inflation,
     median_of_lit,
@@ -242,8 +242,8 @@ class LearnedDense(LearnedNormals):
         network = str(self.model or self.shipped)
         return f"The normal of the base surface at each highlight, by the network {network} of the whole frame."
 
-    def _load(self, path: Path) -> "_Network":
-        return _Network(path)
+    def _load(self, path: Path) -> "DenseNetwork":
+        return DenseNetwork(path)
 
     def maps(
         self, values: Image, calibration: Calibration, highlights_px: Array | None = None, seen: Mask | None = None
@@ -385,7 +385,7 @@ def _unfit(frame: Frame) -> Failure | None:
     return Failure(Reason.NO_ESTIMATE, f"outside the network's training: {told}") if told else None
 
 
-class _Network(Network):
+class DenseNetwork(TaughtNetwork):
     """A network of whole frames."""
 
     def __init__(self, path: Path) -> None:

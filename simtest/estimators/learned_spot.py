@@ -20,7 +20,7 @@ from simtest.estimators.learned import (
     LIGHT_SCALE_MM,
     LOG_RANGE,
     LearnedNormals,
-    Network,
+    TaughtNetwork,
     image_basis,
     inflation,
     median_of_lit,
@@ -163,8 +163,8 @@ class LearnedSpot(LearnedNormals):
         network = str(self.model or self.shipped)
         return f"The normal of the {self.target} surface at each highlight, by the network {network}."
 
-    def _load(self, path: Path) -> "_Network":
-        return _Network(path)
+    def _load(self, path: Path) -> "SpotNetwork":
+        return SpotNetwork(path)
 
     def _at(self, frame: Frame, peaks: Array) -> Sequence[Estimate | Failure] | Failure:
         if frame.camera.distortion is not None:
@@ -200,7 +200,7 @@ class LearnedSpot(LearnedNormals):
         )  # fmt: skip
 
 
-class _Network(Network):
+class SpotNetwork(TaughtNetwork):
     """A network of single highlights."""
 
     def __init__(self, path: Path) -> None:

@@ -1,10 +1,7 @@
-"""Names of estimators with files of the user's own, cores and networks: in results, in records, in other processes.
+"""Estimators by name: installed ones, cores, and networks of the user's own; in results, records, other processes.
 
-The group of installed estimators: their names and packages are asked for without loading any.
-
-What each estimator does, in one line for a reader who chooses one.
-
-Estimators by name: those of packages (entry-point group ``simtest.estimators``), and those of the user's own.
+Names, packages and descriptions of installed estimators (entry-point group ``simtest.estimators``) are asked for
+without loading any.
 """
 
 import inspect
@@ -14,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from simtest.errors import InputError
-from simtest.estimators.protocol import AnyEstimator, Estimator, FrameEstimator
-from simtest.runtime.resources import OWN, SUFFIX, EntryPointGroup, parse_model
+from simtest.runtime.resources import OWN, SUFFIX, EntryPointGroup, ModelName, parse_model
 
 if TYPE_CHECKING:
     from simtest.estimators.process.core import CoreCommand
+    from simtest.estimators.protocol import AnyEstimator
 
 
 def short_names(estimators: Iterable[str]) -> tuple[str, ...]:
@@ -31,12 +28,21 @@ def has_files(name: str) -> bool:
     return is_core(name) or parse_model(name) is not None
 
 
+def _with_files(name: str) -> "ModelName | CoreCommand | None":
+    """Return the network or core of a name, None of all others; what reads a core's is imported at need."""
+    if (model := parse_model(name)) or not is_core(name):
+        return model
+    from simtest.estimators.process.core import parse_core
+
+    return parse_core(name)
+
+
 def short_name(name: str) -> str:
     """Return the short name of a core, or of an estimator with a network's file."""
-    model = parse_model(name)
-    short = _parsed(name).name if model is None else model.short
+    own = _with_files(name)
+    short = name if own is None else own.short
     if short in ESTIMATORS.names():
-        how = "in a TOML file (core.name)" if model is None else "by its file"
+        how = "in a TOML file (core.name)" if is_core(name) else "by its file"
         raise InputError(
             f"estimator {name!r}: is called {short}, as an installed estimator is; name it otherwise {how}"
         )
@@ -45,13 +51,7 @@ def short_name(name: str) -> str:
 
 def absolute_names(estimators: Iterable[str]) -> tuple[str, ...]:
     """Return names that mean the same estimators in a process with another current folder."""
-    return tuple(_absolute(name) for name in estimators)
-
-
-def _absolute(name: str) -> str:
-    if model := parse_model(name):
-        return model.absolute
-    return _parsed(name).absolute if is_core(name) else name
+    return tuple(name if (own := _with_files(name)) is None else own.absolute for name in estimators)
 
 
 def core_records(estimators: Iterable[str]) -> dict[str, dict[str, object]]:
@@ -72,7 +72,7 @@ def core_records(estimators: Iterable[str]) -> dict[str, dict[str, object]]:
 
 def core_hashes(estimators: Iterable[str]) -> dict[str, dict[str, str]]:
     """Return the SHA-256 of the files of cores and networks among estimators, by name and path."""
-    return {name: (parse_model(name) or _parsed(name)).hashes() for name in estimators if has_files(name)}
+    return {name: own.hashes() for name in estimators if (own := _with_files(name)) is not None}
 
 
 def close_cores() -> None:
@@ -86,13 +86,6 @@ def forgive_cores() -> None:
     """Count the faults of all cores from 0 again, so that no part of a run depends on those before it."""
     if loaded := sys.modules.get("simtest.estimators.process.core"):
         loaded.forgive_cores()
-
-
-def _parsed(name: str) -> "CoreCommand":
-    """Return the command of a core; what reads it is imported at need, since few runs name one."""
-    from simtest.estimators.process.core import parse_core
-
-    return parse_core(name)
 
 
 PREFIX = "command:"
@@ -160,8 +153,10 @@ def _first_line(estimator: object) -> str:
     return (inspect.cleandoc(own).splitlines() or [""])[0] if own else ""
 
 
-def as_estimator(name: str, given: object) -> AnyEstimator:
+def as_estimator(name: str, given: object) -> "AnyEstimator":
     """Return an object as an estimator; raise `InputError` if it is none, or a class where an instance is meant."""
+    from simtest.estimators.protocol import Estimator, FrameEstimator
+
     if isinstance(given, type):
         raise InputError(f"estimator {name!r}: {given.__qualname__} is a class; must be an instance of it")
     if isinstance(given, Estimator | FrameEstimator):
@@ -172,7 +167,7 @@ def as_estimator(name: str, given: object) -> AnyEstimator:
     )
 
 
-def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> dict[str, AnyEstimator]:
+def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> "dict[str, AnyEstimator]":
     """Load estimators by name, or take those of a mapping, in the given order.
 
     A name is as registered, or "package:name" where two packages register it; or it is a core's

@@ -12,12 +12,12 @@ import numpy as np
 
 from simtest.calibration import Frame, Priors
 from simtest.errors import Failure, Reason
-from simtest.estimators.budget import LARGEST_VARIANCE, STATED, Budget, bounded, total
+from simtest.estimators.budget import LARGEST_VARIANCE, STATED, Budget, bounded, deviations, total
 from simtest.estimators.cloud_shape import CloudShape
 from simtest.estimators.isophotes import FittedIsophote
-from simtest.geometry import Array, Camera, Patch
+from simtest.geometry import Array, Camera, Patch, chi_squared
 from simtest.geometry.cones import PoseRegion
-from simtest.geometry.vectors import deviation_deg
+from simtest.geometry.vectors import covariance_across, deviation_deg, tilt_deg
 from simtest.runtime.arrays import LONGEST, clipped, vector
 
 Target = Literal["fine", "base"]
@@ -136,9 +136,23 @@ class Estimate:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the normal in the view with its 95 % ellipse, and the budget."""
-        from simtest.estimators.notebook import estimate_html
+        from simtest.pages.notebook import normal_html, note_html, table_html
 
-        return estimate_html(self)
+        x, y, z = self.normal
+        tilt = tilt_deg(self.normal)
+        lines = [f"normal ({x:.4f}, {y:.4f}, {z:.4f}), camera frame; {tilt:.2f} deg from the optical axis"]
+        if self.deviation_deg is not None:
+            lines.append(f"standard deviation {self.deviation_deg:.3g} deg; the ellipse holds 95 % of the errors")
+        if len(self.candidates) > 1:
+            lines.append(f"{len(self.candidates)} candidates; the proposed one is shown")
+        if self.flags:
+            lines.append("flags: " + ", ".join(self.flags))
+        parts = sorted(deviations(self.budget or {}).items(), key=lambda part: -part[1])
+        table = table_html(("part", "standard deviation (deg)"), [(n, f"{np.degrees(v):.3g}") for n, v in parts])
+        region = None
+        if self.covariance is not None:
+            region = chi_squared.quantile(0.95, 2) * covariance_across(self.normal, self.covariance)
+        return normal_html(self.normal[:2], region) + "".join(map(note_html, lines)) + (table if parts else "")
 
     def with_parts(self, **parts: Array) -> "Estimate":
         """Return the estimate with more parts in its budget, rad^2; one that is there already is added to.

@@ -187,7 +187,9 @@ def test_covariances_are_turned_out_of_another_basis(seed):
     # A core states its basis with the covariance.
     fields = {"covariance": COVARIANCE.tolist(), "basis": basis.tolist()}
     assert np.allclose(
-        in_space(normal, messages.Answer(normal=normal, **fields).uncertainty(normal)["covariance"]), wanted, atol=1e-12
+        in_space(normal, messages.AnsweredEstimate(normal=normal, **fields).uncertainty(normal)["covariance"]),
+        wanted,
+        atol=1e-12,
     )
 
 

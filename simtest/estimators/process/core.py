@@ -1,9 +1,4 @@
-"""A core: its greeting, its requests, and what becomes of it when it breaks down.
-
-A core as a user names it: a command, or a TOML file that describes one.
-
-Cores as estimators: of single highlights, or of whole frames.
-"""
+"""Cores: how a user names one, its life with one request after the other, and the estimators that it is."""
 
 import atexit
 import errno
@@ -32,7 +27,7 @@ from simtest.estimators.process.messages import (
     frame_request,
     hello_of,
     patch_request,
-    told,
+    shown_value,
 )
 from simtest.estimators.process.pipe import PROTOCOL, Child, CoreFault, Message, broken, encode, exchange_files
 from simtest.estimators.protocol import Estimate
@@ -92,6 +87,11 @@ class CoreCommand:
     kind: Literal["patch", "frame"] | None = None  # what the core must be
 
     @property
+    def short(self) -> str:
+        """Name in results."""
+        return self.name
+
+    @property
     def absolute(self) -> str:
         """The same core under a name that means the same in every folder."""
         if not self.text.startswith(PREFIX):
@@ -132,10 +132,9 @@ def parse_core(text: str) -> CoreCommand:
     folder = path.absolute().parent
     arguments, files, _ = _resolved(f"{text}: core.command", table.command, folder)
     further = tuple(_further(text, folder, name) for name in table.files)
-    return CoreCommand(
-        text, table.name, arguments, (*dict.fromkeys((*files, *further)), path.absolute()), table.time_limit_s,
-        table.start_limit_s, table.environment, table.kind,
-    )  # fmt: skip
+    stated = table.model_dump(include={"name", "time_limit_s", "start_limit_s", "environment", "kind"})
+    files = (*dict.fromkeys((*files, *further)), path.absolute())
+    return CoreCommand(text, arguments=arguments, files=files, **stated)
 
 
 def _further(text: str, folder: Path, name: str) -> Path:
@@ -180,36 +179,23 @@ def _exists(path: Path) -> bool:
         return False
 
 
-def _called(word: str) -> str:
-    """Return how a script is called; nothing if its name does not tell what runs it."""
-    interpreter = SCRIPTS.get(Path(word).suffix)
-    return f'a script is called with what runs it: "{interpreter} {word!s:.80}"' if interpreter else ""
-
-
 def _program(what: str, word: str, folder: Path) -> Path:
     """Return the absolute path of a program; raise `InputError` where it is missing or cannot be run."""
-    if word in (".", ".."):
-        raise InputError(f"{what}: {word} is a folder; must be a program")
-    if "/" not in word:
-        found = shutil.which(word)
-        # A directory of the name beside the user is no program, but a likely mistake.
-        if found is None:
-            near = (
-                ""
-                if not _exists(folder / word)
-                else _called(word) or "a program in this folder is named ./ and its name"
-            )
-            raise InputError(f"{what}: no program {word!r:.80} on PATH{f' ({near})' if near else ''}")
+    path, is_path = folder / word, "/" in word or word in (".", "..")
+    # Links stay: a virtual environment's Python is one.
+    if found := shutil.which(str(path) if is_path else word):
         return Path(os.path.abspath(found))
-    path = folder / word
+    interpreter = SCRIPTS.get(Path(word).suffix)
+    called = interpreter and f'a script is called with what runs it: "{interpreter} {word!s:.80}"'
+    if not is_path:
+        # A directory of the name beside the user is no program, but a likely mistake.
+        near = f" ({called or 'a program in this folder is named ./ and its name'})" if _exists(path) else ""
+        raise InputError(f"{what}: no program {word!r:.80} on PATH{near}")
     if not _exists(path):
         raise InputError(f"{what}: {word!s:.200} does not exist; must be a program")
     if not path.is_file():
         raise InputError(f"{what}: {word!s:.200} is a {'folder' if path.is_dir() else 'device'}; must be a program")
-    if not os.access(path, os.X_OK):
-        raise InputError(f"{what}: {word!s:.200} is not executable; must be a program ({_called(word) or 'chmod +x'})")
-    # Links stay: a virtual environment's Python is one.
-    return Path(os.path.normpath(path))
+    raise InputError(f"{what}: {word!s:.200} is not executable; must be a program ({called or 'chmod +x'})")
 
 
 MAX_FAULTS = 5
@@ -256,10 +242,13 @@ class Core:
                 if error.errno == errno.ENOEXEC:
                     what += "; must be a compiled program, or a script with #! in its first line"
                 raise CoreFault(Reason.CORE_DIED, what) from error
-            greeting = {"type": "hello", "protocol": PROTOCOL, "simtest": provenance.version()}
+            greeting, kind = {"type": "hello", "protocol": PROTOCOL, "simtest": provenance.version()}, self.command.kind
             try:
                 hello = hello_of(self._child.exchange(encode(greeting, {}), self.command.start_limit_s).header)
-                self._check(hello)
+                if kind is not None and hello.kind != kind:
+                    raise broken(f"hello: kind {hello.kind}; {self.command.text} says {kind}")
+                if self.hello is not None and hello != self.hello:
+                    raise broken("hello: differs from that of the first start")
             except BaseException:
                 self._end()
                 raise
@@ -278,12 +267,10 @@ class Core:
                 raise CoreFault(self._last.reason, f"not asked after {MAX_FAULTS} faults in a row: {self._last.detail}")
             try:
                 answer = self._asked(header, arrays, next(self._numbers))
-            except CoreFault as fault:
-                self._faults, self._last = self._faults + 1, fault
-                self._end()
-                raise
-            except BaseException:
-                # Ctrl-C in the middle of a message, of which the rest would be taken for the next answer.
+            except BaseException as error:
+                if isinstance(error, CoreFault):
+                    self._faults, self._last = self._faults + 1, error
+                # Also at Ctrl-C in the middle of a message, of which the rest would be taken for the next answer.
                 self._end()
                 raise
             self._faults = 0
@@ -316,36 +303,23 @@ class Core:
         child = self._child
         assert child is not None
         child.check_silent()
-        kind, rest = header["type"], {key: value for key, value in header.items() if key != "type"}
-        request = {"type": kind, "id": number, **rest}
+        request = {"type": header["type"], "id": number, **header}
         if hello.transport == "files":
             answer = exchange_files(child, request, arrays, self.command.time_limit_s)
         else:
             answer = child.exchange(encode(request, arrays), self.command.time_limit_s)
-        _check_answer(answer.header, number, hello.kind)
+        given, stated = answer.header.get("id"), answer.header.get("type")
+        if given != number or isinstance(given, bool):
+            raise broken(f"an answer with id {shown_value(given)} to request {number}")
+        allowed = ("estimate" if hello.kind == "patch" else "estimates", "failure")
+        if stated not in allowed:
+            raise broken(f"an answer of type {shown_value(stated)}; must be {' or '.join(allowed)}")
         return answer
-
-    def _check(self, hello: Hello) -> None:
-        """Raise `CoreFault` where a greeting is not that of this core."""
-        if self.command.kind is not None and hello.kind != self.command.kind:
-            raise broken(f"hello: kind {hello.kind}; {self.command.text} says {self.command.kind}")
-        if self.hello is not None and hello != self.hello:
-            raise broken("hello: differs from that of the first start")
 
     def _end(self) -> None:
         child, self._child = self._child, None
         if child is not None:
             child.kill()
-
-
-def _check_answer(header: Mapping[str, Any], number: int, kind: str) -> None:
-    """Raise `CoreFault` where an answer is not that to the request of this number, or of a type that is none."""
-    given, stated = header.get("id"), header.get("type")
-    if given != number or isinstance(given, bool):
-        raise broken(f"an answer with id {told(given)} to request {number}")
-    allowed = ("estimate" if kind == "patch" else "estimates", "failure")
-    if stated not in allowed:
-        raise broken(f"an answer of type {told(stated)}; must be {' or '.join(allowed)}")
 
 
 _started: "weakref.WeakSet[Core]" = weakref.WeakSet()
@@ -410,9 +384,6 @@ class _Process:
         assert self.core.hello is not None
         return self.core.hello
 
-    def _ask(self, request: tuple[Mapping[str, Any], Mapping[str, npt.NDArray[Any]]]) -> Message:
-        return self.core.ask(*request)
-
 
 @dataclass(frozen=True)
 class ProcessEstimator(_Process):
@@ -421,10 +392,10 @@ class ProcessEstimator(_Process):
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Ask the core (see `simtest.estimators.Estimator`); its breakdown is a Failure ``core_...``."""
         try:
-            answer = self._ask(patch_request(patch, camera, priors, self._hello))
-            return estimate_of(answer, camera, self._hello)
+            answer = self.core.ask(*patch_request(patch, camera, priors, self._hello))
         except CoreFault as fault:
             return Failure(fault.reason, fault.detail)
+        return estimate_of(answer, camera, self._hello)
 
 
 @dataclass(frozen=True)
@@ -436,10 +407,10 @@ class ProcessFrameEstimator(_Process):
     ) -> list[Estimate | Failure] | Failure:
         """Ask the core (see `simtest.estimators.FrameEstimator`); its breakdown is a Failure ``core_...``."""
         try:
-            answer = self._ask(frame_request(frame, camera, priors, self._hello))
-            return estimates_of(answer, camera, self._hello)
+            answer = self.core.ask(*frame_request(frame, camera, priors, self._hello))
         except CoreFault as fault:
             return Failure(fault.reason, fault.detail)
+        return estimates_of(answer, camera, self._hello)
 
 
 def load_core(text: str) -> ProcessEstimator | ProcessFrameEstimator:

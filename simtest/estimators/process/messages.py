@@ -78,9 +78,9 @@ def outline_names(level: float) -> tuple[str, str]:
 def hello_of(header: Mapping[str, Any]) -> Hello:
     """Read a core's greeting; raise `CoreFault` where it is malformed."""
     if header.get("type") != "hello":
-        raise broken(f"the first line is of type {told(header.get('type'))}; must be hello")
+        raise broken(f"the first line is of type {shown_value(header.get('type'))}; must be hello")
     if header.get("protocol") != PROTOCOL or isinstance(header.get("protocol"), bool):
-        raise broken(f"hello: protocol {told(header.get('protocol'))}; simtest speaks {PROTOCOL}")
+        raise broken(f"hello: protocol {shown_value(header.get('protocol'))}; simtest speaks {PROTOCOL}")
     is_patch = header.get("kind") == "patch"
     given = {"version": ""} | {field.name: header[field.name] for field in fields(Hello) if field.name in header}
     if isinstance(given["version"], int | float):
@@ -88,7 +88,7 @@ def hello_of(header: Mapping[str, Any]) -> Hello:
     if given.get("arrays") is None:
         given["arrays"] = ["values" if is_patch else "intensity"]
     if header.get("kind") == "frame" and given.get("isophotes"):
-        raise broken(f"hello: isophotes {told(given['isophotes'])}; must be none, since a frame has no peak")
+        raise broken(f"hello: isophotes {shown_value(given['isophotes'])}; must be none, since a frame has no peak")
     try:
         hello = Hello(**given)
     except ValidationError as error:
@@ -97,10 +97,10 @@ def hello_of(header: Mapping[str, Any]) -> Hello:
     outlines = [outline_names(level) for level in hello.isophotes]
     if len(set(outlines)) < len(set(hello.isophotes)):
         must = "must differ in their first six digits, by which arrays are named"
-        raise broken(f"hello: isophotes {told(given['isophotes'])}; {must}")
+        raise broken(f"hello: isophotes {shown_value(given['isophotes'])}; {must}")
     offered = (*(PATCH_ARRAYS if is_patch else FRAME_ARRAYS), *itertools.chain.from_iterable(outlines))
     if unknown := next((name for name in hello.arrays if name not in offered), None):
-        raise broken(f"hello: array {told(unknown)}; must be one of {', '.join(offered)}")
+        raise broken(f"hello: array {shown_value(unknown)}; must be one of {', '.join(offered)}")
     unnamed = [name for pair in outlines if not set(pair) & set(hello.arrays) for name in pair]
     return replace(hello, arrays=tuple(dict.fromkeys([*hello.arrays, *unnamed])))
 
@@ -108,7 +108,7 @@ def hello_of(header: Mapping[str, Any]) -> Hello:
 def _malformed(error: ValidationError, given: Mapping[str, Any], model: type) -> str:
     """Return name and value of a message's first malformed field, and what it must be, as the field says."""
     name = str(error.errors(include_url=False, include_input=False)[0]["loc"][0])
-    value = told(given[name]) if name in given else "missing"
+    value = shown_value(given[name]) if name in given else "missing"
     return f"{name} {value}; must be {model.__pydantic_fields__[name].description}"  # type: ignore[attr-defined]
 
 
@@ -132,11 +132,11 @@ def _numbers(*shape: int | None) -> PlainValidator:
         try:
             values = given if is_array else np.array(_only_numbers(given), dtype=float)
         except (TypeError, ValueError, OverflowError, RecursionError):
-            raise Refused(f"{name}: {told(given)}; must be {wanted}") from None
+            raise Refused(f"{name}: {shown_value(given)}; must be {wanted}") from None
         if values.dtype.kind == "b":
             raise Refused(f"{name}: holds true or false; must be {wanted}")
         if values.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, values.shape, strict=True)):
-            raise Refused(f"{name}: {told(given)}; must be {wanted}")
+            raise Refused(f"{name}: {shown_value(given)}; must be {wanted}")
         numbers: Array = np.array(values, dtype=float)
         # `Refused` is no ValueError: pydantic lets it pass with its reason.
         if not np.isfinite(numbers).all():
@@ -153,7 +153,7 @@ Square = Annotated[Array, _numbers(2, 2)]
 Directions = Annotated[Array, _numbers(2, 3)]
 
 
-class Isophote(BaseModel):
+class AnsweredIsophote(BaseModel):
     """An isophote that an estimate says it was made of: isovalue and cone of sightlines."""
 
     isovalue: Number
@@ -172,7 +172,7 @@ class Isophote(BaseModel):
         return made
 
 
-class Curvature(BaseModel):
+class AnsweredCurvature(BaseModel):
     """The surface's curvature (see `simtest.estimators.EstimatedCurvature`)."""
 
     directions: Directions
@@ -184,7 +184,7 @@ class Curvature(BaseModel):
         return EstimatedCurvature(self.directions, self.axis_ratio, self.hypotheses)
 
 
-class Answer(BaseModel):
+class AnsweredEstimate(BaseModel):
     """What a core answers of one highlight: an `Estimate`, in the basis that it names."""
 
     model_config = ConfigDict(strict=True)
@@ -199,12 +199,12 @@ class Answer(BaseModel):
     axis_ratio: Number | None = None
     axis_ratio_deviation: Number | None = None
     choice_margin: Number | None = None
-    isophotes: list[Isophote] | None = Field(
+    isophotes: list[AnsweredIsophote] | None = Field(
         None, max_length=MAX_ISOPHOTES,
         description=f"at most {MAX_ISOPHOTES} objects of isovalue, cone and sightline",
     )  # fmt: skip
     flags: list[Annotated[str, Field(pattern="^[^ ]*$")]] | None = Field(None, description="a list of words")
-    curvature: Curvature | None = Field(None, description="an object of directions and axis_ratio")
+    curvature: AnsweredCurvature | None = Field(None, description="an object of directions and axis_ratio")
     target: Any = None  # `check` judges it
 
     def estimate(self, camera: Camera, target: Target) -> Estimate:
@@ -278,11 +278,11 @@ def estimates_of(answer: Message, camera: Camera, hello: Hello) -> list[Estimate
 def _read(given: Mapping[str, Any], camera: Camera, hello: Hello) -> Estimate | Failure:
     """Return an estimate of its fields, or what is wrong with the first that cannot be read."""
     try:
-        return Answer.model_validate(given).estimate(camera, hello.target)
+        return AnsweredEstimate.model_validate(given).estimate(camera, hello.target)
     except Refused as refused:
         return refused.failure
     except ValidationError as error:
-        return Failure(Reason.ESTIMATOR_ERROR, _malformed(error, given, Answer))
+        return Failure(Reason.ESTIMATOR_ERROR, _malformed(error, given, AnsweredEstimate))
 
 
 def _listed(answer: Message) -> list[dict[str, Any]]:
@@ -291,7 +291,7 @@ def _listed(answer: Message) -> list[dict[str, Any]]:
     count = max(lengths, default=0)
     listed = answer.header.get("estimates", [{}] * min(count, MAX_ESTIMATES))
     if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
-        raise Refused(f"estimates: {told(listed)}; must be a list of objects")
+        raise Refused(f"estimates: {shown_value(listed)}; must be a list of objects")
     if (most := max(count, len(listed))) > MAX_ESTIMATES:
         raise Refused(f"{most} estimates of a frame; at most {MAX_ESTIMATES}")
     if lengths - {len(listed)}:
@@ -473,6 +473,6 @@ def _outline(patch: Patch, level: float, camera: Camera | None = None) -> npt.ND
     return points if camera is None else camera.unproject(points)
 
 
-def told(value: object) -> str:
+def shown_value(value: object) -> str:
     """Return the beginning of a value's text, for a message."""
     return excerpt(repr(value).encode("utf-8", "replace"), 60)
