@@ -34,7 +34,7 @@ USE = """
 import json, pathlib, sys
 import simtest
 from simtest.detection.detector import DETECTORS
-from simtest.estimators.installed import ESTIMATORS
+from simtest.estimators.names import ESTIMATORS
 from simtest.runtime.resources import find
 from simtest.spec import load_experiment
 

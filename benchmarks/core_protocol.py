@@ -16,8 +16,7 @@ import psutil
 from benchmarks.measuring import Figure
 from simtest.calibration import NO_PRIORS, Calibration, Frame
 from simtest.estimators import Estimate
-from simtest.estimators.process.core import Core
-from simtest.estimators.process.estimator import ProcessEstimator, ProcessFrameEstimator, load_core
+from simtest.estimators.process.core import Core, ProcessEstimator, ProcessFrameEstimator, load_core
 from simtest.geometry import Camera, Patch
 
 ROUNDS = 200

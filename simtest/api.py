@@ -233,7 +233,7 @@ def validate(
     >>> run.page.name, run.results["estimator"].unique().to_list()
     ('index.html', ['cone_axis'])
     """
-    from simtest.estimators.process.naming import close_cores
+    from simtest.estimators.names import close_cores
     from simtest.runtime.locks import exclusive_folder
     from simtest.runtime.processes import make_engine
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import simtest
-from simtest.estimators.registry import load_estimators
+from simtest.estimators.names import load_estimators
 from simtest.geometry import Array
 from simtest.geometry.vectors import angle_deg
 

@@ -20,11 +20,11 @@ import numpy as np
 from simtest.cli.progress import progress_bar
 from simtest.dataset.reader import read_samples, sample_positions
 from simtest.dataset.sample import Sample
+from simtest.dataset.scoring.dense.shading_maps import shading_maps
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
+from simtest.estimators.learned import normal_of
 from simtest.estimators.learned_dense import LEAST_HIGHLIGHTS, LearnedDense
-from simtest.estimators.shading_maps import shading_maps
-from simtest.estimators.spot_inputs import normal_of
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg, tangent_basis, tangent_coordinates
 from simtest.reconstruction.pipeline import run_pipeline

@@ -22,8 +22,7 @@ from simtest.dataset.reader import read_samples, sample_positions
 from simtest.dataset.sample import Sample
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
-from simtest.estimators.learned_spot import LearnedSpot
-from simtest.estimators.spot_inputs import rays_of
+from simtest.estimators.learned_spot import LearnedSpot, rays_of
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import run_pipeline

@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from simtest.cli.progress import progress_bar
-from simtest.estimators.learned_spot import LearnedSpot, _Network, log_deviation
-from simtest.estimators.spot_inputs import ROTATION_SCALE, SURFACES, normal_of
+from simtest.estimators.learned import normal_of
+from simtest.estimators.learned_spot import ROTATION_SCALE, SURFACES, LearnedSpot, SpotNetwork, log_deviation
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.arrays import AnyArray, Array
@@ -94,7 +94,7 @@ def _rows(estimator: LearnedSpot, spots: Examples) -> Iterator[tuple[str, list[s
         yield row, [*_cells(network, outputs[chosen, BASE], inflated[chosen], _chosen(spots, chosen)), told]
 
 
-def _cells(network: _Network, made: Array, inflated: Array, spots: Examples) -> Iterator[str]:
+def _cells(network: SpotNetwork, made: Array, inflated: Array, spots: Examples) -> Iterator[str]:
     """Yield number, median and 95th percentile of the base's errors, and the coverage."""
     count = len(spots["rays"])
     yield str(count)

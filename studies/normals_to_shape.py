@@ -20,9 +20,9 @@ import numpy as np
 
 from benchmarks.measuring import print_markdown
 from simtest.calibration import Calibration
+from simtest.dataset.scoring.dense.shading_maps import shading_maps
 from simtest.errors import Failure
 from simtest.estimators.protocol import Target
-from simtest.estimators.shading_maps import shading_maps
 from simtest.geometry import Camera
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.reconstruction.ranking import best_of

@@ -9,7 +9,7 @@ liver and gallbladder in equal shares, under the first light of their scope alon
 the camera; the relief's slope is drawn anew, from 2 to 8 deg. What is told is the camera, the light, and the scope's
 working range; a light beside the camera is also judged with a told distance. The best estimates are scored as in
 `studies.twins`, by kind of highlight. "Before" is the same picture without room for near misses
-(`simtest.estimators.near_misses`), the negative control. A second table is of the base's normals: of single highlights,
+(`simtest.estimators.prior_parts`), the negative control. A second table is of the base's normals: of single highlights,
 and of clouds. Nothing was tuned on the seed. With `--clouds` only those are judged, on colon, stomach and liver. With
 `--base` only single highlights against the base's normal are judged: with the default prior of the relief's slope, with
 the slope told exactly, and, as negative control, with slopes up to 8 deg that are no steeper at highlights.
@@ -30,7 +30,7 @@ from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.calibration import Calibration, Normal, Priors, Uniform, exactly
 from simtest.dataset.plan import Drawn, Plan
 from simtest.errors import Failure
-from simtest.estimators import Estimate, near_misses, prior_parts
+from simtest.estimators import Estimate, prior_parts
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import Reconstruction, default_estimators, run_picture
@@ -169,7 +169,7 @@ def report(rows: Sequence[Row]) -> int:
     crowded = [row for row in rows if row["crowd"] == "many"]
     if crowded and all(row["stated"] == row["before"] for row in crowded):
         # A copy of the constant would make the control equal what it controls, without a word.
-        raise SystemExit("near_misses.CROWD does not take the part for near misses away")
+        raise SystemExit("prior_parts.CROWD does not take the part for near misses away")
     cells = {
         "highlight points": ("kind", "glint"), "near misses": ("kind", "near_miss"),
         "light at the camera": ("told", "light at the camera"),
@@ -236,7 +236,7 @@ def _told_rows(
 ) -> list[Row]:
     made = run_picture(picture, calibration)[0]
     scored = score(session, view, made)
-    with replaced.object(near_misses, "CROWD", math.inf):
+    with replaced.object(prior_parts, "CROWD", math.inf):
         before = {spot.spot.index: spot for spot in score(session, view, run_picture(picture, calibration)[0])}
     count = len(made.specularities)
     crowd = "none" if count <= 3 else "few" if count <= 30 else "many"

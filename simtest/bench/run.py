@@ -38,9 +38,8 @@ from simtest.dataset.scoring.dense.scorer import ANGLE, NORMAL, depth_source
 from simtest.dataset.scoring.record import read_record
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
-from simtest.estimators.installed import ESTIMATORS
-from simtest.estimators.process.command import INTERPRETERS, parse_core
-from simtest.estimators.process.naming import core_hashes, core_records, has_files, short_name
+from simtest.estimators.names import ESTIMATORS, core_hashes, core_records, has_files, short_name
+from simtest.estimators.process.core import INTERPRETERS, parse_core
 from simtest.runtime import provenance
 from simtest.runtime.files import Json, JsonObject, make_folder, write_json
 from simtest.runtime.processes import Engine, make_engine

@@ -189,7 +189,7 @@ def names_of(kind: str) -> dict[str, str]:
     if kind in shipped.FOLDERS:
         return shipped.shipped_files(kind)
     if kind in ("estimators", "detectors"):
-        from simtest.estimators.descriptions import DESCRIPTIONS
+        from simtest.estimators.names import DESCRIPTIONS
 
         return EntryPointGroup(f"simtest.{kind}", kind[:-1]).described(DESCRIPTIONS if kind == "estimators" else None)
     return shipped.sensor_presets() if kind == "sensors" else shipped.rig_presets()

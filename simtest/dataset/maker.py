@@ -18,7 +18,7 @@ from simtest.dataset.sample_calibration import calibration_of_picture, stored_pi
 from simtest.detection.peaks import Component
 from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, load_estimators
-from simtest.estimators.process.naming import forgive_cores
+from simtest.estimators.names import forgive_cores
 from simtest.geometry import ellipse_of_conic, fit_ellipse
 from simtest.reconstruction.found import Specularity
 from simtest.rendering import Frame, Session, backend

@@ -11,7 +11,7 @@ from pydantic import JsonValue
 
 from simtest.dataset.plan import Plan
 from simtest.errors import InputError
-from simtest.estimators.process.naming import core_hashes, short_name
+from simtest.estimators.names import core_hashes, short_name
 from simtest.runtime import provenance
 from simtest.runtime.files import check_limit, write_json
 from simtest.spec.recipes import Dataset

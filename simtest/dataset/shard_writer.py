@@ -31,7 +31,7 @@ from simtest.dataset.sample import Sample
 from simtest.dataset.shard import PART, finish, whole_samples, write_sample
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
-from simtest.estimators.process.naming import absolute_names
+from simtest.estimators.names import absolute_names
 from simtest.runtime.boundary import plain
 from simtest.runtime.files import sync_folder
 from simtest.runtime.locks import LOCK, exclusive_folder, waiting_for

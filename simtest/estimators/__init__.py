@@ -1,9 +1,9 @@
 """Estimators of the surface normal at a highlight; they see a frame and its calibration, never the truth.
 
-`protocol` declares what an estimator is and returns, `registry` finds it by name, `dispatch` runs it. Each estimator is
-a file of its name: `cone_axis`, `brightest_point`, `circle_pose`, `curved`, `bisector`, `photometric`, `cloud`, and the
-networks `learned_spot` and `learned_dense`. Those of single highlights share `isophote_fit` (ellipses) and
-`isophote_family` (the isophotes of one highlight together, extrapolated to its peak).
+`protocol` declares what an estimator is and returns, `names` finds it, `dispatch` runs it. Each estimator is a file of
+its name: `cone_axis`, `brightest_point`, `circle_pose`, `curved`, `bisector`, `photometric`, `cloud`, and the networks
+`learned_spot` and `learned_dense`. Those of single highlights share what `highlight` fits: ellipses (`isophotes`),
+these together, extrapolated to the peak (`family`), or the centre of a spot of a few pixels (`small_spots`).
 """
 
 from typing import TYPE_CHECKING
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from simtest.estimators.isophote_fit import FittedIsophote
+    from simtest.estimators.isophotes import FittedIsophote
+    from simtest.estimators.names import load_estimators
     from simtest.estimators.protocol import (
         AnyEstimator,
         BatchEstimator,
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
         Estimator,
         FrameEstimator,
     )
-    from simtest.estimators.registry import load_estimators
 
 __all__ = [
     "AnyEstimator",

@@ -1,4 +1,7 @@
-"""`bisector`: with the light's position known, the normal bisects the directions to light and camera."""
+"""`bisector`: with the light's position known, the normal bisects the directions to light and camera.
+
+Which of several lights made a highlight: decided by the positions of the other highlights around it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,15 +10,88 @@ from typing import ClassVar, TypeGuard
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Distribution, Normal, Priors
-from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget, line_covariance
-from simtest.estimators.highlight_fit import HighlightAxis, fit_highlight, fit_highlights
-from simtest.estimators.light_assignment import light_of_highlight
+from simtest.estimators.highlight import OfHighlight
 from simtest.estimators.prior_parts import add_common_parts, told_light_part
 from simtest.estimators.protocol import Estimate, Law
+from simtest.estimators.small_spots import HighlightAxis
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
+
+LARGEST_MISFIT = 0.25
+"""Largest misfit of the offsets that the mirror geometry predicts, as a share of their length."""
+
+CLEAR = 2.0
+"""The next best light must fit this many times worse for the choice to be clear."""
+
+ALONE = 3.0
+"""The highlights of one place must lie this many times nearer together than the next one does. On rough tissue glints
+meet the lights' arrangement by chance: of two lights 16 times in 100, half of them wrongly; of three 3 times in 100,
+which are half of all choices that seem clear there."""
+
+
+def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
+    """Return the index of the light that made a highlight; None where that is not clear.
+
+    The highlights of lights at L_i lie at w_i in the image with M (w_i - w_j) = (L_i - L_j)_perp / (2 d): the bisector
+    turns by half the light's angle, the normal turns against the sightline by M. M is the root of the lobe's H up to a
+    factor, which is fitted. It is taken as positive: no surface that is concave beyond its centre of curvature. Of the
+    frame's other highlights, which the patch names, the nearest are used, one for each other light; with them the
+    highlight must stand alone (`ALONE`).
+    """
+    if len(priors.lights_mm) == 1:
+        return 0
+    # observed offsets, turned by M into those of the lights up to a factor
+    peaks = _other_peaks(family)
+    others = peaks[: len(priors.lights_mm) - 1]
+    if not _stand_alone(peaks, len(others)):
+        return None
+    values, vectors = np.linalg.eigh(family.moments)
+    if not len(others) or values[0] <= 0:
+        return None
+    M = vectors @ np.diag(np.sqrt(values[0] / values)) @ vectors.T
+    seen = others @ M
+    # misfit if light i made this highlight
+    lights = priors.lights @ family.basis.T
+    misfits = np.array([_misfit(seen, np.delete(lights, i, axis=0) - light) for i, light in enumerate(lights)])
+    first, second = np.argsort(misfits, kind="stable")[:2]
+    clear = misfits[first] < LARGEST_MISFIT and misfits[second] > max(CLEAR * misfits[first], LARGEST_MISFIT)
+    return int(first) if clear else None
+
+
+def _stand_alone(peaks: Array, count: int) -> bool:
+    """Return whether the first so many of other peaks, nearest first, shape (K, 2), are far nearer than the next."""
+    gaps = np.linalg.norm(peaks[: count + 1], axis=1)
+    return len(gaps) <= count or bool(gaps[count] > ALONE * gaps[count - 1])
+
+
+def _misfit(seen: Array, offsets: Array) -> float:
+    """Return how badly other peaks, shape (K, 2), fit the other lights' offsets, shape (L - 1, 2), up to a factor > 0.
+
+    The misfit is the RMS of the residual over that of the offsets; 0 is a perfect fit.
+    """
+    best = np.inf
+    # Each pairing of the first peak sets the factor; the other peaks then take the nearest light.
+    for offset in offsets:
+        factor = max(float(seen[0] @ offset / (seen[0] @ seen[0])), 0.0)
+        gaps = np.linalg.norm(factor * seen[:, None] - offsets[None], axis=2)
+        taken = np.concatenate([[int(np.argmin(np.linalg.norm(offsets - offset, axis=1)))], gaps[1:].argmin(axis=1)])
+        if len(set(taken.tolist())) < len(taken):
+            continue
+        matched = offsets[taken]
+        # refine the factor with all pairs
+        factor = max(float(np.sum(seen * matched) / np.sum(seen * seen)), 0.0)
+        best = min(best, float(np.linalg.norm(factor * seen - matched) / np.linalg.norm(matched)))
+    return best
+
+
+def _other_peaks(family: HighlightAxis) -> Array:
+    """Return the offsets of the other highlights, the nearest first, tangents in the basis, shape (K, 2)."""
+    others, peak = family.patch.neighbours_px, family.patch.peak_px
+    order = np.argsort(np.linalg.norm(others - peak, axis=1), kind="stable")
+    return np.asarray(family.tangents(others[order]) - family.tangents(peak[None]))
+
 
 STEP = 1e-4
 """Step of the differences of the normal, rad, and as a share of the distance."""
@@ -29,7 +105,7 @@ DISTANCES = (np.arange(32) + 0.5) / 32
 
 
 @dataclass(frozen=True)
-class Bisector:
+class Bisector(OfHighlight):
     """The bisector of the directions to the light and to the camera at P = d s (theory.md section 3, item 1).
 
     s is the sightline of the BP: the cones' axis followed to t -> 1, less the shift of the radiance's peak by the
@@ -43,60 +119,46 @@ class Bisector:
     surface is nearer than twice the median, which for a uniform distribution is everywhere. The mean of the normals
     would follow the few near distances, and be worse than no correction beyond 55 of 5 to 80 mm.
 
-    Parameters
-    ----------
-    isovalues : tuple of float
-        Each t in (0, 1).
+    The candidates are those of the lights that may have made the highlight, the proposed one first. With several
+    lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
+    lights' mean position is used, flagged ``ambiguous_light``, and the part ``light_offset`` of the budget is the
+    mean square of what the single lights would give, over the distances. Fails with ``not_known`` without lights.
     """
 
-    isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
     laws: ClassVar[tuple[Law, ...]] = ("bisector", "axis_ratio_seen")
 
-    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
-        """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
-        fit_highlights(patches, camera, self.isovalues)
-
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
-        """Estimate the normal (see `simtest.estimators.Estimator`); the lights must be told.
-
-        The candidates are those of the lights that may have made the highlight, the proposed one first. With several
-        lights the positions of the other highlights decide between them (`light_of_highlight`). Where they do not, the
-        lights' mean position is used, flagged ``ambiguous_light``, and the part ``light_offset`` of the budget is the
-        mean square of what the single lights would give, over the distances.
-
-        Fails as `cone_axis` does, and with ``not_known`` without lights. In a highlight too small for isophotes s is
-        the sightline of its centre, flagged ``unresolved``, and no axis ratio is stated.
-        """
+        """Estimate the normal (see `simtest.estimators.Estimator`); the lights must be told."""
         if not priors.lights_mm:
             return Failure(Reason.NOT_KNOWN, "needs the lights' positions")
-        family = fit_highlight(patch, camera, self.isovalues)
-        if isinstance(family, Failure):
-            return family
-        lights, flags = priors.lights, family.flags
-        own = light_of_highlight(family, priors)
+        return super().estimate(patch, camera, priors)
+
+    def of(self, highlight: HighlightAxis, priors: Priors) -> Estimate:
+        """Estimate the normal at a fitted highlight."""
+        lights, flags = priors.lights, highlight.flags
+        own = light_of_highlight(highlight, priors)
         order = [*lights] if own is None else [lights[own]]
         if own is None:
             # What is seen is then usually the lights' common lobe.
             order.insert(0, lights.mean(axis=0))
             flags = (*flags, "ambiguous_light")
-        found = [_normal(family, light, priors.distance) for light in order]
+        found = [_normal(highlight, light, priors.distance) for light in order]
         normal, sightline = found[0]
-        candidates = np.array([candidate for candidate, _ in found])
-        budget = _budget(family, order[0], priors.distance, normal)
+        budget = _budget(highlight, order[0], priors.distance, normal)
         if budget is not None and own is None:
-            budget = {**budget, "light_offset": _light_part(family, order, priors.distance, normal)}
+            budget = {**budget, "light_offset": _light_part(highlight, order, priors.distance, normal)}
         if budget is not None and priors.lights_covariance is not None:
             budget = _with_light_error(budget, found[0], order[0], own, priors)
         estimate = Estimate(
             normal=normal,
-            candidates=candidates,
-            look_px=camera.project(sightline),
-            axis_ratio=family.axis_ratio,
-            isophotes=family.isophotes,
+            candidates=np.array([candidate for candidate, _ in found]),
+            look_px=highlight.camera.project(sightline),
+            axis_ratio=highlight.axis_ratio,
+            isophotes=highlight.isophotes,
             budget=budget,
             flags=flags,
         )
-        return add_common_parts(estimate, camera, priors, family)
+        return add_common_parts(estimate, highlight.camera, priors, highlight)
 
 
 bisector = Bisector()

@@ -1,63 +1,52 @@
 """`brightest_point`: the sightline through the peak carries the normal (theory.md section 3, item 1)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from simtest.calibration import NO_PRIORS, Priors
-from simtest.conventions import CONE_AXIS_ISOVALUES, HIGHLIGHT_ISOVALUE
+from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
-from simtest.estimators.family_fit import fit_isophote_family
-from simtest.estimators.highlight_fit import Fitted, fit_highlight, fit_highlights, fit_small
-from simtest.estimators.isophote_family import IsophoteFamily
+from simtest.estimators.family import OF_MEAN, AxisErrors, IsophoteFamily, fit_isophote_family
+from simtest.estimators.highlight import Fitted, OfHighlight, fit_highlight, of_spot
 from simtest.estimators.prior_parts import add_untold_parts
 from simtest.estimators.protocol import Estimate, Law
+from simtest.estimators.small_spots import SmallSpot
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.patch import slope_divisor_px2
 from simtest.runtime.fitted import fitted_number
 
-PIXEL_PX2 = fitted_number("ripples.brightest_px2")
-GAP_SHARE, RIPPLES = fitted_number("ripples.brightest_gap"), fitted_number("ripples.brightest")
+OF_APEX = AxisErrors(fitted_number("ripples.brightest"), OF_MEAN.bends, fitted_number("ripples.brightest_px2"))
+GAP_SHARE = fitted_number("ripples.brightest_gap")
 
 TOP_ISOVALUE = 0.9
 """Where the border cuts even the isophote at this value, it may cut off the peak."""
 
 
 @dataclass(frozen=True)
-class BrightestPoint:
-    """The reversed sightline through the peak of the smoothed patch.
+class BrightestPoint(OfHighlight):
+    """The reversed sightline through the peak of the smoothed patch (see `OfHighlight`).
 
-    It assumes that the peak is in the picture. What the priors leave open is added to the budget
-    (`simtest.estimators.prior_parts`).
+    The estimate has one candidate and looks at the peak, of a small highlight at its fitted centre. It has the flags of
+    `cone_axis` for the isophote at t = 0.5; along a streak the peak may lie anywhere. Where the border of the region,
+    the frame or the view cuts that isophote, the highlight's peak may be outside: the result is a Failure where no arcs
+    can be fitted either, or where the cut reaches up to `TOP_ISOVALUE`. The budget follows from the isophotes; without
+    any, no uncertainty is stated.
     """
 
     laws: ClassVar[tuple[Law, ...]] = ("sightline",)
 
-    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
-        """Fit the isophotes of several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
-        fit_highlights(patches, camera, CONE_AXIS_ISOVALUES)
-
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
-        """Estimate the normal (see `simtest.estimators.Estimator`).
-
-        The estimate has one candidate and looks at the peak. It has the flags of `cone_axis` for the isophote at
-        t = 0.5; along a streak the peak may lie anywhere. Where the border of the region, the frame or the view cuts
-        that isophote, the highlight's peak may be outside: the result is a Failure where no arcs can be fitted either,
-        or where the cut reaches up to `TOP_ISOVALUE`. In a highlight too small for isophotes it looks at the fitted
-        centre instead, flagged ``unresolved``. The budget follows from the isophotes; without any, no uncertainty is
-        stated.
-        """
-        if (spot := fit_small([patch], camera)[0]) is not None:
-            return add_untold_parts(spot.estimate(), camera, priors, spot)
-        normal = -camera.unproject(patch.peak_px)
-        whole = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
+        """Estimate the normal (see `simtest.estimators.Estimator`)."""
+        whole = fit_highlight(patch, camera, self.isovalues)
+        if isinstance(whole, SmallSpot):
+            return of_spot(whole, priors)
         if (cut := _cut_off(patch, whole)) is not None:
             return cut
-        family = whole if isinstance(whole, IsophoteFamily) else None
-        budget = None if family is None else _budget(family)
+        normal, family = -camera.unproject(patch.peak_px), None if isinstance(whole, Failure) else whole
+        budget = None if family is None else budget_of_peak(family)
         estimate = Estimate(normal, normal[None], patch.peak_px, flags=_flags(patch, camera, family), budget=budget)
         return add_untold_parts(estimate, camera, priors, family)
 
@@ -81,16 +70,12 @@ def _flags(patch: Patch, camera: Camera, family: IsophoteFamily | None) -> tuple
     return alone.flags
 
 
-def _budget(family: IsophoteFamily) -> Budget | None:
+def budget_of_peak(family: IsophoteFamily) -> Budget | None:
     """Return the budget of the peak in the family's basis, which differs from the peak's by a few degrees at most."""
     if family.axes_covariance is None:
         return None
     gap = family.basis @ (family.peak_axis - family.camera.unproject(family.patch.peak_px))
-    return {
-        "noise": _noise(family),
-        "resolution": PIXEL_PX2 * family.px2 + RIPPLES * family.ripple_error + family.clipping,
-        "shape": GAP_SHARE * np.outer(gap, gap) + family.bend_error() + family.drift_error,
-    }
+    return family.budget(_noise(family), OF_APEX, GAP_SHARE * np.outer(gap, gap))
 
 
 def _noise(family: IsophoteFamily) -> Array:

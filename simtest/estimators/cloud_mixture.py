@@ -87,27 +87,15 @@ def at_camera(centre: Array) -> Array:
 
 @dataclass(frozen=True)
 class Cloud:
-    """One cloud of a mixture; of several lights, a part alike for each.
+    """One cloud of a mixture; of several lights, a part alike for each."""
 
-    Parameters
-    ----------
-    centre : ndarray, shape (3,)
-        Unit sightline around which the cloud of a light at the camera would lie: the reversed normal of the base.
-    covariance : ndarray, shape (2, 2)
-        Of each light's spots in the plane across `centre` at unit distance, in ``basis_across(centre)``.
-    turns : ndarray, shape (L, 2)
-        Centres of the lights' parts in that plane.
-    share : float
-        Of the spots that are seen.
-    seen : float
-        Part of the cloud that lies in the view.
-    """
-
+    # (3,): unit sightline around which the cloud of a light at the camera would lie: the reversed normal of the base.
     centre: Array
+    # (2, 2): of each light's spots in the plane across `centre` at unit distance, in ``basis_across(centre)``.
     covariance: Array
-    turns: Array
-    share: float
-    seen: float = 1.0
+    turns: Array  # (L, 2): centres of the lights' parts in that plane
+    share: float  # of the spots that are seen
+    seen: float = 1.0  # part of the cloud that lies in the view
 
     @property
     def sightline(self) -> Array:
@@ -162,14 +150,7 @@ class Mixture:
 def fit_mixture(sightlines: Array, window: Window, turns: Turns = at_camera) -> Mixture:
     """Fit as many clouds as the spots tell apart, at least one.
 
-    Parameters
-    ----------
-    sightlines : ndarray, shape (N, 3)
-        Unit, of the spots.
-    window : Window
-        The view.
-    turns : callable
-        Where each light has its part of a cloud.
+    `sightlines`, (N, 3): unit, of the spots; `window`: the view; `turns`: where each light has its part of a cloud.
     """
     best = current = _fit([_cloud_of(sightlines, turns)], sightlines, window, turns)
     while len(current.clouds) < MOST_CLOUDS:

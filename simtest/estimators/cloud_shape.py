@@ -107,14 +107,8 @@ def slope_of(
 ) -> Slope:
     """Return the slope of an isotropic relief from a cloud's covariance, shape (2, 2), rad^2.
 
-    Parameters
-    ----------
-    independent : float
-        Number of independent spots.
-    lobe : Distribution
-        1 / c of the lobe.
-    gains : tuple of float, optional
-        1 + d k of the base; the larger one lies across the cloud's longer axis. None: not told.
+    `independent`: number of independent spots; `lobe`: 1 / c of the lobe; `gains`: 1 + d k of the base; the larger one
+    lies across the cloud's longer axis. None: not told.
     """
     small, large = np.linalg.eigvalsh(covariance)
     freedom = max(2 * round(independent - 1), 2)

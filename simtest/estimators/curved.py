@@ -1,21 +1,18 @@
 """`curved`: the isophotes' centre carries the normal, their shape the curvature (theory.md section 3)."""
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from simtest.calibration import NO_PRIORS, Priors
-from simtest.conventions import CONE_AXIS_ISOVALUES
+from simtest.calibration import Priors
 from simtest.errors import Failure, Reason
-from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
-from simtest.estimators.isophote_family import STREAK_RATIO, IsophoteFamily
-from simtest.estimators.prior_parts import add_untold_parts
+from simtest.estimators.family import STREAK_RATIO, IsophoteFamily
+from simtest.estimators.highlight import OfHighlight, along, of_spot
 from simtest.estimators.protocol import Estimate, EstimatedCurvature, Law
-from simtest.estimators.small_spot import SmallSpot
-from simtest.geometry import Array, Camera, Patch
+from simtest.estimators.small_spots import HighlightAxis, SmallSpot
+from simtest.geometry import Array
 
 STREAK_GAIN = 0.1
 """A highlight with an abs(1 + d k) below this is a streak; where the lobe is not known `STREAK_RATIO` decides."""
@@ -25,8 +22,8 @@ ROUND_SHARE = 3.0
 
 
 @dataclass(frozen=True)
-class Curved:
-    """Normal and curvature of a surface lit from the camera's position.
+class Curved(OfHighlight):
+    """Normal and curvature of a surface lit from the camera's position (see `OfHighlight`).
 
     The normal is the cones' mean axis as in `cone_axis`, followed to t -> 1 where the axis drifts by more than the
     noise explains. The lobe's second moments at the peak, 1/H, give the rest: with m = 1 + d k and c the curvature of
@@ -34,52 +31,26 @@ class Curved:
     which have a quarter of the noise. Where c is not known, m is known up to scale and the 2 m of the falloff is
     neglected: the axis ratio is then too large, by 1 % at 1 + d k = 1/3 for n = 50.
 
-    Of the priors, the lobe's curvature is used; what they leave open is added to the budget as by `cone_axis`.
-
-    Parameters
-    ----------
-    isovalues : tuple of float
-        Each t in (0, 1).
+    The estimate has one candidate, and the flag ``round`` where noise hides the principal directions. Fails with
+    ``degenerate_conic`` where the moments at the peak are not those of a lobe, and with ``streak`` where 1 + d k is
+    near 0.
     """
 
-    isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
     laws: ClassVar[tuple[Law, ...]] = ("sightline",)
 
-    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
-        """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
-        fit_highlights(patches, camera, self.isovalues)
-
-    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
-        """Estimate normal and curvature (see `simtest.estimators.Estimator`).
-
-        The estimate has one candidate, the flags of `cone_axis`, and ``round`` where noise hides the principal
-        directions. Fails as `cone_axis` does; with ``degenerate_conic`` where the moments at the peak are not those of
-        a lobe, and with ``streak`` where 1 + d k is near 0. A highlight too small for isophotes gets the normal of its
-        centre, flagged ``unresolved``, and no curvature.
-        """
-        family = fit_highlight(patch, camera, self.isovalues)
-        if isinstance(family, Failure):
-            return family
-        if isinstance(family, SmallSpot):
-            return add_untold_parts(family.estimate(), camera, priors, family)
-        found = _curvature(family, None if priors.lobe_curvature is None else priors.lobe_curvature.mean)
+    def of(self, highlight: HighlightAxis, priors: Priors) -> Estimate | Failure:
+        """Estimate normal and curvature at a fitted highlight."""
+        if isinstance(highlight, SmallSpot):
+            return of_spot(highlight, priors)
+        found = _curvature(highlight, None if priors.lobe_curvature is None else priors.lobe_curvature.mean)
         if isinstance(found, Failure):
             return found
         curvature, is_round = found
-        axis, budget = family.axis, family.axis_budget
-        if family.drift_is_real:
-            axis, budget = family.peak_axis, family.peak_budget
-        estimate = Estimate(
-            normal=-axis,
-            candidates=-axis[None],
-            look_px=camera.project(axis),
-            axis_ratio=curvature.axis_ratio,
-            isophotes=family.isophotes,
-            budget=budget,
-            flags=(*family.flags, "round") if is_round else family.flags,
-            curvature=curvature,
-        )
-        return add_untold_parts(estimate, camera, priors, family)
+        axis, budget = highlight.axis, highlight.axis_budget
+        if highlight.drift_is_real:
+            axis, budget = highlight.peak_axis, highlight.peak_budget
+        flags = (*highlight.flags, "round") if is_round else highlight.flags
+        return along(highlight, axis, budget, priors, axis_ratio=curvature.axis_ratio, flags=flags, curvature=curvature)
 
 
 curved = Curved()

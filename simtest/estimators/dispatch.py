@@ -12,7 +12,6 @@ import numpy as np
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.errors import Failure, InputError, Reason
-from simtest.estimators.estimate_check import check
 from simtest.estimators.protocol import (
     AnyEstimator,
     BatchEstimator,
@@ -21,6 +20,7 @@ from simtest.estimators.protocol import (
     FrameEstimator,
     PreparedEstimator,
     RegionEstimator,
+    check,
 )
 from simtest.geometry import Array, Camera, Patch
 
@@ -43,7 +43,7 @@ def run(estimator: Estimator, patch: Patch | Failure, camera: Camera, priors: Pr
     """Run an estimator on a patch; a patch that is a Failure is passed on.
 
     What the estimator raises is a Failure ``estimator_error``: one highlight must not end a run of thousands. So is
-    what it returns in another form than `Estimate` describes (`simtest.estimators.estimate_check`).
+    what it returns in another form than `Estimate` describes (`simtest.estimators.protocol`).
     """
     if isinstance(patch, Failure):
         return patch

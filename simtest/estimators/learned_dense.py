@@ -1,41 +1,181 @@
-"""`learned_dense`: a trained network's normals and distances all over a frame, run by ONNX Runtime, without PyTorch."""
+"""`learned_dense`: a trained network's normals and distances all over a frame, run by ONNX Runtime, without PyTorch.
+
+What a dense network sees of a frame, and returns: planes on a coarse grid, of light, colour, sightlines and lights.
+
+The frame lies in the middle of a grid of 4:3, whole; a frame of another aspect leaves cells empty, as a view mask does.
+Directions are in the tangent basis of the direction to the camera that is aligned with the frame
+(`simtest.estimators.learned.image_basis`).
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
+import cv2
 import numpy as np
 
-from simtest.calibration import Calibration, Frame, Priors
+from simtest.calibration import Calibration, Frame
 from simtest.errors import Failure, Reason
-from simtest.estimators.covariance_scale import CovarianceScale
-from simtest.estimators.dense_inputs import (
-    CAMERA,
-    CELLS,
-    DISTANCE_MM,
-    DISTANCE_SCALE,
-    OUTPUTS,
-    ROTATION_SCALE,
-    STRIDE,
-    Layout,
-    camera_values,
-    dense_inputs,
+from simtest.estimators.learned import (
+    LIGHT_SCALE_MM,
+    LOG_RANGE,
+    LearnedNormals,
+    TaughtNetwork,
+    image_basis,
+    inflation,
+    median_of_lit,
+    reflection_distances,
+    turned_normals,
 )
-from simtest.estimators.onnx_model import OnnxModel
 from simtest.estimators.protocol import Estimate
-from simtest.estimators.reflection_check import reflection_distances
-from simtest.estimators.spot_inputs import LOG_RANGE
-from simtest.estimators.training_range import TrainingRange, inflation, read_usual
-from simtest.estimators.turned_normals import turned_normals
-from simtest.geometry import Array, Camera, Mask, Patch
+from simtest.geometry import Array, Camera, Mask
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import data_root
+
+GRID = (96, 128)
+"""Rows and columns of the planes."""
+
+STRIDE = 2
+"""Cells of the planes, along each axis, for one cell of the outputs."""
+
+CELLS = (GRID[0] // STRIDE, GRID[1] // STRIDE)
+"""Rows and columns of the outputs."""
+
+DARKEST = 0.02
+"""Share of the lit pixels' median light that is added before the logarithm."""
+
+LEAST_LIT = 0.1
+"""Cells with less light than this share of the view's median have no colour of their own."""
+
+LEAST_SEEN = 0.02
+"""A cell of which a smaller share is seen is empty."""
+
+PLANES = (
+    "logarithm of the light over its median", "logarithm of the mean light over that mean",
+    "logarithm of red over green", "logarithm of blue over green", "share seen",
+    "sightline, x", "sightline, y", "mean light, first", "mean light, second", "mean light, towards",
+)  # fmt: skip
+"""Planes of light and colour are 0 where nothing is seen."""
+
+CAMERA = (
+    "log of the focal length along x over the grid", "log of the focal length along y over the grid",
+    "principal point off the middle, x", "principal point off the middle, y",
+    "mean light, x", "mean light, y", "mean light, z", "lights' spread",
+)  # fmt: skip
+"""What a network answers for a limited range of; lights in units of `LIGHT_SCALE_MM`."""
+
+VIEWED = PLANES[:5]
+"""The planes that change from frame to frame of one camera."""
+
+# What a network returns
+
+OUTPUTS = ("rotation, first", "rotation, second", "logarithm of L11", "L21", "logarithm of L22",
+           "logarithm of the distance", "logarithm of that one's deviation")  # fmt: skip
+"""In each cell. L is the Cholesky factor of the rotation's covariance, in units of `ROTATION_SCALE`."""
+
+ROTATION_SCALE = 0.5
+"""Rotation, rad, for an output of 1."""
+
+DISTANCE_MM, DISTANCE_SCALE = 30.0, 0.5
+"""A distance of `DISTANCE_MM` along the ray is an output of 0; an output of 1 is a logarithm of `DISTANCE_SCALE`."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where a frame lies on the grid."""
+
+    # columns, rows: of the grid that the frame covers.
+    columns: int
+    rows: int
+    # left, top: cells before it.
+    left: int
+    top: int
+
+    @classmethod
+    def of(cls, width: int, height: int) -> "Layout":
+        """Return the layout of a frame of a size, px."""
+        share = min(GRID[1] / width, GRID[0] / height)
+        columns, rows = max(1, round(width * share)), max(1, round(height * share))
+        return cls(columns, rows, (GRID[1] - columns) // 2, (GRID[0] - rows) // 2)
+
+    def to_pixels(self, cells: Array, camera: Camera) -> Array:
+        """Return the positions, px, of points of the grid, shape (..., 2): x, y, in cells of the planes."""
+        offset, count = np.array([self.left, self.top]), np.array([self.columns, self.rows])
+        return np.asarray((cells - offset) * [camera.width, camera.height] / count)
+
+    def to_cells(self, points_px: Array, camera: Camera) -> Array:
+        """Return the points of the grid at pixel positions, shape (..., 2): the inverse of `to_pixels`."""
+        offset, count = np.array([self.left, self.top]), np.array([self.columns, self.rows])
+        return np.asarray(points_px * count / [camera.width, camera.height] + offset)
+
+
+def output_centres(camera: Camera) -> Array:
+    """Return the pixel positions of the outputs' centres, shape (rows, columns, 2); some may lie off the frame."""
+    x, y = (STRIDE * (np.arange(count) + 0.5) for count in reversed(CELLS))
+    return Layout.of(camera.width, camera.height).to_pixels(np.stack(np.meshgrid(x, y), axis=-1), camera)
+
+
+def camera_values(frame: Frame) -> Array:
+    """Return what a network's range is checked by, in the order of `CAMERA`; the lights must be told."""
+    camera, lights = frame.camera, frame.calibration.priors.lights / LIGHT_SCALE_MM
+    layout = Layout.of(camera.width, camera.height)
+    share = np.array([layout.columns / camera.width, layout.rows / camera.height])
+    focal = np.log(share * [camera.fx, camera.fy] / GRID[1])
+    off_centre = np.array([camera.cx / camera.width, camera.cy / camera.height]) - 0.5
+    spread = np.sqrt(((lights - lights.mean(axis=0)) ** 2).sum(axis=1).mean())
+    return np.array([*focal, *off_centre, *lights.mean(axis=0), spread])
+
+
+def dense_inputs(frame: Frame) -> Image:
+    """Return the planes of a frame, whose lights must be told and whose lens has no distortion, shape (10, 96, 128)."""
+    camera = frame.camera
+    layout = Layout.of(camera.width, camera.height)
+    where = (slice(layout.top, layout.top + layout.rows), slice(layout.left, layout.left + layout.columns))
+    planes = np.zeros((len(PLANES), *GRID), dtype=np.float32)
+    planes[(slice(0, len(VIEWED)), *where)] = _viewed(frame, (layout.columns, layout.rows))
+    x, y = (np.arange(count) + 0.5 for count in reversed(GRID))
+    rays = camera.unproject(layout.to_pixels(np.stack(np.meshgrid(x, y), axis=-1), camera)).reshape(-1, 3)
+    mean = frame.calibration.priors.lights.mean(axis=0) / LIGHT_SCALE_MM
+    of_camera = [rays[:, 0], rays[:, 1], *(image_basis(rays) @ mean).T, -rays @ mean]
+    planes[len(VIEWED) :] = np.reshape(of_camera, (-1, *GRID))
+    return planes
+
+
+def _viewed(frame: Frame, size: tuple[int, int]) -> Image:
+    """Return the planes of light and colour on a grid of columns and rows, shape (5, rows, columns)."""
+    channels = frame.channels if frame.channels.ndim == 3 else np.repeat(frame.channels[..., None], 3, axis=2)
+    gain = frame.corrected.gain
+    light = channels.mean(axis=2, dtype=np.float32) * (1 if gain is None else gain)
+    seen = np.ones(light.shape, dtype=bool) if frame.seen is None else frame.seen
+    weight = seen.astype(np.float32)
+    share = _averaged(weight, size)
+    known = share > LEAST_SEEN
+    whole = np.where(known, share, 1.0)
+
+    def mean(values: Image) -> Image:
+        return np.asarray(_averaged(values * weight, size) / whole, dtype=np.float32)
+
+    median = median_of_lit(light[seen])
+    light = light / np.float32(median)
+    logarithm = mean(np.log(light + DARKEST, dtype=np.float32))
+    whole_light = mean(light)
+    spread = np.log(whole_light + DARKEST) - logarithm
+    lit = known & (whole_light > LEAST_LIT)
+    red, green, blue = (mean(channels[..., k]) / median + DARKEST for k in range(3))
+    colours = [_centred(np.log(other / green), lit) for other in (red, blue)]
+    return np.asarray(np.stack([logarithm, spread, *colours, share]) * known, dtype=np.float32)
+
+
+def _averaged(values: Image, size: tuple[int, int]) -> Image:
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _centred(values: Image, lit: Mask) -> Image:
+    """Return values less those of the lit cells' median: albedo and white balance are no part of the shape."""
+    return np.asarray(values - np.median(values[lit])) if lit.any() else values
+
 
 FORMAT = "simtest dense_normals, version 2"
-
-SHIPPED = ("learning", "weights", "learned_dense.onnx")
-"""Below the shipped scenes; its card lies beside it."""
 
 ASPECTS = (1.0, 1.9)
 """Width over height: what the training's cut views cover."""
@@ -77,15 +217,15 @@ class DenseMaps:
 
 
 @dataclass(frozen=True)
-class LearnedDense:
+class LearnedDense(LearnedNormals):
     """A network that states normals all over a frame (`studies.networks.dense`) as an estimator.
 
     It sees the whole frame on a coarse grid, the sightlines and the lights. It states the base's normal and the
     distance everywhere (`maps`); as an estimator it answers for each detection. It refuses with ``no_estimate`` what
     lies outside the range that it was taught: another lens or other lights, a frame without colour, of an unusual
     aspect or too small, and frames whose features lie far from those of the train split. Short of that, what it states
-    grows less certain with the features' distance (`simtest.estimators.training_range.inflation`). At highlights it is
-    checked against the law of reflection (`simtest.estimators.reflection_check`): a frame, and a highlight alone, where
+    grows less certain with the features' distance (`simtest.estimators.learned.inflation`). At highlights it is
+    checked against the law of reflection (`simtest.estimators.learned`): a frame, and a highlight alone, where
     its normals contradict that law is refused.
 
     Parameters
@@ -94,27 +234,16 @@ class LearnedDense:
         The file model.onnx. Default: the shipped network.
     """
 
-    model: str | Path | None = None
-
-    def check(self) -> None:
-        """Load the network; raise `InputError` where it cannot be used."""
-        _ = self._network
-
-    def with_model(self, model: Path) -> "LearnedDense":
-        """Return the estimator with another network, loaded; raise `InputError` where it cannot be used."""
-        made = replace(self, model=model)
-        made.check()
-        return made
+    shipped: ClassVar[str] = "learned_dense.onnx"
 
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
-        network = str(self.model or SHIPPED[-1])
+        network = str(self.model or self.shipped)
         return f"The normal of the base surface at each highlight, by the network {network} of the whole frame."
 
-    @cached_property
-    def _network(self) -> "_Network":
-        return _Network(Path(self.model) if self.model else data_root("scenes").joinpath(*SHIPPED))
+    def _load(self, path: Path) -> "DenseNetwork":
+        return DenseNetwork(path)
 
     def maps(
         self, values: Image, calibration: Calibration, highlights_px: Array | None = None, seen: Mask | None = None
@@ -162,34 +291,18 @@ class LearnedDense:
         made = self.stated(frame, points_px)
         return made if isinstance(made, Failure) else _contradictions(made, frame, points_px)
 
-    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
-        """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
-        return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
-
-    def estimate_regions(
-        self, frame: Frame, patches: Sequence[Patch | Failure], /
-    ) -> tuple[Sequence[Estimate | Failure | None], Sequence[Estimate]]:
-        """Return an estimate or a failure for each patch (see `simtest.estimators.protocol.RegionEstimator`)."""
-        peaks = [patch.peak_px for patch in patches if not isinstance(patch, Failure)]
-        made = iter(self._at(frame, peaks))
-        return [patch if isinstance(patch, Failure) else next(made) for patch in patches], []
-
-    def _at(self, frame: Frame, peaks: Sequence[Array]) -> list[Estimate | Failure]:
-        """Return an estimate or a failure for each peak of a frame."""
-        if not peaks:
-            return []
+    def _at(self, frame: Frame, peaks: Array) -> Sequence[Estimate | Failure] | Failure:
         outputs = self._outputs(frame)
         if isinstance(outputs, Failure):
-            return [outputs] * len(peaks)
-        points = np.asarray(peaks, dtype=float)
-        stated = self._stated(*outputs, frame.camera, points)
-        squared = _contradictions(stated, frame, points)
+            return outputs
+        stated = self._stated(*outputs, frame.camera, peaks)
+        squared = _contradictions(stated, frame, peaks)
         if refused := _contradicts(squared):
-            return [refused] * len(points)
+            return refused
         return [
             _refused_highlight(off)
             or Estimate(normal=normal, candidates=normal[None], look_px=point, covariance=covariance, target="base")
-            for normal, covariance, point, off in zip(*stated[:2], points, squared.tolist(), strict=True)
+            for normal, covariance, point, off in zip(*stated[:2], peaks, squared.tolist(), strict=True)
         ]
 
     def _outputs(self, frame: Frame) -> tuple[Array, float] | Failure:
@@ -272,16 +385,11 @@ def _unfit(frame: Frame) -> Failure | None:
     return Failure(Reason.NO_ESTIMATE, f"outside the network's training: {told}") if told else None
 
 
-class _Network:
-    """A network in ONNX Runtime, with the range that it was taught."""
+class DenseNetwork(TaughtNetwork):
+    """A network of whole frames."""
 
     def __init__(self, path: Path) -> None:
-        self._model = OnnxModel(path, FORMAT, "learned_dense")
-        with self._model.reading():
-            content = self._model.content
-            self.scales = {name: CovarianceScale.read(content["scales"][name]) for name in ("base", "distance")}
-            self._range = TrainingRange.read(content, CAMERA)
-            self._usual = read_usual(content)
+        super().__init__(path, FORMAT, "learned_dense", CAMERA, {"scales": ("base", "distance")})
 
     def run(self, frame: Frame) -> tuple[Array, float] | Failure:
         """Return the outputs of a frame, shape (7, 48, 64), and the covariances' factor, or why it is refused."""

@@ -1,33 +1,124 @@
-"""`learned_spot`: a trained network's normals at single highlights, run by ONNX Runtime, without PyTorch."""
+"""`learned_spot`: a trained network's normals at single highlights, run by ONNX Runtime, without PyTorch.
+
+What a network sees of a highlight, and returns: crops around its peak, the lights and the optical axis go in.
+
+The three crops have fixed sizes in pixels, so they do not depend on the detector. All directions are in the tangent
+basis of the direction to the camera that is aligned with the crops' axes (`image_basis`).
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
+import cv2
 import numpy as np
 
-from simtest.calibration import Frame, Priors
+from simtest.calibration import Frame
 from simtest.errors import Failure, InputError, Reason
-from simtest.estimators.covariance_scale import CovarianceScale
-from simtest.estimators.onnx_model import OnnxModel
-from simtest.estimators.protocol import Estimate, Target
-from simtest.estimators.spot_inputs import (
-    EXTRAS,
+from simtest.estimators.learned import (
+    LIGHT_SCALE_MM,
     LOG_RANGE,
-    OUTPUTS,
-    RATIO_DEVIATION,
-    ROTATION_SCALE,
-    SURFACES,
+    LearnedNormals,
+    TaughtNetwork,
+    image_basis,
+    inflation,
+    median_of_lit,
     normal_of,
-    rays_of,
-    spot_inputs,
 )
-from simtest.estimators.training_range import TrainingRange, inflation, read_usual
-from simtest.geometry import Array, Camera, Patch
+from simtest.estimators.protocol import Estimate, Target
+from simtest.geometry import Array, Camera
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
-from simtest.runtime.resources import data_root
+
+SIDE = 32
+"""Side of a crop, px of the crop."""
+
+STEPS = (1, 3, 9)
+"""Pixels of the frame for one of each crop: the highlight, its neighbours, the shading around."""
+
+DARKEST = 0.02
+"""Share of the frame's median light that is added before the logarithm; what lies outside the view is this dark."""
+
+
+EXTRAS = (
+    "log of the focal length over 300 px",
+    "optical axis, first", "optical axis, second",
+    "mean light, first", "mean light, second", "mean light, towards",
+    "lights' spread, first", "lights' spread, mixed", "lights' spread, second",
+    "peak over the median light, logarithm", "clipped pixels",
+)  # fmt: skip
+
+# What a network returns
+
+ROTATION_SCALE = 0.1
+"""Rotation, rad, for an output of 1."""
+
+SURFACES = ("base", "fine")
+
+OUTPUTS = ("rotation, first", "rotation, second", "logarithm of L11", "L21", "logarithm of L22", "axis ratio, logit",
+           "logarithm of the axis ratio's deviation")  # fmt: skip
+"""Of each surface. L is the Cholesky factor of the rotation's covariance, both in units of `ROTATION_SCALE`."""
+
+RATIO, RATIO_DEVIATION = 5, 6
+"""Columns of the axis ratio and of its deviation."""
+
+
+def spot_inputs(frame: Frame, peaks_px: Sequence[Array] | Array) -> tuple[Image, Image]:
+    """Return the inputs of a network at peaks of a frame.
+
+    `frame`: encoded values and calibration, whose lights must be told; `peaks_px`, (N, 2): positions, px. Returns
+    `crops`, (N, 3, 32, 32): logarithm of the linear light over the median of the frame's lit pixels, the smallest step
+    first; `extras`, (N, 11): see `EXTRAS`.
+    """
+    peaks = np.asarray(peaks_px, dtype=float).reshape(-1, 2)
+    light = frame.channels if frame.channels.ndim == 2 else frame.channels.mean(axis=2, dtype=np.float32)
+    seen = np.ones(light.shape, dtype=bool) if frame.seen is None else frame.seen
+    logarithm = np.log(np.where(seen, light / median_of_lit(light[seen]), 0.0) + DARKEST, dtype=np.float32)
+    # A coarse crop averages what one of its pixels covers.
+    layers = [logarithm if step == 1 else cv2.blur(logarithm, (step, step)) for step in STEPS]
+    outside = float(np.log(DARKEST))
+    crops = np.empty((len(peaks), len(STEPS), SIDE, SIDE), dtype=np.float32)
+    for n, peak in enumerate(peaks):
+        for k, (layer, step) in enumerate(zip(layers, STEPS, strict=True)):
+            corner = peak - 0.5 - (SIDE - 1) / 2 * step  # warpAffine has the centre of pixel (0, 0) at the origin
+            frame_from_crop = np.array([[step, 0, corner[0]], [0, step, corner[1]]])
+            cv2.warpAffine(
+                layer, frame_from_crop, (SIDE, SIDE), dst=crops[n, k], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_CONSTANT, borderValue=outside,
+            )  # fmt: skip
+    return crops, _extras(frame, peaks, crops)
+
+
+def _extras(frame: Frame, peaks: Array, crops: Image) -> Image:
+    camera, lights = frame.calibration.camera, frame.calibration.priors.lights
+    rays = rays_of(camera, peaks)
+    basis = image_basis(rays)
+    mean, offsets = lights.mean(axis=0) / LIGHT_SCALE_MM, (lights - lights.mean(axis=0)) / LIGHT_SCALE_MM
+    spread = np.einsum("nij,jk,nlk->nil", basis, offsets.T @ offsets / len(lights), basis)
+    clipped = [_clipped_near(frame, peak) for peak in peaks]
+    columns = [
+        np.full(len(peaks), np.log(camera.fx / 300.0)),
+        *basis[:, :, 2].T,
+        *(basis @ mean).T, -rays @ mean,
+        spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1],
+        crops[:, 0, SIDE // 2 - 2 : SIDE // 2 + 2, SIDE // 2 - 2 : SIDE // 2 + 2].max(axis=(1, 2)),
+        np.log1p(clipped),
+    ]  # fmt: skip
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def rays_of(camera: Camera, peaks: Array) -> Array:
+    """Return the unit sightlines through pixels, shape (N, 3)."""
+    return np.array([camera.unproject(peak) for peak in peaks]).reshape(-1, 3)
+
+
+def _clipped_near(frame: Frame, peak: Array) -> int:
+    """Return the number of clipped pixels of the smallest crop."""
+    x, y = (int(v) for v in peak)
+    half = SIDE // 2
+    return int(frame.clipped[max(y - half, 0) : y + half, max(x - half, 0) : x + half].sum())
+
 
 FORMAT = "simtest spot_normals, version 3"
 
@@ -37,9 +128,6 @@ _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 STEP = 1e-5
 """Step of the differences of the normal, rad."""
 
-SHIPPED = ("learning", "weights", "learned_spot.onnx")
-"""Below the shipped scenes; its card lies beside it."""
-
 
 def log_deviation(outputs: Array) -> Array:
     """Return the mean logarithm of the two stated deviations for the outputs of one surface, shape (..., 7)."""
@@ -47,7 +135,7 @@ def log_deviation(outputs: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class LearnedSpot:
+class LearnedSpot(LearnedNormals):
     """A network that states the normal at one highlight (`studies.networks.spots`) as an estimator.
 
     It sees three crops around each highlight and the lights' positions, and answers for each detection on its own. It
@@ -62,59 +150,29 @@ class LearnedSpot:
         Which surface's normals are stated.
     """
 
-    model: str | Path | None = None
     target: Target = "base"
+    shipped: ClassVar[str] = "learned_spot.onnx"
 
     def __post_init__(self) -> None:
         if self.target not in SURFACES:
             raise InputError(f"target = {self.target}: must be base or fine")
 
-    def with_model(self, model: Path) -> "LearnedSpot":
-        """Return the estimator with another network, which is read (see `simtest.runtime.resources`)."""
-        made = replace(self, model=model)
-        made.check()
-        return made
-
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
-        network = str(self.model or SHIPPED[-1])
+        network = str(self.model or self.shipped)
         return f"The normal of the {self.target} surface at each highlight, by the network {network}."
 
-    def check(self) -> None:
-        """Load the network; raise `InputError` where it cannot be used."""
-        _ = self._network
+    def _load(self, path: Path) -> "SpotNetwork":
+        return SpotNetwork(path)
 
-    @cached_property
-    def _network(self) -> "_Network":
-        return _Network(Path(self.model) if self.model else data_root("scenes").joinpath(*SHIPPED))
-
-    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Sequence[Estimate] | Failure:
-        """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
-        return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
-
-    def estimate_regions(
-        self, frame: Frame, patches: Sequence[Patch | Failure], /
-    ) -> tuple[Sequence[Estimate | Failure | None], Sequence[Estimate]]:
-        """Return an estimate or a failure for each patch (see `simtest.estimators.protocol.RegionEstimator`)."""
-        if not frame.calibration.priors.lights_mm:
-            missing = Failure(Reason.NOT_KNOWN, "needs the lights' positions")
-            return [patch if isinstance(patch, Failure) else missing for patch in patches], []
-        peaks = [patch.peak_px for patch in patches if not isinstance(patch, Failure)]
-        made = iter(self._at(frame, peaks))
-        return [patch if isinstance(patch, Failure) else next(made) for patch in patches], []
-
-    def _at(self, frame: Frame, peaks: Sequence[Array]) -> list[Estimate | Failure]:
-        """Return an estimate or a failure for each peak of a frame whose lights are told."""
-        if not peaks:
-            return []
+    def _at(self, frame: Frame, peaks: Array) -> Sequence[Estimate | Failure] | Failure:
         if frame.camera.distortion is not None:
             # Checked before the network is loaded: it would not help.
-            refused = Failure(Reason.NO_ESTIMATE, "outside the network's training: a lens with distortion")
-            return [refused] * len(peaks)
+            return Failure(Reason.NO_ESTIMATE, "outside the network's training: a lens with distortion")
         crops, extras = spot_inputs(frame, peaks)
         outputs, inflations, refusals = self._network.run(crops, extras)
-        rays, number = rays_of(frame.camera, np.asarray(peaks)), SURFACES.index(self.target)
+        rays, number = rays_of(frame.camera, peaks), SURFACES.index(self.target)
         rows = zip(rays, peaks, outputs[:, number], inflations, refusals, strict=True)
         return [refusal or self._estimate(*row) for *row, refusal in rows]
 
@@ -136,23 +194,19 @@ class LearnedSpot:
         sure = float(np.clip(made[RATIO_DEVIATION], *LOG_RANGE))
         deviation = np.exp(sure) * np.sqrt(self._network.ratio_scales[self.target].at(sure) * inflated)
         return Estimate(
-            normal=normals[0], candidates=normals[:1], look_px=np.asarray(peak, dtype=float),
+            normal=normals[0], candidates=normals[:1], look_px=peak,
             axis_ratio=float(1 / (1 + np.exp(-made[5]))), covariance=covariance, target=self.target,
             axis_ratio_deviation=float(deviation),
         )  # fmt: skip
 
 
-class _Network:
-    """A network in ONNX Runtime, with the range that it was taught."""
+class SpotNetwork(TaughtNetwork):
+    """A network of single highlights."""
 
     def __init__(self, path: Path) -> None:
-        self._model = OnnxModel(path, FORMAT, "learned_spot")
-        with self._model.reading():
-            content = self._model.content
-            self.scales = {surface: CovarianceScale.read(content["scales"][surface]) for surface in SURFACES}
-            self.ratio_scales = {name: CovarianceScale.read(content["ratio_scales"][name]) for name in SURFACES}
-            self._range = TrainingRange.read(content, EXTRAS)
-            self._usual = read_usual(content)
+        kinds = {"scales": SURFACES, "ratio_scales": SURFACES}
+        super().__init__(path, FORMAT, "learned_spot", EXTRAS, kinds)
+        self.ratio_scales = self._scales["ratio_scales"]
         self._shapes = {"outputs": (None, len(SURFACES), len(OUTPUTS)), "features": (None, len(self._range.mean))}
 
     def run(self, crops: Image, extras: Image) -> tuple[Array, Array, list[Failure | None]]:

@@ -1,29 +1,204 @@
-"""`photometric`: maximum-likelihood fit of a Phong lobe to the pixels of a highlight (theory.md sections 2 and 3)."""
+"""`photometric`: maximum-likelihood fit of a Phong lobe to the pixels of a highlight (theory.md sections 2 and 3).
 
-from collections.abc import Sequence
+Goodness of a lobe's fit: whether it explains its pixels, and how far the normal depends on which are fitted.
+"""
+
+import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
-from simtest.calibration import NO_PRIORS, Priors
-from simtest.conventions import CONE_AXIS_ISOVALUES
+from simtest.calibration import Priors
+from simtest.calibration.frame import COLOURED
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import Budget
-from simtest.estimators.circle_pose import circle_pose
-from simtest.estimators.goodness import correlation_of_noise, excess_of_misfit, is_misfit
-from simtest.estimators.highlight_fit import fit_highlight, fit_highlights
-from simtest.estimators.isophote_family import IsophoteFamily
-from simtest.estimators.isophote_fit import FittedIsophote
-from simtest.estimators.lobe_fit import LobeFit, Model, fit_lobe
-from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
-from simtest.estimators.prior_parts import add_untold_parts
+from simtest.estimators.family import IsophoteFamily
+from simtest.estimators.highlight import OfHighlight, along, of_spot
+from simtest.estimators.least_squares import LobeFit, Model, fit_lobe
 from simtest.estimators.protocol import Estimate, Law
-from simtest.estimators.small_spot import SmallSpot
-from simtest.geometry import Array, Camera, Mask, Patch
-from simtest.geometry.vectors import basis_across
+from simtest.estimators.small_spots import HighlightAxis, SmallSpot
+from simtest.geometry import Array, Camera, Mask, Patch, chi_squared
+from simtest.geometry.vectors import basis_across, tangent_coordinates
 from simtest.runtime.arrays import Index
 from simtest.runtime.fitted import fitted_number
+
+DARK = 1e-6
+"""Least cosine of the lobe's angle: below it the specular term is 0 and has no logarithm."""
+
+
+@dataclass(frozen=True)
+class ColocatedQuadric:
+    """A quadric patch with light and camera at one position (theory.md section 3).
+
+    In units of the distance d to the BP, with s its sightline, the surface is P = s (1 + z) + (x, y) in the tangent
+    plane, z = (x, y) K (x, y)^T / 2, K = d S. The radiance is c max(0, cos 2 theta)^n over the squared distance.
+    Parameters: rotation of s in its tangent plane (2), K11, K12, K22, log c. n is held, because beside the three of K
+    it is all but undetermined.
+    """
+
+    rays: Array  # (m, 3): sightlines of the pixels
+    frame: Array  # (3, 3): rows e, f, s: tangent basis and sightline of the BP, camera frame
+    K: Array  # (3,): K11, K12, K22 in the basis e, f
+    log_scale: float  # log c
+    exponent: float  # n
+
+    @property
+    def normal(self) -> Array:
+        """N = -s, shape (3,)."""
+        return -self.frame[2]
+
+    @property
+    def shape(self) -> Array:
+        """K, shape (2, 2), in the basis e, f."""
+        k11, k12, k22 = self.K
+        return np.array([[k11, k12], [k12, k22]])
+
+    def moved(self, step: Array) -> Self:
+        """Turn s, with the basis carried along the shortest way, and add to K and log c."""
+        e, f, s = self.frame
+        turned = s + step[0] * e + step[1] * f
+        turned /= np.linalg.norm(turned)
+        # The basis rotates with s along a great circle.
+        carried = [v - (turned @ v) / (1 + s @ turned) * (s + turned) for v in (e, f)]
+        frame = np.stack([*carried, turned])
+        return replace(self, frame=frame, K=self.K + step[2:5], log_scale=self.log_scale + float(step[5]))
+
+    def evaluate(self) -> tuple[Array, Array]:
+        """Return intensities and derivatives."""
+        # tangents (a, b) of each ray in the basis, and q = (a, b) K (a, b)^T
+        e, f, s = self.frame
+        along = self.rays @ s
+        a, b = (self.rays @ e) / along, (self.rays @ f) / along
+        k11, k12, k22 = self.K
+        ka, kb = k11 * a + k12 * b, k12 * a + k22 * b
+        q = a * ka + b * kb
+        # t: hit along the ray; where the ray misses the quadric, its closest approach
+        root = np.sqrt(np.maximum(1 - 2 * q, 1e-6))
+        t = 2 / (1 + root)
+        across = 1 + a * a + b * b
+        A, B = 1 - t * q, 1 + t * t * (ka * ka + kb * kb)
+        # cos^2 of the angle between view and normal; cos 2 theta = 2 cos^2 - 1
+        squared = A * A / (B * across)
+        cosine = np.maximum(2 * squared - 1, DARK)
+        intensity = np.exp(self.log_scale) * cosine**self.exponent / (t * t * across)
+
+        # derivatives by q, g = ka^2 + kb^2 and across
+        dt_dq = t * t / (2 * root)
+        dA_dq = -(t + q * dt_dq)
+        dB_dq = 2 * t * (ka * ka + kb * kb) * dt_dq
+        # d log I = on_q dq + on_g dg + on_across d(across)
+        lobe = self.exponent / cosine * 2 * squared
+        on_q = lobe * (2 * dA_dq / A - dB_dq / B) - 2 * dt_dq / t
+        on_g = -lobe * t * t / B
+        on_across = -(lobe + 1) / across
+        # derivatives by the tangents, then by the six parameters
+        by_a = on_q * 2 * ka + on_g * 2 * (ka * k11 + kb * k12) + on_across * 2 * a
+        by_b = on_q * 2 * kb + on_g * 2 * (ka * k12 + kb * k22) + on_across * 2 * b
+        J = np.empty((len(a), 6))
+        J[:, 0] = -by_a * (1 + a * a) - by_b * a * b
+        J[:, 1] = -by_a * a * b - by_b * (1 + b * b)
+        J[:, 2] = on_q * a * a + on_g * 2 * ka * a
+        J[:, 3] = on_q * 2 * a * b + on_g * 2 * (ka * b + kb * a)
+        J[:, 4] = on_q * b * b + on_g * 2 * kb * b
+        J[:, 5] = 1.0
+        J *= intensity[:, None]
+        return intensity, J
+
+
+RINGS, SECTORS = 6, 8
+"""The lobe is divided by the model's intensity into rings of equally many pixels, each ring into sectors."""
+
+MIN_IN_BIN = 8
+LEVEL = 1e-3
+"""A fit is a misfit if noise alone would leave as much structure in less than this share of fits."""
+
+FLOOR = 2e-3
+"""Structure below this share of the peak does not count: rendering and sampling leave as much."""
+
+INNER = 0.5
+"""Near the peak all smooth lobes agree: pixels above this share of it are fitted for comparison."""
+
+CORRELATED_PX, SUMMED_DEVIATIONS = 4, 2.0
+"""Coding and demosaicing correlate the noise of pixels this far apart along an axis at most. The sum of white noise's
+correlations exceeds 1 by so many of its standard deviations once in 40 highlights."""
+
+
+def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None, noise: float | Array) -> bool:
+    """Test whether the residuals hold more structure than the frame's noise: a chi-square test of their local means.
+
+    A sum over single pixels would detect less, since misfits are smooth, and would need the noise to within a percent.
+    Pixels have intensities `observed`, shape (m,), and noise of standard deviation `noise`; clipped ones are left out.
+    """
+    model, _ = fitted.model.evaluate()
+    e, f = fitted.model.frame[:2]
+    rays = fitted.model.rays
+    kept = np.ones(len(model), dtype=bool) if clipped is None else ~clipped
+    residual, level = (observed - model)[kept], model[kept]
+    variance = np.broadcast_to(np.square(noise), model.shape)[kept]
+    if len(residual) < RINGS * SECTORS * MIN_IN_BIN:
+        return False
+    # bins: rings by intensity, sectors by direction from the axis
+    ring = np.searchsorted(np.quantile(level, np.arange(1, RINGS) / RINGS), level)
+    angle = np.arctan2(rays[kept] @ f, rays[kept] @ e)
+    sector = np.minimum(((angle + np.pi) / (2 * np.pi) * SECTORS).astype(int), SECTORS - 1)
+    number = ring * SECTORS + sector
+    count, total, spread = (
+        np.bincount(number, weights, RINGS * SECTORS) for weights in (np.ones(len(number)), residual, variance)
+    )
+    # chi-square of the bins' means
+    used = count >= MIN_IN_BIN
+    mean = total[used] / count[used]
+    allowed = spread[used] / count[used] ** 2 + (FLOOR * model.max()) ** 2
+    return bool(np.sum(mean**2 / allowed) > chi_squared.quantile(1 - LEVEL, int(np.count_nonzero(used))))
+
+
+def correlation_of_noise(
+    fitted: LobeFit[Model], observed: Array, clipped: Mask | None, noise: float | Array, places: Index
+) -> float:
+    """Return by how much the noise's correlation between pixels raises a covariance of white residuals; 1: not at all.
+
+    A smooth model takes from correlated noise the sum of its correlations over all distances. Both the smoothed frame's
+    noise, `noise`, and the residuals must show more than chance; the larger one counts. `places` are the residuals'
+    rows and columns, shape (2, m).
+    """
+    raised = float(np.mean(np.square(noise))) / max(fitted.sigma**2, 1e-300)
+    if raised < COLOURED**2:
+        return 1.0
+    rows, columns = places - places.min(axis=1, keepdims=True)
+    kept = np.ones(len(observed)) if clipped is None else (~clipped).astype(float)
+    residual = kept * (observed - fitted.model.evaluate()[0])
+    sums, pairs = (_products(values, rows, columns) for values in (residual, kept))
+    summed = float((sums / np.maximum(pairs, 1.0)).sum()) / fitted.sigma**2
+    chance = SUMMED_DEVIATIONS * math.sqrt((2 * CORRELATED_PX + 1) ** 2 / len(observed))
+    return max(raised, summed) if summed > 1 + chance else 1.0
+
+
+def _products(values: Array, rows: Index, columns: Index) -> Array:
+    """Return the sums of products of values at pixels up to `CORRELATED_PX` apart along both axes."""
+    grid = np.zeros((int(rows.max()) + 1 + CORRELATED_PX, int(columns.max()) + 1 + CORRELATED_PX))
+    grid[rows, columns] = values
+    products = np.fft.irfft2(np.abs(np.fft.rfft2(grid)) ** 2, s=grid.shape)
+    near = np.arange(-CORRELATED_PX, CORRELATED_PX + 1)
+    return np.asarray(products[np.ix_(near, near)])
+
+
+def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None) -> float:
+    """Return how far the normal moves, beyond noise, when only the pixels near the peak are fitted, squared, rad^2.
+
+    It is 0 where these pixels alone do not determine a fit.
+    """
+    model, _ = fitted.model.evaluate()
+    near = model > INNER * model.max()
+    part = replace(fitted.model, rays=fitted.model.rays[near])
+    inner = fit_lobe(part, observed[near], None if clipped is None else clipped[near])
+    if inner is None:
+        return 0.0
+    moved = tangent_coordinates(fitted.model.normal, inner.model.normal)
+    # The two fits share pixels: the variance of their difference is the difference of their variances.
+    noise = float(np.trace(inner.covariance[:2, :2]) - np.trace(fitted.covariance[:2, :2]))
+    return max(float(moved @ moved) - max(noise, 0.0), 0.0)
+
 
 REGIONS = (0.05, 0.1, 0.2, 0.3, 0.5)
 """The pixels inside the first of these isophotes that closes are fitted. Further out there is little but noise."""
@@ -34,17 +209,12 @@ CUT_REGION = 0.3
 MAX_PIXELS = 16384
 """In a larger region every second, third ... pixel is fitted, evenly spread."""
 
-COARSE = 4
-"""Every fourth pixel suffices to choose between the two candidates of a plane."""
 
 MISFIT_SHARE = fitted_number("misfit.share")
 
 MISFIT_FACTOR = 1.5
 """A misfit is told where it makes the stated standard deviation this many times larger: texture and lobes of another
 form leave structure in nearly every real highlight, and it seldom matters."""
-
-SAME_RAD = 1e-3
-"""Two fits closer than this are one."""
 
 
 @dataclass(frozen=True)
@@ -82,136 +252,51 @@ class HighlightPixels:
 
 
 @dataclass(frozen=True)
-class Photometric:
-    """A quadric patch with a co-located light, fitted to the pixels from `cone_axis` as start.
+class Photometric(OfHighlight):
+    """A quadric patch with a co-located light, fitted to the pixels from `cone_axis` as start (see `OfHighlight`).
 
     N = -s with s the sightline of the BP. The shape d S and the lobe's scale are fitted too; its exponent, all but
     degenerate with the shape, is held. Under white noise this is the maximum-likelihood estimate; where coding or
     demosaicing has correlated the noise, the covariance is that of noise so correlated. Clipped pixels count
     as "at least this bright". Pixels are those before smoothing where the patch has them.
 
-    What the priors leave open is added to the budget (`simtest.estimators.prior_parts`).
+    The estimate has one candidate and looks at the fitted BP. It is flagged ``misfit`` where the residuals hold more
+    structure than the frame's noise and the stated error is larger by half or more for it: the covariance then includes
+    how far the normal moves when only the pixels around the peak are fitted. It also includes the drift of the
+    isophotes' axis where that is more than noise. Where the patch does not know its noise no uncertainty is stated.
     """
 
     laws: ClassVar[tuple[Law, ...]] = ("sightline",)
 
-    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
-        """Fit the isophotes of several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
-        fit_highlights(patches, camera, CONE_AXIS_ISOVALUES)
-
-    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
-        """Estimate the normal (see `simtest.estimators.Estimator`).
-
-        The estimate has one candidate with its covariance and looks at the fitted BP. Flags are those of `cone_axis`,
-        and ``misfit`` where the residuals hold more structure than the frame's noise and the stated error is larger by
-        half or more for it: the covariance then includes how far the normal moves when only the pixels around the peak
-        are fitted. It also includes the drift of the isophotes' axis where that is more than noise. A highlight too
-        small for isophotes gets the normal of its centre, flagged ``unresolved``. Where the patch does not know its
-        noise no uncertainty is stated, as by the estimators of isophotes.
-        """
-        family = fit_highlight(patch, camera, CONE_AXIS_ISOVALUES)
-        if isinstance(family, Failure):
-            return family
-        if isinstance(family, SmallSpot):
-            return add_untold_parts(family.estimate(), camera, priors, family)
-        pixels = highlight_pixels(patch, camera, any(isophote.cut for isophote in family.isophotes), family.least)
+    def of(self, highlight: HighlightAxis, priors: Priors) -> Estimate | Failure:
+        """Estimate the normal at a fitted highlight."""
+        if isinstance(highlight, SmallSpot):
+            return of_spot(highlight, priors)
+        patch, camera = highlight.patch, highlight.camera
+        pixels = highlight_pixels(patch, camera, any(isophote.cut for isophote in highlight.isophotes), highlight.least)
         if isinstance(pixels, Failure):
             return pixels
-        fitted = fit_lobe(_quadric(family, pixels.rays), pixels.observed, pixels.clipped)
+        fitted = fit_lobe(_quadric(highlight, pixels.rays), pixels.observed, pixels.clipped)
         if fitted is None:
             return Failure(Reason.NOT_CONVERGED, "the fit of a quadric did not converge")
         e, f, s = fitted.model.frame
-        covariance = _turned(pixels.covariance(fitted)[:2, :2], fitted.model.normal, np.stack([e, f]))
+        covariance = in_tangent_basis(pixels.covariance(fitted)[:2, :2], fitted.model.normal, np.stack([e, f]))
         excess, misfit = 0.0, False
         if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
             misfit = True
             excess = excess_of_misfit(fitted, pixels.observed, pixels.clipped)
         else:
             covariance = covariance * pixels.correlation(fitted)
-        budget = {"noise": covariance, **beyond_noise(family, excess)}
-        estimate = Estimate(
-            normal=fitted.model.normal,
-            candidates=fitted.model.normal[None],
-            look_px=camera.project(s),
-            axis_ratio=_axis_ratio(fitted.model),
-            isophotes=family.isophotes,
-            budget=None if pixels.noise is None else budget,
-            flags=family.flags,
+        budget = {"noise": covariance, **beyond_noise(highlight, excess)}
+        estimate = along(
+            highlight, s, None if pixels.noise is None else budget, priors, axis_ratio=_axis_ratio(fitted.model)
         )
-        estimate = add_untold_parts(estimate, camera, priors, family)
         # A bend of the isophotes and the residuals of the fit show the same structure.
-        added = float(np.trace(budget["shape"] - family.drift_error))
+        added = float(np.trace(budget["shape"] - highlight.drift_error))
         return _with_misfit_told(estimate, added) if misfit else estimate
 
 
-@dataclass(frozen=True)
-class PhotometricPlane:
-    """A plane lit from above the BP and pictured from aside [MB, section 3.1], fitted from `circle_pose` as start.
-
-    Both candidates of the pose are fitted. The picture's perspective differs between them, so the sum of squares
-    separates them: `choice_margin` is the root of its difference over the noise.
-
-    Parameters
-    ----------
-    start_isovalue : float
-        Of the circle pose; higher ones are tried where it does not close.
-    """
-
-    start_isovalue: float = 0.3
-
-    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
-        """Estimate the normal (see `simtest.estimators.Estimator`); priors are not used.
-
-        The estimate holds the fitted normals, the better one first, with its covariance, and looks at the fitted BP.
-        """
-        start = self._start(patch, camera)
-        if isinstance(start, Failure):
-            return start
-        pixels = highlight_pixels(patch, camera)
-        if isinstance(pixels, Failure):
-            return pixels
-        # candidates: a plane from each pose, fitted to few pixels
-        foot = camera.unproject(patch.peak_px)
-        few, fits = pixels.every(COARSE), []
-        for normal in start.candidates:
-            if normal @ foot < 0:
-                model = _plane(normal, foot / foot[2], start.isophotes[0], patch.peak_value, few.rays)
-                fitted = fit_lobe(model, few.observed, few.clipped)
-                if fitted is not None and (pixels.rays @ fitted.model.normal < 0).all():
-                    fits.append(fitted)
-        fits.sort(key=lambda fitted: fitted.chi2)
-        if len(fits) > 1 and fits[0].model.normal @ fits[1].model.normal > np.cos(SAME_RAD):
-            # Near the branch point both lead to one minimum.
-            fits.pop()
-        # refine the better one with all pixels
-        best = fit_lobe(replace(fits[0].model, rays=pixels.rays), pixels.observed, pixels.clipped) if fits else None
-        if best is None:
-            return Failure(Reason.NOT_CONVERGED, "no fit of a plane converged")
-        margin = None
-        if len(fits) > 1 and best.sigma > 0:
-            margin = float(np.sqrt(COARSE * (fits[1].chi2 - fits[0].chi2)) / best.sigma)
-        normals = np.stack([fitted.model.normal for fitted in (best, *fits[1:])])
-        covariance = _turned(pixels.covariance(best)[:2, :2], normals[0], basis_across(normals[0]))
-        return Estimate(
-            normal=normals[0],
-            candidates=normals,
-            look_px=camera.project(best.model.foot),
-            isophotes=start.isophotes,
-            choice_margin=margin,
-            budget=None if pixels.noise is None else {"noise": covariance},
-        )
-
-    def _start(self, patch: Patch, camera: Camera) -> Estimate | Failure:
-        """Return the circle pose at the first isovalue that closes, or the first one's Failure."""
-        tried = (self.start_isovalue, *(t for t in (0.4, 0.5, 0.6, 0.7) if t > self.start_isovalue))
-        poses = (replace(circle_pose, isovalue=t, with_region=False).estimate(patch, camera) for t in tried)
-        first = next(poses)
-        if isinstance(first, Estimate):
-            return first
-        return next((pose for pose in poses if isinstance(pose, Estimate)), first)
-
-
-photometric, photometric_plane = Photometric(), PhotometricPlane()
+photometric = Photometric()
 
 
 def _with_misfit_told(estimate: Estimate, added: float) -> Estimate:
@@ -272,23 +357,13 @@ def _quadric(family: IsophoteFamily, rays: Array) -> ColocatedQuadric:
     return ColocatedQuadric(rays, basis, shape, float(np.log(family.patch.peak_value)), float(exponent))
 
 
-def _plane(normal: Array, foot: Array, isophote: FittedIsophote, peak: float, rays: Array) -> PlaneFromAside:
-    """Start with the exponent that follows from the isophote's radius on the plane."""
-    points = isophote.rays()
-    reach = (normal @ foot) / (points @ normal)
-    rho2 = float(np.median(np.sum((points * reach[:, None] - foot) ** 2, axis=1)))
-    cosine = max((1 - rho2) / (1 + rho2), 0.1)
-    exponent = np.log(isophote.isovalue) / np.log(cosine)
-    return PlaneFromAside(rays, normal, foot, float(np.log(exponent)), float(np.log(peak)))
-
-
 def _axis_ratio(model: ColocatedQuadric) -> float:
     """Return the smaller over the larger abs(1 + d k)."""
     gains = np.abs(1 + np.linalg.eigvalsh(model.shape))
     return float(gains.min() / gains.max())
 
 
-def _turned(covariance: Array, normal: Array, basis: Array) -> Array:
+def in_tangent_basis(covariance: Array, normal: Array, basis: Array) -> Array:
     """Express a covariance of tilts along `basis`, rows, in the tangent basis of the normal."""
     turn = basis_across(normal) @ basis.T
     return np.asarray(turn @ covariance @ turn.T)

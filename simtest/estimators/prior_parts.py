@@ -3,26 +3,155 @@
 The picture itself does not show where the light is: on a plane 10 mm away, a light 1 mm beside the camera moves the
 highlight by 2.8 deg and leaves its isophotes ellipses. No test of a fit finds that; only what is told of the rig does,
 and what nobody told is a prior.
+
+
+How a light somewhere beside the camera moves the normal from the reversed sightline, over the priors.
+
+The light lies at an offset across the optical axis, in any direction, the surface at a distance along the sightline;
+the true normal bisects the directions to both (theory.md section 3, item 1). The sightline's angle from the optical
+axis alone changes the distribution of the moves, so a table over that angle holds it.
+
+How far a highlight may be off because it is a near miss, in frames that show many highlights.
+
+Where a surface is rough or folded, a bright spot need not hold a point at which the normal bisects the directions to
+light and camera: a minimum of the misfit tau above 0 shines too (theory.md 7.1b). Such a near miss looks like any other
+spot, and the estimate is off by abs(tau) in an unknown direction. What the frame tells is its brightness: a Gaussian
+lobe of standard deviation s gives a near miss the radiance I0 exp(-abs(tau)^2 / (2 s^2)), with I0 that of a highlight
+point at the same place. So
+
+    abs(tau)^2 = 2 s^2 ln(I0 / I).
+
+The brightest of the spots around stands for I0. Smaller spots are also dimmed by the point spread, and clipped ones
+are brighter than they look; both are part of what was fitted.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Normal, Priors
 from simtest.calibration.priors import AT_CAMERA_MM
-from simtest.estimators.budget import equivalent_covariance
-from simtest.estimators.highlight_fit import HighlightAxis
-from simtest.estimators.light_table import light_table
-from simtest.estimators.near_misses import near_miss_parts
+from simtest.estimators.budget import Budget, equivalent_covariance
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Array, Camera, chi_squared
+from simtest.estimators.small_spots import HighlightAxis
+from simtest.geometry import Array, Camera, Patch, chi_squared
 from simtest.geometry.lenses import undistort_with_errors
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
 from simtest.runtime.fitted import fitted_number
 from simtest.runtime.statistics import CONFIDENCE
+
+SIDE = 40
+"""Shares of the offset, and of the distance, that are combined; fewer would miss the tail of near surfaces."""
+
+ANGLES = np.radians([0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 89.0, 105.0, 120.0])
+"""Sightline's angles from the optical axis; a fisheye's go beyond 90 deg, where the moves would lie along one line."""
+
+GOLDEN = (np.sqrt(5.0) - 1) / 2
+"""Step of the azimuths, as a share of the full circle: neighbours in the list point in different directions."""
+
+
+@dataclass(frozen=True)
+class LightTable:
+    """Equivalent variances of the moves over the sightline's angle from the optical axis."""
+
+    # along, across: (A,): variance towards the optical axis and perpendicular to it, rad^2, at each of `ANGLES`.
+    along: Array
+    across: Array
+
+    def covariance(self, normal: Array, basis: Array) -> Array:
+        """Return the covariance of a reversed sightline, shape (2, 2), rad^2, in a basis of its tangent plane."""
+        # Scalars, since NumPy's functions take ten times as long on one number.
+        x, y, z = normal.tolist()
+        angle = math.atan2(math.hypot(x, y), -z)
+        along, across = (float(np.interp(angle, ANGLES, values)) for values in (self.along, self.across))
+        # the direction towards the optical axis; on the axis both variances are equal
+        u, v = basis[:, 2].tolist()
+        square = max(u * u + v * v, 1e-24)
+        more = (along - across) / square
+        return np.array([[across + more * u * u, more * u * v], [more * u * v, across + more * v * v]])
+
+
+@lru_cache(maxsize=16)
+def light_table(offset: Distribution, distance: Distribution) -> LightTable:
+    """Tabulate the moves for priors of a light's offset across the optical axis and of the distance, mm."""
+    shares = (np.arange(SIDE) + 0.5) / SIDE
+    o, d = (each.ravel() for each in np.meshgrid(offset.quantile(shares), distance.quantile(shares)))
+    azimuth = 2 * np.pi * (np.arange(SIDE**2) * GOLDEN % 1.0)
+    # Mirrored azimuths make the moves even about the sightline's meridian.
+    lights = np.stack([o * np.cos(azimuth), o * np.sin(azimuth), np.zeros(SIDE**2)], axis=1)
+    lights = np.concatenate([lights, lights * [1.0, -1.0, 1.0]])
+    d = np.concatenate([d, d])
+    variances = [np.diag(equivalent_covariance(_moves(angle, lights, d))) for angle in ANGLES.tolist()]
+    along, across = np.array(variances).T
+    return LightTable(along, across)
+
+
+def _moves(angle: float, lights: Array, distance: Array) -> Array:
+    """Return the moves of the normal at a sightline in the plane y = 0, shape (N, 2): along that plane and across."""
+    sightline = np.array([np.sin(angle), 0.0, np.cos(angle)])
+    to_light = lights - distance[:, None] * sightline
+    normals = to_light / np.linalg.norm(to_light, axis=1)[:, None] - sightline
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    along, across = normals @ [np.cos(angle), 0.0, -np.sin(angle)], normals[:, 1]
+    sine = np.hypot(along, across)
+    scale = np.where(sine > 0, np.arctan2(sine, -normals @ sightline) / np.maximum(sine, 1e-300), 1.0)
+    return np.stack([along, across], axis=1) * scale[:, None]
+
+
+CROWD = 3
+"""A frame with more highlights than this for each light shows relief or folds: a smooth patch shows one for each."""
+
+AROUND = 12
+"""The brightest of so many nearest highlights stands for a highlight point's radiance."""
+
+BRIGHT = np.radians(fitted_number("near_misses.bright")) ** 2
+FAINT = np.radians(fitted_number("near_misses.faint")) ** 2
+USUAL, MOST = fitted_number("near_misses.usual"), fitted_number("near_misses.most")
+RARER = fitted_number("near_misses.rarer")
+
+APART = 3
+"""Lights of a larger number are a ring, whose highlights melt: it counts as so many."""
+
+SEVERAL = 0.5
+"""Share of the variance under two or three lights. Which light made a highlight is then seldom known, and that error is
+as large as the part of the budget that stands for it, or smaller, never several times larger: the sum of both parts
+would hold 99 % and more."""
+
+UNTOLD_FAINTNESS = 1.0
+"""ln(I0 / I) where the patch does not know how bright the others are; two thirds of the spots have less."""
+
+
+def near_miss_parts(patch: Patch, priors: Priors) -> Budget:
+    """Return the part ``shape`` of a highlight that may be a near miss; a plane that is told has none."""
+    variance = 0.0 if priors.plane else near_miss_variance(patch, max(len(priors.lights_mm), 1))
+    return {"shape": variance * np.eye(2)} if variance > 0 else {}
+
+
+def near_miss_variance(patch: Patch, lights: int) -> float:
+    """Return the variance of a highlight's normal along each axis by the chance that it is a near miss, rad^2.
+
+    `patch`: the highlight, with the frame's other ones; `lights`: how many lights there are, at least 1. Returns 0 in a
+    frame that does not show more than `CROWD` highlights for each light; where the patch does not know the frame's
+    others, that of the usual number.
+    """
+    count = USUAL if patch.others_px is None else (len(patch.others_px) + 1) / min(lights, APART)
+    if count <= CROWD:
+        return 0.0
+    scale = (USUAL / min(count, MOST)) ** RARER * (SEVERAL if 1 < lights <= APART else 1.0)
+    return float(scale * (BRIGHT + FAINT * _faintness(patch)))
+
+
+def _faintness(patch: Patch) -> float:
+    """Return ln(I0 / I) of a highlight, 0 for one that is brighter than those around."""
+    values = np.array(patch.others_value)
+    if len(values) == 0 or len(values) != len(patch.neighbours_px):
+        return UNTOLD_FAINTNESS
+    away = np.sum((patch.neighbours_px - patch.peak_px) ** 2, axis=1)
+    brightest = float(values[np.argsort(away, kind="stable")[:AROUND]].max())
+    return max(float(np.log(brightest / patch.peak_value)), 0.0) if brightest > 0 else 0.0
+
 
 NEAR_SHARE = 0.05
 """Share of the distances that are nearer than the one at which a told light's offset must be negligible."""
@@ -48,7 +177,7 @@ TILT = math.radians(10.0)
 """Standard deviation an axis of the angle between a falloff's axis and the optical axis: light guides beside an oblique
 lens or with lenses of their own shine up to 25 deg aside."""
 
-FAINT = 0.1
+LEAST_COSINE = 0.1
 """Cosine of the angle from its axis down to which a falloff is followed; little light is left there."""
 
 _LATTICE = (np.arange(64)[:, None] * [1, 41, 49, 37, 53] % 64 + 0.5) / 64
@@ -130,19 +259,10 @@ def told_light_part(sightline: Array, normal: Array, light: Array, covariance: A
 
     The normal turns by half the angle by which the light moves, as seen from the surface (theory.md section 3, item 1).
 
-    Parameters
-    ----------
-    sightline, normal, light : ndarray, shape (3,)
-        Unit sightline and unit normal, camera frame; nominal position of the light, mm.
-    covariance : ndarray, shape (3, 3)
-        Of the light's position, mm^2.
-    distances : ndarray, shape (D,)
-        Distances of the surface along the sightline, mm, each as likely; the part is the mean over them.
-
-    Returns
-    -------
-    ndarray, shape (2, 2)
-        rad^2, in the basis ``tangent_basis(normal)``.
+    `sightline`, `normal`, `light`, (3,): unit sightline and unit normal, camera frame; nominal position of the light,
+    mm; `covariance`, (3, 3): of the light's position, mm^2; `distances`, (D,): distances of the surface along the
+    sightline, mm, each as likely; the part is the mean over them. Returns (2, 2): rad^2, in the basis
+    ``tangent_basis(normal)``.
     """
     across = basis_across(normal)
     position = distances[:, None] * sightline
@@ -224,7 +344,7 @@ def falloff_part(normal: Array, family: HighlightAxis, power: Distribution, prio
         place = sightline - origins / _distances(priors.distance)
         steps = steps - np.outer(steps @ normal / (sightline @ normal), sightline)
     squares = np.sum(place * place, axis=1, keepdims=True)
-    reached = np.maximum(np.sum(place * axes, axis=1, keepdims=True), FAINT * np.sqrt(squares))
+    reached = np.maximum(np.sum(place * axes, axis=1, keepdims=True), LEAST_COSINE * np.sqrt(squares))
     slopes = axes @ steps.T / reached - place @ steps.T / squares
     shift = basis_across(normal) @ family.basis.T @ family.seen_moments
     return equivalent_covariance(powers * slopes @ shift.T)

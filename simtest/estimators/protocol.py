@@ -1,19 +1,23 @@
-"""Estimator protocols, and the estimate that an estimator returns."""
+"""Estimator protocols, and the estimate that an estimator returns.
 
-from collections.abc import Sequence
+The contract of an estimate: what in-process estimators, cores and tables of answers may report.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from simtest.calibration import Frame, Priors
-from simtest.errors import Failure
-from simtest.estimators.budget import STATED, Budget, bounded, total
+from simtest.errors import Failure, Reason
+from simtest.estimators.budget import LARGEST_VARIANCE, STATED, Budget, bounded, deviations, total
 from simtest.estimators.cloud_shape import CloudShape
-from simtest.estimators.isophote_fit import FittedIsophote
-from simtest.geometry import Array, Camera, Patch
+from simtest.estimators.isophotes import FittedIsophote
+from simtest.geometry import Array, Camera, Patch, chi_squared
 from simtest.geometry.cones import PoseRegion
-from simtest.geometry.vectors import deviation_deg
+from simtest.geometry.vectors import covariance_across, deviation_deg, tilt_deg
 from simtest.runtime.arrays import LONGEST, clipped, vector
 
 Target = Literal["fine", "base"]
@@ -132,9 +136,23 @@ class Estimate:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the normal in the view with its 95 % ellipse, and the budget."""
-        from simtest.estimators.notebook import estimate_html
+        from simtest.pages.notebook import normal_html, note_html, table_html
 
-        return estimate_html(self)
+        x, y, z = self.normal
+        tilt = tilt_deg(self.normal)
+        lines = [f"normal ({x:.4f}, {y:.4f}, {z:.4f}), camera frame; {tilt:.2f} deg from the optical axis"]
+        if self.deviation_deg is not None:
+            lines.append(f"standard deviation {self.deviation_deg:.3g} deg; the ellipse holds 95 % of the errors")
+        if len(self.candidates) > 1:
+            lines.append(f"{len(self.candidates)} candidates; the proposed one is shown")
+        if self.flags:
+            lines.append("flags: " + ", ".join(self.flags))
+        parts = sorted(deviations(self.budget or {}).items(), key=lambda part: -part[1])
+        table = table_html(("part", "standard deviation (deg)"), [(n, f"{np.degrees(v):.3g}") for n, v in parts])
+        region = None
+        if self.covariance is not None:
+            region = chi_squared.quantile(0.95, 2) * covariance_across(self.normal, self.covariance)
+        return normal_html(self.normal[:2], region) + "".join(map(note_html, lines)) + (table if parts else "")
 
     def with_parts(self, **parts: Array) -> "Estimate":
         """Return the estimate with more parts in its budget, rad^2; one that is there already is added to.
@@ -248,3 +266,187 @@ AnyEstimator = Estimator | FrameEstimator
 def laws_of(estimator: object) -> tuple[Law, ...]:
     """Return the laws that an estimator says it follows; none where it says nothing."""
     return tuple(getattr(estimator, "laws", ()))
+
+
+ROUNDED, EXACT = 1e-3, 1e-9
+"""A unit vector or covariance that is off by less than the first was printed with few digits, and is made exact; one
+that is off by less than the second keeps its last digits. Shares of the length and of the largest element."""
+
+LEAST_VARIANCE = 1e-24
+"""rad^2; below it a normal is more certain than its own digits."""
+
+LEAST_SHARE = 1e-12
+"""Of the largest variance squared: a determinant below it is rounding."""
+
+OUTSIDE = 0.5
+"""An estimate looks at a pixel at most this share of the frame outside: the border may cut off a highlight's peak."""
+
+MAX_CANDIDATES, MAX_FLAGS, MAX_PARTS, LONGEST_FLAG = 64, 16, 16, 60
+
+
+class Refused(Exception):
+    """What is wrong with an estimate, as a failure."""
+
+    def __init__(self, detail: str, reason: Reason = Reason.ESTIMATOR_ERROR) -> None:
+        super().__init__(detail)
+        self.failure = Failure(reason, detail)
+
+
+def check(result: object, camera: Camera) -> Estimate | Failure:
+    """Return an estimator's result, or a Failure where it is not what `Estimate` describes.
+
+    Malformed parts are a Failure ``estimator_error``, values that are not finite a Failure ``not_finite``. Unit vectors
+    and covariances that were printed with few digits are made exact.
+    """
+    if isinstance(result, Failure):
+        return result
+    try:
+        return _checked(result, camera)
+    except Refused as refused:
+        return refused.failure
+
+
+def unit_vector(vector: Array, name: str) -> Array:
+    """Return a vector of unit length but for rounding, shape (3,), made exact; raise `Refused` for another."""
+    length = math.sqrt(sum(part * part for part in vector.tolist()))
+    if abs(length - 1) > ROUNDED:
+        raise Refused(f"{name} of length {length:.6g}: must be a unit vector")
+    return vector if abs(length - 1) < EXACT else vector / length
+
+
+def _checked(result: object, camera: Camera) -> Estimate:
+    """Return an estimate with exact unit vectors and covariances; raise `Refused` where it is malformed."""
+    if not isinstance(result, Estimate):
+        raise Refused(f"gave a {type(result).__name__}; must be an Estimate or a Failure")
+    if result.target not in ("fine", "base"):
+        raise Refused(f"target {result.target!r:.60}; must be fine or base")
+    changed: dict[str, object] = {}
+    budget = _budget(result)
+    if any(part is not result.budget[name] for name, part in budget.items()):  # type: ignore[index]
+        changed |= {"budget": budget, "covariance": None}
+    # unit vectors, the proposed one first
+    normal = unit_vector(_numbers(result.normal, "normal", (3,)), "normal")
+    given = [*_numbers(result.candidates, "candidates", (None, 3))]
+    if not 1 <= len(given) <= MAX_CANDIDATES:
+        raise Refused(f"{len(given)} candidates; must be 1 to {MAX_CANDIDATES}")
+    candidates = [unit_vector(each, "candidate") for each in given]
+    apart = max(map(abs, (candidates[0] - normal).tolist()))
+    if apart > ROUNDED:
+        raise Refused("the first candidate must be the proposed normal")
+    rounded = any(exact is not each for exact, each in zip(candidates, given, strict=True))
+    if normal is not result.normal or rounded or apart > EXACT:
+        changed |= {"normal": normal, "candidates": np.array([normal, *candidates[1:]])}
+    _check_look(_numbers(result.look_px, "look_px", (2,)), normal, camera)
+    # numbers
+    _check_ratio(result.axis_ratio, "axis_ratio")
+    if result.axis_ratio_deviation is not None and not _number(result.axis_ratio_deviation, "axis_ratio_deviation") > 0:
+        raise Refused(f"axis_ratio_deviation: {result.axis_ratio_deviation:g}; must be above 0")
+    if result.choice_margin is not None:
+        _number(result.choice_margin, "choice_margin")
+    if result.region is not None and not np.isfinite(result.region.statistic(result.candidates)).all():
+        raise Refused("region: the statistic of a candidate is not finite", Reason.NOT_FINITE)
+    if result.curvature is not None:
+        _check_curvature(result.curvature)
+    if not isinstance(result.flags, tuple) or len(result.flags) > MAX_FLAGS or not all(map(_is_flag, result.flags)):
+        allowed = f"a tuple of at most {MAX_FLAGS} texts of at most {LONGEST_FLAG} printable characters without a comma"
+        raise Refused(f"flags: {result.flags!r:.60}; must be {allowed}")
+    return replace(result, **changed) if changed else result  # type: ignore[arg-type]
+
+
+def _budget(result: Estimate) -> Mapping[str, Array]:
+    """Return the parts of an estimate's budget, each a covariance, whose sum is its covariance."""
+    if result.budget is None:
+        return {}
+    if not isinstance(result.budget, Mapping) or not 1 <= len(result.budget) <= MAX_PARTS:
+        raise Refused(f"budget: must be 1 to {MAX_PARTS} parts by name")
+    if bad := [name for name in result.budget if not (isinstance(name, str) and name.isidentifier())]:
+        raise Refused(f"budget: part {bad[0]!r:.60}; must be a word")
+    budget = {
+        name: _covariance(part, "covariance" if name == STATED else f"budget {name}")
+        for name, part in result.budget.items()
+    }
+    whole = total(budget)
+    # Plain numbers: this is done for each estimate.
+    stated = _numbers(result.covariance, "covariance", (2, 2))
+    pairs = zip(total(result.budget).ravel().tolist(), stated.ravel().tolist(), strict=True)
+    if any(abs(one - other) > 1e-6 * abs(other) + 1e-18 for one, other in pairs):
+        raise Refused("covariance: must be the sum of the budget's parts")
+    (first, mixed), (_, second) = whole.tolist()
+    largest = max(first, second)
+    if min(first, second) <= LEAST_VARIANCE or first * second - mixed * mixed <= LEAST_SHARE * largest * largest:
+        raise Refused("covariance: singular; must have a variance in each direction")
+    return budget
+
+
+def _covariance(part: object, name: str) -> Array:
+    """Return a covariance, rad^2, symmetric but for rounding, as it is or made exact."""
+    values = _numbers(part, name, (2, 2))
+    (first, mixed), (other, second) = values.tolist()
+    size = max(abs(first), abs(mixed), abs(other), abs(second))
+    least = (first + second) / 2 - math.hypot((first - second) / 2, (mixed + other) / 2)
+    if abs(mixed - other) > ROUNDED * size or least < -ROUNDED * size:
+        shown = f"[[{first:g}, {mixed:g}], [{other:g}, {second:g}]]"
+        raise Refused(f"{name} {shown}: must be symmetric and have no negative eigenvalue")
+    if size > LARGEST_VARIANCE:
+        allowed = f"at most {LARGEST_VARIANCE:.4g} rad^2 (deg^2 times (pi / 180)^2 is rad^2)"
+        raise Refused(f"{name}: holds {size:g}; must be {allowed}")
+    return values if abs(mixed - other) <= EXACT * size else (values + values.T) / 2
+
+
+def _check_look(look: Array, normal: Array, camera: Camera) -> None:
+    """Raise `Refused` where an estimate looks far outside the frame, or sees its surface from behind."""
+    (x, y), (width, height) = look.tolist(), (camera.width, camera.height)
+    if not (-OUTSIDE * width <= x <= (1 + OUTSIDE) * width and -OUTSIDE * height <= y <= (1 + OUTSIDE) * height):
+        raise Refused(
+            f"look_px: looks at the pixel ({x:g}, {y:g}); must lie in the frame of {width} x {height} px, or near it"
+        )
+    towards = float(normal @ camera.unproject(look))
+    if math.isnan(towards):
+        raise Refused(f"look_px: the lens sees nothing at the pixel ({x:g}, {y:g})", Reason.NOT_FINITE)
+    if towards >= 0:
+        shown = " ".join(f"{value:.4g}" for value in normal.tolist())
+        raise Refused(f"the normal faces away from the camera: ({shown}); z points forward, so it is below 0 in front")
+
+
+def _check_curvature(curvature: EstimatedCurvature) -> None:
+    """Raise `Refused` where a curvature is malformed."""
+    for direction in _numbers(curvature.directions, "curvature directions", (2, 3)):
+        unit_vector(direction, "curvature direction")
+    _check_ratio(curvature.axis_ratio, "curvature axis_ratio")
+    if curvature.hypotheses is not None:
+        count = len(_numbers(curvature.hypotheses, "curvature hypotheses", (None, 2)))
+        if not 1 <= count <= MAX_CANDIDATES:
+            raise Refused(f"curvature hypotheses: must be 1 to {MAX_CANDIDATES} pairs")
+
+
+def _check_ratio(value: object, name: str) -> None:
+    if value is not None and not 0 < (ratio := _number(value, name)) <= 1:
+        raise Refused(f"{name}: {ratio:g}; must be in (0, 1]")
+
+
+def _is_flag(flag: object) -> bool:
+    """Whether a flag can stand in the results, which list several between commas."""
+    return isinstance(flag, str) and 0 < len(flag) <= LONGEST_FLAG and flag.isprintable() and "," not in flag
+
+
+def _number(value: object, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise Refused(f"{name}: must be a number")
+    if not math.isfinite(value):
+        raise Refused(f"{name} is {value}", Reason.NOT_FINITE)
+    return float(value)
+
+
+def _numbers(values: object, name: str, shape: tuple[int | None, ...]) -> Array:
+    """Return an array of finite numbers of this shape, None standing for any length; raise `Refused` for another."""
+    fits = isinstance(values, np.ndarray) and values.ndim == len(shape) and values.dtype.kind in "fiu"
+    if (
+        not isinstance(values, np.ndarray)
+        or not fits
+        or any(n not in (None, m) for n, m in zip(shape, values.shape, strict=True))
+    ):
+        raise Refused(f"{name}: must be an array of shape ({', '.join('n' if n is None else str(n) for n in shape)})")
+    # `np.isfinite` takes three times as long for a few numbers.
+    if not all(map(math.isfinite, values.ravel().tolist())):
+        raise Refused(f"{name} holds NaN or infinity", Reason.NOT_FINITE)
+    return values

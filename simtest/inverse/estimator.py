@@ -8,14 +8,13 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators.bisector import DISTANCES, is_narrow
+from simtest.estimators.bisector import DISTANCES, is_narrow, light_of_highlight
 from simtest.estimators.budget import Budget, line_covariance
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import gain_of_stiffness, sign_hypotheses
-from simtest.estimators.highlight_fit import fit_highlight, fit_small
-from simtest.estimators.isophote_family import IsophoteFamily
-from simtest.estimators.light_assignment import light_of_highlight
-from simtest.estimators.lobe_fit import LobeFit, fit_lobe
+from simtest.estimators.family import IsophoteFamily
+from simtest.estimators.highlight import fit_highlight, fit_small
+from simtest.estimators.least_squares import LobeFit, fit_lobe
 from simtest.estimators.photometric import HighlightPixels, beyond_noise, highlight_pixels
 from simtest.estimators.prior_parts import add_common_parts, light_offset_part, mean_light_part
 from simtest.estimators.protocol import Estimate, EstimatedCurvature, Law

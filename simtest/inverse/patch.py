@@ -170,7 +170,7 @@ class _Surface:
 
 @dataclass(frozen=True)
 class RenderedQuadric:
-    """A quadric patch with rendered radiance: a model for `simtest.estimators.lobe_fit.fit_lobe`.
+    """A quadric patch with rendered radiance: a model for `simtest.estimators.least_squares.fit_lobe`.
 
     The BP is P0 = d s; its normal N bisects the directions to the highlight's light and to the camera. Around it the
     surface is z + ((x, y) K (x, y)^T + q z^2) / (2 d) = 0 along N, K = d S. With q = 0 it is a paraboloid; with

@@ -12,7 +12,7 @@ import numpy as np
 from simtest.calibration import Priors
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.two_views import CLEAR, MovedView, PoseError, RankedHypotheses, rank_by_motions
+from simtest.estimators.motion_signs import CLEAR, MovedView, PoseError, RankedHypotheses, rank_by_motions
 from simtest.reconstruction.description import SpecularityRecord
 from simtest.reconstruction.motion_record import MotionRecord
 from simtest.reconstruction.tracking import TrackedFrame

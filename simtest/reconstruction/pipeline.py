@@ -16,10 +16,10 @@ from simtest.detection.detector import Detection, Detector, Kind, load_detector,
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import prepare, run_in_frame
+from simtest.estimators.names import short_names
 from simtest.estimators.prior_parts import to_base
-from simtest.estimators.process.naming import short_names
 from simtest.estimators.protocol import Target
-from simtest.estimators.small_spot import UNRESOLVED
+from simtest.estimators.small_spots import UNRESOLVED
 from simtest.geometry import Camera, Patch
 from simtest.geometry.patch import share_of_noise
 from simtest.reconstruction.assumptions import assumptions, calibration_of_view

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.estimators.two_views import PoseError
+from simtest.estimators.motion_signs import PoseError
 from simtest.geometry.vectors import rotation_of
 from simtest.reconstruction.dataset_poses import dataset_poses
 from simtest.runtime.arrays import Array

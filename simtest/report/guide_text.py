@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from simtest.estimators.descriptions import is_own
+from simtest.estimators.names import is_own
 from simtest.pages.style import estimator_order, number
 from simtest.validation.guide import BREAK_DEG, LEAST_ANSWERED, Advice, Guide, MethodFigures
 from simtest.validation.paired import LEAST_FRAMES

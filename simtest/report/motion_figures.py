@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
-from simtest.estimators.two_views import WRONG_SHARE
+from simtest.estimators.motion_signs import WRONG_SHARE
 from simtest.pages.charts import Axis, Chart, Mark, Panel
 from simtest.pages.palette import SERIES
 from simtest.pages.style import number, symbols

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from simtest.estimators.descriptions import DESCRIPTIONS
+from simtest.estimators.names import DESCRIPTIONS
 from simtest.pages import style
 from simtest.pages.charts import embedded, packed
 from simtest.pages.html import environment

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import polars as pl
 
-from simtest.estimators.process.naming import absolute_names
+from simtest.estimators.names import absolute_names
 from simtest.runtime.files import write_atomically
 from simtest.runtime.processes import Engine
 from simtest.validation.cases import Case, swept_example

@@ -9,13 +9,17 @@ import numpy as np
 
 from simtest.errors import Failure, Reason
 from simtest.estimators.dispatch import run, run_in_frame
-from simtest.estimators.process import PREFIX, is_core
-from simtest.estimators.process.child import END_S, Child
-from simtest.estimators.process.command import CoreCommand, parse_core
-from simtest.estimators.process.core import Core, Hello, hello_of
-from simtest.estimators.process.estimator import ProcessEstimator, ProcessFrameEstimator
-from simtest.estimators.process.naming import short_name
-from simtest.estimators.process.wire import PROTOCOL, CoreFault, encode
+from simtest.estimators.names import PREFIX, is_core, short_name
+from simtest.estimators.process.core import (
+    Core,
+    CoreCommand,
+    Hello,
+    ProcessEstimator,
+    ProcessFrameEstimator,
+    hello_of,
+    parse_core,
+)
+from simtest.estimators.process.pipe import END_S, PROTOCOL, Child, CoreFault, encode
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array
 from simtest.geometry.vectors import angle_deg

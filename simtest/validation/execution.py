@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from simtest.estimators import AnyEstimator, load_estimators
-from simtest.estimators.process.naming import forgive_cores
+from simtest.estimators.names import forgive_cores
 from simtest.runtime.processes import OnStep
 from simtest.spec import Experiment
 from simtest.spec.recipes import PaperSetting

@@ -4,8 +4,7 @@ import hashlib
 import json
 from pathlib import Path
 
-from simtest.estimators.installed import ESTIMATORS
-from simtest.estimators.process.naming import core_hashes
+from simtest.estimators.names import ESTIMATORS, core_hashes
 from simtest.runtime import provenance
 from simtest.runtime.files import Json
 from simtest.spec import Experiment

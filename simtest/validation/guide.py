@@ -20,7 +20,7 @@ import polars as pl
 
 from simtest.conventions import MOTION
 from simtest.errors import FAULTS
-from simtest.estimators.descriptions import is_own
+from simtest.estimators.names import is_own
 from simtest.runtime.statistics import Interval, median_interval
 from simtest.validation.paired import LEAST_FRAMES, Distinct, distinct_frames, side_by_side, targets_of
 from simtest.validation.ranking import Pair, best_of, compare

@@ -12,7 +12,7 @@ from simtest.conventions import MOTION
 from simtest.errors import Failure, Reason
 from simtest.estimators import AnyEstimator, Estimate
 from simtest.estimators.cone_axis import cone_axis
-from simtest.estimators.two_views import EXACT, MovedView, PoseError, RankedHypotheses, rank_by_motions
+from simtest.estimators.motion_signs import EXACT, MovedView, PoseError, RankedHypotheses, rank_by_motions
 from simtest.geometry.vectors import rotation
 from simtest.reconstruction.pipeline import Specularity, reconstruct
 from simtest.rendering import HighlightPoint, Session

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import polars as pl
 
-from simtest.estimators.descriptions import describe_estimators
+from simtest.estimators.names import describe_estimators
 from simtest.runtime import provenance
 from simtest.runtime.files import Json, write_atomically, write_json
 from simtest.spec import Experiment

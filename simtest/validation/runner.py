@@ -9,8 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from simtest.estimators.process import is_core
-from simtest.estimators.process.naming import close_cores, core_records
+from simtest.estimators.names import close_cores, core_records, is_core
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.files import Json
@@ -209,7 +208,7 @@ def _check_estimators(jobs: Sequence[Job]) -> dict[Path, Cores]:
     The workers load them; a finished run names none that is unknown.
     """
     if jobs:
-        from simtest.estimators.registry import load_estimators
+        from simtest.estimators.names import load_estimators
     for job in jobs:
         load_estimators(job.experiment.estimators)
     return {job.folder: core_records(job.experiment.estimators) for job in jobs}

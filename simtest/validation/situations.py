@@ -13,7 +13,7 @@ CO_LOCATED = 1e-3
 """A light nearer to the camera than this share of the distance counts as at the camera; it costs below 0.03 deg."""
 
 SMALL_SPOT_PX = 3.0
-"""Radius at half height below which isophotes carry no shape (`simtest.estimators.small_spot`)."""
+"""Radius at half height below which isophotes carry no shape (`simtest.estimators.small_spots`)."""
 
 FAR_BESIDE = 0.11
 """Light offset over distance above which a light counts as far beside the camera: 0.1, and what a tilt adds to it."""

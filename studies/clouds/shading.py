@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from simtest.calibration import Frame
-from simtest.estimators.cloud_base import ALBEDO_SLOPE, JACKKNIFE_CUBIC, LEAST_GAIN, MOST_EXTENT
+from simtest.estimators.cloud import ALBEDO_SLOPE, JACKKNIFE_CUBIC, LEAST_GAIN, MOST_EXTENT
+from simtest.estimators.cloud_light import DiffuseLight, Shading, find_spots
 from simtest.estimators.cloud_mixture import CLUMPING, fit_mixture, window_of
-from simtest.estimators.cloud_shading import DiffuseLight, Shading
-from simtest.estimators.cloud_spots import find_spots
 from simtest.geometry import Array
 from simtest.geometry.vectors import basis_across
 from studies.clouds.__main__ import tuned_tissue

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import onnx
 
-from simtest.estimators.onnx_model import METADATA
+from simtest.estimators.learned import METADATA
 
 LIMIT = 1e12
 """Above the squared Mahalanobis distance of any features."""

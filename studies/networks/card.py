@@ -20,7 +20,7 @@ from onnx import TensorProto, numpy_helper
 from simtest.dataset.index import SAMPLES
 from simtest.dataset.manifest import NAME
 from simtest.dataset.reader import open_manifest
-from simtest.estimators.onnx_model import METADATA
+from simtest.estimators.learned import METADATA
 from simtest.pages.markdown import escaped, paragraphs
 from simtest.runtime import provenance
 from simtest.runtime.files import JsonObject, write_atomically

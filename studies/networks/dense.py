@@ -8,19 +8,18 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
-from simtest.estimators.covariance_scale import CovarianceScale
-from simtest.estimators.dense_inputs import (
+from simtest.estimators.learned import LOG_RANGE, CovarianceScale, inflation
+from simtest.estimators.learned_dense import (
     CAMERA,
     DISTANCE_MM,
     DISTANCE_SCALE,
+    FORMAT,
     OUTPUTS,
     PLANES,
     ROTATION_SCALE,
     VIEWED,
+    stated_deviation,
 )
-from simtest.estimators.learned_dense import FORMAT, stated_deviation
-from simtest.estimators.spot_inputs import LOG_RANGE
-from simtest.estimators.training_range import inflation
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
 from simtest.validation.runner import Progress

@@ -13,8 +13,9 @@ from simtest.dataset.sample import Sample
 from simtest.dataset.sample_calibration import calibration_of
 from simtest.detection.detector import load_detector, run_detector
 from simtest.errors import Failure, InputError
-from simtest.estimators.dense_inputs import camera_values, dense_inputs, output_centres
-from simtest.estimators.spot_inputs import rays_of, rotation_of, spot_inputs
+from simtest.estimators.learned import rotation_of
+from simtest.estimators.learned_dense import camera_values, dense_inputs, output_centres
+from simtest.estimators.learned_spot import rays_of, spot_inputs
 from simtest.geometry import Camera
 from simtest.runtime.arrays import AnyArray, Array, Image
 from simtest.validation.runner import Progress
@@ -38,7 +39,7 @@ DENSE_FIELDS = ("image", "depth", "normal_base", INSTRUMENT)
 def read_spots(folder: Path, split: str, most: int = MOST_OF_A_FRAME, progress: Progress | None = None) -> Examples:
     """Read the highlights of a split, as detected by colour.
 
-    They are crops and extras (`simtest.estimators.spot_inputs`), rays, peaks_px; base and fine, the rotation from the
+    They are crops and extras (`simtest.estimators.learned_spot`), rays, peaks_px; base and fine, the rotation from the
     direction to the camera to the true normal, rad: of the base at the peak's pixel, of the fine surface at the only
     glint of the visible highlight that the detection shows; base_ratio and fine_ratio, abs(1 + d k) of the smaller over
     that of the larger; index, family and anatomy of the sample. NaN where a truth is not known. Raises errors as
@@ -115,9 +116,9 @@ def only_glints(sample: Sample, peaks: Array) -> Iterator[tuple[int, int]]:
 def read_dense_frames(folder: Path, split: str, progress: Progress | None = None) -> Examples:
     """Read the frames of a split.
 
-    They are planes (`simtest.estimators.dense_inputs`); rotation, from the direction to the camera to the base's normal
-    at each cell's centre, rad; distance along the ray there, mm; camera, lens and lights. NaN where a truth is not
-    known. Raises errors as `simtest.dataset.read`, and `InputError` where there is no frame.
+    They are planes (`simtest.estimators.learned_dense`); rotation, from the direction to the camera to the base's
+    normal at each cell's centre, rad; distance along the ray there, mm; camera, lens and lights. NaN where a truth
+    is not known. Raises errors as `simtest.dataset.read`, and `InputError` where there is no frame.
     """
     rows, total = [], len(sample_positions(folder, split))
     for number, sample in enumerate(read_samples(folder, split, DENSE_FIELDS)):

@@ -7,9 +7,7 @@ import torch
 from scipy.special import chdtri
 from torch import Tensor
 
-from simtest.estimators.covariance_scale import CovarianceScale
-from simtest.estimators.spot_inputs import LOG_RANGE
-from simtest.estimators.training_range import TrainingRange
+from simtest.estimators.learned import LOG_RANGE, CovarianceScale, TrainingRange
 from simtest.runtime.arrays import AnyArray, Array
 
 COVERAGE = 0.95

@@ -19,7 +19,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from simtest.errors import SimtestError
-from simtest.estimators.onnx_model import METADATA
+from simtest.estimators.learned import METADATA
 from simtest.runtime.files import JsonObject, write_atomically
 
 OPSET = 17

@@ -7,11 +7,10 @@ import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
-from simtest.estimators.covariance_scale import CovarianceScale
-from simtest.estimators.learned_spot import FORMAT, log_deviation
-from simtest.estimators.spot_inputs import (
+from simtest.estimators.learned import LOG_RANGE, CovarianceScale, inflation
+from simtest.estimators.learned_spot import (
     EXTRAS,
-    LOG_RANGE,
+    FORMAT,
     OUTPUTS,
     RATIO,
     RATIO_DEVIATION,
@@ -19,8 +18,8 @@ from simtest.estimators.spot_inputs import (
     SIDE,
     STEPS,
     SURFACES,
+    log_deviation,
 )
-from simtest.estimators.training_range import inflation
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
 from simtest.validation.runner import Progress

@@ -17,14 +17,13 @@ from typing import Any
 
 import numpy as np
 
-import simtest.estimators.brightest_point as of_peak
 from simtest.calibration import Calibration
 from simtest.calibration.photometry import NoiseModel
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.detection.colour import ColourDetector
-from simtest.estimators.bends import MEAN_BENDS, PEAK_BENDS
-from simtest.estimators.highlight_fit import fit_highlight
-from simtest.estimators.isophote_family import MEAN_RIPPLES, PEAK_RIPPLES, IsophoteFamily
+from simtest.estimators.brightest_point import OF_APEX, budget_of_peak
+from simtest.estimators.family import OF_MEAN, OF_PEAK, IsophoteFamily
+from simtest.estimators.highlight import fit_highlight
 from simtest.geometry import Array, Camera, Mask, Patch, chi_squared
 from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, run_pipeline
 from simtest.runtime.seeds import Stage, generator
@@ -55,7 +54,7 @@ BENT = 0.01
 """A bend of less tells of nothing: the code adds under 2 % of the radius."""
 
 AXES = ("mean axis", "axis at the peak", "peak")
-STATED = dict(zip(AXES, (MEAN_RIPPLES, PEAK_RIPPLES, of_peak.RIPPLES), strict=True))
+STATED = dict(zip(AXES, (OF_MEAN, OF_PEAK, OF_APEX), strict=True))
 
 
 @dataclass(frozen=True)
@@ -124,13 +123,13 @@ def _axes(number: int, field: Field, picture: str, patch: Patch) -> Iterator[See
     family = fit_highlight(patch, CAMERA, CONE_AXIS_ISOVALUES)
     if len(glints) != 1 or not isinstance(family, IsophoteFamily):
         return
-    budgets = (family.axis_budget, family.peak_budget, of_peak._budget(family))
+    budgets = (family.axis_budget, family.peak_budget, budget_of_peak(family))
     axes = (family.axis, family.peak_axis, CAMERA.unproject(patch.peak_px))
     true = CAMERA.unproject(glints[0])
-    for name, axis, budget, slope in zip(AXES, axes, budgets, (MEAN_BENDS, PEAK_BENDS, MEAN_BENDS), strict=True):
+    for name, axis, budget in zip(AXES, axes, budgets, strict=True):
         if budget is not None:
-            bends, ripples = family.bend_error(slope), family.ripple_error
-            other = sum(budget.values()) - bends - STATED[name] * ripples
+            bends, ripples = family.bend_error(STATED[name].bends), family.ripple_error
+            other = sum(budget.values()) - bends - STATED[name].ripples * ripples
             error = family.basis @ (axis - true)
             yield Seen(number, picture, name, error, other, ripples, bends, float(family.residuals.min()))
 
@@ -146,7 +145,7 @@ def _beyond(seen: Sequence[Seen], ripples: Array, bends: Array) -> Mask:
 
 
 def _stated(seen: Sequence[Seen]) -> tuple[Array, Array]:
-    return np.array([STATED[each.axis] for each in seen], dtype=float), np.ones(len(seen))
+    return np.array([STATED[each.axis].ripples for each in seen], dtype=float), np.ones(len(seen))
 
 
 def _least(seen: Sequence[Seen], of: str) -> Array:
@@ -193,7 +192,9 @@ def _table(seen: Sequence[Seen]) -> list[str]:
     for name, own in parts.items():
         bent = [each for each in own if each.bend > BENT]
         told = [_factor(own, "ripples"), _factor(own, "ripples alone"), _factor(bent, "bends") if bent else "-"]
-        made.append(f"| {name} | {len(own)} | {STATED[name]:g} | {told[0]} | {told[1]} | {len(bent)} | {told[2]} |")
+        made.append(
+            f"| {name} | {len(own)} | {STATED[name].ripples:g} | {told[0]} | {told[1]} | {len(bent)} | {told[2]} |"
+        )
     made += ["", "Coverage as stated, %:", "| picture | " + " | ".join(AXES) + " |", "|---|" + "---|" * len(AXES)]
     for picture in (*PICTURES, "all"):
         cells = []

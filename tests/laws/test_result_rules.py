@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 
 from simtest.conventions import MOTION, MOTION_COLUMNS
-from simtest.estimators.two_views import RankedHypotheses
+from simtest.estimators.motion_signs import RankedHypotheses
 from simtest.runtime.processes import make_engine
 from simtest.spec import Experiment, load_experiment
 from simtest.validation.runner import run_experiments

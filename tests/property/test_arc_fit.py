@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.errors import Failure, Reason
-from simtest.estimators.isophote_fit import FittedIsophote, fit_cut_isophote
+from simtest.estimators.isophotes import FittedIsophote, fit_cut_isophote
 from simtest.geometry import Camera, FittedArc, Patch, ellipse_of_conic, fit_arc, fit_ellipse, smooth
 from simtest.geometry.ellipse_fit import _residuals
 from tests.example_counts import examples

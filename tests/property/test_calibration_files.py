@@ -25,7 +25,7 @@ from simtest.calibration import (
 from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import InputError
-from simtest.estimators.process.requests import priors_message
+from simtest.estimators.process.messages import priors_message
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, ViewMask
 from simtest.reconstruction.assumptions import calibration_of_view
 from simtest.simulation.frame_files import picture_calibration

@@ -12,9 +12,10 @@ from simtest.estimators.circle_pose import circle_pose as circle_pose_estimator
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.dispatch import run
-from simtest.estimators.highlight_fit import fit_highlight
-from simtest.estimators.photometric import photometric, photometric_plane
+from simtest.estimators.highlight import fit_highlight
+from simtest.estimators.photometric import photometric
 from simtest.geometry import Camera, FittedArc, FittedConic, KannalaBrandt, Patch, circle_pose, fit_arc, fit_ellipse
+from simtest.validation.paper.plane_from_aside import photometric_plane
 
 ESTIMATORS = {
     "cone_axis": cone_axis,

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.estimate_check import check
-from simtest.estimators.process.answers import estimate_of, estimates_of
 from simtest.estimators.process.core import Hello, hello_of
-from simtest.estimators.process.wire import CoreFault, Message, MessageReader
+from simtest.estimators.process.messages import estimate_of, estimates_of
+from simtest.estimators.process.pipe import CoreFault, Message, MessageReader
+from simtest.estimators.protocol import check
 from simtest.geometry import Camera
 
 CAMERA = Camera.from_fov(70.0, 640, 480)

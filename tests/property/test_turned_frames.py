@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Calibration, CameraPrior, Normal, Priors, exactly
-from simtest.estimators import lobe_models, photometric, two_views
-from simtest.estimators.process import answers
+from simtest.estimators import motion_signs, photometric
+from simtest.estimators.process import messages
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, KannalaBrandt
 from simtest.geometry.vectors import basis_across, covariance_across, rotation, tangent_basis
@@ -182,11 +182,15 @@ def bases(seed):
 def test_covariances_are_turned_out_of_another_basis(seed):
     normal, basis = bases(seed)
     wanted = basis.T @ COVARIANCE @ basis
-    assert np.allclose(in_space(normal, photometric._turned(COVARIANCE, normal, basis)), wanted, atol=1e-12)
+    assert np.allclose(in_space(normal, photometric.in_tangent_basis(COVARIANCE, normal, basis)), wanted, atol=1e-12)
     assert np.allclose(covariance_across(normal, COVARIANCE), in_space(normal, COVARIANCE)[:2, :2], atol=1e-15)
     # A core states its basis with the covariance.
     fields = {"covariance": COVARIANCE.tolist(), "basis": basis.tolist()}
-    assert np.allclose(in_space(normal, answers._uncertainty(fields, normal)["covariance"]), wanted, atol=1e-12)
+    assert np.allclose(
+        in_space(normal, messages.AnsweredEstimate(normal=normal, **fields).uncertainty(normal)["covariance"]),
+        wanted,
+        atol=1e-12,
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -195,7 +199,7 @@ def test_a_further_pictures_covariance_is_turned_into_the_first_cameras_frame(se
     first_from_second = rotation(np.array([0.5, -0.8, 0.4]))
     estimate = Estimate(normal, normal[None], np.zeros(2), covariance=COVARIANCE)
     here = first_from_second @ normal
-    found = two_views._turned(estimate, first_from_second.T, here)
+    found = motion_signs._turned(estimate, first_from_second.T, here)
     wanted = first_from_second @ in_space(normal, COVARIANCE) @ first_from_second.T
     assert np.allclose(in_space(here, found), wanted, atol=1e-12)
 
@@ -203,7 +207,7 @@ def test_a_further_pictures_covariance_is_turned_into_the_first_cameras_frame(se
 def test_the_photometric_frame_turns_with_its_step():
     """The tilts whose covariance is reported are those along the frame's own axes."""
     normal, basis = bases(1)
-    model = lobe_models.ColocatedQuadric(-normal[None], np.stack([*basis, -normal]), np.zeros(3), 0.0, 50.0)
+    model = photometric.ColocatedQuadric(-normal[None], np.stack([*basis, -normal]), np.zeros(3), 0.0, 50.0)
     step = np.array([3e-4, -5e-4, 0.0, 0.0, 0.0, 0.0])
     moved = replace(model).moved(step)
     assert np.allclose(basis @ (moved.normal - normal), -step[:2], atol=1e-9)

@@ -12,8 +12,7 @@ from simtest.detection import detect
 from simtest.estimators.bisector import bisector
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
-from simtest.estimators.lobe_models import ColocatedQuadric
-from simtest.estimators.photometric import photometric
+from simtest.estimators.photometric import ColocatedQuadric, photometric
 from simtest.geometry import smooth
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct

@@ -11,8 +11,8 @@ from scipy.stats import binom
 from simtest.calibration import Calibration, Priors, exactly
 from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
+from simtest.estimators.names import load_estimators
 from simtest.estimators.prior_parts import TILT
-from simtest.estimators.registry import load_estimators
 from simtest.geometry import Camera, Patch, chi_squared, smooth
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.spec import scene_from_dict

@@ -11,9 +11,8 @@ from scipy.stats import chi2
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, NoiseModel
 from simtest.errors import Failure, Reason
 from simtest.estimators.cone_axis import cone_axis
-from simtest.estimators.lobe_fit import fit_lobe
-from simtest.estimators.lobe_models import ColocatedQuadric, PlaneFromAside
-from simtest.estimators.photometric import HighlightPixels, photometric, photometric_plane
+from simtest.estimators.least_squares import fit_lobe
+from simtest.estimators.photometric import ColocatedQuadric, HighlightPixels, photometric
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
@@ -24,6 +23,7 @@ from simtest.spec import scene_from_dict
 from simtest.spec.recipes import PaperSetting
 from simtest.validation.metrics import mahalanobis2
 from simtest.validation.paper.bound import cramer_rao_bound
+from simtest.validation.paper.plane_from_aside import PlaneFromAside, photometric_plane
 from simtest.validation.paper.published_pipeline import Pipeline
 from tests.marked import marked
 

@@ -5,8 +5,7 @@ import pytest
 from scipy import stats
 
 from simtest.calibration import Priors
-from simtest.estimators.circle_pose import CirclePoseEstimator
-from simtest.estimators.pose_uncertainty import pose_region
+from simtest.estimators.circle_pose import CirclePoseEstimator, pose_region
 from simtest.runtime.seeds import from_integer
 from simtest.spec.recipes import PaperSetting
 from simtest.validation.paper.published_pipeline import Pipeline

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from simtest.estimators.process.command import CoreCommand
+from simtest.estimators.process.core import CoreCommand
 from simtest.geometry import Camera, Patch
 
 CORES = Path(__file__).parent / "cores"

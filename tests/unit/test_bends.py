@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from simtest.calibration import LIGHT_AT_CAMERA
 from simtest.conventions import CONE_AXIS_ISOVALUES
-from simtest.estimators.bends import MEAN_BENDS, MELTED, MELTED_RESIDUAL, PEAK_BENDS, bend_variance
+from simtest.estimators.budget import MELTED, MELTED_RESIDUAL, bend_variance
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
-from simtest.estimators.family_fit import fit_isophote_family
+from simtest.estimators.family import OF_MEAN, OF_PEAK, fit_isophote_family
 from simtest.geometry import Camera, Patch, chi_squared, smooth
 from simtest.geometry.vectors import tangent_coordinates
 
@@ -56,7 +56,7 @@ def test_a_single_highlight_has_no_bend_whatever_the_noise():
     assert np.trace(melted.bend_error()) > 10 * np.trace(melted.axis_budget["noise"])
 
 
-@given(st.floats(0.001, 0.3), st.floats(0, 0.3), st.sampled_from([MEAN_BENDS, PEAK_BENDS]))
+@given(st.floats(0.001, 0.3), st.floats(0, 0.3), st.sampled_from([OF_MEAN.bends, OF_PEAK.bends]))
 def test_more_bend_is_never_less_error_and_noise_is_no_bend(residual, more, slope):
     def share(bend, noise=0.0):
         return np.sqrt(bend_variance(np.array([bend, 2 * bend]), np.array([noise, noise]), ROUND, slope) / 1e-4)
@@ -69,4 +69,4 @@ def test_more_bend_is_never_less_error_and_noise_is_no_bend(residual, more, slop
 
 
 def test_moments_that_are_none_give_no_error():
-    assert bend_variance(np.array([0.1]), np.array([0.0]), np.diag([1e-4, -1e-5]), MEAN_BENDS) == 0
+    assert bend_variance(np.array([0.1]), np.array([0.0]), np.diag([1e-4, -1e-5]), OF_MEAN.bends) == 0

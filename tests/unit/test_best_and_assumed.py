@@ -10,7 +10,7 @@ import pytest
 import simtest
 from simtest.calibration import NO_PRIORS, CameraPrior, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
-from simtest.estimators.process.requests import priors_message
+from simtest.estimators.process.messages import priors_message
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import KannalaBrandt, ViewMask
 from simtest.reconstruction.assumptions import (

@@ -11,9 +11,9 @@ from simtest.errors import Failure
 from simtest.estimators import load_estimators
 from simtest.estimators.budget import PARTS, STATED, deviations, dominant, equivalent_covariance, total
 from simtest.estimators.dispatch import run
-from simtest.estimators.photometric import photometric_plane
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Camera, Patch, smooth
+from simtest.validation.paper.plane_from_aside import photometric_plane
 
 NORMAL = np.array([0.0, 0.0, -1.0])
 CAMERA = Camera.from_fov(60.0, 32, 32)

@@ -13,7 +13,7 @@ from simtest.detection import Region, detect, estimate_noise
 from simtest.detection.detector import Detection
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.clipping import plateau_area_px
+from simtest.estimators.budget import plateau_area_px
 from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
 from simtest.reconstruction.pipeline import reconstruct, run_pipeline

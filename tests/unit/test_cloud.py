@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, Priors, Response, Uniform, exactly
 from simtest.errors import Failure, Reason
 from simtest.estimators.cloud import CloudCentre, cloud, small_sample
+from simtest.estimators.cloud_light import find_spots
 from simtest.estimators.cloud_mixture import fit_mixture, sampling_covariance, window_of
 from simtest.estimators.cloud_shape import slope_of
-from simtest.estimators.cloud_spots import find_spots
 from simtest.estimators.dispatch import run_in_frame
 from simtest.estimators.protocol import CloudEstimator
 from simtest.geometry import Camera, chi_squared

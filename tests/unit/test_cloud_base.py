@@ -8,9 +8,8 @@ import pytest
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, Priors, Response, exactly
 from simtest.errors import Failure
 from simtest.estimators import cloud as cloud_module
-from simtest.estimators.cloud import cloud
-from simtest.estimators.cloud_base import BaseEvidence
-from simtest.estimators.cloud_shading import DiffuseLight
+from simtest.estimators.cloud import BaseEvidence, cloud
+from simtest.estimators.cloud_light import DiffuseLight
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg, basis_across
 

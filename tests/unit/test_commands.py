@@ -19,9 +19,7 @@ from simtest.cli.runs import validate
 from simtest.cli.scenes import HEADINGS, names_of
 from simtest.dataset import verify as verifying
 from simtest.errors import InputError
-from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
-from simtest.estimators.installed import ESTIMATORS
-from simtest.estimators.registry import load_estimators
+from simtest.estimators.names import DESCRIPTIONS, ESTIMATORS, describe_estimators, load_estimators
 from simtest.rendering import backend
 from simtest.rendering.backend import BackendReport
 from simtest.runtime.boundary import suggestion
@@ -87,7 +85,7 @@ def test_an_estimator_without_a_docstring_has_its_modules_line(monkeypatch):
     module = types.ModuleType("own_core", "Centroid of the highlight.\n\nMore of it.")
     exec("class Own:\n    def estimate(self, patch, camera, priors): ...\nown = Own()", vars(module))
     monkeypatch.setitem(sys.modules, "own_core", module)
-    monkeypatch.setattr("simtest.estimators.registry.load_estimators", lambda names: {names[0]: module.own})
+    monkeypatch.setattr("simtest.estimators.names.load_estimators", lambda names: {names[0]: module.own})
     assert describe_estimators(["own"]) == {"own": "Centroid of the highlight."}
 
 

@@ -43,7 +43,7 @@ IN_ANSWERS = {
     "no_look": "look_px or look_ray: missing",
     "indefinite": r"covariance \[.*\]: must be symmetric",
     "target": "target 'liver'; must be fine or base",
-    "flags": "flags: ",
+    "flags": "flags .*; must be a list of words",
     "infinite_covariance": "not_finite: covariance",
     "candidates": "the first candidate must be the proposed normal",
     "basis": "basis: must be two unit vectors",

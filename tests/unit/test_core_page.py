@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 from simtest.errors import Reason
-from simtest.estimators.process.answers import estimate_of
-from simtest.estimators.process.command import PASSED, THREADS, CoreTable
-from simtest.estimators.process.core import FRAME_ARRAYS, PATCH_ARRAYS, Hello, hello_of
-from simtest.estimators.process.requests import frame_request, patch_request
-from simtest.estimators.process.wire import DTYPES, PROTOCOL, Message
+from simtest.estimators.process.core import PASSED, THREADS, CoreTable, Hello, hello_of
+from simtest.estimators.process.messages import FRAME_ARRAYS, PATCH_ARRAYS, estimate_of, frame_request, patch_request
+from simtest.estimators.process.pipe import DTYPES, PROTOCOL, Message
 from simtest.estimators.protocol import Estimate
 from simtest.validation.core_cases import core_cases
 

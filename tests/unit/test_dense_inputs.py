@@ -5,7 +5,7 @@ import pytest
 
 from simtest.calibration import Calibration, Frame, Priors, Response
 from simtest.dataset.sample import Sample
-from simtest.estimators.dense_inputs import (
+from simtest.estimators.learned_dense import (
     CAMERA,
     CELLS,
     GRID,

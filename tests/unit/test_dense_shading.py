@@ -8,7 +8,7 @@ from dense_frames import LENSES, hit, sphere_truth
 
 from simtest.calibration import Calibration
 from simtest.dataset.scoring.dense import MapOptions, Shading, score_frames
-from simtest.estimators.shading_maps import shading_maps
+from simtest.dataset.scoring.dense.shading_maps import shading_maps
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
 from tests.marked import marked

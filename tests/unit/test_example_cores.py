@@ -11,7 +11,7 @@ import pytest
 
 import simtest
 from simtest.errors import Reason
-from simtest.estimators.isophote_fit import fit_isophotes
+from simtest.estimators.isophotes import fit_isophotes
 from studies.authors_core import Agreement
 
 CORES = Path(__file__).resolve().parents[2] / "examples" / "cores"

@@ -91,8 +91,8 @@ import simtest
 from simtest.calibration import Calibration, Frame, Priors
 from simtest.detection import load_detector
 from simtest.detection.detector import DETECTORS
-from simtest.estimators.installed import ESTIMATORS
-from simtest.estimators.registry import load_estimators
+from simtest.estimators.names import ESTIMATORS
+from simtest.estimators.names import load_estimators
 from simtest.reconstruction.picture import Options, reconstruct_values
 
 camera = simtest.Camera(120, 90, 100.0, 100.0, 60.0, 45.0)

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 from test_report import make_run
 
-from simtest.estimators.descriptions import DESCRIPTIONS, describe_estimators
+from simtest.estimators.names import DESCRIPTIONS, describe_estimators
 from simtest.report import write_report
 from simtest.report.guide_text import guide_rows, method_rows, seen_sentence
 from simtest.report.pairs import pairs

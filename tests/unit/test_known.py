@@ -15,8 +15,8 @@ from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved, gain_of_stiffness
 from simtest.estimators.dispatch import run
-from simtest.estimators.family_fit import fit_isophote_family
-from simtest.estimators.peak_value import fit_peak_value
+from simtest.estimators.family import fit_isophote_family
+from simtest.estimators.isophotes import fit_peak_value
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import angle_deg, bisect, tangent_coordinates
 from simtest.reconstruction.pipeline import reconstruct

@@ -5,7 +5,7 @@ import pytest
 
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure, Reason
-from simtest.estimators import isophote_fit as base
+from simtest.estimators import isophotes as base
 from simtest.geometry import Patch
 from simtest.validation import laws
 from studies import error_ladder as ladder

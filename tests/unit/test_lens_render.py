@@ -9,7 +9,7 @@ import pytest
 from simtest.detection import detect, estimate_noise
 from simtest.errors import Failure, Reason
 from simtest.estimators.cone_axis import cone_axis
-from simtest.estimators.isophote_fit import fit_isophote_of_each
+from simtest.estimators.isophotes import fit_isophote_of_each
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, Scaramuzza, ViewMask, smooth
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct

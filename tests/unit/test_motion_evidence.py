@@ -8,9 +8,8 @@ import pytest
 
 from simtest.calibration import Normal, Priors
 from simtest.errors import Failure, Reason
-from simtest.estimators.moved_patch import FirstPicture
+from simtest.estimators.motion_signs import EXACT, WRONG_SHARE, FirstPicture, MovedView, PoseError, rank_by_motions
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
-from simtest.estimators.two_views import EXACT, WRONG_SHARE, MovedView, PoseError, rank_by_motions
 from simtest.geometry.vectors import basis_across, rotation
 from tests.marked import marked
 

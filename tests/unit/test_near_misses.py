@@ -11,7 +11,7 @@ from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, Calibration, exactly
 from simtest.dataset.maker import colour_variant
 from simtest.errors import Failure, Reason
 from simtest.estimators import load_estimators
-from simtest.estimators.near_misses import (
+from simtest.estimators.prior_parts import (
     AROUND,
     BRIGHT,
     CROWD,
@@ -215,5 +215,5 @@ def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monk
     scored = [spot.held for spot in score(session, view, Reconstruction(cut, boxes)) if spot.held is not None]
     assert np.mean(scored) > 0.85
     # Negative control: no frame is crowded.
-    monkeypatch.setattr("simtest.estimators.near_misses.CROWD", math.inf)
+    monkeypatch.setattr("simtest.estimators.prior_parts.CROWD", math.inf)
     assert shares()[2] < 0.75

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from simtest.estimators.installed import ESTIMATORS
+from simtest.estimators.names import ESTIMATORS
 from simtest.pages import palette, style
 
 # Machado, Oliveira and Fernandes (2009), severity 1, linear RGB: what a dichromat sees, as a normal observer sees it.

@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
-from simtest.estimators.family_fit import fit_isophote_family
-from simtest.estimators.isophote_family import DRIFT_CHI2, MEAN_PX2, MEAN_SHARE, MEAN_SIZE, PEAK_PX2, SUSPECT_CHI2
+from simtest.estimators.family import (
+    DRIFT_CHI2,
+    MEAN_SHARE,
+    MEAN_SIZE,
+    OF_MEAN,
+    OF_PEAK,
+    SUSPECT_CHI2,
+    fit_isophote_family,
+)
+from simtest.estimators.isophotes import weights_at_zero, weights_of_axes
 from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.lenses import KannalaBrandt
 from simtest.geometry.vectors import angle_deg
@@ -83,10 +90,10 @@ def test_a_round_lobe_aside_of_the_optical_axis_has_its_peak_where_it_is(distort
 
 def test_weights_sum_to_one_and_leave_a_common_axis():
     family = fit_isophote_family(lopsided((0.0, 0.0, 0.0)), CAMERA, ISOVALUES)
-    weights = weights_of_axes(family._crossings.conics, family._crossings.isovalues, family.px2, 2.0)
+    weights = weights_of_axes(family.conics, family.isovalues, family.px2, 2.0)
     assert weights.sum() == pytest.approx(1)
     assert angle_deg(family.peak_axis, family.axis) < 0.01 * PIXEL_DEG
-    one = family._crossings
+    one = family
     assert weights_of_axes(one.conics[:1], one.isovalues[:1], family.px2, 2.0) == pytest.approx([1])
 
 
@@ -96,8 +103,8 @@ def test_what_a_drift_adds_and_where_it_adds_nothing():
     assert list(plain.axis_budget) == ["noise", "resolution"]
     np.testing.assert_array_equal(plain.axis_budget["noise"], plain.axes_covariance[:2, :2])
     # A round lobe in white noise is left with what the grid of pixels makes.
-    np.testing.assert_allclose(plain.axis_budget["resolution"], MEAN_PX2 * plain.px2)
-    np.testing.assert_allclose(plain.peak_budget["resolution"], PEAK_PX2 * plain.px2)
+    np.testing.assert_allclose(plain.axis_budget["resolution"], OF_MEAN.px2 * plain.px2)
+    np.testing.assert_allclose(plain.peak_budget["resolution"], OF_PEAK.px2 * plain.px2)
     family = fit_isophote_family(lopsided((0.02, 0.01, 0.0), sigma=0.002), CAMERA, ISOVALUES)
     assert family.drift_is_real
     np.testing.assert_array_equal(family.axis_budget["noise"], family.axes_covariance[:2, :2])

@@ -4,7 +4,7 @@ import pytest
 
 from simtest.detection.detector import DETECTORS
 from simtest.errors import InputError
-from simtest.estimators.installed import ESTIMATORS
+from simtest.estimators.names import ESTIMATORS
 
 POINTS = {
     "simtest.estimators": ("cone_axis", "json:loads"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simtest.estimators.pose_uncertainty import _conic, _ellipse
+from simtest.estimators.circle_pose import _conic, _ellipse
 from simtest.geometry import circle_pose
 from simtest.geometry.cones import PoseRegion
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.estimators.two_views import PoseError
+from simtest.estimators.motion_signs import PoseError
 from simtest.geometry.vectors import rotation
 from simtest.reconstruction.poses import UNTOLD_ERROR, read_poses
 

@@ -10,7 +10,8 @@ from simtest.calibration import LIGHT_AT_CAMERA, CameraPrior, LogUniform, Normal
 from simtest.errors import InputError
 from simtest.estimators import prior_parts
 from simtest.estimators.budget import equivalent_variance, line_covariance
-from simtest.estimators.family_fit import fit_isophote_family
+from simtest.estimators.family import fit_isophote_family
+from simtest.estimators.names import load_estimators
 from simtest.estimators.prior_parts import (
     SPOT_ONSET,
     SPOT_SPREAD,
@@ -22,7 +23,6 @@ from simtest.estimators.prior_parts import (
     to_base,
 )
 from simtest.estimators.protocol import Estimate
-from simtest.estimators.registry import load_estimators
 from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, ViewMask, smooth
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
 

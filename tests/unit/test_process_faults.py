@@ -12,10 +12,15 @@ from simtest.calibration import NO_PRIORS, Calibration, Frame
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.dispatch import run, run_in_frame
-from simtest.estimators.process.command import CoreCommand, parse_core
-from simtest.estimators.process.core import MAX_FAULTS, Core
-from simtest.estimators.process.estimator import ProcessEstimator, ProcessFrameEstimator
-from simtest.estimators.process.wire import CoreFault
+from simtest.estimators.process.core import (
+    MAX_FAULTS,
+    Core,
+    CoreCommand,
+    ProcessEstimator,
+    ProcessFrameEstimator,
+    parse_core,
+)
+from simtest.estimators.process.pipe import CoreFault
 from tests.unit.core_helpers import CAMERA, PATCH, bad_command, processes_with, wait_until
 
 SHORT_S = 0.3
@@ -299,7 +304,7 @@ def test_a_process_with_many_open_files_has_cores_too(folder):
 
 
 def test_a_core_that_stays_after_its_input_closed_is_killed(folder, monkeypatch):
-    monkeypatch.setattr("simtest.estimators.process.child.Child.close.__defaults__", (SHORT_S,))
+    monkeypatch.setattr("simtest.estimators.process.pipe.Child.close.__defaults__", (SHORT_S,))
     command, mark = bad_command("stays")
     core = Core(command)
     core.start()
@@ -327,7 +332,7 @@ def test_an_interrupt_in_the_middle_of_a_request_ends_the_core(folder, monkeypat
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("simtest.estimators.process.child.Child._write", interrupt)
+    monkeypatch.setattr("simtest.estimators.process.pipe.Child._write", interrupt)
     with pytest.raises(KeyboardInterrupt):
         answer_of(core)
     assert wait_until(lambda: not processes_with(mark))

@@ -11,10 +11,16 @@ from simtest.calibration import NO_PRIORS, Calibration, Frame, Priors
 from simtest.calibration.priors import LogUniform, Normal, exactly
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.process.answers import estimate_of, estimates_of
 from simtest.estimators.process.core import Hello, hello_of
-from simtest.estimators.process.requests import camera_message, frame_request, patch_request, priors_message
-from simtest.estimators.process.wire import CoreFault, Message, MessageReader, encode, to_line
+from simtest.estimators.process.messages import (
+    camera_message,
+    estimate_of,
+    estimates_of,
+    frame_request,
+    patch_request,
+    priors_message,
+)
+from simtest.estimators.process.pipe import CoreFault, Message, MessageReader, encode, to_line
 from simtest.geometry import Camera, ViewMask
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt
 from simtest.geometry.vectors import basis_across

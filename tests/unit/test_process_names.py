@@ -9,8 +9,8 @@ import pytest
 import simtest
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
-from simtest.estimators.process.command import parse_core
-from simtest.estimators.process.naming import absolute_names, close_cores, core_hashes, short_names
+from simtest.estimators.names import absolute_names, close_cores, core_hashes, short_names
+from simtest.estimators.process.core import parse_core
 from tests.unit.core_helpers import BAD_CORE
 
 TABLE = """

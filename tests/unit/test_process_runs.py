@@ -18,7 +18,7 @@ from simtest.dataset.manifest import new_manifest, read_manifest
 from simtest.dataset.plan import Plan
 from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
-from simtest.estimators.process.naming import close_cores
+from simtest.estimators.names import close_cores
 from simtest.runtime.provenance import file_hash
 from simtest.spec.recipes import Dataset, PaperSetting, load_dataset
 from simtest.validation.paper.gallery_item import reproduce_command

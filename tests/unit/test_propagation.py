@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.estimators.propagation import gram, raw_moves
+from simtest.estimators.budget import gram, raw_moves
 from simtest.geometry import smooth
 
 SIZE, SMOOTHING = 41, 2.0

@@ -123,7 +123,7 @@ def test_a_picture_is_reconstructed_without_slow_packages(known, tmp_path):
 
 def test_estimators_that_are_registered():
     from simtest.detection.detector import DETECTORS
-    from simtest.estimators.installed import ESTIMATORS
+    from simtest.estimators.names import ESTIMATORS
     from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS
 
     registered = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]

@@ -11,7 +11,7 @@ import pytest
 from simtest.errors import Reason
 from simtest.estimators.budget import PARTS, STATED
 from simtest.estimators.protocol import Estimate
-from simtest.estimators.small_spot import UNRESOLVED
+from simtest.estimators.small_spots import UNRESOLVED
 from simtest.reconstruction.explanations import FLAGS
 from simtest.runtime.files import DEFAULTS
 from simtest.spec import Scene

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.estimators.reflection_check import RELIEF_RAD, reflection_distances
+from simtest.estimators.learned import RELIEF_RAD, reflection_distances
 from simtest.geometry.vectors import tangent_basis
 
 LIGHTS = np.array([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0]])

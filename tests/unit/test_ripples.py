@@ -8,9 +8,9 @@ from simtest.calibration import LIGHT_AT_CAMERA
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
 from simtest.estimators.brightest_point import brightest_point
+from simtest.estimators.budget import HARMONICS, excess, ripples, spectrum
 from simtest.estimators.cone_axis import cone_axis
-from simtest.estimators.family_fit import fit_isophote_family
-from simtest.estimators.ripples import HARMONICS, excess, ripples, spectrum
+from simtest.estimators.family import fit_isophote_family
 from simtest.geometry import Camera, Patch, chi_squared, smooth
 from simtest.geometry.vectors import tangent_coordinates
 

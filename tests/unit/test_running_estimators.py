@@ -17,8 +17,7 @@ from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import ConeAxis
 from simtest.estimators.dispatch import run, run_each, run_in_frame
-from simtest.estimators.estimate_check import check
-from simtest.estimators.protocol import EstimatedCurvature
+from simtest.estimators.protocol import EstimatedCurvature, check
 from simtest.geometry import Camera, Patch, smooth
 from simtest.reconstruction.description import describe
 from simtest.reconstruction.pipeline import reconstruct, run_pipeline

@@ -11,14 +11,14 @@ from simtest.calibration import Calibration, Frame
 from simtest.calibration.photometry import AngularProfile
 from simtest.errors import Failure, Reason
 from simtest.estimators.brightest_point import brightest_point
+from simtest.estimators.budget import plateau_area_px
 from simtest.estimators.circle_pose import circle_pose
-from simtest.estimators.clipping import plateau_area_px
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
-from simtest.estimators.family_fit import fit_isophote_family
-from simtest.estimators.highlight_fit import fit_highlights
+from simtest.estimators.family import fit_isophote_family
+from simtest.estimators.highlight import fit_highlights
 from simtest.estimators.photometric import photometric
-from simtest.estimators.small_spot import fit_small_spots, is_small, radius_before_smoothing_px
+from simtest.estimators.small_spots import fit_small_spots, is_small, radius_before_smoothing_px
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import angle_deg
 

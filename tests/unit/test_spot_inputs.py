@@ -4,16 +4,8 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Calibration, Frame, Priors
-from simtest.estimators.spot_inputs import (
-    EXTRAS,
-    SIDE,
-    STEPS,
-    image_basis,
-    median_of_lit,
-    normal_of,
-    rotation_of,
-    spot_inputs,
-)
+from simtest.estimators.learned import image_basis, median_of_lit, normal_of, rotation_of
+from simtest.estimators.learned_spot import EXTRAS, SIDE, STEPS, spot_inputs
 from simtest.geometry import Camera
 
 WIDTH = 121

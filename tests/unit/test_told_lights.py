@@ -9,7 +9,7 @@ import simtest
 from simtest.calibration import Priors, exactly
 from simtest.errors import InputError
 from simtest.estimators.prior_parts import mean_light_part, told_light_part
-from simtest.estimators.process.requests import priors_message
+from simtest.estimators.process.messages import priors_message
 from simtest.geometry import Array
 from simtest.geometry.vectors import basis_across, bisect
 from simtest.spec.calibration_file import load_calibration, save_calibration

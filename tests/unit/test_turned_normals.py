@@ -2,9 +2,8 @@
 
 import numpy as np
 
+from simtest.estimators.learned import normal_of, turned_normals
 from simtest.estimators.learned_dense import interpolated
-from simtest.estimators.spot_inputs import normal_of
-from simtest.estimators.turned_normals import turned_normals
 from simtest.geometry.vectors import tangent_coordinates
 
 

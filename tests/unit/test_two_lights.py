@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Priors, exactly
-from simtest.estimators.bisector import bisector
-from simtest.estimators.highlight_fit import fit_highlight
-from simtest.estimators.light_assignment import ALONE, light_of_highlight
+from simtest.estimators.bisector import ALONE, bisector, light_of_highlight
+from simtest.estimators.highlight import fit_highlight
 from simtest.geometry import Camera
 from tests.unit.core_helpers import PATCH
 
@@ -55,7 +54,7 @@ def test_neighbours_on_rough_tissue_seldom_choose_one_of_two_lights(monkeypatch)
     # A sixth of the neighbours lies along the lights' line; a ninth of those stands alone. Bound: 3 deviations above.
     assert chosen() < 1 / 6 / ALONE**2 + 3 * np.sqrt(1 / 6 / ALONE**2 / len(fields))
     # Negative control: the same fields choose where nothing stands alone.
-    monkeypatch.setattr("simtest.estimators.light_assignment.ALONE", 1.0)
+    monkeypatch.setattr("simtest.estimators.bisector.ALONE", 1.0)
     assert chosen() > 0.11
 
 
@@ -74,5 +73,5 @@ def test_neighbours_on_rough_tissue_hardly_ever_choose_one_of_three_lights(monke
     for others, light in ((group, 0), ([*group, (0, 250)], 0), ([*group, (0, 100)], None)):
         assert light_of_highlight(replace(fitted, patch=among(others)), three) == light
     # Negative control.
-    monkeypatch.setattr("simtest.estimators.light_assignment.ALONE", 1.0)
+    monkeypatch.setattr("simtest.estimators.bisector.ALONE", 1.0)
     assert chosen() >= 9

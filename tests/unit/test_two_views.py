@@ -10,8 +10,8 @@ from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Normal, Priors, ex
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved, sign_hypotheses
+from simtest.estimators.motion_signs import rank_by_motion
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
-from simtest.estimators.two_views import rank_by_motion
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer

@@ -11,8 +11,7 @@ from simtest.dataset.scoring.record import Record
 from simtest.dataset.scoring.table_file import COVARIANCE, NORMAL, PIXEL, SECOND, Table, read_table
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
-from simtest.estimators.estimate_check import check
-from simtest.estimators.protocol import Target
+from simtest.estimators.protocol import Target, check
 from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array, Mask
 from simtest.spec.camera import CameraSpec

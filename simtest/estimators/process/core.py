@@ -1,126 +1,208 @@
-"""A core: its greeting, its requests, and what becomes of it when it breaks down."""
+"""Cores: how a user names one, its life with one request after the other, and the estimators that it is."""
 
 import atexit
 import errno
 import itertools
 import os
+import re
+import shlex
+import shutil
 import threading
 import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy.typing as npt
+from pydantic import Field
 
-from simtest.errors import InputError, Reason
-from simtest.estimators.process import files
-from simtest.estimators.process.child import Child
-from simtest.estimators.process.command import CoreCommand, parse_core
-from simtest.estimators.process.wire import PROTOCOL, CoreFault, Message, broken, encode, excerpt
+from simtest.calibration import NO_PRIORS, Frame, Priors
+from simtest.errors import Failure, InputError, Reason
+from simtest.estimators.names import PREFIX
+from simtest.estimators.process.messages import (
+    Hello,
+    estimate_of,
+    estimates_of,
+    frame_request,
+    hello_of,
+    patch_request,
+    shown_value,
+)
+from simtest.estimators.process.pipe import PROTOCOL, Child, CoreFault, Message, broken, encode, exchange_files
+from simtest.estimators.protocol import Estimate
+from simtest.geometry import Camera, Patch
 from simtest.runtime import provenance
+from simtest.spec.spec_model import Spec, validate
+from simtest.spec.toml_files import read_toml
 
-PATCH_ARRAYS = ("values", "raw", "noise", "saturated", "seen", "rays")
-FRAME_ARRAYS = ("encoded", "channels", "intensity", "smoothed", "noise", "clipped", "seen", "rays")
-OUTLINES = ("isophote_", "isophote_rays_")
-"""Names of the arrays of an isovalue, without it."""
+TIME_LIMIT_S = 10.0
+START_LIMIT_S = 60.0
 
-MAX_ISOPHOTES = 16
+PASSED = ("PATH", "HOME", "LANG", "LD_LIBRARY_PATH")
+"""Environment variables that every core sees, beside the locale (LC_*), TMPDIR and the numbers of threads."""
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+INTERPRETERS = re.compile(r"(python|pypy|octave|matlab|julia|java|node|ruby|perl|Rscript|bash|sh|env)([-0-9.]|$)")
+"""Names of programs that run a file, by how they begin."""
+
+SCRIPTS = {".py": "python", ".m": "octave-cli", ".jl": "julia", ".js": "node", ".R": "Rscript", ".sh": "bash"}
+"""What runs a script, by the end of its name."""
+
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$"
+
+
+class CoreTable(Spec):
+    """The table ``core`` of a core's TOML file."""
+
+    name: str = Field(pattern=_NAME, description="name in results, in tables and on pages")
+    command: str = Field(min_length=1, max_length=4096, description="program and arguments, as in a shell")
+    time_limit_s: float = Field(TIME_LIMIT_S, ge=0.01, le=3600, description="for each request, s")
+    start_limit_s: float = Field(START_LIMIT_S, ge=0.01, le=3600, description="from the start to the greeting, s")
+    environment: tuple[str, ...] = Field((), description="names of further environment variables that it sees")
+    kind: Literal["patch", "frame"] | None = Field(None, description="what its greeting must say that it takes")
+    files: tuple[str, ...] = Field((), max_length=1000, description="further files it reads: modules, weights")
+
+
+class CoreFile(Spec):
+    """A core's TOML file."""
+
+    core: CoreTable
+
+
+@dataclass(frozen=True)
+class CoreCommand:
+    """How a core is started."""
+
+    text: str  # as the user named it
+    name: str  # of the estimator
+    arguments: tuple[str, ...]  # program and arguments; those that name files are absolute
+    # The program and the files that arguments name, and those of the TOML file and itself, if any.
+    files: tuple[Path, ...]
+    # time_limit_s, start_limit_s: for a request, and for the start.
+    time_limit_s: float = TIME_LIMIT_S
+    start_limit_s: float = START_LIMIT_S
+    environment: tuple[str, ...] = ()  # names of environment variables that are passed on beside `PASSED`
+    kind: Literal["patch", "frame"] | None = None  # what the core must be
+
+    @property
+    def short(self) -> str:
+        """Name in results."""
+        return self.name
+
+    @property
+    def absolute(self) -> str:
+        """The same core under a name that means the same in every folder."""
+        if not self.text.startswith(PREFIX):
+            return str(self.files[-1])
+        # A program that is found on PATH stays one, since the core's name depends on it.
+        program = shlex.split(self.text.removeprefix(PREFIX))[0]
+        return f"{PREFIX} {shlex.join((program if '/' not in program else self.arguments[0], *self.arguments[1:]))}"
+
+    def hashes(self) -> dict[str, str]:
+        """Return the SHA-256 of each of the files, by path."""
+        return {str(file): provenance.file_hash(file) for file in self.files}
+
+    def signature(self) -> tuple[object, ...]:
+        """Return what changes when one of the files does, found without reading them."""
+        found = (file.stat() for file in self.files)
+        return (self, *((each.st_ino, each.st_size, each.st_mtime_ns) for each in found))
+
+    def variables(self) -> dict[str, str]:
+        """Return the core's environment, without TMPDIR."""
+        names = (*PASSED, *THREADS, *self.environment, *(name for name in os.environ if name.startswith("LC_")))
+        passed = {name: os.environ[name] for name in names if name in os.environ}
+        # A worker's share of the cores.
+        share = os.environ.get("SIMTEST_THREADS")
+        return {name: share for name in THREADS if share} | passed
+
+
+def parse_core(text: str) -> CoreCommand:
+    """Read a core's name: ``command: PROGRAM ARGUMENT...``, or the path of a TOML file with a table ``core``.
+
+    Arguments that name existing files become absolute. Relative ones are looked for in the current folder; those of a
+    TOML file in that file's folder.
+    """
+    if text.startswith(PREFIX):
+        arguments, files, name = _resolved(text, text.removeprefix(PREFIX), Path.cwd())
+        return CoreCommand(text, name, arguments, files)
+    path = Path(text)
+    table = validate(CoreFile, read_toml(path), str(path)).core
+    folder = path.absolute().parent
+    arguments, files, _ = _resolved(f"{text}: core.command", table.command, folder)
+    further = tuple(_further(text, folder, name) for name in table.files)
+    stated = table.model_dump(include={"name", "time_limit_s", "start_limit_s", "environment", "kind"})
+    files = (*dict.fromkeys((*files, *further)), path.absolute())
+    return CoreCommand(text, arguments=arguments, files=files, **stated)
+
+
+def _further(text: str, folder: Path, name: str) -> Path:
+    """Return the absolute path of a file that a TOML file lists; raise `InputError` where it is none."""
+    file = Path(os.path.normpath(folder / name))
+    if not _exists(file) or not file.is_file():
+        raise InputError(f"{text}: core.files: {name} is no file in {folder}; must be a file")
+    return file
+
+
+def _resolved(text: str, command: str, folder: Path) -> tuple[tuple[str, ...], tuple[Path, ...], str]:
+    """Return a command's absolute arguments, the files among them, and the name that they give it."""
+    what = f"estimator {text!r:.120}"
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise InputError(f"{what}: cannot be split into words ({error})") from None
+    if not words or not words[0]:
+        raise InputError(f"{what}: names no program; must be {PREFIX!r}, a program and its arguments")
+    if "\0" in command:
+        raise InputError(f"{what}: holds a zero byte; must be text")
+    program = _program(what, words[0], folder)
+    arguments, files = [str(program)], [program]
+    for word in words[1:]:
+        option, equals, value = word.rpartition("=") if word.startswith("-") else ("", "", word)
+        found = folder / value if value and _exists(folder / value) else None
+        arguments.append(word if found is None else f"{option}{equals}{os.path.normpath(found)}")
+        if found is not None and found.is_file():
+            files.append(Path(os.path.normpath(found)))
+    named = [file for file in files[1:] if str(file) in arguments]
+    # A program of the user's own has a name; what runs a script has that of the script.
+    source = named[0] if named and ("/" not in words[0] or INTERPRETERS.match(program.name)) else program
+    name = re.sub("[^A-Za-z0-9_.-]+", "_", source.stem).lstrip("_.-")[:40]
+    return tuple(arguments), tuple(dict.fromkeys(files)), name or "core"
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        # Longer than a name may be, for one: then it names no file.
+        return False
+
+
+def _program(what: str, word: str, folder: Path) -> Path:
+    """Return the absolute path of a program; raise `InputError` where it is missing or cannot be run."""
+    path, is_path = folder / word, "/" in word or word in (".", "..")
+    # Links stay: a virtual environment's Python is one.
+    if found := shutil.which(str(path) if is_path else word):
+        return Path(os.path.abspath(found))
+    interpreter = SCRIPTS.get(Path(word).suffix)
+    called = interpreter and f'a script is called with what runs it: "{interpreter} {word!s:.80}"'
+    if not is_path:
+        # A directory of the name beside the user is no program, but a likely mistake.
+        near = f" ({called or 'a program in this folder is named ./ and its name'})" if _exists(path) else ""
+        raise InputError(f"{what}: no program {word!r:.80} on PATH{near}")
+    if not _exists(path):
+        raise InputError(f"{what}: {word!s:.200} does not exist; must be a program")
+    if not path.is_file():
+        raise InputError(f"{what}: {word!s:.200} is a {'folder' if path.is_dir() else 'device'}; must be a program")
+    raise InputError(f"{what}: {word!s:.200} is not executable; must be a program ({called or 'chmod +x'})")
+
+
 MAX_FAULTS = 5
 """After so many faults in a row a core is not started again."""
 
 KEPT_CORES = 8
 """Cores that are kept at once; the one that was named last stays longest."""
-
-
-@dataclass(frozen=True)
-class Hello:
-    """A core's greeting: what it is and what it wants.
-
-    Parameters
-    ----------
-    name, version : str
-        What the core calls itself.
-    kind : {"patch", "frame"}
-        Whether it takes single highlights or whole frames.
-    transport : {"stream", "files"}
-        How arrays are handed over.
-    arrays : tuple of str
-        Names of the arrays that it wants.
-    isophotes : tuple of float
-        Isovalues of the isophotes that it wants.
-    target : {"fine", "base"}
-        Which surface's normals it states where an estimate does not say so.
-    """
-
-    name: str
-    version: str
-    kind: Literal["patch", "frame"]
-    transport: Literal["stream", "files"] = "stream"
-    arrays: tuple[str, ...] = ()
-    isophotes: tuple[float, ...] = ()
-    target: Literal["fine", "base"] = "fine"
-
-
-def outline_names(level: float) -> tuple[str, str]:
-    """Return the names of the arrays of an isovalue: the isophote's points, px, and their sightlines."""
-    return f"{OUTLINES[0]}{level:g}", f"{OUTLINES[1]}{level:g}"
-
-
-def hello_of(header: Mapping[str, Any]) -> Hello:
-    """Read a core's greeting; raise `CoreFault` where it is malformed."""
-    if header.get("type") != "hello":
-        raise broken(f"the first line is of type {_told(header.get('type'))}; must be hello")
-    if header.get("protocol") != PROTOCOL or isinstance(header.get("protocol"), bool):
-        raise broken(f"hello: protocol {_told(header.get('protocol'))}; simtest speaks {PROTOCOL}")
-    name, version = header.get("name"), header.get("version", "")
-    if not isinstance(name, str) or not 0 < len(name) <= 80 or not name.isprintable():
-        raise broken(f"hello: name {_told(name)}; must be text of 1 to 80 characters")
-    if not isinstance(version, str | int | float) or len(str(version)) > 80 or not str(version).isprintable():
-        raise broken(f"hello: version {_told(version)}; must be text of at most 80 characters")
-    kind = header.get("kind")
-    if kind not in ("patch", "frame"):
-        raise broken(f"hello: kind {_told(kind)}; must be patch or frame")
-    transport = header.get("transport", "stream")
-    if transport not in ("stream", "files"):
-        raise broken(f"hello: transport {_told(transport)}; must be stream or files")
-    target = header.get("target", "fine")
-    if target not in ("fine", "base"):
-        raise broken(f"hello: target {_told(target)}; must be fine or base")
-    levels = _levels(header.get("isophotes", []), kind)
-    return Hello(name, str(version), kind, transport, _wanted(header.get("arrays"), kind, levels), levels, target)
-
-
-def _levels(given: object, kind: str) -> tuple[float, ...]:
-    """Return the isovalues of a greeting."""
-    listed: list[Any] = given if isinstance(given, list) else [None]
-    good = all(isinstance(t, int | float) and not isinstance(t, bool) and 0 < t < 1 for t in listed)
-    if not good or len(listed) > MAX_ISOPHOTES or (listed and kind == "frame"):
-        allowed = "none, since a frame has no peak" if kind == "frame" else f"at most {MAX_ISOPHOTES} numbers in (0, 1)"
-        raise broken(f"hello: isophotes {_told(given)}; must be {allowed}")
-    if len({outline_names(level) for level in listed}) < len(set(listed)):
-        raise broken(
-            f"hello: isophotes {_told(given)}; must differ in their first six digits, by which arrays are named"
-        )
-    return tuple(float(t) for t in listed)
-
-
-def _wanted(given: object, kind: str, levels: tuple[float, ...]) -> tuple[str, ...]:
-    """Return the names of the wanted arrays; an isovalue of which none is named gets both of its own."""
-    offered = PATCH_ARRAYS if kind == "patch" else FRAME_ARRAYS
-    outlines = [outline_names(level) for level in levels]
-    allowed = (*offered, *itertools.chain.from_iterable(outlines))
-    if given is None:
-        given = ["values" if kind == "patch" else "intensity"]
-    if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
-        raise broken(f"hello: arrays {_told(given)}; must be a list of names")
-    if unknown := next((name for name in given if name not in allowed), None):
-        raise broken(f"hello: array {_told(unknown)}; must be one of {', '.join(allowed)}")
-    unnamed = [name for pair in outlines if not set(pair) & set(given) for name in pair]
-    return tuple(dict.fromkeys([*given, *unnamed]))
-
-
-def _told(value: object) -> str:
-    return excerpt(repr(value).encode("utf-8", "replace"), 60)
 
 
 class Core:
@@ -147,10 +229,7 @@ class Core:
     def start(self) -> Hello:
         """Start the core, if it does not run, and return its greeting.
 
-        Raises
-        ------
-        CoreFault
-            If it does not start, or greets otherwise than it must.
+        Raises `CoreFault` if it does not start, or greets otherwise than it must.
         """
         with self._lock:
             if self._child is not None and self._child.owner == os.getpid():
@@ -163,10 +242,13 @@ class Core:
                 if error.errno == errno.ENOEXEC:
                     what += "; must be a compiled program, or a script with #! in its first line"
                 raise CoreFault(Reason.CORE_DIED, what) from error
-            greeting = {"type": "hello", "protocol": PROTOCOL, "simtest": provenance.version()}
+            greeting, kind = {"type": "hello", "protocol": PROTOCOL, "simtest": provenance.version()}, self.command.kind
             try:
                 hello = hello_of(self._child.exchange(encode(greeting, {}), self.command.start_limit_s).header)
-                self._check(hello)
+                if kind is not None and hello.kind != kind:
+                    raise broken(f"hello: kind {hello.kind}; {self.command.text} says {kind}")
+                if self.hello is not None and hello != self.hello:
+                    raise broken("hello: differs from that of the first start")
             except BaseException:
                 self._end()
                 raise
@@ -177,22 +259,18 @@ class Core:
     def ask(self, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> Message:
         """Send a request, which gets a number of its own, and return the answer to it.
 
-        Raises
-        ------
-        CoreFault
-            If the core breaks down or breaks the protocol. It has been ended then, and the next request starts it anew.
+        Raises `CoreFault` if the core breaks down or breaks the protocol. It has been ended then, and the next request
+        starts it anew.
         """
         with self._lock:
             if self._faults >= MAX_FAULTS and self._last is not None:
                 raise CoreFault(self._last.reason, f"not asked after {MAX_FAULTS} faults in a row: {self._last.detail}")
             try:
                 answer = self._asked(header, arrays, next(self._numbers))
-            except CoreFault as fault:
-                self._faults, self._last = self._faults + 1, fault
-                self._end()
-                raise
-            except BaseException:
-                # Ctrl-C in the middle of a message, of which the rest would be taken for the next answer.
+            except BaseException as error:
+                if isinstance(error, CoreFault):
+                    self._faults, self._last = self._faults + 1, error
+                # Also at Ctrl-C in the middle of a message, of which the rest would be taken for the next answer.
                 self._end()
                 raise
             self._faults = 0
@@ -225,36 +303,23 @@ class Core:
         child = self._child
         assert child is not None
         child.check_silent()
-        kind, rest = header["type"], {key: value for key, value in header.items() if key != "type"}
-        request = {"type": kind, "id": number, **rest}
+        request = {"type": header["type"], "id": number, **header}
         if hello.transport == "files":
-            answer = files.exchange(child, request, arrays, self.command.time_limit_s)
+            answer = exchange_files(child, request, arrays, self.command.time_limit_s)
         else:
             answer = child.exchange(encode(request, arrays), self.command.time_limit_s)
-        _check_answer(answer.header, number, hello.kind)
+        given, stated = answer.header.get("id"), answer.header.get("type")
+        if given != number or isinstance(given, bool):
+            raise broken(f"an answer with id {shown_value(given)} to request {number}")
+        allowed = ("estimate" if hello.kind == "patch" else "estimates", "failure")
+        if stated not in allowed:
+            raise broken(f"an answer of type {shown_value(stated)}; must be {' or '.join(allowed)}")
         return answer
-
-    def _check(self, hello: Hello) -> None:
-        """Raise `CoreFault` where a greeting is not that of this core."""
-        if self.command.kind is not None and hello.kind != self.command.kind:
-            raise broken(f"hello: kind {hello.kind}; {self.command.text} says {self.command.kind}")
-        if self.hello is not None and hello != self.hello:
-            raise broken("hello: differs from that of the first start")
 
     def _end(self) -> None:
         child, self._child = self._child, None
         if child is not None:
             child.kill()
-
-
-def _check_answer(header: Mapping[str, Any], number: int, kind: str) -> None:
-    """Raise `CoreFault` where an answer is not that to the request of this number, or of a type that is none."""
-    given, stated = header.get("id"), header.get("type")
-    if given != number or isinstance(given, bool):
-        raise broken(f"an answer with id {_told(given)} to request {number}")
-    allowed = ("estimate" if kind == "patch" else "estimates", "failure")
-    if stated not in allowed:
-        raise broken(f"an answer of type {_told(stated)}; must be {' or '.join(allowed)}")
 
 
 _started: "weakref.WeakSet[Core]" = weakref.WeakSet()
@@ -299,3 +364,57 @@ def forgive_cores() -> None:
     """Count the faults of all cores of this process from 0 again."""
     for core in list(_started):
         core.forgive()
+
+
+@dataclass(frozen=True)
+class _Process:
+    """What both kinds share."""
+
+    core: Core = field(repr=False)  # started once at least, so that its greeting is known
+
+    @property
+    def description(self) -> str:
+        """What the core is, in one line for a reader who chooses an estimator."""
+        hello = self._hello
+        version = f" {hello.version}" if hello.version else ""
+        return f"A core of its own process: {hello.name}{version}, {self.core.command.text}."
+
+    @property
+    def _hello(self) -> Hello:
+        assert self.core.hello is not None
+        return self.core.hello
+
+
+@dataclass(frozen=True)
+class ProcessEstimator(_Process):
+    """A core that takes single highlights."""
+
+    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
+        """Ask the core (see `simtest.estimators.Estimator`); its breakdown is a Failure ``core_...``."""
+        try:
+            answer = self.core.ask(*patch_request(patch, camera, priors, self._hello))
+        except CoreFault as fault:
+            return Failure(fault.reason, fault.detail)
+        return estimate_of(answer, camera, self._hello)
+
+
+@dataclass(frozen=True)
+class ProcessFrameEstimator(_Process):
+    """A core that takes whole frames."""
+
+    def estimate_frame(
+        self, frame: Frame, camera: Camera, priors: Priors = NO_PRIORS
+    ) -> list[Estimate | Failure] | Failure:
+        """Ask the core (see `simtest.estimators.FrameEstimator`); its breakdown is a Failure ``core_...``."""
+        try:
+            answer = self.core.ask(*frame_request(frame, camera, priors, self._hello))
+        except CoreFault as fault:
+            return Failure(fault.reason, fault.detail)
+        return estimates_of(answer, camera, self._hello)
+
+
+def load_core(text: str) -> ProcessEstimator | ProcessFrameEstimator:
+    """Start a core, if it does not run in this process already, and return it as an estimator."""
+    core = kept_core(text)
+    assert core.hello is not None
+    return ProcessEstimator(core) if core.hello.kind == "patch" else ProcessFrameEstimator(core)

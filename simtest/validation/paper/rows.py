@@ -10,12 +10,13 @@ import polars as pl
 from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, Estimate, Estimator, load_estimators
 from simtest.estimators.circle_pose import CirclePoseEstimator
-from simtest.estimators.photometric import Photometric, photometric_plane
+from simtest.estimators.photometric import Photometric
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime.seeds import from_integer
 from simtest.spec.recipes import PaperSetting
 from simtest.validation.columns import SCHEMA, Row, Value
 from simtest.validation.metrics import mahalanobis2
+from simtest.validation.paper.plane_from_aside import photometric_plane
 from simtest.validation.paper.published_pipeline import Pipeline
 from simtest.validation.paper.smoothing import smoothing_bias
 

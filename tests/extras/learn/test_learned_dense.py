@@ -14,18 +14,17 @@ from simtest.calibration import Calibration, Frame, Priors, Response
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
 from simtest.estimators import learned_dense as learned_dense_module
-from simtest.estimators.dense_inputs import (
+from simtest.estimators.learned import METADATA, TrainingRange, inflation, normal_of, rotation_of
+from simtest.estimators.learned_dense import (
     CAMERA,
     CELLS,
     DISTANCE_MM,
+    LearnedDense,
     camera_values,
     dense_inputs,
     output_centres,
+    stated_deviation,
 )
-from simtest.estimators.learned_dense import LearnedDense, stated_deviation
-from simtest.estimators.onnx_model import METADATA
-from simtest.estimators.spot_inputs import normal_of, rotation_of
-from simtest.estimators.training_range import TrainingRange, inflation
 from simtest.geometry import BrownConrady, Camera
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.learned_maps import learned_maps

@@ -13,11 +13,8 @@ import torch
 from simtest.calibration import Calibration, Priors
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
-from simtest.estimators.covariance_scale import CovarianceScale
-from simtest.estimators.learned_spot import LearnedSpot, log_deviation
-from simtest.estimators.onnx_model import METADATA
-from simtest.estimators.spot_inputs import EXTRAS, rays_of, spot_inputs
-from simtest.estimators.training_range import TrainingRange, inflation
+from simtest.estimators.learned import METADATA, CovarianceScale, TrainingRange, inflation
+from simtest.estimators.learned_spot import EXTRAS, LearnedSpot, log_deviation, rays_of, spot_inputs
 from simtest.geometry import BrownConrady, Camera
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import run_pipeline

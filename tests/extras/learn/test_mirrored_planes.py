@@ -7,7 +7,7 @@ import torch
 from test_dense_inputs import LIGHTS, frame
 
 from simtest.dataset.sample import Sample
-from simtest.estimators.dense_inputs import (
+from simtest.estimators.learned_dense import (
     dense_inputs,
     output_centres,
 )

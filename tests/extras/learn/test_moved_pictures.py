@@ -6,11 +6,8 @@ import test_spot_inputs
 import torch
 from test_spot_inputs import LIGHTS, PEAK, WIDTH, frame
 
-from simtest.estimators.spot_inputs import (
-    rays_of,
-    rotation_of,
-    spot_inputs,
-)
+from simtest.estimators.learned import rotation_of
+from simtest.estimators.learned_spot import rays_of, spot_inputs
 from studies.networks.spots import moved as moved_batch
 
 picture = test_spot_inputs.picture

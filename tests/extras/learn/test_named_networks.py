@@ -7,9 +7,9 @@ import pytest
 from simtest.bench.run import core_record
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
-from simtest.estimators.installed import ESTIMATORS
-from simtest.estimators.learned_spot import SHIPPED
-from simtest.estimators.process.naming import absolute_names, core_hashes, core_records, short_names
+from simtest.estimators.learned import WEIGHTS
+from simtest.estimators.learned_spot import LearnedSpot
+from simtest.estimators.names import ESTIMATORS, absolute_names, core_hashes, core_records, short_names
 from simtest.runtime.provenance import file_hash
 from simtest.runtime.resources import data_root
 
@@ -18,7 +18,9 @@ from simtest.runtime.resources import data_root
 def own(tmp_path, monkeypatch):
     """Return the shipped network's copy in a folder of its own."""
     (tmp_path / "models" / "spots").mkdir(parents=True)
-    shutil.copy(data_root("scenes").joinpath(*SHIPPED), tmp_path / "models" / "spots" / "model.onnx")
+    shutil.copy(
+        data_root("scenes").joinpath(*WEIGHTS, LearnedSpot.shipped), tmp_path / "models" / "spots" / "model.onnx"
+    )
     monkeypatch.chdir(tmp_path)
     return "learned_spot:models/spots/model.onnx"
 

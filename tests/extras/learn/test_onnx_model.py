@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from simtest.errors import InputError, SimtestError
-from simtest.estimators import onnx_model
-from simtest.estimators.onnx_model import METADATA, OnnxModel
-from simtest.estimators.training_range import TrainingRange
+from simtest.estimators import learned
+from simtest.estimators.learned import METADATA, OnnxModel, TrainingRange
 from studies.networks import onnx_file
 from studies.networks.fitted import fitted_range
 
@@ -134,7 +133,7 @@ def test_files_that_cannot_be_a_network_are_told_in_one_line(line, tmp_path, mon
         with pytest.raises(InputError, match=rf"{name}.onnx: {said}") as raised:
             OnnxModel(tmp_path / f"{name}.onnx", FORM, "line")
         assert "\n" not in str(raised.value)
-    monkeypatch.setattr(onnx_model, "LARGEST_MODEL_BYTES", 1000)
+    monkeypatch.setattr(learned, "LARGEST_MODEL_BYTES", 1000)
     with pytest.raises(InputError, match=r"line.onnx: has \d+ bytes; may have 1000"):
         OnnxModel(line[1], FORM, "line")
 

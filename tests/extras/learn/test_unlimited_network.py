@@ -4,13 +4,14 @@ import json
 
 import onnx
 
-from simtest.estimators.learned_spot import SHIPPED
+from simtest.estimators.learned import WEIGHTS
+from simtest.estimators.learned_spot import LearnedSpot
 from simtest.runtime.resources import data_root
 from studies.learned_transfer.unlimited import LIMIT, unlimited
 
 
 def test_a_network_without_its_limit_keeps_everything_else():
-    model = onnx.load(data_root("scenes").joinpath(*SHIPPED))
+    model = onnx.load(data_root("scenes").joinpath(*WEIGHTS, LearnedSpot.shipped))
     made = unlimited(model)
     before, after = ({prop.key: prop.value for prop in one.metadata_props} for one in (model, made))
     contents = [json.loads(props.pop("simtest")) for props in (before, after)]

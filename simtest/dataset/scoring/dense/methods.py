@@ -11,8 +11,8 @@ import numpy as np
 from simtest.dataset.scoring.dense.conventions import Answer, MapOptions
 from simtest.dataset.scoring.dense.frame_truth import FrameTruth
 from simtest.dataset.scoring.dense.map_files import Kind, MapFile, RawMap, find_maps, read_map
+from simtest.dataset.scoring.dense.shading_maps import shading_maps
 from simtest.errors import InputError
-from simtest.estimators.shading_maps import shading_maps
 
 
 class Method(Protocol):
@@ -121,7 +121,7 @@ def _peek(one: MapFile) -> Kind:
 
 @dataclass(frozen=True)
 class Shading:
-    """The baseline: normals and depths by shading alone (`simtest.estimators.shading_maps`)."""
+    """The baseline: normals and depths by shading alone (`simtest.dataset.scoring.dense.shading_maps`)."""
 
     name: str = "shading"
     kinds: tuple[Kind, ...] = ("normal", "depth")

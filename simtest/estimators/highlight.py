@@ -1,19 +1,65 @@
 """What the estimators share of a highlight: its isophotes or, where it is small, its centre; each fitted once."""
 
 from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
+from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.errors import Failure
-from simtest.estimators.family_fit import fit_isophote_families
-from simtest.estimators.isophote_family import IsophoteFamily
-from simtest.estimators.isophote_fit import FittedIsophote, fit_isophote_of_each
-from simtest.estimators.small_spot import SmallSpot, fit_small_spots, is_small
-from simtest.geometry import Camera, Patch
-
-HighlightAxis = IsophoteFamily | SmallSpot
-"""What states a highlight's axis, with its moments and its budget."""
+from simtest.estimators.budget import Budget
+from simtest.estimators.family import IsophoteFamily, fit_isophote_families
+from simtest.estimators.isophotes import FittedIsophote, fit_isophote_of_each
+from simtest.estimators.prior_parts import add_untold_parts
+from simtest.estimators.protocol import Estimate
+from simtest.estimators.small_spots import HighlightAxis, SmallSpot, fit_small_spots, is_small
+from simtest.geometry import Array, Camera, Patch
 
 Fitted = HighlightAxis | Failure
+
+
+@dataclass(frozen=True)
+class OfHighlight:
+    """What the estimators of single highlights share: the highlight is fitted, and what the method makes of it is `of`.
+
+    Isovalues without a closed isophote are left out and flagged ``missing_isovalues``; with fewer than 2 left it fails
+    for the first one's reason. A highlight too small for isophotes (`simtest.estimators.small_spots`) has its centre
+    alone, and neither axis ratio nor curvature: flag ``unresolved``. What the priors leave open is added to the budget
+    (`simtest.estimators.prior_parts`).
+
+    Parameters
+    ----------
+    isovalues : tuple of float
+        Each t in (0, 1).
+    """
+
+    isovalues: tuple[float, ...] = CONE_AXIS_ISOVALUES
+
+    def prepare(self, patches: Sequence[Patch], camera: Camera) -> None:
+        """Fit several highlights at once (see `simtest.estimators.protocol.PreparedEstimator`)."""
+        fit_highlights(patches, camera, self.isovalues)
+
+    def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
+        """Estimate the normal (see `simtest.estimators.Estimator`)."""
+        highlight = fit_highlight(patch, camera, self.isovalues)
+        return highlight if isinstance(highlight, Failure) else self.of(highlight, priors)
+
+    def of(self, highlight: HighlightAxis, priors: Priors) -> Estimate | Failure:
+        """Estimate the normal at a fitted highlight."""
+        raise NotImplementedError
+
+
+def along(highlight: HighlightAxis, axis: Array, budget: Budget | None, priors: Priors, **more: Any) -> Estimate:
+    """State a reversed axis of a highlight with its isophotes and what the priors leave open (`add_untold_parts`)."""
+    camera = highlight.camera
+    seen = {"axis_ratio": highlight.axis_ratio, "isophotes": highlight.isophotes, "flags": highlight.flags}
+    stated = {"look_px": camera.project(axis), **seen, **more}
+    return add_untold_parts(Estimate(-axis, -axis[None], budget=budget, **stated), camera, priors, highlight)
+
+
+def of_spot(spot: SmallSpot, priors: Priors) -> Estimate:
+    """State the reversed sightline of a spot's centre."""
+    return along(spot, spot.axis, spot.axis_budget, priors, look_px=spot.centre_px)
 
 
 def fit_highlight(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> Fitted:

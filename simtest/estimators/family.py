@@ -4,26 +4,40 @@ Near its peak the lobe is Gaussian to second order: -log(I / I0) = w^T H w / 2, 
 isophote at t is then an ellipse with second moments E(t) = -2 ln t / H, and the axis of its cone is the peak's
 sightline. Terms of higher order in w make E(t) / (-2 ln t) and the axis linear in -ln t to leading order, so both are
 extrapolated to the peak by a straight line (theory.md section 3, items 3 and 4; section 6): the axis over the
-isophote's area, and to the peak of the lobe before smoothing (`simtest.estimators.extrapolation`).
+isophote's area, and to the peak of the lobe before smoothing (`simtest.estimators.isophotes`).
+
+
+Fitting of highlights' isophote families, all ellipses and poses of several highlights at once.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ELLIPSE_RESIDUAL
 from simtest.errors import Failure, Reason
-from simtest.estimators.bends import MEAN_BENDS, PEAK_BENDS, bend_variance
-from simtest.estimators.budget import Budget
-from simtest.estimators.clipping import hidden_peak_moments, plateau_area_px
-from simtest.estimators.extrapolation import weights_at_zero, weights_of_axes
-from simtest.estimators.family_crossings import FamilyCrossings
-from simtest.estimators.isophote_fit import FittedIsophote
-from simtest.estimators.peak_value import PeakValue, fit_peak_value
-from simtest.estimators.propagation import gram
-from simtest.estimators.ripples import excess
-from simtest.geometry import Array, Camera, CirclePose, Mask, Patch, cone_axes
+from simtest.estimators.budget import (
+    Budget,
+    bend_variance,
+    excess,
+    gram,
+    hidden_peak_moments,
+    plateau_area_px,
+)
+from simtest.estimators.isophotes import (
+    FittedIsophote,
+    IsophotesAcross,
+    PeakValue,
+    fit_cut_isophote,
+    fit_isophotes_of_each,
+    fit_peak_value,
+    weights_at_zero,
+    weights_of_axes,
+)
+from simtest.geometry import Array, Camera, CirclePose, Mask, Patch, circle_poses, cone_axes
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2
 from simtest.geometry.patch import share_of_noise
 from simtest.geometry.vectors import basis_across
@@ -36,14 +50,21 @@ that, and where noise hides the drift it hides an error several times the mean a
 
 MEAN_SHARE, MEAN_SIZE = fitted_number("drift.mean_share"), fitted_number("drift.mean_size")
 DRIFT_SHARE, DRIFT_PX2 = fitted_number("drift.both_share"), fitted_number("drift.both_px2")
-MEAN_PX2, PEAK_PX2 = fitted_number("drift.mean_grid_px2"), fitted_number("drift.peak_grid_px2")
-MEAN_RIPPLES, PEAK_RIPPLES = fitted_number("ripples.mean"), fitted_number("ripples.peak")
+
+
+class AxisErrors(NamedTuple):
+    """Fitted shares of one axis's errors: of its ripples and bends beyond noise, and of the grid of pixels, px^2."""
+
+    ripples: float
+    bends: float
+    px2: float
+
+
+OF_MEAN = AxisErrors(fitted_number("ripples.mean"), fitted_number("bends.mean"), fitted_number("drift.mean_grid_px2"))
+OF_PEAK = AxisErrors(fitted_number("ripples.peak"), fitted_number("bends.peak"), fitted_number("drift.peak_grid_px2"))
 
 STREAK_RATIO = 0.1
 """An isophote with a smaller axis ratio is a streak."""
-
-HOLDS_OTHERS = "holds other highlights"
-"""End of the detail of a Failure of an isophote that was left out for it."""
 
 MIN_CLIPPED_PX = 3
 """Fewer clipped pixels change a smoothed peak by less than its noise."""
@@ -53,34 +74,38 @@ NOISE_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
-class IsophoteFamily:
-    """The fitted isophotes of one highlight.
+class IsophoteFamily(IsophotesAcross):
+    """The fitted isophotes of one highlight together: the axis of their cones, and what leads from it to the peak."""
 
-    Parameters
-    ----------
-    patch : Patch
-        Region of interest.
-    camera : Camera
-        Calibration.
-    isophotes : tuple of FittedIsophote
-        At least one; each the cone of an ellipse.
-    poses : tuple of CirclePose
-        Of each isophote.
-    failures : tuple of Failure
-        Of the other isovalues.
-    """
+    poses: tuple[CirclePose, ...]  # of each isophote
+    failures: tuple[Failure, ...]  # of the other isovalues
+    least: float = 0.0  # isovalue below which the isophotes hold other highlights too
 
-    patch: Patch
-    camera: Camera
-    isophotes: tuple[FittedIsophote, ...]
-    poses: tuple[CirclePose, ...]
-    failures: tuple[Failure, ...]
+    @staticmethod
+    def of(
+        patch: Patch,
+        camera: Camera,
+        isophotes: Iterable[FittedIsophote],
+        poses: Iterable[CirclePose],
+        failures: Iterable[Failure] = (),
+        least: float = 0.0,
+    ) -> "IsophoteFamily":
+        """Return the family of isophotes with their poses, about the mean of their axes."""
+        poses = tuple(poses)
+        axis = sum(pose.axis for pose in poses)
+        axis = np.asarray(axis / np.linalg.norm(axis))
+        frame = np.concatenate([basis_across(-axis), axis[None]])
+        return IsophoteFamily(patch, camera, tuple(isophotes), frame, poses, tuple(failures), least)
 
-    @cached_property
+    @property
     def axis(self) -> Array:
         """Mean of the cones' axes, unit, shape (3,), camera frame."""
-        axis = sum(pose.axis for pose in self.poses)
-        return np.asarray(axis / np.linalg.norm(axis))
+        return self.frame[2]
+
+    @property
+    def basis(self) -> Array:
+        """Two unit vectors across the axis, shape (2, 3): ``tangent_basis`` of the normal that is its reverse."""
+        return self.frame[:2]
 
     @property
     def axis_ratio(self) -> float:
@@ -88,21 +113,12 @@ class IsophoteFamily:
         return sum(pose.axis_ratio for pose in self.poses) / len(self.poses)
 
     @cached_property
-    def basis(self) -> Array:
-        """Two unit vectors across the axis, shape (2, 3): ``tangent_basis`` of the normal that is its reverse."""
-        return basis_across(-self.axis)
-
-    @cached_property
-    def _crossings(self) -> FamilyCrossings:
-        return FamilyCrossings(self.patch, self.camera, self.isophotes, np.concatenate([self.basis, self.axis[None]]))
-
-    @cached_property
     def levels(self) -> Array:
         """-ln t of each isophote, t over the lobe's peak, shape (K,).
 
         The highest pixel, which isovalues are relative to, is too high where the peak is flat and noisy.
         """
-        return np.asarray(-np.log(self._crossings.isovalues * self.patch.peak_value / self._peak.value))
+        return np.asarray(-np.log(self.isovalues * self.patch.peak_value / self._peak.value))
 
     @cached_property
     def _peak(self) -> PeakValue:
@@ -115,8 +131,7 @@ class IsophoteFamily:
     @cached_property
     def _weights(self) -> Array:
         """Weights of the cones' axes in the axis at the peak, shape (K,)."""
-        crossings = self._crossings
-        return weights_of_axes(crossings.conics, crossings.isovalues, self.px2, self.patch.smoothing_px)
+        return weights_of_axes(self.conics, self.isovalues, self.px2, self.patch.smoothing_px)
 
     @property
     def can_extrapolate(self) -> bool:
@@ -130,7 +145,7 @@ class IsophoteFamily:
         The sightlines through the isophotes' centres in the picture are followed: to area 0 they lead where the axes
         do, and beyond it, since the picture was smoothed, they alone lead to the peak before smoothing.
         """
-        return self._weights @ self._crossings.picture_centres if self.can_extrapolate else np.zeros(2)
+        return self._weights @ self.picture_centres if self.can_extrapolate else np.zeros(2)
 
     @property
     def peak_axis(self) -> Array:
@@ -217,7 +232,7 @@ class IsophoteFamily:
         by_conic[:, :2, 3:] = by_linear / len(by_linear)
         if self.can_extrapolate:
             by_conic[:, 2:, 3:] = by_linear * (self._weights - 1 / len(by_linear))[:, None, None]
-        return gram(self._crossings.moved_by_noise(by_conic))
+        return gram(self.moved_by_noise(by_conic))
 
     @cached_property
     def moments_covariance(self) -> Array | None:
@@ -227,15 +242,11 @@ class IsophoteFamily:
         # derivative by a common shift of the levels, which the peak value causes
         step = 1e-4
         by_shift = (self._moments_at(step) - self._moments_at(-step))[_UPPER] / (2 * step)
-        return gram(self._crossings.moved_by_noise(self._moments_by_conic, (by_shift, self._peak)))
-
-    def conic(self, k: int) -> Array:
-        """Return (a, b, c, d, e) of an isophote in the basis: a x^2 + b x y + c y^2 + d x + e y = 1, shape (5,)."""
-        return self._crossings.conics[k]
+        return gram(self.moved_by_noise(self._moments_by_conic, (by_shift, self._peak)))
 
     def conic_covariance(self, k: int) -> Array:
-        """Return the conic's covariance by noise, shape (5, 5); the noise must be known."""
-        alone = replace(self._crossings, isophotes=self.isophotes[k : k + 1])
+        """Return the covariance by noise of an isophote's conic, shape (5, 5); the noise must be known."""
+        alone = IsophotesAcross(self.patch, self.camera, self.isophotes[k : k + 1], self.frame)
         return gram(alone.moved_by_noise(np.eye(5)[None]))
 
     def widening(self, k: int = 0) -> Array:
@@ -258,26 +269,39 @@ class IsophoteFamily:
         size_px2 = float(np.sqrt(np.linalg.det(ellipse) / np.linalg.det(self.px2)))
         by_noise = float(np.trace(np.linalg.solve(ellipse, _summed(covariance)))) / 2
         weights = self._weights if self.can_extrapolate else np.ones(1)
-        beyond = excess(self._crossings.ripples, weights, self.levels, by_noise, size_px2, self.patch.smoothing_px)
+        beyond = excess(self.ripples, weights, self.levels, by_noise, size_px2, self.patch.smoothing_px)
         return np.asarray(beyond * ellipse)
 
     @property
     def axis_budget(self) -> Budget | None:
-        """Budget of the mean axis in the basis.
-
-        Noise; resolution: the grid of pixels, a clipped peak, and ripples of the isophotes beyond noise; shape, where
-        the drift may be more than noise, or an isophote is bent.
-        """
-        covariance = self.axes_covariance
-        if covariance is None:
+        """Budget of the mean axis in the basis, with what a drift that may be more than noise adds to shape."""
+        if self.axes_covariance is None:
             return None
-        parts = {"noise": covariance[:2, :2], "resolution": MEAN_RIPPLES * self.ripple_error + self.clipping}
-        parts["resolution"] = parts["resolution"] + MEAN_PX2 * self.px2
-        parts["shape"] = self.bend_error() + self.drift_error
+        drifted: list[Array] = []
         if self.drift_is_suspect:
             by_size = MEAN_SIZE * np.sqrt(max(float(np.linalg.det(self.mean_moments)), 0.0)) * np.eye(2)
-            parts["shape"] = parts["shape"] + MEAN_SHARE * np.outer(self.drift, self.drift) + by_size
-        return _present(parts)
+            drifted = [MEAN_SHARE * np.outer(self.drift, self.drift), by_size]
+        return self.budget(self.axes_covariance[:2, :2], OF_MEAN, *drifted)
+
+    @property
+    def peak_budget(self) -> Budget | None:
+        """Budget of the axis at the peak in the basis: shape is what a straight line misses.
+
+        Noise that makes a large drift is already in this axis's noise: of one that may be noise the excess counts.
+        """
+        return None if self.axes_covariance is None else self.budget(_summed(self.axes_covariance), OF_PEAK)
+
+    def budget(self, noise: Array, errors: AxisErrors, *shapes: Array) -> Budget:
+        """Return the budget of an axis in the basis, whose noise is known, with more covariances that are of shape.
+
+        Resolution: the grid of pixels, a clipped peak, and ripples of the isophotes beyond noise. Shape: the bend of an
+        isophote, and a drift beyond noise.
+        """
+        resolution = errors.ripples * self.ripple_error + self.clipping + errors.px2 * self.px2
+        shape = sum(shapes, self.bend_error(errors.bends) + self.drift_error)
+        parts = {"noise": noise, "resolution": resolution, "shape": shape}
+        # Noise is always stated.
+        return {name: part for name, part in parts.items() if name == "noise" or part.any()}
 
     @cached_property
     def drift_excess(self) -> float:
@@ -287,26 +311,14 @@ class IsophoteFamily:
             return 0.0
         return max(float(self.drift @ self.drift - np.trace(covariance[2:4, 2:4])), 0.0)
 
-    @property
-    def peak_budget(self) -> Budget | None:
-        """Budget of the axis at the peak in the basis, of the same parts: shape is what a straight line misses."""
-        covariance = self.axes_covariance
-        if covariance is None:
-            return None
-        parts = {"noise": _summed(covariance), "resolution": PEAK_RIPPLES * self.ripple_error + self.clipping}
-        parts["resolution"] = parts["resolution"] + PEAK_PX2 * self.px2
-        # Noise that makes a large drift is already in this axis's noise: of one that may be noise the excess counts.
-        parts["shape"] = self.bend_error(PEAK_BENDS) + self.drift_error
-        return _present(parts)
-
-    def bend_error(self, slope: float = MEAN_BENDS) -> Array:
-        """Covariance of the centre by the bend of the isophotes, rad^2, shape (2, 2) (`simtest.estimators.bends`)."""
+    def bend_error(self, slope: float = OF_MEAN.bends) -> Array:
+        """Covariance of the centre by the bend of the isophotes, rad^2, shape (2, 2) (`simtest.estimators.budget`)."""
         return bend_variance(self.residuals, self._residuals_by_noise, self.mean_moments, slope) * np.eye(2)
 
     @cached_property
     def clipping(self) -> Array:
         """Covariance for a clipped peak, which the isophotes below do not show; 0 where none is clipped."""
-        area = plateau_area_px(self.patch, float(self._crossings.isovalues.min()))
+        area = plateau_area_px(self.patch, float(self.isovalues.min()))
         if area < MIN_CLIPPED_PX:
             return np.zeros((2, 2))
         innermost = float(self.residuals[-1])
@@ -320,23 +332,7 @@ class IsophoteFamily:
 
     def tangents(self, points: Array) -> Array:
         """Return the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
-        return self._crossings.tangents(points).T
-
-    @property
-    def least(self) -> float:
-        """Isovalue below which the isophotes hold other highlights too; 0 where none does."""
-        others = any(failure.detail.endswith(HOLDS_OTHERS) for failure in self.failures)
-        return self.isophotes[0].isovalue if others else 0.0
-
-    @property
-    def are_ellipses(self) -> Mask:
-        """Whether each isophote is an ellipse across the mean axis, shape (K,)."""
-        return self._crossings.are_ellipses
-
-    @property
-    def residuals(self) -> Array:
-        """RMS distance of each isophote's points from its conic, over its mean radius, shape (K,)."""
-        return self._crossings.residuals
+        return self._across(points).T
 
     @cached_property
     def _residuals_by_noise(self) -> Array:
@@ -344,8 +340,7 @@ class IsophoteFamily:
         at_peak = self.patch.noise_at_peak or 0.0
         left = at_peak * share_of_noise(self.patch.smoothing_px) / self.patch.peak_value
         # For a Gaussian lobe, noise over t |d log I / d log r| is the share of its radius that the contour moves by.
-        isovalues = self._crossings.isovalues
-        return np.asarray(NOISE_FACTOR * left / (-2 * isovalues * np.log(isovalues)))
+        return np.asarray(NOISE_FACTOR * left / (-2 * self.isovalues * np.log(self.isovalues)))
 
     @cached_property
     def is_bent(self) -> Mask:
@@ -382,14 +377,14 @@ class IsophoteFamily:
     def _by_linear(self) -> Array:
         """Derivative of each cone's axis by (d, e) of its conic, shape (K, 2, 2)."""
         # The cone's axis is its third eigenvector, near that of the basis: -(A + I)^-1 (d, e) / 2.
-        a, b, c = self._crossings.conics.T[:3]
+        a, b, c = self.conics.T[:3]
         determinant = (a + 1) * (c + 1) - b * b / 4
         return np.asarray((np.array([[c + 1, -b / 2], [-b / 2, a + 1]]) / (-2 * determinant)).transpose(2, 0, 1))
 
     @property
     def _moments_by_conic(self) -> Array:
         """Derivative of the moments by the conic of each isophote, shape (K, 3, 5)."""
-        a, b, c = self._crossings.conics.T[:3]
+        a, b, c = self.conics.T[:3]
         made = np.zeros((len(self.isophotes), 3, 5))  # the moments do not depend on d and e
         # E = A^-1 = [[p, q], [q, r]] moves by -E dA E.
         p, q, r = np.array([c, -b / 2, a]) / (a * c - b * b / 4)
@@ -407,6 +402,110 @@ def _summed(covariance: Array) -> Array:
     return np.asarray(both @ covariance @ both.T)
 
 
-def _present(parts: dict[str, Array]) -> dict[str, Array]:
-    """Return the parts of a budget that are not 0; noise is always stated."""
-    return {name: part for name, part in parts.items() if name == "noise" or part.any()}
+MIN_ISOPHOTES = 2
+"""One isophote alone may be an accident of the background."""
+
+OTHERS_RESIDUAL, OTHERS_RATIO = 0.1, 2.5
+"""A lower isophote that differs from its ellipse by more than this share of its radius, and so many times more than the
+innermost one does, holds other highlights too."""
+
+
+def fit_isophote_family(patch: Patch, camera: Camera, isovalues: Sequence[float]) -> IsophoteFamily | Failure:
+    """Fit the isophotes of one highlight (see `fit_isophote_families`)."""
+    return fit_isophote_families([patch], camera, isovalues)[0]
+
+
+def fit_isophote_families(
+    patches: Sequence[Patch], camera: Camera, isovalues: Sequence[float]
+) -> list[IsophoteFamily | Failure]:
+    """Fit the isophotes of several highlights, all ellipses and poses at once, isovalues in any order.
+
+    Where fewer than 2 isophotes (1, if only one isovalue is given) are whole, the seen parts of those that are cut are
+    fitted too; with fewer than 2 of either kind the result is the first one's Failure.
+    """
+    if not patches:
+        return []
+    # A family begins with the lowest isophote, from which neighbours are left out, and ends with the innermost.
+    isovalues = sorted(set(isovalues))
+    # whole isophotes
+    posed = _with_poses(fit_isophotes_of_each(patches, camera, isovalues))
+    least = min(MIN_ISOPHOTES, len(isovalues))
+    made: list[IsophoteFamily | Failure] = []
+    for patch, (kept, poses, failures) in zip(patches, posed, strict=True):
+        if len(poses) < least:
+            made.append(_with_arcs(patch, camera, isovalues, kept, failures))
+        else:
+            family = _of_ellipses(IsophoteFamily.of(patch, camera, kept, poses, failures), least)
+            made.append(family if isinstance(family, Failure) else _of_one(family, least))
+    return made
+
+
+def _of_ellipses(family: IsophoteFamily, least: int) -> IsophoteFamily | Failure:
+    """Leave out isophotes that are no ellipses across the mean axis; a Failure where too few are left."""
+    while not (whole := family.are_ellipses).all():
+        # Without them the mean axis is another one.
+        failed = [Failure(Reason.NOT_AN_ELLIPSE, f"t = {i.isovalue:g} reaches too far off the mean axis")
+                  for i, good in zip(family.isophotes, whole, strict=True) if not good]  # fmt: skip
+        if whole.sum() < least:
+            return failed[0]
+        kept = np.flatnonzero(whole)
+        isophotes, poses = tuple(family.isophotes[i] for i in kept), tuple(family.poses[i] for i in kept)
+        family = IsophoteFamily.of(family.patch, family.camera, isophotes, poses, (*family.failures, *failed))
+    return family
+
+
+def _of_one(family: IsophoteFamily, least: int) -> IsophoteFamily:
+    """Leave out the lower isophotes of a highlight that hold others too, as long as enough are left."""
+    residuals = family.residuals
+    allowed = max(OTHERS_RESIDUAL, OTHERS_RATIO * float(residuals[-1]))
+    first = int(np.max(np.flatnonzero(residuals > allowed), initial=-1)) + 1
+    if first == 0 or len(residuals) - first < least:
+        return family
+    held = [
+        Failure(Reason.NOT_AN_ELLIPSE, f"t = {i.isovalue:g} holds other highlights") for i in family.isophotes[:first]
+    ]
+    kept, poses = family.isophotes[first:], family.poses[first:]
+    failures = (*family.failures, *held)
+    return IsophoteFamily.of(family.patch, family.camera, kept, poses, failures, kept[0].isovalue)
+
+
+def _with_arcs(
+    patch: Patch, camera: Camera, isovalues: Sequence[float], whole: list[FittedIsophote], failures: list[Failure]
+) -> IsophoteFamily | Failure:
+    """Fit the arcs of isophotes that the border or the view cuts, where too few are whole."""
+    least = min(MIN_ISOPHOTES, len(isovalues))
+    closed = {isophote.isovalue for isophote in whole}
+    arcs = [fit_cut_isophote(patch, camera, t) for t in isovalues if t not in closed]
+    cut = [arc for arc in arcs if isinstance(arc, FittedIsophote)]
+    if len(whole) + len(cut) < least:
+        return failures[0]
+    failed = [arc for arc in arcs if isinstance(arc, Failure)]
+    ((kept, poses, failed),) = _with_poses([(sorted([*whole, *cut], key=lambda i: i.isovalue), failed)])
+    if len(poses) < least:
+        return failures[0]
+    return _of_ellipses(IsophoteFamily.of(patch, camera, kept, poses, failed), least)
+
+
+Posed = tuple[list[FittedIsophote], list[CirclePose], list[Failure]]
+
+
+def _with_poses(fitted: Sequence[tuple[list[FittedIsophote], list[Failure]]]) -> list[Posed]:
+    """Return each highlight's isophotes whose cones have a pose, their poses, and all failures."""
+    every = [isophote for isophotes, _ in fitted for isophote in isophotes]
+    if not every:
+        return [([], [], failures) for _, failures in fitted]
+    found = circle_poses(
+        np.array([isophote.cone for isophote in every]), np.array([isophote.sightline for isophote in every])
+    )
+    poses = (found[i] for i in range(len(every)))
+    made: list[Posed] = []
+    for isophotes, failures in fitted:
+        kept, own, failed = [], [], [*failures]
+        for isophote in isophotes:
+            if isinstance(pose := next(poses), Failure):
+                failed.append(pose)
+            else:
+                kept.append(isophote)
+                own.append(pose)
+        made.append((kept, own, failed))
+    return made

@@ -1,7 +1,13 @@
 """Small highlights: below a radius of about 3 px isophotes carry no shape, and the spot's centre carries the normal.
 
 Pixels, point spread, mosaic and coding then make the isophotes. The centre is that of a Gaussian on a local background,
-fitted to the unsmoothed pixels (`simtest.estimators.spot_fit`); neither axis ratio nor curvature is stated.
+fitted to the unsmoothed pixels (`simtest.estimators.small_spots`); neither axis ratio nor curvature is stated.
+
+
+Least-squares fit of small spots: a Gaussian on a local background, clipped pixels censored, many spots at once.
+
+A spot of a few pixels is the image of a highlight through lens and pixels, whose point spread is nearly Gaussian. Its
+centre is then what the pixels tell; the fit is the maximum-likelihood estimate of it under white noise.
 """
 
 import math
@@ -13,14 +19,135 @@ import numpy as np
 
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure, Reason
-from simtest.estimators.budget import Budget
-from simtest.estimators.clipping import clipped_pixels
-from simtest.estimators.isophote_fit import FittedIsophote
-from simtest.estimators.protocol import Estimate
-from simtest.estimators.spot_fit import LEAST_VARIANCE_PX2, XX, XY, YY, SpotFits, SpotWindows, X, Y, fit_spots
-from simtest.geometry import Array, Camera, Mask, Patch
+from simtest.estimators.budget import Budget, clipped_pixels
+from simtest.estimators.family import IsophoteFamily
+from simtest.estimators.isophotes import FittedIsophote
+from simtest.estimators.least_squares import Descent, Equations, minimise
+from simtest.geometry import Array, Camera, Index, Mask, Patch
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.fitted import fitted_number
+
+OF_SPOTS = Descent(1e-2, 1e-9, 1e8, 40, 1e-9, ridge=(1e-12, 1e-30))
+
+EXACT = 1e-20
+"""Sum of squares, over the peak squared, that rounding alone leaves."""
+
+LEAST_VARIANCE_PX2 = 0.1
+"""A spot is no narrower than its pixel, whose own variance is 1/12 px^2."""
+
+BACKGROUND_SLOPE = 0.01
+"""Standard deviation of the background's slope, share of the spot's height per px: it has a prior, because the flank of
+a wide spot looks like a slope."""
+
+PRIOR_RESIDUAL = 0.02
+"""Residual, share of the height, against which that prior is weighed."""
+
+HEIGHT, X, Y, XX, XY, YY, LEVEL, RIGHT, DOWN = range(9)
+"""Parameters: height; centre, px; inverse covariance, 1/px^2; background at the window's centre, and its slope."""
+
+
+@dataclass(frozen=True)
+class SpotWindows:
+    """The pixels of N spots, each in a square window around its peak's pixel, its m pixels in one row."""
+
+    values: Array  # (N, m): unsmoothed intensities over the spot's height; 0 where not used
+    # used, clipped: (N, m): pixels that are fitted, and those of them whose intensity is at least the value.
+    used: Mask
+    clipped: Mask
+    offsets: Array  # (2, m): each pixel's centre from the centre of the window, px
+
+
+@dataclass(frozen=True)
+class SpotFits:
+    """Fitted spots."""
+
+    parameters: Array  # (N, 9): at the minimum; see `HEIGHT` and the others
+    covariance: Array  # (N, 2, 2): of the centre, px^2, for residuals of variance 1; NaN where it is not determined
+    residual: Array  # (N,): standard deviation of the residuals, in the values' unit
+    sound: Mask  # (N,): whether the fit converged to a spot inside its window
+
+
+def fit_spots(windows: SpotWindows, centres: Array, variances: Array, levels: Array) -> SpotFits:
+    """Fit spots by Levenberg and Marquardt's method, all at once.
+
+    `windows`: their pixels; `centres`, (N, 2): where to start, px from the centre of the window; `variances`, `levels`,
+    (N,): variance of each spot, px^2, and level of its background to start with.
+    """
+    count = len(centres)
+    p = np.zeros((count, 9))
+    p[:, HEIGHT] = 1 - levels
+    p[:, X], p[:, Y] = centres.T
+    p[:, XX] = p[:, YY] = 1 / np.maximum(variances, 2 * LEAST_VARIANCE_PX2)
+    p[:, LEVEL] = levels
+    reach = float(np.abs(windows.offsets).max())
+
+    def equations(p: Array, at: Index) -> Equations:
+        part = SpotWindows(windows.values[at], windows.used[at], windows.clipped[at], windows.offsets)
+        squares, normal, gradient = _equations(part, p)
+        return squares, normal, gradient, np.isfinite(squares) & _is_spot(p, reach)
+
+    # A step too far overflows, and is then not taken.
+    with np.errstate(all="ignore"):
+        p, squares, normal, has_ended = minimise(p, equations, np.add, OF_SPOTS, EXACT)
+        return _stated(windows, p, squares, normal, has_ended & _is_spot(p, reach))
+
+
+def _equations(windows: SpotWindows, p: Array) -> tuple[Array, Array, Array]:
+    """Return each spot's sum of squares, and its normal equations, shapes (N,), (N, 9, 9) and (N, 9)."""
+    x, y = windows.offsets
+    dx, dy = x - p[:, X, None], y - p[:, Y, None]
+    xx, xy, yy = p[:, XX, None], p[:, XY, None], p[:, YY, None]
+    along_x, along_y = xx * dx + xy * dy, xy * dx + yy * dy
+    lobe = np.exp(-0.5 * (dx * along_x + dy * along_y))
+    height = p[:, HEIGHT, None]
+    raised = height * lobe
+    model = raised + p[:, LEVEL, None] + p[:, RIGHT, None] * x + p[:, DOWN, None] * y
+    residual = windows.values - model
+    counted = windows.used & ~(windows.clipped & (residual < 0))
+    residual = np.where(counted, residual, 0.0)
+    J = np.empty((len(p), 9, len(x)))
+    J[:, HEIGHT] = lobe
+    J[:, X], J[:, Y] = raised * along_x, raised * along_y
+    J[:, XX], J[:, XY], J[:, YY] = -0.5 * raised * dx * dx, -raised * dx * dy, -0.5 * raised * dy * dy
+    J[:, LEVEL], J[:, RIGHT], J[:, DOWN] = 1.0, x, y
+    J *= counted[:, None, :]
+    normal, gradient = J @ J.transpose(0, 2, 1), (J @ residual[:, :, None])[:, :, 0]
+    # prior of the background's slope
+    weight = (PRIOR_RESIDUAL / BACKGROUND_SLOPE) ** 2
+    squares = np.sum(residual * residual, axis=1) + weight * np.sum(p[:, RIGHT:] ** 2, axis=1)
+    for k in (RIGHT, DOWN):
+        normal[:, k, k] += weight
+        gradient[:, k] -= weight * p[:, k]
+    return squares, normal, gradient
+
+
+def _is_spot(p: Array, reach: float) -> Mask:
+    """Return whether parameters are those of a spot: raised, not narrower than a pixel, its centre in the window."""
+    half, product = (p[:, XX] + p[:, YY]) / 2, p[:, XX] * p[:, YY] - p[:, XY] ** 2
+    largest = half + np.sqrt(np.maximum(half * half - product, 0.0))
+    narrow = largest > 1 / LEAST_VARIANCE_PX2
+    wide = (product <= 0) | (half <= 0) | (product / largest < 1 / (4 * reach * reach))
+    inside = (np.abs(p[:, X]) < reach) & (np.abs(p[:, Y]) < reach)
+    return np.asarray((p[:, HEIGHT] > 0) & inside & ~narrow & ~wide)
+
+
+def _stated(windows: SpotWindows, p: Array, squares: Array, normal: Array, sound: Mask) -> SpotFits:
+    """Return the fits with the covariances of their centres."""
+    free = np.count_nonzero(windows.used & ~windows.clipped, axis=1) - 7
+    covariance = np.full((len(p), 2, 2), np.nan)
+    diagonal = np.diagonal(normal, axis1=1, axis2=2)
+    sound = sound & (free > 0) & (diagonal > 0).all(axis=1)
+    for i in np.flatnonzero(sound):
+        # scaled to a diagonal of 1, so that the condition does not depend on units
+        scale = np.sqrt(diagonal[i])
+        information = normal[i] / np.outer(scale, scale)
+        if np.linalg.cond(information) > 1e12:
+            sound[i] = False
+            continue
+        covariance[i] = (np.linalg.inv(information) / np.outer(scale, scale))[X : Y + 1, X : Y + 1]
+    residual = np.sqrt(squares / np.maximum(free, 1))
+    return SpotFits(p, covariance, residual, sound)
+
 
 RESOLVED_PX = 3.0
 """Least radius at half height, before smoothing, of a highlight whose isophotes are used."""
@@ -51,26 +178,14 @@ UNRESOLVED = "unresolved"
 
 @dataclass(frozen=True)
 class SmallSpot:
-    """The fitted centre of a small highlight; it stands in where an `IsophoteFamily` is asked for its axis.
-
-    Parameters
-    ----------
-    patch : Patch
-        Region of interest.
-    camera : Camera
-        Calibration.
-    centre_px : ndarray, shape (2,)
-        Centre, px.
-    variance_px2 : ndarray, shape (2, 2)
-        Second moments of the fitted spot as its pixels show it, px^2.
-    by_noise_px2, by_shape_px2 : ndarray, shape (2, 2)
-        Covariance of the centre by noise, and by everything that makes the spot no Gaussian, px^2.
-    """
+    """The fitted centre of a small highlight; it stands in where an `IsophoteFamily` is asked for its axis."""
 
     patch: Patch
     camera: Camera
     centre_px: Array
-    variance_px2: Array
+    variance_px2: Array  # (2, 2): second moments of the fitted spot as its pixels show it, px^2
+    # by_noise_px2, by_shape_px2: (2, 2): covariance of the centre by noise, and by everything that makes the spot no
+    # Gaussian, px^2.
     by_noise_px2: Array
     by_shape_px2: Array
 
@@ -129,20 +244,14 @@ class SmallSpot:
             Reason.UNRESOLVED, f"a radius of {radius:.1f} px; isophotes carry shape above {RESOLVED_PX:g} px"
         )
 
-    def estimate(self) -> Estimate:
-        """Return the reversed sightline of the centre as an estimate."""
-        return Estimate(
-            normal=-self.axis,
-            candidates=-self.axis[None],
-            look_px=self.centre_px,
-            budget=self.axis_budget,
-            flags=self.flags,
-        )
-
     def tangents(self, points: Array) -> Array:
         """Return the tangents of pixels' angles from the axis, in the basis, shape (N, 2)."""
         rays = self.camera.unproject(points)
         return np.asarray((rays @ self.basis.T) / (rays @ self.axis)[:, None])
+
+
+HighlightAxis = IsophoteFamily | SmallSpot
+"""What states a highlight's axis, with its moments and its budget."""
 
 
 def radius_before_smoothing_px(patch: Patch) -> float | None:
