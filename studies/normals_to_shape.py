@@ -25,7 +25,7 @@ from simtest.estimators.protocol import Target
 from simtest.estimators.shading_maps import shading_maps
 from simtest.geometry import Camera
 from simtest.reconstruction.pipeline import reconstruct
-from simtest.reconstruction.ranking import best_of
+from simtest.reconstruction.records import best_of
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Mask
 from simtest.simulation.rendered_view import render_view

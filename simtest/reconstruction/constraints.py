@@ -8,13 +8,13 @@ import numpy.typing as npt
 from simtest.estimators import Estimate
 from simtest.estimators.budget import MISPLACED
 from simtest.geometry.vectors import tangent_basis
-from simtest.reconstruction.description import PictureRecord, SpecularityRecord
+from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.arrays import Array
 
 VERSION = 2
 
 
-def constraints_arrays(record: PictureRecord) -> dict[str, npt.NDArray[np.generic]]:
+def constraints_arrays(found: Specularities) -> dict[str, npt.NDArray[np.generic]]:
     """Return the content of constraints.npz: no pickles, K (3, 3), and a row a best normal that looks along a ray.
 
     The normal and its covariance are those of the surface at the highlight's brightest point, wherever that is; the
@@ -23,9 +23,9 @@ def constraints_arrays(record: PictureRecord) -> dict[str, npt.NDArray[np.generi
     """
     made = [
         (spot, spot.best, best)
-        for spot in record.specularities
+        for spot in found
         if spot.best is not None and (best := spot.best_estimate) is not None
-        if np.isfinite(record.camera.unproject(best.look_px)).all()
+        if np.isfinite(found.camera.unproject(best.look_px)).all()
     ]
     pixels = np.array([best.look_px for _, _, best in made], dtype=float).reshape(-1, 2)
     normals = np.array([best.normal for _, _, best in made], dtype=float).reshape(-1, 3)
@@ -38,7 +38,7 @@ def constraints_arrays(record: PictureRecord) -> dict[str, npt.NDArray[np.generi
         "version": np.array(VERSION),
         "id": np.array([spot.id for spot, _, _ in made], dtype=int),
         "pixel": pixels,
-        "sightline": record.camera.unproject(pixels),
+        "sightline": found.camera.unproject(pixels),
         "normal": normals,
         "basis": np.stack(tangent_basis(normals), axis=1),
         "covariance": _stacked([unknown if best.covariance is None else best.covariance for _, _, best in made]),
@@ -46,11 +46,11 @@ def constraints_arrays(record: PictureRecord) -> dict[str, npt.NDArray[np.generi
         "candidates": candidates,
         "estimator": np.array([name for _, name, _ in made], dtype=str),
         "target": np.array([best.target for _, _, best in made], dtype=str),
-        "K": record.camera.K,
+        "K": found.camera.K,
     }
 
 
-def _at_pixel(spot: SpecularityRecord, best: Estimate) -> Array:
+def _at_pixel(spot: Specularity, best: Estimate) -> Array:
     """Return the covariance of a normal as that of the surface on the ray through the look pixel; NaN if not known.
 
     Where the brightest point is misplaced by an angle w, the surface's normal turns by d k w from there to the ray, and

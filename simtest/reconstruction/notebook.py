@@ -10,12 +10,10 @@ from simtest.estimators.protocol import Estimate
 from simtest.geometry.vectors import tilt_deg
 from simtest.pages.notebook import note_html, picture_html, table_html
 from simtest.pages.pixels import displayed
-from simtest.reconstruction.description import Drawing, SpecularityRecord, describe
 from simtest.reconstruction.explanations import kind_name
 from simtest.reconstruction.overlay import draw_overlay
-from simtest.reconstruction.pipeline import Reconstruction, Specularities, Specularity
-from simtest.reconstruction.ranking import best_of
-from simtest.runtime.arrays import Array, Image
+from simtest.reconstruction.records import Specularities, Specularity
+from simtest.runtime.arrays import Image
 
 MOST_ROWS = 10
 PATCH_PX = 300
@@ -23,30 +21,27 @@ PATCH_PX = 300
 HEADS = ("normal (x, y, z)", "tilt (deg)", "± (deg)", "flags")
 
 
-def specularities_html(found: Specularities) -> str:
+def specularities_html(spots: Specularities) -> str:
     """Return the frame with its best normals, and the rows of the brightest specularities."""
-    frame = found.detection.frame
-    records = describe(Reconstruction(list(found), found.detection), frame.camera)
-    drawn = cv2.cvtColor(draw_overlay(_picture(frame.encoded, found.choices.encoding), records), cv2.COLOR_BGR2RGB)
-    what = "specularity" if len(found) == 1 else "specularities"
-    more = f"{len(found)} {what}; the best normal of each is drawn"
-    more += f", the brightest {MOST_ROWS} are listed." if len(found) > MOST_ROWS else "."
-    rows = [_best_row(each) for each in records[:MOST_ROWS]]
+    picture = _picture(spots.detection.frame.encoded, spots.choices.encoding)
+    drawn = cv2.cvtColor(draw_overlay(picture, spots), cv2.COLOR_BGR2RGB)
+    what = "specularity" if len(spots) == 1 else "specularities"
+    more = f"{len(spots)} {what}; the best normal of each is drawn"
+    more += f", the brightest {MOST_ROWS} are listed." if len(spots) > MOST_ROWS else "."
+    rows = [_best_row(spot) for spot in spots[:MOST_ROWS]]
     return picture_html(drawn, more) + note_html(more) + table_html(("No.", "kind", "best estimator", *HEADS), rows)
 
 
-def specularity_html(found: Specularity) -> str:
+def specularity_html(spot: Specularity) -> str:
     """Return the patch of a specularity, with the isophotes of its best estimate, and a row for each estimator."""
-    best, because = best_of(found.estimates)
-    rows = [_row(name + " *" * (name == best), each) for name, each in found.estimates.items()]
-    table = table_html(("estimator", *HEADS), rows) + note_html(f"* best: {because}" if best else because)
-    if isinstance(found.patch, Failure):
-        return found.patch._repr_html_() + table
-    record = SpecularityRecord(0, found.region.box, found.patch.peak_px, None, None, None, best, found.estimates)
-    values = np.asarray(found.patch.values, dtype=np.float32)
-    # The patch alone is drawn, so what stands in px of the frame is moved to it.
-    moved = _moved(record, found, np.array(found.patch.origin_px, dtype=float))
-    drawn = cv2.cvtColor(draw_overlay(_picture(values, "linear"), [moved]), cv2.COLOR_BGR2RGB)
+    rows = [_row(name + " *" * (name == spot.best), each) for name, each in spot.estimates.items()]
+    because = f"* best: {spot.best_because}" if spot.best else spot.best_because
+    table = table_html(("estimator", *HEADS), rows) + note_html(because)
+    if isinstance(spot.patch, Failure):
+        return spot.patch._repr_html_() + table
+    picture = _picture(np.asarray(spot.patch.values, dtype=np.float32), "linear")
+    # Without the camera the isophote is drawn alone, without its ellipse.
+    drawn = cv2.cvtColor(draw_overlay(picture, [replace(spot, camera=None)], spot.patch.origin_px), cv2.COLOR_BGR2RGB)
     return picture_html(drawn, "the highlight with its best normal", PATCH_PX) + table
 
 
@@ -58,27 +53,12 @@ def _picture(values: Image, encoding: str) -> Image:
     return displayed(scaled / max(float(scaled.max()), 1e-12))
 
 
-def _moved(record: SpecularityRecord, found: Specularity, origin: Array) -> SpecularityRecord:
-    """Return the record in px of the patch, whose upper left corner lies at `origin` in the frame."""
-    estimates = {
-        name: each if isinstance(each, Failure) else replace(each, look_px=each.look_px - origin, cloud=None)
-        for name, each in record.estimates.items()
-    }
-    drawings = {
-        name: Drawing([(t, (points - origin).tolist()) for t, points in each.contours(found.patch)], [])
-        for name, each in record.normals.items()
-    }
-    x, y = found.region.box[:2]
-    box = (x - int(origin[0]), y - int(origin[1]), *found.region.box[2:])
-    return replace(record, box_px=box, estimates=estimates, drawings=drawings)
-
-
-def _best_row(record: SpecularityRecord) -> tuple[object, ...]:
-    best = record.best_estimate
-    kind = kind_name(record.kind) or ("cloud" if best is not None and best.cloud is not None else "")
+def _best_row(spot: Specularity) -> tuple[object, ...]:
+    best = spot.best_estimate
+    kind = kind_name(spot.kind) or ("cloud" if best is not None and best.cloud is not None else "")
     if best is None:
-        return (record.id, kind, "no normal", "", "", "", record.best_because)
-    return (record.id, kind, record.best, *_row("", best)[1:])
+        return (spot.id, kind, "no normal", "", "", "", spot.best_because)
+    return (spot.id, kind, spot.best, *_row("", best)[1:])
 
 
 def _row(name: str, result: Estimate | Failure) -> tuple[object, ...]:

@@ -2,22 +2,21 @@
 
 import csv
 import json
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import BrownConrady, Camera
+from simtest.geometry.vectors import deviation_deg
 from simtest.reconstruction.constraints import constraints_arrays
-from simtest.reconstruction.description import PictureRecord, SpecularityRecord
 from simtest.reconstruction.overlay import draw_overlay
+from simtest.reconstruction.records import Specularities, Specularity
 from simtest.reconstruction.result_page import write_picture_page
 from simtest.runtime.arrays import Array, Image
-from simtest.runtime.files import make_folder, write_atomically, write_json
+from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 
 MANY = 10
 """Above this many specularities normals.json is written on one line, since most of it is outlines."""
@@ -32,45 +31,46 @@ FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "constrain
 
 
 def write_outputs(
-    out: Path, record: PictureRecord, picture: Image, depth_mm: Sequence[float] | None = None
+    out: Path, found: Specularities, picture: Image, depth_mm: Sequence[float] | None = None
 ) -> list[Path]:
     """Write what was reconstructed in a picture, its overlay and its page; return the files.
 
     The folder is made if need be; `InputError` is raised where it cannot be written,
     `SimtestError` where its disk is full. A specularity's points stand at its depth, mm, by default at 1.
     """
-    spots, camera = record.specularities, record.camera
-    depths = [1.0] * len(spots) if depth_mm is None else depth_mm
-    arrays = constraints_arrays(record)
-    points = normals_ply(spots, camera, depths)
+    depths = [1.0] * len(found) if depth_mm is None else depth_mm
+    arrays = constraints_arrays(found)
+    points = normals_ply(found, found.camera, depths)
+    entries = found.to_json()
     make_folder(out)
-    write_json(out / "normals.json", record, compact=len(spots) > MANY)
-    write_atomically(out / "normals.csv", lambda part: write_csv(part, COLUMNS, normals_rows(spots)))
+    write_json(out / "normals.json", entries, compact=len(found) > MANY)
+    write_atomically(out / "normals.csv", lambda part: write_csv(part, COLUMNS, normals_rows(entries["specularities"])))
     write_atomically(out / "normals.ply", lambda part: part.write_text(points, encoding="ascii"))
-    write_atomically(out / "overlay.png", lambda part: cv2.imwrite(str(part), draw_overlay(picture, spots)))
+    write_atomically(out / "overlay.png", lambda part: cv2.imwrite(str(part), draw_overlay(picture, found)))
     write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
-    write_atomically(out / "index.html", lambda part: write_picture_page(part, record, picture))
+    write_atomically(out / "index.html", lambda part: write_picture_page(part, found, picture))
     return [out / name for name in FILES]
 
 
-def normals_rows(spots: Iterable[SpecularityRecord]) -> Iterator[tuple[object, ...]]:
-    """Yield a row of `COLUMNS` for each specularity, estimator and candidate; candidate 0 is the proposed normal."""
-    for spot in spots:
-        peak = (None, None) if spot.peak_px is None else spot.peak_px.tolist()
-        for name, result in spot.estimates.items():
-            best = int(name == spot.best)
-            if isinstance(result, Failure):
+def normals_rows(entries: Iterable[JsonObject]) -> Iterator[tuple[object, ...]]:
+    """Yield a row of `COLUMNS` for each entry of ``specularities``, estimator and candidate; 0 is the proposed one."""
+    for entry in entries:
+        peak = (None, None) if entry["peak_px"] is None else (float(v) for v in entry["peak_px"])
+        judged = (*peak, entry.get("kind"), entry.get("score"))
+        for name, each in entry["estimates"].items():
+            start, best = (entry["id"], name, each["status"]), int(name == entry["best"])
+            if each["status"] != "ok":
                 # candidate, normal, look and axis ratio; then margin and covariance
                 nothing = (None,) * 7
-                judged = (*peak, spot.kind, spot.score, None, None)
-                yield (spot.id, name, result.reason, *nothing, "", best, *nothing[:4], *judged)
+                yield (*start, *nothing, "", best, *nothing[:4], *judged, None, None)
                 continue
-            look = [v if math.isfinite(v) else None for v in result.look_px.tolist()]
-            covariance = (None,) * 3 if result.covariance is None else result.covariance[np.triu_indices(2)].tolist()
-            seen = (*look, result.axis_ratio, ";".join(result.flags), best, result.choice_margin, *covariance)
-            stated = (*peak, spot.kind, spot.score, result.target, result.deviation_deg)
-            for k, normal in enumerate(result.candidates.tolist()):
-                yield (spot.id, name, "ok", k, *normal, *seen, *stated)
+            covariance, deviation = (None,) * 3, None
+            if each["covariance"] is not None:
+                matrix = np.array(each["covariance"])
+                covariance, deviation = matrix[np.triu_indices(2)].tolist(), deviation_deg(matrix)
+            shape = (*each["look_px"], each["axis_ratio"], ";".join(each["flags"]), best, each["choice_margin"])
+            for k, normal in enumerate(np.array(each["candidates"]).tolist()):
+                yield (*start, k, *normal, *shape, *covariance, *judged, each["target"], deviation)
 
 
 def write_csv(path: Path, columns: Sequence[str], table: Iterable[Sequence[object]]) -> None:
@@ -81,7 +81,7 @@ def write_csv(path: Path, columns: Sequence[str], table: Iterable[Sequence[objec
         writer.writerows(table)
 
 
-def normals_ply(spots: Sequence[SpecularityRecord], camera: Camera, depths_mm: Sequence[float]) -> str:
+def normals_ply(spots: Sequence[Specularity], camera: Camera, depths_mm: Sequence[float]) -> str:
     """Return the proposed normals as oriented points on the sightlines that they look along (PLY, ASCII).
 
     The points are at the depth of their specularity; through a fisheye, which sees sideways and backwards too, at that

@@ -18,8 +18,8 @@ from simtest.pages.pixels import jpeg_address
 from simtest.pages.style import colours
 from simtest.reconstruction import explanations
 from simtest.reconstruction.assumptions import light_note
-from simtest.reconstruction.description import PictureRecord, Points, SpecularityRecord, members
-from simtest.reconstruction.tracking import Track, TrackedFrame
+from simtest.reconstruction.records import Points, Specularities, Specularity, cloud_members
+from simtest.reconstruction.tracking import DoneFrame, Track
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import JsonObject
 
@@ -36,18 +36,17 @@ HALF = 0.5
 """Isovalue of the isophote that is drawn of every highlight."""
 
 
-def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> None:
+def write_picture_page(path: Path, spots: Specularities, picture: Image) -> None:
     """Write the page of a picture in [0, 1], RGB as encoded: its highlights one by one, to zoom and click."""
-    spots = record.specularities
     palette = colours(name for spot in spots for name in spot.estimates)
-    belongs = members(spots)
+    belongs = cloud_members(spots)
     data = {
         "spots": [_spot(spot, belongs.get(spot.id)) for spot in spots],
         "others": [
             {"kind": explanations.kind_name(h.kind), "outline": _rounded(h.outline, 1),
              "peak": np.add(h.region.peak, 0.5).tolist(), "score": h.score, "id": number}
             for number, h in [
-                *((None, h) for h in record.other_highlights),
+                *((None, h) for h in spots.detection.others),
                 *((s.id, s.highlight) for s in spots if s.highlight and s.peak_px is None),
             ]
         ],
@@ -56,26 +55,25 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
         | {"kinds": {explanations.kind_name(kind): text for kind, text in explanations.KINDS.items()}},
     }  # fmt: skip
     height, width = picture.shape[:2]
-    best, stated = Counter(spot.best for spot in spots if spot.best), record.stated
-    # Parts below a hundredth of the whole change nothing that is shown.
-    told = [] if stated is None else [p for p in stated.parts_deg.items() if p[1] >= 0.01 * stated.median_deg]
+    best, stated = Counter(spot.best for spot in spots if spot.best), spots.stated
+    parts = {} if stated is None else stated.shown_parts_deg
     write_page(
-        path, "picture.html.j2", data, record=record, stated=stated, told=told, picture=_address(picture),
-        title=Path(record.image).name, width=width, height=height, palette=palette, best=best,
+        path, "picture.html.j2", data, record=spots, stated=stated, told=list(parts.items()), picture=_address(picture),
+        title=Path(spots.image).name, width=width, height=height, palette=palette, best=best,
         answered=sum(best.values()), clouds=any(_clouds(spot) for spot in spots), terms=explanations.TERMS,
-        others=len(data["others"]), left_out=len(record.other_highlights),
-        left_out_kinds=explanations.kinds_counted(h.kind for h in record.other_highlights),
-        light_note=light_note(record.assumed), parts=explanations.PARTS, outline=OUTLINE,
+        others=len(data["others"]), left_out=len(spots.detection.others),
+        left_out_kinds=explanations.kinds_counted(h.kind for h in spots.detection.others),
+        light_note=light_note(spots.choices.assumed), parts=explanations.PARTS, outline=OUTLINE,
         chi95=chi_squared.quantile(0.95, 2),
     )  # fmt: skip
 
 
-def write_sequence_page(path: Path, frames: Sequence[TrackedFrame], tracks: Sequence[Track]) -> None:
+def write_sequence_page(path: Path, frames: Sequence[DoneFrame], tracks: Sequence[Track]) -> None:
     """Write the page of a sequence: its frames, whose pictures lie beside it in frames/, and its tracks."""
     data = {
         "frames": [
             {"file": f"frames/{frame.index:06d}.jpg", "name": frame.name, "time": frame.time_s,
-             "count": len(frame.specularities)}
+             "count": frame.count}
             for frame in frames
         ],
         "position": {frame.index: i for i, frame in enumerate(frames)},
@@ -116,13 +114,13 @@ class _Lines:
         return self.kept.index(rounded)
 
 
-def _spot(spot: SpecularityRecord, cloud_id: int | None) -> JsonObject:
+def _spot(spot: Specularity, cloud_id: int | None) -> JsonObject:
     lines = _Lines()
     rows = [{"name": name, **_row(name, result, spot, lines)} for name, result in spot.estimates.items()]
     return {
         "id": spot.id,
         "peak": _rounded(spot.position_px, 2),
-        "size": max(spot.box_px[2:]),
+        "size": max(spot.region.box[2:]),
         "kind": explanations.kind_name(spot.kind),
         "score": spot.score,
         "best": spot.best,
@@ -133,7 +131,7 @@ def _spot(spot: SpecularityRecord, cloud_id: int | None) -> JsonObject:
     }
 
 
-def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord, lines: _Lines) -> JsonObject:
+def _row(name: str, result: Estimate | Failure, spot: Specularity, lines: _Lines) -> JsonObject:
     if isinstance(result, Failure):
         return {"status": str(result.reason), "detail": result.detail}
     error = spot.reference.errors.get(name) if spot.reference else None
@@ -176,7 +174,7 @@ def _cloud(result: Estimate) -> JsonObject | None:
     return {"points": points, "seen": cloud.seen, "ratio": round(cloud.axis_ratio, 3), "slope": slope}
 
 
-def _clouds(spot: SpecularityRecord) -> list[str]:
+def _clouds(spot: Specularity) -> list[str]:
     """Return the names of the estimates of a specularity that stand on a cloud."""
     return [name for name, result in spot.normals.items() if result.cloud is not None]
 

@@ -10,7 +10,7 @@ from simtest.errors import Failure
 from simtest.estimators import AnyEstimator, Estimate
 from simtest.estimators.protocol import CloudEstimator
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.pipeline import Specularity
+from simtest.reconstruction.records import Specularity
 from simtest.rendering import HighlightPoint, Session
 from simtest.simulation import clouds as regions
 from simtest.simulation.rendered_view import RenderedView

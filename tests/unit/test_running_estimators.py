@@ -20,8 +20,7 @@ from simtest.estimators.dispatch import run, run_each, run_in_frame
 from simtest.estimators.estimate_check import check
 from simtest.estimators.protocol import EstimatedCurvature
 from simtest.geometry import Camera, Patch, smooth
-from simtest.reconstruction.description import describe
-from simtest.reconstruction.pipeline import reconstruct, run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.validation.matching import match
 
 CAMERA = Camera(400, 100, 406.0, 406.0, 200.0, 50.0)
@@ -325,8 +324,10 @@ def test_without_specularities_a_frame_estimator_is_asked_all_the_same():
         def detect(self, frame, camera, priors):
             return Detection((), frame)
 
-    made = run_pipeline(picture(), CAMERA, Blind(), {"frame": Peaks(((10.0, 90.0),))}, None, SMOOTHING_PX)
-    assert [list(spot.estimates) for spot in made.specularities] == [["frame"]]
+    made = reconstruct(
+        picture(), CAMERA, {"frame": Peaks(((10.0, 90.0),))}, detector=Blind(), smoothing_px=SMOOTHING_PX
+    )
+    assert [list(spot.estimates) for spot in made] == [["frame"]]
 
 
 def test_what_a_frame_estimator_alone_sees_is_described_and_matched_last():
@@ -334,9 +335,11 @@ def test_what_a_frame_estimator_alone_sees_is_described_and_matched_last():
         def detect(self, frame, camera, priors):
             return Detection((Region((0, 0, 100, 100), (50, 49), 1.0),), frame)
 
-    made = run_pipeline(picture(), CAMERA, Blind(), {"frame": Peaks(((50.2, 49.5), (50.4, 49.6)))}, None, SMOOTHING_PX)
-    detected, alone = made.specularities
-    assert len(describe(made, CAMERA)) == 2
+    made = reconstruct(
+        picture(), CAMERA, {"frame": Peaks(((50.2, 49.5), (50.4, 49.6)))}, detector=Blind(), smoothing_px=SMOOTHING_PX
+    )
+    detected, alone = made
+    assert len(made.to_json()["specularities"]) == 2
     # The truth lies at the second estimate's pixel; the detection keeps it all the same.
     true = SimpleNamespace(bp_px=np.array([50.45, 49.6]))
     assert match([alone, detected], [true.bp_px]) == {1: 0}

@@ -17,7 +17,6 @@ from simtest.errors import InputError
 from simtest.geometry import Array, Image
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_integer, check_number
-from simtest.reconstruction.choices import check_encoding, complete
 from simtest.reconstruction.image_io import is_sequence, open_source, read_picture
 from simtest.reconstruction.light_calibration.observations import (
     Circle,
@@ -32,6 +31,7 @@ from simtest.reconstruction.light_calibration.observations import (
     unlit_outline_errors,
 )
 from simtest.reconstruction.light_calibration.outline import outline_through
+from simtest.reconstruction.options import check_encoding, complete
 from simtest.reconstruction.poses import check_names, read_poses
 
 LEAST_PICTURES = 2
