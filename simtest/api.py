@@ -360,9 +360,9 @@ def reconstruct_picture(
 def _reconstruct_picture(
     image: Path, out: Path, options: "Options", extras: Extras
 ) -> tuple["Specularities", list[Path]]:
-    from simtest.reconstruction.image_io import read_picture
+    from simtest.reconstruction.images import read_picture
     from simtest.reconstruction.options import calibration_for
-    from simtest.reconstruction.output_files import write_outputs
+    from simtest.reconstruction.outputs import write_outputs
     from simtest.reconstruction.pipeline import NOTHING, reconstruct_values
 
     # read

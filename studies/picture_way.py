@@ -31,7 +31,7 @@ from simtest.detection.blobs import Highlight
 from simtest.estimators import Estimate
 from simtest.geometry import Patch
 from simtest.reconstruction import Specularities, Specularity
-from simtest.reconstruction.image_io import read_picture
+from simtest.reconstruction.images import read_picture
 
 ROOT = Path(__file__).resolve().parents[1]
 DOORS, GROUND = ("cli", "api"), ("geometry", "runtime", "errors", "conventions")

@@ -76,7 +76,7 @@ def reconstruct(
     image : Path
         PNG, JPEG, BMP or TIFF; a folder of these; or a video that OpenCV reads.
     """
-    from simtest.reconstruction.image_io import is_sequence
+    from simtest.reconstruction.images import is_sequence
     from simtest.reconstruction.options import parse_roi
 
     sequence = is_sequence(image)
@@ -179,7 +179,7 @@ def assumed_lines(assumed: "Sequence[Assumption]") -> "Iterator[str]":
 
 def count_lines(spots: "Specularities", image: Path) -> "Iterator[str]":
     """Tell how many highlights were found, how many have a normal, and what the others are."""
-    from simtest.reconstruction.borders import BORDERED
+    from simtest.reconstruction.assumptions import BORDERED
     from simtest.reconstruction.explanations import kinds_counted
     from simtest.reconstruction.pipeline import REFUSED
 

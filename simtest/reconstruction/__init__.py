@@ -1,8 +1,8 @@
 """From a picture, film or array to normals and what is written of them; never sees the truth.
 
-image_io reads; options says how a picture is taken, and what is chosen where nobody says it. pipeline leads from values
-to normals: linear light, a detector, the estimators. records holds what it made, which output_files, overlay,
-constraints and result_page write. sequence does all this for a folder or a video, with tracking.
+images reads; options says how a picture is taken, and what is chosen where nobody says it. pipeline leads from values
+to normals: linear light, a detector, the estimators. records holds what it made, which outputs, overlay and page write.
+sequence does all this for a folder or a video, with tracking.
 """
 
 from typing import TYPE_CHECKING

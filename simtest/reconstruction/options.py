@@ -27,7 +27,7 @@ from simtest.reconstruction.assumptions import (
     calibration_of_round_view,
     calibration_of_view,
 )
-from simtest.reconstruction.picture_values import check_roi, is_coloured
+from simtest.reconstruction.images import check_roi, is_coloured
 from simtest.runtime.arrays import Image, short_repr
 
 AUTO = "auto"

@@ -23,10 +23,9 @@ from simtest.estimators.protocol import Target
 from simtest.estimators.small_spot import UNRESOLVED
 from simtest.geometry import Camera, Patch
 from simtest.geometry.patch import share_of_noise
-from simtest.reconstruction.assumptions import calibration_of_view
-from simtest.reconstruction.borders import border_note
+from simtest.reconstruction.assumptions import border_note, calibration_of_view
+from simtest.reconstruction.images import check_frame, check_size, image_size
 from simtest.reconstruction.options import SMOOTHING_BY_COLOUR_PX, Options, check_encoding, choose
-from simtest.reconstruction.picture_values import check_frame, check_size, image_size
 from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.boundary import plain_errors

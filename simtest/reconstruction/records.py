@@ -208,7 +208,7 @@ class Specularity:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the patch with isophotes and normals, and a row for each estimator."""
-        from simtest.reconstruction.notebook import specularity_html
+        from simtest.reconstruction.page import specularity_html
 
         return specularity_html(self)
 
@@ -281,7 +281,7 @@ class Specularities(list[Specularity]):
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the frame with the best normals, and the first rows."""
-        from simtest.reconstruction.notebook import specularities_html
+        from simtest.reconstruction.page import specularities_html
 
         return specularities_html(self)
 

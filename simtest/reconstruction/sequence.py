@@ -20,7 +20,7 @@ import numpy.typing as npt
 from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.reconstruction.assumptions import Assumption
-from simtest.reconstruction.image_io import SequenceFrame, Source, open_source
+from simtest.reconstruction.images import SequenceFrame, Source, open_source
 from simtest.reconstruction.motion import COLUMNS as MOTION_COLUMNS
 from simtest.reconstruction.motion import (
     LEAST_MOTION,
@@ -34,11 +34,11 @@ from simtest.reconstruction.motion import (
     motion_row,
 )
 from simtest.reconstruction.options import Options, calibration_for, default_estimators
-from simtest.reconstruction.output_files import COLUMNS, normals_rows, write_csv
+from simtest.reconstruction.outputs import COLUMNS, normals_rows, write_csv
 from simtest.reconstruction.overlay import draw_overlay
+from simtest.reconstruction.page import write_sequence_page
 from simtest.reconstruction.pipeline import reconstruct_values
 from simtest.reconstruction.poses import Poses, read_poses
-from simtest.reconstruction.result_page import write_sequence_page
 from simtest.reconstruction.tracking import DoneFrame, Track, Tracker
 from simtest.runtime.boundary import plain_errors
 from simtest.runtime.files import JsonObject, make_folder, read_json, write_atomically, write_json

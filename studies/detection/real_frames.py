@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from simtest.detection.blobs import Highlight
 from simtest.reconstruction import detect_in_picture
-from simtest.reconstruction.image_io import read_picture
+from simtest.reconstruction.images import read_picture
 from simtest.reconstruction.pipeline import PictureDetection
 
 Mask = npt.NDArray[np.bool_]

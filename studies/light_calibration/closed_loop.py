@@ -21,7 +21,7 @@ from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.calibration import Calibration, Normal, Priors, Response
 from simtest.errors import InputError
 from simtest.estimators.budget import deviations
-from simtest.reconstruction.image_io import read_picture
+from simtest.reconstruction.images import read_picture
 from simtest.reconstruction.light_calibration.run import Ball, calibrate_lights, picture_readers
 from simtest.reconstruction.light_calibration.write import write_calibration
 from simtest.reconstruction.options import Options

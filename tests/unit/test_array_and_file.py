@@ -17,7 +17,7 @@ from simtest.calibration import Calibration, Priors, Response, exactly, srgb_enc
 from simtest.detection.colour import ColourDetector
 from simtest.errors import Failure
 from simtest.geometry import Camera
-from simtest.reconstruction.image_io import read_picture
+from simtest.reconstruction.images import read_picture
 from simtest.reconstruction.options import DEFAULT_ESTIMATORS, Options, calibration_for
 from simtest.reconstruction.pipeline import reconstruct, reconstruct_values
 

@@ -14,6 +14,7 @@ from simtest.estimators.process.requests import priors_message
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import KannalaBrandt, ViewMask
 from simtest.reconstruction.assumptions import (
+    BORDERED,
     CENTRE_SD_SHARE,
     FOCAL_SD,
     LENS_SD,
@@ -22,7 +23,6 @@ from simtest.reconstruction.assumptions import (
     calibration_of_round_view,
     calibration_of_view,
 )
-from simtest.reconstruction.borders import BORDERED
 from simtest.reconstruction.options import Options, calibration_for
 from simtest.reconstruction.pipeline import reconstruct_values
 from simtest.reconstruction.records import best_of, stated_errors

@@ -13,9 +13,9 @@ from simtest.detection.view_mask import WHOLE, View
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
 from simtest.geometry import Camera, chi_squared
-from simtest.reconstruction.constraints import constraints_arrays
 from simtest.reconstruction.motion import NEEDED, TrackedHighlight
 from simtest.reconstruction.options import Choices, Options
+from simtest.reconstruction.outputs import constraints_arrays
 from simtest.reconstruction.pipeline import reconstruct_values
 from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.files import write_json

@@ -16,10 +16,9 @@ import simtest
 from simtest.api import Extras, reconstruct_picture
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.reconstruction.constraints import constraints_arrays
-from simtest.reconstruction.image_io import open_source, read_picture
+from simtest.reconstruction.images import is_coloured, open_source, read_picture
 from simtest.reconstruction.options import Options
-from simtest.reconstruction.picture_values import is_coloured
+from simtest.reconstruction.outputs import constraints_arrays
 from simtest.reconstruction.sequence import reconstruct_sequence
 from simtest.reconstruction.tracking import Tracker
 from simtest.validation.depth_maps import depth_normals, depth_points, depth_problems, depths_at, read_depth

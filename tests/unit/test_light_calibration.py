@@ -18,7 +18,7 @@ from simtest.calibration.lights.search import find_lights
 from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.camera import Camera
-from simtest.reconstruction.image_io import read_picture
+from simtest.reconstruction.images import read_picture
 from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
 from simtest.reconstruction.light_calibration.observations import (
     View,

@@ -15,8 +15,8 @@ import simtest
 from simtest.calibration import Calibration
 from simtest.dataset.index import HighlightRow, SampleRow
 from simtest.geometry import Camera
-from simtest.reconstruction.constraints import constraints_arrays
 from simtest.reconstruction.options import Options
+from simtest.reconstruction.outputs import constraints_arrays
 from simtest.reconstruction.pipeline import reconstruct_values
 from simtest.runtime.files import as_json
 from simtest.simulation.frame_files import FILES

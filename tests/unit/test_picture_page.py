@@ -22,8 +22,8 @@ from simtest.reconstruction import explanations
 from simtest.reconstruction.assumptions import LIGHT_AT_CAMERA, assumptions, calibration_of_view
 from simtest.reconstruction.options import Choices
 from simtest.reconstruction.overlay import ISOPHOTE, NUMBER, draw_overlay
+from simtest.reconstruction.page import write_picture_page
 from simtest.reconstruction.records import Drawing, Specularities, Specularity, cloud_members
-from simtest.reconstruction.result_page import write_picture_page
 
 WIDTH, HEIGHT = 320, 240
 PACKAGE = Path(explanations.__file__).parents[1]

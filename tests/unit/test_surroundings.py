@@ -16,7 +16,7 @@ from simtest.cli.main import _mend_terminal
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction import reconstruct
-from simtest.reconstruction.picture_values import is_coloured
+from simtest.reconstruction.images import is_coloured
 from simtest.rendering import bitmap
 from simtest.runtime.arrays import cache_folder
 from simtest.runtime.files import user_cache

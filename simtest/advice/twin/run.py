@@ -15,7 +15,7 @@ from simtest.advice.twin.tissue import Tissue, tissue_of
 from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.reconstruction.assumptions import NEAR_MISSES, Assumption
-from simtest.reconstruction.image_io import is_sequence, read_picture
+from simtest.reconstruction.images import is_sequence, read_picture
 from simtest.reconstruction.options import Options, calibration_for
 from simtest.reconstruction.pipeline import run
 from simtest.runtime.arrays import Array, Image

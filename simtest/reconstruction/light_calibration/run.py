@@ -17,7 +17,7 @@ from simtest.errors import InputError
 from simtest.geometry import Array, Image
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_integer, check_number
-from simtest.reconstruction.image_io import is_sequence, open_source, read_picture
+from simtest.reconstruction.images import is_sequence, open_source, read_picture
 from simtest.reconstruction.light_calibration.observations import (
     Circle,
     View,
