@@ -319,8 +319,8 @@ def light(
     pictures : list of Path
         Pictures, or folders of pictures: the ball at 6 to 12 places, near and far, across the view.
     """
+    from simtest.reconstruction.light_calibration.page import result_json, write_calibration
     from simtest.reconstruction.light_calibration.run import calibrate_lights, picture_readers
-    from simtest.reconstruction.light_calibration.write import result_json, write_calibration
     from simtest.spec.calibration_file import load_calibration
 
     mirror = _mirror(ball_radius, ball_radius_sd, outlines, plate, (plate_sd, plate_tilt_sd))
@@ -333,8 +333,7 @@ def light(
 def _mirror(
     radius: float | None, radius_sd: float, outlines: Path | None, plate: Path | None, plate_sd: tuple[float, float]
 ) -> "Ball | Plate":
-    from simtest.reconstruction.light_calibration.observations import circles_of
-    from simtest.reconstruction.light_calibration.run import Ball, Plate
+    from simtest.reconstruction.light_calibration.run import Ball, Plate, circles_of
 
     if (radius is None) == (plate is None):
         raise InputError("--ball-radius or --plate: exactly one of them must be given")

@@ -22,8 +22,8 @@ from simtest.calibration import Calibration, Normal, Priors, Response
 from simtest.errors import InputError
 from simtest.estimators.budget import deviations
 from simtest.reconstruction.images import read_picture
+from simtest.reconstruction.light_calibration.page import write_calibration
 from simtest.reconstruction.light_calibration.run import Ball, calibrate_lights, picture_readers
-from simtest.reconstruction.light_calibration.write import write_calibration
 from simtest.reconstruction.options import Options
 from simtest.reconstruction.pipeline import run
 from simtest.rendering import Session
