@@ -81,13 +81,7 @@ class Poses:
     error_told: bool
 
     def of_frames(self, names: Sequence[str], indices: Sequence[int]) -> list[Array | None]:
-        """Return the pose of each frame, None for those without one.
-
-        Parameters
-        ----------
-        names, indices : sequence
-            Names of the frames' files, and their numbers in the sequence, which count where the poses have no names.
-        """
+        """Return the pose of each frame by its file's name, or by its number where the poses have no names."""
         if self.names:
             table = {name: pose for name, pose in zip(self.names, self.world_from_camera, strict=True)}
             found = [table.get(name) for name in names]

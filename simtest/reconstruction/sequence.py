@@ -252,11 +252,11 @@ def _read_done(path: Path, name: str) -> JsonObject | None:
     """Read what an earlier run wrote of a frame; None where there is nothing, or it cannot be used."""
     try:
         entry: JsonObject = read_json(path)
-        rows = [*_rows(0, None, entry)]
-        usable = entry["image"] == name and len(entry["size"]) == 2 and "time_s" in entry and rows is not None
+        # The rows of the tables need what a frame's file must hold.
+        tuple(_rows(0, None, entry))
+        return entry if (entry["image"], len(entry["size"])) == (name, 2) and "time_s" in entry else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return entry if usable else None
 
 
 def _judge_by_motion(run: _Run, poses: Poses, calibration: Calibration) -> str:

@@ -65,14 +65,9 @@ class _Moving:
 
 
 class Tracker:
-    """Assigns the specularities of each frame to tracks.
+    """Assigns the specularities of each frame, of a width and height in px, to tracks.
 
     All are assigned together, by the least sum of distances to where tracks are expected; the rest begin new tracks.
-
-    Parameters
-    ----------
-    size : tuple of int
-        Width and height of the frames, px.
     """
 
     def __init__(self, size: tuple[int, int]) -> None:

@@ -20,7 +20,7 @@ from simtest.estimators.dispatch import run, run_each, run_in_frame
 from simtest.estimators.estimate_check import check
 from simtest.estimators.protocol import EstimatedCurvature
 from simtest.geometry import Camera, Patch, smooth
-from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction.pipeline import UNRESOLVED, _flagged, reconstruct
 from simtest.validation.matching import match
 
 CAMERA = Camera(400, 100, 406.0, 406.0, 200.0, 50.0)
@@ -364,3 +364,21 @@ def test_the_protocols_tell_the_kinds_apart():
 def test_what_is_no_estimator_is_refused(given, said):
     with pytest.raises(InputError, match=said):
         load_estimators({"given": given})
+
+
+def test_flags_of_the_frame_stand_behind_those_of_the_estimator_in_one_order():
+    y, x = np.mgrid[:40, :40] + 0.5
+    patch = Patch.cut(np.exp(-((x - 20) ** 2 + (y - 18) ** 2) / 50), (5, 5, 30, 30))
+    patch = replace(patch, saturated=np.ones((30, 30), bool))
+    frame = SimpleNamespace(corrected=SimpleNamespace(limited=np.ones((40, 40), bool)))
+    normal = np.array([0.0, 0.0, -1.0])
+    given = Estimate(normal, normal[None], np.array([20.0, 18.0]), flags=("round", "dim"))
+    made = _flagged(given, patch, frame, small=True, dim=True)
+    assert made.flags == ("round", "dim", "saturated", "vignetted", "small")
+    # An unresolved highlight states no shape that smoothing could have changed; nothing is limited where all light is.
+    clear = SimpleNamespace(corrected=SimpleNamespace(limited=None))
+    unresolved = replace(given, flags=(UNRESOLVED,))
+    assert _flagged(unresolved, replace(patch, saturated=None), clear, small=True, dim=True).flags == (
+        UNRESOLVED,
+        "dim",
+    )

@@ -87,18 +87,9 @@ class _Blob:
 
 
 def separate(values: Array, where: npt.NDArray[np.bool_], noise: float, base: float) -> Spots | None:
-    """Return the spots of a blob; None where spots of one profile do not explain it.
+    """Return the spots of a blob of linear light, shape (H, W); None where spots of one profile do not explain it.
 
-    Parameters
-    ----------
-    values : ndarray, shape (H, W)
-        Linear light.
-    where : ndarray of bool, shape (H, W)
-        Pixels of the blob and of some of what surrounds it.
-    noise : float
-        Standard deviation of a pixel.
-    base : float
-        Light of what surrounds the blob.
+    `where` are its pixels and some of what surrounds it, where the light is `base`; `noise` is a pixel's deviation.
     """
     blob = _blob(values, where, noise, base)
     best = _start(blob, base)
@@ -260,18 +251,9 @@ MOST_OPENED_PX = 200.0
 
 @dataclass(frozen=True)
 class MeasuredHighlight:
-    """A highlight.
+    """A highlight: its centre, px, with the covariance, px^2, and why it is not used, empty where it is.
 
-    Parameters
-    ----------
-    pixel : ndarray, shape (2,)
-        Centre, px.
-    covariance : ndarray, shape (2, 2)
-        Of the centre, px^2.
-    problem : str
-        Why it is not used; empty: it is.
-    width_px, width_sd_px : float
-        Radius at half height, px, and its standard deviation; 0: not known.
+    `width_px` is its radius at half height, with its standard deviation; 0: not known.
     """
 
     pixel: Array
@@ -282,16 +264,9 @@ class MeasuredHighlight:
 
 
 def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px: float) -> list[MeasuredHighlight]:
-    """Return the highlights of a picture, the brightest first.
+    """Return the highlights of a picture of linear light on the pixels of ball or plate, the brightest first.
 
-    Parameters
-    ----------
-    intensity : ndarray, shape (H, W)
-        Linear light.
-    where : ndarray of bool, shape (H, W)
-        Pixels of the ball or plate.
-    widest_px : float
-        A spot that is longer is no highlight of a light.
+    A spot that is longer than `widest_px` is no highlight of a light.
     """
     rows, columns = np.flatnonzero(where.any(axis=1)), np.flatnonzero(where.any(axis=0))
     if not len(rows):

@@ -184,15 +184,7 @@ class _Band:
 
 
 def refine_outline(intensity: Array, camera: Camera, start: BallOutline) -> BallOutline | None:
-    """Fit the outline to the pixels around it; None where too little of it shows an edge.
-
-    Parameters
-    ----------
-    intensity : ndarray, shape (H, W)
-        Linear light.
-    start : BallOutline
-        Within about 3 px of the outline.
-    """
+    """Fit the outline to linear light, from a start within about 3 px; None where too little of it shows an edge."""
     found = start
     for _ in range(3):
         # The band moves with the outline.
@@ -380,6 +372,8 @@ def has_dark_ring(intensity: Array, camera: Camera, outline: BallOutline) -> boo
         np.isfinite(left[-1]) and gap_px > RING_WIDTH_PX and left[-1] + floor > RING_GAIN * (left[best] + floor)
     )
 
+
+# Search of a ball: circles by Hough's transform, each moved onto the edges around it ----------------------------------
 
 SEARCHED_PX = 480
 """Longer side of the picture in which circles are searched."""

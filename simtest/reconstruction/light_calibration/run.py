@@ -81,20 +81,10 @@ Pictures = Sequence[tuple[str, Callable[[], Image]]]
 
 @dataclass(frozen=True)
 class View:
-    """A picture with its mirror and highlights.
+    """A picture with its mirror and highlights, the brightest first.
 
-    Parameters
-    ----------
-    name : str
-        The picture's file.
-    intensity : ndarray, shape (H, W)
-        Linear light, falloff undone.
-    highlights : list of MeasuredHighlight
-        The brightest first.
-    outline : BallOutline, optional
-        Of the ball.
-    plane : tuple, optional
-        Of the plate: unit normal towards the camera, shape (3,), and n . x on it, mm.
+    `intensity` is linear light, falloff undone. A ball has an outline, a plate a plane: its unit normal towards the
+    camera, shape (3,), and n . x on it, mm.
     """
 
     name: str
@@ -284,19 +274,7 @@ class Plate:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """The result, with the pictures that it stands on.
-
-    Parameters
-    ----------
-    result : LightCalibration
-        Lights, intervals and doubts.
-    views : Views
-        Pictures, their highlights, and pictures left out.
-    mirror : Ball or Plate
-        What was photographed.
-    calibration : Calibration
-        As it was given, with the lights that travel with the camera.
-    """
+    """The lights, with what was photographed, the pictures that they stand on, and the calibration that states them."""
 
     result: LightCalibration
     views: Views
