@@ -12,8 +12,8 @@ from benchmarks.measuring import Figure
 from benchmarks.timing import in_turns, times_in_turns
 from simtest.calibration import Calibration, srgb_encode
 from simtest.geometry import Camera
-from simtest.reconstruction import detect_in_picture, reconstruct_colour
-from simtest.reconstruction.pipeline import default_estimators
+from simtest.reconstruction import Specularities, detect_in_picture, reconstruct
+from simtest.reconstruction.options import default_estimators
 
 WIDTH, HEIGHT, HIGHLIGHTS = 1280, 720, 30
 MANY = 110
@@ -62,17 +62,17 @@ def figures() -> list[Figure]:
         for _ in range(BLURS):
             cv2.GaussianBlur(picture, (0, 0), 2.0)
 
-    found = reconstruct_colour(picture, calibration, names)
+    found = by_colour(picture, calibration, names)
     times = in_turns(
         {
             "blurs": blurs,
             "detection": lambda: detect_in_picture(picture),
-            "all": lambda: reconstruct_colour(picture, calibration, names),
+            "all": lambda: by_colour(picture, calibration, names),
         },
         ROUNDS,
     )
     about = ", ".join(f"{name} {1e3 * seconds:.0f} ms" for name, seconds in times.items())
-    count = len(found.specularities)
+    count = len(found)
     return [
         Figure(
             f"1280 x 720, {count} highlights, detection over {BLURS} blurs",
@@ -86,12 +86,15 @@ def figures() -> list[Figure]:
     ]
 
 
+def by_colour(picture: npt.NDArray[np.float32], calibration: Calibration, names: Sequence[str]) -> Specularities:
+    """Reconstruct an sRGB picture by its colours."""
+    return reconstruct(picture, calibration, names, detector="colour", encoding="srgb")
+
+
 def _many(calibration: Calibration, names: Sequence[str]) -> Figure:
     """Return the processor time of a frame with many highlights, warm, in one process."""
     picture = spotted(MANY)
-    found = reconstruct_colour(picture, calibration, names)
-    seconds = times_in_turns(
-        {"all": lambda: reconstruct_colour(picture, calibration, names)}, ROUNDS, time.process_time
-    )
-    own, count = statistics.median(seconds["all"]), len(found.specularities)
+    found = by_colour(picture, calibration, names)
+    seconds = times_in_turns({"all": lambda: by_colour(picture, calibration, names)}, ROUNDS, time.process_time)
+    own, count = statistics.median(seconds["all"]), len(found)
     return Figure(f"1280 x 720, {count} highlights, all normals, processor", own, MANY_LIMIT_S, unit="s")

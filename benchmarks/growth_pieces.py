@@ -10,15 +10,15 @@ from pathlib import Path
 
 import polars as pl
 
-from benchmarks.colour import spotted
+from benchmarks.colour import by_colour, spotted
 from benchmarks.nights import run_of
 from benchmarks.transfers import smooth_scene
 from simtest.calibration import Calibration
 from simtest.geometry import Camera
 from simtest.nightly.gate.quantities import setting_figures
 from simtest.nightly.run import verdict_on
-from simtest.reconstruction import detect_in_picture, reconstruct_colour
-from simtest.reconstruction.pipeline import default_estimators
+from simtest.reconstruction import detect_in_picture
+from simtest.reconstruction.options import default_estimators
 from simtest.rendering import Session, backend
 from simtest.report import write_report
 from simtest.runtime.resources import find
@@ -181,7 +181,7 @@ def _pictures(normals: bool) -> Callable[[], AbstractContextManager[Works]]:
             picture = spotted(spots)
             found = len(detect_in_picture(picture).detection.highlights)
             if normals:
-                works[float(found)] = lambda p=picture: reconstruct_colour(p, calibration, names)  # type: ignore[misc]
+                works[float(found)] = lambda p=picture: by_colour(p, calibration, names)  # type: ignore[misc]
             else:
                 works[float(found)] = lambda p=picture: detect_in_picture(p)  # type: ignore[misc]
         yield works

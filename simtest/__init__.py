@@ -2,7 +2,7 @@
 
 From a picture to normals:
 
-1. read: a picture, folder or video becomes values as encoded (reconstruction.image_io)
+1. read: a picture, folder or video becomes values as encoded (reconstruction.images)
 2. linear light: response, vignetting and emission are undone, as far as they are known (calibration)
 3. detect: regions of interest, by local maxima or by the tissue's colour, and their smoothed patches (detection)
 4. estimate: normals, with covariances, from the isophotes of each patch (estimators, inverse; on geometry)

@@ -6,7 +6,7 @@ needs them all.
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +17,8 @@ from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from simtest.reconstruction import reconstruct
-    from simtest.reconstruction.description import PictureRecord
-    from simtest.reconstruction.picture import Options
+    from simtest.reconstruction.options import Options
+    from simtest.reconstruction.records import Specularities
     from simtest.report.run_results import RunResults
     from simtest.runtime.processes import Engine
     from simtest.simulation.frame import LabelledFrame
@@ -348,7 +348,7 @@ class Extras:
 @plain_errors
 def reconstruct_picture(
     image: Path, out: Path, options: "Options", extras: Extras | None = None
-) -> tuple["PictureRecord", list[Path]]:
+) -> tuple["Specularities", list[Path]]:
     """Reconstruct the normals of a picture and write them; return what was found, and the files."""
     from simtest.runtime.locks import exclusive_folder
 
@@ -358,14 +358,15 @@ def reconstruct_picture(
 
 def _reconstruct_picture(
     image: Path, out: Path, options: "Options", extras: Extras
-) -> tuple["PictureRecord", list[Path]]:
-    from simtest.reconstruction.image_io import read_picture
-    from simtest.reconstruction.output_files import write_outputs
-    from simtest.reconstruction.picture import NOTHING, read_calibration, reconstruct_values
+) -> tuple["Specularities", list[Path]]:
+    from simtest.reconstruction.images import read_picture
+    from simtest.reconstruction.options import calibration_for
+    from simtest.reconstruction.outputs import write_outputs
+    from simtest.reconstruction.pipeline import NOTHING, reconstruct_values
 
     # read
     picture = read_picture(image)
-    calibration, cautions = read_calibration(options, picture)
+    calibration, cautions = calibration_for(options, picture)
     for caution in cautions:
         warnings.warn(caution, stacklevel=2)
     reference = None
@@ -375,20 +376,20 @@ def _reconstruct_picture(
         reference = load_reference(
             extras.reference, extras.camera_from_model, calibration.camera, extras.depth_scale, extras.reference_format
         )
-    # linear light, detect, estimate, describe
-    record = reconstruct_values(str(image), picture, calibration, options, cautions)
-    if not record.specularities:
+    # linear light, detect, estimate
+    found = reconstruct_values(str(image), picture, calibration, options, cautions)
+    if not found:
         warnings.warn(NOTHING, stacklevel=2)
-        record = replace(record, warnings=[*record.warnings, NOTHING])
+        found.warnings.append(NOTHING)
     depth = None
     if extras.depth is not None:
         from simtest.validation.depth_maps import depths_at
 
-        peaks = [spot.peak_px for spot in record.specularities]
+        peaks = [spot.peak_px for spot in found]
         depth = depths_at(extras.depth, peaks, (picture.shape[1], picture.shape[0]), extras.depth_scale)
     if reference is not None:
         from simtest.validation.reference_surface import compare
 
-        record = compare(record, reference)
+        compare(found, reference)
     # write
-    return record, write_outputs(out, record, picture, depth)
+    return found, write_outputs(out, found, picture, depth)

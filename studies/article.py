@@ -16,7 +16,8 @@ import numpy as np
 from simtest.estimators import Estimate, load_estimators
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.pipeline import Specularities, reconstruct
+from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction.records import Specularities
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.runtime.resources import find

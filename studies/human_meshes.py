@@ -21,7 +21,8 @@ from simtest.estimators import Estimate
 from simtest.geometry import chi_squared
 from simtest.geometry.patch import encloses
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, Specularity, run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction.records import Specularity
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.simulation.frame import RenderedView, render_view
@@ -115,11 +116,9 @@ def _scored(path: Path, viewpoints: range) -> Score:
 
 def _judge(score: Score, session: Session, view: RenderedView, seed: int) -> None:
     """Add a frame's counts and answers."""
-    made = run_pipeline(
-        view.frame(seed), view.calibration, ColourDetector(True), list(ESTIMATORS), None, SMOOTHING_BY_COLOUR_PX
-    )
+    made = reconstruct(view.frame(seed), view.calibration, list(ESTIMATORS), detector=ColourDetector(True))
     detection = made.detection
-    judged = list(zip(made.specularities, detection.highlights, strict=True))
+    judged = list(zip(made, detection.highlights, strict=True))
     kept = [pair for pair in judged if pair[1].is_isolated]
     found = [specularity for specularity, _ in kept]
     lit = [h for h in view.highlights if h.lit]

@@ -27,7 +27,7 @@ from simtest.estimators.learned import normal_of
 from simtest.estimators.learned_dense import LEAST_HIGHLIGHTS, LearnedDense
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg, tangent_basis, tangent_coordinates
-from simtest.reconstruction.pipeline import run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.arrays import Array
 from simtest.runtime.statistics import CONFIDENCE, NORMAL_QUANTILE
 from studies.networks.examples import DENSE_FIELDS, sample_frame, truth_at
@@ -138,15 +138,17 @@ def _score_spots(
     """Score estimators of the base's normal at the detected highlights of a frame, and pair them."""
     frame = sample_frame(sample)
     estimators = {**(load_estimators(["bisector", "learned_spot"]) if others else {}), **dense}
-    found = run_pipeline(frame.encoded, frame.calibration, "colour", estimators, None, frame.smoothing_px)
-    peaks = [each.patch.peak_px for each in found.specularities if not isinstance(each.patch, Failure)]
+    found = reconstruct(
+        frame.encoded, frame.calibration, estimators, smoothing_px=frame.smoothing_px, detector="colour"
+    )
+    peaks = [each.patch.peak_px for each in found if not isinstance(each.patch, Failure)]
     if len(peaks) >= LEAST_HIGHLIGHTS:
         for name, estimator in dense.items():
             told = estimator.contradictions(frame, np.array(peaks, dtype=float))
             scores[name].contradictions += [] if isinstance(told, Failure) else [float(told.mean()) / 2]
     errors: dict[str, dict[int, float]] = defaultdict(dict)
     inside: dict[str, list[float]] = defaultdict(list)
-    for number, each in enumerate(found.specularities):
+    for number, each in enumerate(found):
         if isinstance(each.patch, Failure):
             continue
         point = np.asarray(each.patch.peak_px, dtype=float)[None]

@@ -25,7 +25,7 @@ from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.learned_spot import LearnedSpot, rays_of
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
-from simtest.reconstruction.pipeline import run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.arrays import Array
 from simtest.runtime.statistics import CONFIDENCE, NORMAL_QUANTILE
 from studies.networks.examples import NEAR_PX, SPOT_FIELDS, only_glints, sample_frame
@@ -92,8 +92,10 @@ def main() -> None:
 def _rows(sample: Sample, estimators: dict[str, object]) -> Iterator[Row]:
     """Yield the estimates at the highlights of a sample that the detector by colour finds."""
     frame, anatomy = sample_frame(sample), sample.meta["anatomy"]
-    found = run_pipeline(frame.encoded, frame.calibration, "colour", estimators, None, frame.smoothing_px)  # type: ignore[arg-type]
-    single = [each for each in found.specularities if not isinstance(each.patch, Failure)]
+    found = reconstruct(  # type: ignore[arg-type]
+        frame.encoded, frame.calibration, estimators, smoothing_px=frame.smoothing_px, detector="colour"
+    )
+    single = [each for each in found if not isinstance(each.patch, Failure)]
     peaks = np.array([each.patch.peak_px for each in single if not isinstance(each.patch, Failure)]).reshape(-1, 2)
     glints, kinds = dict(only_glints(sample, peaks)), _kinds(sample, peaks)
     for number, (each, peak) in enumerate(zip(single, peaks, strict=True)):
@@ -113,7 +115,7 @@ def _rows(sample: Sample, estimators: dict[str, object]) -> Iterator[Row]:
     answered = [
         (n, p) for n, p in enumerate(peaks) if isinstance(single[n].estimates.get("learned_spot, base"), Estimate)
     ]
-    for each in found.specularities:
+    for each in found:
         for result in each.estimates.values():
             if isinstance(result, Estimate) and result.cloud is not None and answered:
                 base = _base(sample, result.look_px)

@@ -25,7 +25,7 @@ from simtest.errors import Failure
 from simtest.estimators.protocol import Target
 from simtest.geometry import Camera
 from simtest.reconstruction.pipeline import reconstruct
-from simtest.reconstruction.ranking import best_of
+from simtest.reconstruction.records import best_of
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Mask
 from simtest.simulation.frame import render_view

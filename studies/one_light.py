@@ -33,7 +33,9 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate, prior_parts
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.pipeline import Reconstruction, default_estimators, run_picture
+from simtest.reconstruction.options import Options, default_estimators
+from simtest.reconstruction.pipeline import run
+from simtest.reconstruction.records import Specularities
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import from_integer
@@ -127,7 +129,7 @@ def clouds_alone(frames: int, seed: int) -> None:
         session, view, family = made
         scope = next(name for name, families in SCOPES.items() if family in families)
         picture = np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
-        clouds = run_picture(picture, told(view, scope), estimators=("cloud",), target="base")[0]
+        clouds = run(picture, told(view, scope), Options(estimators=("cloud",), target="base"))
         rows += _cloud_rows(session, view, clouds, {"frame": number, "organ": ORGANS[family]})
         print(f"frame {number}: {len(rows)} clouds so far", file=sys.stderr, flush=True)
     about = {"all": rows, **{organ: [row for row in rows if row["organ"] == organ] for organ in ORGANS}}
@@ -234,11 +236,11 @@ def _rows(session: Session, view: RenderedView, number: int, family: int) -> lis
 def _told_rows(
     session: Session, view: RenderedView, picture: Image, calibration: Calibration, about: Mapping[str, float | str]
 ) -> list[Row]:
-    made = run_picture(picture, calibration)[0]
+    made = run(picture, calibration, Options())
     scored = score(session, view, made)
     with replaced.object(prior_parts, "CROWD", math.inf):
-        before = {spot.spot.index: spot for spot in score(session, view, run_picture(picture, calibration)[0])}
-    count = len(made.specularities)
+        before = {spot.spot.index: spot for spot in score(session, view, run(picture, calibration, Options()))}
+    count = len(made)
     crowd = "none" if count <= 3 else "few" if count <= 30 else "many"
     return [{**about, "crowd": crowd, **_numbers(spot, before.get(spot.spot.index))} for spot in scored]
 
@@ -249,7 +251,7 @@ def base_rows(session: Session, view: RenderedView, number: int, family: int) ->
     calibration = told(view, next(name for name, families in SCOPES.items() if family in families))
     relief = view.scene.surface.relief
     assert relief is not None
-    made = run_picture(picture, calibration, estimators=default_estimators(calibration), target="base")[0]
+    made = run(picture, calibration, Options(estimators=default_estimators(calibration), target="base"))
     slope = Priors(relief_slope=exactly(math.radians(relief.slope_deg)))
     by_slope = score(session, view, _having_relief(made, prior_parts.relief_part(slope)))
     # On a plane highlights are no steeper: the control is the part as it would be there.
@@ -267,13 +269,13 @@ def base_rows(session: Session, view: RenderedView, number: int, family: int) ->
     ]  # fmt: skip
 
 
-def _having_relief(made: Reconstruction, part: Array) -> Reconstruction:
+def _having_relief(made: Specularities, part: Array) -> Specularities:
     """Return a reconstruction of the base in which the part `relief` of each single highlight is another one."""
     changed = [
         replace(each, estimates={name: _with_part(estimate, part) for name, estimate in each.estimates.items()})
-        for each in made.specularities
+        for each in made
     ]
-    return replace(made, specularities=changed)
+    return Specularities(changed, made.detection, made.choices)
 
 
 def _with_part(estimate: Estimate | Failure, part: Array) -> Estimate | Failure:
@@ -287,7 +289,7 @@ def _base_rows(
 ) -> list[Row]:
     """Return the rows of what the picture says of the base's normals: single highlights, and clouds of them."""
     names = (*default_estimators(calibration), "cloud")
-    made = run_picture(picture, calibration, estimators=names, target="base")[0]
+    made = run(picture, calibration, Options(estimators=names, target="base"))
     rows: list[Row] = [
         {
             **about,
@@ -303,11 +305,11 @@ def _base_rows(
 
 
 def _cloud_rows(
-    session: Session, view: RenderedView, made: Reconstruction, about: Mapping[str, float | str]
+    session: Session, view: RenderedView, made: Specularities, about: Mapping[str, float | str]
 ) -> list[Row]:
     """Return the rows of a picture's clouds; one whose spots belong to no point of the base is not held."""
     rows: list[Row] = []
-    for specularity in made.specularities:
+    for specularity in made:
         cloud = specularity.estimates.get("cloud")
         if not isinstance(cloud, Estimate):
             continue

@@ -30,13 +30,12 @@ from simtest.detection import Region
 from simtest.detection.detector import Highlight
 from simtest.estimators import Estimate
 from simtest.geometry import Patch
-from simtest.reconstruction import Specularity
-from simtest.reconstruction.description import PictureRecord, SpecularityRecord
-from simtest.reconstruction.image_io import read_picture
+from simtest.reconstruction import Specularities, Specularity
+from simtest.reconstruction.images import read_picture
 
 ROOT = Path(__file__).resolve().parents[1]
 DOORS, GROUND = ("cli", "api"), ("geometry", "runtime", "errors", "conventions")
-MADE_OF_IT = (Region, Patch, Highlight, Estimate, Specularity, SpecularityRecord, PictureRecord)
+MADE_OF_IT = (Region, Patch, Highlight, Estimate, Specularity, Specularities)
 CONSTRUCTORS = ("__init__", "__post_init__", "__new__")
 
 

@@ -36,9 +36,9 @@ from simtest.dataset.plan import Plan
 from simtest.errors import InputError, SimtestError
 from simtest.geometry import Camera
 from simtest.reconstruction.assumptions import calibration_of_view
-from simtest.reconstruction.choices import complete
-from simtest.reconstruction.found import Reconstruction
-from simtest.reconstruction.pipeline import run_picture
+from simtest.reconstruction.options import Options, complete
+from simtest.reconstruction.pipeline import run
+from simtest.reconstruction.records import Specularities
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image, IntArray
 from simtest.runtime.seeds import from_integer
@@ -206,7 +206,7 @@ def _pictures(count: int, mode: str) -> list[Scored]:
             camera = calibration.camera
             width_deg = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
             calibration = calibration_of_view(width_deg, camera.width, camera.height, "width")
-        truth = score(session, view, run_picture(picture, calibration)[0])
+        truth = score(session, view, run(picture, calibration, Options()))
         print(f"frame {number}, {ORGANS[family]}: {len(truth)} usable highlights", file=sys.stderr, flush=True)
         if truth:
             pictures.append(Scored(number, ORGANS[family], picture, calibration, truth))
@@ -240,8 +240,8 @@ def _rows(pictures: Sequence[Scored], organ: str | None, twin_frames: int) -> li
         return []
     calibration = pictures[0].told
 
-    def reconstructs(values: Image) -> Reconstruction:
-        return run_picture(values, calibration)[0]
+    def reconstructs(values: Image) -> Specularities:
+        return run(values, calibration, Options())
 
     def say(done: int, total: int, what: str) -> None:
         print(f"{organ or 'any tissue'}: {what}, {done} of {total}", file=sys.stderr, flush=True)
@@ -263,7 +263,7 @@ def _rows(pictures: Sequence[Scored], organ: str | None, twin_frames: int) -> li
 
 def _subject(each: Scored, organ: str | None) -> Subject:
     """Return what the bank is told of a picture; its highlights are detected anew."""
-    made = run_picture(each.picture, each.told)[0]
+    made = run(each.picture, each.told, Options())
     peaks = np.array([spot.peak_px for spot in usable_spots(made)])
     seen = made.detection.view.seen
     tissue = tissue_of(organ)

@@ -15,7 +15,8 @@ import numpy as np
 from benchmarks.measuring import print_markdown
 from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.dataset.plan import Plan
-from simtest.reconstruction.pipeline import run_picture
+from simtest.reconstruction.options import Options
+from simtest.reconstruction.pipeline import run
 from simtest.spec.recipes import load_dataset
 from studies.twins import SCOPES, _rendered, told
 
@@ -50,7 +51,7 @@ def _scored(frames: int) -> list[ScoredSpot]:
             continue
         session, view, _ = made
         picture = np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
-        found = score(session, view, run_picture(picture, told(view, "colonoscope"))[0])
+        found = score(session, view, run(picture, told(view, "colonoscope"), Options()))
         print(f"frame {number}: {len(found)} usable highlights", file=sys.stderr, flush=True)
         spots += found
     return spots

@@ -17,7 +17,7 @@ from simtest.cli.main import MANNERS
 from simtest.runtime.files import as_json
 
 if TYPE_CHECKING:
-    from simtest.reconstruction.picture import Options
+    from simtest.reconstruction.options import Options
     from simtest.runtime.processes import Engine
 
 
@@ -224,10 +224,12 @@ class PictureOptions:
 
     def checked(self, **others: Any) -> "Options":
         """Return them, and others, as the reconstruction takes them; raise `InputError` where they are malformed."""
-        from simtest.reconstruction.picture import Options
+        from simtest.reconstruction.options import Options
 
         names = None if self.estimators is None else tuple(self.estimators)
-        return Options(**vars(self) | {"estimators": names} | others)
+        options = Options(**vars(self) | {"estimators": names} | others)
+        options.require_camera()
+        return options
 
 
 DEFAULTS = PictureOptions()

@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
     from simtest.advice.twin.run import SpotTwins, TwinResult
     from simtest.reconstruction.assumptions import Assumption
-    from simtest.reconstruction.description import PictureRecord, SpecularityRecord
     from simtest.reconstruction.light_calibration.run import Ball, Calibrated, Plate
-    from simtest.reconstruction.picture import Options
+    from simtest.reconstruction.options import Options
+    from simtest.reconstruction.records import Specularities, Specularity
     from simtest.runtime.arrays import Array
 
 MOST_FLAGS = 3
@@ -76,8 +76,8 @@ def reconstruct(
     image : Path
         PNG, JPEG, BMP or TIFF; a folder of these; or a video that OpenCV reads.
     """
-    from simtest.reconstruction.image_io import is_sequence
-    from simtest.reconstruction.picture import parse_roi
+    from simtest.reconstruction.images import is_sequence
+    from simtest.reconstruction.options import parse_roi
 
     sequence = is_sequence(image)
     if sequence and any(vars(replace(extras, depth_scale=None)).values()):
@@ -87,8 +87,8 @@ def reconstruct(
     options = known.checked(roi=None if roi is None else parse_roi(roi), poses=poses)
     if sequence:
         return _sequence(image, out, options)
-    record, files = reconstruct_picture(image, out, options, extras)
-    return Told(files, record.to_json, _record_parts(record, image))
+    spots, files = reconstruct_picture(image, out, options, extras)
+    return Told(files, spots.to_json, _record_parts(spots, image))
 
 
 def _sequence(source: Path, out: Path, options: "Options") -> Told:
@@ -106,27 +106,26 @@ def _sequence(source: Path, out: Path, options: "Options") -> Told:
     return Told(made.files, asdict(made), parts)
 
 
-def _record_parts(record: "PictureRecord", image: Path) -> "Iterator[str | Table]":
+def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]":
     """Tell the best normals, what they state, what is assumed, and how many highlights have one."""
-    yield from record_tables(record)
-    if record.stated is not None:
-        yield f"reported: {record.stated}"
+    yield from record_tables(spots)
+    if spots.stated is not None:
+        yield f"reported: {spots.stated}"
         yield MEANING
-    yield from silent_lines(record.specularities)
-    yield from assumed_lines(record.assumed)
-    yield from count_lines(record, image)
+    yield from silent_lines(spots)
+    yield from assumed_lines(spots.choices.assumed)
+    yield from count_lines(spots, image)
 
 
-def record_tables(record: "PictureRecord") -> "Iterator[str | Table]":
+def record_tables(spots: "Specularities") -> "Iterator[str | Table]":
     """Tell the best normals, or a summary of many, and how the estimators compare with a reference."""
-    spots = record.specularities
     if len(spots) > MOST_ROWS and not MANNERS.verbose:
         yield _summary(spots)
         yield f"--verbose prints a row for each of the {len(spots)}; normals.csv and index.html hold them"
     elif spots:
         columns = ("no.", "x (px)", "y (px)", "kind", "score", "best", "normal", "± deg", "choice", "flags")
         yield Table(columns, [_cells(spot) for spot in spots])
-    if (compared := record.reference) is not None:
+    if (compared := spots.reference) is not None:
         yield from (f"reference: {problem}" for problem in compared.problems)
         rows = [
             (name, str(errors.n), _pair(errors.mean_deg, errors.std_deg),
@@ -137,14 +136,14 @@ def record_tables(record: "PictureRecord") -> "Iterator[str | Table]":
         yield f"{compared.missed} sightlines miss {compared.source}"
 
 
-def _summary(spots: "Sequence[SpecularityRecord]") -> Table:
+def _summary(spots: "Sequence[Specularity]") -> Table:
     """Return how many specularities of each kind have which best estimator, and what that states."""
     from collections import Counter
     from statistics import median
 
     from simtest.reconstruction.explanations import kind_name
 
-    groups: dict[tuple[str, str], list[SpecularityRecord]] = {}
+    groups: dict[tuple[str, str], list[Specularity]] = {}
     for spot in spots:
         groups.setdefault((kind_name(spot.kind), spot.best or "none"), []).append(spot)
     rows = []
@@ -156,7 +155,7 @@ def _summary(spots: "Sequence[SpecularityRecord]") -> Table:
     return Table(("kind", "best", "n", "median ± deg", "flags"), rows)
 
 
-def silent_lines(spots: "Sequence[SpecularityRecord]") -> "Iterator[str]":
+def silent_lines(spots: "Sequence[Specularity]") -> "Iterator[str]":
     """Tell why best normals have no ±, and how many."""
     from collections import Counter
 
@@ -178,17 +177,17 @@ def assumed_lines(assumed: "Sequence[Assumption]") -> "Iterator[str]":
         yield f"given: {each.what}: {each.distribution}" if each.given else f"assumed: {each}"
 
 
-def count_lines(record: "PictureRecord", image: Path) -> "Iterator[str]":
+def count_lines(spots: "Specularities", image: Path) -> "Iterator[str]":
     """Tell how many highlights were found, how many have a normal, and what the others are."""
-    from simtest.reconstruction.borders import BORDERED
+    from simtest.reconstruction.assumptions import BORDERED
     from simtest.reconstruction.explanations import kinds_counted
-    from simtest.reconstruction.picture import REFUSED
+    from simtest.reconstruction.pipeline import REFUSED
 
-    for warning in record.warnings:
+    for warning in spots.warnings:
         if warning.startswith((BORDERED, REFUSED)):
             yield f"note: {warning}"
 
-    spots, others = record.specularities, record.other_highlights
+    others = spots.detection.others
     answered = sum(spot.best is not None for spot in spots)
     found = f"{counted(len(spots), 'specularity', 'specularities')} found in {image}"
     yield found + (f", {answered} with a normal" if answered < len(spots) else "")
@@ -202,7 +201,7 @@ def _pair(mean: float, spread: float | None) -> str:
     return fixed(mean) if spread is None else f"{mean:.2f} ± {spread:.2f}"
 
 
-def _cells(spot: "SpecularityRecord") -> list[str]:
+def _cells(spot: "Specularity") -> list[str]:
     from simtest.reconstruction.explanations import kind_name
 
     best, published = spot.best_estimate, spot.normals.get("circle_pose")
@@ -320,8 +319,8 @@ def light(
     pictures : list of Path
         Pictures, or folders of pictures: the ball at 6 to 12 places, near and far, across the view.
     """
+    from simtest.reconstruction.light_calibration.page import result_json, write_calibration
     from simtest.reconstruction.light_calibration.run import calibrate_lights, picture_readers
-    from simtest.reconstruction.light_calibration.write import result_json, write_calibration
     from simtest.spec.calibration_file import load_calibration
 
     mirror = _mirror(ball_radius, ball_radius_sd, outlines, plate, (plate_sd, plate_tilt_sd))
@@ -334,8 +333,7 @@ def light(
 def _mirror(
     radius: float | None, radius_sd: float, outlines: Path | None, plate: Path | None, plate_sd: tuple[float, float]
 ) -> "Ball | Plate":
-    from simtest.reconstruction.light_calibration.observations import circles_of
-    from simtest.reconstruction.light_calibration.run import Ball, Plate
+    from simtest.reconstruction.light_calibration.run import Ball, Plate, circles_of
 
     if (radius is None) == (plate is None):
         raise InputError("--ball-radius or --plate: exactly one of them must be given")

@@ -28,7 +28,7 @@ from simtest.dataset.scoring.record import (
 )
 from simtest.dataset.scoring.views import Shown, Views, views_of_cases
 from simtest.errors import InputError
-from simtest.reconstruction.picture_values import scale_picture
+from simtest.reconstruction.images import scale_picture
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import are_nested, write_atomically, write_json

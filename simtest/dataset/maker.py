@@ -20,7 +20,7 @@ from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.names import forgive_cores
 from simtest.geometry import ellipse_of_conic, fit_ellipse
-from simtest.reconstruction.found import Specularity
+from simtest.reconstruction.records import Specularity
 from simtest.rendering import Frame, Session, backend
 from simtest.runtime.arrays import AnyArray, Image, only_reading
 from simtest.simulation.frame import RenderedView, brightest_mm, quick_look, render_view, shows_isolated

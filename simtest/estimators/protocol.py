@@ -168,18 +168,6 @@ class Estimate:
         """Return the estimate without covariance and budget: it states no uncertainty."""
         return replace(self, budget=None, covariance=None)
 
-    def contours(self, patch: Patch | Failure) -> list[tuple[float, Array]]:
-        """Return the isophotes that were used on a patch: isovalue and closed polygon, shape (N, 2), px."""
-        if isinstance(patch, Failure):
-            return []
-        traced = [(isophote.isovalue, patch.isophote(isophote.isovalue)) for isophote in self.isophotes]
-        return [(t, points) for t, points in traced if not isinstance(points, Failure)]
-
-
-def drawable(curve: Array) -> list[list[float]]:
-    """Return a curve, shape (N, 2), px, as lists for a JSON file, without points that the lens does not image."""
-    return np.round(curve[np.isfinite(curve).all(axis=1)], 3).tolist()
-
 
 @runtime_checkable
 class Estimator(Protocol):

@@ -10,7 +10,7 @@ import numpy as np
 
 from simtest.dataset.reader import read_samples, shard_names
 from simtest.errors import InputError
-from simtest.reconstruction.image_io import Source, is_sequence, open_source, read_picture
+from simtest.reconstruction.images import Source, is_sequence, open_source, read_picture
 from simtest.runtime.arrays import AnyArray, Image, only_reading
 from simtest.runtime.files import check_count, require_plain
 from simtest.spec.scene import Scene, load_scene

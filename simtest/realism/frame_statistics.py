@@ -17,7 +17,7 @@ from simtest.detection.colour import ColourDetector
 from simtest.detection.detector import Highlight
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.reconstruction.picture_values import is_coloured
+from simtest.reconstruction.images import is_coloured
 from simtest.runtime.arrays import Array, Image, Mask
 from simtest.runtime.fitted import fitted_number
 

@@ -8,7 +8,7 @@ from simtest.detection.view import find_view
 from simtest.errors import Failure
 from simtest.estimators.learned_dense import DenseMaps, LearnedDense, learned_dense
 from simtest.geometry import Array
-from simtest.reconstruction.choices import complete
+from simtest.reconstruction.options import complete
 from simtest.runtime.arrays import Image, Mask
 
 SMOOTHING_PX = 1.0

@@ -4,7 +4,7 @@ Each highlight is judged by the other frames of its track. The light must be at 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,9 @@ from simtest.calibration import Priors
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.motion_signs import CLEAR, MovedView, PoseError, RankedHypotheses, rank_by_motions
-from simtest.reconstruction.description import SpecularityRecord
-from simtest.reconstruction.motion_record import MotionRecord
-from simtest.reconstruction.tracking import TrackedFrame
+from simtest.estimators.protocol import EstimatedCurvature
 from simtest.runtime.arrays import Array
+from simtest.runtime.files import JsonObject
 
 MOST_VIEWS = 6
 """Other frames that judge a highlight: evenly spaced ones of all that may."""
@@ -40,6 +39,65 @@ _FLIPPED = np.diag([1.0, -1.0, -1.0, 1.0])
 _BENDS = {1: "convex", -1: "concave", 0: "undecided"}
 
 
+COLUMNS = ("motion", "motion_frames", "bend_1", "bend_2", "sign_1", "sign_2", "margin_1", "margin_2")
+"""Columns of timeline.csv of a sequence with poses."""
+
+
+@dataclass(frozen=True)
+class MotionRecord:
+    """What motion tells of a highlight.
+
+    Parameters
+    ----------
+    status : str
+        "ok" where both signs are told, else the `Reason`; `detail` says more.
+    frames : tuple of int
+        Frames that judged it.
+    signs : tuple of int
+        Of 1 + d k along both principal directions of the estimate `curved`; 0 where it is not told.
+    margins : tuple of float
+        Twice the log of the likelihood ratio of each sign and the other one.
+    gains : tuple of float
+        1 + d k of the hypothesis that explains the frames best, told or not.
+    bends : tuple of str
+        "convex", "concave" or "undecided" along both directions.
+    distance2, freedom : float, int
+        Squared Mahalanobis distance of that hypothesis, and its degrees of freedom; `fits` says whether it is one that
+        chance explains.
+    motions : tuple of float, optional
+        Shortest and longest motion to another frame of its track, as shares of the distance; None where there is none.
+    """
+
+    status: str
+    detail: str = ""
+    frames: tuple[int, ...] = ()
+    signs: tuple[int, int] = (0, 0)
+    margins: tuple[float, ...] = (0.0, 0.0)
+    gains: tuple[float, ...] = ()
+    bends: tuple[str, str] = ("undecided", "undecided")
+    distance2: float | None = None
+    freedom: int = 0
+    fits: bool = False
+    motions: tuple[float, float] | None = None
+
+    @property
+    def shape(self) -> str:
+        """The bends in a word: convex, concave, saddle, or both one by one."""
+        first, second = self.bends
+        if first == second:
+            return first
+        return "saddle" if "undecided" not in self.bends else f"{first} and {second}"
+
+    def to_json(self) -> JsonObject:
+        """Return the entry ``motion`` of a specularity."""
+        return {**vars(self), "shape": self.shape}
+
+
+def motion_row(entry: JsonObject) -> tuple[object, ...]:
+    """Return the values of `COLUMNS` of an entry ``motion``."""
+    return (entry["status"], len(entry["frames"]), *entry["bends"], *entry["signs"], *entry["margins"])
+
+
 def check_priors(priors: Priors, camera: Path) -> None:
     """Raise `InputError` where a calibration lacks what the method needs."""
     where = f"--camera {camera}: --poses needs"
@@ -55,97 +113,106 @@ def check_priors(priors: Priors, camera: Path) -> None:
         raise InputError(f"{where} all lights at the camera, within {MOST_OFFSET:.0%} of the distance; {told}")
 
 
+@dataclass(frozen=True)
+class TrackedHighlight:
+    """A highlight of a sequence: the number of its frame, that of its track, and the estimates that motion needs."""
+
+    frame: int
+    track: int
+    estimates: Mapping[str, Estimate | Failure]
+
+    @classmethod
+    def from_json(cls, frame: int, entry: JsonObject) -> "TrackedHighlight":
+        """Read it from an entry of ``specularities`` of a frame's file."""
+        answers = {name: entry["estimates"][name] for name in JUDGING if name in entry["estimates"]}
+        return cls(frame, entry["track"], {name: _estimate_from_json(answer) for name, answer in answers.items()})
+
+    @property
+    def judging(self) -> Estimate | None:
+        """The normal by which it judges others of its track."""
+        answered = (self.estimates.get(name) for name in JUDGING)
+        return next((each for each in answered if isinstance(each, Estimate)), None)
+
+
 def judge_by_motion(
-    frames: Sequence[TrackedFrame], poses: Sequence[Array | None], error: PoseError, priors: Priors
-) -> list[TrackedFrame]:
-    """Judge the highlights of each frame by the other frames of their tracks.
+    highlights: Sequence[TrackedHighlight], poses: Mapping[int, Array | None], error: PoseError, priors: Priors
+) -> list[MotionRecord]:
+    """Judge the highlights of a sequence by the other frames of their tracks.
 
-    Parameters
-    ----------
-    frames : sequence of TrackedFrame
-        With estimates of `NEEDED`.
-    poses : sequence of ndarray, shape (4, 4), or None
-        world_from_camera of each frame, mm.
-    error : PoseError
-        Of the motion between two frames.
-    priors : Priors
-        See `check_priors`.
-
-    Returns
-    -------
-    list of TrackedFrame
-        Whose specularities have a `motion`.
+    `poses` are world_from_camera by the number of the frame, mm, and `error` is that of the motion between two frames;
+    for the priors see `check_priors`.
     """
-    tracks: dict[int, list[tuple[TrackedFrame, Array, Estimate]]] = {}
-    for frame, pose in zip(frames, poses, strict=True):
-        for spot in frame.specularities:
-            estimate = _normal(spot.estimates)
-            if pose is not None and estimate is not None and spot.track is not None:
-                tracks.setdefault(spot.track, []).append((frame, pose, estimate))
-    made = []
-    for frame, pose in zip(frames, poses, strict=True):
-        spots = [
-            replace(spot, motion=_judge(spot, frame, pose, tracks.get(-1 if spot.track is None else spot.track, []),
-                                        error, priors))
-            for spot in frame.specularities
-        ]  # fmt: skip
-        made.append(replace(frame, specularities=spots))
-    return made
+    tracks: dict[int, list[TrackedHighlight]] = {}
+    for each in highlights:
+        if poses[each.frame] is not None and each.judging is not None:
+            tracks.setdefault(each.track, []).append(each)
+    return [_judge(each, tracks.get(each.track, []), poses, error, priors) for each in highlights]
 
 
 def fits_flipped_axes(
-    judged: Sequence[TrackedFrame], poses: Sequence[Array | None], error: PoseError, priors: Priors
-) -> bool:
+    highlights: Sequence[TrackedHighlight], judged: Sequence[MotionRecord], poses: Mapping[int, Array | None],
+    error: PoseError, priors: Priors,
+) -> bool:  # fmt: skip
     """Return whether the frames fit clearly better if the poses' camera axes are those of OpenGL.
 
     Wrong axes are not always found so: where the motion is short, or along x alone, both fit. The median over the
     highlights decides, by a squared distance that is less by the `CLEAR` of a told sign. See `judge_by_motion`, which
     made `judged`.
     """
-    turned = judge_by_motion(judged, [None if pose is None else pose @ _FLIPPED for pose in poses], error, priors)
-    pairs = [
-        (given.motion.distance2, other.motion.distance2)
-        for frame, flipped in zip(judged, turned, strict=True)
-        for given, other in zip(frame.specularities, flipped.specularities, strict=True)
-        if given.motion is not None and other.motion is not None
-    ]
+    flipped = {frame: None if pose is None else pose @ _FLIPPED for frame, pose in poses.items()}
+    turned = judge_by_motion(highlights, flipped, error, priors)
+    pairs = [(given.distance2, other.distance2) for given, other in zip(judged, turned, strict=True)]
     gained = [given - other for given, other in pairs if given is not None and other is not None]
     return bool(gained) and float(np.median(gained)) > CLEAR
 
 
-def _normal(estimates: Mapping[str, Estimate | Failure]) -> Estimate | None:
-    """Return the normal of a highlight that judges others."""
-    for name in JUDGING:
-        if isinstance(found := estimates.get(name), Estimate):
-            return found
-    return None
-
-
 def _judge(
-    spot: SpecularityRecord, frame: TrackedFrame, pose: Array | None,
-    track: Sequence[tuple[TrackedFrame, Array, Estimate]], error: PoseError, priors: Priors,
+    highlight: TrackedHighlight, track: Sequence[TrackedHighlight], poses: Mapping[int, Array | None],
+    error: PoseError, priors: Priors,
 ) -> MotionRecord:  # fmt: skip
-    first = spot.estimates.get(NEEDED)
+    first, pose = highlight.estimates.get(NEEDED), poses[highlight.frame]
     if pose is None:
         return _undecided(Failure(Reason.NOT_KNOWN, "no pose of this frame"))
     if not isinstance(first, Estimate) or first.curvature is None:
         return _undecided(first if isinstance(first, Failure) else Failure(Reason.NOT_KNOWN, "no curvature"))
     assert priors.distance_mm is not None
-    lengths = np.array([np.linalg.norm(other[:3, 3] - pose[:3, 3]) for _, other, _ in track]) / priors.distance_mm.mean
-    to_others = lengths[[other is not frame for other, _, _ in track]]
+    seen = [(each.frame, other, each.judging) for each in track if (other := poses[each.frame]) is not None]
+    lengths = np.array([np.linalg.norm(other[:3, 3] - pose[:3, 3]) for _, other, _ in seen]) / priors.distance_mm.mean
+    to_others = lengths[[frame != highlight.frame for frame, _, _ in seen]]
     motions = (float(to_others.min()), float(to_others.max())) if len(to_others) else None
     near = np.flatnonzero((lengths >= LEAST_MOTION) & (lengths <= MOST_MOTION))
-    chosen = [track[i] for i in near[np.unique(np.linspace(0, len(near) - 1, MOST_VIEWS).round().astype(int))]] \
-        if len(near) else []  # fmt: skip
-    if not chosen:
-        told = f"{LEAST_MOTION:g} to {MOST_MOTION:g} of the distance away"
-        undecided = _undecided(Failure(Reason.NO_ESTIMATE, f"its track has no other frame {told}"))
+    if not len(near):
+        distance = f"{LEAST_MOTION:g} to {MOST_MOTION:g} of the distance away"
+        undecided = _undecided(Failure(Reason.NO_ESTIMATE, f"its track has no other frame {distance}"))
         return replace(undecided, motions=motions)
-    views = [MovedView([estimate], np.linalg.inv(other) @ pose, error) for _, other, estimate in chosen]
+    spread = np.unique(np.linspace(0, len(near) - 1, MOST_VIEWS).round().astype(int))
+    chosen = [seen[i] for i in near[spread]]
+    views = [
+        MovedView([estimate], np.linalg.inv(other) @ pose, error)
+        for _, other, estimate in chosen
+        if estimate is not None
+    ]
     ranked = rank_by_motions(first, views, priors)
-    indices = tuple(other.index for other, _, _ in chosen)
+    indices = tuple(frame for frame, _, _ in chosen)
     record = _undecided(ranked, indices) if isinstance(ranked, Failure) else _record(ranked, indices)
     return replace(record, motions=motions)
+
+
+def _estimate_from_json(entry: JsonObject) -> Estimate | Failure:
+    """Read the estimate of an entry, without its isophotes."""
+    if entry["status"] != "ok":
+        return Failure(Reason(entry["status"]), entry["detail"])
+    normal, candidates, look_px = (np.array(entry[key], dtype=float) for key in ("normal", "candidates", "look_px"))
+    budget = entry["budget"] and {name: np.array(part) for name, part in entry["budget"].items()}
+    curvature = None
+    if (shape := entry["curvature"]) is not None:
+        gains = None if shape["gains"] is None else np.array(shape["gains"], dtype=float)
+        curvature = EstimatedCurvature(np.array(shape["directions"], dtype=float), shape["axis_ratio"], gains)
+    return Estimate(
+        normal, candidates, look_px, entry["axis_ratio"], (), entry["choice_margin"], flags=tuple(entry["flags"]),
+        budget=budget, target=entry["target"], curvature=curvature,
+        axis_ratio_deviation=entry.get("axis_ratio_deviation"),
+    )  # fmt: skip
 
 
 def _undecided(failure: Failure, frames: tuple[int, ...] = ()) -> MotionRecord:

@@ -2,44 +2,32 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, Frame, Priors
+from simtest.calibration import Calibration, Frame, Response
 from simtest.calibration.frame import Box
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.detection import Region
-from simtest.detection.colour import ColourDetector
-from simtest.detection.detector import Detection, Detector, Kind, load_detector, run_detector
+from simtest.detection.colour import ColourDetection, detect_colour
+from simtest.detection.detector import Detection, Detector, Kind, run_detector
+from simtest.detection.view import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import prepare, run_in_frame
-from simtest.estimators.names import short_names
 from simtest.estimators.prior_parts import to_base
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spots import UNRESOLVED
 from simtest.geometry import Camera, Patch
 from simtest.geometry.patch import share_of_noise
-from simtest.reconstruction.assumptions import assumptions, calibration_of_view
-from simtest.reconstruction.choices import (
-    AUTO,
-    SMOOTHING_BY_COLOUR_PX,
-    Choices,
-    check_encoding,
-    choose_detector,
-    choose_smoothing,
-    complete,
-    untold,
-)
-from simtest.reconstruction.found import Reconstruction, Specularities, Specularity
-from simtest.reconstruction.picture_values import check_frame, check_roi, check_size, image_size
-from simtest.runtime.arrays import Array, Image, Mask
+from simtest.reconstruction.assumptions import border_note, calibration_of_view
+from simtest.reconstruction.images import check_frame, check_size, image_size
+from simtest.reconstruction.options import SMOOTHING_BY_COLOUR_PX, Options, check_encoding, choose
+from simtest.reconstruction.records import Specularities, Specularity
+from simtest.runtime.arrays import Array, Image
 from simtest.runtime.boundary import plain_errors
-
-DEFAULT_ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis", "curved")
-MAX_SMOOTHING_PX = 50
 
 LEAST_HEIGHT = 6.0
 """A user's region holds a highlight if its peak is so many standard deviations of the smoothed noise above its median:
@@ -48,6 +36,11 @@ noise alone reaches 6 in one of 10^5 regions. What is detected stands out far mo
 SMALL_RADIUS = 3.0
 """A highlight whose radius at half height is below this many smoothing widths is made rounder by more than a tenth: its
 estimates have the flag ``small``."""
+
+NOTHING = "no specularity found that stands out of the noise and has the shape of a highlight; try --all or --roi"
+
+REFUSED = "the detector does not answer for this picture"
+"""Begins the warning of a picture that the detector refuses."""
 
 
 @plain_errors
@@ -125,147 +118,73 @@ def reconstruct(
     if isinstance(camera, int | float) and not isinstance(camera, bool):
         height, width = image_size(frame)
         camera = calibration_of_view(camera, width, height)
-    known = _calibration(camera)
-    check_encoding(encoding, known)
-    image, is_picture = check_frame(frame, known.camera, encoding)
-    if is_picture:
-        finder = AUTO if detector is None else detector
-        options = (encoding, finder, estimators, roi, smoothing_px, isolated, target)
-        return Specularities(*run_picture(image, known, *options))
-    # light of any scale, which has no largest value
-    finder = "peaks" if detector is None else detector
-    names = DEFAULT_ESTIMATORS if estimators is None else estimators
-    made, choices = _choose(image, known, finder, names, roi, smoothing_px, isolated, target)
-    inferred = untold(known, encoding=encoding, detector=detector, smoothing_px=smoothing_px, estimators=estimators)
-    # Values that nobody called encoded are taken as linear: that is the rule for real numbers, and no guess.
-    assumed = assumptions(known, encoding or "linear", target)
-    return Specularities(made, replace(choices, inferred=inferred, assumed=tuple(assumed)))
+    elif isinstance(camera, Camera):
+        camera = Calibration(camera)
+    elif not isinstance(camera, Calibration):
+        raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera or simtest.Calibration")
+    check_encoding(encoding, camera)
+    image, is_picture = check_frame(frame, camera.camera, encoding)
+    options = Options(
+        estimators=estimators, roi=roi, encoding=encoding, every=not isolated, detector=detector,
+        smoothing_px=smoothing_px, target=target,
+    )  # fmt: skip
+    return run(image, camera, options, is_picture)
 
 
-def run_picture(
-    picture: Image,
-    calibration: Calibration,
-    encoding: str | None = None,
-    detector: str | Detector = AUTO,
-    estimators: Sequence[str] | Mapping[str, AnyEstimator] | None = None,
-    roi: tuple[int, int, int, int] | None = None,
-    smoothing_px: float | None = None,
-    isolated: bool = True,
-    target: Target = "fine",
-) -> tuple[Reconstruction, Choices]:
-    """Reconstruct the normals of a picture, from a file or an array (see `reconstruct`).
+def reconstruct_values(
+    name: str, picture: Image, calibration: Calibration, options: Options, cautions: Sequence[str] = ()
+) -> Specularities:
+    """Reconstruct a named picture, shape (H, W) or (H, W, 3), as encoded in [0, 1], and say what its user should know.
 
-    The picture holds encoded values in [0, 1], float32, shape (H, W) or (H, W, 3). Raises `InputError` as
-    `reconstruct` does.
+    Raises `InputError` if the picture's size is not the camera's, an estimator is unknown, or the detector does not fit
+    the picture.
     """
-    check_size(picture, calibration.camera)
-    # what every picture has: an encoding, and a largest value
-    known = complete(calibration, encoding)
-    names = default_estimators(known) if estimators is None else estimators
-    made, choices = _choose(picture, known, detector, names, roi, smoothing_px, isolated, target)
-    inferred = untold(
-        calibration, encoding=encoding, detector=detector, smoothing_px=smoothing_px, estimators=estimators
-    )
-    assumed = assumptions(calibration, encoding, target)
-    return made, replace(choices, inferred=inferred, assumed=tuple(assumed))
+    try:
+        check_size(picture, calibration.camera)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+    spots = run(picture, calibration, options)
+    spots.image = name
+    # Any other extent is that of the whole picture, borders included.
+    across_all = options.fov_deg is not None and options.fov_of != "view"
+    bordered = border_note(picture, spots.detection.view) if across_all else ""
+    refusal = spots.detection.refusal
+    refused = f"{REFUSED} ({spots.choices.detector}): {refusal.detail}" if refusal else ""
+    spots.warnings = [*cautions, *filter(None, (bordered, refused))]
+    return spots
 
 
-def _choose(
-    image: Image,
-    known: Calibration,
-    detector: str | Detector,
-    estimators: Sequence[str] | Mapping[str, AnyEstimator],
-    roi: tuple[int, int, int, int] | None,
-    smoothing_px: float | None,
-    isolated: bool,
-    target: Target,
-) -> tuple[Reconstruction, Choices]:
-    """Choose detector and smoothing, and run the pipeline."""
-    name, finder = choose_detector(detector, image, known, roi is not None, isolated)
-    smoothing = choose_smoothing(smoothing_px, finder)
-    # A region of interest is cut as by peaks; its neighbours are those that would be found without it.
-    searching = finder if roi is None else choose_detector(detector, image, known, False, isolated)[1]
-    made = _run(image, known, searching, estimators, roi, smoothing, target)
-    kind = known.response.kind if known.response else "linear"
-    return made, Choices(kind, known.saturation_level, name, smoothing, short_names(estimators), known.priors)
-
-
-def reconstruct_colour(
-    picture: npt.ArrayLike,
-    camera: Camera | Calibration,
-    estimators: Sequence[str] | Mapping[str, AnyEstimator] = DEFAULT_ESTIMATORS,
-    smoothing_px: float = SMOOTHING_BY_COLOUR_PX,
-    isolated: bool = True,
-) -> Reconstruction:
-    """Reconstruct the normals at the isolated highlights of a colour picture.
-
-    The estimators see the specular light alone: the tissue's part of each pixel is taken off (`split_light`).
-
-    Parameters
-    ----------
-    picture : array_like, shape (H, W, 3)
-        RGB values as encoded, in [0, 1].
-    camera : Camera or Calibration
-        Of the same size. Where it has no response, sRGB is taken; where it has no view mask, that of the picture.
-    isolated : bool
-        Leave out highlights of the other kinds.
-    estimators, smoothing_px
-        As of `reconstruct`, as are the errors raised.
-
-    Returns
-    -------
-    Reconstruction
-        Estimates of highlights that smoothing has made rounder have the flag ``small``; those of highlights too small
-        to have a shape ``unresolved``.
-    """
-    known = complete(_calibration(camera), None)
-    return run_pipeline(picture, known, ColourDetector(isolated), estimators, None, smoothing_px)
-
-
-def default_estimators(calibration: Calibration) -> tuple[str, ...]:
-    """Return the names of the estimators that the calibration states enough for."""
-    return (*DEFAULT_ESTIMATORS, *(("bisector",) if calibration.priors.lights_mm else ()))
-
-
-def run_pipeline(
-    picture: npt.ArrayLike,
-    camera: Camera | Calibration,
-    detector: str | Detector,
-    estimators: Sequence[str] | Mapping[str, AnyEstimator],
-    roi: tuple[int, int, int, int] | None,
-    smoothing_px: float,
-    target: Target = "fine",
-) -> Reconstruction:
-    """Reconstruct the normals of a frame with any detector; nothing is inferred (see `reconstruct`)."""
-    calibration = _calibration(camera)
-    image, _ = check_frame(picture, calibration.camera)
-    return _run(image, calibration, load_detector(detector), estimators, roi, smoothing_px, target)
-
-
-def _run(
-    image: Image,
-    calibration: Calibration,
-    detector: Detector,
-    estimators: Sequence[str] | Mapping[str, AnyEstimator],
-    roi: tuple[int, int, int, int] | None,
-    smoothing_px: float,
-    target: Target,
-) -> Reconstruction:
-    """Run detector and estimators on a frame that has been checked."""
-    number = isinstance(smoothing_px, int | float | np.number) and not isinstance(smoothing_px, bool)
-    if not number or not 0 <= smoothing_px <= MAX_SMOOTHING_PX:
-        raise InputError(f"smoothing_px = {smoothing_px!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
-    box = None if roi is None else check_roi(roi)
-    chosen = load_estimators(estimators if isinstance(estimators, Mapping) else _check_names(estimators))
+def run(image: Image, calibration: Calibration, options: Options, is_picture: bool = True) -> Specularities:
+    """Reconstruct the normals of a frame that has been checked: encoded values in [0, 1], or light of any scale."""
+    choices, finder, estimators = choose(image, calibration, options, is_picture)
+    chosen = load_estimators(estimators)
     # linear light: a frame computes each step of its correction when it is first asked for
-    frame = Frame(image, calibration, smoothing_px)
+    frame = Frame(image, choices.calibration, choices.smoothing_px)
     # detect
-    detection, beside = run_detector(detector, frame), tuple[Region, ...]()
-    if box is not None:
-        detection, beside = _cut_region(frame, box, detection)
+    detection, beside = run_detector(finder, frame), tuple[Region, ...]()
+    if options.roi is not None:
+        detection, beside = _cut_region(frame, options.roi, detection)
     # estimate
-    made = _estimate(detection, chosen, beside, box)
-    return made if target == "fine" else _at_base(made, calibration.priors)
+    numbered = enumerate(_estimate(detection, chosen, beside, options))
+    spots = [replace(spot, camera=calibration.camera, target=options.target, id=i) for i, spot in numbered]
+    return Specularities(spots, detection, choices)
+
+
+@dataclass(frozen=True)
+class PictureDetection:
+    """What a colour picture shows: the part of it that is tissue, and its highlights."""
+
+    view: View
+    detection: ColourDetection
+
+
+def detect_in_picture(picture: Image) -> PictureDetection:
+    """Find the highlights of a colour picture, sRGB values in [0, 1], shape (H, W, 3), without a camera."""
+    # Detection by colour uses no angle, so any field of view serves.
+    camera = Camera.from_fov(60.0, picture.shape[1], picture.shape[0])
+    calibration = Calibration(camera, response=Response("srgb"), saturation_level=1.0)
+    frame, view = Frame(picture, calibration, SMOOTHING_BY_COLOUR_PX), find_view(picture)
+    return PictureDetection(view, detect_colour(frame.channels, frame.clipped, view.seen))
 
 
 def _cut_region(frame: Frame, box: Box, found: Detection) -> tuple[Detection, tuple[Region, ...]]:
@@ -304,22 +223,23 @@ def _above_noise(patch: Patch | Failure) -> Patch | Failure:
 
 
 def _estimate(
-    detection: Detection, estimators: Mapping[str, AnyEstimator], beside: Sequence[Region], box: Box | None
-) -> Reconstruction:
+    detection: Detection, estimators: Mapping[str, AnyEstimator], beside: Sequence[Region], options: Options
+) -> list[Specularity]:
     """Run each estimator on all patches of a picture, or on the whole frame.
 
-    `beside` are further specularities of the frame, which are only neighbours; answers outside `box`, the region that a
-    user named, are not asked for.
+    `beside` are further specularities of the frame, which are only neighbours; answers outside the region that a user
+    named are not asked for.
     """
     frame, regions = detection.frame, detection.regions
+    highlights = detection.highlights or (None,) * len(regions)
     # Each patch holds the peaks of the others: `bisector` assigns lights to highlights by their arrangement, and a dim
     # highlight among brighter ones may be a near miss.
     known = [*regions, *beside]
     peaks = [(region.peak[0] + PIXEL_CENTRE, region.peak[1] + PIXEL_CENTRE) for region in known]
     cut = [_above_noise(frame.patch(r.box)) if r.contrast is None else frame.patch(r.box, r.peak) for r in known]
     # Highlights that touch have no isophotes of their own, so no estimator answers for them.
-    for i, highlight in enumerate(detection.highlights):
-        if highlight.kind is Kind.CLUSTER:
+    for i, highlight in enumerate(highlights):
+        if highlight is not None and highlight.kind is Kind.CLUSTER:
             cut[i] = Failure(Reason.CLUSTER, f"{len(highlight.peaks)} highlights touch, and carry no single normal")
     values = [0.0 if isinstance(patch, Failure) else patch.peak_value for patch in cut]
     patches = [
@@ -328,50 +248,33 @@ def _estimate(
         else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]), others_value=(*values[:i], *values[i + 1 :]))
         for i, patch in enumerate(cut[: len(regions)])
     ]
-    prepare(list(estimators.values()), patches, frame.calibration.camera)
-    made = {name: run_in_frame(each, frame, patches, frame.calibration.priors) for name, each in estimators.items()}
-    # Flags that depend on the frame are added behind those of the estimators.
-    limited = frame.corrected.limited
-    result = Reconstruction([], detection)
-    rounded_px = SMALL_RADIUS * frame.smoothing_px
-    small = [math.sqrt(h.area_px / math.pi) < rounded_px for h in detection.highlights] or [False] * len(patches)
-    dim = [h.dim for h in detection.highlights] or [False] * len(patches)
-    for i, (region, patch) in enumerate(zip(regions, patches, strict=True)):
-        own = {name: each.of_patches[i] for name, each in made.items()}
-        estimates = {
-            name: _flagged(result, patch, limited, small[i], dim[i])
-            for name, result in own.items()
-            if result is not None
-        }
-        result.specularities.append(Specularity(region, patch, estimates))
+    prepare(list(estimators.values()), patches, frame.camera)
+    priors = frame.calibration.priors
+    answers = {name: run_in_frame(each, frame, patches, priors) for name, each in estimators.items()}
+    spots = []
+    for i, (region, patch, highlight) in enumerate(zip(regions, patches, highlights, strict=True)):
+        given = {name: each.of_patches[i] for name, each in answers.items()}
+        results = {name: result for name, result in given.items() if result is not None}
+        if not isinstance(patch, Failure):
+            small = highlight is not None and math.sqrt(highlight.area_px / math.pi) < SMALL_RADIUS * frame.smoothing_px
+            dim = highlight is not None and highlight.dim
+            results = {name: _flagged(each, patch, frame, small, dim) for name, each in results.items()}
+        spots.append(Specularity(region, patch, results, highlight))
+    box = options.roi
     undetected = [
         _undetected(name, estimate, frame)
-        for name, each in made.items()
+        for name, each in answers.items()
         for estimate in each.elsewhere
         if box is None or _is_inside(estimate.look_px, box)
     ]
     # Clouds stand last.
-    result.specularities.extend(sorted(undetected, key=_is_of_cloud))
-    return result
-
-
-def _at_base(made: Reconstruction, priors: Priors) -> Reconstruction:
-    """Return a reconstruction whose estimates state the base's normals."""
-    based = [
-        replace(
-            each,
-            estimates={
-                name: result if isinstance(result, Failure) else to_base(result, priors)
-                for name, result in each.estimates.items()
-            },
-        )
-        for each in made.specularities
-    ]
-    return replace(made, specularities=based)
-
-
-def _is_of_cloud(specularity: Specularity) -> bool:
-    return any(isinstance(e, Estimate) and e.cloud is not None for e in specularity.estimates.values())
+    spots.extend(sorted(undetected, key=lambda spot: any(each.cloud is not None for each in spot.normals.values())))
+    if options.target == "base":
+        spots = [
+            replace(spot, estimates=spot.estimates | {name: to_base(e, priors) for name, e in spot.normals.items()})
+            for spot in spots
+        ]
+    return spots
 
 
 def _is_inside(point_px: Array, box: Box) -> bool:
@@ -394,12 +297,11 @@ def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
     return Specularity(Region(box, (x, y), None), no_patch, {name: estimate})
 
 
-def _flagged(
-    result: Estimate | Failure, patch: Patch | Failure, limited: Mask | None, small: bool, dim: bool
-) -> Estimate | Failure:
-    """Add the flags that depend on the frame, not on the estimator."""
-    if isinstance(result, Failure) or isinstance(patch, Failure):
+def _flagged(result: Estimate | Failure, patch: Patch, frame: Frame, small: bool, dim: bool) -> Estimate | Failure:
+    """Add the flags that depend on the frame, behind those of the estimator."""
+    if isinstance(result, Failure):
         return result
+    limited = frame.corrected.limited
     # What an estimate used is what its lowest isophote encloses.
     masks = {"saturated": patch.saturated}
     if limited is not None:
@@ -416,17 +318,3 @@ def _flagged(
     # Answers made elsewhere may state them already.
     new = [flag for flag in flags if flag not in result.flags]
     return replace(result, flags=(*result.flags, *new)) if new else result
-
-
-def _calibration(camera: object) -> Calibration:
-    if isinstance(camera, Calibration):
-        return camera
-    if not isinstance(camera, Camera):
-        raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera or simtest.Calibration")
-    return Calibration(camera)
-
-
-def _check_names(names: Sequence[str]) -> Sequence[str]:
-    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-        raise InputError(f"estimators = {names!r:.80}: must be a list of names")
-    return names

@@ -1,8 +1,13 @@
 """Poses of the camera over the frames of a sequence, from a file.
 
-It is views.json, a list of matrices, a TUM trajectory, a file of COLMAP or NeRF, or that of a public data set.
+It is views.json, a list of matrices, a TUM trajectory, a file of COLMAP or NeRF, or that of a public data set of
+colonoscopy. docs/howto/motion.md describes the formats.
 
-docs/howto/motion.md describes the formats.
+C3VD writes camera-to-world matrices, 16 numbers a line, mm. Its loader takes them for row vectors, with the translation
+in the last row; its page calls them row-major, and that of its successor column-major. Where the translation stands
+tells which they are: the last row, or the last column, is 0, 0, 0, 1.
+SimCol3D writes tx ty tz, cm, into SavedPosition_NAME.txt and qx qy qz qw into SavedRotationQuaternion_NAME.txt, in the
+left-handed frame of its game engine, whose y axis points up.
 """
 
 import json
@@ -18,7 +23,6 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.estimators.motion_signs import PoseError
 from simtest.geometry.vectors import rotation_of
-from simtest.reconstruction.dataset_poses import dataset_poses
 from simtest.runtime.arrays import Array
 from simtest.runtime.boundary import close_names
 from simtest.runtime.files import require_plain
@@ -42,6 +46,14 @@ COLMAP_WORDS = 10
 """Words of an image's line in COLMAP's images.txt."""
 SETTINGS = ("unit", "translation_error", "rotation_error_deg")
 NAMES = ("frame", "picture", "image", "name")
+
+POSITION, ROTATION = "SavedPosition_", "SavedRotationQuaternion_"
+"""Begins of the names of SimCol3D's files."""
+
+MM_PER_CM = 10.0
+
+DOWN = np.diag([1.0, -1.0, 1.0])
+"""From y up to y down, which makes the left-handed frame right-handed."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +81,7 @@ class Poses:
     error_told: bool
 
     def of_frames(self, names: Sequence[str], indices: Sequence[int]) -> list[Array | None]:
-        """Return the pose of each frame, None for those without one.
-
-        Parameters
-        ----------
-        names, indices : sequence
-            Names of the frames' files, and their numbers in the sequence, which count where the poses have no names.
-        """
+        """Return the pose of each frame by its file's name, or by its number where the poses have no names."""
         if self.names:
             table = {name: pose for name, pose in zip(self.names, self.world_from_camera, strict=True)}
             found = [table.get(name) for name in names]
@@ -143,11 +149,14 @@ def read_poses(path: Path) -> Poses:
     except UnicodeDecodeError as error:
         raise InputError(f"{where}: no text (byte {error.start}); must be JSON or a TUM trajectory") from error
     is_json = path.suffix.lower() == ".json"
-    of_dataset = None if is_json else dataset_poses(path, text, where)
-    foreign = of_dataset is None and _is_foreign(text, is_json)
-    if of_dataset is not None:
-        poses, names, settings = _from_dataset(of_dataset, where)
-    elif foreign:
+    first = next((line for line in text.splitlines() if line.strip()), "")
+    of_c3vd, of_simcol3d = len(first.split(",")) == 16, path.name.startswith(POSITION)
+    foreign, names = False, list[str]()
+    if not is_json and (of_simcol3d or of_c3vd):
+        matrices = _simcol3d(path, text, where) if of_simcol3d else _c3vd(text, where)
+        poses = [_matrix(T.tolist(), f"{where}: pose {number}") for number, T in enumerate(matrices)]
+        settings = {"unit": "mm"}
+    elif foreign := _is_foreign(text, is_json):
         poses, names, settings = _from_others(path, text, is_json, where)
     else:
         poses, names, settings = _from_json(text, where) if is_json else _from_tum(text, where)
@@ -176,18 +185,11 @@ def read_poses(path: Path) -> Poses:
 Read = tuple[list[Array], list[str], dict[str, Any]]
 
 
-def _from_dataset(found: list[Array], where: str) -> Read:
-    return [_matrix(T.tolist(), f"{where}: pose {number}") for number, T in enumerate(found)], [], {"unit": "mm"}
-
-
 def _unit_mm(unit: object, where: str) -> float:
     """Return the millimetres of a unit: a name, or their number."""
     if isinstance(unit, str) and unit in UNITS_MM:
         return UNITS_MM[unit]
-    try:
-        number = np.nan if isinstance(unit, bool) or not isinstance(unit, str | int | float) else float(unit)
-    except (ValueError, OverflowError):
-        number = np.nan
+    number = _number(unit)
     if not 0 < number < np.inf:
         raise InputError(
             f"{where}: unit = {unit!s}; must be one of {', '.join(UNITS_MM)}, or the millimetres of one unit"
@@ -200,13 +202,18 @@ def _share(settings: dict[str, Any], key: str, most: float, where: str) -> float
     value = settings.get(key)
     if value is None:
         return None
-    try:
-        number = np.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = np.nan
+    number = _number(value)
     if not 0 <= number <= most:
         raise InputError(f"{where}: {key} = {value!s:.40}; must be a number in [0, {most:g}]")
     return number
+
+
+def _number(value: object) -> float:
+    """Return the number that a setting states; NaN where it is none."""
+    try:
+        return np.nan if isinstance(value, bool) or not isinstance(value, str | int | float) else float(value)
+    except (ValueError, OverflowError):
+        return np.nan
 
 
 def _from_json(text: str, where: str) -> Read:
@@ -241,11 +248,7 @@ def _from_json(text: str, where: str) -> Read:
         poses.append(_matrix(matrix, at))
     if names and len(names) < len(poses):
         raise InputError(f"{where}: {len(names)} of {len(poses)} poses name their frame; must be all or none")
-    return (
-        poses,
-        names,
-        {key: table[key] for key in SETTINGS if key in table},
-    )
+    return poses, names, {key: table[key] for key in SETTINGS if key in table}
 
 
 def _is_foreign(text: str, is_json: bool) -> bool:
@@ -310,13 +313,9 @@ def _matrix(value: object, at: str) -> Array:
     off = max(float(np.abs(R @ R.T - np.eye(3)).max()), float(np.abs(T[3] - [0, 0, 0, 1]).max()))
     if off > ROUNDED or np.linalg.det(R) < 0:
         raise InputError(f"{at}: off a rotation and a translation by {off:.3g}; must be rigid, determinant 1")
-    T[:3, :3], T[3] = _nearest_rotation(R), [0, 0, 0, 1]
-    return T
-
-
-def _nearest_rotation(R: Array) -> Array:
     U, _, Vt = np.linalg.svd(R)
-    return np.asarray(U @ Vt)
+    T[:3, :3], T[3] = U @ Vt, [0, 0, 0, 1]
+    return T
 
 
 def _from_tum(text: str, where: str) -> Read:
@@ -324,17 +323,58 @@ def _from_tum(text: str, where: str) -> Read:
     poses: list[Array] = []
     settings: dict[str, Any] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        settings |= _setting(line, f"{where}: line {number}")
-        if not (words := line.partition("#")[0].replace(",", " ").split()):
-            continue
         at = f"{where}: line {number}"
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            values = []
-        if len(values) != 8 or not np.isfinite(values).all():
-            raise InputError(f"{at}: {line.strip()!s:.60}; must be 8 numbers: time tx ty tz qx qy qz qw")
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation_of(np.roll(values[4:], 1), at), values[1:4]
-        poses.append(T)
+        settings |= _setting(line, at)
+        if words := line.partition("#")[0].replace(",", " ").split():
+            values = _numbers(words, 8, at, f"{line.strip()!s:.60}", ": time tx ty tz qx qy qz qw")
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = rotation_of(np.roll(values[4:], 1), at), values[1:4]
+            poses.append(T)
     return poses, [], settings
+
+
+def _c3vd(text: str, where: str) -> Array:
+    matrices = np.array(_rows(text, 16, ",", where)).reshape(-1, 4, 4)
+    transposed = matrices.transpose(0, 2, 1)
+    in_row, in_column = matrices[:, 3, :3].any(), matrices[:, :3, 3].any()
+    if not (in_row or in_column or np.array_equal(matrices, transposed)):
+        raise InputError(f"{where}: no pose has a translation, which tells rows from columns; must hold one that has")
+    return transposed if in_row else matrices
+
+
+def _simcol3d(path: Path, text: str, where: str) -> list[Array]:
+    other = path.with_name(ROTATION + path.name.removeprefix(POSITION))
+    try:
+        turned = require_plain(other, "record_bytes").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        raise InputError(f"{where}: needs {other.name} beside it, which cannot be read") from None
+    at, of = _rows(text, 3, None, where), _rows(turned, 4, None, f"--poses {other}")
+    if len(at) != len(of):
+        raise InputError(f"{where}: {len(at)} positions, but {other.name} has {len(of)} rotations")
+    poses = []
+    for number, (position, (x, y, z, w)) in enumerate(zip(at, of, strict=True)):
+        T = np.eye(4)
+        T[:3, :3] = DOWN @ rotation_of((w, x, y, z), f"--poses {other}: pose {number}") @ DOWN
+        T[:3, 3] = DOWN @ position * MM_PER_CM
+        poses.append(T)
+    return poses
+
+
+def _rows(text: str, count: int, separator: str | None, where: str) -> list[list[float]]:
+    """Return the numbers of each line that is not empty."""
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    return [
+        _numbers(line.split(separator), count, f"{where}: line {number}", f"{line.strip()!s:.60}")
+        for number, line in lines
+    ]
+
+
+def _numbers(words: Sequence[str], count: int, at: str, shown: str, named: str = "") -> list[float]:
+    """Return finite numbers; raise `InputError` where there are not `count` of them."""
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(f"{at}: {shown}; must be {count} numbers{named}")
+    return values

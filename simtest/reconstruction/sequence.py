@@ -1,39 +1,45 @@
-"""Reconstruction of a folder of pictures or a video: frame by frame, with tracks; a stopped run goes on."""
+"""Reconstruction of a folder of pictures or a video: frame by frame, with tracks; a stopped run goes on.
+
+What a frame gave stands in its JSON file alone, and the tables are made of these files: of a film of any length memory
+holds its tracks.
+"""
 
 import hashlib
 import json
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
+import numpy as np
+import numpy.typing as npt
 
 from simtest.calibration import Calibration
 from simtest.errors import InputError
-from simtest.estimators import Estimate
 from simtest.reconstruction.assumptions import Assumption
-from simtest.reconstruction.description import SpecularityRecord
-from simtest.reconstruction.image_io import SequenceFrame, Source, open_source
+from simtest.reconstruction.images import SequenceFrame, Source, open_source
+from simtest.reconstruction.motion import COLUMNS as MOTION_COLUMNS
 from simtest.reconstruction.motion import (
-    JUDGING,
     LEAST_MOTION,
     MOST_MOTION,
     NEEDED,
+    MotionRecord,
+    TrackedHighlight,
     check_priors,
     fits_flipped_axes,
     judge_by_motion,
+    motion_row,
 )
-from simtest.reconstruction.motion_record import COLUMNS as MOTION_COLUMNS
-from simtest.reconstruction.output_files import COLUMNS, normals_rows, write_csv
+from simtest.reconstruction.options import Options, calibration_for, default_estimators
+from simtest.reconstruction.outputs import COLUMNS, normals_rows, write_csv
 from simtest.reconstruction.overlay import draw_overlay
-from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
-from simtest.reconstruction.pipeline import default_estimators
+from simtest.reconstruction.page import write_sequence_page
+from simtest.reconstruction.pipeline import reconstruct_values
 from simtest.reconstruction.poses import Poses, read_poses
-from simtest.reconstruction.result_page import write_sequence_page
-from simtest.reconstruction.tracking import Track, TrackedFrame, Tracker, tracks_of
+from simtest.reconstruction.tracking import DoneFrame, Track, Tracker
 from simtest.runtime.boundary import plain_errors
 from simtest.runtime.files import JsonObject, make_folder, read_json, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
@@ -79,32 +85,36 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
         Called with frames done, frames in all, and the frame's name; what it raises stops the run, and what is done
         is kept.
     """
-    source = open_source(path)
-    poses = None
+    options.require_camera()
+    source, calibration, poses = open_source(path), None, None
+    if options.camera is not None:
+        # Imported here: the models of files are slow to load.
+        from simtest.spec.calibration_file import load_calibration
+
+        calibration = load_calibration(options.camera)
     if options.poses is not None:
-        poses, options = _checked_poses(options.poses, source, options)
+        poses, options = _checked_poses(options.poses, source, options, calibration)
     with exclusive_folder(out):
-        return _reconstruct(source, out, options, progress, poses)
+        return _reconstruct(source, out, options, calibration, progress, poses)
 
 
-def _checked_poses(path: Path, source: Source, options: Options) -> tuple[Poses, Options]:
+def _checked_poses(
+    path: Path, source: Source, options: Options, calibration: Calibration | None
+) -> tuple[Poses, Options]:
     """Read the poses, and return them with options that have the estimator of curvature.
 
     Whatever is wrong is found before the work: malformed poses, and a calibration that lacks what the method needs.
     """
-    # Imported here: the models of files are slow to load.
-    from simtest.spec.calibration_file import load_calibration
-
-    if options.camera is None:
+    if options.camera is None or calibration is None:
         raise InputError(f"--poses {path}: needs a calibration; give --camera in place of --fov")
-    poses, calibration = read_poses(path), load_calibration(options.camera)
+    poses = read_poses(path)
     check_priors(calibration.priors, options.camera)
     if source.is_video:
         # The count of a whole film may be off by one, that of one that is cut by more.
         poses = poses.of_film(1 if source.is_cut else source.count - 1)
     else:
         poses.of_files([file.name for file in source.files])
-    names = options.estimators or default_estimators(calibration)
+    names = tuple(options.estimators or default_estimators(calibration))
     return poses, replace(options, estimators=names if NEEDED in names else (*names, NEEDED))
 
 
@@ -112,10 +122,11 @@ def _reconstruct(
     source: Source,
     out: Path,
     options: Options,
-    progress: Callable[[int, int, str], None] | None,
+    calibration: Calibration | None,
+    progress: Progress | None,
     poses: Poses | None,
 ) -> SequenceResult:
-    path, settings = source.path, _settings(source.path, options)
+    path, settings = source.path, _settings(source.path, options, calibration)
     _check_settings(out / SETTINGS, settings)
     run = _Run(out, options, settings)
     if poses is not None and poses.names:
@@ -133,7 +144,8 @@ def _reconstruct(
         warnings.warn(
             f"{path}: {how}ends after {run.taken} of {source.count} frames; what was read is kept", stacklevel=2
         )
-    if poses is not None:
+    motion = None
+    if poses is not None and calibration is not None:
         # The count of a film is not known before it is read.
         if source.is_video and not source.is_cut and len(poses.world_from_camera) > run.taken:
             warnings.warn(
@@ -141,15 +153,14 @@ def _reconstruct(
                 "ones are taken in their order",
                 stacklevel=2,
             )
-        run.judge_by_motion(poses)
-    tracks = tracks_of(run.frames)
-    files = _write(out, run.frames, tracks)
+        motion = _judge_by_motion(run, poses, calibration)
+    tracks = [run.tracks[number] for number in sorted(run.tracks)]
+    files = _write(run, tracks)
     if progress is not None:
         progress(run.taken, run.taken, "")
-    found = sum(len(frame.specularities) for frame in run.frames)
     return SequenceResult(
-        run.taken, run.failed, found, sum(len(track.frames) > 1 for track in tracks), files, run.assumed,
-        _told_by_motion(run.frames, poses, run.is_flipped),
+        run.taken, run.failed, sum(frame.count for frame in run.frames), sum(len(track.frames) > 1 for track in tracks),
+        files, run.assumed, motion,
     )  # fmt: skip
 
 
@@ -158,11 +169,11 @@ class _Run:
 
     def __init__(self, out: Path, options: Options, settings: JsonObject) -> None:
         self.out, self.folder, self.options, self.settings = out, out / "frames", options, settings
-        self.frames: list[TrackedFrame] = []
+        self.frames: list[DoneFrame] = []
+        self.tracks: dict[int, Track] = {}
         self.taken = self.failed = 0
         self.first_error = ""
         self.strangers: frozenset[str] = frozenset()  # files that the poses do not name, such as a contact sheet
-        self.is_flipped = False
         self.assumed: Sequence[Assumption] = ()
         self._is_made = False  # a frame of this run; those behind it that an earlier one did have other tracks
         self._calibration: Calibration | None = None
@@ -172,14 +183,17 @@ class _Run:
     def take(self, frame: SequenceFrame) -> None:
         """Reconstruct a frame, or read what an earlier run made of it."""
         self.taken += 1
-        stem = self.folder / f"{frame.index:06d}"
         # done by an earlier run: only the tracks are counted anew
-        done = None if self._is_made else _read_done(stem.with_suffix(".json"), frame.name)
+        done = None if self._is_made else _read_done(self.file(frame.index), frame.name)
         if done is not None:
-            self._keep(done, self._tracked(done.specularities, done.size, frame.index))
+            spots = done["specularities"]
+            peaks = [spot["peak_px"] for spot in spots]
+            middles = [np.add(spot["box_px"][:2], np.divide(spot["box_px"][2:], 2)) for spot in spots]
+            positions = [middle if peak is None else peak for peak, middle in zip(peaks, middles, strict=True)]
+            self._keep(frame.index, done, self._track_numbers(positions, done["size"], frame.index))
             return
         try:
-            self._reconstruct(frame, stem)
+            self._reconstruct(frame)
             self._is_made = True
         except InputError as error:
             # The first frame shows a wrong camera or estimator; a file that is no picture is passed over.
@@ -189,85 +203,84 @@ class _Run:
             self.first_error = self.first_error or str(error)
             warnings.warn(f"frame {frame.index}: {error}", stacklevel=3)
 
-    def _reconstruct(self, frame: SequenceFrame, stem: Path) -> None:
+    def file(self, index: int) -> Path:
+        """Return the JSON file of a frame."""
+        return self.folder / f"{index:06d}.json"
+
+    def _reconstruct(self, frame: SequenceFrame) -> None:
         picture = frame.read()
         size = (picture.shape[1], picture.shape[0])
         # The first picture's size completes a camera that is known by its field of view alone.
         if self._calibration is None:
-            self._calibration, self._cautions = read_calibration(self.options, picture)
+            self._calibration, self._cautions = calibration_for(self.options, picture)
             for caution in self._cautions:
                 warnings.warn(caution, stacklevel=5)
-        record = reconstruct_values(frame.name, picture, self._calibration, self.options, self._cautions)
-        self.assumed = record.assumed
-        spots = self._tracked(record.specularities, size, frame.index)
-        overlay = draw_overlay(picture, spots)
+        found = reconstruct_values(frame.name, picture, self._calibration, self.options, self._cautions)
+        self.assumed = found.choices.assumed
+        numbers = self._track_numbers([spot.position_px for spot in found], size, frame.index)
+        found[:] = [replace(spot, track=number) for spot, number in zip(found, numbers, strict=True)]
+        overlay = draw_overlay(picture, found)
         # Not before a frame is there: a run that reads nothing leaves nothing.
         if not self.folder.is_dir() or not (self.out / SETTINGS).is_file():
             make_folder(self.folder)
             write_json(self.out / SETTINGS, self.settings)
-        write_atomically(stem.with_suffix(".jpg"), lambda part: cv2.imwrite(str(part), overlay))
-        plain = [replace(spot, drawings={}) for spot in spots]
-        entry = {"frame_index": frame.index, "time_s": frame.time_s, "size": size}
+        file = self.file(frame.index)
+        write_atomically(file.with_suffix(".jpg"), lambda part: cv2.imwrite(str(part), overlay))
+        entry = {**found.to_json(drawn=False), "frame_index": frame.index, "time_s": frame.time_s, "size": size}
         # Last: a frame whose JSON is there is done.
-        write_json(stem.with_suffix(".json"), replace(record, specularities=plain).to_json() | entry, compact=True)
-        self._keep(TrackedFrame(frame.name, frame.index, frame.time_s, size, []), plain)
+        write_json(file, entry, compact=True)
+        self._keep(frame.index, entry, numbers)
 
-    def _keep(self, frame: TrackedFrame, spots: Sequence[SpecularityRecord]) -> None:
-        """Keep of a frame what tracks and motion need: a film has thousands, and their files hold the rest."""
-        needed = () if self.options.poses is None else JUDGING
-        self.frames.append(replace(frame, specularities=[_slim(spot, needed) for spot in spots]))
+    def _keep(self, index: int, entry: JsonObject, numbers: Sequence[int]) -> None:
+        """Add a frame to the tracks, in plain numbers: a film has thousands, and their files hold the rest."""
+        time_s, spots = entry["time_s"], entry["specularities"]
+        self.frames.append(DoneFrame(index, entry["image"], time_s, len(spots)))
+        for spot, number in zip(spots, numbers, strict=True):
+            track = self.tracks.setdefault(number, Track(number))
+            best = spot["best"] and spot["estimates"][spot["best"]]["normal"]
+            track.frames.append(index)
+            track.times_s.append(time_s)
+            for values, value in ((track.peaks_px, spot["peak_px"]), (track.normals, best)):
+                values.append(None if value is None else np.asarray(value).tolist())
 
-    def judge_by_motion(self, poses: Poses) -> None:
-        """Judge the highlights' curvatures by the poses, and add that to the frames' files."""
-        # Imported here: the models of files are slow to load.
-        from simtest.spec.calibration_file import load_calibration
-
-        assert self.options.camera is not None
-        names, indices = [frame.name for frame in self.frames], [frame.index for frame in self.frames]
-        told = poses.of_frames(names, indices)
-        priors = load_calibration(self.options.camera).priors
-        self.frames = judge_by_motion(self.frames, told, poses.error, priors)
-        self.is_flipped = fits_flipped_axes(self.frames, told, poses.error, priors)
-        for frame in self.frames:
-            path = self.folder / f"{frame.index:06d}.json"
-            data = read_json(path)
-            for entry, spot in zip(data["specularities"], frame.specularities, strict=True):
-                entry["motion"] = spot.motion
-            write_json(path, data, compact=True)
-
-    def _tracked(self, spots: list[SpecularityRecord], size: tuple[int, int], index: int) -> list[SpecularityRecord]:
+    def _track_numbers(self, positions_px: Sequence[npt.ArrayLike], size: tuple[int, int], index: int) -> list[int]:
         self._tracker = self._tracker or Tracker(size)
-        numbers = self._tracker.update([spot.position_px for spot in spots], index)
-        return [replace(spot, track=number) for spot, number in zip(spots, numbers, strict=True)]
+        return self._tracker.update(positions_px, index)
 
 
-def _slim(spot: SpecularityRecord, needed: Sequence[str]) -> SpecularityRecord:
-    """Return a specularity with the estimates that are needed, and of the best one the normal."""
-    estimates = {name: spot.estimates[name] for name in needed if name in spot.estimates}
-    if spot.best is not None and (best := spot.best_estimate) is not None:
-        estimates.setdefault(spot.best, Estimate(best.normal, best.normal[None], best.look_px))
-    return replace(spot, estimates=estimates, highlight=None)
-
-
-def _read(path: Path) -> TrackedFrame:
-    """Read the file of a frame."""
-    return TrackedFrame.from_json(read_json(path))
-
-
-def _read_done(path: Path, name: str) -> TrackedFrame | None:
+def _read_done(path: Path, name: str) -> JsonObject | None:
     """Read what an earlier run wrote of a frame; None where there is nothing, or it cannot be used."""
     try:
-        frame = _read(path)
+        entry: JsonObject = read_json(path)
+        # The rows of the tables need what a frame's file must hold.
+        tuple(_rows(0, None, entry))
+        return entry if (entry["image"], len(entry["size"])) == (name, 2) and "time_s" in entry else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return frame if frame.name == name else None
 
 
-def _told_by_motion(frames: Sequence[TrackedFrame], poses: Poses | None, is_flipped: bool) -> str | None:
-    """Return how many highlights' curvatures motion told, as a sentence; None without poses."""
-    if poses is None:
-        return None
-    judged = [spot.motion for frame in frames for spot in frame.specularities if spot.motion is not None]
+def _judge_by_motion(run: _Run, poses: Poses, calibration: Calibration) -> str:
+    """Judge the highlights' curvatures by the poses, add that to the frames' files and the tracks, and say how many."""
+    files = [(frame.index, run.file(frame.index)) for frame in run.frames]
+    told = poses.of_frames([frame.name for frame in run.frames], [index for index, _ in files])
+    pose_of = {index: pose for (index, _), pose in zip(files, told, strict=True)}
+    highlights = [
+        TrackedHighlight.from_json(index, entry) for index, file in files for entry in read_json(file)["specularities"]
+    ]
+    judged = judge_by_motion(highlights, pose_of, poses.error, calibration.priors)
+    is_flipped = fits_flipped_axes(highlights, judged, pose_of, poses.error, calibration.priors)
+    records = iter(judged)
+    for _, file in files:
+        data = read_json(file)
+        for entry in data["specularities"]:
+            entry["motion"] = next(records)
+            run.tracks[entry["track"]].shapes.append(entry["motion"].shape)
+        write_json(file, data, compact=True)
+    return _told_by_motion(judged, poses, is_flipped)
+
+
+def _told_by_motion(judged: Sequence[MotionRecord], poses: Poses, is_flipped: bool) -> str:
+    """Return how many highlights' curvatures motion told, as a sentence."""
     shapes = Counter(each.shape for each in judged)
     counts = ", ".join(f"{count} {shape}" for shape, count in shapes.most_common())
     compared = [each for each in judged if each.distance2 is not None]
@@ -295,23 +308,17 @@ def _told_by_motion(frames: Sequence[TrackedFrame], poses: Poses | None, is_flip
     return told
 
 
-def _settings(source: Path, options: Options) -> JsonObject:
+def _settings(source: Path, options: Options, calibration: Calibration | None) -> JsonObject:
     """Return the run's settings, through JSON, so that paths and tuples compare with the text and lists of a file."""
     given = {key: value for key, value in asdict(options).items() if key != "poses" or value is not None}
-    if options.camera is not None:
-        # Imported here: the models of files are slow to load.
-        from simtest.spec.calibration_file import load_calibration
-
-        content = json.dumps(asdict(load_calibration(options.camera)), default=str)
+    if calibration is not None:
+        content = json.dumps(asdict(calibration), default=str)
         given["calibration"] = hashlib.sha256(content.encode()).hexdigest()
-    return dict(
-        json.loads(
-            json.dumps(
-                {"source": source, **given, "version": environment()["version"]},
-                default=lambda value: str(value.resolve()) if isinstance(value, Path) else str(value),
-            )
-        )
+    settings = json.dumps(
+        {"source": source, **given, "version": environment()["version"]},
+        default=lambda value: str(value.resolve()) if isinstance(value, Path) else str(value),
     )
+    return dict(json.loads(settings))
 
 
 def _check_settings(path: Path, settings: JsonObject) -> None:
@@ -329,19 +336,25 @@ def _check_settings(path: Path, settings: JsonObject) -> None:
         )
 
 
-def _write(out: Path, frames: list[TrackedFrame], tracks: list[Track]) -> list[Path]:
-    files = [out / name for name in ("timeline.csv", "tracks.json", "index.html")]
-    judged = any(spot.motion is not None for frame in frames for spot in frame.specularities)
+def _write(run: _Run, tracks: Sequence[Track]) -> list[Path]:
+    judged = any(track.shapes for track in tracks)
+    files = [run.out / name for name in ("timeline.csv", "tracks.json", "index.html")]
     columns = (*TIMELINE, *MOTION_COLUMNS) if judged else TIMELINE
-    table = (
-        (frame.index, frame.time_s, spot.track, *row, *(() if spot.motion is None else spot.motion.row()))
-        for frame in frames
-        for spot, whole in zip(
-            frame.specularities, _read(out / "frames" / f"{frame.index:06d}.json").specularities, strict=True
-        )
-        for row in normals_rows([whole])
-    )
-    write_atomically(files[0], lambda part: write_csv(part, columns, table))
+    write_atomically(files[0], lambda part: write_csv(part, columns, _timeline(run)))
     write_json(files[1], tracks, compact=True)
-    write_atomically(files[2], lambda part: write_sequence_page(part, frames, tracks))
+    write_atomically(files[2], lambda part: write_sequence_page(part, run.frames, tracks))
     return files
+
+
+def _timeline(run: _Run) -> Iterator[tuple[object, ...]]:
+    """Yield the rows of timeline.csv, from one frame's file after the other."""
+    for frame in run.frames:
+        yield from _rows(frame.index, frame.time_s, read_json(run.file(frame.index)))
+
+
+def _rows(index: int, time_s: float | None, frame: JsonObject) -> Iterator[tuple[object, ...]]:
+    """Yield the rows of timeline.csv of a frame's file."""
+    for entry in frame["specularities"]:
+        motion = motion_row(entry["motion"]) if "motion" in entry else ()
+        for row in normals_rows([entry]):
+            yield (index, time_s, entry["track"], *row, *motion)

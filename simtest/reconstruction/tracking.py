@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from simtest.reconstruction.description import SpecularityRecord
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
 
@@ -22,21 +21,13 @@ DAMPING = 0.5
 
 
 @dataclass(frozen=True)
-class TrackedFrame:
-    """A frame of a sequence, its specularities numbered by their tracks and without drawings; its size is in px."""
+class DoneFrame:
+    """A frame that has its files: its number, its file's name or the film's with the number, and its specularities."""
 
-    name: str
     index: int
+    name: str
     time_s: float | None
-    size: tuple[int, int]
-    specularities: list[SpecularityRecord]
-
-    @classmethod
-    def from_json(cls, data: JsonObject) -> "TrackedFrame":
-        """Read the JSON file of a frame."""
-        width, height = data["size"]
-        spots = [SpecularityRecord.from_json(entry) for entry in data["specularities"]]
-        return cls(data["image"], data["frame_index"], data["time_s"], (width, height), spots)
+    count: int
 
 
 @dataclass(frozen=True)
@@ -44,10 +35,10 @@ class Track:
     """The same specularity over frames: where it was seen, its best normals, and what motion tells of its shape."""
 
     track: int
-    frames: list[int]
-    times_s: list[float | None]
-    peaks_px: list[Array | None]
-    normals: list[Array | None]
+    frames: list[int] = field(default_factory=list)
+    times_s: list[float | None] = field(default_factory=list)
+    peaks_px: list[list[float] | None] = field(default_factory=list)
+    normals: list[list[float] | None] = field(default_factory=list)
     shapes: list[str] = field(default_factory=list)
 
     @property
@@ -59,23 +50,6 @@ class Track:
     def to_json(self) -> JsonObject:
         """Return an entry of tracks.json; shapes only where poses are known."""
         return {key: value for key, value in vars(self).items() if key != "shapes" or value}
-
-
-def tracks_of(frames: Sequence[TrackedFrame]) -> list[Track]:
-    """Return the tracks of a sequence by their numbers."""
-    tracks: dict[int, Track] = {}
-    for frame in frames:
-        for spot in frame.specularities:
-            assert spot.track is not None
-            track = tracks.setdefault(spot.track, Track(spot.track, [], [], [], []))
-            best = spot.best_estimate
-            track.frames.append(frame.index)
-            track.times_s.append(frame.time_s)
-            track.peaks_px.append(spot.peak_px)
-            track.normals.append(None if best is None else best.normal)
-            if spot.motion is not None:
-                track.shapes.append(spot.motion.shape)
-    return [tracks[number] for number in sorted(tracks)]
 
 
 @dataclass
@@ -91,14 +65,9 @@ class _Moving:
 
 
 class Tracker:
-    """Assigns the specularities of each frame to tracks.
+    """Assigns the specularities of each frame, of a width and height in px, to tracks.
 
     All are assigned together, by the least sum of distances to where tracks are expected; the rest begin new tracks.
-
-    Parameters
-    ----------
-    size : tuple of int
-        Width and height of the frames, px.
     """
 
     def __init__(self, size: tuple[int, int]) -> None:

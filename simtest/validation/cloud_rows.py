@@ -10,7 +10,7 @@ from simtest.errors import Failure
 from simtest.estimators import AnyEstimator, Estimate
 from simtest.estimators.protocol import CloudEstimator
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.pipeline import Specularity
+from simtest.reconstruction.records import Specularity
 from simtest.rendering import HighlightPoint, Session
 from simtest.simulation.frame import RenderedView
 from simtest.simulation.highlights import assign_clouds

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.reconstruction.image_io import read_raw
+from simtest.reconstruction.images import read_raw
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.files import check_limit, require_plain
 

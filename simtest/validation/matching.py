@@ -7,7 +7,7 @@ import numpy as np
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.geometry.patch import encloses
-from simtest.reconstruction.pipeline import Specularity
+from simtest.reconstruction.records import Specularity
 from simtest.runtime.arrays import Array
 from simtest.simulation.frame import RenderedView
 

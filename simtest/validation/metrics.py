@@ -12,7 +12,7 @@ from simtest.estimators.budget import deviations
 from simtest.estimators.protocol import Law
 from simtest.geometry import Patch
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
-from simtest.reconstruction.pipeline import Specularity
+from simtest.reconstruction.records import Specularity
 from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.arrays import Array
 from simtest.simulation.highlights import TrueHighlight

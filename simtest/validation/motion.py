@@ -14,7 +14,8 @@ from simtest.estimators import AnyEstimator, Estimate
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.motion_signs import EXACT, MovedView, PoseError, RankedHypotheses, rank_by_motions
 from simtest.geometry.vectors import rotation
-from simtest.reconstruction.pipeline import Specularity, reconstruct
+from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction.records import Specularity
 from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import Stage, generator

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from simtest.errors import Reason
 from simtest.estimators import AnyEstimator
 from simtest.estimators.protocol import laws_of
-from simtest.reconstruction.pipeline import Specularity, reconstruct
+from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction.records import Specularity
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image, Picture, only_reading
 from simtest.simulation.frame import RenderedView, render_view

@@ -12,15 +12,9 @@ import numpy.typing as npt
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.description import (
-    ComparisonRecord,
-    ErrorRecord,
-    ErrorSummary,
-    PictureRecord,
-    ReferenceRecord,
-    SpecularityRecord,
-)
+from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.files import JsonObject
 from simtest.spec.toml_files import read_toml
 from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,
@@ -34,6 +28,48 @@ from simtest.validation.depth_maps import (
 
 ROTATION_TOLERANCE = 1e-3
 """Largest difference of R^T R from the identity, entry by entry: poses are written with a few digits."""
+
+
+@dataclass(frozen=True)
+class ErrorRecord:
+    """Angle to a reference, deg: of the proposed normal, and of the better candidate."""
+
+    error_deg: float
+    error_oracle_deg: float
+
+
+@dataclass(frozen=True)
+class ReferenceRecord:
+    """The reference's normal at a specularity, and each estimator's error; None where the sightline misses it."""
+
+    normal: Array | None
+    errors: dict[str, ErrorRecord]
+
+    def to_json(self) -> JsonObject | None:
+        """Return the entry ``reference`` of a specularity."""
+        return None if self.normal is None else vars(self)
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """An estimator's errors against a reference, deg; a single one has no spread."""
+
+    n: int
+    mean_deg: float
+    std_deg: float | None
+    mean_oracle_deg: float
+    std_oracle_deg: float | None
+
+
+@dataclass(frozen=True)
+class ComparisonRecord:
+    """How normals compare with a reference: its file, what is wrong with it, and each estimator's errors."""
+
+    source: str
+    problems: list[str]
+    compared: int
+    missed: int
+    estimators: dict[str, ErrorSummary]
 
 
 @dataclass(frozen=True)
@@ -203,43 +239,31 @@ def _numbers(data: Mapping[str, Any], key: str, shapes: Sequence[tuple[int, ...]
     return values
 
 
-def compare(record: PictureRecord, reference: Reference) -> PictureRecord:
+def compare(spots: Specularities, reference: Reference) -> None:
     """Compare the normals of a picture with a reference at their brightest points.
 
-    Parameters
-    ----------
-    record : PictureRecord
-        What was reconstructed.
-    reference : MeshReference or DepthReference
-        What it is compared with.
-
-    Returns
-    -------
-    PictureRecord
-        The same with the reference's normal and the errors of the estimators, deg, at each specularity that has a
-        peak: of the proposed normal, and of the better candidate, as the article chooses by hand. Their means and
-        standard deviations by estimator stand in the picture's own ``reference``.
+    Each specularity that has a peak gets the reference's normal and the errors of the estimators, deg: of the proposed
+    normal, and of the better candidate, as the article chooses by hand. Their means and standard deviations by
+    estimator become the picture's own ``reference``.
     """
-    peaks = np.array([spot.peak_px for spot in record.specularities if spot.peak_px is not None], dtype=float)
-    normals = iter(reference.normals_at(peaks, record.camera) if len(peaks) else ())
-    spots = [
-        spot if spot.peak_px is None else replace(spot, reference=_errors(spot, next(normals)))
-        for spot in record.specularities
+    peaks = np.array([spot.peak_px for spot in spots if spot.peak_px is not None], dtype=float)
+    normals = iter(reference.normals_at(peaks, spots.camera) if len(peaks) else ())
+    spots[:] = [
+        spot if spot.peak_px is None else replace(spot, reference=_errors(spot, next(normals))) for spot in spots
     ]
     # summarise the sightlines that meet the reference
     met = [spot.reference.errors for spot in spots if spot.reference is not None and spot.reference.normal is not None]
     names = dict.fromkeys(name for errors in met for name in errors)
-    comparison = ComparisonRecord(
+    spots.reference = ComparisonRecord(
         source=reference.source,
         problems=list(reference.notes),
         compared=len(met),
         missed=len(peaks) - len(met),
         estimators={name: _summary([errors[name] for errors in met if name in errors]) for name in names},
     )
-    return replace(record, specularities=spots, reference=comparison)
 
 
-def _errors(spot: SpecularityRecord, normal: Array) -> ReferenceRecord:
+def _errors(spot: Specularity, normal: Array) -> ReferenceRecord:
     if not np.isfinite(normal).all():
         return ReferenceRecord(None, {})
     angles = {name: angle_deg(estimate.candidates, normal) for name, estimate in spot.normals.items()}

@@ -16,7 +16,7 @@ from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.dataset import calibration_of
 from simtest.errors import Failure
 from simtest.reconstruction import Specularity, reconstruct
-from simtest.reconstruction.picture import Options
+from simtest.reconstruction.options import Options
 from simtest.simulation.flow import HIDDEN, OUT, SEEN
 from simtest.simulation.frame import make_frame
 from simtest.simulation.frame_files import write_frame
@@ -141,7 +141,7 @@ def counts(case: Case) -> Faults:
     arrays = np.load(case.folder / "normals" / "constraints.npz")
     answers = {(s["id"], name) for s in found for name, e in s["estimates"].items() if e["status"] == "ok"}
     others = {
-        "Python": {(s.id, name) for s in record.specularities for name in s.normals},
+        "Python": {(s.id, name) for s in record for name in s.normals},
         "normals.csv": {(int(r["specularity"]), r["estimator"]) for r in lines if r["status"] == "ok"},
         "the page": {(s["id"], r["name"]) for s in shown for r in s["rows"] if r["status"] == "ok"},
     }

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from simtest.detection.detector import Highlight
 from simtest.reconstruction import detect_in_picture
-from simtest.reconstruction.image_io import read_picture
-from simtest.reconstruction.picture_detection import PictureDetection
+from simtest.reconstruction.images import read_picture
+from simtest.reconstruction.pipeline import PictureDetection
 
 Mask = npt.NDArray[np.bool_]
 Polygon = Sequence[int]

@@ -12,7 +12,9 @@ from simtest.detection.peaks import PeakDetector
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry.vectors import angle_deg, deviation_deg
-from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, Specularity, run_pipeline
+from simtest.reconstruction.options import SMOOTHING_BY_COLOUR_PX
+from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction.records import Specularity
 from simtest.rendering import Radiance, Session
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import key as hashed
@@ -57,7 +59,7 @@ class Frames:
         calibration = calibration_of(self.number, row, span)
         # Tissue is seen as the command sees a coloured picture, smooth surfaces as `simtest.reconstruct` does.
         detector, smoothing = (ColourDetector(), SMOOTHING_BY_COLOUR_PX) if view.is_rough else (None, SMOOTHING_PX)
-        found = run_pipeline(frame, calibration, detector or PeakDetector(True), {}, None, smoothing).specularities
+        found = reconstruct(frame, calibration, {}, smoothing_px=smoothing, detector=detector or PeakDetector(True))
         for specularity, truth, holds, radius in _judged(found, view):
             if not isinstance(specularity.patch, Failure):
                 own = (None, None) if truth is None else (truth.normal, truth.normal_base)

@@ -11,7 +11,8 @@ from simtest.detection.colour import ColourDetector
 from simtest.errors import Failure
 from simtest.estimators import AnyEstimator, Estimate
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.pipeline import Specularity, run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction.records import Specularity
 from simtest.runtime.arrays import Array
 from simtest.validation.metrics import mahalanobis2
 from studies.hard.table import CHI2_95
@@ -67,8 +68,10 @@ def why(failure: Failure) -> str:
 
 def answers(frame: HardFrame, estimators: Mapping[str, AnyEstimator]) -> Iterator[Answer]:
     """Yield the answers at the highlights that the detector by colour finds in a frame."""
-    found = run_pipeline(frame.encoded, frame.calibration, ColourDetector(), estimators, None, SMOOTHING_PX)
-    for number, each in enumerate(found.specularities):
+    found = reconstruct(
+        frame.encoded, frame.calibration, estimators, smoothing_px=SMOOTHING_PX, detector=ColourDetector()
+    )
+    for number, each in enumerate(found):
         base, fine = base_at(frame, _pixel(each)), fine_at(frame, _pixel(each))
         if base is None:
             continue

@@ -22,7 +22,8 @@ from simtest.estimators import AnyEstimator, Estimate
 from simtest.geometry.vectors import basis_across, tangent_coordinates
 from simtest.reconstruction import Specularity
 from simtest.reconstruction.assumptions import calibration_of_view
-from simtest.reconstruction.pipeline import run_picture
+from simtest.reconstruction.options import Options
+from simtest.reconstruction.pipeline import run
 from simtest.runtime.arrays import Array, Image
 from simtest.spec.lights import Rig
 from studies.detection.real_frames import (
@@ -104,7 +105,7 @@ def specularities(
     picture: Image, calibration: Calibration, estimators: Mapping[str, AnyEstimator]
 ) -> Sequence[Specularity]:
     """Return the estimates at a picture's highlights; all state the base's normals."""
-    return run_picture(picture, calibration, detector="colour", estimators=estimators, target="base")[0].specularities
+    return run(picture, calibration, Options(detector="colour", estimators=estimators, target="base"))
 
 
 def refusals(found: Sequence[Specularity], name: str) -> Counter[str]:

@@ -21,10 +21,11 @@ from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.calibration import Calibration, Normal, Priors, Response
 from simtest.errors import InputError
 from simtest.estimators.budget import deviations
-from simtest.reconstruction.image_io import read_picture
+from simtest.reconstruction.images import read_picture
+from simtest.reconstruction.light_calibration.page import write_calibration
 from simtest.reconstruction.light_calibration.run import Ball, calibrate_lights, picture_readers
-from simtest.reconstruction.light_calibration.write import write_calibration
-from simtest.reconstruction.pipeline import run_picture
+from simtest.reconstruction.options import Options
+from simtest.reconstruction.pipeline import run
 from simtest.rendering import Session
 from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec import Scene, load_scene
@@ -91,7 +92,7 @@ def rated(
     session: Session, view: RenderedView, picture: Path, calibration: Calibration, names: tuple[str, str]
 ) -> list[Rated]:
     """Return the highlights of a picture that have a stated region."""
-    made = run_picture(read_picture(picture), calibration)[0]
+    made = run(read_picture(picture), calibration, Options())
     return [
         _rated(each, *names) for each in score(session, view, made) if each.held is not None and each.kind != "false"
     ]

@@ -8,7 +8,7 @@ from docstring_parser import parse
 
 from simtest.dataset.fields import FIELDS as SAMPLE_FIELDS
 from simtest.dataset.index import HighlightRow, SampleRow
-from simtest.reconstruction.output_files import COLUMNS
+from simtest.reconstruction.outputs import COLUMNS
 from simtest.simulation.frame_files import FIELDS, FILES, INSTRUMENT_FIELDS
 from simtest.validation.columns import COLUMNS as RESULTS
 from simtest.validation.runner import RunRecord

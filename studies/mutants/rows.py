@@ -392,7 +392,7 @@ ROWS = (
         "float(rotation)", "poses"),
     row("motion between frames of a sequence inverted", "transposes", "reconstruction.motion:_judge",
         "np.linalg.inv(other) @ pose", "np.linalg.inv(pose) @ other", "motion_sequence"),
-    row("constraints without their second candidate", "labels", "reconstruction.constraints:constraints_arrays",
+    row("constraints without their second candidate", "labels", "reconstruction.outputs:constraints_arrays",
         "pair[: len(listed)] = listed[:2]", "pair[:1] = listed[:1]",
         "imaging picture_page"),
     # validation

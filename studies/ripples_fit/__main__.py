@@ -25,7 +25,7 @@ from simtest.estimators.brightest_point import OF_APEX, budget_of_peak
 from simtest.estimators.family import OF_MEAN, OF_PEAK, IsophoteFamily
 from simtest.estimators.highlight import fit_highlight
 from simtest.geometry import Array, Camera, Mask, Patch, chi_squared
-from simtest.reconstruction.pipeline import SMOOTHING_BY_COLOUR_PX, run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.seeds import Stage, generator
 from simtest.simulation.sensor import capture, collect
 from simtest.spec.sensor import Sensor
@@ -108,7 +108,7 @@ def _highlights(number: int) -> Iterator[Seen]:
         response = sensor.response.model()
         noise = NoiseModel(sensor.noise_sigma, sensor.full_well, sensor.read_noise, sensor.bits, response)
         calibration = Calibration(CAMERA, response, noise=noise, saturation_level=1.0)
-        found = run_pipeline(frame, calibration, ColourDetector(), {}, None, SMOOTHING_BY_COLOUR_PX).specularities
+        found = reconstruct(frame, calibration, {}, detector=ColourDetector())
         for specularity in found:
             if isinstance(specularity.patch, Patch):
                 yield from _axes(number, field, picture, specularity.patch)

@@ -17,9 +17,9 @@ from simtest.calibration import Calibration, Priors, Response, exactly, srgb_enc
 from simtest.detection.colour import ColourDetector
 from simtest.errors import Failure
 from simtest.geometry import Camera
-from simtest.reconstruction.image_io import read_picture
-from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
-from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, reconstruct, reconstruct_colour
+from simtest.reconstruction.images import read_picture
+from simtest.reconstruction.options import DEFAULT_ESTIMATORS, Options, calibration_for
+from simtest.reconstruction.pipeline import reconstruct, reconstruct_values
 
 CAMERA = Camera.from_fov(60.0, WIDTH, HEIGHT)
 FRAMES = Path(__file__).resolve().parents[3] / "shared" / "data" / "frames"
@@ -36,14 +36,14 @@ def by_file(path, tmp_path, camera, **options):
     """Reconstruct a file as the command does, without writing what it writes."""
     simtest.save_camera(camera, tmp_path / "camera.toml")
     told, values = Options(tmp_path / "camera.toml", **options), read_picture(path)
-    return reconstruct_values(str(path), values, read_calibration(told, values)[0], told)
+    return reconstruct_values(str(path), values, calibration_for(told, values)[0], told)
 
 
 def same(found, record):
     """Check that an array's specularities are those of a file, to the last bit."""
-    assert len(found) == len(record.specularities)
-    for spot, told in zip(found, record.specularities, strict=True):
-        assert spot.region.box == told.box_px
+    assert len(found) == len(record)
+    for spot, told in zip(found, record, strict=True):
+        assert spot.region.box == told.region.box
         assert list(spot.estimates) == list(told.estimates)
         for name, estimate in spot.estimates.items():
             other = told.estimates[name]
@@ -55,7 +55,7 @@ def same(found, record):
             np.testing.assert_array_equal(estimate.covariance, other.covariance)
             assert estimate.flags == other.flags
     for name in ("encoding", "detector", "smoothing_px", "inferred", "assumed"):
-        assert getattr(found.choices, name) == getattr(record, name), name
+        assert getattr(found.choices, name) == getattr(record.choices, name), name
 
 
 def stored(values, path):
@@ -141,7 +141,7 @@ def test_a_field_of_view_is_told_alike(tmp_path):
     stored(values, tmp_path / "frame.png")
     told = Options(fov_deg=60.0)
     picture_values = read_picture(tmp_path / "frame.png")
-    record = reconstruct_values("frame.png", picture_values, read_calibration(told, picture_values)[0], told)
+    record = reconstruct_values("frame.png", picture_values, calibration_for(told, picture_values)[0], told)
     found = reconstruct(values, 60.0)
     same(found, record)
     assert "focal length" in [each.what for each in found.choices.assumed]
@@ -204,7 +204,8 @@ def test_real_numbers_are_a_picture_where_that_is_said():
 def test_by_colour_takes_pictures_of_any_depth():
     values = tissue()
     for other in (values / np.float32(255), values.astype(np.uint16) * 257):
-        boxes = [[s.region.box for s in reconstruct_colour(v, CAMERA, {}).specularities] for v in (values, other)]
+        made = [reconstruct(v, CAMERA, {}, detector="colour", encoding="srgb") for v in (values, other)]
+        boxes = [[spot.region.box for spot in each] for each in made]
         assert boxes[0] == boxes[1]
         assert len(boxes[0]) == 2
 

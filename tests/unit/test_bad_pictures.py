@@ -6,7 +6,8 @@ import pytest
 from simtest.calibration import Calibration, Response
 from simtest.errors import Failure, Reason
 from simtest.geometry import Camera, Patch
-from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS, reconstruct
+from simtest.reconstruction.options import DEFAULT_ESTIMATORS
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.spec import load_camera
 from tests.refusals import refused
 

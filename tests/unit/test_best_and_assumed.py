@@ -14,6 +14,7 @@ from simtest.estimators.process.messages import priors_message
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import KannalaBrandt, ViewMask
 from simtest.reconstruction.assumptions import (
+    BORDERED,
     CENTRE_SD_SHARE,
     FOCAL_SD,
     LENS_SD,
@@ -22,9 +23,9 @@ from simtest.reconstruction.assumptions import (
     calibration_of_round_view,
     calibration_of_view,
 )
-from simtest.reconstruction.borders import BORDERED
-from simtest.reconstruction.picture import Options, read_calibration, reconstruct_values
-from simtest.reconstruction.ranking import best_of, stated_errors
+from simtest.reconstruction.options import Options, calibration_for
+from simtest.reconstruction.pipeline import reconstruct_values
+from simtest.reconstruction.records import best_of, stated_errors
 from simtest.runtime.files import write_json
 from simtest.spec import load_calibration, save_calibration
 
@@ -123,7 +124,7 @@ def test_a_field_of_view_is_told_with_its_extent(tmp_path):
     masked = calibration_of_round_view(170.0, 400, 160, ViewMask(200.0, 80.0, 60.0)).camera
     assert masked.view_mask == ViewMask(200.0, 80.0, 60.0)
     picture = np.zeros((160, 200), np.float32)
-    _, (told,) = read_calibration(Options(fov_deg=70.0, fov_of="diagonal"), picture)
+    _, (told,) = calibration_for(Options(fov_deg=70.0, fov_of="diagonal"), picture)
     assert "70 deg across the picture's diagonal" in told
 
 
@@ -134,7 +135,7 @@ def tissue(lit):
 
 def notes_of(picture, fov_of="width"):
     options = Options(fov_deg=70.0, fov_of=fov_of, estimators=("brightest_point",))
-    warnings = reconstruct_values("a", picture, read_calibration(options, picture)[0], options).warnings
+    warnings = reconstruct_values("a", picture, calibration_for(options, picture)[0], options).warnings
     return [each for each in warnings if each.startswith(BORDERED)]
 
 
@@ -163,7 +164,7 @@ def test_dark_borders_are_named_and_the_note_can_be_obeyed():
 
 def test_a_field_of_view_may_span_the_round_view():
     options = Options(fov_deg=140.0, fov_of="view")
-    calibration, (told,) = read_calibration(options, tissue(ROUND))
+    calibration, (told,) = calibration_for(options, tissue(ROUND))
     camera, edge = calibration.camera, np.radians(70.0)
     assert (camera.cx, camera.cy) == pytest.approx((110, 80), abs=0.7)
     assert (camera.distortion, camera.view_mask) == (KannalaBrandt(), None)
@@ -175,7 +176,7 @@ def test_a_field_of_view_may_span_the_round_view():
     )
     assert "across the picture's round view" in told
     with pytest.raises(InputError, match="--fov-of view: no round view was found"):
-        read_calibration(options, tissue(np.ones((160, 200), bool)))
+        calibration_for(options, tissue(np.ones((160, 200), bool)))
 
 
 def test_a_full_calibration_leaves_nothing_open(tmp_path):
@@ -275,9 +276,9 @@ def test_malformed_keys_are_named(tmp_path, text, said):
 @pytest.mark.parametrize("target", ["fine", "base"])
 def test_a_picture_of_which_nothing_is_told(tmp_path, target):
     options = Options(fov_deg=53.0, estimators=("cone_axis",), encoding="linear", target=target)
-    calibration, _ = read_calibration(options, spot())
+    calibration, _ = calibration_for(options, spot())
     record = reconstruct_values("spot", spot(), calibration, options)
-    write_json(tmp_path / "normals.json", record)
+    write_json(tmp_path / "normals.json", record.to_json())
     document = json.loads((tmp_path / "normals.json").read_text())
     (found,) = document["specularities"]
     assert (found["best"], found["estimates"]["cone_axis"]["target"]) == ("cone_axis", target)
@@ -291,7 +292,7 @@ def test_a_picture_of_which_nothing_is_told(tmp_path, target):
     stated = np.degrees(np.sqrt(np.trace(found["estimates"]["cone_axis"]["covariance"])))
     assert 4 < stated < (7 if target == "fine" else 15)
     assert [each["what"] for each in document["assumed"]][:2] == ["light", "distance of the tissue"]
-    with pytest.raises(InputError, match="--target top"):
+    with pytest.raises(InputError, match="target = top: must be one of fine, base"):
         Options(fov_deg=53.0, target="top")
 
 

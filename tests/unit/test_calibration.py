@@ -16,7 +16,7 @@ from simtest.estimators import Estimate
 from simtest.estimators.budget import plateau_area_px
 from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry import Camera, KannalaBrandt, Patch, ViewMask, smooth
-from simtest.reconstruction.pipeline import reconstruct, run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
 from simtest.simulation.sensor import capture, collect
 from simtest.spec import load_calibration, load_camera, save_calibration
 from simtest.spec.sensor import Sensor
@@ -395,8 +395,8 @@ def test_a_highlight_that_a_border_cuts_is_flagged_for_its_own_pixels_alone():
         def estimate(self, patch, camera, priors):
             return Estimate(-camera.unproject(patch.peak_px), -camera.unproject(patch.peak_px)[None], patch.peak_px)
 
-    made = run_pipeline(frame, known, Found(), {"facing": Facing()}, None, 1.0)
-    (found,) = made.specularities
+    made = reconstruct(frame, known, {"facing": Facing()}, smoothing_px=1.0, detector=Found())
+    (found,) = made
     assert isinstance(found.patch.isophote(0.5), Failure)
     assert found.estimates["facing"].flags == ()
 

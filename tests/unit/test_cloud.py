@@ -18,8 +18,7 @@ from simtest.estimators.dispatch import run_in_frame
 from simtest.estimators.protocol import CloudEstimator
 from simtest.geometry import Camera, chi_squared
 from simtest.geometry.vectors import angle_deg, basis_across, tangent_coordinates
-from simtest.reconstruction.description import describe
-from simtest.reconstruction.pipeline import reconstruct, run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
 
 CAMERA = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 FORWARD = np.array([0.0, 0.0, 1.0])
@@ -320,12 +319,12 @@ def test_no_patch_takes_a_cloud():
 def test_clouds_reach_normals_json_and_the_drawings():
     points = spread_points(np.random.default_rng(5), 24)
     calibration = Calibration(CAMERA, priors=LIGHT_AT_CAMERA)
-    made = run_pipeline(picture_of(points), calibration, "peaks", {"cloud": cloud}, None, 1.0)
-    last = made.specularities[-1]
+    made = reconstruct(picture_of(points), calibration, {"cloud": cloud}, smoothing_px=1.0, detector="peaks")
+    last = made[-1]
     width = last.region.box[2]
     assert width > 40
-    assert all("cloud" not in other.estimates for other in made.specularities[:-1])
-    (record,) = [spot for spot in describe(made, CAMERA) if spot.best == "cloud"]
+    assert all("cloud" not in other.estimates for other in made[:-1])
+    (record,) = [spot for spot in made if spot.best == "cloud"]
     (outline,) = record.drawings["cloud"].curves
     area = cv2.contourArea(np.array(outline, dtype=np.float32))
     values = np.linalg.eigvalsh(last.estimates["cloud"].cloud.covariance)

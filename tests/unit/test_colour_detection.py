@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, srgb_decode, srgb_encode
+from simtest.calibration import srgb_decode, srgb_encode
 from simtest.detection import colour as colour_detection
 from simtest.detection.classify import _around, _isophotes
 from simtest.detection.detector import Kind
@@ -11,12 +11,15 @@ from simtest.detection.view import find_view
 from simtest.errors import InputError
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
-from simtest.reconstruction import detect_in_picture, reconstruct, reconstruct_colour
+from simtest.reconstruction import detect_in_picture, reconstruct
 from studies.detection.scores import Scores, score
 from studies.detection.truth import SpecularTruth, specular_truth
 
 WIDTH, HEIGHT = 320, 240
 TISSUE = np.array([0.55, 0.28, 0.22])
+
+
+BY_COLOUR = {"detector": "colour", "encoding": "srgb"}
 
 
 def places():
@@ -171,9 +174,9 @@ def test_fill_keeps_what_is_known_and_is_smooth_between():
 
 def test_normals_of_a_sphere_point_back_along_the_sightlines():
     camera = Camera.from_fov(60.0, WIDTH, HEIGHT)
-    made = reconstruct_colour(picture(lobe(90, 70, 5.0) + lobe(230, 160, 6.0, 4.0)), Calibration(camera))
-    assert len(made.specularities) == len(made.detection.highlights) == 2
-    for spot in made.specularities:
+    made = reconstruct(picture(lobe(90, 70, 5.0) + lobe(230, 160, 6.0, 4.0)), camera, **BY_COLOUR)
+    assert len(made) == len(made.detection.highlights) == 2
+    for spot in made:
         estimate = spot.estimates["cone_axis"]
         assert isinstance(estimate, Estimate)
         angle = np.degrees(np.arccos(-estimate.normal @ camera.unproject(spot.patch.peak_px)))
@@ -182,36 +185,37 @@ def test_normals_of_a_sphere_point_back_along_the_sightlines():
 
 def test_smoothing_has_the_limits_of_grey_pictures():
     with pytest.raises(InputError, match=r"smoothing_px = 51: must be a number in \[0, 50\]"):
-        reconstruct_colour(picture(lobe(90, 70, 5.0)), Camera.from_fov(60.0, WIDTH, HEIGHT), smoothing_px=51)
+        reconstruct(picture(lobe(90, 70, 5.0)), Camera.from_fov(60.0, WIDTH, HEIGHT), smoothing_px=51, **BY_COLOUR)
 
 
 def test_small_highlights_are_flagged():
-    made = reconstruct_colour(
-        picture(lobe(100, 100, 1.3) + lobe(220, 100, 6.0)), Calibration(Camera.from_fov(60.0, WIDTH, HEIGHT))
+    made = reconstruct(
+        picture(lobe(100, 100, 1.3) + lobe(220, 100, 6.0)), Camera.from_fov(60.0, WIDTH, HEIGHT), **BY_COLOUR
     )
-    flags = {round(spot.patch.peak_px[0]): spot.estimates["cone_axis"].flags for spot in made.specularities}
+    flags = {round(spot.patch.peak_px[0]): spot.estimates["cone_axis"].flags for spot in made}
     assert "unresolved" in flags[100]
     assert not {"small", "unresolved"} & set(flags[220])
 
 
 def test_highlights_that_smoothing_has_rounded_are_flagged():
-    made = reconstruct_colour(
+    made = reconstruct(
         picture(lobe(100, 100, 3.0) + lobe(220, 100, 8.0)),
-        Calibration(Camera.from_fov(60.0, WIDTH, HEIGHT)),
+        Camera.from_fov(60.0, WIDTH, HEIGHT),
         smoothing_px=2.0,
+        **BY_COLOUR,
     )
-    flags = {round(spot.patch.peak_px[0]): spot.estimates["cone_axis"].flags for spot in made.specularities}
+    flags = {round(spot.patch.peak_px[0]): spot.estimates["cone_axis"].flags for spot in made}
     assert "small" in flags[100]
     assert not {"small", "unresolved"} & set(flags[220])
 
 
 def test_a_highlight_that_is_dim_beside_clipped_ones_is_flagged():
     """One lobe is as bright at every zero of the misfit; at a near miss it is not (theory.md 7.1b)."""
-    camera = Calibration(Camera.from_fov(60.0, WIDTH, HEIGHT))
+    camera = Camera.from_fov(60.0, WIDTH, HEIGHT)
     bright, dim = lobe(90, 70, 5.0, peak=4.0), lobe(230, 160, 5.0, peak=0.35)
     for specular, expected in ((bright + dim, [False, True]), (dim, [False]), (bright + 10 * dim, [False, False])):
-        made = reconstruct_colour(picture(specular), camera)
-        spots = sorted(made.specularities, key=lambda spot: spot.patch.peak_px[0])
+        made = reconstruct(picture(specular), camera, **BY_COLOUR)
+        spots = sorted(made, key=lambda spot: spot.patch.peak_px[0])
         assert [
             all("dim" in e.flags for e in s.estimates.values() if isinstance(e, Estimate)) for s in spots
         ] == expected

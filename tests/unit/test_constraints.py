@@ -7,14 +7,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Response, exactly
+from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, Response, exactly
+from simtest.detection import Detection, Region
 from simtest.detection.view import View
+from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
 from simtest.geometry import Camera, chi_squared
-from simtest.reconstruction.constraints import constraints_arrays
-from simtest.reconstruction.description import PictureRecord, SpecularityRecord
-from simtest.reconstruction.picture import Options, reconstruct_values
+from simtest.reconstruction.motion import NEEDED, TrackedHighlight
+from simtest.reconstruction.options import Choices, Options
+from simtest.reconstruction.outputs import constraints_arrays
+from simtest.reconstruction.pipeline import reconstruct_values
+from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.files import write_json
+from simtest.validation.columns import WHOLE
 
 CAMERA = Camera(160, 120, 400.0, 400.0, 80.0, 60.0)
 AXIS = CAMERA.unproject(np.array([87.0, 64.0]))
@@ -67,17 +72,24 @@ def held(made, truths, key):
     return np.mean(inside)
 
 
+def found(spots, view=WHOLE):
+    """Return specularities of a frame of `CAMERA`."""
+    calibration = Calibration(CAMERA)
+    frame = Frame(np.zeros((120, 160), np.float32), calibration, 2.0)
+    return Specularities(spots, Detection((), frame, view=view), Choices(calibration, "peaks", 2.0, ()))
+
+
+def alone_at(i, name, estimate):
+    nowhere = Failure(Reason.NO_PEAK, "no region was detected here")
+    return Specularity(Region((30, 20, 1, 1), (30, 20), None), nowhere, {name: estimate}, id=i)
+
+
 def test_an_answer_without_a_patch_is_a_constraint_too():
     """What a frame's estimator finds by itself, such as a cloud: the other files hold it."""
     normal, look = np.array([0.0, 0.0, -1.0]), np.array([30.0, 20.0])
     alone = Estimate(normal, normal[None], look, covariance=np.diag([1e-4, 4e-4]), target="base")
     beyond = replace(alone, look_px=np.array([np.nan, np.nan]))
-    camera, whole = CAMERA, View(None)
-    spots = [
-        SpecularityRecord(i, (30, 20, 1, 1), None, None, None, None, "own", {"own": each})
-        for i, each in ((4, alone), (5, beyond))
-    ]
-    made = constraints_arrays(PictureRecord("", camera, "linear", "peaks", whole, [], spots, ()))
+    made = constraints_arrays(found([alone_at(4, "own", alone), alone_at(5, "own", beyond)]))
     # An answer that looks along no ray has no sightline to stand on.
     assert (made["id"].tolist(), made["target"].tolist()) == ([4], ["base"])
     np.testing.assert_array_equal(made["pixel"], [look])
@@ -88,17 +100,16 @@ def test_an_answer_without_a_patch_is_a_constraint_too():
 def test_an_estimate_is_read_back_with_the_spread_of_its_axis_ratio(tmp_path):
     normal = np.array([0.0, 0.0, -1.0])
     given = Estimate(normal, normal[None], np.array([30.0, 20.0]), axis_ratio=0.5, axis_ratio_deviation=0.1)
-    spot = SpecularityRecord(0, (30, 20, 1, 1), None, None, None, None, "own", {"own": given})
-    write_json(tmp_path / "spot.json", spot)
-    read = SpecularityRecord.from_json(json.loads((tmp_path / "spot.json").read_text()))
-    assert read.normals["own"].axis_ratio_deviation == 0.1
+    write_json(tmp_path / "spot.json", alone_at(0, NEEDED, given).to_json() | {"track": 7})
+    read = TrackedHighlight.from_json(3, json.loads((tmp_path / "spot.json").read_text()))
+    assert (read.frame, read.track) == (3, 7)
+    assert read.judging.axis_ratio_deviation == 0.1
 
 
 def test_the_outline_of_the_view_is_that_of_its_largest_part():
     y, x = np.mgrid[:120, :160]
     seen = (x < 110) | ((x - 140) ** 2 + (y - 60) ** 2 < 15**2)
-    record = PictureRecord("", CAMERA, "linear", "peaks", View(seen), [], [], ())
-    outline = np.array(record.to_json()["view"]["outline"])
+    outline = np.array(found([], View(seen)).to_json()["view"]["outline"])
     assert (outline.min(axis=0).tolist(), outline.max(axis=0).tolist()) == ([0.5, 0.5], [109.5, 119.5])
 
 

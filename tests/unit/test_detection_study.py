@@ -3,9 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, srgb_encode
+from simtest.calibration import srgb_encode
 from simtest.detection.detector import Kind
-from simtest.reconstruction import reconstruct_colour
+from simtest.reconstruction import reconstruct
 from simtest.rendering import Session
 from simtest.spec import load_scene
 from studies.detection.frames import SPLITS, study_frames
@@ -55,8 +55,8 @@ def test_normals_through_a_clipped_8_bit_picture_of_a_tilted_sphere(radius):
     linear = tissue / (2.5 * tissue.max()) + radiance.specular[:, :, None] / (0.7 * radiance.specular.max())
     linear += np.random.default_rng(0).normal(0, 0.004, linear.shape)
     picture = (np.rint(255 * srgb_encode(np.clip(linear, 0, 1))) / 255).astype(np.float32)
-    made = reconstruct_colour(picture, Calibration(session.camera))
-    (spot,) = made.specularities
+    made = reconstruct(picture, session.camera, detector="colour", encoding="srgb")
+    (spot,) = made
     assert made.detection.highlights[0].kind is Kind.ISOLATED
     for name, most in (("cone_axis", 0.1), ("brightest_point", 0.5)):
         estimate = spot.estimates[name]

@@ -9,11 +9,12 @@ from simtest.calibration import NO_PRIORS, Calibration, Frame, NoiseModel, Respo
 from simtest.calibration.photometry import AngularProfile
 from simtest.detection import Detection, Detector, Region, load_detector, peak_shape
 from simtest.detection.colour import ColourDetector, colour
+from simtest.detection.detector import run_detector
 from simtest.detection.peaks import PeakDetector, peaks
 from simtest.errors import Failure, InputError
 from simtest.geometry import Camera, Patch, ViewMask
-from simtest.reconstruction.choices import complete
-from simtest.reconstruction.pipeline import reconstruct, reconstruct_colour
+from simtest.reconstruction.options import complete
+from simtest.reconstruction.pipeline import reconstruct
 
 CAMERA = Camera(200, 160, 200.0, 200.0, 100.0, 80.0)
 CALIBRATIONS = {
@@ -73,9 +74,9 @@ def test_peaks_are_those_of_the_pipeline(name, isolated, smoothing_px):
 def test_colour_is_that_of_the_pipeline(name, isolated):
     calibration = CALIBRATIONS[name]
     found = ColourDetector(isolated).detect(Frame(tissue(), complete(calibration, None), 1.0), calibration.camera)
-    made = reconstruct_colour(tissue(), calibration, {}, isolated=isolated)
-    assert len(made.specularities) == 2
-    same_patches(found, made.specularities)
+    made = reconstruct(tissue(), calibration, {}, isolated=isolated, detector="colour", encoding="srgb")
+    assert len(made) == 2
+    same_patches(found, made)
     there = made.detection
     assert [h.kind for h in found.highlights] == [h.kind for h in there.highlights]
     assert len(found.others) == len(there.others)
@@ -171,4 +172,4 @@ def test_a_detector_may_hand_on_other_light_of_a_grey_frame():
 def test_colour_takes_three_channels(channels):
     shape = (CAMERA.height, CAMERA.width) if channels is None else (CAMERA.height, CAMERA.width, channels)
     with pytest.raises(InputError, match=r"takes \(H, W, 3\)"):
-        reconstruct_colour(np.full(shape, 0.5, dtype=np.float32), CAMERA, {})
+        run_detector(colour, Frame(np.full(shape, 0.5, dtype=np.float32), Calibration(CAMERA), 1.0))

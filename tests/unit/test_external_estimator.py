@@ -91,9 +91,10 @@ import simtest
 from simtest.calibration import Calibration, Frame, Priors
 from simtest.detection import load_detector
 from simtest.detection.detector import DETECTORS
-from simtest.estimators.names import ESTIMATORS
-from simtest.estimators.names import load_estimators
-from simtest.reconstruction.picture import Options, reconstruct_values
+from simtest.estimators.installed import ESTIMATORS
+from simtest.estimators.registry import load_estimators
+from simtest.reconstruction.options import Options
+from simtest.reconstruction.pipeline import reconstruct_values
 
 camera = simtest.Camera(120, 90, 100.0, 100.0, 60.0, 45.0)
 x, y = np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5)
@@ -126,7 +127,7 @@ except simtest.InputError as error:
 print(json.dumps({
     "available": ESTIMATORS.names(), "detectors": DETECTORS.names(), "said": said, "refused": refused,
     "distributions": ESTIMATORS.distributions(["other_axis", "Other-Core:cone_axis", "nobody"]),
-    "taken": [taken.detector, [list(spot.box_px) for spot in taken.specularities]],
+    "taken": [taken.choices.detector, [list(spot.region.box) for spot in taken]],
     "middle": list(load_detector("other_middle").detect(seen, camera, Priors()).regions[0].box),
 }))
 """

@@ -7,7 +7,7 @@ from simtest import Camera, InputError
 from simtest.calibration.calibration import brightest_channel, mean_channel
 from simtest.detection.view import _row_ends
 from simtest.geometry.vectors import basis_across, tangent_basis
-from simtest.reconstruction.picture_values import check_frame
+from simtest.reconstruction.images import check_frame
 
 CAMERA = Camera.from_fov(60.0, 8, 6)
 

@@ -5,7 +5,7 @@ import pytest
 
 from simtest.calibration import Calibration, Frame, NoiseModel, Response
 from simtest.geometry import Camera
-from simtest.reconstruction.choices import complete
+from simtest.reconstruction.options import complete
 from simtest.reconstruction.pipeline import reconstruct
 
 CAMERA = Camera.from_fov(60.0, 160, 120)

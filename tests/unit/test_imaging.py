@@ -16,10 +16,9 @@ import simtest
 from simtest.api import Extras, reconstruct_picture
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.reconstruction.constraints import constraints_arrays
-from simtest.reconstruction.image_io import open_source, read_picture
-from simtest.reconstruction.picture import Options
-from simtest.reconstruction.picture_values import is_coloured
+from simtest.reconstruction.images import is_coloured, open_source, read_picture
+from simtest.reconstruction.options import Options
+from simtest.reconstruction.outputs import constraints_arrays
 from simtest.reconstruction.sequence import reconstruct_sequence
 from simtest.reconstruction.tracking import Tracker
 from simtest.validation.depth_maps import depth_normals, depth_points, depth_problems, depths_at, read_depth
@@ -70,7 +69,7 @@ def quietly(path, out, extras=None, **options):
 
 def test_a_picture_gives_all_files(shot, tmp_path):
     record, files = quietly(shot, tmp_path / "out")
-    assert len(record.specularities) == 2
+    assert len(record) == 2
     assert [file.name for file in files] == [
         "normals.json", "normals.csv", "normals.ply", "overlay.png", "constraints.npz", "index.html",
     ]  # fmt: skip
@@ -121,7 +120,7 @@ def test_grey_pictures_keep_to_peaks(tmp_path, detector):
     values = np.clip(0.05 + 0.9 * lobe(160, 120, 8.0), 0, 1)
     cv2.imwrite(str(tmp_path / "grey.png"), np.rint(65535 * values).astype(np.uint16))
     record, files = quietly(tmp_path / "grey.png", tmp_path / "out", detector=detector)
-    assert len(record.specularities) == 1
+    assert len(record) == 1
     assert json.loads(files[0].read_text())["detector"] == "peaks"
     told(lambda: by_fov(tmp_path / "grey.png", tmp_path / "o", detector="colour"), "the picture is grey")
 
@@ -169,7 +168,7 @@ def test_other_depths_and_channels_are_read(tmp_path):
     assert is_coloured(read_picture(tmp_path / "alpha.png"))
     assert not is_coloured(np.repeat(read_picture(tmp_path / "grey.png")[:, :, None], 3, axis=2))
     for name in ("wide", "alpha"):
-        assert len(quietly(tmp_path / f"{name}.png", tmp_path / name)[0].specularities) == 2
+        assert len(quietly(tmp_path / f"{name}.png", tmp_path / name)[0]) == 2
 
 
 def test_a_camera_of_another_size(shot, tmp_path):

@@ -71,8 +71,8 @@ def test_an_answer_is_judged_against_the_surface_that_it_states(monkeypatch):
         "refuses": Failure(Reason.NO_ESTIMATE, "unlike the network's training: features at 90, limit 80"),
         "sure": an_estimate(0.02, 0.001),
     }
-    found = type("Found", (), {"specularities": [a_specularity(results), a_specularity(results, (2, 10))]})()
-    monkeypatch.setattr(answering, "run_pipeline", lambda *arguments: found)
+    found = [a_specularity(results), a_specularity(results, (2, 10))]
+    monkeypatch.setattr(answering, "reconstruct", lambda *arguments, **options: found)
     made = {each.estimator: each for each in answering.answers(frame, {})}
     assert len(list(answering.answers(frame, {}))) == len(results)  # nothing is known off the surface
     assert made["base"].base_deg == pytest.approx(math.degrees(0.02), abs=1e-6)

@@ -18,31 +18,27 @@ from simtest.calibration.lights.search import find_lights
 from simtest.errors import InputError
 from simtest.geometry import Array
 from simtest.geometry.camera import Camera
-from simtest.reconstruction.image_io import read_picture
-from simtest.reconstruction.light_calibration.ball_highlights import MeasuredHighlight, measure_highlights
-from simtest.reconstruction.light_calibration.observations import (
-    View,
-    Views,
-    balls_of,
-    circles_of,
-    read_balls,
-    with_floor,
-    without_merged,
-)
+from simtest.reconstruction.images import read_picture
+from simtest.reconstruction.light_calibration.highlights import MeasuredHighlight, measure_highlights
 from simtest.reconstruction.light_calibration.outline import (
     BallOutline,
     has_dark_ring,
     outline_through,
     refine_outline,
 )
+from simtest.reconstruction.light_calibration.page import write_calibration
 from simtest.reconstruction.light_calibration.run import (
     Ball,
     Plate,
+    View,
+    Views,
     _variations,
     calibrate_lights,
+    circles_of,
     picture_readers,
+    with_floor,
+    without_merged,
 )
-from simtest.reconstruction.light_calibration.write import write_calibration
 from simtest.spec.calibration_file import load_calibration
 from studies.light_calibration.pictures import Look, picture_of_ball
 
@@ -183,9 +179,8 @@ def test_same_picture_twice_counts_once() -> None:
     values = np.random.default_rng(2).uniform(0, 1, (200, 240)).astype(np.float32)
     circle = {"a.png": (120.0, 100.0, 40.0), "b.png": (120.0, 100.0, 40.0)}
     twice = [(name, lambda: values) for name in ("a.png", "b.png")]
-    assert (
-        read_balls(twice, Calibration(CAMERA), circle).left_out["b.png"] == "the same picture as a.png; it counts once"
-    )
+    seen = Ball(RADIUS, circles=circle).read(twice, Calibration(CAMERA))
+    assert seen.left_out["b.png"] == "the same picture as a.png; it counts once"
 
 
 def test_long_reflection_is_left_out() -> None:
@@ -227,7 +222,7 @@ def test_a_radial_distortion_that_is_not_given_is_in_the_intervals() -> None:
         views.append(View(f"{i}.png", np.zeros((1, 1)), [highlight], outline=outline))
     found_by = Views(views)
     highlights = found_by.highlights()
-    found = find_lights(CAMERA, balls_of(views, CAMERA, RADIUS), highlights, 1)
+    found = find_lights(CAMERA, Ball(RADIUS).mirrors(views, CAMERA), highlights, 1)
     assert found is not None
     gap = found.bundle.lights[0] - light
     assert np.linalg.norm(gap) > 0.5

@@ -16,7 +16,7 @@ from simtest.dataset.manifest import ManifestError, read_manifest
 from simtest.dataset.scoring.record import read_record
 from simtest.errors import InputError, SimtestError
 from simtest.realism.frame_sets import open_generated
-from simtest.reconstruction.image_io import _tiff_size, read_picture
+from simtest.reconstruction.images import _tiff_size, read_picture
 from simtest.runtime.files import DEFAULTS, VARIABLE, check_limit, limit, require_plain
 from simtest.runtime.processes import call_apart, check_workers
 from simtest.spec import load_experiment, load_scene
@@ -287,7 +287,7 @@ def test_what_a_process_of_its_own_makes_of_a_file(tmp_path):
 
 
 def test_the_first_bytes_of_a_film_tell_its_container(tmp_path):
-    from simtest.reconstruction.image_io import open_source
+    from simtest.reconstruction.images import open_source
 
     path = tmp_path / "x.mp4"
     # FFmpeg would read the list, and whatever it names.

@@ -378,7 +378,7 @@ def test_a_full_disk_is_exit_1(tmp_path, run_here, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("simtest.reconstruction.output_files.write_json", full)
+    monkeypatch.setattr("simtest.reconstruction.outputs.write_json", full)
     code, lines = run_here("reconstruct", "a.png", "--fov", "60", "--out", "out")
     assert code == 1
     assert lines[-1] == "simtest: No space left on device"

@@ -15,8 +15,9 @@ import simtest
 from simtest.calibration import Calibration
 from simtest.dataset.index import HighlightRow, SampleRow
 from simtest.geometry import Camera
-from simtest.reconstruction.constraints import constraints_arrays
-from simtest.reconstruction.picture import Options, reconstruct_values
+from simtest.reconstruction.options import Options
+from simtest.reconstruction.outputs import constraints_arrays
+from simtest.reconstruction.pipeline import reconstruct_values
 from simtest.runtime.files import as_json
 from simtest.simulation.frame_files import FILES
 from simtest.validation.columns import COLUMNS
@@ -175,7 +176,7 @@ def spot_picture():
 def test_keys_of_normals_json_are_those_of_the_page():
     camera = Camera.from_fov(70.0, 200, 160)
     record = reconstruct_values("spot.png", spot_picture() / 255, Calibration(camera), Options(fov_deg=70.0))
-    made = json.loads(json.dumps(record, default=as_json))
+    made = json.loads(json.dumps(record.to_json(), default=as_json))
     assert set(made) | {"reference"} == set(tables.NORMALS)
     (spot, *_) = made["specularities"]
     assert set(spot) <= set(tables.SPECULARITY)

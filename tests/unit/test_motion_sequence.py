@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.reconstruction.picture import Options
+from simtest.reconstruction.options import Options
 from simtest.reconstruction.sequence import reconstruct_sequence
 from simtest.rendering import Session
 from simtest.simulation.frame import render_view

@@ -24,9 +24,9 @@ from simtest.estimators.prior_parts import (
     near_miss_variance,
 )
 from simtest.geometry import Camera, Patch, chi_squared, smooth
-from simtest.reconstruction.found import Reconstruction
-from simtest.reconstruction.pipeline import reconstruct, run_picture
-from simtest.reconstruction.ranking import best_of
+from simtest.reconstruction.options import Options
+from simtest.reconstruction.pipeline import reconstruct, run
+from simtest.reconstruction.records import Specularities, best_of
 from simtest.rendering import Session
 from simtest.simulation.frame import render_view
 from simtest.spec import load_scene
@@ -191,7 +191,7 @@ def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monk
 
     def shares():
         scored = [
-            spot for spot in score(session, view, run_picture(picture, view.calibration)[0]) if spot.held is not None
+            spot for spot in score(session, view, run(picture, view.calibration, Options())) if spot.held is not None
         ]
         near = [spot.is_near_miss for spot in scored]
         return len(scored), np.mean(near), np.mean([spot.held for spot in scored])
@@ -201,10 +201,10 @@ def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monk
     assert near > 0.2
     assert held > 0.88
     # Regions of interest of the same boxes are as uncertain, and hold as many.
-    whole = run_picture(picture, view.calibration)[0]
+    whole = run(picture, view.calibration, Options())
     cut, ratios = [], []
-    for spot in whole.specularities[:60]:
-        (alone,) = run_picture(picture, view.calibration, roi=spot.region.box)[0].specularities
+    for spot in whole[:60]:
+        (alone,) = run(picture, view.calibration, Options(roi=spot.region.box))
         pair = [each.estimates[best].deviation_deg for each in (spot, alone) if (best := best_of(each.estimates)[0])]
         if len(pair) == 2:
             ratios.append(pair[1] / pair[0])
@@ -212,7 +212,9 @@ def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monk
     assert len(ratios) >= 20
     assert min(ratios) > 0.8
     boxes = replace(whole.detection, regions=tuple(each.region for each in cut), highlights=())
-    scored = [spot.held for spot in score(session, view, Reconstruction(cut, boxes)) if spot.held is not None]
+    scored = [
+        spot.held for spot in score(session, view, Specularities(cut, boxes, whole.choices)) if spot.held is not None
+    ]
     assert np.mean(scored) > 0.85
     # Negative control: no frame is crowded.
     monkeypatch.setattr("simtest.estimators.prior_parts.CROWD", math.inf)

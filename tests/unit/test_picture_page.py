@@ -9,20 +9,21 @@ import cv2
 import numpy as np
 import pytest
 
-from simtest.calibration import Uniform
+from simtest.calibration import Calibration, Frame, Uniform
 from simtest.cli.pictures import assumed_lines, count_lines, silent_lines
-from simtest.detection.detector import Highlight, Kind, Region
-from simtest.detection.view import View
+from simtest.detection import Detection, Region
+from simtest.detection.detector import Highlight, Kind
 from simtest.errors import Failure, Reason
 from simtest.estimators.budget import PARTS
 from simtest.estimators.cloud_shape import CloudShape, Slope
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Camera
+from simtest.geometry import Camera, Patch
 from simtest.reconstruction import explanations
 from simtest.reconstruction.assumptions import LIGHT_AT_CAMERA, assumptions, calibration_of_view
-from simtest.reconstruction.description import Drawing, PictureRecord, SpecularityRecord, members
+from simtest.reconstruction.options import Choices
 from simtest.reconstruction.overlay import ISOPHOTE, NUMBER, draw_overlay
-from simtest.reconstruction.result_page import write_picture_page
+from simtest.reconstruction.page import write_picture_page
+from simtest.reconstruction.records import Drawing, Specularities, Specularity, cloud_members
 
 WIDTH, HEIGHT = 320, 240
 PACKAGE = Path(explanations.__file__).parents[1]
@@ -37,12 +38,24 @@ def estimate(look, degrees=2.0, **more):
     )
 
 
+def highlight(kind, at, score=0.2):
+    edge = np.array(RING) + at
+    region = Region((at[0] - 5, at[1] - 5, 10, 10), np.array(at), 0.5)
+    return Highlight(region, kind, score, 9, None, None, None, 1.0, 0.0, edge, np.array([at]), 0.0)
+
+
 def spot(i, at, estimates, best, drawings=None):
-    peak = np.array(at, float)
-    return SpecularityRecord(
-        i, (int(at[0]) - 5, int(at[1]) - 5, 10, 10), peak, None, "isolated", 0.5, best, estimates,
-        drawings=drawings or {name: Drawing([], []) for name in estimates}, best_because="smallest expected error",
-    )  # fmt: skip
+    """Return a specularity whose best estimate and drawings are given, not computed."""
+    corner = (int(at[0]) - 5, int(at[1]) - 5)
+    patch = Patch(np.zeros((10, 10)), corner, np.array(at, float), 1.0, (5, 5))
+    region = Region((*corner, 10, 10), (corner[0] + 5, corner[1] + 5), None)
+    made = Specularity(region, patch, estimates, highlight(Kind.ISOLATED, at, 0.5), id=i)
+    return given(made, best, drawings or {name: Drawing([], []) for name in estimates})
+
+
+def given(made, best, drawings):
+    vars(made).update(_judged=(best, "smallest expected error"), drawings=drawings)
+    return made
 
 
 def cloud_spot(i, points, look):
@@ -50,12 +63,15 @@ def cloud_spot(i, points, look):
         np.array(points, float), np.diag([1e-3, 2e-3]), 4.0, 1.0, Uniform(0.0, 1e-3), Slope(0.05, 0.02, 0.08, False)
     )
     made = spot(i, look, {"cloud": estimate(look, target="base", cloud=shape, flags=("cut",))}, "cloud")
-    return replace(made, peak_px=None, kind=None, score=None, drawings={"cloud": Drawing([], [RING])})
+    alone = replace(made, patch=Failure(Reason.NO_PEAK, "a cloud"), highlight=None)
+    return given(alone, "cloud", {"cloud": Drawing([], [RING])})
 
 
-def record_of(spots):
-    camera = Camera.from_fov(60.0, WIDTH, HEIGHT)
-    return PictureRecord("a/frame.png", camera, "srgb", "colour", View(None), ["no calibration"], spots, [])
+def record_of(spots, others=(), assumed=()):
+    calibration = Calibration(Camera.from_fov(60.0, WIDTH, HEIGHT))
+    frame = Frame(np.zeros((HEIGHT, WIDTH), np.float32), calibration, 1.0)
+    choices = Choices(calibration, "colour", 1.0, (), (), assumed)
+    return Specularities(spots, Detection((), frame, others=others), choices, "a/frame.png", ["no calibration"])
 
 
 def page_of(spots, tmp_path):
@@ -114,7 +130,7 @@ def test_numbers_of_the_overlay_stand_on_a_dark_ground():
     white = np.ones((HEIGHT, WIDTH, 3), np.float32)
     made = draw_overlay(white, [spot(0, (150, 100), {"cone_axis": estimate((150, 100))}, "cone_axis")])
     scale = made.shape[1] // WIDTH
-    x, y, w, h = spot(0, (150, 100), {}, None).box_px
+    x, y, w, h = spot(0, (150, 100), {}, None).region.box
     left, low = int((x + 0.75 * w) * scale), int((y + 0.25 * h) * scale)
     ground = made[low - 12 : low + 3, left : left + 9]
     yellow = (ground == NUMBER).all(axis=-1)
@@ -125,7 +141,7 @@ def test_numbers_of_the_overlay_stand_on_a_dark_ground():
 
 def test_glints_belong_to_their_cloud(tmp_path):
     spots = [*many(2), cloud_spot(2, [many(2)[1].peak_px, (100, 100)], (120.0, 110.0))]
-    assert members(spots) == {1: 2}
+    assert cloud_members(spots) == {1: 2}
     text, data = page_of(spots, tmp_path)
     assert [s["cloud"] for s in data["spots"]] == [None, 2, None]
     cloud = data["spots"][2]["rows"][0]["cloud"]
@@ -150,37 +166,31 @@ def test_a_picture_without_highlights_has_a_page(tmp_path):
     assert "No highlight was found" in text
 
 
-def left_out(kind, at):
-    edge = np.array(RING) + at
-    region = Region((at[0] - 5, at[1] - 5, 10, 10), np.array(at), 0.5)
-    return Highlight(region, kind, 0.2, 9, None, None, None, 1.0, 0.0, edge, np.array([at]), 0.0)
-
-
 def test_what_the_calibration_gives_stands_apart_from_what_is_assumed(tmp_path):
     first, *others = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None, "fine")
-    record = replace(record_of(many(1)), assumed=[first, *(replace(each, given=True) for each in others)])
+    record = record_of(many(1), assumed=[first, *(replace(each, given=True) for each in others)])
     write_picture_page(tmp_path / "index.html", record, np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "Given by the calibration, not exactly: distance of the tissue, focal length" in page
     assert "Assumed, because nobody gave it: light</summary>" in page
-    _, *lines = assumed_lines(record.assumed)
+    _, *lines = assumed_lines(record.choices.assumed)
     assert [line.split(": ")[:2] for line in (lines[0], lines[-1])] == [
         ["given", "distance of the tissue"], ["assumed", "light"]
     ]  # fmt: skip
 
 
 def test_counts_and_the_light_are_told_alike_on_page_and_terminal(tmp_path):
-    others = [left_out(Kind.SMALL, (40, 40)), left_out(Kind.BORDER, (80, 40)), left_out(Kind.BORDER, (90, 60))]
+    others = [highlight(Kind.SMALL, (40, 40)), highlight(Kind.BORDER, (80, 40)), highlight(Kind.BORDER, (90, 60))]
     spots = [*many(2), spot(2, (50, 90), {"cone_axis": Failure(Reason.CLUSTER, "two")}, None)]
     assumed = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None, "fine")
-    record = replace(record_of(spots), other_highlights=others, assumed=assumed)
+    record = record_of(spots, others, assumed)
     write_picture_page(tmp_path / "index.html", record, np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "2 of 3 highlights have a normal" in page
     assert "3 more were found and left out" in page
     assert "(2 border, 1 few pixels)" in page
     assert LIGHT_AT_CAMERA in page
-    lines = [*assumed_lines(record.assumed), *count_lines(record, Path("frame.png"))]
+    lines = [*assumed_lines(record.choices.assumed), *count_lines(record, Path("frame.png"))]
     said = "\n".join(lines)
     assert lines[0] == f"note: {LIGHT_AT_CAMERA}"
     assert "3 specularities found in frame.png, 2 with a normal" in lines
@@ -193,7 +203,7 @@ def test_counts_and_the_light_are_told_alike_on_page_and_terminal(tmp_path):
 
 
 def test_a_kind_that_is_named_as_a_flag_has_another_name_for_people(tmp_path):
-    _, data = page_of([replace(each, kind="small") for each in many(1)], tmp_path)
+    _, data = page_of([replace(each, highlight=highlight(Kind.SMALL, (40, 40))) for each in many(1)], tmp_path)
     name = data["spots"][0]["kind"]
     assert name == "few pixels"
     assert data["words"]["kinds"][name] == explanations.KINDS["small"]

@@ -31,7 +31,7 @@ PUBLIC = {
     "RunResults": "simtest.report.run_results",
     "Scene": "simtest.spec.scene",
     "SimtestError": "simtest.errors",
-    "Specularity": "simtest.reconstruction.found",
+    "Specularity": "simtest.reconstruction.records",
     "ViewMask": "simtest.geometry.camera",
     "export": "simtest.api",
     "load_calibration": "simtest.spec.calibration_file",
@@ -124,7 +124,7 @@ def test_a_picture_is_reconstructed_without_slow_packages(known, tmp_path):
 def test_estimators_that_are_registered():
     from simtest.detection.detector import DETECTORS
     from simtest.estimators.names import ESTIMATORS
-    from simtest.reconstruction.pipeline import DEFAULT_ESTIMATORS
+    from simtest.reconstruction.options import DEFAULT_ESTIMATORS
 
     registered = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
     assert {"circle_pose", "brightest_point", "cone_axis"} <= set(registered[ESTIMATORS.group])

@@ -19,7 +19,7 @@ from simtest.realism.distance import distances, mean_distribution
 from simtest.realism.frame_sets import NamedFrame, _Film, open_frames
 from simtest.realism.frame_statistics import COLUMNS
 from simtest.realism.page import write_comparison
-from simtest.reconstruction.image_io import Source, open_source
+from simtest.reconstruction.images import Source, open_source
 
 
 def frame(seed, spots=4, size=(96, 128)):

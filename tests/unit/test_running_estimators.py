@@ -19,8 +19,7 @@ from simtest.estimators.cone_axis import ConeAxis
 from simtest.estimators.dispatch import run, run_each, run_in_frame
 from simtest.estimators.protocol import EstimatedCurvature, check
 from simtest.geometry import Camera, Patch, smooth
-from simtest.reconstruction.description import describe
-from simtest.reconstruction.pipeline import reconstruct, run_pipeline
+from simtest.reconstruction.pipeline import UNRESOLVED, _flagged, reconstruct
 from simtest.validation.matching import match
 
 CAMERA = Camera(400, 100, 406.0, 406.0, 200.0, 50.0)
@@ -324,8 +323,10 @@ def test_without_specularities_a_frame_estimator_is_asked_all_the_same():
         def detect(self, frame, camera, priors):
             return Detection((), frame)
 
-    made = run_pipeline(picture(), CAMERA, Blind(), {"frame": Peaks(((10.0, 90.0),))}, None, SMOOTHING_PX)
-    assert [list(spot.estimates) for spot in made.specularities] == [["frame"]]
+    made = reconstruct(
+        picture(), CAMERA, {"frame": Peaks(((10.0, 90.0),))}, detector=Blind(), smoothing_px=SMOOTHING_PX
+    )
+    assert [list(spot.estimates) for spot in made] == [["frame"]]
 
 
 def test_what_a_frame_estimator_alone_sees_is_described_and_matched_last():
@@ -333,9 +334,11 @@ def test_what_a_frame_estimator_alone_sees_is_described_and_matched_last():
         def detect(self, frame, camera, priors):
             return Detection((Region((0, 0, 100, 100), (50, 49), 1.0),), frame)
 
-    made = run_pipeline(picture(), CAMERA, Blind(), {"frame": Peaks(((50.2, 49.5), (50.4, 49.6)))}, None, SMOOTHING_PX)
-    detected, alone = made.specularities
-    assert len(describe(made, CAMERA)) == 2
+    made = reconstruct(
+        picture(), CAMERA, {"frame": Peaks(((50.2, 49.5), (50.4, 49.6)))}, detector=Blind(), smoothing_px=SMOOTHING_PX
+    )
+    detected, alone = made
+    assert len(made.to_json()["specularities"]) == 2
     # The truth lies at the second estimate's pixel; the detection keeps it all the same.
     true = SimpleNamespace(bp_px=np.array([50.45, 49.6]))
     assert match([alone, detected], [true.bp_px]) == {1: 0}
@@ -360,3 +363,21 @@ def test_the_protocols_tell_the_kinds_apart():
 def test_what_is_no_estimator_is_refused(given, said):
     with pytest.raises(InputError, match=said):
         load_estimators({"given": given})
+
+
+def test_flags_of_the_frame_stand_behind_those_of_the_estimator_in_one_order():
+    y, x = np.mgrid[:40, :40] + 0.5
+    patch = Patch.cut(np.exp(-((x - 20) ** 2 + (y - 18) ** 2) / 50), (5, 5, 30, 30))
+    patch = replace(patch, saturated=np.ones((30, 30), bool))
+    frame = SimpleNamespace(corrected=SimpleNamespace(limited=np.ones((40, 40), bool)))
+    normal = np.array([0.0, 0.0, -1.0])
+    given = Estimate(normal, normal[None], np.array([20.0, 18.0]), flags=("round", "dim"))
+    made = _flagged(given, patch, frame, small=True, dim=True)
+    assert made.flags == ("round", "dim", "saturated", "vignetted", "small")
+    # An unresolved highlight states no shape that smoothing could have changed; nothing is limited where all light is.
+    clear = SimpleNamespace(corrected=SimpleNamespace(limited=None))
+    unresolved = replace(given, flags=(UNRESOLVED,))
+    assert _flagged(unresolved, replace(patch, saturated=None), clear, small=True, dim=True).flags == (
+        UNRESOLVED,
+        "dim",
+    )

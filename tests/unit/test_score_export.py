@@ -15,7 +15,7 @@ from simtest.dataset.export import export_run
 from simtest.dataset.scoring.frames import scored_frames
 from simtest.dataset.scoring.record import image_hash
 from simtest.errors import InputError
-from simtest.reconstruction.image_io import read_picture
+from simtest.reconstruction.images import read_picture
 from simtest.runtime.processes import make_engine
 from simtest.spec import load_experiment
 

@@ -10,7 +10,7 @@ import pytest
 import simtest
 from simtest.dataset.scoring.run import score_table
 from simtest.errors import InputError
-from simtest.reconstruction.image_io import read_picture
+from simtest.reconstruction.images import read_picture
 
 LENS = """
 realisations = 2

@@ -13,7 +13,7 @@ from simtest.calibration import Response
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.errors import Failure, InputError, Reason
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.picture import Options
+from simtest.reconstruction.options import Options
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.simulation.frame import render_picture, render_view
@@ -350,7 +350,7 @@ def test_pictures_read_back_as_the_frame(tmp_path, sensor):
         warnings.simplefilter("error")
         options = Options(tmp_path / "calibration.toml")
         record, _ = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", options)
-    assert len(record.specularities) == 1
+    assert len(record) == 1
     (direct,) = reconstruct(frame.image, described.calibration())
     (read,) = json.loads((tmp_path / "normals" / "normals.json").read_text())["specularities"]
     for name, estimate in direct.estimates.items():
@@ -385,7 +385,7 @@ def test_a_picture_through_a_lens_with_vignetting_reads_back(tmp_path):
         options = Options(tmp_path / "told.toml")
         record, files = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", options)
         document = json.loads(files[0].read_text())
-        assert len(record.specularities) == 1
+        assert len(record) == 1
         assert document["camera"]["view_mask"]["radius"] == 190.0
         made = document["specularities"][0]["estimates"]["cone_axis"]
         assert made["flags"] == []
@@ -476,8 +476,8 @@ def test_render_then_reconstruct_knows_its_light(tmp_path):
     assert stated.priors.distance_mm is not None
     record, _ = reconstruct_picture(tmp_path / "frame.png", tmp_path / "out", Options(tmp_path / "calibration.toml"))
     truths = np.array([h.normal for h in frame.highlights if h.isolated])
-    assert len(record.specularities) == len(truths) == 2
-    for spot in record.specularities:
+    assert len(record) == len(truths) == 2
+    for spot in record:
         near, far = (
             min(angle_deg(spot.normals[name].normal, truth) for truth in truths) for name in ("bisector", "cone_axis")
         )

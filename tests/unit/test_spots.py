@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simtest.calibration import Calibration, srgb_encode
+from simtest.calibration import srgb_encode
 from simtest.detection.classify import border_of
 from simtest.detection.detector import Kind
 from simtest.detection.spots import find_basins
 from simtest.detection.view import find_foreign, find_view
 from simtest.errors import Failure, Reason
 from simtest.geometry import Camera
-from simtest.reconstruction import detect_in_picture, reconstruct_colour
+from simtest.reconstruction import detect_in_picture, reconstruct
 from simtest.simulation.highlights import find_spots as visible_spots
 
 WIDTH, HEIGHT = 240, 180
@@ -116,13 +116,13 @@ def test_paler_tissue_that_is_no_brighter_is_no_highlight():
 
 def test_touching_highlights_are_one_cluster_that_no_estimator_answers_for():
     specular = sum(lobe(x, 90, 3.0, 0.5) for x in (108, 118, 128)) + lobe(40, 40, 4.0, 0.5)
-    made = reconstruct_colour(picture(specular), Calibration(Camera.from_fov(60.0, WIDTH, HEIGHT)))
+    made = reconstruct(picture(specular), Camera.from_fov(60.0, WIDTH, HEIGHT), detector="colour", encoding="srgb")
     kinds = {highlight.kind: highlight for highlight in made.detection.highlights}
     assert set(kinds) == {Kind.ISOLATED, Kind.CLUSTER}
     cluster = kinds[Kind.CLUSTER]
     assert sorted(x for x, _ in cluster.peaks) == pytest.approx([107.5, 117.5, 127.5], abs=1.5)
     assert cv2.pointPolygonTest(cluster.outline.astype(np.float32), (113.0, 90.0), False) > 0
-    (spot,) = [each for each in made.specularities if isinstance(each.patch, Failure)]
+    (spot,) = [each for each in made if isinstance(each.patch, Failure)]
     for estimate in spot.estimates.values():
         assert isinstance(estimate, Failure)
         assert estimate.reason is Reason.CLUSTER

@@ -11,13 +11,12 @@ import numpy as np
 import platformdirs
 import pytest
 
-from simtest.calibration import Calibration
 from simtest.cli.common import named_path
 from simtest.cli.main import _mend_terminal
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.reconstruction import reconstruct_colour
-from simtest.reconstruction.picture_values import is_coloured
+from simtest.reconstruction import reconstruct
+from simtest.reconstruction.images import is_coloured
 from simtest.rendering import bitmap
 from simtest.runtime.arrays import cache_folder
 from simtest.runtime.files import user_cache
@@ -80,10 +79,13 @@ def test_coded_grey_is_grey():
 
 def test_grey_by_colour_warns_of_nothing():
     # Warnings are errors here.
-    made = reconstruct_colour(
-        np.repeat(grey_sphere()[..., :1], 3, axis=2), Calibration(Camera.from_fov(60.0, 160, 120))
+    made = reconstruct(
+        np.repeat(grey_sphere()[..., :1], 3, axis=2),
+        Camera.from_fov(60.0, 160, 120),
+        detector="colour",
+        encoding="srgb",
     )
-    assert made.specularities == []
+    assert made == []
 
 
 def test_a_mark_of_the_encoding_is_read_over(tmp_path):

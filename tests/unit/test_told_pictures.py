@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from simtest.reconstruction.image_io import open_source, read_picture
+from simtest.reconstruction.images import open_source, read_picture
 from tests.refusals import refused
 
 

@@ -27,8 +27,8 @@ from simtest.estimators import Estimate
 from simtest.geometry import Camera
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.picture import Options
-from simtest.reconstruction.pipeline import run_picture
+from simtest.reconstruction.options import Options
+from simtest.reconstruction.pipeline import run
 from simtest.runtime.arrays import kept
 from simtest.spec import load_scene
 from simtest.spec.camera import SceneCamera
@@ -389,7 +389,7 @@ def test_refusals_are_one_line(tmp_path, monkeypatch, name, said):
 
 def test_features_are_those_of_the_picture(framed):
     picture = cv2.imread(str(framed))[..., ::-1].astype(np.float32) / 255
-    made, _ = run_picture(np.ascontiguousarray(picture), Calibration(CAMERA))
+    made = run(np.ascontiguousarray(picture), Calibration(CAMERA), Options())
     spots = usable_spots(made)
     assert len(spots) == 3
     for each in spots:
@@ -406,13 +406,13 @@ def test_features_are_those_of_the_picture(framed):
 def test_the_files_hold_what_was_measured(tmp_path, framed):
     """The bank is made up, so that nothing is rendered."""
     picture = np.ascontiguousarray(cv2.imread(str(framed))[..., ::-1].astype(np.float32) / 255)
-    made, choices = run_picture(picture, Calibration(CAMERA))
+    made = run(picture, Calibration(CAMERA), Options())
     spots = usable_spots(made)
     twins = made_bank(200, frames=2)
     found = match_spots(spots, twins, "frame.png", 2)
     frames = [BankFrame(np.asarray(255 * picture, np.uint8), [s for f, s in twins if f == i]) for i in range(2)]
     result = TwinResult("frame.png", picture, found, frames, all_spots(frames), Look("tissue_colon", 0.4),
-                        list(choices.assumed), [], 1.0)  # fmt: skip
+                        list(made.choices.assumed), [], 1.0)  # fmt: skip
     files = write_twins(result, tmp_path / "out", "simtest twin frame.png")
     told = json.loads(files[0].read_text())
     rows = list(csv.DictReader(files[1].read_text().splitlines()))

@@ -14,7 +14,8 @@ from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate, load_estimators
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import angle_deg, tangent_basis
-from simtest.reconstruction.pipeline import Specularity, reconstruct, run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
+from simtest.reconstruction.records import Specularity
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, from_integer, generator, integer, key, sequence
 from simtest.simulation.frame import render_view
@@ -476,9 +477,9 @@ def test_highlights_of_a_frame_that_the_detector_refuses_are_missed(monkeypatch)
             return Detection((), frame, refusal=Failure(Reason.NO_ESTIMATE, "unlike the training"))
 
     def refused(frame, calibration, estimators, isolated, detector):
-        made = run_pipeline(frame, calibration, Refusing(), estimators, None, 2.0)
+        made = reconstruct(frame, calibration, estimators, smoothing_px=2.0, detector=Refusing())
         assert made.detection.refusal is not None
-        return made.specularities
+        return made
 
     monkeypatch.setattr("simtest.validation.realisation.reconstruct", refused)
     described = experiment(FIXED, realisations=1)

@@ -11,7 +11,7 @@ from simtest.advice.twin.scenes import SceneDraws
 from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.dataset.maker import colour_variant
 from simtest.errors import SimtestError
-from simtest.reconstruction.found import Reconstruction
+from simtest.reconstruction.records import Specularities
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image, Mask, Picture, only_reading
 from simtest.runtime.seeds import from_integer
@@ -25,7 +25,7 @@ FRAMES, FEWEST_FRAMES = 48, 12
 FRAMES_PER_PATCH = 2
 """Views of a patch, at least: another patch is another mesh."""
 
-Reconstructs = Callable[[Image], Reconstruction]
+Reconstructs = Callable[[Image], Specularities]
 """The reconstruction of a picture, as encoded, with what the user told."""
 
 Progress = Callable[[int, int, str], None]

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,9 @@ from simtest.advice.twin.tissue import Tissue, tissue_of
 from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.reconstruction.assumptions import NEAR_MISSES, Assumption
-from simtest.reconstruction.choices import complete
-from simtest.reconstruction.found import Reconstruction
-from simtest.reconstruction.image_io import is_sequence, read_picture
-from simtest.reconstruction.picture import Options, read_calibration
-from simtest.reconstruction.pipeline import run_picture
+from simtest.reconstruction.images import is_sequence, read_picture
+from simtest.reconstruction.options import Options, calibration_for
+from simtest.reconstruction.pipeline import run
 from simtest.runtime.arrays import Array, Image
 
 LEAST_TWINS = 20
@@ -150,7 +148,7 @@ def twin_picture(
     # A wrong name is told before minutes of rendering.
     tissue_of(organ)
     picture = read_picture(image)
-    calibration, warnings = read_calibration(options, picture)
+    calibration, warnings = calibration_for(options, picture)
     found, bank, look, assumed = twins_of(picture, calibration, options, str(image), frames, seed, progress, organ)
     spots = all_spots(bank)
     return TwinResult(
@@ -169,31 +167,21 @@ def twins_of(
     organ: str | None = None,
 ) -> tuple[list[SpotTwins], list[BankFrame], Look, list[Assumption]]:
     """Measure twins of a picture's usable highlights (see `twin_picture`); return them, the bank, look and priors."""
-
-    def reconstructs(values: Image) -> Reconstruction:
-        return run_picture(
-            values, calibration, options.encoding, options.detector, options.estimators, None, options.smoothing_px,
-            not options.every, options.target,
-        )[0]  # fmt: skip
-
-    made, choices = run_picture(
-        picture, calibration, options.encoding, options.detector, options.estimators, None, options.smoothing_px,
-        not options.every, options.target,
-    )  # fmt: skip
+    whole = replace(options, roi=None)
+    made = run(picture, calibration, whole)
     spots = usable_spots(made)
     if not spots:
         raise InputError(f"{name}: no usable highlight: none was found that has a normal of its own; try --all")
     view = made.detection.view
-    known = complete(calibration, options.encoding)
     peaks: Array = np.array([spot.peak_px for spot in spots])
     count = frames_for(picture.shape[0] * picture.shape[1]) if frames is None else frames
     tissue = tissue_of(organ)
     look = look_of(picture, view.seen, tissue)
-    subject = Subject(SceneDraws(known, look, tissue), peaks, view.seen, picture.ndim == 2)
-    bank = make_bank([subject], reconstructs, count, seed, progress)
+    subject = Subject(SceneDraws(made.choices.calibration, look, tissue), peaks, view.seen, picture.ndim == 2)
+    bank = make_bank([subject], lambda values: run(values, calibration, whole), count, seed, progress)
     matched = match_spots(spots, all_spots(bank), name, count)
     # Twins have near misses, so nothing is assumed of them.
-    assumed = [each for each in choices.assumed if each is not NEAR_MISSES]
+    assumed = [each for each in made.choices.assumed if each is not NEAR_MISSES]
     return matched, bank, look, [*assumed, *_drawn(organ, tissue)]
 
 

@@ -8,13 +8,11 @@ from typing import Literal
 import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
-from simtest.detection.detector import Highlight
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.found import Reconstruction, Specularity
-from simtest.reconstruction.ranking import best_of
+from simtest.reconstruction.records import Specularities, Specularity
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.simulation.frame import RenderedView
@@ -114,36 +112,33 @@ of the distance to the third neighbour, px. off_axis is the sightline's angle fr
 are the frame's medians of radius and crowding: together its highlights tell more of the distance than one does."""
 
 
-def usable_spots(made: Reconstruction) -> list[Spot]:
+def usable_spots(made: Specularities) -> list[Spot]:
     """Return the highlights of a reconstruction that have a normal of their own, with their features."""
-    judged: list[Highlight | None] = [*made.detection.highlights]
-    judged += [None] * (len(made.specularities) - len(judged))
     chosen = []
-    for index, (specularity, highlight) in enumerate(zip(made.specularities, judged, strict=True)):
-        best, _ = best_of(specularity.estimates)
-        estimate = None if best is None else specularity.estimates[best]
-        if best is not None and isinstance(estimate, Estimate) and estimate.cloud is None:
-            chosen.append((index, specularity, highlight, best, estimate))
-    peaks = np.array([peak_px(each[1]) for each in chosen]).reshape(-1, 2)
-    radii = [_radius_px(specularity, highlight) for _, specularity, highlight, *_ in chosen]
+    for index, specularity in enumerate(made):
+        estimate, best = specularity.best_estimate, specularity.best
+        if best is not None and estimate is not None and estimate.cloud is None:
+            chosen.append((index, specularity, best, estimate))
+    peaks = np.array([peak_px(specularity) for _, specularity, *_ in chosen]).reshape(-1, 2)
+    radii = [_radius_px(specularity) for _, specularity, *_ in chosen]
     crowding = [_crowding_px(peaks, number) for number in range(len(chosen))]
     of_frame = np.median(np.log(np.maximum([radii, crowding], LEAST_RADIUS_PX)), axis=1) if chosen else np.empty(2)
     spots = []
-    for number, (index, specularity, highlight, best, estimate) in enumerate(chosen):
-        own = _features(radii[number], crowding[number], specularity, highlight, estimate)
+    for number, (index, specularity, best, estimate) in enumerate(chosen):
+        own = _features(radii[number], crowding[number], specularity, estimate)
         features = np.concatenate([own, of_frame])
         spots.append(Spot(index, peaks[number], radii[number], best, estimate, features))
     return spots
 
 
-def score(session: Session, view: RenderedView, made: Reconstruction) -> list[ScoredSpot]:
+def score(session: Session, view: RenderedView, made: Specularities) -> list[ScoredSpot]:
     """Score the usable highlights of a rendered frame; the session stands at its scene.
 
     Detections are matched to lit highlight points, of the fine surface, by the harness's own rule. Those on an
     instrument, and those whose sightline meets no surface, are left out.
     """
     spots = usable_spots(made)
-    found = [made.specularities[spot.index] for spot in spots]
+    found = [made[spot.index] for spot in spots]
     lit = [point for point in view.highlights if point.lit]
     matched = match(found, [point.bp_px for point in lit])
     metal = on_instruments(found, matched, view)
@@ -182,10 +177,10 @@ def _scored(spot: Spot, kind: SpotKind, fine: Array, base: Array, distance_mm: f
     return ScoredSpot(spot, kind, to_fine, to_base, held, distance_mm)
 
 
-def _radius_px(specularity: Specularity, highlight: Highlight | None) -> float:
+def _radius_px(specularity: Specularity) -> float:
     """Return the radius of the circle that has the area above half height, px."""
-    if highlight is not None:
-        return math.sqrt(highlight.area_px / math.pi)
+    if specularity.highlight is not None:
+        return math.sqrt(specularity.highlight.area_px / math.pi)
     contour = None if isinstance(specularity.patch, Failure) else specularity.patch.isophote(HIGHLIGHT_ISOVALUE)
     if contour is None or isinstance(contour, Failure):
         return math.sqrt(specularity.region.box[2] * specularity.region.box[3] / math.pi) / 2
@@ -193,10 +188,9 @@ def _radius_px(specularity: Specularity, highlight: Highlight | None) -> float:
     return math.sqrt(abs(float(x @ np.roll(y, 1) - y @ np.roll(x, 1))) / 2 / math.pi)
 
 
-def _features(
-    radius: float, crowding: float, specularity: Specularity, highlight: Highlight | None, estimate: Estimate
-) -> Array:
+def _features(radius: float, crowding: float, specularity: Specularity, estimate: Estimate) -> Array:
     """Return the features of a spot but for those of its frame; NaN where it does not show one."""
+    highlight = specularity.highlight
     ratio = estimate.axis_ratio if highlight is None else highlight.axis_ratio
     peak = specularity.region.contrast
     residual = None if highlight is None else highlight.residual

@@ -5,7 +5,7 @@ from pathlib import Path
 from simtest.advice.twin.matching import Twins
 from simtest.advice.twin.page import render_page
 from simtest.advice.twin.run import SpotTwins, TwinResult
-from simtest.reconstruction.output_files import write_csv
+from simtest.reconstruction.outputs import write_csv
 from simtest.runtime import provenance
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 

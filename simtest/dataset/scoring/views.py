@@ -10,7 +10,7 @@ import numpy as np
 from simtest.dataset.sample_calibration import picture_sensor, stored_picture
 from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
-from simtest.reconstruction.pipeline import Specularity
+from simtest.reconstruction.records import Specularity
 from simtest.rendering import Session
 from simtest.runtime.arrays import Image
 from simtest.simulation.frame import RenderedView

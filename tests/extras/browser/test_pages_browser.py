@@ -20,7 +20,7 @@ from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
 from simtest.realism.comparison import compare
 from simtest.realism.page import write_comparison
-from simtest.reconstruction.picture import Options
+from simtest.reconstruction.options import Options
 from simtest.report import write_report
 from simtest.report.scene3d import grid_triangles
 from simtest.report.viewer import Content, write_scene_page

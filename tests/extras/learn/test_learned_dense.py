@@ -28,7 +28,7 @@ from simtest.estimators.learned_dense import (
 from simtest.geometry import BrownConrady, Camera
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.learned_maps import learned_maps
-from simtest.reconstruction.pipeline import run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
 from studies.networks import onnx_file
 from studies.networks.dense import (
     DenseNetwork,
@@ -182,8 +182,8 @@ def test_maps_are_those_of_the_network(made):
 def test_the_pipeline_runs_it_beside_the_others(made):
     picture, _, _ = plane(300)
     learned = LearnedDense(made[3])
-    found = run_pipeline(picture, calibration(), "peaks", {"one": learned}, None, 1.0)
-    results = [each.estimates["one"] for each in found.specularities]
+    found = reconstruct(picture, calibration(), {"one": learned}, smoothing_px=1.0, detector="peaks")
+    results = [each.estimates["one"] for each in found]
     assert results
     maps = learned.maps(picture, calibration())
     for result in results:
@@ -316,8 +316,10 @@ def test_it_refuses_what_it_was_not_taught(made, changes, size, said):
 def test_it_refuses_frames_unlike_those_of_its_training(made):
     blocks = np.random.default_rng(0).integers(0, 2, (HEIGHT // 12, WIDTH // 12, 3)).astype(np.float32)
     assert "unlike the network's training" in refusal(made[3], blocks.repeat(12, axis=0).repeat(12, axis=1))
-    found = run_pipeline(plane(1)[0], calibration(lights=()), "peaks", {"one": LearnedDense(made[3])}, None, 1.0)
-    assert all("needs the lights" in each.estimates["one"].detail for each in found.specularities)
+    found = reconstruct(
+        plane(1)[0], calibration(lights=()), {"one": LearnedDense(made[3])}, smoothing_px=1.0, detector="peaks"
+    )
+    assert all("needs the lights" in each.estimates["one"].detail for each in found)
 
 
 def changed(**values):

@@ -17,7 +17,7 @@ from simtest.estimators.learned import METADATA, CovarianceScale, TrainingRange,
 from simtest.estimators.learned_spot import EXTRAS, LearnedSpot, log_deviation, rays_of, spot_inputs
 from simtest.geometry import BrownConrady, Camera
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.pipeline import run_pipeline
+from simtest.reconstruction.pipeline import reconstruct
 from studies.networks.fitted import fitted_scale
 from studies.networks.spots import SpotNormals, squared_distance
 
@@ -117,12 +117,12 @@ def test_what_is_stated_too_surely_gets_a_larger_factor():
 
 def test_the_shipped_network_runs_by_its_name():
     from simtest.estimators import load_estimators
-    from simtest.reconstruction.pipeline import default_estimators
+    from simtest.reconstruction.options import default_estimators
 
     assert "learned_spot" not in default_estimators(calibration())
     made = load_estimators(["learned_spot"])["learned_spot"]
     # Its frames have 480 px; the features of a smaller one's highlights are another matter.
-    results = run_pipeline(picture(7), calibration(), "peaks", {"one": made}, None, 2.0).specularities
+    results = reconstruct(picture(7), calibration(), {"one": made}, smoothing_px=2.0)
     assert results
     assert all("outside the network's training: log of the focal length" in r.estimates["one"].detail for r in results)
 
@@ -144,8 +144,8 @@ def test_the_pipeline_runs_it_beside_the_others(made):
     network, path = made[0], made[3]
     frame = picture(7)
     learned = LearnedSpot(path)
-    found = run_pipeline(frame, calibration(), "peaks", {"learned_spot": learned}, None, 2.0)
-    results = [each.estimates["learned_spot"] for each in found.specularities]
+    found = reconstruct(frame, calibration(), {"learned_spot": learned}, smoothing_px=2.0)
+    results = [each.estimates["learned_spot"] for each in found]
     assert results
     assert isinstance(learned.estimate_frame(found.detection.frame, calibration().camera, Priors()), Failure)
     assert all(isinstance(result, Estimate) for result in results), results
@@ -170,8 +170,8 @@ def test_the_pipeline_runs_it_beside_the_others(made):
 
 
 def told(path, calibrated, seed=7):
-    found = run_pipeline(picture(seed), calibrated, "peaks", {"learned_spot": LearnedSpot(path)}, None, 2.0)
-    return [each.estimates["learned_spot"] for each in found.specularities]
+    found = reconstruct(picture(seed), calibrated, {"learned_spot": LearnedSpot(path)}, smoothing_px=2.0)
+    return [each.estimates["learned_spot"] for each in found]
 
 
 def test_it_refuses_what_it_was_not_taught(made):
@@ -194,8 +194,8 @@ def test_it_refuses_highlights_unlike_those_of_its_training(made):
     # Spots of another form: wide stripes, whose crops no frame of the train split holds.
     y, x = np.mgrid[:SIZE, :SIZE] + 0.5
     stripes = (0.02 + 0.9 * np.exp(-((x - 48) ** 2) / 8 - ((y - 48) ** 2) / 900)).astype(np.float32) ** 2
-    found = run_pipeline(stripes, calibration(), "peaks", {"one": LearnedSpot(made[3])}, (20, 20, 56, 56), 2.0)
-    (result,) = [each.estimates["one"] for each in found.specularities]
+    found = reconstruct(stripes, calibration(), {"one": LearnedSpot(made[3])}, (20, 20, 56, 56), smoothing_px=2.0)
+    (result,) = [each.estimates["one"] for each in found]
     assert isinstance(result, Failure)
     assert "unlike the network's training" in result.detail
 

@@ -1,10 +1,14 @@
-"""The pages of a picture and of a sequence: one file each that needs nothing else, but for a sequence's pictures."""
+"""What is shown of a reconstruction: the page of a picture, that of a sequence, and what a notebook displays.
+
+A page is one file that needs nothing else, but for a sequence's pictures.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -14,12 +18,15 @@ from simtest.estimators.budget import deviations
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import covariance_across, tilt_deg
 from simtest.pages.html import write_page
-from simtest.pages.pixels import jpeg_address
+from simtest.pages.notebook import note_html, picture_html, table_html
+from simtest.pages.pixels import displayed, jpeg_address
 from simtest.pages.style import colours
 from simtest.reconstruction import explanations
 from simtest.reconstruction.assumptions import light_note
-from simtest.reconstruction.description import PictureRecord, Points, SpecularityRecord, members
-from simtest.reconstruction.tracking import Track, TrackedFrame
+from simtest.reconstruction.explanations import kind_name
+from simtest.reconstruction.overlay import draw_overlay
+from simtest.reconstruction.records import Points, Specularities, Specularity, cloud_members
+from simtest.reconstruction.tracking import DoneFrame, Track
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import JsonObject
 
@@ -36,18 +43,17 @@ HALF = 0.5
 """Isovalue of the isophote that is drawn of every highlight."""
 
 
-def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> None:
+def write_picture_page(path: Path, spots: Specularities, picture: Image) -> None:
     """Write the page of a picture in [0, 1], RGB as encoded: its highlights one by one, to zoom and click."""
-    spots = record.specularities
     palette = colours(name for spot in spots for name in spot.estimates)
-    belongs = members(spots)
+    belongs = cloud_members(spots)
     data = {
         "spots": [_spot(spot, belongs.get(spot.id)) for spot in spots],
         "others": [
             {"kind": explanations.kind_name(h.kind), "outline": _rounded(h.outline, 1),
              "peak": np.add(h.region.peak, 0.5).tolist(), "score": h.score, "id": number}
             for number, h in [
-                *((None, h) for h in record.other_highlights),
+                *((None, h) for h in spots.detection.others),
                 *((s.id, s.highlight) for s in spots if s.highlight and s.peak_px is None),
             ]
         ],
@@ -56,26 +62,25 @@ def write_picture_page(path: Path, record: PictureRecord, picture: Image) -> Non
         | {"kinds": {explanations.kind_name(kind): text for kind, text in explanations.KINDS.items()}},
     }  # fmt: skip
     height, width = picture.shape[:2]
-    best, stated = Counter(spot.best for spot in spots if spot.best), record.stated
-    # Parts below a hundredth of the whole change nothing that is shown.
-    told = [] if stated is None else [p for p in stated.parts_deg.items() if p[1] >= 0.01 * stated.median_deg]
+    best, stated = Counter(spot.best for spot in spots if spot.best), spots.stated
+    parts = {} if stated is None else stated.shown_parts_deg
     write_page(
-        path, "picture.html.j2", data, record=record, stated=stated, told=told, picture=_address(picture),
-        title=Path(record.image).name, width=width, height=height, palette=palette, best=best,
+        path, "picture.html.j2", data, record=spots, stated=stated, told=list(parts.items()), picture=_address(picture),
+        title=Path(spots.image).name, width=width, height=height, palette=palette, best=best,
         answered=sum(best.values()), clouds=any(_clouds(spot) for spot in spots), terms=explanations.TERMS,
-        others=len(data["others"]), left_out=len(record.other_highlights),
-        left_out_kinds=explanations.kinds_counted(h.kind for h in record.other_highlights),
-        light_note=light_note(record.assumed), parts=explanations.PARTS, outline=OUTLINE,
+        others=len(data["others"]), left_out=len(spots.detection.others),
+        left_out_kinds=explanations.kinds_counted(h.kind for h in spots.detection.others),
+        light_note=light_note(spots.choices.assumed), parts=explanations.PARTS, outline=OUTLINE,
         chi95=chi_squared.quantile(0.95, 2),
     )  # fmt: skip
 
 
-def write_sequence_page(path: Path, frames: Sequence[TrackedFrame], tracks: Sequence[Track]) -> None:
+def write_sequence_page(path: Path, frames: Sequence[DoneFrame], tracks: Sequence[Track]) -> None:
     """Write the page of a sequence: its frames, whose pictures lie beside it in frames/, and its tracks."""
     data = {
         "frames": [
             {"file": f"frames/{frame.index:06d}.jpg", "name": frame.name, "time": frame.time_s,
-             "count": len(frame.specularities)}
+             "count": frame.count}
             for frame in frames
         ],
         "position": {frame.index: i for i, frame in enumerate(frames)},
@@ -116,13 +121,13 @@ class _Lines:
         return self.kept.index(rounded)
 
 
-def _spot(spot: SpecularityRecord, cloud_id: int | None) -> JsonObject:
+def _spot(spot: Specularity, cloud_id: int | None) -> JsonObject:
     lines = _Lines()
     rows = [{"name": name, **_row(name, result, spot, lines)} for name, result in spot.estimates.items()]
     return {
         "id": spot.id,
         "peak": _rounded(spot.position_px, 2),
-        "size": max(spot.box_px[2:]),
+        "size": max(spot.region.box[2:]),
         "kind": explanations.kind_name(spot.kind),
         "score": spot.score,
         "best": spot.best,
@@ -133,7 +138,7 @@ def _spot(spot: SpecularityRecord, cloud_id: int | None) -> JsonObject:
     }
 
 
-def _row(name: str, result: Estimate | Failure, spot: SpecularityRecord, lines: _Lines) -> JsonObject:
+def _row(name: str, result: Estimate | Failure, spot: Specularity, lines: _Lines) -> JsonObject:
     if isinstance(result, Failure):
         return {"status": str(result.reason), "detail": result.detail}
     error = spot.reference.errors.get(name) if spot.reference else None
@@ -176,10 +181,67 @@ def _cloud(result: Estimate) -> JsonObject | None:
     return {"points": points, "seen": cloud.seen, "ratio": round(cloud.axis_ratio, 3), "slope": slope}
 
 
-def _clouds(spot: SpecularityRecord) -> list[str]:
+def _clouds(spot: Specularity) -> list[str]:
     """Return the names of the estimates of a specularity that stand on a cloud."""
     return [name for name, result in spot.normals.items() if result.cloud is not None]
 
 
 def _rounded(points: npt.ArrayLike, digits: int) -> Points:
     return np.round(np.asarray(points, dtype=float), digits).tolist()
+
+
+# What a notebook shows -----------------------------------------------------------------------------------------------
+
+MOST_ROWS = 10
+PATCH_PX = 300
+
+HEADS = ("normal (x, y, z)", "tilt (deg)", "± (deg)", "flags")
+
+
+def specularities_html(spots: Specularities) -> str:
+    """Return the frame with its best normals, and the rows of the brightest specularities."""
+    picture = _picture(spots.detection.frame.encoded, spots.choices.encoding)
+    drawn = cv2.cvtColor(draw_overlay(picture, spots), cv2.COLOR_BGR2RGB)
+    what = "specularity" if len(spots) == 1 else "specularities"
+    more = f"{len(spots)} {what}; the best normal of each is drawn"
+    more += f", the brightest {MOST_ROWS} are listed." if len(spots) > MOST_ROWS else "."
+    rows = [_best_cells(spot) for spot in spots[:MOST_ROWS]]
+    return picture_html(drawn, more) + note_html(more) + table_html(("No.", "kind", "best estimator", *HEADS), rows)
+
+
+def specularity_html(spot: Specularity) -> str:
+    """Return the patch of a specularity, with the isophotes of its best estimate, and a row for each estimator."""
+    rows = [_cells(name + " *" * (name == spot.best), each) for name, each in spot.estimates.items()]
+    because = f"* best: {spot.best_because}" if spot.best else spot.best_because
+    table = table_html(("estimator", *HEADS), rows) + note_html(because)
+    if isinstance(spot.patch, Failure):
+        return spot.patch._repr_html_() + table
+    picture = _picture(np.asarray(spot.patch.values, dtype=np.float32), "linear")
+    # Without the camera the isophote is drawn alone, without its ellipse.
+    drawn = cv2.cvtColor(draw_overlay(picture, [replace(spot, camera=None)], spot.patch.origin_px), cv2.COLOR_BGR2RGB)
+    return picture_html(drawn, "the highlight with its best normal", PATCH_PX) + table
+
+
+def _picture(values: Image, encoding: str) -> Image:
+    """Return values in [0, 1] for the eye: linear light gets the display's gamma."""
+    scaled = np.asarray(values, dtype=np.float32)
+    if encoding != "linear":
+        return np.clip(scaled, 0, 1)
+    return displayed(scaled / max(float(scaled.max()), 1e-12))
+
+
+def _best_cells(spot: Specularity) -> tuple[object, ...]:
+    best = spot.best_estimate
+    kind = kind_name(spot.kind) or ("cloud" if best is not None and best.cloud is not None else "")
+    if best is None:
+        return (spot.id, kind, "no normal", "", "", "", spot.best_because)
+    return (spot.id, kind, spot.best, *_cells("", best)[1:])
+
+
+def _cells(name: str, result: Estimate | Failure) -> tuple[object, ...]:
+    """Return the cells under an estimator's name and `HEADS`."""
+    if isinstance(result, Failure):
+        return (name, "no normal", "", "", str(result.reason))
+    x, y, z = result.normal
+    deviation = "–" if result.deviation_deg is None else f"{result.deviation_deg:.3g}"
+    return (name, f"{x:.3f}, {y:.3f}, {z:.3f}", f"{tilt_deg(result.normal):.1f}", deviation, ", ".join(result.flags))

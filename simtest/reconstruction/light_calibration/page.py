@@ -9,8 +9,7 @@ import numpy as np
 from simtest.calibration.lights.result import LightCalibration, MeasuredLight
 from simtest.pages import palette, pixels
 from simtest.pages.html import environment
-from simtest.reconstruction.light_calibration.observations import View
-from simtest.reconstruction.light_calibration.run import Ball, Calibrated
+from simtest.reconstruction.light_calibration.run import Calibrated, View
 from simtest.runtime import provenance
 from simtest.runtime.files import make_folder, write_atomically, write_json
 
@@ -51,12 +50,6 @@ def write_calibration(made: Calibrated, out: Path, command: str = "") -> list[Pa
 def result_json(made: Calibrated) -> dict[str, Any]:
     """Return a result as JSON: lengths in mm, camera frame; pixels with centres at integer + 0.5."""
     result, views = made.result, made.views
-    mirror = made.mirror
-    about: dict[str, Any] = (
-        {"ball_radius_mm": mirror.radius_mm, "ball_radius_sd_mm": mirror.radius_sd_mm}
-        if isinstance(mirror, Ball)
-        else {"poses": str(mirror.poses), "plate_sd_mm": mirror.sd_mm, "plate_tilt_sd_deg": mirror.sd_deg}
-    )
     pictures, row = [], 0
     for number, view in enumerate(views.views):
         shown = []
@@ -69,9 +62,9 @@ def result_json(made: Calibrated) -> dict[str, Any]:
                 told |= _explained(result, number, source, row)
                 row += 1
             shown.append(told)
-        pictures.append({"picture": view.name, **_mirror_json(view, mirror), "highlights": shown})
+        pictures.append({"picture": view.name, **made.mirror.view_json(view), "highlights": shown})
     return {
-        **about,
+        **made.mirror.to_json(),
         "lights": [_light_json(light) for light in result.lights],
         "residual_rms_px": result.rms_px, "chi2": result.chi2, "degrees_of_freedom": result.freedom,
         "inflation": result.inflation, "notes": list(result.notes), "problems": list(result.problems),
@@ -99,14 +92,6 @@ def _light_json(light: MeasuredLight) -> dict[str, Any]:
         "pictures": light.pictures,
         "on_the_tip": not light.is_foreign,
     }
-
-
-def _mirror_json(view: View, mirror: object) -> dict[str, Any]:
-    if view.outline is not None and isinstance(mirror, Ball):
-        centre, covariance = view.outline.centre_mm(mirror.radius_mm)
-        return {"ball_centre_mm": centre.round(4).tolist(), "ball_centre_sd_mm": np.sqrt(np.diag(covariance)).tolist()}
-    assert view.plane is not None
-    return {"plate_normal": view.plane[0].tolist(), "plate_distance_mm": -view.plane[1]}
 
 
 def _page(made: Calibrated, command: str) -> str:
@@ -154,8 +139,7 @@ def _drawn(made: Calibrated, view: View, number: int, rows: range) -> str:
             canvas.ring(point, PREDICTED, 10)
             at = ((point - canvas.corner) * canvas.scale).round().astype(int)
             place = (int(at[0]) + 12, int(at[1]) - 8)
-            cv2.putText(canvas.pixels, str(source + 1), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 3, cv2.LINE_AA)
-            cv2.putText(
-                canvas.pixels, str(source + 1), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA
-            )
+            for shade, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+                font = (cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, width, cv2.LINE_AA)
+                cv2.putText(canvas.pixels, str(source + 1), place, *font)
     return pixels.data_address(canvas.pixels)

@@ -1,0 +1,170 @@
+"""What is written of a picture: normals.json, a table, oriented points, overlay, constraints and the page."""
+
+import csv
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from simtest.estimators import Estimate
+from simtest.estimators.budget import MISPLACED
+from simtest.geometry import BrownConrady, Camera
+from simtest.geometry.vectors import deviation_deg, tangent_basis
+from simtest.reconstruction.overlay import draw_overlay
+from simtest.reconstruction.page import write_picture_page
+from simtest.reconstruction.records import Specularities, Specularity
+from simtest.runtime.arrays import Array, Image
+from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
+
+MANY = 10
+"""Above this many specularities normals.json is written on one line, since most of it is outlines."""
+
+COLUMNS = (
+    "specularity", "estimator", "status", "candidate", "normal_x", "normal_y", "normal_z", "look_x_px", "look_y_px",
+    "axis_ratio", "flags", "best", "choice_margin", "cov_11", "cov_12", "cov_22", "peak_x_px", "peak_y_px", "kind",
+    "score", "target", "deviation_deg",
+)  # fmt: skip
+
+FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "constraints.npz", "index.html")
+
+
+def write_outputs(
+    out: Path, found: Specularities, picture: Image, depth_mm: Sequence[float] | None = None
+) -> list[Path]:
+    """Write what was reconstructed in a picture, its overlay and its page; return the files.
+
+    The folder is made if need be; `InputError` is raised where it cannot be written,
+    `SimtestError` where its disk is full. A specularity's points stand at its depth, mm, by default at 1.
+    """
+    depths = [1.0] * len(found) if depth_mm is None else depth_mm
+    arrays = constraints_arrays(found)
+    points = normals_ply(found, found.camera, depths)
+    entries = found.to_json()
+    make_folder(out)
+    write_json(out / "normals.json", entries, compact=len(found) > MANY)
+    write_atomically(out / "normals.csv", lambda part: write_csv(part, COLUMNS, normals_rows(entries["specularities"])))
+    write_atomically(out / "normals.ply", lambda part: part.write_text(points, encoding="ascii"))
+    write_atomically(out / "overlay.png", lambda part: cv2.imwrite(str(part), draw_overlay(picture, found)))
+    write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
+    write_atomically(out / "index.html", lambda part: write_picture_page(part, found, picture))
+    return [out / name for name in FILES]
+
+
+def normals_rows(entries: Iterable[JsonObject]) -> Iterator[tuple[object, ...]]:
+    """Yield a row of `COLUMNS` for each entry of ``specularities``, estimator and candidate; 0 is the proposed one."""
+    for entry in entries:
+        peak = (None, None) if entry["peak_px"] is None else (float(v) for v in entry["peak_px"])
+        judged = (*peak, entry.get("kind"), entry.get("score"))
+        for name, each in entry["estimates"].items():
+            start, best = (entry["id"], name, each["status"]), int(name == entry["best"])
+            if each["status"] != "ok":
+                # candidate, normal, look and axis ratio; then margin and covariance
+                nothing = (None,) * 7
+                yield (*start, *nothing, "", best, *nothing[:4], *judged, None, None)
+                continue
+            covariance, deviation = (None,) * 3, None
+            if each["covariance"] is not None:
+                matrix = np.array(each["covariance"])
+                covariance, deviation = matrix[np.triu_indices(2)].tolist(), deviation_deg(matrix)
+            shape = (*each["look_px"], each["axis_ratio"], ";".join(each["flags"]), best, each["choice_margin"])
+            for k, normal in enumerate(np.array(each["candidates"]).tolist()):
+                yield (*start, k, *normal, *shape, *covariance, *judged, each["target"], deviation)
+
+
+def write_csv(path: Path, columns: Sequence[str], table: Iterable[Sequence[object]]) -> None:
+    """Write rows as CSV; what is None stays empty."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(table)
+
+
+def normals_ply(spots: Sequence[Specularity], camera: Camera, depths_mm: Sequence[float]) -> str:
+    """Return the proposed normals as oriented points on the sightlines that they look along (PLY, ASCII).
+
+    The points are at the depth of their specularity; through a fisheye, which sees sideways and backwards too, at that
+    distance.
+    """
+    # Estimators are numbered by name, so that the file does not depend on the order in which they ran.
+    lines, names = [], sorted({name for spot in spots for name in spot.estimates})
+    for spot, depth in zip(spots, depths_mm, strict=True):
+        for name, result in spot.normals.items():
+            if (point := _surface_point(result, camera, depth)) is not None:
+                values = [*point.tolist(), *result.normal.tolist()]
+                lines.append(" ".join(f"{v:.9g}" for v in values) + f" {spot.id} {names.index(name)}")
+    header = [
+        "ply", "format ascii 1.0", f"comment estimators by number: {json.dumps(names)}", f"element vertex {len(lines)}",
+        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
+        "property int specularity", "property int estimator", "end_header",
+    ]  # fmt: skip
+    return "\n".join([*header, *lines]) + "\n"
+
+
+def _surface_point(result: Estimate, camera: Camera, depth_mm: float) -> Array | None:
+    """Return the point at a depth on the sightline of a normal; None where there is no such sightline or depth."""
+    ray, lens = camera.unproject(result.look_px), camera.distortion
+    # Depth is along the optical axis of a perspective lens, along the sightline of one that sees sideways.
+    point = depth_mm * (ray / ray[2] if lens is None or isinstance(lens, BrownConrady) else ray)
+    return np.asarray(point) if np.isfinite(point).all() else None
+
+
+VERSION = 2
+
+
+def constraints_arrays(found: Specularities) -> dict[str, npt.NDArray[np.generic]]:
+    """Return the content of constraints.npz: no pickles, K (3, 3), and a row a best normal that looks along a ray.
+
+    The normal and its covariance are those of the surface at the highlight's brightest point, wherever that is; the
+    pixel, at which the best normal looks, is where it is estimated. Of the surface on the sightline through that pixel
+    the normal is the same, with `covariance_at_pixel`. docs/howto/constraints.md lists the arrays.
+    """
+    made = [
+        (spot, spot.best, best)
+        for spot in found
+        if spot.best is not None and (best := spot.best_estimate) is not None
+        if np.isfinite(found.camera.unproject(best.look_px)).all()
+    ]
+    pixels = np.array([best.look_px for _, _, best in made], dtype=float).reshape(-1, 2)
+    normals = np.array([best.normal for _, _, best in made], dtype=float).reshape(-1, 3)
+    unknown = np.full((2, 2), np.nan)
+    candidates = np.full((len(made), 2, 3), np.nan)
+    for pair, (spot, _, best) in zip(candidates, made, strict=True):
+        listed = spot.normals.get("circle_pose", best).candidates
+        pair[: len(listed)] = listed[:2]
+    return {
+        "version": np.array(VERSION),
+        "id": np.array([spot.id for spot, _, _ in made], dtype=int),
+        "pixel": pixels,
+        "sightline": found.camera.unproject(pixels),
+        "normal": normals,
+        "basis": np.stack(tangent_basis(normals), axis=1),
+        "covariance": _stacked([unknown if best.covariance is None else best.covariance for _, _, best in made]),
+        "covariance_at_pixel": _stacked([_at_pixel(spot, best) for spot, _, best in made]),
+        "candidates": candidates,
+        "estimator": np.array([name for _, name, _ in made], dtype=str),
+        "target": np.array([best.target for _, _, best in made], dtype=str),
+        "K": found.camera.K,
+    }
+
+
+def _at_pixel(spot: Specularity, best: Estimate) -> Array:
+    """Return the covariance of a normal as that of the surface on the ray through the look pixel; NaN if not known.
+
+    Where the brightest point is misplaced by an angle w, the surface's normal turns by d k w from there to the ray, and
+    the estimate by -w: together (1 + d k) w.
+    """
+    curvatures = (each.curvature for each in spot.normals.values())
+    known = next((each for each in curvatures if each is not None and each.hypotheses is not None), None)
+    if best.budget is None or known is None or known.hypotheses is None:
+        return np.full((2, 2), np.nan)
+    axes = known.directions @ np.concatenate(tangent_basis(best.normal[None])).T
+    M = axes.T @ np.diag(np.abs(known.hypotheses).max(axis=0)) @ axes
+    parts = [M @ part @ M.T if name in MISPLACED else part for name, part in best.budget.items()]
+    return np.asarray(np.sum(parts, axis=0))
+
+
+def _stacked(matrices: Sequence[Array]) -> Array:
+    return np.array(matrices, dtype=float).reshape(-1, 2, 2)

@@ -1,0 +1,449 @@
+"""The record of what was reconstructed: a specularity with its estimates and the best of them, and those of a picture.
+
+docs/howto/reconstruct.md explains the keys of their JSON. It is what the tables, the overlay and the pages are made of.
+"""
+
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+
+from simtest.conventions import PIXEL_CENTRE
+from simtest.detection import Region
+from simtest.detection.detector import Detection, Highlight
+from simtest.detection.view import View
+from simtest.errors import Failure
+from simtest.estimators import Estimate
+from simtest.estimators.budget import deviations, dominant
+from simtest.estimators.protocol import Target
+from simtest.geometry import Camera, Patch
+from simtest.reconstruction.options import Choices
+from simtest.runtime import provenance
+from simtest.runtime.arrays import LONGEST, Array, clipped, short_repr, vector
+from simtest.runtime.files import JsonObject
+from simtest.spec import describe_camera
+
+Points = list[list[float]]
+
+WITHOUT_UNCERTAINTY = ("bisector", "curved", "photometric", "cone_axis", "brightest_point")
+"""Order of estimates that state no uncertainty, so that nothing else can rank them: that which knows the lights, those
+which follow the lobe to its peak, that which averages isophotes, and the one that needs none. Other packages' follow,
+and `circle_pose` last, which takes a curved surface for a plane."""
+
+SAME_GLINT_PX = 2.5
+"""A glint of a cloud and a highlight whose peaks are nearer to each other are the same: two detectors found them."""
+
+FRAME = "camera: x right, y down, z forward; normals are unit and face the camera"
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What drawings need of an estimate, px: its isophotes, each with its isovalue, and the fitted curves."""
+
+    isophotes: list[tuple[float, Points]]
+    curves: list[Points]
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True)
+class Specularity:
+    """One region of interest and what each estimator made of it.
+
+    Parameters
+    ----------
+    region : Region
+        Where it is.
+    patch : Patch or Failure
+        The smoothed crop.
+    estimates : dict
+        `Estimate` or `Failure` by estimator name.
+    highlight : Highlight, optional
+        How the detector judged it, if it judges any.
+    camera : Camera, optional
+        Of the frame.
+    target : {"fine", "base"}
+        The surface whose normal is wanted: the best estimate states it, where there is any.
+    id : int
+        Its place among those of the frame.
+    track : int, optional
+        Its number over the frames of a sequence.
+    reference : optional
+        The reference's normal here and the errors against it (`simtest.validation.reference_surface`).
+
+    Examples
+    --------
+    >>> import numpy as np, simtest
+    >>> y, x = np.mgrid[:120, :160] + 0.5
+    >>> frame = np.exp(-((x - 80) ** 2 + (y - 60) ** 2) / 200).astype(np.float32)
+    >>> spot = simtest.reconstruct(frame, simtest.Camera.from_fov(60.0, 160, 120))[0]
+    >>> spot.estimates["cone_axis"].normal.round(2) + 0.0
+    array([ 0.,  0., -1.])
+    """
+
+    region: Region
+    patch: Patch | Failure
+    estimates: dict[str, Estimate | Failure]
+    highlight: Highlight | None = None
+    camera: Camera | None = None
+    target: Target = "fine"
+    id: int = 0
+    track: int | None = None
+    reference: Any = None
+
+    @property
+    def peak_px(self) -> Array | None:
+        """The peak; None where there is no patch."""
+        return None if isinstance(self.patch, Failure) else self.patch.peak_px
+
+    @property
+    def position_px(self) -> Array:
+        """The peak, or the middle of the region where there is none."""
+        x, y, width, height = self.region.box
+        return np.array([x + width / 2, y + height / 2]) if self.peak_px is None else self.peak_px
+
+    @property
+    def kind(self) -> str | None:
+        """Kind of highlight that the detector takes it for."""
+        return None if self.highlight is None else str(self.highlight.kind)
+
+    @property
+    def score(self) -> float | None:
+        """How sure the detector is of that."""
+        return None if self.highlight is None else self.highlight.score
+
+    @property
+    def normals(self) -> dict[str, Estimate]:
+        """The results of the estimators that did not fail."""
+        return {name: result for name, result in self.estimates.items() if isinstance(result, Estimate)}
+
+    @cached_property
+    def _judged(self) -> tuple[str | None, str]:
+        return best_of(self.estimates, self.target)
+
+    @property
+    def best(self) -> str | None:
+        """Name of the estimator whose normal is the best one."""
+        return self._judged[0]
+
+    @property
+    def best_because(self) -> str:
+        """Why that one is."""
+        return self._judged[1]
+
+    @property
+    def best_estimate(self) -> Estimate | None:
+        """The result of the best estimator."""
+        return None if self.best is None else self.normals[self.best]
+
+    @cached_property
+    def drawings(self) -> dict[str, Drawing]:
+        """What is drawn of each estimate; the fitted curves where the camera is known."""
+        # Estimators share isophotes: the curve of each is computed once.
+        curves: dict[int, Points] = {}
+        made = {}
+        for name, result in self.normals.items():
+            fitted = [] if self.camera is None else [*result.isophotes]
+            for isophote in fitted:
+                if id(isophote) not in curves and self.camera is not None:
+                    curves[id(isophote)] = drawable(isophote.ellipse_px(self.camera))
+            outlines = [curves[id(isophote)] for isophote in fitted]
+            if result.cloud is not None and self.camera is not None:
+                look = self.camera.unproject(result.look_px)
+                outlines.append(drawable(self.camera.project(result.cloud.outline(result.normal, look))))
+            traced = [(t, np.round(points, 3).tolist()) for t, points in contours(result, self.patch)]
+            made[name] = Drawing(traced, outlines)
+        return made
+
+    def to_json(self, drawn: bool = True) -> JsonObject:
+        """Return an entry of ``specularities``; without isophotes and curves where it is not `drawn`."""
+        sightline = None if self.peak_px is None or self.camera is None else self.camera.unproject(self.peak_px)
+        # A lens sees no direction beyond its fold.
+        if sightline is not None and not np.isfinite(sightline).all():
+            sightline = None
+        drawings = self.drawings if drawn else {}
+        return {
+            "id": self.id,
+            "box_px": self.region.box,
+            "peak_px": self.peak_px,
+            "sightline": sightline,
+            **({} if self.highlight is None else _highlight_json(self.highlight)),
+            "best": self.best,
+            "best_because": self.best_because,
+            "estimates": {name: _estimate_json(each, drawings.get(name)) for name, each in self.estimates.items()},
+            **{name: value for name in ("track", "reference") if (value := getattr(self, name)) is not None},
+        }
+
+    def clouds_json(self, drawn: bool = True) -> list[JsonObject]:
+        """Describe the clouds of highlights that its estimates stand on."""
+        return [
+            {
+                "specularity": self.id,
+                "estimator": name,
+                "highlights": len(cloud.points_px),
+                "points_px": np.round(cloud.points_px, 2),
+                "covariance": cloud.covariance,
+                "axis_ratio": cloud.axis_ratio,
+                "seen": cloud.seen,
+                "slope_deg": {end: float(np.degrees(getattr(cloud.slope, end))) for end in ("value", "low", "high")},
+                "outline": self.drawings[name].curves[0] if drawn else None,
+            }
+            for name, result in self.normals.items()
+            if (cloud := result.cloud) is not None
+        ]
+
+    def __repr__(self) -> str:
+        x, y, width, height = self.region.box
+        failed = [f"{name} ({each.reason})" for name, each in self.estimates.items() if isinstance(each, Failure)]
+        where = f"at ({x + width / 2:.1f}, {y + height / 2:.1f}) px"
+        if self.peak_px is not None:
+            where = f"peak {vector(self.peak_px)} px"
+        text = f"{where}, normals: {' '.join(self.normals) or 'none'}" + f", failed: {', '.join(failed)}" * bool(failed)
+        return f"Specularity({clipped(text, LONGEST - 13)})"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the patch with isophotes and normals, and a row for each estimator."""
+        from simtest.reconstruction.page import specularity_html
+
+        return specularity_html(self)
+
+
+class Specularities(list[Specularity]):
+    """The specularities found in a frame, the brightest first, with how the frame was taken.
+
+    Attributes
+    ----------
+    detection : Detection
+        What the detector found, with highlights of other kinds and the view where it judges them.
+    choices : Choices
+        Encoding, detector, smoothing, estimators and priors; `choices.inferred` names those that nobody gave.
+    image : str
+        The picture's file, or its name.
+    warnings : list of str
+        What its user should know.
+    reference : optional
+        How its normals compare with a reference (`simtest.validation.reference_surface`).
+    """
+
+    def __init__(
+        self, spots: Iterable[Specularity], detection: Detection, choices: Choices, image: str = "",
+        warnings: Iterable[str] = (), reference: Any = None,
+    ) -> None:  # fmt: skip
+        super().__init__(spots)
+        self.detection, self.choices = detection, choices
+        self.image, self.warnings, self.reference = image, [*warnings], reference
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the frame was taken with."""
+        return self.choices.calibration.camera
+
+    @property
+    def stated(self) -> "StatedErrors | None":
+        """What the best estimates state, with the medians of their budgets; None where none states anything."""
+        return stated_errors([best for each in self if (best := each.best_estimate) is not None])
+
+    def to_json(self, drawn: bool = True) -> JsonObject:
+        """Return the content of normals.json; without isophotes and curves where it is not `drawn`."""
+        others = [
+            {"box_px": h.region.box, "peak_px": [v + PIXEL_CENTRE for v in h.region.peak], **_highlight_json(h)}
+            for h in self.detection.others
+        ]
+        return {
+            "image": self.image,
+            "camera": describe_camera(self.camera),
+            "encoding": self.choices.encoding,
+            "detector": self.choices.detector,
+            "smoothing_px": self.choices.smoothing_px,
+            "inferred": self.choices.inferred,
+            "view": _view_json(self.detection.view),
+            "warnings": self.warnings,
+            "assumed": self.choices.assumed,
+            "stated": self.stated,
+            "frame": FRAME,
+            "specularities": [spot.to_json(drawn) for spot in self],
+            "clouds": [entry for spot in self for entry in spot.clouds_json(drawn)],
+            "other_highlights": others,
+            "provenance": provenance.environment(),
+            **({} if self.reference is None else {"reference": self.reference}),
+        }
+
+    def __repr__(self) -> str:
+        answered = sum(bool(each.normals) for each in self)
+        what = "specularity" if len(self) == 1 else "specularities"
+        text = f"{len(self)} {what}, {answered} with a normal; {self.choices}"
+        return f"<Specularities: {clipped(text, LONGEST - 18)}>"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the frame with the best normals, and the first rows."""
+        from simtest.reconstruction.page import specularities_html
+
+        return specularities_html(self)
+
+
+def contours(result: Estimate, patch: Patch | Failure) -> list[tuple[float, Array]]:
+    """Return the isophotes that an estimate used on a patch: isovalue and closed polygon, shape (N, 2), px."""
+    if isinstance(patch, Failure):
+        return []
+    traced = [(isophote.isovalue, patch.isophote(isophote.isovalue)) for isophote in result.isophotes]
+    return [(t, points) for t, points in traced if not isinstance(points, Failure)]
+
+
+def drawable(curve: Array) -> Points:
+    """Return a curve, shape (N, 2), px, as lists for a JSON file, without points that the lens does not image."""
+    return np.round(curve[np.isfinite(curve).all(axis=1)], 3).tolist()
+
+
+def cloud_members(spots: Sequence[Specularity]) -> dict[int, int]:
+    """Return the specularity of the cloud that each single highlight belongs to, by the highlight's id.
+
+    A highlight belongs to a cloud where one of the cloud's glints lies within `SAME_GLINT_PX` of its peak.
+    """
+    members: dict[int, int] = {}
+    single = [spot for spot in spots if spot.peak_px is not None]
+    peaks = np.array([spot.peak_px for spot in single]).reshape(-1, 2)
+    for spot in spots:
+        for result in spot.normals.values():
+            if result.cloud is not None and single:
+                apart = np.linalg.norm(peaks[:, None] - result.cloud.points_px[None], axis=2).min(axis=1)
+                members |= {single[i].id: spot.id for i in np.flatnonzero(apart < SAME_GLINT_PX)}
+    return members
+
+
+# Which estimate is the best one --------------------------------------------------------------------------------------
+
+
+def best_of(estimates: Mapping[str, Estimate | Failure], target: Target = "fine") -> tuple[str | None, str]:
+    """Return the name of the estimator whose normal is the best one, and why; None where all failed.
+
+    The best one has the smallest expected error, the square root of the covariance's trace, of those that state the
+    wanted surface's normal, or else of all. Estimates without uncertainty are worse than any with one.
+    """
+    answered = {name: result for name, result in estimates.items() if isinstance(result, Estimate)}
+    if not answered:
+        return None, "no estimator answered"
+    wanted = {name: result for name, result in answered.items() if result.target == target} or answered
+    stated = {name: expected for name, result in wanted.items() if (expected := result.deviation_deg) is not None}
+    if not stated:
+        best = min(wanted, key=_rank)
+        return best, "no estimator reports an uncertainty; chosen by the estimators' order"
+    # The first of equal ones; so the result does not depend on rounding alone.
+    best = min(stated, key=lambda name: (stated[name], _rank(name)))
+    others = sorted((expected, name) for name, expected in stated.items() if name != best)
+    budget = wanted[best].budget or {}
+    # The largest part of a budget is named where it has several.
+    mostly = f", mostly {dominant(budget)}" if len(budget) > 1 else ""
+    because = f"smallest expected error, {stated[best]:.2g} deg{mostly}"
+    if others:
+        return best, f"{because}; next {others[0][1]} with {others[0][0]:.2g} deg"
+    return best, f"{because}; " + ("the only answer" if len(wanted) == 1 else "the others report no uncertainty")
+
+
+def _rank(name: str) -> int:
+    if name in WITHOUT_UNCERTAINTY:
+        return WITHOUT_UNCERTAINTY.index(name)
+    return len(WITHOUT_UNCERTAINTY) + (name == "circle_pose")
+
+
+@dataclass(frozen=True)
+class StatedErrors:
+    """What the best estimates of a picture state, deg: medians of the standard deviation and of each part's.
+
+    Parameters
+    ----------
+    count, silent : int
+        Best estimates that state an uncertainty, and others.
+    median_deg : float
+        Of the square root of the covariance's trace.
+    parts_deg : dict
+        The same of each part of the budget, the largest first.
+    """
+
+    count: int
+    silent: int
+    median_deg: float
+    parts_deg: dict[str, float]
+
+    @property
+    def shown_parts_deg(self) -> dict[str, float]:
+        """The parts without those below a hundredth of the whole, which change nothing that is shown."""
+        return {name: value for name, value in self.parts_deg.items() if value >= 0.01 * self.median_deg}
+
+    def __str__(self) -> str:
+        parts = ", ".join(f"{name} {value:.2g}" for name, value in self.shown_parts_deg.items())
+        left = f"; {self.silent} report none" if self.silent else ""
+        return f"median ± {self.median_deg:.2g} deg of {self.count} best normals ({parts}){left}"
+
+
+def stated_errors(best: Sequence[Estimate]) -> StatedErrors | None:
+    """Summarise the uncertainties of a picture's best estimates; None where none states any."""
+    stated = [each for each in best if each.covariance is not None]
+    if not stated:
+        return None
+    parts: dict[str, list[float]] = {}
+    for each in stated:
+        for name, value in deviations(each.budget or {}).items():
+            parts.setdefault(name, []).append(float(np.degrees(value)))
+    # A part that some estimates do not have is 0 there.
+    medians = {name: statistics.median(values + [0.0] * (len(stated) - len(values))) for name, values in parts.items()}
+    median = statistics.median([deviation for each in stated if (deviation := each.deviation_deg) is not None])
+    ordered = dict(sorted(medians.items(), key=lambda item: -item[1]))
+    return StatedErrors(len(stated), len(best) - len(stated), median, ordered)
+
+
+# JSON ----------------------------------------------------------------------------------------------------------------
+
+
+def _view_json(view: View) -> JsonObject | None:
+    """Describe the view's border: its circle where it is round, and the outline of what is seen."""
+    if view.seen is None:
+        return None
+    contours, _ = cv2.findContours(view.seen.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    polygon = cv2.approxPolyDP(max(contours, key=cv2.contourArea), 1.0, True)[:, 0] if contours else np.empty((0, 2))
+    return {"circle": view.circle, "outline": polygon + PIXEL_CENTRE}
+
+
+def _highlight_json(highlight: Highlight) -> JsonObject:
+    return {
+        "kind": highlight.kind,
+        "score": highlight.score,
+        "area_px": highlight.area_px,
+        "peaks": max(len(highlight.peaks), 1),
+        "clipped": round(highlight.clipped, 3),
+        "specular_peak": highlight.region.contrast,
+        "shape": {name: getattr(highlight, name) for name in ("axis_ratio", "residual", "wander", "tint", "clutter")},
+        "outline": np.round(highlight.outline, 2),
+    }
+
+
+def _estimate_json(result: Estimate | Failure, drawing: Drawing | None) -> JsonObject:
+    if isinstance(result, Failure):
+        return {"status": result.reason, "detail": result.detail}
+    entry: JsonObject = {
+        "status": "ok",
+        "normal": result.normal,
+        "candidates": result.candidates,
+        "choice_margin": result.choice_margin,
+        "look_px": [float(v) if np.isfinite(v) else None for v in result.look_px],
+        "axis_ratio": result.axis_ratio,
+        "isovalues": [isophote.isovalue for isophote in result.isophotes],
+        "target": result.target,
+        "covariance": result.covariance,
+        "budget": result.budget,
+        "curvature": None,
+        "flags": result.flags,
+    }
+    if result.axis_ratio_deviation is not None:
+        entry["axis_ratio_deviation"] = result.axis_ratio_deviation
+    if (shape := result.curvature) is not None:
+        entry["curvature"] = {"directions": shape.directions, "axis_ratio": shape.axis_ratio, "gains": shape.hypotheses}
+    if drawing is not None:
+        entry["isophotes"] = [{"t": t, "points": points} for t, points in drawing.isophotes]
+        entry["ellipses"] = [isophote.conic.image for isophote in result.isophotes if isophote.conic is not None]
+        entry["cones"] = [isophote.cone for isophote in result.isophotes]
+        entry["curves"] = drawing.curves
+    return entry
