@@ -295,16 +295,11 @@ def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
     # Pieces of negative volume are inside out.
     outward = np.where((volume[piece] < 0)[:, None], oriented[:, ::-1], oriented)
     # A face and its reverse differ by an odd permutation: compare the corner that follows the smallest.
-    inward = np.bincount(piece, _follower(faces) != _follower(outward), count)
+    given, now = (np.take_along_axis(f, (f.argmin(axis=1)[:, None] + 1) % 3, axis=1)[:, 0] for f in (faces, outward))
+    inward = np.bincount(piece, given != now, count)
     turned = inward > size / 2
     against = np.where(turned, size - inward, inward).sum()
     return np.ascontiguousarray(outward, dtype=np.int64), int(against), int(turned.sum())
-
-
-def _follower(faces: IntArray) -> IntArray:
-    """Return the corner that comes after the smallest one in each face, shape (F,)."""
-    after = (np.argmin(faces, axis=1) + 1) % 3
-    return faces[np.arange(len(faces)), after]
 
 
 def examine(vertices: Array, faces: IntArray, crossings: bool = True) -> Condition:

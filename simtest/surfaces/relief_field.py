@@ -214,20 +214,12 @@ def _drawn(spec: Relief) -> ReliefField:
     return ReliefField(bands, deviation, min(felt))
 
 
-@dataclass(frozen=True)
-class _Unscaled:
-    """A band before its slope and wavelength are set."""
-
-    turn: Array  # (3, 3): of the lattice
-    coefficients: Array  # (NODES, NODES, NODES): of the B-splines
-    # slope, wave: What `_plane_statistics` measures
-    slope: float
-    wave: float
-
-
 @remembered
-def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...]) -> _Unscaled:
-    """Draw a band from a branch of the relief's seed; reliefs of one seed differ in their scales alone."""
+def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...]) -> tuple[Array, Array, float, float]:
+    """Draw a band from a branch of the relief's seed; reliefs of one seed differ in their scales alone.
+
+    Returns the turn of its lattice, the coefficients of its B-splines, and its slope and wavelength in cells.
+    """
     # Imported here: slow to load, and smooth scenes have no relief.
     from scipy import ndimage
     from scipy.spatial.transform import Rotation
@@ -243,19 +235,20 @@ def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...])
         nodes = _shaped(nodes, kind)
     coefficients = ndimage.spline_filter(nodes, order=3, mode="grid-wrap")
     # The spline's own slope and wavelength on a plane, in lattice cells.
-    return _Unscaled(turn, coefficients, *_plane_statistics(BandField(np.eye(3), coefficients, coefficients), rng))
+    return turn, coefficients, *_plane_statistics(BandField(np.eye(3), coefficients, coefficients), rng)
 
 
 def _make_band(spec: ReliefBand, branch: np.random.SeedSequence, diffusion_mm: float) -> BandField:
     """Scale a band to the slope and wavelength that are asked for."""
     assert isinstance(branch.entropy, int)
-    drawn = _unscaled(spec.kind, spec.width, branch.entropy, tuple(branch.spawn_key))
+    key = tuple(branch.spawn_key)
+    turn, unscaled, slope, wave = _unscaled(spec.kind, spec.width, branch.entropy, key)
     # Stretch along the direction, so that the wavelength there is longer and the slope lower.
     axis = np.array(spec.direction) / np.linalg.norm(spec.direction)
     stretch = np.eye(3) + (1 / spec.anisotropy - 1) * np.outer(axis, axis)
-    lattice_from_model = (drawn.wave / spec.wavelength_mm) * drawn.turn @ stretch
-    height = np.radians(spec.slope_deg) / drawn.slope * (spec.wavelength_mm / drawn.wave)
-    coefficients = drawn.coefficients * height
+    lattice_from_model = (wave / spec.wavelength_mm) * turn @ stretch
+    height = np.radians(spec.slope_deg) / slope * (spec.wavelength_mm / wave)
+    coefficients = unscaled * height
     return BandField(lattice_from_model, coefficients, _diffused(coefficients, lattice_from_model, diffusion_mm))
 
 

@@ -75,12 +75,15 @@ def isoperimetric_quotient(vertices: Array, faces: IntArray) -> float:
     return float(36 * np.pi * volume**2 / area**3)
 
 
-def cut_faces(faces: IntArray, middles: IntArray) -> IntArray:
-    """Cut each triangle into 1 to 4, by how many of its edges have a new vertex; the winding is kept.
+def halve(faces: IntArray, index: IntArray, chosen: IntArray, first_vertex: int, edge_count: int) -> IntArray:
+    """Cut faces at the chosen edges, whose middles are the vertices from `first_vertex` on, in the same order.
 
-    `middles`, of the shape (F, 3) of `faces`, holds the new vertex on the edge from each corner to the next; -1 for
-    none.
+    `index` holds the edges' numbers after each corner (see `face_edges`). Each triangle is cut into 1 to 4, by how many
+    of its edges have a new vertex; the winding is kept.
     """
+    added = np.full(edge_count, -1, dtype=np.int64)
+    added[chosen] = first_vertex + np.arange(len(chosen))
+    middles = added[index]
     count = (middles >= 0).sum(axis=1)
     parts = [faces[count == 0]]
     # Rotate the corners of each face: a single halved edge comes first, a single whole edge last.
@@ -121,13 +124,6 @@ def off_between(ends: Array, normals: Array, share: float, limit_deg: float) -> 
     between = unit((1 - share) * ends[:, 0] + share * ends[:, 1])
     # By the chord, which grows with the angle up to 180 deg; a sine would fall again beyond 90.
     return np.asarray(np.linalg.norm(between - normals, axis=1) > 2 * math.sin(math.radians(limit_deg) / 2))
-
-
-def halve(faces: IntArray, index: IntArray, chosen: IntArray, first_vertex: int, edge_count: int) -> IntArray:
-    """Cut faces at the chosen edges, whose middles are the vertices from `first_vertex` on, in the same order."""
-    added = np.full(edge_count, -1, dtype=np.int64)
-    added[chosen] = first_vertex + np.arange(len(chosen))
-    return cut_faces(faces, added[index])
 
 
 class MeshProbe:

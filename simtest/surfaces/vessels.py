@@ -129,7 +129,10 @@ def make_table(segments: "VesselSegments", blur_mm: float, half_mm: Array) -> Se
     if not len(width):
         return NO_VESSELS
     cell_mm = CELL_PER_WIDTH * float(np.median(width))
-    owner, cell = _cells(segments, width, cell_mm)
+    parts = [
+        _cells(segments, width, cell_mm, slice(start, start + SEGMENTS)) for start in range(0, len(width), SEGMENTS)
+    ]
+    owner, cell = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     slots = 1 << max(1, math.ceil(math.log2(len(owner) / LOAD)))
     slot = _hash(cell) & (slots - 1)
     first = np.zeros(slots + 1, dtype=np.uint32)
@@ -139,17 +142,9 @@ def make_table(segments: "VesselSegments", blur_mm: float, half_mm: Array) -> Se
     return SegmentTable(cell_mm, first, sorted_rows, half_mm)
 
 
-def _cells(segments: "VesselSegments", width: Array, cell_mm: float) -> tuple[IntArray, IntArray]:
-    """Return pairs of a segment and a cell, shapes (P,) and (P, 3), in which it is seen on the surface."""
-    parts = [
-        _cells_of(segments, width, cell_mm, slice(start, start + SEGMENTS)) for start in range(0, len(width), SEGMENTS)
-    ]
-    owner, cell = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return owner, cell
-
-
-def _cells_of(segments: "VesselSegments", width: Array, cell_mm: float, some: slice) -> tuple[IntArray, IntArray]:
-    """Return the pairs of some segments. Lengths are in cells, in single precision: `MARGIN_MM` covers its rounding."""
+def _cells(segments: "VesselSegments", width: Array, cell_mm: float, some: slice) -> tuple[IntArray, IntArray]:
+    """Return pairs of some segment and a cell, shapes (P,) and (P, 3), in which it is seen on the surface."""
+    # Lengths are in cells, in single precision: `MARGIN_MM` covers its rounding.
     start, end = segments.start[some] / cell_mm, segments.end[some] / cell_mm
     reach = ((width[some] + MARGIN_MM) / cell_mm)[:, None]
     low = np.floor(np.minimum(start, end) - reach).astype(np.int32)
@@ -339,15 +334,10 @@ def thinned(points: Array, distance: float) -> Mask:
         stays = undecided & ~beaten
         kept |= stays
         undecided &= ~stays
-        undecided[_partners(first, second, stays)] = False
+        undecided[second[stays[first]]] = False
         live = undecided[first] & undecided[second]
         first, second = first[live], second[live]
     return kept | undecided
-
-
-def _partners(first: IntArray, second: IntArray, chosen: Mask) -> IntArray:
-    """Return the later partners of chosen points."""
-    return second[chosen[first]]
 
 
 NODES_PER_SPACING = 2.5
