@@ -22,7 +22,7 @@ from simtest.surfaces.model import (
     TriangleMesh,
     implicit_shape_operator,
     pack_points,
-)  # fmt: skip
+)
 
 PLANE_REACH = 1000.0
 """Half-size of the rendered plane over the anchor's distance: beyond the view even at grazing tilt."""

@@ -254,8 +254,8 @@ class DeformedRelief(ReliefField):
         """Compute the jets of the tissue below the film at deformed points, shape (N, 3), model frame, mm."""
         assert self.deformation is not None
         rest = self.deformation.at_rest(points)
-        own = super().tissue_jets(rest, diffused)
-        return Jet(own.value, *carry(self.deformation.jets(rest), own.gradient, own.hessian))
+        at_rest = super().tissue_jets(rest, diffused)
+        return Jet(at_rest.value, *carry(self.deformation.jets(rest), at_rest.gradient, at_rest.hessian))
 
 
 def stays_in_free_space(rest: SurfaceModel, parts: Sequence[Deformation], time_s: float, point: Array) -> bool:
@@ -336,12 +336,10 @@ class DeformedSurface(SurfaceModel):
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Return the points where rays meet the deformed surface (see `SurfaceModel.points`)."""
         distance = np.where(np.isfinite(hits.distance) & np.isfinite(directions).all(axis=1), hits.distance, np.nan)
-        found = np.flatnonzero(np.isfinite(distance))
-        solved, points, jets = self._solve(
-            origins[found], directions[found], replace(hits, distance=distance).rows(found)
-        )
+        hit = np.flatnonzero(np.isfinite(distance))
+        solved, points, jets = self._solve(origins[hit], directions[hit], replace(hits, distance=distance).rows(hit))
         forms = implicit_shape_operator(*carry(jets, points.normal_base, shape_operator(points)))
-        return pack_points(origins, directions, *in_rows(len(origins), found, solved, *forms))
+        return pack_points(origins, directions, *in_rows(len(origins), hit, solved, *forms))
 
     def _solve(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, SurfacePoints, Jet]:
         """Return distances along rays, the points at rest that they meet there, and the map at these."""

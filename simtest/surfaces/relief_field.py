@@ -140,15 +140,15 @@ class ReliefField:
         base tangent t is ((1 + N.G) S + N (G^T S + N^T H) - H) t / |m|, across n, with the base's S and the height's
         Hessian H. Curvatures are eigenvalues of its symmetric part on the surface that the relief makes.
         """
-        found = np.flatnonzero(points.valid)
-        if not len(found):
+        valid = np.flatnonzero(points.valid)
+        if not len(valid):
             return points
-        tissue = self.tissue_jets(points.position[found])
-        fine = fine_curvatures(points.normal[found], shape_operator(points)[found], self.fill(tissue))
+        tissue = self.tissue_jets(points.position[valid])
+        fine = fine_curvatures(points.normal[valid], shape_operator(points)[valid], self.fill(tissue))
         names = ("normal", "k_min", "k_max", "direction_min", "direction_max")
-        changed: dict[str, Any] = dict(zip(names, in_rows(len(points.valid), found, *fine), strict=True))
+        changed: dict[str, Any] = dict(zip(names, in_rows(len(points.valid), valid, *fine), strict=True))
         pool = np.zeros(len(points.valid), dtype=bool)
-        pool[found] = False if self.level is None else tissue.value < self.level
+        pool[valid] = False if self.level is None else tissue.value < self.level
         return replace(points, **changed, pool=pool)
 
 
@@ -205,8 +205,8 @@ def _packed(field: ReliefField) -> dict[str, AnyArray]:
 def _drawn(spec: Relief) -> ReliefField:
     """Draw the bands of a relief."""
     branches = np.random.SeedSequence(spec.seed).spawn(len(spec.bands))
-    bands = tuple(_make_band(band, branch, spec.diffusion_mm)
-                  for band, branch in zip(spec.bands, branches, strict=True))  # fmt: skip
+    pairs = zip(spec.bands, branches, strict=True)
+    bands = tuple(_make_band(band, branch, spec.diffusion_mm) for band, branch in pairs)
     # Bands are independent, and each has mean 0.
     deviation = float(np.sqrt(sum(np.var(_node_values(band.coefficients)) for band in bands)))
     whole = sum(band.slope_deg**2 for band in spec.bands)

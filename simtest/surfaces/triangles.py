@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
+from numpy.random import Generator
 
 from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
@@ -17,22 +18,20 @@ from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, 
 MIN_CLEARANCE_MM = 5.0
 """A camera in a lumen keeps this distance from the wall if the lumen is wide enough."""
 
-Generator = np.random.Generator
-
 
 def face_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
     """Return the edges of faces, shape (E, 2), smaller vertex first, and their numbers after each corner, (F, 3)."""
     codes, span = _edge_codes(faces)
     # Each edge once, and for each corner which of them it starts
-    found, index = np.unique(codes, return_inverse=True)
-    return np.stack(np.divmod(found, span), axis=1), index.reshape(-1, 3)
+    unique, index = np.unique(codes, return_inverse=True)
+    return np.stack(np.divmod(unique, span), axis=1), index.reshape(-1, 3)
 
 
 def edge_uses(faces: IntArray) -> tuple[IntArray, IntArray]:
     """Return the edges, shape (E, 2), smaller vertex first, and how many faces each belongs to, shape (E,)."""
     codes, span = _edge_codes(faces)
-    found, uses = np.unique(codes, return_counts=True)
-    return np.stack(np.divmod(found, span), axis=1), uses
+    unique, uses = np.unique(codes, return_counts=True)
+    return np.stack(np.divmod(unique, span), axis=1), uses
 
 
 def _edge_codes(faces: IntArray) -> tuple[IntArray, int]:
@@ -211,9 +210,17 @@ class MeshedSurface(SurfaceModel):
         surface.model_from_camera = model_from_camera
         return surface
 
+    def sites(self, rng: Generator) -> Array:
+        """Draw candidates for a camera in a lumen, shape (N, 3), mm."""
+        return self.probe.sites(rng)
+
     def shape(self) -> Shape:
         """Return the mesh; winding and normals on the camera's side."""
         return Shape("mesh", False, np.eye(4), self.mesh, self.key)
+
+    @abstractmethod
+    def vertex_shape_operators(self) -> Array:
+        """Return S at the mesh's vertices for its normals, 1/mm, shape (V, 3, 3)."""
 
     @abstractmethod
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:

@@ -510,7 +510,7 @@ class Tube:
     ) -> tuple[Array, Array, Array]:
         """Solve P(u, v) = origin + t direction by Newton's method from a start close by; return t, NaN: none, u, v."""
         u, v, t = u.copy(), v.copy(), distance.copy()
-        found = np.zeros(len(u), dtype=bool)
+        solved = np.zeros(len(u), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
         for _ in range(NEWTON_STEPS):
             p, pu, pv = self.tangents(u[active], v[active])
@@ -522,7 +522,7 @@ class Tube:
                 inverse = 1.0 / _dot(pu, minor)
                 du, dv, dt = (_dot(miss, m) * inverse for m in (minor, np.cross(towards, pu), np.cross(pu, pv)))
             done = _dot(miss, miss) < NEWTON_TOLERANCE_MM**2
-            found[active[done]] = True
+            solved[active[done]] = True
             # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
             scale = np.minimum(1.0, MAX_SHIFT_MM / np.maximum(np.abs(dt), np.finfo(float).tiny))
             scale[done] = 0.0
@@ -534,7 +534,7 @@ class Tube:
             if not active.size:
                 break
         inside = (u >= -1.0) & (u <= self.recipe.length_mm + 1.0)
-        return np.where(found & inside, t, np.nan), u, v
+        return np.where(solved & inside, t, np.nan), u, v
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -87,15 +87,15 @@ class SegmentTable:
         points = self.mirrored(points)
         slot = self.slots(points)
         first, last = self.first[slot], self.first[slot + 1]
-        found = np.zeros((len(points), 2))
+        longest = np.zeros((len(points), 2))
         active = np.flatnonzero(last > first)
         row = first.astype(np.int64)
         while len(active):
             chord, vein = _chord(points[active], self.rows[row[active]].astype(np.float64))
-            found[active, vein] = np.maximum(found[active, vein], chord)
+            longest[active, vein] = np.maximum(longest[active, vein], chord)
             row[active] += 1
             active = active[row[active] < last[active]]
-        return found
+        return longest
 
 
 NO_VESSELS = SegmentTable(1.0, np.zeros(3, dtype=np.uint32), np.zeros((1, 8), dtype=np.float32))
@@ -263,14 +263,14 @@ def _quadric(surface: Quadric) -> PatternPatch:
 
     def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
         rows: list[Array] = []
-        found = 0
+        drawn = 0
         # Rejection: the density over the plane below is the slope's secant.
-        while found < count:
+        while drawn < count:
             x, y = rng.uniform(-half, half, (2, 2 * count))
             secant = np.sqrt(1 + (k1 * x) ** 2 + (k2 * y) ** 2)
             kept = rng.uniform(0, steepest, 2 * count) < secant
             rows.append(np.stack([x[kept], y[kept]], axis=1))
-            found += int(kept.sum())
+            drawn += int(kept.sum())
         x, y = np.concatenate(rows)[:count].T
         normal = np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1)
         points = np.stack([x, y, -(k1 * x**2 + k2 * y**2) / 2], axis=1)
@@ -480,9 +480,9 @@ def _trees(graph: sparse.csr_matrix, roots: IntArray, ends: Mask) -> tuple[IntAr
     return parent, order
 
 
-def _carried(parent: IntArray, order: IntArray, own: Array) -> Array:
+def _carried(parent: IntArray, order: IntArray, amount: Array) -> Array:
     """Sum a quantity over each node's subtree; `order` lists parents before their children."""
-    total, above = own.tolist(), parent.tolist()
+    total, above = amount.tolist(), parent.tolist()
     for node in reversed(order.tolist()):
         if above[node] >= 0:
             total[above[node]] += total[node]

@@ -1,6 +1,7 @@
 """Camera poses: rigid, repeatable, never in tissue, looking at the surface."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import igl
 import numpy as np
@@ -9,11 +10,8 @@ import pytest
 from simtest.errors import InputError
 from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces import make_surface
-from simtest.surfaces.colon import make_colon
-from simtest.surfaces.liver import make_liver
 from simtest.surfaces.mesh_surface import make_mesh_surface
 from simtest.surfaces.poses import AXIS_RANGE_MM, MeshProbe, lumen_pose, organ_pose
-from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
 from tests.marked import marked
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,11 +21,7 @@ SURFACES = marked(["colon", "liver", "colon_edingca_00090", "liver_sksurgery"], 
 
 def make(name, viewpoint):
     if (shipped := ROOT / "meshes" / f"{name}.toml").is_file():
-        recipe = load_recipe(shipped)
-        if isinstance(recipe, ColonRecipe):
-            return make_colon(recipe, viewpoint)
-        assert isinstance(recipe, LiverRecipe)
-        return make_liver(recipe, viewpoint)
+        return make_surface(AnatomySurface(path=str(shipped), viewpoint=viewpoint))
     path = MESHES / f"{name}.ply"
     if not path.is_file():
         pytest.skip(f"no reference mesh {path}")
@@ -122,7 +116,12 @@ def test_no_place_is_an_input_error():
     def cast(origins, directions):
         return np.full(len(origins), np.inf)
 
+    def targets(rng, count):
+        return np.zeros((count, 3)), np.tile([0, 0, 1.0], (count, 1))
+
+    probe = SimpleNamespace(cast=cast, targets=targets)
+    surface = SimpleNamespace(sites=lambda rng: rng.normal(size=(4, 3)), clearance=nowhere, probe=probe)
     with pytest.raises(InputError, match="viewpoint 3"):
-        lumen_pose("x", 3, lambda rng: rng.normal(size=(4, 3)), nowhere, cast)
+        lumen_pose("x", 3, surface)
     with pytest.raises(InputError, match="viewpoint 3"):
-        organ_pose("x", 3, lambda rng, n: (np.zeros((n, 3)), np.tile([0, 0, 1.0], (n, 1))), nowhere, cast)
+        organ_pose("x", 3, surface)
