@@ -232,7 +232,12 @@ def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...])
     k0 = 2 * np.pi / NODES_PER_WAVE * np.sqrt(1.25 * (1 + w**2) / (1 + 6 * w**2 + 3 * w**4))
     nodes = shell_noise(rng, NODES, lambda k: np.exp(-(((k - k0) / (w * k0)) ** 2) / 4))
     if kind != "gaussian":
-        nodes = _shaped(nodes, kind)
+        # Crests and grooves, or pits
+        rounded = (
+            np.sqrt(nodes**2 + RIDGE_ROUNDING**2) if kind == "ridged" else np.maximum(nodes - PIT_THRESHOLD, 0) ** 2
+        )
+        nodes = ndimage.gaussian_filter(-rounded, KIND_SMOOTHING * NODES_PER_WAVE, mode="wrap")
+        nodes = nodes - nodes.mean()
     coefficients = ndimage.spline_filter(nodes, order=3, mode="grid-wrap")
     # The spline's own slope and wavelength on a plane, in lattice cells.
     return turn, coefficients, *_plane_statistics(BandField(np.eye(3), coefficients, coefficients), rng)
@@ -271,16 +276,6 @@ def shell_noise(rng: np.random.Generator, nodes: int, shell: Callable[[Array], A
     noise = np.fft.rfftn(rng.standard_normal((nodes,) * 3))
     field = np.fft.irfftn(noise * amplitude, s=(nodes,) * 3, axes=(0, 1, 2))
     return np.asarray(field / field.std())
-
-
-def _shaped(g: Array, kind: str) -> Array:
-    """Turn a gaussian field into crests and grooves, or into pits."""
-    # Imported here: slow to load, and smooth scenes have no relief.
-    from scipy import ndimage
-
-    shaped = -np.sqrt(g**2 + RIDGE_ROUNDING**2) if kind == "ridged" else -(np.maximum(g - PIT_THRESHOLD, 0) ** 2)
-    shaped = ndimage.gaussian_filter(shaped, KIND_SMOOTHING * NODES_PER_WAVE, mode="wrap")
-    return np.asarray(shaped - shaped.mean())
 
 
 def _plane_statistics(field: BandField, rng: np.random.Generator) -> tuple[float, float]:

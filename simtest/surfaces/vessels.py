@@ -271,10 +271,7 @@ def _quadric(surface: Quadric) -> PatternPatch:
             kept = rng.uniform(0, steepest, 2 * count) < secant
             rows.append(np.stack([x[kept], y[kept]], axis=1))
             drawn += int(kept.sum())
-        x, y = np.concatenate(rows)[:count].T
-        normal = np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1)
-        points = np.stack([x, y, -(k1 * x**2 + k2 * y**2) / 2], axis=1)
-        return points, unit(normal)
+        return surface.over(*np.concatenate(rows)[:count].T)
 
     # The area by a midpoint rule.
     side = (np.arange(200) + 0.5) / 100 * half - half
