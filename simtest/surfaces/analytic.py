@@ -22,7 +22,7 @@ from simtest.surfaces.model import (
     TriangleMesh,
     implicit_shape_operator,
     pack_points,
-)  # fmt: skip
+)
 
 PLANE_REACH = 1000.0
 """Half-size of the rendered plane over the anchor's distance: beyond the view even at grazing tilt."""
@@ -300,11 +300,14 @@ class Quadric(_Analytic):
     def mesh(self) -> TriangleMesh:
         """A grid with the exact vertex normals."""
         side = np.linspace(-self._reach, self._reach, QUADRIC_CELLS + 1)
-        x, y = (grid.ravel() for grid in np.meshgrid(side, side))
-        k1, k2, _ = self.curvatures
-        vertices = np.stack([x, y, -(k1 * x**2 + k2 * y**2) / 2], axis=1)
-        normals = unit(np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1))
+        vertices, normals = self.over(*(grid.ravel() for grid in np.meshgrid(side, side)))
         return TriangleMesh(vertices, grid_faces(QUADRIC_CELLS, QUADRIC_CELLS), normals)
+
+    def over(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Return points and unit normals, shape (N, 3), of the graph over x and y."""
+        k1, k2, _ = self.curvatures
+        points = np.stack([x, y, -(k1 * x**2 + k2 * y**2) / 2], axis=1)
+        return points, unit(np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1))
 
     def clearance(self, points: Array) -> Array:
         """Return F/|grad F| of F = z + (k1 x^2 + k2 y^2)/2 (see `SurfaceModel.clearance`)."""

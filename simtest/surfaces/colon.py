@@ -4,12 +4,12 @@ import math
 from hashlib import blake2b
 
 import numpy as np
+from numpy.random import Generator
 
 from simtest.errors import InputError
 from simtest.geometry.vectors import unit
 from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
 from simtest.surfaces.model import RayHits, TriangleMesh, in_rows, remembered
-from simtest.surfaces.poses import Generator, lumen_pose
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.triangles import (
     MeshedSurface,
@@ -94,12 +94,6 @@ class Colon(MeshedSurface):
         u, v = recipe.length_mm * rng.uniform(0.2, 0.8, count), rng.uniform(0, 2 * math.pi, count)
         radial = 0.6 * np.sqrt(rng.random(count)) * self.tube.radius(u, v).value
         return self.tube.centreline(u) + radial[:, None] * self.tube.frame(u, v)[1]
-
-
-def make_colon(recipe: ColonRecipe, viewpoint: int) -> Colon:
-    """Return a colon with a camera at the pose numbered by `viewpoint`."""
-    colon = build(recipe)
-    return colon.posed(lumen_pose(recipe.type, viewpoint, colon.sites, colon.clearance, colon.probe.cast))
 
 
 @remembered

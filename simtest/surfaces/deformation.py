@@ -7,9 +7,8 @@ operators follow from these.
 """
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +24,7 @@ from simtest.surfaces.model import (
     SurfacePoints,
     TriangleMesh,
     implicit_shape_operator,
+    in_rows,
     pack_points,
     shape_operator,
 )
@@ -56,23 +56,19 @@ def carry(jets: Jet, gradient: Array, hessian: Array) -> tuple[Array, Array]:
     return g, np.asarray(K @ bent @ np.swapaxes(K, 1, 2))
 
 
-class _Part(ABC):
-    """A displacement at one moment, followed by a rigid turn about `centre`."""
+@dataclass(frozen=True)
+class _Part:
+    """A displacement u at one moment, followed by a rigid turn about `centre`."""
 
-    turn: Array = np.eye(3)
-    centre: Array = np.zeros(3)
-
-    @abstractmethod
-    def displacement(self, X: Jet) -> Jet:
-        """Return u."""
+    displacement: Callable[[Jet], Jet]
+    turn: Array = field(default_factory=lambda: np.eye(3))
+    centre: Array = field(default_factory=lambda: np.zeros(3))
+    # Which points, shape (N, 3), it moves by more than rounding; None: it may move all
+    near: Callable[[Array], Mask] | None = None
 
     def moved(self, X: Jet) -> Jet:
         """Return where points go."""
         return (X + self.displacement(X)).affine(1.0, -self.centre).linear(self.turn, self.centre)
-
-    def near(self, points: Array) -> Mask | None:
-        """Return which points, shape (N, 3), the part moves by more than rounding; None: it may move all."""
-        return None
 
     def at_rest(self, points: Array) -> Array:
         """Invert: Newton's method, with fixed-point steps where it does not contract as these do."""
@@ -104,93 +100,70 @@ class _Part(ABC):
         return X
 
 
-class _Contraction(_Part):
-    """Peristalsis: u = -a w(z) r exp((1 - |r|^2/R^2)/2), a = A/R, r = P (X - c) the part across the axis."""
+def _contraction(spec: Peristalsis, time_s: float) -> _Part:
+    """Return peristalsis: u = -a w(z) r exp((1 - |r|^2/R^2)/2), a = A/R, r the part of X - c across the axis."""
+    axis, R2 = unit(spec.axis), spec.radius_mm**2
+    across = np.eye(3) - np.outer(axis, axis)
 
-    def __init__(self, spec: Peristalsis, time_s: float) -> None:
-        self._axis, self._origin = unit(spec.axis), np.array(spec.centre_mm)
-        self._across = np.eye(3) - np.outer(self._axis, self._axis)
-        self._a, self._R2 = spec.amplitude_mm / spec.radius_mm, spec.radius_mm**2
-        self._k, self._cycle = 2 * math.pi / spec.wavelength_mm, 2 * math.pi * spec.cycles(time_s)
+    def displacement(X: Jet) -> Jet:
+        from_centre = X.affine(1.0, -np.array(spec.centre_mm))
+        r = from_centre.linear(across)
+        angle = from_centre.along(axis).affine(2 * math.pi / spec.wavelength_mm, -2 * math.pi * spec.cycles(time_s))
+        g = r.squared().affine(-0.5 / R2, 0.5).exp().affine(-spec.amplitude_mm / spec.radius_mm)
+        return angle.cos().affine(0.5, 0.5) * g * r
 
-    def displacement(self, X: Jet) -> Jet:
-        from_centre = X.affine(1.0, -self._origin)
-        r = from_centre.linear(self._across)
-        w = from_centre.along(self._axis).affine(self._k, -self._cycle).cos().affine(0.5, 0.5)
-        g = r.squared().affine(-0.5 / self._R2, 0.5).exp().affine(-self._a)
-        return w * g * r
+    return _Part(displacement)
 
 
-class _Ring(_Part):
-    """A contraction at one point c of a path: u = -(A/R) r exp((1 - |r|^2/R^2 - z^2/width^2)/2)."""
+def _ring(spec: Contractions, amplitude_mm: float, centre: Array, axis: Array) -> _Part:
+    """Return a contraction at a point of a path: u = -(A/R) r exp((1 - |r|^2/R^2 - z^2/width^2)/2)."""
+    across = np.eye(3) - np.outer(axis, axis)
 
-    def __init__(self, spec: Contractions, amplitude_mm: float, centre: Array, tangent: Array) -> None:
-        self._axis, self._origin = tangent, centre
-        self._across = np.eye(3) - np.outer(tangent, tangent)
-        self._a = amplitude_mm / spec.radius_mm
-        self._R2, self._width2 = spec.radius_mm**2, spec.width_mm**2
-        self._reach = RING_REACH * max(spec.radius_mm, spec.width_mm)
+    def displacement(X: Jet) -> Jet:
+        from_centre = X.affine(1.0, -centre)
+        r, z = from_centre.linear(across), from_centre.along(axis)
+        exponent = r.squared().affine(-0.5 / spec.radius_mm**2) + (z * z).affine(-0.5 / spec.width_mm**2, 0.5)
+        return exponent.exp().affine(-amplitude_mm / spec.radius_mm) * r
 
-    def near(self, points: Array) -> Mask:
-        return np.asarray(np.linalg.norm(points - self._origin, axis=1) < self._reach)
-
-    def displacement(self, X: Jet) -> Jet:
-        from_centre = X.affine(1.0, -self._origin)
-        r, z = from_centre.linear(self._across), from_centre.along(self._axis)
-        exponent = r.squared().affine(-0.5 / self._R2) + (z * z).affine(-0.5 / self._width2, 0.5)
-        return exponent.exp().affine(-self._a) * r
+    reach = RING_REACH * max(spec.radius_mm, spec.width_mm)
+    return _Part(displacement, near=lambda points: np.linalg.norm(points - centre, axis=1) < reach)
 
 
-def _rings(spec: Contractions, time_s: float) -> list[_Part]:
-    """Return the rings that stand on the path at a moment, from its begin to its end."""
+def _rings(spec: Contractions, time_s: float) -> Iterator[_Part]:
+    """Yield the rings that stand on the path at a moment, from its begin to its end."""
+    # Imported here: slow to load, and most deformations need none.
+    from scipy.interpolate import CubicHermiteSpline
+
     nodes = np.array(spec.path_mm)
     at = np.concatenate([[0.0], np.cumsum(spec.chords_mm)])
-    slopes = np.gradient(nodes, at, axis=0)
+    path = CubicHermiteSpline(at, nodes, np.gradient(nodes, at, axis=0))
     length, fade = at[-1], min(spec.spacing_mm, at[-1]) / 2
-    first = spec.cycles(time_s) % 1 * spec.spacing_mm
-    made: list[_Part] = []
-    for s in np.arange(first, length, spec.spacing_mm):
+    for s in np.arange(spec.cycles(time_s) % 1 * spec.spacing_mm, length, spec.spacing_mm):
         share = math.sin(math.pi / 2 * min(1.0, s / fade, (length - s) / fade)) ** 2
-        centre, tangent = _on_curve(at, nodes, slopes, float(s))
-        made.append(_Ring(spec, spec.amplitude_mm * share, centre, tangent))
-    return made
+        yield _ring(spec, spec.amplitude_mm * share, path(s), unit(path(s, 1)))
 
 
-def _on_curve(at: Array, nodes: Array, slopes: Array, s: float) -> tuple[Array, Array]:
-    """Return point and unit tangent of Hermite's cubic through nodes, shape (N, 3), with slopes, at a position s."""
-    i = int(np.clip(np.searchsorted(at, s, side="right") - 1, 0, len(at) - 2))
-    h = at[i + 1] - at[i]
-    t = (s - at[i]) / h
-    near, far, m, n = nodes[i], nodes[i + 1], h * slopes[i], h * slopes[i + 1]
-    point = (1 + 2 * t) * (1 - t) ** 2 * near + t * (1 - t) ** 2 * m + t * t * (3 - 2 * t) * far + t * t * (t - 1) * n
-    change = 6 * t * (1 - t) * (far - near) + (1 - t) * (1 - 3 * t) * m + t * (3 * t - 2) * n
-    return point, unit(change)
+def _breath(spec: Breathing, time_s: float) -> _Part:
+    """Return breathing: u = v A s (1 - warp (1 - cos(k b))/2), then a turn."""
+    share, centre, along = spec.share(time_s), np.array(spec.centre_mm), unit(spec.along)
+    move = spec.amplitude_mm * share * unit(spec.direction)
+
+    def displacement(X: Jet) -> Jet:
+        cosine = X.affine(1.0, -centre).along(along).affine(2 * math.pi / spec.wavelength_mm).cos()
+        return cosine.affine(spec.warp / 2, 1 - spec.warp / 2).outer(move)
+
+    return _Part(displacement, rotation(math.radians(spec.turn_deg) * share * unit(spec.axis)), centre)
 
 
-class _Breath(_Part):
-    """Breathing: u = v A s (1 - warp (1 - cos(k b))/2), then a turn."""
+def _press(spec: Dent, time_s: float) -> _Part:
+    """Return a dent: u = v A s exp(-|X - c|^2/(2 w^2))."""
+    move = spec.amplitude_mm * spec.share(time_s) * unit(spec.direction)
 
-    def __init__(self, spec: Breathing, time_s: float) -> None:
-        share = spec.share(time_s)
-        self._direction, self._amplitude, self._warp = unit(spec.direction), spec.amplitude_mm * share, spec.warp
-        self._along, self._k = unit(spec.along), 2 * math.pi / spec.wavelength_mm
-        self.centre = np.array(spec.centre_mm)
-        self.turn = rotation(math.radians(spec.turn_deg) * share * unit(spec.axis))
+    def displacement(X: Jet) -> Jet:
+        from_centre = X.affine(1.0, -np.array(spec.centre_mm))
+        return from_centre.squared().affine(-0.5 / spec.radius_mm**2).exp().outer(move)
 
-    def displacement(self, X: Jet) -> Jet:
-        cosine = X.affine(1.0, -self.centre).along(self._along).affine(self._k).cos()
-        return cosine.affine(self._warp / 2, 1 - self._warp / 2).outer(self._amplitude * self._direction)
-
-
-class _Press(_Part):
-    """Dent: u = v A s exp(-|X - c|^2/(2 w^2))."""
-
-    def __init__(self, spec: Dent, time_s: float) -> None:
-        self._move = spec.amplitude_mm * spec.share(time_s) * unit(spec.direction)
-        self._origin, self._w2 = np.array(spec.centre_mm), spec.radius_mm**2
-
-    def displacement(self, X: Jet) -> Jet:
-        return X.affine(1.0, -self._origin).squared().affine(-0.5 / self._w2).exp().outer(self._move)
+    return _Part(displacement)
 
 
 class DeformationAt:
@@ -223,7 +196,7 @@ class DeformationAt:
     def at_rest(self, points: Array) -> Array:
         """Return where the points that are now at `points`, shape (N, 3), model frame, mm, are at rest."""
         for part in reversed(self._parts):
-            near = part.near(points)
+            near = part.near and part.near(points)
             if near is None:
                 points = part.at_rest(points)
             elif near.any():
@@ -237,7 +210,7 @@ class DeformationAt:
 
     def _applied(self, X: Jet) -> Jet:
         for part in self._parts:
-            near = part.near(X.value)
+            near = part.near and part.near(X.value)
             if near is None:
                 X = part.moved(X)
             elif near.any():
@@ -248,13 +221,13 @@ class DeformationAt:
 def _parts_of(spec: Deformation, time_s: float) -> list[_Part]:
     match spec:
         case Peristalsis():
-            return [_Contraction(spec, time_s)]
+            return [_contraction(spec, time_s)]
         case Breathing():
-            return [_Breath(spec, time_s)]
+            return [_breath(spec, time_s)]
         case Dent():
-            return [_Press(spec, time_s)]
+            return [_press(spec, time_s)]
         case Contractions():
-            return _rings(spec, time_s)
+            return list(_rings(spec, time_s))
 
 
 NEWTON_STEPS = 12
@@ -281,8 +254,8 @@ class DeformedRelief(ReliefField):
         """Compute the jets of the tissue below the film at deformed points, shape (N, 3), model frame, mm."""
         assert self.deformation is not None
         rest = self.deformation.at_rest(points)
-        own = super().tissue_jets(rest, diffused)
-        return Jet(own.value, *carry(self.deformation.jets(rest), own.gradient, own.hessian))
+        at_rest = super().tissue_jets(rest, diffused)
+        return Jet(at_rest.value, *carry(self.deformation.jets(rest), at_rest.gradient, at_rest.hessian))
 
 
 def stays_in_free_space(rest: SurfaceModel, parts: Sequence[Deformation], time_s: float, point: Array) -> bool:
@@ -363,15 +336,10 @@ class DeformedSurface(SurfaceModel):
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Return the points where rays meet the deformed surface (see `SurfaceModel.points`)."""
         distance = np.where(np.isfinite(hits.distance) & np.isfinite(directions).all(axis=1), hits.distance, np.nan)
-        found = np.flatnonzero(np.isfinite(distance))
-        solved = np.full(len(origins), np.nan)
-        normal, operator = np.full((len(origins), 3), np.nan), np.full((len(origins), 3, 3), np.nan)
-        if len(found):
-            own = replace(hits, distance=distance).rows(found)
-            solved[found], points, jets = self._solve(origins[found], directions[found], own)
-            carried = carry(jets, points.normal_base, shape_operator(points))
-            normal[found], operator[found] = implicit_shape_operator(*carried)
-        return pack_points(origins, directions, solved, normal, operator)
+        hit = np.flatnonzero(np.isfinite(distance))
+        solved, points, jets = self._solve(origins[hit], directions[hit], replace(hits, distance=distance).rows(hit))
+        forms = implicit_shape_operator(*carry(jets, points.normal_base, shape_operator(points)))
+        return pack_points(origins, directions, *in_rows(len(origins), hit, solved, *forms))
 
     def _solve(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, SurfacePoints, Jet]:
         """Return distances along rays, the points at rest that they meet there, and the map at these."""

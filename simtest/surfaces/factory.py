@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
@@ -20,6 +20,9 @@ from simtest.surfaces.analytic import Cylinder, Plane, Quadric, Sphere
 from simtest.surfaces.mesh_file import MESH_SUFFIXES
 from simtest.surfaces.model import CACHES, SurfaceModel, TriangleMesh, principal_curvatures
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
+
+if TYPE_CHECKING:
+    from simtest.surfaces.triangles import MeshedSurface
 
 ANALYTIC: dict[type, Any] = {
     PlaneSurface: Plane,
@@ -83,9 +86,8 @@ def forget_meshes() -> None:
 
 def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
     # Imported here: the mesh libraries are slow to load and analytic scenes do not need them.
-    from simtest.surfaces.colon import make_colon
-    from simtest.surfaces.liver import make_liver
     from simtest.surfaces.mesh_surface import make_mesh_surface
+    from simtest.surfaces.poses import at_viewpoint
 
     suffix = Path(spec.path).suffix.lower()
     if suffix in MESH_SUFFIXES:
@@ -98,9 +100,16 @@ def _make_anatomy(spec: AnatomySurface) -> SurfaceModel:
             f"surface.path = {spec.path!r}: unknown suffix {suffix}; allowed: {allowed}, or a recipe's name"
         )
     recipe = load_recipe(spec.file(), spec.recipe_values)
-    if isinstance(recipe, ColonRecipe):
-        return make_colon(recipe, spec.viewpoint)
-    return make_liver(recipe, spec.viewpoint)
+    return at_viewpoint(_build(recipe), recipe.type, spec.viewpoint)
+
+
+def _build(recipe: ColonRecipe | LiverRecipe, edge_mm: float | None = None) -> "MeshedSurface":
+    from simtest.surfaces import colon, liver
+
+    build: Any = colon.build if isinstance(recipe, ColonRecipe) else liver.build
+    # Not with None, by which the cache would not find it again.
+    surface: MeshedSurface = build(recipe) if edge_mm is None else build(recipe, edge_mm)
+    return surface
 
 
 def make_mesh(recipe: ColonRecipe | LiverRecipe, edge_mm: float | None = None) -> tuple[TriangleMesh, Array, Array]:
@@ -119,9 +128,7 @@ def make_mesh(recipe: ColonRecipe | LiverRecipe, edge_mm: float | None = None) -
     k_min, k_max : ndarray, shape (V,)
         Exact principal curvatures at the vertices, 1/mm.
     """
-    from simtest.surfaces import colon, liver
-
     if edge_mm is not None and not 0.01 <= edge_mm <= 20:
         raise InputError(f"edge_mm = {edge_mm:g}: must be 0.01 to 20 mm")
-    build = colon.build(recipe, edge_mm) if isinstance(recipe, ColonRecipe) else liver.build(recipe, edge_mm)
-    return build.mesh, *principal_curvatures(build.vertex_shape_operators())
+    surface = _build(recipe, edge_mm)
+    return surface.mesh, *principal_curvatures(surface.vertex_shape_operators())

@@ -59,9 +59,9 @@ class RoundCones:
 
 def round_cones(instruments: Mapping[int, Instrument], tips: Mapping[int, Array]) -> RoundCones:
     """Return the shape of instruments, camera frame, whose tips, shape (3,), mm, are given; both by index."""
-    made = [(index, *part) for index, one in instruments.items() for part in _parts(one, tips[index])]
-    starts, ends, radii = (np.array([part[k] for part in made], dtype=float) for k in (1, 2, 3))
-    return RoundCones(starts, ends, radii, np.array([part[0] for part in made], dtype=np.int64))
+    parts = [(index, *part) for index, one in instruments.items() for part in _parts(one, tips[index])]
+    starts, ends, radii = (np.array([part[k] for part in parts], dtype=float) for k in (1, 2, 3))
+    return RoundCones(starts, ends, radii, np.array([part[0] for part in parts], dtype=np.int64))
 
 
 Part = tuple[Array, Array, tuple[float, float]]

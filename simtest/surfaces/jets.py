@@ -1,5 +1,6 @@
 """Functions with their first two derivatives: sums, products and chains of them, for any number of variables."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -65,12 +66,12 @@ class Jet:
 
     def linear(self, matrix: Array, shift: Array | float = 0.0) -> "Jet":
         """Return M f + shift of a vector f, from M of shape (3, 3)."""
-        value, *derivatives = ((matrix @ part.reshape(len(part), 3, -1)).reshape(part.shape) for part in self.parts)
+        value, *derivatives = ((matrix @ _flat(part)).reshape(part.shape) for part in self.parts)
         return Jet(value + shift, *derivatives)
 
     def along(self, axis: Array) -> "Jet":
         """Return the component of a vector along a fixed one, shape (3,)."""
-        return self.each(lambda part: (axis @ part.reshape(len(part), 3, -1)).reshape(len(part), *part.shape[2:]))
+        return self.each(lambda part: (axis @ _flat(part)).reshape(len(part), *part.shape[2:]))
 
     def outer(self, axis: Array) -> "Jet":
         """Return a scalar times a fixed vector, shape (3,)."""
@@ -117,3 +118,8 @@ class Jet:
         """Return the cosine of a scalar."""
         cosine = np.cos(self.value)
         return self.chain(cosine, -np.sin(self.value), -cosine)
+
+
+def _flat(part: Array) -> Array:
+    """Return vectors, or derivatives of such, as matrices, shape (N, 3, M)."""
+    return part.reshape(len(part), 3, math.prod(part.shape[2:]))

@@ -24,7 +24,6 @@ from simtest.runtime.arrays import Array, IntArray, Mask, kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows, remembered
-from simtest.surfaces.poses import organ_pose
 from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
 from simtest.surfaces.triangles import MeshedSurface, face_edges, halve, rough_edges
 
@@ -168,8 +167,8 @@ class Body:
         rest = self._face(points)[1]
         steepest = np.linalg.norm(rest, axis=1) + radius / self.recipe.visceral_radius_mm
         for centre, A, scale in (*self._lobes, *([self._fossa] if self._fossa else [])):
-            own = scale * (np.linalg.norm((points - centre) @ A, axis=1) + radius * np.linalg.norm(A, 2))
-            steepest = np.maximum(steepest, own)
+            slope = scale * (np.linalg.norm((points - centre) @ A, axis=1) + radius * np.linalg.norm(A, 2))
+            steepest = np.maximum(steepest, slope)
         return np.asarray(steepest + self.recipe.relief_mm * np.linalg.norm(self._waves, axis=1).sum())
 
     def evaluate(self, points: Array, second: bool = True) -> Jet:
@@ -206,7 +205,7 @@ class Body:
 
     def solve(self, origins: Array, directions: Array, distance: Array) -> Array:
         """Solve F(origin + t direction) = 0 by Newton's method from a `distance` close by; NaN without solution."""
-        t, found = distance.copy(), np.zeros(len(distance), dtype=bool)
+        t, solved = distance.copy(), np.zeros(len(distance), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
         for _ in range(NEWTON_STEPS):
             at = self.evaluate(origins[active] + t[active, None] * directions[active], second=False)
@@ -217,11 +216,11 @@ class Body:
             step = np.clip(-at.value / slope, -0.5 * MAX_SHIFT_MM, 0.5 * MAX_SHIFT_MM)
             t[active] += step
             done = np.abs(step) < NEWTON_TOLERANCE_MM
-            found[active[done]] = True
+            solved[active[done]] = True
             active = active[~done & (np.abs(t[active] - distance[active]) <= MAX_SHIFT_MM)]
             if not active.size:
                 break
-        return np.where(found, t, np.nan)
+        return np.where(solved, t, np.nan)
 
 
 def _lobe(lobe: LiverLobe | LiverFossa) -> tuple[Array, Array, float]:
@@ -262,13 +261,6 @@ class Liver(MeshedSurface):
     def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Return exact distances (see `MeshedSurface.distances_at_hits`)."""
         return self.body.solve(origins, directions, hits.distance)
-
-
-def make_liver(recipe: LiverRecipe, viewpoint: int) -> Liver:
-    """Return a liver with a camera at the pose numbered by `viewpoint`."""
-    liver = build(recipe)
-    probe = liver.probe
-    return liver.posed(organ_pose(recipe.type, viewpoint, probe.targets, liver.clearance, probe.cast))
 
 
 @remembered

@@ -71,11 +71,11 @@ class MeshCheck:
     @property
     def problems(self) -> list[str]:
         """Faults that are not repaired, worst first."""
-        found, problems = self.condition, []
-        if found.crossing_faces:
-            problems.append(f"{found.crossing_faces} faces cut through others: normals around them mean nothing")
-        if found.non_manifold_edges:
-            problems.append(f"{found.non_manifold_edges} edges belong to more than two faces: cannot be refined")
+        condition, problems = self.condition, []
+        if condition.crossing_faces:
+            problems.append(f"{condition.crossing_faces} faces cut through others: normals around them mean nothing")
+        if condition.non_manifold_edges:
+            problems.append(f"{condition.non_manifold_edges} edges belong to more than two faces: cannot be refined")
         if self.other_unit:
             problems.append(f"lengths are taken as mm; by its extent the file may be in {self.other_unit}")
         return problems
@@ -100,20 +100,20 @@ class MeshCheck:
         return (f"{label:<12}{text}" for label, text in self._rows())
 
     def _rows(self) -> Iterator[tuple[str, str]]:
-        found, size = self.condition, " x ".join(f"{extent:.4g}" for extent in self.extents_mm)
+        condition, size = self.condition, " x ".join(f"{extent:.4g}" for extent in self.extents_mm)
         yield "file", self.file
         yield "size", f"{self.vertices} vertices, {self.faces} faces, {size} mm"
         yield "taken for", self.side
         if self.doubt:
             yield "doubt", self.doubt
-        yield "pieces", f"{found.pieces}"
-        if found.watertight:
+        yield "pieces", f"{condition.pieces}"
+        if condition.watertight:
             yield "surface", "watertight"
-        elif found.open_edges:
-            yield "surface", f"open: {found.open_edges} edges at its rims"
-        if found.crossing_faces is None:
+        elif condition.open_edges:
+            yield "surface", f"open: {condition.open_edges} edges at its rims"
+        if condition.crossing_faces is None:
             yield "crossings", f"not looked for above {MAX_CROSSING_FACES} faces"
-        elif not found.crossing_faces:
+        elif not condition.crossing_faces:
             yield "crossings", "none"
         yield from (("repaired", sentence) for sentence in self.repairs.sentences(self.lumen))
         yield "normals", "computed from the triangles; those of a file are not used"
@@ -195,8 +195,7 @@ def _wide_rims(vertices: Array, faces: IntArray) -> int:
 def _fine_share(wanted: Array, vertices: Array, faces: IntArray) -> float:
     """Return the share of the area whose edges are at most as long as wanted there; `wanted` at the vertices."""
     # Mean length of the edges at each vertex
-    edges, _ = edge_uses(faces)
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    edges, length = edge_uses(faces)[0], edge_lengths(vertices, faces)
     count = np.bincount(edges.ravel(), minlength=len(vertices))
     mean = np.bincount(edges.ravel(), np.repeat(length, 2), len(vertices)) / count
     weight = vertex_areas(vertices, faces)

@@ -81,11 +81,11 @@ def check_ply(path: Path, size: int) -> tuple[int, int]:
     """
     where = str(path)
     order, elements, start = read_header(path)
-    found = {element.name: element for element in elements}
+    by_name = {element.name: element for element in elements}
     for name in ("vertex", "face"):
-        if name not in found:
+        if name not in by_name:
             raise InputError(f"{where}: its header has no element {name}; a mesh has vertices and faces")
-    vertex, face = found["vertex"], found["face"]
+    vertex, face = by_name["vertex"], by_name["face"]
     for needed in "xyz":
         if needed not in vertex.properties:
             raise InputError(f"{where}: its vertices have no property {needed}; they need x, y and z")
@@ -182,8 +182,8 @@ def _fans(data: mmap, begins: IntArray, counts: IntArray, corner: np.dtype) -> I
     """Cut polygons into triangles that share the first corner."""
     octets, parts = np.frombuffer(data, np.uint8), []
     for count in np.unique(counts[counts >= 3]):
-        own = begins[counts == count]
-        raw = octets[own[:, None] + np.arange(count * corner.itemsize)]
+        starts = begins[counts == count]
+        raw = octets[starts[:, None] + np.arange(count * corner.itemsize)]
         polygons = raw.reshape(-1).view(corner).reshape(-1, count).astype(np.int64)
         parts += [polygons[:, [0, k, k + 1]] for k in range(1, count - 1)]
     return np.concatenate(parts)
@@ -295,16 +295,11 @@ def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
     # Pieces of negative volume are inside out.
     outward = np.where((volume[piece] < 0)[:, None], oriented[:, ::-1], oriented)
     # A face and its reverse differ by an odd permutation: compare the corner that follows the smallest.
-    inward = np.bincount(piece, _follower(faces) != _follower(outward), count)
+    given, now = (np.take_along_axis(f, (f.argmin(axis=1)[:, None] + 1) % 3, axis=1)[:, 0] for f in (faces, outward))
+    inward = np.bincount(piece, given != now, count)
     turned = inward > size / 2
     against = np.where(turned, size - inward, inward).sum()
     return np.ascontiguousarray(outward, dtype=np.int64), int(against), int(turned.sum())
-
-
-def _follower(faces: IntArray) -> IntArray:
-    """Return the corner that comes after the smallest one in each face, shape (F,)."""
-    after = (np.argmin(faces, axis=1) + 1) % 3
-    return faces[np.arange(len(faces)), after]
 
 
 def examine(vertices: Array, faces: IntArray, crossings: bool = True) -> Condition:
@@ -317,8 +312,8 @@ def examine(vertices: Array, faces: IntArray, crossings: bool = True) -> Conditi
     pieces = int(np.max(igl.vertex_components(faces))) + 1
     crossing = None
     if crossings and len(faces) <= MAX_CROSSING_FACES:
-        found, pairs, _ = predicates.find_self_intersections(vertices, faces)
-        crossing = len(np.unique(pairs)) if found else 0
+        crossed, pairs, _ = predicates.find_self_intersections(vertices, faces)
+        crossing = len(np.unique(pairs)) if crossed else 0
     return Condition(pieces, int((uses == 1).sum()), int((uses > 2).sum()), crossing)
 
 
@@ -378,7 +373,7 @@ def read_mesh(path: str | Path) -> tuple[Array, IntArray, Repairs]:
         raise
     except Exception as error:
         # The readers raise whatever their parser runs into; the file is at fault, not the program.
-        raise InputError(f"{path}: not a readable {suffix[1:].upper()} mesh ({_told(error)})") from error
+        raise InputError(f"{path}: not a readable {suffix[1:].upper()} mesh ({_reason(error)})") from error
     # Its reader says nothing of lines that are missing.
     held = (len(vertices), len(faces))
     if held[0] < announced[0] or held[1] < announced[1]:
@@ -578,7 +573,7 @@ def _check_arrays(path: Path, vertices: Array, faces: IntArray) -> None:
         )
 
 
-def _told(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """Return what a reader ran into; a fault of its own, such as an index out of range, says nothing to a user."""
     lines = str(error).strip().splitlines()
     if isinstance(error, IndexError | KeyError | TypeError | AttributeError | AssertionError) or not lines:

@@ -18,7 +18,7 @@ from simtest.runtime.resources import find
 from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import MESH_SUFFIXES, Repairs, examine, other_unit, read_mesh
 from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures, remembered
-from simtest.surfaces.poses import lumen_pose, nearest_mm, organ_pose
+from simtest.surfaces.poses import at_viewpoint, nearest_mm
 from simtest.surfaces.triangles import (
     MeshedSurface,
     area_quantile,
@@ -356,12 +356,7 @@ def make_mesh_surface(spec: AnatomySurface) -> MeshSurface:
     path = find(spec.path, "meshes", suffixes=MESH_SUFFIXES)
     surface = prepare(path, spec.subdivisions, spec.edge_mm, spec.smoothing_mm, spec.kind)
     _check_relief(spec, surface.shortest_mm)
-    probe = surface.probe
-    if surface.lumen:
-        pose = lumen_pose(spec.label, spec.viewpoint, probe.sites, probe.clearance, probe.cast)
-    else:
-        pose = organ_pose(spec.label, spec.viewpoint, probe.targets, probe.clearance, probe.cast)
-    return surface.posed(pose)
+    return at_viewpoint(surface, spec.label, spec.viewpoint)
 
 
 def _check_relief(spec: AnatomySurface, shortest_mm: float) -> None:

@@ -1,16 +1,16 @@
 """Camera poses by number, and along a path through a lumen; never in tissue.
 
-The same label and number give the same pose. The surface is passed as callables, so that generated anatomies and a
-user's mesh share the two pose functions. For a path the inside of the lumen is sampled on a grid; it joins the two
+The same label and number give the same pose. For a path the inside of the lumen is sampled on a grid; it joins the two
 cells that are farthest apart, by the route that keeps farthest from the wall, and is then smoothed.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import igl
 import numpy as np
+from numpy.random import Generator
 from scipy import ndimage, sparse
 
 from simtest.errors import InputError
@@ -19,7 +19,7 @@ from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.model import SurfaceModel, TriangleMesh, remembered
-from simtest.surfaces.triangles import MIN_CLEARANCE_MM, Generator, MeshProbe
+from simtest.surfaces.triangles import MIN_CLEARANCE_MM, MeshedSurface, MeshProbe
 
 CLEARANCE_SHARE = 0.6
 """In a narrower lumen: share of the largest clearance found."""
@@ -37,8 +37,7 @@ ORGAN_TILT_DEG = 25.0
 _DIRECTIONS = 64
 _TARGETS = 64
 
-Clearance = Callable[[Array], Array]
-Cast = Callable[[Array, Array], Array]
+Surface = TypeVar("Surface", bound=MeshedSurface)
 
 
 def nearest_mm(lumen: bool) -> float:
@@ -46,21 +45,22 @@ def nearest_mm(lumen: bool) -> float:
     return (AXIS_RANGE_MM if lumen else ORGAN_RANGE_MM)[0]
 
 
-def lumen_pose(
-    label: str, viewpoint: int, sites: Callable[[Generator], Array], clearance: Clearance, cast: Cast
-) -> Array:
+def at_viewpoint(surface: Surface, label: str, viewpoint: int) -> Surface:
+    """Return a surface with a camera at the pose of a label and number: inside a shell, outside what is solid."""
+    return surface.posed((organ_pose if surface.solid else lumen_pose)(label, viewpoint, surface))
+
+
+def lumen_pose(label: str, viewpoint: int, surface: MeshedSurface) -> Array:
     """Return model_from_camera, shape (4, 4), of a camera inside a lumen, at the pose of a label and number.
 
     The site keeps `MIN_CLEARANCE_MM` or, in a narrow lumen, `CLEARANCE_SHARE` of the largest clearance found. The
     direction is random among those whose axis meets the wall within `AXIS_RANGE_MM`; if there are none, the one whose
-    axis meets it closest to that range. `sites` draws candidates, shape (N, 3); `clearance` is their signed distance to
-    the wall, positive in the lumen; `cast` the distance along rays to the wall, inf if there is none; all in mm. Raises
-    `InputError` if no candidate lies in the lumen.
+    axis meets it closest to that range. Raises `InputError` if no candidate lies in the lumen.
     """
     rng = generator(0, "viewpoint", label, viewpoint, Stage.VIEWPOINT)
     # site
-    candidates = sites(rng)
-    room = clearance(candidates)
+    candidates = surface.sites(rng)
+    room = surface.clearance(candidates)
     if not room.max() > 0:
         raise InputError(f"{label}: viewpoint {viewpoint}: no free place for the camera; kind lumen needs a cavity")
     allowed = np.flatnonzero(room >= min(MIN_CLEARANCE_MM, CLEARANCE_SHARE * float(room.max())))
@@ -68,33 +68,26 @@ def lumen_pose(
     site = candidates[rng.choice(allowed, p=room[allowed] / room[allowed].sum())]
     # direction
     directions = unit(rng.normal(size=(_DIRECTIONS, 3)))
-    distance = cast(np.broadcast_to(site, directions.shape), directions)
+    distance = surface.probe.cast(np.broadcast_to(site, directions.shape), directions)
     low, high = AXIS_RANGE_MM
     outside = np.maximum(np.maximum(low - distance, distance - high), 0.0)
     return _pose(site, directions[int(np.argmin(outside))], rng)  # argmin: the first in range
 
 
-def organ_pose(
-    label: str,
-    viewpoint: int,
-    targets: Callable[[Generator, int], tuple[Array, Array]],
-    clearance: Clearance,
-    cast: Cast,
-) -> Array:
+def organ_pose(label: str, viewpoint: int, surface: MeshedSurface) -> Array:
     """Return model_from_camera, shape (4, 4), of a camera outside an organ, looking at a random point of it.
 
     The distance is random in `ORGAN_RANGE_MM`, the sightline within `ORGAN_TILT_DEG` of the normal and free of
-    obstacles. `targets` draws surface points and outward unit normals; for the rest see `lumen_pose`. Raises
-    `InputError` if no drawn point can be seen from such a position.
+    obstacles. Raises `InputError` if no drawn point can be seen from such a position.
     """
     rng = generator(0, "viewpoint", label, viewpoint, Stage.VIEWPOINT)
     # candidates
-    points, normals = targets(rng, _TARGETS)
+    points, normals = surface.probe.targets(rng, _TARGETS)
     away = _cap(normals, math.radians(ORGAN_TILT_DEG), rng)
     distance = rng.uniform(*ORGAN_RANGE_MM, size=_TARGETS)
     cameras = points + distance[:, None] * away
     # A hit well before the target means that something else is in the way.
-    free = (clearance(cameras) > 0) & (cast(cameras, -away) > distance - 0.5)
+    free = (surface.clearance(cameras) > 0) & (surface.probe.cast(cameras, -away) > distance - 0.5)
     if not free.any():
         raise InputError(f"{label}: viewpoint {viewpoint}: no free view of the surface found; kind organ needs one")
     chosen = int(np.argmax(free))  # the first

@@ -127,10 +127,18 @@ class LiverRecipe(Spec):
         return self
 
 
+RECIPES: dict[str, type[ColonRecipe] | type[LiverRecipe]] = {"colon": ColonRecipe, "liver": LiverRecipe}
+
+
 def load_recipe(path: str | Path, settings: Mapping[str, Any] | None = None) -> ColonRecipe | LiverRecipe:
     """Read a recipe, whose ``type`` is colon or liver; `settings` by key path or as tables replace its values."""
     path, values = Path(path), dict(_flat(settings or {}))
-    return recipe_from_dict(apply_settings(read_toml(path), values, str(path)), source_name(path, values))
+    data, where = apply_settings(read_toml(path), values, str(path)), source_name(path, values)
+    kind = data.get("type")
+    if kind not in list(RECIPES):
+        got = f"type = {kind!r}" if "type" in data else "type: missing"
+        raise InputError(f"{where}: {got}; allowed: {', '.join(RECIPES)}")
+    return validate(RECIPES[kind], data, where)
 
 
 def _flat(tables: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
@@ -140,17 +148,6 @@ def _flat(tables: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any
             yield from _flat(value, f"{above}{key}.")
         else:
             yield f"{above}{key}", value
-
-
-def recipe_from_dict(data: Mapping[str, Any], where: str) -> ColonRecipe | LiverRecipe:
-    """Validate a recipe given as nested tables; `where` names the file in the `InputError` if it is malformed."""
-    kind = data.get("type")
-    if kind == "colon":
-        return validate(ColonRecipe, data, where)
-    if kind == "liver":
-        return validate(LiverRecipe, data, where)
-    got = f"type = {kind!r}" if "type" in data else "type: missing"
-    raise InputError(f"{where}: {got}; allowed: colon, liver")
 
 
 def load_anatomy(

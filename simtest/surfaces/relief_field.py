@@ -140,15 +140,15 @@ class ReliefField:
         base tangent t is ((1 + N.G) S + N (G^T S + N^T H) - H) t / |m|, across n, with the base's S and the height's
         Hessian H. Curvatures are eigenvalues of its symmetric part on the surface that the relief makes.
         """
-        found = np.flatnonzero(points.valid)
-        if not len(found):
+        valid = np.flatnonzero(points.valid)
+        if not len(valid):
             return points
-        tissue = self.tissue_jets(points.position[found])
-        fine = fine_curvatures(points.normal[found], shape_operator(points)[found], self.fill(tissue))
+        tissue = self.tissue_jets(points.position[valid])
+        fine = fine_curvatures(points.normal[valid], shape_operator(points)[valid], self.fill(tissue))
         names = ("normal", "k_min", "k_max", "direction_min", "direction_max")
-        changed: dict[str, Any] = dict(zip(names, in_rows(len(points.valid), found, *fine), strict=True))
+        changed: dict[str, Any] = dict(zip(names, in_rows(len(points.valid), valid, *fine), strict=True))
         pool = np.zeros(len(points.valid), dtype=bool)
-        pool[found] = False if self.level is None else tissue.value < self.level
+        pool[valid] = False if self.level is None else tissue.value < self.level
         return replace(points, **changed, pool=pool)
 
 
@@ -205,8 +205,8 @@ def _packed(field: ReliefField) -> dict[str, AnyArray]:
 def _drawn(spec: Relief) -> ReliefField:
     """Draw the bands of a relief."""
     branches = np.random.SeedSequence(spec.seed).spawn(len(spec.bands))
-    bands = tuple(_make_band(band, branch, spec.diffusion_mm)
-                  for band, branch in zip(spec.bands, branches, strict=True))  # fmt: skip
+    pairs = zip(spec.bands, branches, strict=True)
+    bands = tuple(_make_band(band, branch, spec.diffusion_mm) for band, branch in pairs)
     # Bands are independent, and each has mean 0.
     deviation = float(np.sqrt(sum(np.var(_node_values(band.coefficients)) for band in bands)))
     whole = sum(band.slope_deg**2 for band in spec.bands)
@@ -214,20 +214,12 @@ def _drawn(spec: Relief) -> ReliefField:
     return ReliefField(bands, deviation, min(felt))
 
 
-@dataclass(frozen=True)
-class _Unscaled:
-    """A band before its slope and wavelength are set."""
-
-    turn: Array  # (3, 3): of the lattice
-    coefficients: Array  # (NODES, NODES, NODES): of the B-splines
-    # slope, wave: What `_plane_statistics` measures
-    slope: float
-    wave: float
-
-
 @remembered
-def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...]) -> _Unscaled:
-    """Draw a band from a branch of the relief's seed; reliefs of one seed differ in their scales alone."""
+def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...]) -> tuple[Array, Array, float, float]:
+    """Draw a band from a branch of the relief's seed; reliefs of one seed differ in their scales alone.
+
+    Returns the turn of its lattice, the coefficients of its B-splines, and its slope and wavelength in cells.
+    """
     # Imported here: slow to load, and smooth scenes have no relief.
     from scipy import ndimage
     from scipy.spatial.transform import Rotation
@@ -240,22 +232,28 @@ def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...])
     k0 = 2 * np.pi / NODES_PER_WAVE * np.sqrt(1.25 * (1 + w**2) / (1 + 6 * w**2 + 3 * w**4))
     nodes = shell_noise(rng, NODES, lambda k: np.exp(-(((k - k0) / (w * k0)) ** 2) / 4))
     if kind != "gaussian":
-        nodes = _shaped(nodes, kind)
+        # Crests and grooves, or pits
+        rounded = (
+            np.sqrt(nodes**2 + RIDGE_ROUNDING**2) if kind == "ridged" else np.maximum(nodes - PIT_THRESHOLD, 0) ** 2
+        )
+        nodes = ndimage.gaussian_filter(-rounded, KIND_SMOOTHING * NODES_PER_WAVE, mode="wrap")
+        nodes = nodes - nodes.mean()
     coefficients = ndimage.spline_filter(nodes, order=3, mode="grid-wrap")
     # The spline's own slope and wavelength on a plane, in lattice cells.
-    return _Unscaled(turn, coefficients, *_plane_statistics(BandField(np.eye(3), coefficients, coefficients), rng))
+    return turn, coefficients, *_plane_statistics(BandField(np.eye(3), coefficients, coefficients), rng)
 
 
 def _make_band(spec: ReliefBand, branch: np.random.SeedSequence, diffusion_mm: float) -> BandField:
     """Scale a band to the slope and wavelength that are asked for."""
     assert isinstance(branch.entropy, int)
-    drawn = _unscaled(spec.kind, spec.width, branch.entropy, tuple(branch.spawn_key))
+    key = tuple(branch.spawn_key)
+    turn, unscaled, slope, wave = _unscaled(spec.kind, spec.width, branch.entropy, key)
     # Stretch along the direction, so that the wavelength there is longer and the slope lower.
     axis = np.array(spec.direction) / np.linalg.norm(spec.direction)
     stretch = np.eye(3) + (1 / spec.anisotropy - 1) * np.outer(axis, axis)
-    lattice_from_model = (drawn.wave / spec.wavelength_mm) * drawn.turn @ stretch
-    height = np.radians(spec.slope_deg) / drawn.slope * (spec.wavelength_mm / drawn.wave)
-    coefficients = drawn.coefficients * height
+    lattice_from_model = (wave / spec.wavelength_mm) * turn @ stretch
+    height = np.radians(spec.slope_deg) / slope * (spec.wavelength_mm / wave)
+    coefficients = unscaled * height
     return BandField(lattice_from_model, coefficients, _diffused(coefficients, lattice_from_model, diffusion_mm))
 
 
@@ -278,16 +276,6 @@ def shell_noise(rng: np.random.Generator, nodes: int, shell: Callable[[Array], A
     noise = np.fft.rfftn(rng.standard_normal((nodes,) * 3))
     field = np.fft.irfftn(noise * amplitude, s=(nodes,) * 3, axes=(0, 1, 2))
     return np.asarray(field / field.std())
-
-
-def _shaped(g: Array, kind: str) -> Array:
-    """Turn a gaussian field into crests and grooves, or into pits."""
-    # Imported here: slow to load, and smooth scenes have no relief.
-    from scipy import ndimage
-
-    shaped = -np.sqrt(g**2 + RIDGE_ROUNDING**2) if kind == "ridged" else -(np.maximum(g - PIT_THRESHOLD, 0) ** 2)
-    shaped = ndimage.gaussian_filter(shaped, KIND_SMOOTHING * NODES_PER_WAVE, mode="wrap")
-    return np.asarray(shaped - shaped.mean())
 
 
 def _plane_statistics(field: BandField, rng: np.random.Generator) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
+from numpy.random import Generator
 
 from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, IntArray, Mask
@@ -17,22 +18,20 @@ from simtest.surfaces.model import RayHits, Shape, SurfaceModel, SurfacePoints, 
 MIN_CLEARANCE_MM = 5.0
 """A camera in a lumen keeps this distance from the wall if the lumen is wide enough."""
 
-Generator = np.random.Generator
-
 
 def face_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
     """Return the edges of faces, shape (E, 2), smaller vertex first, and their numbers after each corner, (F, 3)."""
     codes, span = _edge_codes(faces)
     # Each edge once, and for each corner which of them it starts
-    found, index = np.unique(codes, return_inverse=True)
-    return np.stack(np.divmod(found, span), axis=1), index.reshape(-1, 3)
+    unique, index = np.unique(codes, return_inverse=True)
+    return np.stack(np.divmod(unique, span), axis=1), index.reshape(-1, 3)
 
 
 def edge_uses(faces: IntArray) -> tuple[IntArray, IntArray]:
     """Return the edges, shape (E, 2), smaller vertex first, and how many faces each belongs to, shape (E,)."""
     codes, span = _edge_codes(faces)
-    found, uses = np.unique(codes, return_counts=True)
-    return np.stack(np.divmod(found, span), axis=1), uses
+    unique, uses = np.unique(codes, return_counts=True)
+    return np.stack(np.divmod(unique, span), axis=1), uses
 
 
 def _edge_codes(faces: IntArray) -> tuple[IntArray, int]:
@@ -75,12 +74,15 @@ def isoperimetric_quotient(vertices: Array, faces: IntArray) -> float:
     return float(36 * np.pi * volume**2 / area**3)
 
 
-def cut_faces(faces: IntArray, middles: IntArray) -> IntArray:
-    """Cut each triangle into 1 to 4, by how many of its edges have a new vertex; the winding is kept.
+def halve(faces: IntArray, index: IntArray, chosen: IntArray, first_vertex: int, edge_count: int) -> IntArray:
+    """Cut faces at the chosen edges, whose middles are the vertices from `first_vertex` on, in the same order.
 
-    `middles`, of the shape (F, 3) of `faces`, holds the new vertex on the edge from each corner to the next; -1 for
-    none.
+    `index` holds the edges' numbers after each corner (see `face_edges`). Each triangle is cut into 1 to 4, by how many
+    of its edges have a new vertex; the winding is kept.
     """
+    added = np.full(edge_count, -1, dtype=np.int64)
+    added[chosen] = first_vertex + np.arange(len(chosen))
+    middles = added[index]
     count = (middles >= 0).sum(axis=1)
     parts = [faces[count == 0]]
     # Rotate the corners of each face: a single halved edge comes first, a single whole edge last.
@@ -121,13 +123,6 @@ def off_between(ends: Array, normals: Array, share: float, limit_deg: float) -> 
     between = unit((1 - share) * ends[:, 0] + share * ends[:, 1])
     # By the chord, which grows with the angle up to 180 deg; a sine would fall again beyond 90.
     return np.asarray(np.linalg.norm(between - normals, axis=1) > 2 * math.sin(math.radians(limit_deg) / 2))
-
-
-def halve(faces: IntArray, index: IntArray, chosen: IntArray, first_vertex: int, edge_count: int) -> IntArray:
-    """Cut faces at the chosen edges, whose middles are the vertices from `first_vertex` on, in the same order."""
-    added = np.full(edge_count, -1, dtype=np.int64)
-    added[chosen] = first_vertex + np.arange(len(chosen))
-    return cut_faces(faces, added[index])
 
 
 class MeshProbe:
@@ -215,9 +210,17 @@ class MeshedSurface(SurfaceModel):
         surface.model_from_camera = model_from_camera
         return surface
 
+    def sites(self, rng: Generator) -> Array:
+        """Draw candidates for a camera in a lumen, shape (N, 3), mm."""
+        return self.probe.sites(rng)
+
     def shape(self) -> Shape:
         """Return the mesh; winding and normals on the camera's side."""
         return Shape("mesh", False, np.eye(4), self.mesh, self.key)
+
+    @abstractmethod
+    def vertex_shape_operators(self) -> Array:
+        """Return S at the mesh's vertices for its normals, 1/mm, shape (V, 3, 3)."""
 
     @abstractmethod
     def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:

@@ -352,7 +352,9 @@ class Tube:
         values = values[:, [0, 2]].reshape(len(self._knots), len(nodes), 2)
         # Chebyshev's basis is well conditioned; powers are quicker to evaluate.
         fitted = np.linalg.solve(np.polynomial.chebyshev.chebvander(nodes, _PANEL_DEGREE), values)
-        powers = np.stack([np.pad(p, (0, len(nodes) - len(p))) for p in map(_powers, np.eye(len(nodes)))])
+        powers = np.stack(
+            [np.pad(p, (0, len(nodes) - len(p))) for p in map(np.polynomial.chebyshev.cheb2poly, np.eye(len(nodes)))]
+        )
         return np.ascontiguousarray(np.einsum("kcx,cp->xpk", fitted, powers))
 
     def slice_of(self, points: Array) -> tuple[Array, Array, Array]:
@@ -451,35 +453,29 @@ class Tube:
 
     def tangents(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return P, mm, P_u and P_v, three arrays of shape (N, 3)."""
-        radius, bend = self.radius(u, v, second=False), self.heading(u)[1]
-        r, (ru, rv) = radius.value[:, None], radius.gradient.T[:, :, None]
-        T, rho, tau = self.frame(u, v)
-        position = self.centreline(u) + r * rho
-        first, second = (1 - bend[:, None] * r * np.cos(v)[:, None]) * T + ru * rho, rv * rho + r * tau
-        if not self._stalks:
-            return position, first, second
-        moved = self._with_stalks(Jet(position, np.stack([first, second], axis=2)))
-        return moved.value, moved.gradient[..., 0], moved.gradient[..., 1]
+        p = self.jet(u, v, second=False)
+        along, around = np.ascontiguousarray(np.moveaxis(p.gradient, 2, 0))
+        return p.value, along, around
 
-    def jet(self, u: Array, v: Array) -> Jet:
+    def jet(self, u: Array, v: Array, second: bool = True) -> Jet:
         """Return P, mm, and its derivatives by the formulas at the head of this module; u, v of shape (N,)."""
-        radius = self.radius(u, v)
-        r, (ru, rv), (ruu, ruv, _, rvv) = radius.value, radius.gradient.T, radius.hessian.reshape(-1, 4).T
-        _, bend, twist = self.heading(u)
-        cv, sv = np.cos(v), np.sin(v)
+        radius = self.radius(u, v, second)
+        r, (ru, rv) = radius.value[:, None], radius.gradient.T[:, :, None]
+        bend, twist = (part[:, None] for part in self.heading(u)[1:])
+        cv, sv = np.cos(v)[:, None], np.sin(v)[:, None]
         T, rho, tau = self.frame(u, v)
-
-        def combine(t: Array, radial: Array, around: Array) -> Array:
-            return t[:, None] * T + radial[:, None] * rho + around[:, None] * tau
-
-        along, zero = 1 - bend * r * cv, np.zeros_like(u)
-        first = [combine(along, ru, zero), combine(zero, rv, r)]
-        uu = combine(-twist * r * cv - 2 * bend * ru * cv, along * bend * cv + ruu, -along * bend * sv)
-        uv = combine(bend * (r * sv - rv * cv), ruv, ru)
-        second = [uu, uv, uv, combine(zero, rvv - r, 2 * rv)]
-        position = self.centreline(u) + r[:, None] * rho
-        wall = Jet(position, np.stack(first, axis=2), np.stack(second, axis=2).reshape(-1, 3, 2, 2))
-        return self._with_stalks(wall)
+        along = 1 - bend * r * cv
+        parts = [self.centreline(u) + r * rho, np.stack([along * T + ru * rho, rv * rho + r * tau], axis=2)]
+        if second:
+            ruu, ruv, _, rvv = radius.hessian.reshape(-1, 4).T[:, :, None]
+            uu = (-twist * r * cv - 2 * bend * ru * cv) * T + (along * bend * cv + ruu) * rho - along * bend * sv * tau
+            uv = bend * (r * sv - rv * cv) * T + ruv * rho + ru * tau
+            vv = (rvv - r) * rho + 2 * rv * tau
+            parts.append(np.stack([uu, uv, uv, vv], axis=2).reshape(-1, 3, 2, 2))
+        wall = Jet(*parts)
+        for stalk in self._stalks:
+            wall = stalk.apply(wall)
+        return wall
 
     @property
     def has_stalks(self) -> bool:
@@ -492,12 +488,6 @@ class Tube:
         for stalk in self._stalks:
             moved |= stalk.moves(points)
         return moved
-
-    def _with_stalks(self, wall: Jet) -> Jet:
-        """Apply the pedunculated polyps."""
-        for stalk in self._stalks:
-            wall = stalk.apply(wall)
-        return wall
 
     def normal_and_shape_operator(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Return the unit normal into the lumen, shape (N, 3), and S, 1/mm, shape (N, 3, 3), at u, v of shape (N,)."""
@@ -520,7 +510,7 @@ class Tube:
     ) -> tuple[Array, Array, Array]:
         """Solve P(u, v) = origin + t direction by Newton's method from a start close by; return t, NaN: none, u, v."""
         u, v, t = u.copy(), v.copy(), distance.copy()
-        found = np.zeros(len(u), dtype=bool)
+        solved = np.zeros(len(u), dtype=bool)
         active = np.flatnonzero(np.isfinite(distance))
         for _ in range(NEWTON_STEPS):
             p, pu, pv = self.tangents(u[active], v[active])
@@ -532,7 +522,7 @@ class Tube:
                 inverse = 1.0 / _dot(pu, minor)
                 du, dv, dt = (_dot(miss, m) * inverse for m in (minor, np.cross(towards, pu), np.cross(pu, pv)))
             done = _dot(miss, miss) < NEWTON_TOLERANCE_MM**2
-            found[active[done]] = True
+            solved[active[done]] = True
             # A grazing ray has a nearly singular matrix: bound the step to the mesh's neighbourhood.
             scale = np.minimum(1.0, MAX_SHIFT_MM / np.maximum(np.abs(dt), np.finfo(float).tiny))
             scale[done] = 0.0
@@ -544,15 +534,10 @@ class Tube:
             if not active.size:
                 break
         inside = (u >= -1.0) & (u <= self.recipe.length_mm + 1.0)
-        return np.where(found & inside, t, np.nan), u, v
+        return np.where(solved & inside, t, np.nan), u, v
 
 
 def _dot(a: Array, b: Array) -> Array:
     """Return the dot products of vectors, shape (N,), added in order."""
     product = a * b
     return np.asarray(product[:, 0] + product[:, 1] + product[:, 2])
-
-
-def _powers(chebyshev: Array) -> Array:
-    """Return the coefficients of powers, the lowest first, of a series of Chebyshev polynomials."""
-    return np.asarray(np.polynomial.chebyshev.cheb2poly(chebyshev))

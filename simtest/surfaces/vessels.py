@@ -85,15 +85,15 @@ class SegmentTable:
         points = self.mirrored(points)
         slot = self.slots(points)
         first, last = self.first[slot], self.first[slot + 1]
-        found = np.zeros((len(points), 2))
+        longest = np.zeros((len(points), 2))
         active = np.flatnonzero(last > first)
         row = first.astype(np.int64)
         while len(active):
             chord, vein = _chord(points[active], self.rows[row[active]].astype(np.float64))
-            found[active, vein] = np.maximum(found[active, vein], chord)
+            longest[active, vein] = np.maximum(longest[active, vein], chord)
             row[active] += 1
             active = active[row[active] < last[active]]
-        return found
+        return longest
 
 
 NO_VESSELS = SegmentTable(1.0, np.zeros(3, dtype=np.uint32), np.zeros((1, 8), dtype=np.float32))
@@ -127,7 +127,10 @@ def make_table(segments: "VesselSegments", blur_mm: float, half_mm: Array) -> Se
     if not len(width):
         return NO_VESSELS
     cell_mm = CELL_PER_WIDTH * float(np.median(width))
-    owner, cell = _cells(segments, width, cell_mm)
+    parts = [
+        _cells(segments, width, cell_mm, slice(start, start + SEGMENTS)) for start in range(0, len(width), SEGMENTS)
+    ]
+    owner, cell = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     slots = 1 << max(1, math.ceil(math.log2(len(owner) / LOAD)))
     slot = _hash(cell) & (slots - 1)
     first = np.zeros(slots + 1, dtype=np.uint32)
@@ -137,17 +140,9 @@ def make_table(segments: "VesselSegments", blur_mm: float, half_mm: Array) -> Se
     return SegmentTable(cell_mm, first, sorted_rows, half_mm)
 
 
-def _cells(segments: "VesselSegments", width: Array, cell_mm: float) -> tuple[IntArray, IntArray]:
-    """Return pairs of a segment and a cell, shapes (P,) and (P, 3), in which it is seen on the surface."""
-    parts = [
-        _cells_of(segments, width, cell_mm, slice(start, start + SEGMENTS)) for start in range(0, len(width), SEGMENTS)
-    ]
-    owner, cell = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return owner, cell
-
-
-def _cells_of(segments: "VesselSegments", width: Array, cell_mm: float, some: slice) -> tuple[IntArray, IntArray]:
-    """Return the pairs of some segments. Lengths are in cells, in single precision: `MARGIN_MM` covers its rounding."""
+def _cells(segments: "VesselSegments", width: Array, cell_mm: float, some: slice) -> tuple[IntArray, IntArray]:
+    """Return pairs of some segment and a cell, shapes (P,) and (P, 3), in which it is seen on the surface."""
+    # Lengths are in cells, in single precision: `MARGIN_MM` covers its rounding.
     start, end = segments.start[some] / cell_mm, segments.end[some] / cell_mm
     reach = ((width[some] + MARGIN_MM) / cell_mm)[:, None]
     low = np.floor(np.minimum(start, end) - reach).astype(np.int32)
@@ -266,18 +261,15 @@ def _quadric(surface: Quadric) -> PatternPatch:
 
     def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
         rows: list[Array] = []
-        found = 0
+        drawn = 0
         # Rejection: the density over the plane below is the slope's secant.
-        while found < count:
+        while drawn < count:
             x, y = rng.uniform(-half, half, (2, 2 * count))
             secant = np.sqrt(1 + (k1 * x) ** 2 + (k2 * y) ** 2)
             kept = rng.uniform(0, steepest, 2 * count) < secant
             rows.append(np.stack([x[kept], y[kept]], axis=1))
-            found += int(kept.sum())
-        x, y = np.concatenate(rows)[:count].T
-        normal = np.stack([k1 * x, k2 * y, np.ones_like(x)], axis=1)
-        points = np.stack([x, y, -(k1 * x**2 + k2 * y**2) / 2], axis=1)
-        return points, unit(normal)
+            drawn += int(kept.sum())
+        return surface.over(*np.concatenate(rows)[:count].T)
 
     # The area by a midpoint rule.
     side = (np.arange(200) + 0.5) / 100 * half - half
@@ -337,15 +329,10 @@ def thinned(points: Array, distance: float) -> Mask:
         stays = undecided & ~beaten
         kept |= stays
         undecided &= ~stays
-        undecided[_partners(first, second, stays)] = False
+        undecided[second[stays[first]]] = False
         live = undecided[first] & undecided[second]
         first, second = first[live], second[live]
     return kept | undecided
-
-
-def _partners(first: IntArray, second: IntArray, chosen: Mask) -> IntArray:
-    """Return the later partners of chosen points."""
-    return second[chosen[first]]
 
 
 NODES_PER_SPACING = 2.5
@@ -490,9 +477,9 @@ def _trees(graph: scipy.sparse.csr_matrix, roots: IntArray, ends: Mask) -> tuple
     return parent, order
 
 
-def _carried(parent: IntArray, order: IntArray, own: Array) -> Array:
+def _carried(parent: IntArray, order: IntArray, amount: Array) -> Array:
     """Sum a quantity over each node's subtree; `order` lists parents before their children."""
-    total, above = own.tolist(), parent.tolist()
+    total, above = amount.tolist(), parent.tolist()
     for node in reversed(order.tolist()):
         if above[node] >= 0:
             total[above[node]] += total[node]

@@ -121,12 +121,12 @@ def anatomy(name):
 
 
 def lumen(number, label="a"):
-    return tuple(
-        poses.lumen_pose(
-            label, number, lambda rng: rng.normal(size=(50, 3)), lambda points: 20 - np.linalg.norm(points, axis=1),
-            lambda origins, directions: np.full(len(origins), 20.0),
-        )[:3, 3]
-    )  # fmt: skip
+    surface = SimpleNamespace(
+        sites=lambda rng: rng.normal(size=(50, 3)),
+        clearance=lambda points: 20 - np.linalg.norm(points, axis=1),
+        probe=SimpleNamespace(cast=lambda origins, directions: np.full(len(origins), 20.0)),
+    )
+    return tuple(poses.lumen_pose(label, number, surface)[:3, 3])
 
 
 def organ(number, label="a"):
@@ -135,11 +135,11 @@ def organ(number, label="a"):
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return 10 * normals, normals
 
-    found = poses.organ_pose(
-        label, number, targets, lambda points: np.linalg.norm(points, axis=1) - 10,
-        lambda origins, directions: np.linalg.norm(origins, axis=1) - 10,
-    )  # fmt: skip
-    return tuple(found[:3, 3])
+    def outside(points, directions=None):
+        return np.linalg.norm(points, axis=1) - 10
+
+    surface = SimpleNamespace(clearance=outside, probe=SimpleNamespace(cast=outside, targets=targets))
+    return tuple(poses.organ_pose(label, number, surface)[:3, 3])
 
 
 def vessels(seed):

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.surfaces.colon import build, make_colon
+from simtest.surfaces.colon import build
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits
+from simtest.surfaces.poses import at_viewpoint
 from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, Polyp, load_recipe
 from simtest.surfaces.triangles import off_between
 from simtest.surfaces.tube import Stalk
@@ -34,6 +35,10 @@ MORE = {
     "polyps and relief": {"polyps": POLYPS, "relief_mm": 0.01, "relief_length_mm": 5.0},
     "pedunculated": {"polyps": (*STALKED, POLYPS[1])},
 }
+
+
+def make_colon(recipe, viewpoint):
+    return at_viewpoint(build(recipe), recipe.type, viewpoint)
 
 
 @pytest.fixture(scope="module", params=list(MORE))

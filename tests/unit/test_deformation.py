@@ -77,6 +77,16 @@ def test_inverse_keeps_missing_points_missing():
     assert np.isfinite(found[1]).all()
 
 
+def test_no_points_and_rays_that_all_miss_are_no_fault():
+    at = DeformationAt(CASES["all"], TIME)
+    none = np.empty((0, 3))
+    assert at.moved(none).shape == at.at_rest(none).shape == (0, 3)
+    assert at.jets(none).hessian.shape == (0, 3, 3, 3)
+    rays = np.tile([[0.0, 0.0, 1.0]], (4, 1))
+    hits = RayHits(np.full(4, np.inf), np.zeros(4, dtype=np.int64), np.zeros((4, 2)))
+    assert not quadric(CASES["all"]).points(0 * rays, rays, hits).valid.any()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_stretch_bounds_the_derivative_and_is_no_idle_bound(kind):
     """No point of a cloud has a displacement's derivative above the bound; some reach half of it."""

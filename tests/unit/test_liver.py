@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.surfaces.liver import _project, build, make_liver
+from simtest.surfaces.liver import _project, build
 from simtest.surfaces.model import RayHits
+from simtest.surfaces.poses import at_viewpoint
 from simtest.surfaces.recipe import LiverRecipe, load_recipe
 
 ROOT = Path(__file__).resolve().parents[2]
 STEP = 0.02
+
+
+def make_liver(recipe, viewpoint):
+    return at_viewpoint(build(recipe), recipe.type, viewpoint)
 
 
 @pytest.fixture(scope="module")

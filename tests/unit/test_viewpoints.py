@@ -1,6 +1,7 @@
 """Camera poses: rigid, repeatable, never in tissue, looking at the surface."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import igl
 import numpy as np
@@ -8,11 +9,9 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.spec.surfaces import AnatomySurface
-from simtest.surfaces.colon import make_colon
-from simtest.surfaces.liver import make_liver
+from simtest.surfaces import make_surface
 from simtest.surfaces.mesh_surface import make_mesh_surface
 from simtest.surfaces.poses import AXIS_RANGE_MM, MeshProbe, lumen_pose, organ_pose
-from simtest.surfaces.recipe import ColonRecipe, LiverRecipe, load_recipe
 from tests.marked import marked
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,11 +21,7 @@ SURFACES = marked(["colon", "liver", "colon_edingca_00090", "liver_sksurgery"], 
 
 def make(name, viewpoint):
     if (shipped := ROOT / "meshes" / f"{name}.toml").is_file():
-        recipe = load_recipe(shipped)
-        if isinstance(recipe, ColonRecipe):
-            return make_colon(recipe, viewpoint)
-        assert isinstance(recipe, LiverRecipe)
-        return make_liver(recipe, viewpoint)
+        return make_surface(AnatomySurface(path=str(shipped), viewpoint=viewpoint))
     path = MESHES / f"{name}.ply"
     if not path.is_file():
         pytest.skip(f"no reference mesh {path}")
@@ -42,6 +37,34 @@ def test_poses_are_rigid_repeatable_and_different(name):
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
         np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
     assert len({pose.tobytes() for pose in poses}) == 5
+
+
+@pytest.mark.parametrize(
+    ("values", "pinned"),
+    [
+        ({"path": "colon"}, 13.957490864766196),
+        ({"path": "liver"}, 162.68511745695957),
+        ({"path": "liver_4mm"}, -663.9348555625647),
+        ({"path": "colon_40mm", "kind": "lumen"}, 40.19216974523482),
+        ({"path": "colon", "view": "path"}, 113.52738710539266),
+        ({"path": "colon", "view": "off_axis"}, 107.20198003121865),
+        ({"path": "colon", "view": "wall"}, 109.0320600366629),
+    ],
+    ids=str,
+)
+def test_poses_are_those_of_ever(values, pinned):
+    """A random sum over ten poses: a changed draw would move all viewpoints of scenes and datasets."""
+    if values["path"] in ("liver_4mm", "colon_40mm"):
+        values = {**values, "path": str(ROOT / "meshes" / f"{values['path']}.ply")}
+    along = "view" in values
+    poses = [
+        make_surface(
+            AnatomySurface(**values, **({"path_share": n / 9, "around_deg": 40} if along else {"viewpoint": n}))
+        ).model_from_camera
+        for n in range(10)
+    ]
+    weights = np.random.default_rng(0).uniform(-1, 1, (10, 3, 4))
+    assert np.sum(weights * np.array(poses)[:, :3]) == pytest.approx(pinned, rel=0, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", SURFACES)
@@ -93,7 +116,12 @@ def test_no_place_is_an_input_error():
     def cast(origins, directions):
         return np.full(len(origins), np.inf)
 
+    def targets(rng, count):
+        return np.zeros((count, 3)), np.tile([0, 0, 1.0], (count, 1))
+
+    probe = SimpleNamespace(cast=cast, targets=targets)
+    surface = SimpleNamespace(sites=lambda rng: rng.normal(size=(4, 3)), clearance=nowhere, probe=probe)
     with pytest.raises(InputError, match="viewpoint 3"):
-        lumen_pose("x", 3, lambda rng: rng.normal(size=(4, 3)), nowhere, cast)
+        lumen_pose("x", 3, surface)
     with pytest.raises(InputError, match="viewpoint 3"):
-        organ_pose("x", 3, lambda rng, n: (np.zeros((n, 3)), np.tile([0, 0, 1.0], (n, 1))), nowhere, cast)
+        organ_pose("x", 3, surface)
