@@ -22,10 +22,10 @@ from simtest.rendering.highlights import radii_px
 from simtest.runtime.arrays import Array, Image, Mask, short_repr
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.highlights import (
+    CloudRegions,
     TrueHighlight,
     VisibleHighlight,
     VisibleSpots,
-    assign_clouds,
     describe,
     examine,
     find_spots,
@@ -312,8 +312,10 @@ def _placed(
         own = [replace(h, radius_px=float(radii[i]), cloud=i) for i, h in enumerate(highlights)]
         return own, own
     centres = session.base_highlights(radiance)
-    lights, pixels = np.array([h.light for h in highlights], dtype=int), [h.bp_px for h in highlights]
-    numbers = assign_clouds(session, lights, np.array(pixels).reshape(-1, 2), centres)
+    numbers: list[int | None] = []
+    if highlights:
+        lights, pixels = np.array([h.light for h in highlights]), np.array([h.bp_px for h in highlights])
+        numbers = CloudRegions.of(session, centres).assign(lights, pixels)
     placed = [
         replace(h, radius_px=float(radius), cloud=number)
         for h, radius, number in zip(highlights, radii, numbers, strict=True)
