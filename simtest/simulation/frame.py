@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration
+from simtest.conventions import HIGHLIGHT_MIN_GAIN
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
@@ -29,7 +30,6 @@ from simtest.simulation.highlights import (
     describe,
     examine,
     find_spots,
-    may_be_isolated,
     verdicts,
 )
 from simtest.simulation.sensor import capture, check_codec, collect, full_scale_of_average, noise_at, to_uint8
@@ -258,7 +258,7 @@ def shows_isolated(session: Session, scene: Scene, least: int, rendered: bool = 
     to be `rendered`, that is the answer, and no frame of a scene for which it is false shows as many.
     """
     session.update(scene)
-    if sum(may_be_isolated(point) for point in session.highlights()) < least:
+    if sum(point.lit and not point.min_gain <= HIGHLIGHT_MIN_GAIN for point in session.highlights()) < least:
         return False
     if not rendered:
         return True
@@ -289,10 +289,11 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
     full_scale = _metered(scene, _mean(light), camera.seen)
     if full_scale is None:
         # Which highlights are isolated is judged without noise first.
+        mean = _mean(direct)
         shown = [h.bp_px for h in verdicts(points, examined, np.zeros(len(points))) if h.isolated]
-        at = [_light_at(_mean(direct), bp_px) for bp_px in shown]
-        peak = float(_mean(direct).max()) or float(_mean(light).max())
-        full_scale = max(at, default=peak) / scene.sensor.exposure.gain
+        pixels = np.minimum(np.array(shown).reshape(-1, 2).astype(int), [mean.shape[1] - 1, mean.shape[0] - 1])
+        peak = float(mean.max()) or float(_mean(light).max())
+        full_scale = max(mean[pixels[:, 1], pixels[:, 0]].tolist(), default=peak) / scene.sensor.exposure.gain
     sigmas = np.zeros(len(points))
     for draws, own in (
         (DRAWS, [i for i, each in enumerate(examined) if not each.why_not]),
@@ -353,12 +354,6 @@ def _metered(scene: Scene, light: Image, seen: Mask | None) -> float | None:
     else:
         return None
     return radiance / exposure.gain
-
-
-def _light_at(light: Image, point_px: Array) -> float:
-    """Return the light of the pixel that a point, px, lies in."""
-    column, row = (min(int(v), size - 1) for v, size in zip(point_px, light.shape[::-1], strict=True))
-    return float(light[row, column])
 
 
 def preview(frame: LabelledFrame) -> npt.NDArray[np.uint8]:

@@ -1,5 +1,6 @@
 """Writes a labelled frame: picture, radiance, truth, and what reconstruction may know of it; sheets of pictures."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -86,14 +87,15 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     write_json(files[3], _description(frame))
     write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
     write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
-    write_atomically(files[6], lambda part: part.write_bytes(_preview_jpeg(frame)))
+    shown = _coded(preview(frame), ".jpg", (cv2.IMWRITE_JPEG_QUALITY, 90))
+    write_atomically(files[6], lambda part: part.write_bytes(shown))
     return files
 
 
-def _preview_jpeg(frame: LabelledFrame) -> bytes:
-    """Encode the preview as JPEG."""
+def _coded(picture: npt.NDArray[np.unsignedinteger], suffix: str = ".png", quality: Sequence[int] = ()) -> bytes:
+    """Encode a picture, grey or red first."""
     # OpenCV wants blue first.
-    ok, encoded = cv2.imencode(".jpg", preview(frame)[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+    ok, encoded = cv2.imencode(suffix, picture if picture.ndim == 2 else picture[:, :, ::-1], quality)
     assert ok
     return bytes(encoded)
 
@@ -131,16 +133,10 @@ def _note(scene: Scene) -> str:
 
 def encoded_png(image: Image, sensor: Sensor) -> bytes:
     """Encode a sensor's frame as PNG: the sensor's own values, or else the sRGB-encoded frame."""
-    picture: npt.NDArray[np.unsignedinteger]
-    if sensor.encodes:
-        kind = np.uint8 if _png_bits(sensor) == 8 else np.uint16
-        picture = np.rint(np.asarray(image, dtype=float) * np.iinfo(kind).max).astype(kind)
-    else:
-        picture = to_uint8(image)
-    # OpenCV wants blue first.
-    ok, encoded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[:, :, ::-1])
-    assert ok
-    return bytes(encoded)
+    if not sensor.encodes:
+        return _coded(to_uint8(image))
+    kind = np.uint8 if _png_bits(sensor) == 8 else np.uint16
+    return _coded(np.rint(np.asarray(image, dtype=float) * np.iinfo(kind).max).astype(kind))
 
 
 def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
@@ -202,6 +198,5 @@ def write_sheet(path: Path, pictures: list[Picture]) -> None:
     columns = min(SHEET_COLUMNS, len(pictures))
     filled = [*pictures, *[np.zeros_like(pictures[0])] * (-len(pictures) % columns)]
     rows = [np.hstack(filled[first : first + columns]) for first in range(0, len(filled), columns)]
-    ok, data = cv2.imencode(".png", np.vstack(rows))
-    assert ok
-    write_atomically(path, lambda part: part.write_bytes(bytes(data)))
+    data = _coded(np.vstack(rows)[:, :, ::-1])
+    write_atomically(path, lambda part: part.write_bytes(data))

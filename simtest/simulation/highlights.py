@@ -228,11 +228,6 @@ def _snr(height: float, sigma: float) -> float:
     return height / sigma if sigma > 0 else math.inf if height > 0 else 0.0
 
 
-def may_be_isolated(point: HighlightPoint) -> bool:
-    """Return whether a highlight point may be isolated: by light and shape alone, whatever the frame."""
-    return point.lit and not point.min_gain <= HIGHLIGHT_MIN_GAIN
-
-
 def lobe_region(point: HighlightPoint, specular: Image, at_point: float) -> tuple[float, Component | None]:
     """Return the peak that a highlight point makes in the lobe's light, and the connected pixels above half of it.
 

@@ -319,16 +319,12 @@ def demosaic(plane: Image, mosaic: Mosaic) -> Image:
     if mosaic.demosaicing == "vng":
         # OpenCV has it for 8 bits alone; the square root makes the noise of light alike at all levels.
         values = np.rint(np.sqrt(clipped) * _8_BITS).astype(np.uint8)
-        root = _convert(values, f"COLOR_Bayer{pattern}2RGB_VNG").astype(np.float32) / np.float32(_8_BITS)
-        return np.square(root)
+        root = cv2.demosaicing(values, getattr(cv2, f"COLOR_Bayer{pattern}2RGB_VNG")).astype(np.float32)
+        return np.square(root / np.float32(_8_BITS))
     suffix = "_EA" if mosaic.demosaicing == "edge_aware" else ""
     values = np.rint(clipped * np.float32(_16_BITS)).astype(np.uint16)
-    filled = _convert(values, f"COLOR_Bayer{pattern}2RGB{suffix}")
+    filled = cv2.demosaicing(values, getattr(cv2, f"COLOR_Bayer{pattern}2RGB{suffix}"))
     return np.asarray(filled.astype(np.float32) / np.float32(_16_BITS))
-
-
-def _convert(plane: npt.NDArray[np.unsignedinteger], code: str) -> npt.NDArray[np.unsignedinteger]:
-    return np.asarray(cv2.demosaicing(plane, getattr(cv2, code)))
 
 
 def as_seen_by_sensor(frame: Image, colour: ColourProcessing) -> Image:
