@@ -295,12 +295,12 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
         peak = float(mean.max()) or float(_mean(light).max())
         full_scale = max(mean[pixels[:, 1], pixels[:, 0]].tolist(), default=peak) / scene.sensor.exposure.gain
     sigmas = np.zeros(len(points))
-    for draws, own in (
+    for draws, indices in (
         (DRAWS, [i for i, each in enumerate(examined) if not each.why_not]),
         (FEW_DRAWS, [i for i, each in enumerate(examined) if each.why_not and each.height is not None]),
     ):
-        rows, columns = np.array([examined[i].peak for i in own], dtype=int).reshape(-1, 2).T
-        sigmas[own] = noise_at(direct, full_scale, scene.sensor, rows, columns, draws)
+        rows, columns = np.array([examined[i].peak for i in indices], dtype=int).reshape(-1, 2).T
+        sigmas[indices] = noise_at(direct, full_scale, scene.sensor, rows, columns, draws)
     return verdicts(points, examined, sigmas, full_scale if scene.sensor.clips else math.inf), full_scale
 
 
@@ -310,8 +310,8 @@ def _placed(
     """Return highlights with their radii and the numbers of their clouds, and the clouds' centres."""
     radii = radii_px(session, highlights, session.scene.reflectance.half_width)
     if session.surface.relief is None:
-        own = [replace(h, radius_px=float(radii[i]), cloud=i) for i, h in enumerate(highlights)]
-        return own, own
+        placed = [replace(h, radius_px=float(radii[i]), cloud=i) for i, h in enumerate(highlights)]
+        return placed, placed
     centres = session.base_highlights(radiance)
     numbers: list[int | None] = []
     if highlights:
@@ -360,20 +360,20 @@ def preview(frame: LabelledFrame) -> npt.NDArray[np.uint8]:
     """Return a frame for the eye, sRGB of 8 bits, shape (H, W, 3) (see `expose_for_eye`)."""
     radiance, truth = frame.radiance, frame.truth
     matt = matt_light(truth.position, truth.normal_base, np.asarray(frame.scene.rig.true_mm(), dtype=float))
-    own = coloured(radiance.diffuse + radiance.indirect)
-    return to_uint8(expose_for_eye(coloured(radiance.specular), own, matt, truth.mask))
+    diffuse = coloured(radiance.diffuse + radiance.indirect)
+    return to_uint8(expose_for_eye(coloured(radiance.specular), diffuse, matt, truth.mask))
 
 
-def expose_for_eye(specular: Image, own: Image, matt: Image, mask: Mask) -> Image:
+def expose_for_eye(specular: Image, diffuse: Image, matt: Image, mask: Mask) -> Image:
     """Return linear light for the eye, shape (..., 3), in which the surface, where `mask` is, is lit.
 
-    A surface whose `own`, diffuse and bounced light is not black beside the specular one is exposed as a whole. Else it
+    A surface whose `diffuse` and bounced light is not black beside the specular one is exposed as a whole. Else it
     gets the light of a matt surface of `TISSUE`, by that of a white one (`matt_light`), to which the specular light is
     added with its brightest point at full scale.
     """
     peak = float(specular.max())
-    is_black = float(own.max()) <= BLACK_SHARE * peak
-    surface = matt[..., None] * TISSUE if is_black else own
+    is_black = float(diffuse.max()) <= BLACK_SHARE * peak
+    surface = matt[..., None] * TISSUE if is_black else diffuse
     lit = surface.mean(axis=-1)[mask]
     level = float(np.quantile(lit, BRIGHT_QUANTILE)) if lit.size else 0.0
     exposure = SURFACE_LEVEL / level if level > 0 else 1.0

@@ -105,7 +105,7 @@ def _png_bits(sensor: Sensor) -> int:
     return 16 if sensor.encodes and (sensor.bits or 16) > 8 else 8
 
 
-def picture_calibration(told: Calibration, sensor: Sensor) -> Calibration:
+def picture_calibration(given: Calibration, sensor: Sensor) -> Calibration:
     """Return what is known of frame.png, from what reconstruction is told of the sensor's frame.
 
     A frame that the sensor encodes is the picture: nothing is added but the 16 bits of one that it does not quantise.
@@ -113,21 +113,21 @@ def picture_calibration(told: Calibration, sensor: Sensor) -> Calibration:
     """
     if sensor.encodes:
         bits = sensor.bits or _png_bits(sensor)
-        return replace(told, noise=replace(told.noise, bits=bits))
+        return replace(given, noise=replace(given.noise, bits=bits))
     response = Response("srgb")
-    noise = replace(told.noise, bits=_png_bits(sensor), response=response)
-    return replace(told, response=response, noise=noise, saturation_level=1.0)
+    noise = replace(given.noise, bits=_png_bits(sensor), response=response)
+    return replace(given, response=response, noise=noise, saturation_level=1.0)
 
 
 def _note(scene: Scene) -> str:
     """Return the comment of calibration.toml: of which picture it is, and what the scene keeps back."""
     sensor, rig, known = scene.sensor, scene.rig, scene.known
-    untold = {
+    given = {
         "response (taken as linear)": sensor.response_known or not sensor.encodes,
         "vignetting": sensor.vignetting_known, "emission": rig.emission_known, "lights": known.lights,
         "lobe": known.lobe,
     }  # fmt: skip
-    kept = ", ".join(name for name, told in untold.items() if not told)
+    kept = ", ".join(name for name, is_given in given.items() if not is_given)
     return "Of frame.png" + (f"; the scene does not tell: {kept}." if kept else ".")
 
 
@@ -179,7 +179,7 @@ def _description(frame: LabelledFrame) -> Json:
     # The lights' true positions where the scene's keys do not show them: a preset's, and those that were drawn.
     if rig.preset is not None or rig.is_drawn:
         described["lights_mm"] = rig.true_mm().tolist()
-    described["highlights"] = [{**own.to_json(), "radiance": own.radiance} for own in frame.highlights]
+    described["highlights"] = [{**point.to_json(), "radiance": point.radiance} for point in frame.highlights]
     described["clouds"] = [cloud_json(centre) for centre in frame.clouds]
     described["visible_highlights"] = [spot.to_json() for spot in frame.visible_highlights]
     origin = cast("dict[str, Json]", provenance.environment())

@@ -198,7 +198,7 @@ def examine(
     pixels = np.array([point.bp_px for point in lit]).reshape(-1, 2).astype(int)
     examined = []
     for point, peak in zip(points, peaks, strict=True):
-        others = pixels[[own is not point for own in lit]] if single and owners.get(peak) is point else pixels[:0]
+        others = pixels[[other is not point for other in lit]] if single and owners.get(peak) is point else pixels[:0]
         height, why_not = _examined(point, smoothed, seen, peak, owners.get(peak) is point, others)
         examined.append(Examined(peak, float(smoothed[peak]), height, why_not))
     return examined
@@ -315,14 +315,14 @@ class CloudRegions:
         misfit = np.hypot(w[:, 0], w[:, 1])
         labels = np.full(misfit.shape, -1, dtype=np.int32)
         for light in set(lights):
-            own = np.flatnonzero(np.array(lights) == light)
+            numbers = np.flatnonzero(np.array(lights) == light)
             # Where descents end, and which centre is near.
             target = _ends(misfit[light])
             bottoms = np.flatnonzero((target == np.arange(target.size)) & np.isfinite(misfit[light].ravel()))
             at = np.stack(np.divmod(bottoms, misfit.shape[2])[::-1], axis=1) + PIXEL_CENTRE
-            gap = np.linalg.norm(at[:, None] - np.array([centre.bp_px for centre in centres])[own], axis=2)
+            gap = np.linalg.norm(at[:, None] - np.array([centre.bp_px for centre in centres])[numbers], axis=2)
             nearest = np.full(target.size, -1)
-            nearest[bottoms] = np.where(gap.min(axis=1) < REACH_PX, own[gap.argmin(axis=1)], -1)
+            nearest[bottoms] = np.where(gap.min(axis=1) < REACH_PX, numbers[gap.argmin(axis=1)], -1)
             labels[light] = nearest[target].reshape(labels.shape[1:])
         seen = session.camera.seen
         return cls(labels, misfit if seen is None else np.where(seen, misfit, np.nan), lights)
