@@ -40,6 +40,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import RenderedView
+from simtest.simulation.highlights import CloudRegions
 from simtest.spec.recipes import load_dataset
 from simtest.validation.cloud_rows import match_cloud
 from simtest.validation.metrics import mahalanobis2
@@ -309,12 +310,13 @@ def _cloud_rows(
 ) -> list[Row]:
     """Return the rows of a picture's clouds; one whose spots belong to no point of the base is not held."""
     rows: list[Row] = []
+    regions = CloudRegions.of(session, view.clouds)
     for specularity in made:
         cloud = specularity.estimates.get("cloud")
         if not isinstance(cloud, Estimate):
             continue
         # Lights are one here, so a cloud belongs to one point of the base.
-        numbers = match_cloud(session, view, cloud)
+        numbers = match_cloud(regions, view, cloud)
         if not numbers:
             rows.append({**about, "of": "none", "error": math.nan, "stated": _stated(cloud), "held": 0.0})
         for number in numbers[:1]:

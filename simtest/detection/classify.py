@@ -260,9 +260,9 @@ def _at_border(spot: SpecularSpot, picture: ColourPicture) -> bool:
     outside = ~seen[top : y + height + REACH_PX, left : x + width + REACH_PX]
     if not outside.any():
         return False
-    own = np.zeros(outside.shape, dtype=bool)
-    own[y - top : y - top + height, x - left : x - left + width] = spot.mask
-    return bool(dilated(own, REACH_PX)[outside].any())
+    spot_mask = np.zeros(outside.shape, dtype=bool)
+    spot_mask[y - top : y - top + height, x - left : x - left + width] = spot.mask
+    return bool(dilated(spot_mask, REACH_PX)[outside].any())
 
 
 def _shape(fits: list[_Contour]) -> tuple[float | None, float | None, float | None]:
@@ -296,9 +296,9 @@ def _around(spot: SpecularSpot, box: Box, picture: ColourPicture, bright: Mask) 
     clutter = _ranked(specular[far], CLUTTER_SHARE) / spot.value
     surroundings = values[around]
     tissue = _medians(surroundings)
-    own = _medians(picture.linear[spot.crop][spot.mask])
+    spot_light = _medians(picture.linear[spot.crop][spot.mask])
     brighter = _ranked(mean_channel(surroundings[None])[0], PALE_SHARE)
-    surround = brighter / max(float(own.mean()), 1e-6)
+    surround = brighter / max(float(spot_light.mean()), 1e-6)
     # gain of each channel, on the rim: channels near full scale have lost it
     shown = visible & (specular >= 0.3 * spot.value) & (brightest_channel(values) < UNCLIPPED)
     if np.count_nonzero(shown) < MIN_AREA_PX:

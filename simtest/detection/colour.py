@@ -174,12 +174,12 @@ def _pixels(spots: list[SpecularSpot], shape: tuple[int, ...]) -> Mask:
 def _with_dim_marked(highlights: list[Highlight], light: SplitLight) -> list[Highlight]:
     """Return highlights of which those are marked that are dim beside clipped ones."""
     pixels = [highlight.region.peak[::-1] for highlight in highlights]
-    total = [float(light.specular[pixel]) + float(light.tissue[pixel]) for pixel in pixels]
-    shining = [own for own, each in zip(total, highlights, strict=True) if each.clipped > CLEARLY_CLIPPED]
+    totals = [float(light.specular[pixel]) + float(light.tissue[pixel]) for pixel in pixels]
+    shining = [total for total, each in zip(totals, highlights, strict=True) if each.clipped > CLEARLY_CLIPPED]
     least = DIM * max(shining, default=0.0)
     return [
-        replace(each, dim=True) if each.area_px >= MIN_SHAPE_PX and own < least else each
-        for own, each in zip(total, highlights, strict=True)
+        replace(each, dim=True) if each.area_px >= MIN_SHAPE_PX and total < least else each
+        for total, each in zip(totals, highlights, strict=True)
     ]
 
 
@@ -200,10 +200,11 @@ def _feet(spots: list[SpecularSpot], mask: Mask, specular: Image, more: Mask) ->
     owner[nearest[mask[box]]] = number[mask]
     down, right = rows_and_columns((more & ~mask)[box])
     rows, columns = down + y, right + x
-    mine = owner[nearest[down, right]]
+    nearest_spot = owner[nearest[down, right]]
     reach = np.array([FOOT_REACH * np.sqrt(spot.area_px / np.pi) + 1 for spot in spots])
     peak = np.array([spot.value for spot in spots])
-    near = (away[down, right] <= reach[mine]) & (specular[rows, columns] >= SPECULAR_PEAK_SHARE * peak[mine])
+    bright = specular[rows, columns] >= SPECULAR_PEAK_SHARE * peak[nearest_spot]
+    near = bright & (away[down, right] <= reach[nearest_spot])
     feet = np.zeros(mask.shape, dtype=bool)
     feet[rows[near], columns[near]] = True
     return feet
@@ -228,11 +229,11 @@ class ColourDetector:
         if frame.encoded.ndim != 3 or frame.encoded.shape[2] != 3:
             raise InputError(f"frame has shape {frame.encoded.shape}: detection by colour takes (H, W, 3)")
         view = view_of(frame)
-        found = detect_colour(frame.channels, frame.clipped, view.seen)
+        detected = detect_colour(frame.channels, frame.clipped, view.seen)
         kinds = (*SINGLE, Kind.CLUSTER) if self.isolated else tuple(Kind)
-        taken = tuple(highlight for highlight in found.highlights if highlight.kind in kinds)
-        others = tuple(highlight for highlight in found.highlights if highlight.kind not in kinds)
-        specular = replace(frame, seen=view.seen, light=found.light.specular)
+        taken = tuple(highlight for highlight in detected.highlights if highlight.kind in kinds)
+        others = tuple(highlight for highlight in detected.highlights if highlight.kind not in kinds)
+        specular = replace(frame, seen=view.seen, light=detected.light.specular)
         return Detection(tuple(highlight.region for highlight in taken), specular, taken, others, view)
 
 

@@ -175,17 +175,19 @@ def run_detector(detector: Detector, frame: Frame) -> Detection:
     """Run a detector; raise `InputError` with its name where it fails or returns what is no detection of the frame."""
     name, (height, width) = type(detector).__qualname__, frame.encoded.shape[:2]
     try:
-        found = detector.detect(frame, frame.calibration.camera, frame.calibration.priors)
+        detection = detector.detect(frame, frame.calibration.camera, frame.calibration.priors)
     except InputError:
         raise
     except Exception as error:
         raise InputError(f"detector {name}: {type(error).__name__}: {error}") from error
-    if not isinstance(found, Detection):
-        raise InputError(f"detector {name}: returned a {type(found).__name__}; must be a Detection")
-    if len(found.highlights) not in (0, len(found.regions)):
-        raise InputError(f"detector {name}: {len(found.highlights)} highlights for {len(found.regions)} regions")
+    if not isinstance(detection, Detection):
+        raise InputError(f"detector {name}: returned a {type(detection).__name__}; must be a Detection")
+    if len(detection.highlights) not in (0, len(detection.regions)):
+        raise InputError(
+            f"detector {name}: {len(detection.highlights)} highlights for {len(detection.regions)} regions"
+        )
     try:
-        return replace(found, regions=tuple(_sound(region, width, height) for region in found.regions))
+        return replace(detection, regions=tuple(_sound(region, width, height) for region in detection.regions))
     except InputError as error:
         raise InputError(f"detector {name}: {error}") from None
 

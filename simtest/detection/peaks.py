@@ -315,13 +315,13 @@ def _at_own_scale(patch: Patch) -> tuple[Patch, float]:
     rows, columns = np.nonzero(patch.inside(TOP_ISOVALUE))
     highest = int(np.argmax(values[rows, columns]))
     height, wide = values.shape
-    found = Patch.cut(
+    smoothed = Patch.cut(
         values, (0, 0, wide, height), (int(columns[highest]), int(rows[highest])), patch.origin_px,
         seen=patch.seen, smoothing_px=width_px,
     )  # fmt: skip
-    if isinstance(found, Failure):
+    if isinstance(smoothed, Failure):
         return patch, 1.0
-    return found, share_of_noise(width_px) / share_of_noise(patch.smoothing_px)
+    return smoothed, share_of_noise(width_px) / share_of_noise(patch.smoothing_px)
 
 
 def _slope(level: float) -> float:

@@ -246,10 +246,10 @@ def find_basins(values: Image, mask: Mask, base: Image, keep: float, noise: floa
     kept = kept[np.argsort(-tops[kept])]
     rank = np.full(len(tops), -1)
     rank[kept] = np.arange(len(kept))
-    mine = rank[owner]
+    kept_number = rank[owner]
     labels = np.zeros(values.shape, dtype=np.int64)
-    labels[rows, columns] = mine[basin] + 1
-    pairs, saddle = _highest_of_pairs(mine[pairs[:, 0]], mine[pairs[:, 1]], saddle, len(kept))
+    labels[rows, columns] = kept_number[basin] + 1
+    pairs, saddle = _highest_of_pairs(kept_number[pairs[:, 0]], kept_number[pairs[:, 1]], saddle, len(kept))
     return Basins(rows[tops[kept]], columns[tops[kept]], labels, pairs, np.stack([rows[saddle], columns[saddle]], 1))
 
 

@@ -132,15 +132,15 @@ def find_view(picture: npt.NDArray[np.floating]) -> View:
         filled &= grid_x[None] ** 2 + grid_y[:, None] ** 2 <= radius**2
         # Coordinates of the small picture are integer-centred.
         cx, cy = (np.array([x, y]) + PIXEL_CENTRE) * ratio
-        found = ViewMask(float(cx), float(cy), float(radius * ratio.mean()))
+        round_border = ViewMask(float(cx), float(cy), float(radius * ratio.mean()))
     else:
-        found = None
+        round_border = None
     filled &= ~notch
     # The view less its rim. The distance transform ignores the picture's own edges, along which there is no rim.
     filled &= ~_bars(brightness)
     depth = cv2.distanceTransform(filled.astype(np.uint8), cv2.DIST_L2, 5)
     depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_LINEAR)
-    return View(np.asarray(depth > max(3 * scale, MARGIN * max(size))), found)
+    return View(np.asarray(depth > max(3 * scale, MARGIN * max(size))), round_border)
 
 
 def _inside(brightness: Image) -> Mask | None:
@@ -318,14 +318,14 @@ def _text_lines(labels: np.ndarray, stats: np.ndarray) -> list[tuple[int, int, i
 def _is_thin(labels: np.ndarray, box: np.ndarray, number: int) -> bool:
     """Return whether a component is made of strokes."""
     x, y, width, height, _ = (int(v) for v in box)
-    own = np.pad((labels[y : y + height, x : x + width] == number).astype(np.uint8), 1)
-    return float(cv2.distanceTransform(own, cv2.DIST_L2, 3).max()) <= max(STROKE * height, 1.5)
+    character = np.pad((labels[y : y + height, x : x + width] == number).astype(np.uint8), 1)
+    return float(cv2.distanceTransform(character, cv2.DIST_L2, 3).max()) <= max(STROKE * height, 1.5)
 
 
 def _tools(labels: np.ndarray, stats: np.ndarray, centres: np.ndarray) -> list[Array]:
     """Return the areas of instruments, corners of shape (4, 2), by the streaks along them."""
     least = STREAK_LENGTH * max(labels.shape)
-    found = []
+    areas = []
     for i in range(1, len(stats)):
         x, y, width, height, _ = (int(v) for v in stats[i])
         if np.hypot(width, height) < least:
@@ -339,5 +339,5 @@ def _tools(labels: np.ndarray, stats: np.ndarray, centres: np.ndarray) -> list[A
             continue
         middle = centres[i] + axes[:, 1] * (along.max() + along.min()) / 2
         half, side = (0.5 + TOOL_ENDS) * length * axes[:, 1], TOOL_WIDTH * length * axes[:, 0]
-        found.append(np.array([middle - half - side, middle + half - side, middle + half + side, middle - half + side]))
-    return found
+        areas.append(np.array([middle - half - side, middle + half - side, middle + half + side, middle - half + side]))
+    return areas

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration
+from simtest.conventions import HIGHLIGHT_MIN_GAIN
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
@@ -22,14 +23,13 @@ from simtest.rendering.highlights import radii_px
 from simtest.runtime.arrays import Array, Image, Mask, short_repr
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.highlights import (
+    CloudRegions,
     TrueHighlight,
     VisibleHighlight,
     VisibleSpots,
-    assign_clouds,
     describe,
     examine,
     find_spots,
-    may_be_isolated,
     verdicts,
 )
 from simtest.simulation.sensor import capture, check_codec, collect, full_scale_of_average, noise_at, to_uint8
@@ -258,7 +258,7 @@ def shows_isolated(session: Session, scene: Scene, least: int, rendered: bool = 
     to be `rendered`, that is the answer, and no frame of a scene for which it is false shows as many.
     """
     session.update(scene)
-    if sum(may_be_isolated(point) for point in session.highlights()) < least:
+    if sum(point.lit and not point.min_gain <= HIGHLIGHT_MIN_GAIN for point in session.highlights()) < least:
         return False
     if not rendered:
         return True
@@ -289,17 +289,18 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
     full_scale = _metered(scene, _mean(light), camera.seen)
     if full_scale is None:
         # Which highlights are isolated is judged without noise first.
+        mean = _mean(direct)
         shown = [h.bp_px for h in verdicts(points, examined, np.zeros(len(points))) if h.isolated]
-        at = [_light_at(_mean(direct), bp_px) for bp_px in shown]
-        peak = float(_mean(direct).max()) or float(_mean(light).max())
-        full_scale = max(at, default=peak) / scene.sensor.exposure.gain
+        pixels = np.minimum(np.array(shown).reshape(-1, 2).astype(int), [mean.shape[1] - 1, mean.shape[0] - 1])
+        peak = float(mean.max()) or float(_mean(light).max())
+        full_scale = max(mean[pixels[:, 1], pixels[:, 0]].tolist(), default=peak) / scene.sensor.exposure.gain
     sigmas = np.zeros(len(points))
-    for draws, own in (
+    for draws, indices in (
         (DRAWS, [i for i, each in enumerate(examined) if not each.why_not]),
         (FEW_DRAWS, [i for i, each in enumerate(examined) if each.why_not and each.height is not None]),
     ):
-        rows, columns = np.array([examined[i].peak for i in own], dtype=int).reshape(-1, 2).T
-        sigmas[own] = noise_at(direct, full_scale, scene.sensor, rows, columns, draws)
+        rows, columns = np.array([examined[i].peak for i in indices], dtype=int).reshape(-1, 2).T
+        sigmas[indices] = noise_at(direct, full_scale, scene.sensor, rows, columns, draws)
     return verdicts(points, examined, sigmas, full_scale if scene.sensor.clips else math.inf), full_scale
 
 
@@ -309,11 +310,13 @@ def _placed(
     """Return highlights with their radii and the numbers of their clouds, and the clouds' centres."""
     radii = radii_px(session, highlights, session.scene.reflectance.half_width)
     if session.surface.relief is None:
-        own = [replace(h, radius_px=float(radii[i]), cloud=i) for i, h in enumerate(highlights)]
-        return own, own
+        placed = [replace(h, radius_px=float(radii[i]), cloud=i) for i, h in enumerate(highlights)]
+        return placed, placed
     centres = session.base_highlights(radiance)
-    lights, pixels = np.array([h.light for h in highlights], dtype=int), [h.bp_px for h in highlights]
-    numbers = assign_clouds(session, lights, np.array(pixels).reshape(-1, 2), centres)
+    numbers: list[int | None] = []
+    if highlights:
+        lights, pixels = np.array([h.light for h in highlights]), np.array([h.bp_px for h in highlights])
+        numbers = CloudRegions.of(session, centres).assign(lights, pixels)
     placed = [
         replace(h, radius_px=float(radius), cloud=number)
         for h, radius, number in zip(highlights, radii, numbers, strict=True)
@@ -353,30 +356,24 @@ def _metered(scene: Scene, light: Image, seen: Mask | None) -> float | None:
     return radiance / exposure.gain
 
 
-def _light_at(light: Image, point_px: Array) -> float:
-    """Return the light of the pixel that a point, px, lies in."""
-    column, row = (min(int(v), size - 1) for v, size in zip(point_px, light.shape[::-1], strict=True))
-    return float(light[row, column])
-
-
 def preview(frame: LabelledFrame) -> npt.NDArray[np.uint8]:
     """Return a frame for the eye, sRGB of 8 bits, shape (H, W, 3) (see `expose_for_eye`)."""
     radiance, truth = frame.radiance, frame.truth
     matt = matt_light(truth.position, truth.normal_base, np.asarray(frame.scene.rig.true_mm(), dtype=float))
-    own = coloured(radiance.diffuse + radiance.indirect)
-    return to_uint8(expose_for_eye(coloured(radiance.specular), own, matt, truth.mask))
+    diffuse = coloured(radiance.diffuse + radiance.indirect)
+    return to_uint8(expose_for_eye(coloured(radiance.specular), diffuse, matt, truth.mask))
 
 
-def expose_for_eye(specular: Image, own: Image, matt: Image, mask: Mask) -> Image:
+def expose_for_eye(specular: Image, diffuse: Image, matt: Image, mask: Mask) -> Image:
     """Return linear light for the eye, shape (..., 3), in which the surface, where `mask` is, is lit.
 
-    A surface whose `own`, diffuse and bounced light is not black beside the specular one is exposed as a whole. Else it
+    A surface whose `diffuse` and bounced light is not black beside the specular one is exposed as a whole. Else it
     gets the light of a matt surface of `TISSUE`, by that of a white one (`matt_light`), to which the specular light is
     added with its brightest point at full scale.
     """
     peak = float(specular.max())
-    is_black = float(own.max()) <= BLACK_SHARE * peak
-    surface = matt[..., None] * TISSUE if is_black else own
+    is_black = float(diffuse.max()) <= BLACK_SHARE * peak
+    surface = matt[..., None] * TISSUE if is_black else diffuse
     lit = surface.mean(axis=-1)[mask]
     level = float(np.quantile(lit, BRIGHT_QUANTILE)) if lit.size else 0.0
     exposure = SURFACE_LEVEL / level if level > 0 else 1.0

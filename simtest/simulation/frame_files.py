@@ -1,5 +1,6 @@
 """Writes a labelled frame: picture, radiance, truth, and what reconstruction may know of it; sheets of pictures."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -86,14 +87,15 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     write_json(files[3], _description(frame))
     write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
     write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
-    write_atomically(files[6], lambda part: part.write_bytes(_preview_jpeg(frame)))
+    shown = _coded(preview(frame), ".jpg", (cv2.IMWRITE_JPEG_QUALITY, 90))
+    write_atomically(files[6], lambda part: part.write_bytes(shown))
     return files
 
 
-def _preview_jpeg(frame: LabelledFrame) -> bytes:
-    """Encode the preview as JPEG."""
+def _coded(picture: npt.NDArray[np.unsignedinteger], suffix: str = ".png", quality: Sequence[int] = ()) -> bytes:
+    """Encode a picture, grey or red first."""
     # OpenCV wants blue first.
-    ok, encoded = cv2.imencode(".jpg", preview(frame)[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+    ok, encoded = cv2.imencode(suffix, picture if picture.ndim == 2 else picture[:, :, ::-1], quality)
     assert ok
     return bytes(encoded)
 
@@ -103,7 +105,7 @@ def _png_bits(sensor: Sensor) -> int:
     return 16 if sensor.encodes and (sensor.bits or 16) > 8 else 8
 
 
-def picture_calibration(told: Calibration, sensor: Sensor) -> Calibration:
+def picture_calibration(given: Calibration, sensor: Sensor) -> Calibration:
     """Return what is known of frame.png, from what reconstruction is told of the sensor's frame.
 
     A frame that the sensor encodes is the picture: nothing is added but the 16 bits of one that it does not quantise.
@@ -111,36 +113,30 @@ def picture_calibration(told: Calibration, sensor: Sensor) -> Calibration:
     """
     if sensor.encodes:
         bits = sensor.bits or _png_bits(sensor)
-        return replace(told, noise=replace(told.noise, bits=bits))
+        return replace(given, noise=replace(given.noise, bits=bits))
     response = Response("srgb")
-    noise = replace(told.noise, bits=_png_bits(sensor), response=response)
-    return replace(told, response=response, noise=noise, saturation_level=1.0)
+    noise = replace(given.noise, bits=_png_bits(sensor), response=response)
+    return replace(given, response=response, noise=noise, saturation_level=1.0)
 
 
 def _note(scene: Scene) -> str:
     """Return the comment of calibration.toml: of which picture it is, and what the scene keeps back."""
     sensor, rig, known = scene.sensor, scene.rig, scene.known
-    untold = {
+    given = {
         "response (taken as linear)": sensor.response_known or not sensor.encodes,
         "vignetting": sensor.vignetting_known, "emission": rig.emission_known, "lights": known.lights,
         "lobe": known.lobe,
     }  # fmt: skip
-    kept = ", ".join(name for name, told in untold.items() if not told)
+    kept = ", ".join(name for name, is_given in given.items() if not is_given)
     return "Of frame.png" + (f"; the scene does not tell: {kept}." if kept else ".")
 
 
 def encoded_png(image: Image, sensor: Sensor) -> bytes:
     """Encode a sensor's frame as PNG: the sensor's own values, or else the sRGB-encoded frame."""
-    picture: npt.NDArray[np.unsignedinteger]
-    if sensor.encodes:
-        kind = np.uint8 if _png_bits(sensor) == 8 else np.uint16
-        picture = np.rint(np.asarray(image, dtype=float) * np.iinfo(kind).max).astype(kind)
-    else:
-        picture = to_uint8(image)
-    # OpenCV wants blue first.
-    ok, encoded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[:, :, ::-1])
-    assert ok
-    return bytes(encoded)
+    if not sensor.encodes:
+        return _coded(to_uint8(image))
+    kind = np.uint8 if _png_bits(sensor) == 8 else np.uint16
+    return _coded(np.rint(np.asarray(image, dtype=float) * np.iinfo(kind).max).astype(kind))
 
 
 def _truth(frame: LabelledFrame) -> dict[str, npt.NDArray[np.generic]]:
@@ -183,7 +179,7 @@ def _description(frame: LabelledFrame) -> Json:
     # The lights' true positions where the scene's keys do not show them: a preset's, and those that were drawn.
     if rig.preset is not None or rig.is_drawn:
         described["lights_mm"] = rig.true_mm().tolist()
-    described["highlights"] = [{**own.to_json(), "radiance": own.radiance} for own in frame.highlights]
+    described["highlights"] = [{**point.to_json(), "radiance": point.radiance} for point in frame.highlights]
     described["clouds"] = [cloud_json(centre) for centre in frame.clouds]
     described["visible_highlights"] = [spot.to_json() for spot in frame.visible_highlights]
     origin = cast("dict[str, Json]", provenance.environment())
@@ -202,6 +198,5 @@ def write_sheet(path: Path, pictures: list[Picture]) -> None:
     columns = min(SHEET_COLUMNS, len(pictures))
     filled = [*pictures, *[np.zeros_like(pictures[0])] * (-len(pictures) % columns)]
     rows = [np.hstack(filled[first : first + columns]) for first in range(0, len(filled), columns)]
-    ok, data = cv2.imencode(".png", np.vstack(rows))
-    assert ok
-    write_atomically(path, lambda part: part.write_bytes(bytes(data)))
+    data = _coded(np.vstack(rows)[:, :, ::-1])
+    write_atomically(path, lambda part: part.write_bytes(data))

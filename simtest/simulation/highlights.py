@@ -198,7 +198,7 @@ def examine(
     pixels = np.array([point.bp_px for point in lit]).reshape(-1, 2).astype(int)
     examined = []
     for point, peak in zip(points, peaks, strict=True):
-        others = pixels[[own is not point for own in lit]] if single and owners.get(peak) is point else pixels[:0]
+        others = pixels[[other is not point for other in lit]] if single and owners.get(peak) is point else pixels[:0]
         height, why_not = _examined(point, smoothed, seen, peak, owners.get(peak) is point, others)
         examined.append(Examined(peak, float(smoothed[peak]), height, why_not))
     return examined
@@ -226,11 +226,6 @@ def verdicts(
 def _snr(height: float, sigma: float) -> float:
     """Return a height over the noise, 0 without both."""
     return height / sigma if sigma > 0 else math.inf if height > 0 else 0.0
-
-
-def may_be_isolated(point: HighlightPoint) -> bool:
-    """Return whether a highlight point may be isolated: by light and shape alone, whatever the frame."""
-    return point.lit and not point.min_gain <= HIGHLIGHT_MIN_GAIN
 
 
 def lobe_region(point: HighlightPoint, specular: Image, at_point: float) -> tuple[float, Component | None]:
@@ -297,65 +292,63 @@ def _peak_pixel(smoothed: Image, point: HighlightPoint) -> Pixel:
         row, column = step[0] + top, step[1] + left
 
 
-def assign_clouds(
-    session: Session, lights: IntArray, points_px: Array, centres: list[HighlightPoint]
-) -> list[int | None]:
-    """Assign image points to the clouds around the base's highlight points.
+@dataclass(frozen=True)
+class CloudRegions:
+    """Which cloud around the base's highlight points each pixel belongs to.
 
-    `lights`, shape (N,), are those of the points, shape (N, 2), px; `centres` the base's of all lights in view. Returns
-    an index in them, of one with the same light; None where the descent leaves the view, or ends at a fold.
+    It is that to which the base's misfit descends from the pixel: `labels`, shape (L, H, W), are indices of the
+    highlight points, by light, -1 where the descent leaves the view or ends at a fold. `misfit`, of the same shape, is
+    the sine of the angle to the bisector, NaN outside the surface and the view mask; `lights` are those of the
+    highlight points.
     """
-    clouds: list[int | None] = [None] * len(points_px)
-    for light in np.unique(lights):
-        own, _, regions = _regions(session, light, centres)
-        height, width = regions.shape
-        for i in np.flatnonzero(lights == light):
-            column, row = (min(int(v), size - 1) for v, size in zip(points_px[i], (width, height), strict=True))
-            if regions[row, column] >= 0:
-                clouds[i] = own[regions[row, column]]
-    return clouds
 
+    labels: npt.NDArray[np.int32]
+    misfit: Image
+    lights: tuple[int, ...]
 
-def cloud_edges(session: Session, centres: Sequence[HighlightPoint]) -> list[float]:
-    """Return the least misfit of the base at the edge of each cloud's region: the sine of the angle to the bisector.
+    @classmethod
+    def of(cls, session: Session, centres: Sequence[HighlightPoint]) -> "CloudRegions":
+        """Follow the misfit of a session's base down to its highlight points, of all lights in view."""
+        maps, lights = session.misfits(), tuple(centre.light for centre in centres)
+        inside = slice(maps.margin, -maps.margin)
+        w = maps.base[:, :, inside, inside]
+        misfit = np.hypot(w[:, 0], w[:, 1])
+        labels = np.full(misfit.shape, -1, dtype=np.int32)
+        for light in set(lights):
+            numbers = np.flatnonzero(np.array(lights) == light)
+            # Where descents end, and which centre is near.
+            target = _ends(misfit[light])
+            bottoms = np.flatnonzero((target == np.arange(target.size)) & np.isfinite(misfit[light].ravel()))
+            at = np.stack(np.divmod(bottoms, misfit.shape[2])[::-1], axis=1) + PIXEL_CENTRE
+            gap = np.linalg.norm(at[:, None] - np.array([centre.bp_px for centre in centres])[numbers], axis=2)
+            nearest = np.full(target.size, -1)
+            nearest[bottoms] = np.where(gap.min(axis=1) < REACH_PX, numbers[gap.argmin(axis=1)], -1)
+            labels[light] = nearest[target].reshape(labels.shape[1:])
+        seen = session.camera.seen
+        return cls(labels, misfit if seen is None else np.where(seen, misfit, np.nan), lights)
 
-    A region is what belongs to the cloud (`assign_clouds`). It ends at the frame's border, at the view mask, where the
-    surface ends, and next to another cloud. A glint lies where the base's misfit is the relief's slope, so a cloud is
-    as good as wholly in view where the misfit at the edge is several slopes.
-    """
-    least, seen = np.zeros(len(centres)), session.camera.seen
-    for light in {centre.light for centre in centres}:
-        own, size, regions = _regions(session, light, centres)
-        regions = np.where(np.isfinite(size) & (True if seen is None else seen), regions, -1)
-        around = np.pad(regions, 1, constant_values=-1)
-        beside = (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])
+    def assign(self, lights: IntArray, points_px: Array) -> list[int | None]:
+        """Return the cloud of each image point, shape (N, 2), px, that a light, shape (N,), makes."""
+        height, width = self.labels.shape[1:]
+        columns, rows = np.minimum(points_px.astype(int), [width - 1, height - 1]).T
+        return [None if number < 0 else number for number in self.labels[lights, rows, columns].tolist()]
+
+    def edges(self) -> list[float]:
+        """Return the least misfit at the edge of each cloud's region.
+
+        A region ends at the frame's border, at the view mask, where the surface ends, and next to another cloud. A
+        glint lies where the base's misfit is the relief's slope, so a cloud is as good as wholly in view where the
+        misfit at the edge is several slopes.
+        """
+        regions = np.where(np.isfinite(self.misfit), self.labels, -1)
+        around = np.pad(regions, ((0, 0), (1, 1), (1, 1)), constant_values=-1)
+        beside = (around[:, :-2, 1:-1], around[:, 2:, 1:-1], around[:, 1:-1, :-2], around[:, 1:-1, 2:])
         edge = np.logical_or.reduce([regions != other for other in beside])
-        for i, number in enumerate(own):
-            least[number] = size[edge & (regions == i)].min(initial=np.inf)
-    return np.where(np.isfinite(least), least, 0.0).tolist()
-
-
-def _regions(session: Session, light: int, centres: Sequence[HighlightPoint]) -> tuple[list[int], Image, IntArray]:
-    """Return the indices of a light's centres, the base's misfit, and where each pixel belongs, shape (H, W).
-
-    The latter is an index in the first, or -1 for none.
-    """
-    own = [number for number, centre in enumerate(centres) if centre.light == light]
-    maps = session.misfits()
-    inside = slice(maps.margin, -maps.margin)
-    w = maps.base[light][:, inside, inside]
-    size = np.hypot(w[0], w[1])
-    height, width = size.shape
-    if not own:
-        return own, size, np.full((height, width), -1)
-    # Where descents end, and which centre is near.
-    target = _ends(size)
-    bottoms = np.flatnonzero((target == np.arange(target.size)) & np.isfinite(size.ravel()))
-    at = np.stack([bottoms % width, bottoms // width], axis=1) + PIXEL_CENTRE
-    gap = np.linalg.norm(at[:, None] - np.array([centres[number].bp_px for number in own]), axis=2)
-    nearest = np.full(target.size, -1)
-    nearest[bottoms] = np.where(gap.min(axis=1) < REACH_PX, gap.argmin(axis=1), -1)
-    return own, size, nearest[target].reshape(height, width)
+        least = [
+            float(self.misfit[light][edge[light] & (regions[light] == number)].min(initial=np.inf))
+            for number, light in enumerate(self.lights)
+        ]
+        return [each if math.isfinite(each) else 0.0 for each in least]
 
 
 def _ends(size: Image) -> IntArray:

@@ -275,12 +275,12 @@ def _zero_of(falling: Callable[[float], float], low: float, high: float) -> floa
         at_middle = falling(middle)
         # Through both ends and the middle goes an exponential times a straight line; its zero lies in the bracket.
         root = math.sqrt(at_middle**2 - at_low * at_high)
-        found = middle + (middle - low) * at_middle / root if root > 0 else middle
-        if abs(found - last) < CLOSE:
-            return found
-        last, value = found, falling(found)
+        crossing = middle + (middle - low) * at_middle / root if root > 0 else middle
+        if abs(crossing - last) < CLOSE:
+            return crossing
+        last, value = crossing, falling(crossing)
         # The narrowest bracket of the four values.
-        points = sorted([(low, at_low), (middle, at_middle), (found, value), (high, at_high)])
+        points = sorted([(low, at_low), (middle, at_middle), (crossing, value), (high, at_high)])
         low, at_low = max(point for point in points if point[1] > 0)
         high, at_high = min(point for point in points if point[1] <= 0)
     return (low + high) / 2
@@ -319,16 +319,12 @@ def demosaic(plane: Image, mosaic: Mosaic) -> Image:
     if mosaic.demosaicing == "vng":
         # OpenCV has it for 8 bits alone; the square root makes the noise of light alike at all levels.
         values = np.rint(np.sqrt(clipped) * _8_BITS).astype(np.uint8)
-        root = _convert(values, f"COLOR_Bayer{pattern}2RGB_VNG").astype(np.float32) / np.float32(_8_BITS)
-        return np.square(root)
+        root = cv2.demosaicing(values, getattr(cv2, f"COLOR_Bayer{pattern}2RGB_VNG")).astype(np.float32)
+        return np.square(root / np.float32(_8_BITS))
     suffix = "_EA" if mosaic.demosaicing == "edge_aware" else ""
     values = np.rint(clipped * np.float32(_16_BITS)).astype(np.uint16)
-    filled = _convert(values, f"COLOR_Bayer{pattern}2RGB{suffix}")
+    filled = cv2.demosaicing(values, getattr(cv2, f"COLOR_Bayer{pattern}2RGB{suffix}"))
     return np.asarray(filled.astype(np.float32) / np.float32(_16_BITS))
-
-
-def _convert(plane: npt.NDArray[np.unsignedinteger], code: str) -> npt.NDArray[np.unsignedinteger]:
-    return np.asarray(cv2.demosaicing(plane, getattr(cv2, code)))
 
 
 def as_seen_by_sensor(frame: Image, colour: ColourProcessing) -> Image:
@@ -475,20 +471,20 @@ def noise_at(light: Image, full_scale: float, sensor: Sensor, rows: IntArray, co
         return np.asarray(noise) * full_scale
     share = np.minimum(1, UNCLIPPED / np.maximum(level, 1e-12)) if sensor.clips else np.ones(len(rows))
     plain, rng, at_once = sensor.model_copy(update={"overlay": None}), from_integer(0), max(1, CELLS // draws)
-    found = []
+    deviations = []
     for first in range(0, len(rows), at_once):
-        own = slice(first, first + at_once)
+        batch = slice(first, first + at_once)
         # A row of equal cells for each pixel, in step with the blocks.
-        down, right = ((at[own] - BLOCK // 2) // BLOCK * BLOCK for at in (rows, columns))
+        down, right = ((at[batch] - BLOCK // 2) // BLOCK * BLOCK for at in (rows, columns))
         inside = [np.clip(start[:, None] + np.arange(CELL), 0, size - 1)
                   for start, size in ((down, light.shape[0]), (right, light.shape[1]))]  # fmt: skip
-        cells = colour[inside[0][:, :, None], inside[1][:, None, :]] * share[own, None, None, None]
+        cells = colour[inside[0][:, :, None], inside[1][:, None, :]] * share[batch, None, None, None]
         picture = np.tile(cells.reshape(-1, CELL, cells.shape[3]), (1, draws, 1)).astype(np.float32)
         frame = capture(picture if light.ndim == 3 else picture[..., 0], full_scale, plain, rng)
         linear = mean_channel(sensor.response.model().decode_picture(frame))
         variance = linear.reshape(len(cells), CELL, draws, CELL).var(axis=2, ddof=1, dtype=float)
         # Cells begin left of and above the frame where the pixel is near its border.
-        number, (row, column) = np.arange(len(cells)), (rows[own] - down, columns[own] - right)
+        number, (row, column) = np.arange(len(cells)), (rows[batch] - down, columns[batch] - right)
         around = [variance[number, row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        found.append(np.sqrt(np.mean(around, axis=0)) * full_scale)
-    return np.concatenate(found)
+        deviations.append(np.sqrt(np.mean(around, axis=0)) * full_scale)
+    return np.concatenate(deviations)

@@ -98,9 +98,9 @@ class SequenceLabels:
             centres.append(np.broadcast_to(second.seen.world_from_camera[:3, 3], inside[-1].shape))
         hidden = hides(session, np.concatenate(centres), np.concatenate(inside))
         ends = np.cumsum([len(points) for points in inside])
-        for (first, second), own in zip(pairs, np.split(hidden, ends[:-1]), strict=True):
+        for (first, second), behind in zip(pairs, np.split(hidden, ends[:-1]), strict=True):
             whole = len(first.sparse)
-            share = float(np.count_nonzero(~own) / whole) if whole else float("nan")
+            share = float(np.count_nonzero(~behind) / whole) if whole else float("nan")
             self._shares[first.number, second.number] = share
 
     def close(self) -> None:

@@ -46,22 +46,10 @@ WRITTEN = (
 
 @dataclass(frozen=True)
 class SampledView:
-    """A view that was kept.
+    """A view that was kept, and how many isolated highlights it shows.
 
-    Parameters
-    ----------
-    viewpoint : int or float
-        Number, or share of the camera path.
-    isolated_highlights : int
-        How many isolated highlights it shows.
-    world_from_camera : ndarray, shape (4, 4)
-        Pose, mm: the world is the surface's own frame.
-    picture : str, optional
-        Name of its picture's file.
-    noise_seed : int, optional
-        Of the noise in that.
-    time_s : float, optional
-        When it is seen, s; None where the views are no sequence.
+    The viewpoint is a number or a share of the camera path, and the pose, shape (4, 4), mm, in the world of the
+    surface's own frame. `noise_seed` is that of its picture's file; `time_s`, when it is seen, None outside a sequence.
     """
 
     viewpoint: int | float

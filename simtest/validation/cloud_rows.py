@@ -13,7 +13,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.records import Specularity
 from simtest.rendering import HighlightPoint, Session
 from simtest.simulation.frame import RenderedView
-from simtest.simulation.highlights import assign_clouds
+from simtest.simulation.highlights import CloudRegions
 from simtest.validation.columns import Row
 from simtest.validation.metrics import MISSED, estimate_columns, mahalanobis2, scene_columns
 from simtest.validation.rough_truth import Cloud, cloud_columns
@@ -57,8 +57,8 @@ def apart(
     return singles, clouds, failures
 
 
-def match_cloud(session: Session, view: RenderedView, estimate: Estimate) -> list[int]:
-    """Return the indices in `view.clouds` of the base's highlight points that an estimate is of, one a light.
+def match_cloud(regions: CloudRegions, view: RenderedView, estimate: Estimate) -> list[int]:
+    """Return the indices in `view.clouds`, whose `regions` are given, of those that an estimate is of, one a light.
 
     Of each light it is the one that most of the estimate's spots belong to; of several, the nearest to where the
     estimate looks. That of most spots comes first. Empty where they belong to none that is in view. A point that an
@@ -69,7 +69,7 @@ def match_cloud(session: Session, view: RenderedView, estimate: Estimate) -> lis
     points, centres = estimate.cloud.points_px, list(view.clouds)
     votes: dict[int, int] = {}
     for light in sorted({centre.light for centre in centres}):
-        owners = assign_clouds(session, np.full(len(points), light), points, centres)
+        owners = regions.assign(np.full(len(points), light), points)
         counts = Counter(n for n in owners if n is not None)
         if counts:
             best = [n for n, count in counts.items() if count == max(counts.values())]
@@ -87,11 +87,12 @@ def cloud_rows(
     `found` and `failures` are those of `apart`, `whole` the clouds that are wholly in view. The column ``true_id`` is
     the index of the base's highlight point, as ``cloud``; the errors are against the base's normal there.
     """
-    made = []
+    made, regions = [], CloudRegions.of(session, view.clouds) if any(found.values()) else None
     for name, estimates in found.items():
         taken: set[int] = set()
         for i, estimate in estimates:
-            numbers = match_cloud(session, view, estimate)
+            assert regions is not None
+            numbers = match_cloud(regions, view, estimate)
             taken.update(numbers)
             row = _row(session, common, view, whole, numbers[0] if numbers else None)
             row |= estimate_columns(estimate) | {"estimator": name, "specularity": i}

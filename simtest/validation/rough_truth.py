@@ -11,7 +11,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.arrays import Array
 from simtest.simulation.frame import RenderedView
-from simtest.simulation.highlights import TrueHighlight, VisibleHighlight, cloud_edges
+from simtest.simulation.highlights import CloudRegions, TrueHighlight, VisibleHighlight
 from simtest.validation.columns import Row
 from simtest.validation.predicted import centroid_law_deg, glint_count_law
 
@@ -151,7 +151,7 @@ def whole_clouds(session: Session, view: RenderedView) -> dict[int, Cloud]:
     relief = view.scene.surface.relief
     assert relief is not None
     least = WHOLE_SLOPES * np.radians(relief.slope_deg)
-    edges = cloud_edges(session, view.clouds)
+    edges = CloudRegions.of(session, view.clouds).edges()
     return {n: _cloud(view, n, centre) for n, centre in enumerate(view.clouds) if edges[n] >= least}
 
 

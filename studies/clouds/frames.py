@@ -13,7 +13,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image, IntArray
 from simtest.runtime.files import write_atomically
 from simtest.simulation.frame import render_picture
-from simtest.simulation.highlights import assign_clouds
+from simtest.simulation.highlights import CloudRegions
 from simtest.spec import load_scene, scene_from_dict
 from simtest.spec.scene import Scene
 from studies.kept import of_this_code
@@ -192,10 +192,10 @@ def _render(case: Case, session: Session | None) -> tuple[BaseFrame, Session]:
     points = [point for point in session.base_highlights(radiance) if point.lit]
     height, width = picture.shape[:2]
     grid = np.stack(np.meshgrid(np.arange(0, width, STRIDE), np.arange(0, height, STRIDE)), axis=-1) + PIXEL_CENTRE
-    owners = []
+    owners, regions = [], CloudRegions.of(session, points)
     for light in range(len(scene.rig.lights)):
         pixels = grid.reshape(-1, 2)
-        own = assign_clouds(session, np.full(len(pixels), light), pixels, points)
+        own = regions.assign(np.full(len(pixels), light), pixels)
         owners.append(np.array([-1 if n is None else n for n in own]).reshape(grid.shape[:2]))
     frame = BaseFrame(
         case=case,

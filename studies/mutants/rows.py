@@ -302,7 +302,7 @@ ROWS = (
         "np.clip(frame, 0.0, 1.0) if sensor.clips", "np.maximum(frame, 0.0) if sensor.clips", "sensor"),
     row("point spread 20 % too narrow", "point spread", "simulation.sensor:collect", "sensor.point_spread_px)",
         "0.8 * sensor.point_spread_px)", "sensor chain_marks"),
-    row("picture written with blue for red", "encodings", "simulation.frame_files:encoded_png", "picture[:, :, ::-1]",
+    row("picture written with blue for red", "encodings", "simulation.frame_files:_coded", "picture[:, :, ::-1]",
         "picture", "frame_files"),
     row("k_min and k_max swapped in truth.npz", "labels", "simulation.frame_files:_truth",
         '"curvature": np.stack([truth.k_min, truth.k_max]', '"curvature": np.stack([truth.k_max, truth.k_min]',

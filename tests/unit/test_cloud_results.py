@@ -10,6 +10,7 @@ from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry.vectors import angle_deg
 from simtest.pages.style import degrees
 from simtest.report.run_folder import read_item
+from simtest.simulation.highlights import CloudRegions
 from simtest.spec import Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
@@ -52,7 +53,7 @@ def test_a_cloud_is_measured_against_the_base():
     assert row["budget_relief_deg"] > 0
     # Where no estimate is of it, the vote is empty.
     estimate = made.specularities[-1].estimates["cloud"]
-    assert match_cloud(session, made.view, estimate) == [row["cloud"]]
+    assert match_cloud(CloudRegions.of(session, made.view.clouds), made.view, estimate) == [row["cloud"]]
 
 
 @pytest.mark.render
@@ -87,12 +88,12 @@ def test_a_cloud_that_is_not_answered_is_a_row_with_its_reason():
     assert "a cloud takes 500" in row["flags"]
 
 
-def test_a_cloud_belongs_to_the_point_of_most_of_its_spots_also_where_an_instrument_covers_that(monkeypatch):
+def test_a_cloud_belongs_to_the_point_of_most_of_its_spots_also_where_an_instrument_covers_that():
     """One stray spot at a lit point far away does not make that point the truth."""
     centres = [SimpleNamespace(light=0, lit=lit, bp_px=np.array(at)) for lit, at in ((False, (50, 50)), (True, (9, 9)))]
     points = np.zeros((26, 2))
     estimate = SimpleNamespace(cloud=SimpleNamespace(points_px=points), look_px=np.array([50.0, 50.0]))
     view = SimpleNamespace(clouds=centres)
     for owners, expected in (([0] * 25 + [1], [0]), ([0] * 12 + [1] * 14, [1]), ([None] * 26, [])):
-        monkeypatch.setattr("simtest.validation.cloud_rows.assign_clouds", lambda *_, owners=owners: owners)
-        assert match_cloud(None, view, estimate) == expected
+        regions = SimpleNamespace(assign=lambda *_, owners=owners: owners)
+        assert match_cloud(regions, view, estimate) == expected

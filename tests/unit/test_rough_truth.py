@@ -7,7 +7,7 @@ import pytest
 from simtest.estimators import load_estimators
 from simtest.rendering import Session
 from simtest.simulation.frame import render_view
-from simtest.simulation.highlights import cloud_edges
+from simtest.simulation.highlights import CloudRegions
 from simtest.spec import Experiment, scene_from_dict
 from simtest.spec.spec_model import validate
 from simtest.validation import relief_laws
@@ -122,7 +122,7 @@ def test_clouds_that_the_frame_cuts_do_not_count():
     session = Session(scene_of())
     view = render_view(session, session.scene)
     # The nearest pixels of the border lie 175.5 px from the base's point.
-    (edge,) = cloud_edges(session, view.clouds)
+    (edge,) = CloudRegions.of(session, view.clouds).edges()
     assert edge == pytest.approx(np.sin(np.arctan(175.5 / 320)), rel=1e-4)
     assert set(whole_clouds(session, view)) == {0}
     # 3 slopes of 4 deg are 68.5 px: moved so near to the border, the cloud is cut.
@@ -130,7 +130,7 @@ def test_clouds_that_the_frame_cuts_do_not_count():
         session.update(scene_of(camera=CAMERA | {"cx": centre}))
         view = render_view(session, session.scene)
         assert (0 in whole_clouds(session, view)) == whole
-        (edge,) = cloud_edges(session, view.clouds)
+        (edge,) = CloudRegions.of(session, view.clouds).edges()
         assert edge == pytest.approx(np.sin(np.arctan((centre - 0.5) / 320)), rel=1e-4)
 
 
