@@ -16,11 +16,11 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from simtest.calibration import Frame, Priors
+from simtest.calibration import Frame
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Camera, Patch
-from simtest.geometry.vectors import tangent_basis
+from simtest.geometry import Patch
+from simtest.geometry.vectors import bisect, tangent_basis
 from simtest.runtime.arrays import AnyArray, Array, Image
 from simtest.runtime.files import JsonObject, require_plain
 from simtest.runtime.fitted import fitted_number
@@ -338,20 +338,13 @@ def reflection_distances(
     basis = np.stack(tangent_basis(normals), axis=1)
     nearest = np.full(len(normals), np.inf)
     for light in lights_mm:
-        near, middle, far = (_bisectors(rays, distance_mm * np.exp(k * share), light) for k in (-1, 0, 1))
+        near, middle, far = (bisect((distance_mm * np.exp(k * share))[:, None] * rays, light) for k in (-1, 0, 1))
         off = _across(basis, normals, middle)
         of_distance = np.einsum("nij,nj->ni", basis, far - near) / 2
         whole = covariances + RELIEF_RAD**2 * np.eye(2) + of_distance[:, :, None] * of_distance[:, None]
         squared = np.einsum("ni,ni->n", off, np.linalg.solve(whole, off[..., None])[..., 0])
         nearest = np.minimum(nearest, squared)
     return nearest
-
-
-def _bisectors(rays: Array, distance_mm: Array, light: Array) -> Array:
-    """Return the unit bisectors of the directions to a light and to the camera, shape (N, 3)."""
-    to_light = light - distance_mm[:, None] * rays
-    between = to_light / np.linalg.norm(to_light, axis=1, keepdims=True) - rays
-    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
 
 
 def _across(basis: Array, normals: Array, others: Array) -> Array:
@@ -411,10 +404,6 @@ class LearnedNormals:
     def _load(self, path: Path) -> TaughtNetwork:
         """Return the network of a file."""
         raise NotImplementedError
-
-    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Failure:
-        """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
-        return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
 
     def estimate_regions(
         self, frame: Frame, patches: Sequence[Patch | Failure], /

@@ -155,11 +155,11 @@ def _first_line(estimator: object) -> str:
 
 def as_estimator(name: str, given: object) -> "AnyEstimator":
     """Return an object as an estimator; raise `InputError` if it is none, or a class where an instance is meant."""
-    from simtest.estimators.protocol import Estimator, FrameEstimator
+    from simtest.estimators.protocol import Estimator, FrameEstimator, RegionEstimator
 
     if isinstance(given, type):
         raise InputError(f"estimator {name!r}: {given.__qualname__} is a class; must be an instance of it")
-    if isinstance(given, Estimator | FrameEstimator):
+    if isinstance(given, Estimator | FrameEstimator | RegionEstimator):
         return given
     raise InputError(
         f"estimator {name!r}: {given!r:.80} has neither estimate(patch, camera, priors) nor "

@@ -251,7 +251,7 @@ class CloudEstimator(FrameEstimator, Protocol):
 
 
 @runtime_checkable
-class RegionEstimator(FrameEstimator, Protocol):
+class RegionEstimator(Protocol):
     """Answers for the regions of a frame by their numbers, as a table of answers made elsewhere does."""
 
     def estimate_regions(
@@ -260,7 +260,7 @@ class RegionEstimator(FrameEstimator, Protocol):
         """Return what there is for each patch, None where there is nothing, and estimates that belong to no patch."""
 
 
-AnyEstimator = Estimator | FrameEstimator
+AnyEstimator = Estimator | FrameEstimator | RegionEstimator
 
 
 def laws_of(estimator: object) -> tuple[Law, ...]:
