@@ -215,19 +215,8 @@ LARGEST_MODEL_BYTES = 256 * 2**20
 class OnnxModel:
     """A trained network in ONNX Runtime, on one thread of the processor.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    form : str
-        Value of the metadata's key ``format``: which inputs, outputs and metadata the network has.
-    core : str
-        Name of the core that needs the network, for messages.
-
-    Attributes
-    ----------
-    content : dict
-        The metadata; read it inside of `reading`.
+    Its metadata, `content`, has the value `form` of the key ``format``, which says what inputs, outputs and metadata it
+    has; it is read inside of `reading`. `core` is the name of the core that needs the network, for messages.
     """
 
     def __init__(self, path: Path, form: str, core: str) -> None:
@@ -353,6 +342,11 @@ def _across(basis: Array, normals: Array, others: Array) -> Array:
     sine = np.linalg.norm(across, axis=1)
     angle = np.arctan2(sine, np.sum(normals * others, axis=1))
     return np.asarray(across * (angle / np.maximum(sine, 1e-12))[:, None])
+
+
+def log_deviation(outputs: Array) -> Array:
+    """Return the mean logarithm of the two stated deviations of a rotation, columns 2 and 4 of outputs (..., 7)."""
+    return np.asarray(np.clip(outputs[..., [2, 4]], *LOG_RANGE).mean(axis=-1))
 
 
 class TaughtNetwork:

@@ -23,6 +23,7 @@ from simtest.estimators.learned import (
     TaughtNetwork,
     image_basis,
     inflation,
+    log_deviation,
     median_of_lit,
     normal_of,
 )
@@ -127,11 +128,6 @@ _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 
 STEP = 1e-5
 """Step of the differences of the normal, rad."""
-
-
-def log_deviation(outputs: Array) -> Array:
-    """Return the mean logarithm of the two stated deviations for the outputs of one surface, shape (..., 7)."""
-    return np.asarray(np.clip(outputs[..., [2, 4]], *LOG_RANGE).mean(axis=-1))
 
 
 @dataclass(frozen=True)

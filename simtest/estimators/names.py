@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from simtest.errors import InputError
+from simtest.estimators.process import is_core
 from simtest.runtime.resources import OWN, SUFFIX, EntryPointGroup, ModelName, parse_model
 
 if TYPE_CHECKING:
@@ -86,15 +87,6 @@ def forgive_cores() -> None:
     """Count the faults of all cores from 0 again, so that no part of a run depends on those before it."""
     if loaded := sys.modules.get("simtest.estimators.process.core"):
         loaded.forgive_cores()
-
-
-PREFIX = "command:"
-"""What a name of an estimator begins with where it is a command."""
-
-
-def is_core(name: str) -> bool:
-    """Return whether an estimator's name is a command or a core's TOML file."""
-    return name.startswith(PREFIX) or name.endswith(".toml")
 
 
 ESTIMATORS = EntryPointGroup("simtest.estimators", "estimator")

@@ -206,17 +206,8 @@ def add_untold_parts(
     ``response`` follow where the priors leave the camera's geometry or the falloff open, and ``shape`` grows where the
     highlight may be a near miss.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Without these parts; one without a covariance gets none.
-    camera : Camera
-        Calibration.
-    priors : Priors
-        What is told.
-    family : IsophoteFamily or SmallSpot, optional
-        The highlight's isophotes or spot: their moments say how far a falloff moves the peak, their patch whether it
-        may be a near miss.
+    An estimate without a covariance gets none of them. The highlight's moments say how far a falloff moves the peak,
+    its patch whether it may be a near miss.
     """
     if priors.lights_mm:
         judged = _with_told_lights(estimate, priors)

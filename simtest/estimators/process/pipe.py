@@ -44,15 +44,7 @@ MAX_DIMENSIONS = 4
 
 
 class CoreFault(Exception):
-    """A core broke the protocol, died or took too long.
-
-    Parameters
-    ----------
-    reason : Reason
-        ``core_died``, ``core_timeout`` or ``core_protocol``.
-    detail : str
-        One line.
-    """
+    """A core broke the protocol, died or took too long: a reason ``core_...`` and one line of detail."""
 
     def __init__(self, reason: Reason, detail: str) -> None:
         super().__init__(detail)
