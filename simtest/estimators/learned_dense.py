@@ -1,10 +1,8 @@
 """`learned_dense`: a trained network's normals and distances all over a frame, run by ONNX Runtime, without PyTorch.
 
-What a dense network sees of a frame, and returns: planes on a coarse grid, of light, colour, sightlines and lights.
-
-The frame lies in the middle of a grid of 4:3, whole; a frame of another aspect leaves cells empty, as a view mask does.
-Directions are in the tangent basis of the direction to the camera that is aligned with the frame
-(`simtest.estimators.learned.image_basis`).
+It sees planes on a coarse grid, of light, colour, sightlines and lights. The frame lies in the middle of a grid of 4:3,
+whole; a frame of another aspect leaves cells empty, as a view mask does. Directions are in the tangent basis of the
+direction to the camera that is aligned with the frame (`simtest.estimators.learned.image_basis`).
 """
 
 from collections.abc import Sequence

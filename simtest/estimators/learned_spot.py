@@ -1,9 +1,8 @@
 """`learned_spot`: a trained network's normals at single highlights, run by ONNX Runtime, without PyTorch.
 
-What a network sees of a highlight, and returns: crops around its peak, the lights and the optical axis go in.
-
-The three crops have fixed sizes in pixels, so they do not depend on the detector. All directions are in the tangent
-basis of the direction to the camera that is aligned with the crops' axes (`image_basis`).
+It sees crops around a highlight's peak, the lights and the optical axis. The three crops have fixed sizes in pixels, so
+they do not depend on the detector. All directions are in the tangent basis of the direction to the camera that is
+aligned with the crops' axes (`image_basis`).
 """
 
 from collections.abc import Sequence

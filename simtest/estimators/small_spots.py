@@ -1,13 +1,9 @@
 """Small highlights: below a radius of about 3 px isophotes carry no shape, and the spot's centre carries the normal.
 
-Pixels, point spread, mosaic and coding then make the isophotes. The centre is that of a Gaussian on a local background,
-fitted to the unsmoothed pixels (`simtest.estimators.small_spots`); neither axis ratio nor curvature is stated.
-
-
-Least-squares fit of small spots: a Gaussian on a local background, clipped pixels censored, many spots at once.
-
-A spot of a few pixels is the image of a highlight through lens and pixels, whose point spread is nearly Gaussian. Its
-centre is then what the pixels tell; the fit is the maximum-likelihood estimate of it under white noise.
+Pixels, point spread, mosaic and coding then make the isophotes. A spot of a few pixels is the image of a highlight
+through lens and pixels, whose point spread is nearly Gaussian: its centre is that of a Gaussian on a local background,
+fitted to the unsmoothed pixels, which is the maximum-likelihood estimate of it under white noise. Clipped pixels are
+censored, and many spots are fitted at once. Neither axis ratio nor curvature is stated.
 """
 
 import math
