@@ -133,8 +133,9 @@ class Photometric(OfHighlight):
         else:
             covariance = covariance * pixels.correlation(fitted)
         budget = {"noise": covariance, **beyond_noise(highlight, excess)}
+        gains = np.abs(1 + np.linalg.eigvalsh(fitted.model.shape))  # abs(1 + d k)
         estimate = along(
-            highlight, s, None if pixels.noise is None else budget, priors, axis_ratio=_axis_ratio(fitted.model)
+            highlight, s, None if pixels.noise is None else budget, priors, axis_ratio=float(gains.min() / gains.max())
         )
         # A bend of the isophotes and the residuals of the fit show the same structure.
         added = float(np.trace(budget["shape"] - highlight.drift_error))
@@ -279,12 +280,6 @@ def _quadric(family: IsophoteFamily, rays: Array) -> ColocatedQuadric:
     K = (gain - 1) * np.outer(vectors[:, 1], vectors[:, 1])
     shape = np.array([K[0, 0], K[0, 1], K[1, 1]])
     return ColocatedQuadric(rays, basis, shape, float(np.log(family.patch.peak_value)), float(exponent))
-
-
-def _axis_ratio(model: ColocatedQuadric) -> float:
-    """Return the smaller over the larger abs(1 + d k)."""
-    gains = np.abs(1 + np.linalg.eigvalsh(model.shape))
-    return float(gains.min() / gains.max())
 
 
 def in_tangent_basis(covariance: Array, normal: Array, basis: Array) -> Array:

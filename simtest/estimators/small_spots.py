@@ -294,17 +294,12 @@ def fit_small_spots(patches: Sequence[Patch], camera: Camera) -> list[SmallSpot]
     values, used, clipped = (np.array(each) for each in zip(*cut, strict=True))
     windows = SpotWindows(values, used, clipped, offsets)
     # start from the smoothed peak
-    centres = np.array([_of_window(patch) for patch in patches])
+    centres = np.array([p.peak_px - np.array(p.origin_px) - np.array(p.peak_pixel) - PIXEL_CENTRE for p in patches])
     radii, bases = np.array(shapes).T
     smoothing = np.array([patch.smoothing_px for patch in patches])
     variances = np.maximum(radii**2 / GAUSSIAN_RADIUS2 - smoothing**2, 2 * LEAST_VARIANCE_PX2)
     fits = fit_spots(windows, centres, variances, bases)
     return [_spot(i, patch, camera, windows, fits, float(radii[i])) for i, patch in enumerate(patches)]
-
-
-def _of_window(patch: Patch) -> Array:
-    """Return a patch's peak from the centre of its peak's pixel, px, shape (2,)."""
-    return np.asarray(patch.peak_px - np.array(patch.origin_px) - np.array(patch.peak_pixel) - PIXEL_CENTRE)
 
 
 def _window(patch: Patch, half: int, reach: float, offsets: Array) -> tuple[Array, Mask, Mask]:
