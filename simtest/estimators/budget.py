@@ -4,27 +4,23 @@ A part is the covariance of the normal distribution whose 95 % region holds 95 %
 that are normal this is their covariance; for a prior with heavy tails, such as that of a light somewhere beside the
 camera, it is a little more (`equivalent_covariance`).
 
+Here stand the parts that a highlight's isophotes show by themselves: the noise of its pixels, carried to quantities
+that depend on the isophotes' crossings, ripples, bends and a clipped peak.
 
-Propagation of pixel noise to quantities that depend on the crossings of isophotes.
-
-Ripples: how isophotes depart from their ellipses, and what that says of an error of their centre.
-
-Whatever disturbs a highlight's pixels, noise that demosaicing, coding or sharpening has correlated, a neighbour, a
-texture or a relief below it, moves its isophotes in all harmonics of the direction phi from the centre alike, as far
-as smoothing leaves them. Harmonics 0 to 2 are size, centre and ellipse, which a fit takes for the highlight's own. The
-next ones remain: they are seen, and say how far the centre may be off, whatever the disturbance is.
+Ripples: how isophotes depart from their ellipses, and what that says of an error of their centre. Whatever disturbs a
+highlight's pixels, noise that demosaicing, coding or sharpening has correlated, a neighbour, a texture or a relief
+below it, moves its isophotes in all harmonics of the direction phi from the centre alike, as far as smoothing leaves
+them. Harmonics 0 to 2 are size, centre and ellipse, which a fit takes for the highlight's own. The next ones remain:
+they are seen, and say how far the centre may be off, whatever the disturbance is.
 
 Radii are relative to the ellipse's, so that a ripple of variance v in one direction stands for a covariance v E of the
 centre, E the ellipse's second moments (its boundary is w^T E^-1 w = 1).
 
-What isophotes that are no ellipses say of their centre.
-
-A highlight whose isophotes are bent holds more than one point that shines: a second glint that it melts with, or a near
-miss beside its own (theory.md 7.1b). Both pull the centre by a share of the highlight's size, and ripples do not show
-it: the bend lies in harmonics 2 and 3, which the highlight's own shape has as well. Isophotes of a single highlight
-are ellipses to a percent or better; a melted one may look no less like an ellipse than to 2 or 3 %.
-
-What clipping hides of a highlight: its pixels, and how far the peak may lie from where the isophotes put it.
+Bends: what isophotes that are no ellipses say of their centre. A highlight whose isophotes are bent holds more than one
+point that shines: a second glint that it melts with, or a near miss beside its own (theory.md 7.1b). Both pull the
+centre by a share of the highlight's size, and ripples do not show it: the bend lies in harmonics 2 and 3, which the
+highlight's own shape has as well. Isophotes of a single highlight are ellipses to a percent or better; a melted one may
+look no less like an ellipse than to 2 or 3 %.
 """
 
 import math

@@ -1,9 +1,7 @@
 """`cloud`: the base's normal from the cloud of highlights that relief makes of one (theory.md 7.1 and 7.5).
 
-What the diffuse light says of a cloud: whether the base has a highlight point there at all, and where.
-
 Spots alone do not tell a highlight point from a fold that nearly faces the camera, nor how far changes of the base's
-gains move their centroid. The diffuse light does (`cloud_shading`), as well as the albedo lets it.
+gains move their centroid. The diffuse light does (`cloud_light`), as well as the albedo lets it.
 """
 
 import math
@@ -156,9 +154,9 @@ ROUND_SIGMA = 2.0
 class CloudCentre:
     """The centre of a cloud of spots carries the base's normal, where a single highlight carries the fine one.
 
-    Spots are found in the frame (`cloud_spots`) and grouped into clouds (`cloud_mixture`). With the light at the camera
+    Spots are found in the frame (`cloud_light`) and grouped into clouds (`cloud_mixture`). With the light at the camera
     a cloud lies around the sightline at which the base faces the camera; the diffuse light says whether there is one,
-    and moves the centre to it (`cloud_base`). Lights that are told have each their part of the cloud, half their angle
+    and moves the centre to it (`evidence_of`). Lights that are told have each their part of the cloud, half their angle
     at the surface off that sightline; lights that are not told apart are one mixture.
 
     Parameters
@@ -178,7 +176,7 @@ class CloudCentre:
         likely turned from the lights at its centre; ``base_unverified`` where too little diffuse light is seen to tell;
         ``clouds_refused`` where another cloud of the frame gets no answer.
         The axis ratio, and the curvature's directions, hold for isotropic relief. Fails with ``no_estimate`` where no
-        cloud has spots enough in view, or the base has no single highlight point at any one's centre (`cloud_base`).
+        cloud has spots enough in view, or the base has no single highlight point at any one's centre (`evidence_of`).
         """
         spots = find_spots(frame)
         if len(spots.peaks) < self.least_spots:

@@ -1,4 +1,4 @@
-"""What the diffuse light around a cloud tells: how far the base is turned away from the camera at its centre.
+"""What `cloud` reads of a frame: its bright spots, and the diffuse light between them.
 
 Light and camera at one place: a base of even albedo at the distance r sends back L = cos(w) / r^2, where the misfit w
 is the turn of its normal from the reversed sightline. Across a sightline w = grad ln r, so that
@@ -9,10 +9,8 @@ A polynomial of ln L around a cloud gives J, and w at its centre. At a highlight
 come near to facing the camera make clouds too; there w is not 0. To first order a light beside the camera, at L across
 the sightline, turns all by L / d: w - L / d takes the place of w.
 
-
-The bright spots of a frame: maxima that a saddle parts from any brighter one, each with its centroid.
-
-On a relief these are what can be seen of the glints (theory.md 7.1b). Estimator `cloud` groups them.
+Between them stand the bright spots of a frame: maxima that a saddle parts from any brighter one, each with its
+centroid. On a relief these are what can be seen of the glints (theory.md 7.1b); `cloud` groups them.
 """
 
 from dataclasses import dataclass

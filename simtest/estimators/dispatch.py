@@ -110,7 +110,7 @@ def run_in_frame(
     estimator raises, every patch gets that Failure.
     """
     camera = frame.calibration.camera
-    if not isinstance(estimator, FrameEstimator):
+    if isinstance(estimator, Estimator) and not isinstance(estimator, FrameEstimator | RegionEstimator):
         return FrameResults(run_each(estimator, patches, camera, priors))
     try:
         if isinstance(estimator, RegionEstimator):

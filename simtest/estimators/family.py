@@ -6,8 +6,7 @@ sightline. Terms of higher order in w make E(t) / (-2 ln t) and the axis linear 
 extrapolated to the peak by a straight line (theory.md section 3, items 3 and 4; section 6): the axis over the
 isophote's area, and to the peak of the lobe before smoothing (`simtest.estimators.isophotes`).
 
-
-Fitting of highlights' isophote families, all ellipses and poses of several highlights at once.
+The families of several highlights are fitted at once.
 """
 
 from collections.abc import Iterable, Sequence

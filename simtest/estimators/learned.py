@@ -16,11 +16,11 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from simtest.calibration import Frame, Priors
+from simtest.calibration import Frame
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Camera, Patch
-from simtest.geometry.vectors import tangent_basis
+from simtest.geometry import Patch
+from simtest.geometry.vectors import bisect, tangent_basis
 from simtest.runtime.arrays import AnyArray, Array, Image
 from simtest.runtime.files import JsonObject, require_plain
 from simtest.runtime.fitted import fitted_number
@@ -215,19 +215,8 @@ LARGEST_MODEL_BYTES = 256 * 2**20
 class OnnxModel:
     """A trained network in ONNX Runtime, on one thread of the processor.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    form : str
-        Value of the metadata's key ``format``: which inputs, outputs and metadata the network has.
-    core : str
-        Name of the core that needs the network, for messages.
-
-    Attributes
-    ----------
-    content : dict
-        The metadata; read it inside of `reading`.
+    Its metadata, `content`, has the value `form` of the key ``format``, which says what inputs, outputs and metadata it
+    has; it is read inside of `reading`. `core` is the name of the core that needs the network, for messages.
     """
 
     def __init__(self, path: Path, form: str, core: str) -> None:
@@ -338,7 +327,7 @@ def reflection_distances(
     basis = np.stack(tangent_basis(normals), axis=1)
     nearest = np.full(len(normals), np.inf)
     for light in lights_mm:
-        near, middle, far = (_bisectors(rays, distance_mm * np.exp(k * share), light) for k in (-1, 0, 1))
+        near, middle, far = (bisect((distance_mm * np.exp(k * share))[:, None] * rays, light) for k in (-1, 0, 1))
         off = _across(basis, normals, middle)
         of_distance = np.einsum("nij,nj->ni", basis, far - near) / 2
         whole = covariances + RELIEF_RAD**2 * np.eye(2) + of_distance[:, :, None] * of_distance[:, None]
@@ -347,19 +336,17 @@ def reflection_distances(
     return nearest
 
 
-def _bisectors(rays: Array, distance_mm: Array, light: Array) -> Array:
-    """Return the unit bisectors of the directions to a light and to the camera, shape (N, 3)."""
-    to_light = light - distance_mm[:, None] * rays
-    between = to_light / np.linalg.norm(to_light, axis=1, keepdims=True) - rays
-    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
-
-
 def _across(basis: Array, normals: Array, others: Array) -> Array:
     """Return the rotations from normals to other directions in their tangent bases, rad, shape (N, 2)."""
     across = np.einsum("nij,nj->ni", basis, others)
     sine = np.linalg.norm(across, axis=1)
     angle = np.arctan2(sine, np.sum(normals * others, axis=1))
     return np.asarray(across * (angle / np.maximum(sine, 1e-12))[:, None])
+
+
+def log_deviation(outputs: Array) -> Array:
+    """Return the mean logarithm of the two stated deviations of a rotation, columns 2 and 4 of outputs (..., 7)."""
+    return np.asarray(np.clip(outputs[..., [2, 4]], *LOG_RANGE).mean(axis=-1))
 
 
 class TaughtNetwork:
@@ -411,10 +398,6 @@ class LearnedNormals:
     def _load(self, path: Path) -> TaughtNetwork:
         """Return the network of a file."""
         raise NotImplementedError
-
-    def estimate_frame(self, frame: Frame, camera: Camera, priors: Priors, /) -> Failure:
-        """Return a failure: which highlights there are is the detector's to say (see `estimate_regions`)."""
-        return Failure(Reason.NO_ESTIMATE, "answers for detected highlights alone")
 
     def estimate_regions(
         self, frame: Frame, patches: Sequence[Patch | Failure], /

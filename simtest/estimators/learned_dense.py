@@ -1,10 +1,8 @@
 """`learned_dense`: a trained network's normals and distances all over a frame, run by ONNX Runtime, without PyTorch.
 
-What a dense network sees of a frame, and returns: planes on a coarse grid, of light, colour, sightlines and lights.
-
-The frame lies in the middle of a grid of 4:3, whole; a frame of another aspect leaves cells empty, as a view mask does.
-Directions are in the tangent basis of the direction to the camera that is aligned with the frame
-(`simtest.estimators.learned.image_basis`).
+It sees planes on a coarse grid, of light, colour, sightlines and lights. The frame lies in the middle of a grid of 4:3,
+whole; a frame of another aspect leaves cells empty, as a view mask does. Directions are in the tangent basis of the
+direction to the camera that is aligned with the frame (`simtest.estimators.learned.image_basis`).
 """
 
 from collections.abc import Sequence
@@ -24,6 +22,7 @@ from simtest.estimators.learned import (
     TaughtNetwork,
     image_basis,
     inflation,
+    log_deviation,
     median_of_lit,
     reflection_distances,
     turned_normals,
@@ -320,7 +319,7 @@ class LearnedDense(LearnedNormals):
         first, second = (np.exp(np.clip(made[:, column], *LOG_RANGE)) for column in (2, 4))
         root = np.zeros((len(made), 2, 2))
         root[:, 0, 0], root[:, 1, 0], root[:, 1, 1] = first, made[:, 3], second
-        root *= ROTATION_SCALE * np.sqrt(inflated * scales["base"].at(stated_deviation(made)))[:, None, None]
+        root *= ROTATION_SCALE * np.sqrt(inflated * scales["base"].at(log_deviation(made)))[:, None, None]
         normals, covariances = turned_normals(camera.unproject(points_px), made[:, :2] * ROTATION_SCALE, root)
         distance = DISTANCE_MM * np.exp(DISTANCE_SCALE * made[:, 5])
         logarithm = np.clip(made[:, 6], *LOG_RANGE)
@@ -350,11 +349,6 @@ def _refused_highlight(squared: float) -> Failure | None:
         return None
     told = f"contradicts the law of reflection: squared distance {squared:.3g}, limit {HIGHLIGHT_LIMIT:g}"
     return Failure(Reason.NO_ESTIMATE, told)
-
-
-def stated_deviation(made: Array) -> Array:
-    """Return the mean logarithm of the two deviations of a rotation, in outputs of shape (N, 7)."""
-    return np.asarray(np.clip(made[:, [2, 4]], *LOG_RANGE).mean(axis=1))
 
 
 def interpolated(outputs: Array, points: Array) -> Array:

@@ -1,9 +1,8 @@
 """`learned_spot`: a trained network's normals at single highlights, run by ONNX Runtime, without PyTorch.
 
-What a network sees of a highlight, and returns: crops around its peak, the lights and the optical axis go in.
-
-The three crops have fixed sizes in pixels, so they do not depend on the detector. All directions are in the tangent
-basis of the direction to the camera that is aligned with the crops' axes (`image_basis`).
+It sees crops around a highlight's peak, the lights and the optical axis. The three crops have fixed sizes in pixels, so
+they do not depend on the detector. All directions are in the tangent basis of the direction to the camera that is
+aligned with the crops' axes (`image_basis`).
 """
 
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from simtest.estimators.learned import (
     TaughtNetwork,
     image_basis,
     inflation,
+    log_deviation,
     median_of_lit,
     normal_of,
 )
@@ -127,11 +127,6 @@ _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 
 STEP = 1e-5
 """Step of the differences of the normal, rad."""
-
-
-def log_deviation(outputs: Array) -> Array:
-    """Return the mean logarithm of the two stated deviations for the outputs of one surface, shape (..., 7)."""
-    return np.asarray(np.clip(outputs[..., [2, 4]], *LOG_RANGE).mean(axis=-1))
 
 
 @dataclass(frozen=True)

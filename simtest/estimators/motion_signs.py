@@ -4,8 +4,7 @@ With light and camera at one position the highlight follows the camera over the 
 sightline the BP moves by u = (I + dS)^-1 delta, and its normal, hence its sightline, by dS u / d. One picture gives the
 sizes of 1 + d k (theory.md section 3, item 3), the motion their signs.
 
-
-The quadric patch of one curvature hypothesis, and the normal that it shows to a camera elsewhere [Z89].
+Each curvature hypothesis is a quadric patch, whose normal a camera elsewhere sees at another place.
 """
 
 from collections.abc import Sequence
@@ -368,7 +367,7 @@ class _Explained:
 
     predicted: Array  # normal in the view's own frame, shape (3,)
     miss: Array  # of the estimate, in the tangent basis of the predicted normal, rad, shape (2,)
-    jacobian: Array  # of the prediction by `moved_patch.SOURCES`, shape (2, 6)
+    jacobian: Array  # of the prediction by `SOURCES`, shape (2, 6)
     own: Array  # covariance of what this picture alone adds, shape (2, 2)
 
 

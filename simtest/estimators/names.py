@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from simtest.errors import InputError
+from simtest.estimators.process import is_core
 from simtest.runtime.resources import OWN, SUFFIX, EntryPointGroup, ModelName, parse_model
 
 if TYPE_CHECKING:
@@ -88,15 +89,6 @@ def forgive_cores() -> None:
         loaded.forgive_cores()
 
 
-PREFIX = "command:"
-"""What a name of an estimator begins with where it is a command."""
-
-
-def is_core(name: str) -> bool:
-    """Return whether an estimator's name is a command or a core's TOML file."""
-    return name.startswith(PREFIX) or name.endswith(".toml")
-
-
 ESTIMATORS = EntryPointGroup("simtest.estimators", "estimator")
 
 
@@ -138,13 +130,12 @@ def describe_estimators(names: Sequence[str]) -> dict[str, str]:
 
 
 def _described(estimator: object) -> str:
-    """Return what an estimator says of itself: its description, where it has one, else its docstring's first line."""
-    stated = getattr(estimator, "description", None)
-    return stated if isinstance(stated, str) else _first_line(estimator)
+    """Return what an estimator says of itself: its description, or the first line of the docstring that it has.
 
-
-def _first_line(estimator: object) -> str:
-    """Return the first line of an estimator's own docstring, of a wrapped function that function's, or the module's."""
+    Of a wrapped function that is the function's; of all without one the module's.
+    """
+    if isinstance(stated := getattr(estimator, "description", None), str):
+        return stated
     given = getattr(estimator, "function", estimator)
     # An instance without a docstring of its own has its class's; `inspect.getdoc` would go on to object's.
     own = given.__doc__ if inspect.isroutine(given) else type(given).__doc__
@@ -155,11 +146,11 @@ def _first_line(estimator: object) -> str:
 
 def as_estimator(name: str, given: object) -> "AnyEstimator":
     """Return an object as an estimator; raise `InputError` if it is none, or a class where an instance is meant."""
-    from simtest.estimators.protocol import Estimator, FrameEstimator
+    from simtest.estimators.protocol import Estimator, FrameEstimator, RegionEstimator
 
     if isinstance(given, type):
         raise InputError(f"estimator {name!r}: {given.__qualname__} is a class; must be an instance of it")
-    if isinstance(given, Estimator | FrameEstimator):
+    if isinstance(given, Estimator | FrameEstimator | RegionEstimator):
         return given
     raise InputError(
         f"estimator {name!r}: {given!r:.80} has neither estimate(patch, camera, priors) nor "
@@ -183,16 +174,26 @@ def load_estimators(estimators: Sequence[str] | Mapping[str, object]) -> "dict[s
     if isinstance(estimators, Mapping):
         return {name: as_estimator(name, given) for name, given in estimators.items()}
     loaded: dict[str, AnyEstimator] = {}
+    given: object
     for name in estimators:
-        short, given = _core(name) if is_core(name) else _network(name) if parse_model(name) else _plain(name)
+        if is_core(name):
+            # Imported at need, since few runs name one.
+            from simtest.estimators.process.core import load_core
+
+            short, given = short_name(name), load_core(name)
+        elif parse_model(name):
+            # Loaded first: an unknown estimator is told before the name that its results would bear.
+            given, short = ESTIMATORS.load(name), short_name(name)
+        else:
+            short, given = name, _installed(name)
         if short in loaded:
             raise InputError(f"estimator {short!r}: given twice")
         loaded[short] = as_estimator(name, given)
     return loaded
 
 
-def _plain(name: str) -> tuple[str, object]:
-    """Return the name and estimator of a registered name; errors say what else it may have meant."""
+def _installed(name: str) -> object:
+    """Return an estimator by its registered name; errors say what else the name may have meant."""
     if "," in name:
         each = " ".join(f"--estimator {part.strip()}" for part in name.split(","))
         raise InputError(f"estimator {name!r}: one name each; several are given as {each}")
@@ -203,20 +204,6 @@ def _plain(name: str) -> tuple[str, object]:
         )
     if " " in name.strip() or "/" in name:
         raise InputError(f"estimator {name!r}: is no estimator's name; a program of yours needs 'command: ' before it")
-    return name, _installed(name)
-
-
-def _network(name: str) -> tuple[str, object]:
-    """Return the short name of an estimator with a user's network, and the estimator."""
-    from simtest.estimators.names import short_name
-
-    # Loaded first: an unknown estimator is told before the name that its results would bear.
-    given = ESTIMATORS.load(name)
-    return short_name(name), given
-
-
-def _installed(name: str) -> object:
-    """Return an installed estimator; where there is none, but a file of its name, the error says how that is run."""
     try:
         return ESTIMATORS.load(name)
     except InputError as error:
@@ -224,11 +211,3 @@ def _installed(name: str) -> object:
             raise
         how = f"python {name}" if name.endswith(".py") else f"./{name}"
         raise InputError(f"{error}; the file {name} is run by 'command: {how}'") from error
-
-
-def _core(name: str) -> tuple[str, object]:
-    """Return a core's short name and its estimator; imported at need, since few runs name one."""
-    from simtest.estimators.names import short_name
-    from simtest.estimators.process.core import load_core
-
-    return short_name(name), load_core(name)

@@ -1,6 +1,6 @@
 """`photometric`: maximum-likelihood fit of a Phong lobe to the pixels of a highlight (theory.md sections 2 and 3).
 
-Goodness of a lobe's fit: whether it explains its pixels, and how far the normal depends on which are fitted.
+Tests of goodness say whether it explains its pixels, and how far the normal depends on which are fitted.
 """
 
 import math
@@ -27,85 +27,6 @@ DARK = 1e-6
 """Least cosine of the lobe's angle: below it the specular term is 0 and has no logarithm."""
 
 
-@dataclass(frozen=True)
-class ColocatedQuadric:
-    """A quadric patch with light and camera at one position (theory.md section 3).
-
-    In units of the distance d to the BP, with s its sightline, the surface is P = s (1 + z) + (x, y) in the tangent
-    plane, z = (x, y) K (x, y)^T / 2, K = d S. The radiance is c max(0, cos 2 theta)^n over the squared distance.
-    Parameters: rotation of s in its tangent plane (2), K11, K12, K22, log c. n is held, because beside the three of K
-    it is all but undetermined.
-    """
-
-    rays: Array  # (m, 3): sightlines of the pixels
-    frame: Array  # (3, 3): rows e, f, s: tangent basis and sightline of the BP, camera frame
-    K: Array  # (3,): K11, K12, K22 in the basis e, f
-    log_scale: float  # log c
-    exponent: float  # n
-
-    @property
-    def normal(self) -> Array:
-        """N = -s, shape (3,)."""
-        return -self.frame[2]
-
-    @property
-    def shape(self) -> Array:
-        """K, shape (2, 2), in the basis e, f."""
-        k11, k12, k22 = self.K
-        return np.array([[k11, k12], [k12, k22]])
-
-    def moved(self, step: Array) -> Self:
-        """Turn s, with the basis carried along the shortest way, and add to K and log c."""
-        e, f, s = self.frame
-        turned = s + step[0] * e + step[1] * f
-        turned /= np.linalg.norm(turned)
-        # The basis rotates with s along a great circle.
-        carried = [v - (turned @ v) / (1 + s @ turned) * (s + turned) for v in (e, f)]
-        frame = np.stack([*carried, turned])
-        return replace(self, frame=frame, K=self.K + step[2:5], log_scale=self.log_scale + float(step[5]))
-
-    def evaluate(self) -> tuple[Array, Array]:
-        """Return intensities and derivatives."""
-        # tangents (a, b) of each ray in the basis, and q = (a, b) K (a, b)^T
-        e, f, s = self.frame
-        along = self.rays @ s
-        a, b = (self.rays @ e) / along, (self.rays @ f) / along
-        k11, k12, k22 = self.K
-        ka, kb = k11 * a + k12 * b, k12 * a + k22 * b
-        q = a * ka + b * kb
-        # t: hit along the ray; where the ray misses the quadric, its closest approach
-        root = np.sqrt(np.maximum(1 - 2 * q, 1e-6))
-        t = 2 / (1 + root)
-        across = 1 + a * a + b * b
-        A, B = 1 - t * q, 1 + t * t * (ka * ka + kb * kb)
-        # cos^2 of the angle between view and normal; cos 2 theta = 2 cos^2 - 1
-        squared = A * A / (B * across)
-        cosine = np.maximum(2 * squared - 1, DARK)
-        intensity = np.exp(self.log_scale) * cosine**self.exponent / (t * t * across)
-
-        # derivatives by q, g = ka^2 + kb^2 and across
-        dt_dq = t * t / (2 * root)
-        dA_dq = -(t + q * dt_dq)
-        dB_dq = 2 * t * (ka * ka + kb * kb) * dt_dq
-        # d log I = on_q dq + on_g dg + on_across d(across)
-        lobe = self.exponent / cosine * 2 * squared
-        on_q = lobe * (2 * dA_dq / A - dB_dq / B) - 2 * dt_dq / t
-        on_g = -lobe * t * t / B
-        on_across = -(lobe + 1) / across
-        # derivatives by the tangents, then by the six parameters
-        by_a = on_q * 2 * ka + on_g * 2 * (ka * k11 + kb * k12) + on_across * 2 * a
-        by_b = on_q * 2 * kb + on_g * 2 * (ka * k12 + kb * k22) + on_across * 2 * b
-        J = np.empty((len(a), 6))
-        J[:, 0] = -by_a * (1 + a * a) - by_b * a * b
-        J[:, 1] = -by_a * a * b - by_b * (1 + b * b)
-        J[:, 2] = on_q * a * a + on_g * 2 * ka * a
-        J[:, 3] = on_q * 2 * a * b + on_g * 2 * (ka * b + kb * a)
-        J[:, 4] = on_q * b * b + on_g * 2 * kb * b
-        J[:, 5] = 1.0
-        J *= intensity[:, None]
-        return intensity, J
-
-
 RINGS, SECTORS = 6, 8
 """The lobe is divided by the model's intensity into rings of equally many pixels, each ring into sectors."""
 
@@ -122,82 +43,6 @@ INNER = 0.5
 CORRELATED_PX, SUMMED_DEVIATIONS = 4, 2.0
 """Coding and demosaicing correlate the noise of pixels this far apart along an axis at most. The sum of white noise's
 correlations exceeds 1 by so many of its standard deviations once in 40 highlights."""
-
-
-def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None, noise: float | Array) -> bool:
-    """Test whether the residuals hold more structure than the frame's noise: a chi-square test of their local means.
-
-    A sum over single pixels would detect less, since misfits are smooth, and would need the noise to within a percent.
-    Pixels have intensities `observed`, shape (m,), and noise of standard deviation `noise`; clipped ones are left out.
-    """
-    model, _ = fitted.model.evaluate()
-    e, f = fitted.model.frame[:2]
-    rays = fitted.model.rays
-    kept = np.ones(len(model), dtype=bool) if clipped is None else ~clipped
-    residual, level = (observed - model)[kept], model[kept]
-    variance = np.broadcast_to(np.square(noise), model.shape)[kept]
-    if len(residual) < RINGS * SECTORS * MIN_IN_BIN:
-        return False
-    # bins: rings by intensity, sectors by direction from the axis
-    ring = np.searchsorted(np.quantile(level, np.arange(1, RINGS) / RINGS), level)
-    angle = np.arctan2(rays[kept] @ f, rays[kept] @ e)
-    sector = np.minimum(((angle + np.pi) / (2 * np.pi) * SECTORS).astype(int), SECTORS - 1)
-    number = ring * SECTORS + sector
-    count, total, spread = (
-        np.bincount(number, weights, RINGS * SECTORS) for weights in (np.ones(len(number)), residual, variance)
-    )
-    # chi-square of the bins' means
-    used = count >= MIN_IN_BIN
-    mean = total[used] / count[used]
-    allowed = spread[used] / count[used] ** 2 + (FLOOR * model.max()) ** 2
-    return bool(np.sum(mean**2 / allowed) > chi_squared.quantile(1 - LEVEL, int(np.count_nonzero(used))))
-
-
-def correlation_of_noise(
-    fitted: LobeFit[Model], observed: Array, clipped: Mask | None, noise: float | Array, places: Index
-) -> float:
-    """Return by how much the noise's correlation between pixels raises a covariance of white residuals; 1: not at all.
-
-    A smooth model takes from correlated noise the sum of its correlations over all distances. Both the smoothed frame's
-    noise, `noise`, and the residuals must show more than chance; the larger one counts. `places` are the residuals'
-    rows and columns, shape (2, m).
-    """
-    raised = float(np.mean(np.square(noise))) / max(fitted.sigma**2, 1e-300)
-    if raised < COLOURED**2:
-        return 1.0
-    rows, columns = places - places.min(axis=1, keepdims=True)
-    kept = np.ones(len(observed)) if clipped is None else (~clipped).astype(float)
-    residual = kept * (observed - fitted.model.evaluate()[0])
-    sums, pairs = (_products(values, rows, columns) for values in (residual, kept))
-    summed = float((sums / np.maximum(pairs, 1.0)).sum()) / fitted.sigma**2
-    chance = SUMMED_DEVIATIONS * math.sqrt((2 * CORRELATED_PX + 1) ** 2 / len(observed))
-    return max(raised, summed) if summed > 1 + chance else 1.0
-
-
-def _products(values: Array, rows: Index, columns: Index) -> Array:
-    """Return the sums of products of values at pixels up to `CORRELATED_PX` apart along both axes."""
-    grid = np.zeros((int(rows.max()) + 1 + CORRELATED_PX, int(columns.max()) + 1 + CORRELATED_PX))
-    grid[rows, columns] = values
-    products = np.fft.irfft2(np.abs(np.fft.rfft2(grid)) ** 2, s=grid.shape)
-    near = np.arange(-CORRELATED_PX, CORRELATED_PX + 1)
-    return np.asarray(products[np.ix_(near, near)])
-
-
-def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None) -> float:
-    """Return how far the normal moves, beyond noise, when only the pixels near the peak are fitted, squared, rad^2.
-
-    It is 0 where these pixels alone do not determine a fit.
-    """
-    model, _ = fitted.model.evaluate()
-    near = model > INNER * model.max()
-    part = replace(fitted.model, rays=fitted.model.rays[near])
-    inner = fit_lobe(part, observed[near], None if clipped is None else clipped[near])
-    if inner is None:
-        return 0.0
-    moved = tangent_coordinates(fitted.model.normal, inner.model.normal)
-    # The two fits share pixels: the variance of their difference is the difference of their variances.
-    noise = float(np.trace(inner.covariance[:2, :2]) - np.trace(fitted.covariance[:2, :2]))
-    return max(float(moved @ moved) - max(noise, 0.0), 0.0)
 
 
 REGIONS = (0.05, 0.1, 0.2, 0.3, 0.5)
@@ -288,8 +133,9 @@ class Photometric(OfHighlight):
         else:
             covariance = covariance * pixels.correlation(fitted)
         budget = {"noise": covariance, **beyond_noise(highlight, excess)}
+        gains = np.abs(1 + np.linalg.eigvalsh(fitted.model.shape))  # abs(1 + d k)
         estimate = along(
-            highlight, s, None if pixels.noise is None else budget, priors, axis_ratio=_axis_ratio(fitted.model)
+            highlight, s, None if pixels.noise is None else budget, priors, axis_ratio=float(gains.min() / gains.max())
         )
         # A bend of the isophotes and the residuals of the fit show the same structure.
         added = float(np.trace(budget["shape"] - highlight.drift_error))
@@ -341,6 +187,85 @@ def highlight_pixels(patch: Patch, camera: Camera, cut: bool = False, least: flo
     return HighlightPixels(rays[sound], values[rows, columns][sound].astype(float), clipped, noise, places)
 
 
+@dataclass(frozen=True)
+class ColocatedQuadric:
+    """A quadric patch with light and camera at one position (theory.md section 3).
+
+    In units of the distance d to the BP, with s its sightline, the surface is P = s (1 + z) + (x, y) in the tangent
+    plane, z = (x, y) K (x, y)^T / 2, K = d S. The radiance is c max(0, cos 2 theta)^n over the squared distance.
+    Parameters: rotation of s in its tangent plane (2), K11, K12, K22, log c. n is held, because beside the three of K
+    it is all but undetermined.
+    """
+
+    rays: Array  # (m, 3): sightlines of the pixels
+    frame: Array  # (3, 3): rows e, f, s: tangent basis and sightline of the BP, camera frame
+    K: Array  # (3,): K11, K12, K22 in the basis e, f
+    log_scale: float  # log c
+    exponent: float  # n
+
+    @property
+    def normal(self) -> Array:
+        """N = -s, shape (3,)."""
+        return -self.frame[2]
+
+    @property
+    def shape(self) -> Array:
+        """K, shape (2, 2), in the basis e, f."""
+        k11, k12, k22 = self.K
+        return np.array([[k11, k12], [k12, k22]])
+
+    def moved(self, step: Array) -> Self:
+        """Turn s, with the basis carried along the shortest way, and add to K and log c."""
+        e, f, s = self.frame
+        turned = s + step[0] * e + step[1] * f
+        turned /= np.linalg.norm(turned)
+        # The basis rotates with s along a great circle.
+        carried = [v - (turned @ v) / (1 + s @ turned) * (s + turned) for v in (e, f)]
+        frame = np.stack([*carried, turned])
+        return replace(self, frame=frame, K=self.K + step[2:5], log_scale=self.log_scale + float(step[5]))
+
+    def evaluate(self) -> tuple[Array, Array]:
+        """Return intensities and derivatives."""
+        # tangents (a, b) of each ray in the basis, and q = (a, b) K (a, b)^T
+        e, f, s = self.frame
+        along = self.rays @ s
+        a, b = (self.rays @ e) / along, (self.rays @ f) / along
+        k11, k12, k22 = self.K
+        ka, kb = k11 * a + k12 * b, k12 * a + k22 * b
+        q = a * ka + b * kb
+        # t: hit along the ray; where the ray misses the quadric, its closest approach
+        root = np.sqrt(np.maximum(1 - 2 * q, 1e-6))
+        t = 2 / (1 + root)
+        across = 1 + a * a + b * b
+        A, B = 1 - t * q, 1 + t * t * (ka * ka + kb * kb)
+        # cos^2 of the angle between view and normal; cos 2 theta = 2 cos^2 - 1
+        squared = A * A / (B * across)
+        cosine = np.maximum(2 * squared - 1, DARK)
+        intensity = np.exp(self.log_scale) * cosine**self.exponent / (t * t * across)
+
+        # derivatives by q, g = ka^2 + kb^2 and across
+        dt_dq = t * t / (2 * root)
+        dA_dq = -(t + q * dt_dq)
+        dB_dq = 2 * t * (ka * ka + kb * kb) * dt_dq
+        # d log I = on_q dq + on_g dg + on_across d(across)
+        lobe = self.exponent / cosine * 2 * squared
+        on_q = lobe * (2 * dA_dq / A - dB_dq / B) - 2 * dt_dq / t
+        on_g = -lobe * t * t / B
+        on_across = -(lobe + 1) / across
+        # derivatives by the tangents, then by the six parameters
+        by_a = on_q * 2 * ka + on_g * 2 * (ka * k11 + kb * k12) + on_across * 2 * a
+        by_b = on_q * 2 * kb + on_g * 2 * (ka * k12 + kb * k22) + on_across * 2 * b
+        J = np.empty((len(a), 6))
+        J[:, 0] = -by_a * (1 + a * a) - by_b * a * b
+        J[:, 1] = -by_a * a * b - by_b * (1 + b * b)
+        J[:, 2] = on_q * a * a + on_g * 2 * ka * a
+        J[:, 3] = on_q * 2 * a * b + on_g * 2 * (ka * b + kb * a)
+        J[:, 4] = on_q * b * b + on_g * 2 * kb * b
+        J[:, 5] = 1.0
+        J *= intensity[:, None]
+        return intensity, J
+
+
 def _quadric(family: IsophoteFamily, rays: Array) -> ColocatedQuadric:
     """Start from the middle isophote: n from its larger half-axis as on a plane, then K from the smaller one."""
     isophote = family.isophotes[len(family.isophotes) // 2]
@@ -357,13 +282,83 @@ def _quadric(family: IsophoteFamily, rays: Array) -> ColocatedQuadric:
     return ColocatedQuadric(rays, basis, shape, float(np.log(family.patch.peak_value)), float(exponent))
 
 
-def _axis_ratio(model: ColocatedQuadric) -> float:
-    """Return the smaller over the larger abs(1 + d k)."""
-    gains = np.abs(1 + np.linalg.eigvalsh(model.shape))
-    return float(gains.min() / gains.max())
-
-
 def in_tangent_basis(covariance: Array, normal: Array, basis: Array) -> Array:
     """Express a covariance of tilts along `basis`, rows, in the tangent basis of the normal."""
     turn = basis_across(normal) @ basis.T
     return np.asarray(turn @ covariance @ turn.T)
+
+
+def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None, noise: float | Array) -> bool:
+    """Test whether the residuals hold more structure than the frame's noise: a chi-square test of their local means.
+
+    A sum over single pixels would detect less, since misfits are smooth, and would need the noise to within a percent.
+    Pixels have intensities `observed`, shape (m,), and noise of standard deviation `noise`; clipped ones are left out.
+    """
+    model, _ = fitted.model.evaluate()
+    e, f = fitted.model.frame[:2]
+    rays = fitted.model.rays
+    kept = np.ones(len(model), dtype=bool) if clipped is None else ~clipped
+    residual, level = (observed - model)[kept], model[kept]
+    variance = np.broadcast_to(np.square(noise), model.shape)[kept]
+    if len(residual) < RINGS * SECTORS * MIN_IN_BIN:
+        return False
+    # bins: rings by intensity, sectors by direction from the axis
+    ring = np.searchsorted(np.quantile(level, np.arange(1, RINGS) / RINGS), level)
+    angle = np.arctan2(rays[kept] @ f, rays[kept] @ e)
+    sector = np.minimum(((angle + np.pi) / (2 * np.pi) * SECTORS).astype(int), SECTORS - 1)
+    number = ring * SECTORS + sector
+    count, total, spread = (
+        np.bincount(number, weights, RINGS * SECTORS) for weights in (np.ones(len(number)), residual, variance)
+    )
+    # chi-square of the bins' means
+    used = count >= MIN_IN_BIN
+    mean = total[used] / count[used]
+    allowed = spread[used] / count[used] ** 2 + (FLOOR * model.max()) ** 2
+    return bool(np.sum(mean**2 / allowed) > chi_squared.quantile(1 - LEVEL, int(np.count_nonzero(used))))
+
+
+def correlation_of_noise(
+    fitted: LobeFit[Model], observed: Array, clipped: Mask | None, noise: float | Array, places: Index
+) -> float:
+    """Return by how much the noise's correlation between pixels raises a covariance of white residuals; 1: not at all.
+
+    A smooth model takes from correlated noise the sum of its correlations over all distances. Both the smoothed frame's
+    noise, `noise`, and the residuals must show more than chance; the larger one counts. `places` are the residuals'
+    rows and columns, shape (2, m).
+    """
+    raised = float(np.mean(np.square(noise))) / max(fitted.sigma**2, 1e-300)
+    if raised < COLOURED**2:
+        return 1.0
+    rows, columns = places - places.min(axis=1, keepdims=True)
+    kept = np.ones(len(observed)) if clipped is None else (~clipped).astype(float)
+    residual = kept * (observed - fitted.model.evaluate()[0])
+    sums, pairs = (_products(values, rows, columns) for values in (residual, kept))
+    summed = float((sums / np.maximum(pairs, 1.0)).sum()) / fitted.sigma**2
+    chance = SUMMED_DEVIATIONS * math.sqrt((2 * CORRELATED_PX + 1) ** 2 / len(observed))
+    return max(raised, summed) if summed > 1 + chance else 1.0
+
+
+def _products(values: Array, rows: Index, columns: Index) -> Array:
+    """Return the sums of products of values at pixels up to `CORRELATED_PX` apart along both axes."""
+    grid = np.zeros((int(rows.max()) + 1 + CORRELATED_PX, int(columns.max()) + 1 + CORRELATED_PX))
+    grid[rows, columns] = values
+    products = np.fft.irfft2(np.abs(np.fft.rfft2(grid)) ** 2, s=grid.shape)
+    near = np.arange(-CORRELATED_PX, CORRELATED_PX + 1)
+    return np.asarray(products[np.ix_(near, near)])
+
+
+def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None) -> float:
+    """Return how far the normal moves, beyond noise, when only the pixels near the peak are fitted, squared, rad^2.
+
+    It is 0 where these pixels alone do not determine a fit.
+    """
+    model, _ = fitted.model.evaluate()
+    near = model > INNER * model.max()
+    part = replace(fitted.model, rays=fitted.model.rays[near])
+    inner = fit_lobe(part, observed[near], None if clipped is None else clipped[near])
+    if inner is None:
+        return 0.0
+    moved = tangent_coordinates(fitted.model.normal, inner.model.normal)
+    # The two fits share pixels: the variance of their difference is the difference of their variances.
+    noise = float(np.trace(inner.covariance[:2, :2]) - np.trace(fitted.covariance[:2, :2]))
+    return max(float(moved @ moved) - max(noise, 0.0), 0.0)

@@ -3,26 +3,6 @@
 The picture itself does not show where the light is: on a plane 10 mm away, a light 1 mm beside the camera moves the
 highlight by 2.8 deg and leaves its isophotes ellipses. No test of a fit finds that; only what is told of the rig does,
 and what nobody told is a prior.
-
-
-How a light somewhere beside the camera moves the normal from the reversed sightline, over the priors.
-
-The light lies at an offset across the optical axis, in any direction, the surface at a distance along the sightline;
-the true normal bisects the directions to both (theory.md section 3, item 1). The sightline's angle from the optical
-axis alone changes the distribution of the moves, so a table over that angle holds it.
-
-How far a highlight may be off because it is a near miss, in frames that show many highlights.
-
-Where a surface is rough or folded, a bright spot need not hold a point at which the normal bisects the directions to
-light and camera: a minimum of the misfit tau above 0 shines too (theory.md 7.1b). Such a near miss looks like any other
-spot, and the estimate is off by abs(tau) in an unknown direction. What the frame tells is its brightness: a Gaussian
-lobe of standard deviation s gives a near miss the radiance I0 exp(-abs(tau)^2 / (2 s^2)), with I0 that of a highlight
-point at the same place. So
-
-    abs(tau)^2 = 2 s^2 ln(I0 / I).
-
-The brightest of the spots around stands for I0. Smaller spots are also dimmed by the point spread, and clipped ones
-are brighter than they look; both are part of what was fitted.
 """
 
 import math
@@ -75,7 +55,12 @@ class LightTable:
 
 @lru_cache(maxsize=16)
 def light_table(offset: Distribution, distance: Distribution) -> LightTable:
-    """Tabulate the moves for priors of a light's offset across the optical axis and of the distance, mm."""
+    """Tabulate the moves for priors of a light's offset across the optical axis and of the distance, mm.
+
+    The light lies at an offset across the optical axis, in any direction, the surface at a distance along the
+    sightline; the true normal bisects the directions to both (theory.md section 3, item 1). The sightline's angle from
+    the optical axis alone changes the distribution of the moves, so a table over that angle holds it.
+    """
     shares = (np.arange(SIDE) + 0.5) / SIDE
     o, d = (each.ravel() for each in np.meshgrid(offset.quantile(shares), distance.quantile(shares)))
     azimuth = 2 * np.pi * (np.arange(SIDE**2) * GOLDEN % 1.0)
@@ -131,6 +116,17 @@ def near_miss_parts(patch: Patch, priors: Priors) -> Budget:
 
 def near_miss_variance(patch: Patch, lights: int) -> float:
     """Return the variance of a highlight's normal along each axis by the chance that it is a near miss, rad^2.
+
+    Where a surface is rough or folded, a bright spot need not hold a point at which the normal bisects the directions
+    to light and camera: a minimum of the misfit tau above 0 shines too (theory.md 7.1b). Such a near miss looks like
+    any other spot, and the estimate is off by abs(tau) in an unknown direction. What the frame tells is its brightness:
+    a Gaussian lobe of standard deviation s gives a near miss the radiance I0 exp(-abs(tau)^2 / (2 s^2)), with I0 that
+    of a highlight point at the same place. So
+
+        abs(tau)^2 = 2 s^2 ln(I0 / I).
+
+    The brightest of the spots around stands for I0. Smaller spots are also dimmed by the point spread, and clipped ones
+    are brighter than they look; both are part of what was fitted.
 
     `patch`: the highlight, with the frame's other ones; `lights`: how many lights there are, at least 1. Returns 0 in a
     frame that does not show more than `CROWD` highlights for each light; where the patch does not know the frame's
@@ -206,17 +202,8 @@ def add_untold_parts(
     ``response`` follow where the priors leave the camera's geometry or the falloff open, and ``shape`` grows where the
     highlight may be a near miss.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Without these parts; one without a covariance gets none.
-    camera : Camera
-        Calibration.
-    priors : Priors
-        What is told.
-    family : IsophoteFamily or SmallSpot, optional
-        The highlight's isophotes or spot: their moments say how far a falloff moves the peak, their patch whether it
-        may be a near miss.
+    An estimate without a covariance gets none of them. The highlight's moments say how far a falloff moves the peak,
+    its patch whether it may be a near miss.
     """
     if priors.lights_mm:
         judged = _with_told_lights(estimate, priors)

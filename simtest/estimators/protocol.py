@@ -1,12 +1,9 @@
-"""Estimator protocols, and the estimate that an estimator returns.
-
-The contract of an estimate: what in-process estimators, cores and tables of answers may report.
-"""
+"""What estimators are, and the estimate that they return: its parts, and what it may hold wherever it was made."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -239,7 +236,7 @@ class CloudEstimator(FrameEstimator, Protocol):
 
 
 @runtime_checkable
-class RegionEstimator(FrameEstimator, Protocol):
+class RegionEstimator(Protocol):
     """Answers for the regions of a frame by their numbers, as a table of answers made elsewhere does."""
 
     def estimate_regions(
@@ -248,7 +245,7 @@ class RegionEstimator(FrameEstimator, Protocol):
         """Return what there is for each patch, None where there is nothing, and estimates that belong to no patch."""
 
 
-AnyEstimator = Estimator | FrameEstimator
+AnyEstimator = Estimator | FrameEstimator | RegionEstimator
 
 
 def laws_of(estimator: object) -> tuple[Law, ...]:
@@ -425,14 +422,10 @@ def _number(value: object, name: str) -> float:
     return float(value)
 
 
-def _numbers(values: object, name: str, shape: tuple[int | None, ...]) -> Array:
+def _numbers(values: Any, name: str, shape: tuple[int | None, ...]) -> Array:
     """Return an array of finite numbers of this shape, None standing for any length; raise `Refused` for another."""
-    fits = isinstance(values, np.ndarray) and values.ndim == len(shape) and values.dtype.kind in "fiu"
-    if (
-        not isinstance(values, np.ndarray)
-        or not fits
-        or any(n not in (None, m) for n, m in zip(shape, values.shape, strict=True))
-    ):
+    is_array = isinstance(values, np.ndarray) and values.ndim == len(shape) and values.dtype.kind in "fiu"
+    if not is_array or any(n not in (None, m) for n, m in zip(shape, values.shape, strict=True)):
         raise Refused(f"{name}: must be an array of shape ({', '.join('n' if n is None else str(n) for n in shape)})")
     # `np.isfinite` takes three times as long for a few numbers.
     if not all(map(math.isfinite, values.ravel().tolist())):

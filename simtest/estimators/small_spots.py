@@ -1,13 +1,9 @@
 """Small highlights: below a radius of about 3 px isophotes carry no shape, and the spot's centre carries the normal.
 
-Pixels, point spread, mosaic and coding then make the isophotes. The centre is that of a Gaussian on a local background,
-fitted to the unsmoothed pixels (`simtest.estimators.small_spots`); neither axis ratio nor curvature is stated.
-
-
-Least-squares fit of small spots: a Gaussian on a local background, clipped pixels censored, many spots at once.
-
-A spot of a few pixels is the image of a highlight through lens and pixels, whose point spread is nearly Gaussian. Its
-centre is then what the pixels tell; the fit is the maximum-likelihood estimate of it under white noise.
+Pixels, point spread, mosaic and coding then make the isophotes. A spot of a few pixels is the image of a highlight
+through lens and pixels, whose point spread is nearly Gaussian: its centre is that of a Gaussian on a local background,
+fitted to the unsmoothed pixels, which is the maximum-likelihood estimate of it under white noise. Clipped pixels are
+censored, and many spots are fitted at once. Neither axis ratio nor curvature is stated.
 """
 
 import math
@@ -298,17 +294,12 @@ def fit_small_spots(patches: Sequence[Patch], camera: Camera) -> list[SmallSpot]
     values, used, clipped = (np.array(each) for each in zip(*cut, strict=True))
     windows = SpotWindows(values, used, clipped, offsets)
     # start from the smoothed peak
-    centres = np.array([_of_window(patch) for patch in patches])
+    centres = np.array([p.peak_px - np.array(p.origin_px) - np.array(p.peak_pixel) - PIXEL_CENTRE for p in patches])
     radii, bases = np.array(shapes).T
     smoothing = np.array([patch.smoothing_px for patch in patches])
     variances = np.maximum(radii**2 / GAUSSIAN_RADIUS2 - smoothing**2, 2 * LEAST_VARIANCE_PX2)
     fits = fit_spots(windows, centres, variances, bases)
     return [_spot(i, patch, camera, windows, fits, float(radii[i])) for i, patch in enumerate(patches)]
-
-
-def _of_window(patch: Patch) -> Array:
-    """Return a patch's peak from the centre of its peak's pixel, px, shape (2,)."""
-    return np.asarray(patch.peak_px - np.array(patch.origin_px) - np.array(patch.peak_pixel) - PIXEL_CENTRE)
 
 
 def _window(patch: Patch, half: int, reach: float, offsets: Array) -> tuple[Array, Mask, Mask]:

@@ -9,7 +9,8 @@ import numpy as np
 
 from simtest.errors import Failure, Reason
 from simtest.estimators.dispatch import run, run_in_frame
-from simtest.estimators.names import PREFIX, is_core, short_name
+from simtest.estimators.names import short_name
+from simtest.estimators.process import PREFIX, is_core
 from simtest.estimators.process.core import (
     Core,
     CoreCommand,

@@ -9,7 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from simtest.estimators.names import close_cores, core_records, is_core
+from simtest.estimators.names import close_cores, core_records
+from simtest.estimators.process import is_core
 from simtest.rendering import backend
 from simtest.runtime import provenance
 from simtest.runtime.files import Json

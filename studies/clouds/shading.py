@@ -1,4 +1,4 @@
-"""What the constants of `cloud_base` were fitted to: python -m studies.clouds.shading [--frames FOLDER] [--most N].
+"""What the constants of `cloud` were fitted to: python -m studies.clouds.shading [--frames FOLDER] [--most N].
 
 The clouds of the tissue frames that the estimator was tuned on, before any is refused, against the base's true
 highlight points: how far off the light's gradient is, how far off the spots' centre, and how many of the long ones

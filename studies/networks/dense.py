@@ -18,7 +18,7 @@ from simtest.estimators.learned_dense import (
     PLANES,
     ROTATION_SCALE,
     VIEWED,
-    stated_deviation,
+    log_deviation,
 )
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import JsonObject
@@ -254,7 +254,7 @@ def dense_scales(outputs: Tensor, judged: Batch, inflated: Array) -> tuple[Covar
     coverage = min(1.0, COVERAGE * (len(outputs) + 1) / len(outputs))
     stated = made.double().numpy()
     factors = np.repeat(inflated, cells_of(judged).numpy())
-    base = fitted_scale(_double(squared_distance(made, rotation)) / factors, stated_deviation(stated), coverage)
+    base = fitted_scale(_double(squared_distance(made, rotation)) / factors, log_deviation(stated), coverage)
     logarithm = made[:, 6].clamp(*LOG_RANGE)
     off = _double(((distance - made[:, 5]) * torch.exp(-logarithm)) ** 2)
     return base, fitted_scale(off / factors, _double(logarithm), coverage, dimensions=1)

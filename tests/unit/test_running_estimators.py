@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from simtest.calibration import Calibration, Frame, Priors
+from simtest.calibration import Calibration, Frame, Normal, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
 from simtest.detection import Detection, Region
 from simtest.errors import Failure, InputError, Reason
@@ -16,7 +16,7 @@ from simtest.estimators import BatchEstimator, Estimate, Estimator, FrameEstimat
 from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.circle_pose import circle_pose
 from simtest.estimators.cone_axis import ConeAxis
-from simtest.estimators.dispatch import run, run_each, run_in_frame
+from simtest.estimators.dispatch import prepare, run, run_each, run_in_frame
 from simtest.estimators.protocol import EstimatedCurvature, check
 from simtest.geometry import Camera, Patch, smooth
 from simtest.reconstruction.pipeline import UNRESOLVED, _flagged, reconstruct
@@ -80,6 +80,29 @@ def test_the_order_of_isovalues_is_irrelevant():
             np.testing.assert_array_equal(other.normal, first.normal)
             assert [i.isovalue for i in other.isophotes] == [i.isovalue for i in first.isophotes]
     assert left_out >= 3
+
+
+# `replace` leaves what was fitted to a patch behind.
+@pytest.mark.parametrize("name", ["cone_axis", "curved", "brightest_point", "bisector", "photometric", "circle_pose"])
+def test_no_other_highlight_of_a_batch_changes_a_digit(patches, name):
+    (estimator,) = load_estimators([name]).values()
+    priors = Priors(lights_mm=((3.0, 0.0, 0.0),), distance_mm=Normal(30.0, 2.0))
+    fresh = [patch if isinstance(patch, Failure) else replace(patch) for patch in patches]
+    prepare([estimator], fresh, CAMERA)
+    together = run_each(estimator, fresh, CAMERA, priors)
+    answered = 0
+    for patch, found in zip(patches, together, strict=True):
+        alone = run(estimator, patch if isinstance(patch, Failure) else replace(patch), CAMERA, priors)
+        if isinstance(alone, Failure):
+            assert found == alone
+            continue
+        answered += 1
+        np.testing.assert_array_equal(found.candidates, alone.candidates)
+        np.testing.assert_array_equal(found.look_px, alone.look_px)
+        assert (found.covariance is None) == (alone.covariance is None)
+        if alone.covariance is not None:
+            np.testing.assert_array_equal(found.covariance, alone.covariance)
+    assert answered == 3
 
 
 # A batch --------------------------------------------------------------------------------------------------------------

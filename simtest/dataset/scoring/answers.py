@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from simtest.calibration import Frame, Priors
+from simtest.calibration import Frame
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.dispatch import assign
-from simtest.geometry import Array, Camera, Patch
+from simtest.geometry import Array, Patch
 
 _TAKEN = Failure(Reason.NO_ESTIMATE, "a row names this detection")
 
@@ -36,10 +36,6 @@ class TableEstimator:
     """Answers made elsewhere, of one frame. It sees nothing of the frame: what it returns was in the table."""
 
     answers: Sequence[Answer]
-
-    def estimate_frame(self, _frame: Frame, _camera: Camera, _priors: Priors, /) -> Sequence[Estimate]:
-        """Return all normals, whatever they are of."""
-        return [answer.result for answer in self.answers if isinstance(answer.result, Estimate)]
 
     def estimate_regions(
         self, _frame: Frame, patches: Sequence[Patch | Failure], /

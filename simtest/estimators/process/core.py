@@ -19,7 +19,7 @@ from pydantic import Field
 
 from simtest.calibration import NO_PRIORS, Frame, Priors
 from simtest.errors import Failure, InputError, Reason
-from simtest.estimators.names import PREFIX
+from simtest.estimators.process import PREFIX
 from simtest.estimators.process.messages import (
     Hello,
     estimate_of,
@@ -209,11 +209,6 @@ class Core:
     """A core of one command: started at need, asked one request after the other, and started again after a fault.
 
     After `MAX_FAULTS` faults without an answer between them it is not started any more.
-
-    Parameters
-    ----------
-    command : CoreCommand
-        How it is started.
     """
 
     def __init__(self, command: CoreCommand) -> None:

@@ -341,7 +341,9 @@ def priors_message(priors: Priors) -> dict[str, Any]:
     return {
         "lights_mm": [list(light) for light in priors.lights_mm],
         **{
-            name: None if prior is None else _distribution(prior) | {"told": _is_told(priors, name)}
+            name: None
+            if prior is None
+            else _distribution(prior) | {"told": bool(getattr(priors, name) != getattr(NO_PRIORS, name))}
             for name, prior in named.items()
         },
         "camera": priors.camera.deviations,
@@ -349,10 +351,6 @@ def priors_message(priors: Priors) -> dict[str, Any]:
         # A core that was written before this key existed gets the messages that it knows.
         **({"lights_covariance_mm2": priors.lights_covariance_mm2} if priors.lights_covariance_mm2 else {}),
     }
-
-
-def _is_told(priors: Priors, name: str) -> bool:
-    return bool(getattr(priors, name) != getattr(NO_PRIORS, name))
 
 
 def _distribution(prior: Distribution) -> dict[str, Any]:

@@ -44,15 +44,7 @@ MAX_DIMENSIONS = 4
 
 
 class CoreFault(Exception):
-    """A core broke the protocol, died or took too long.
-
-    Parameters
-    ----------
-    reason : Reason
-        ``core_died``, ``core_timeout`` or ``core_protocol``.
-    detail : str
-        One line.
-    """
+    """A core broke the protocol, died or took too long: a reason ``core_...`` and one line of detail."""
 
     def __init__(self, reason: Reason, detail: str) -> None:
         super().__init__(detail)
@@ -190,15 +182,12 @@ def _listed(given: object) -> Iterator[tuple[str, np.dtype[Any], tuple[int, ...]
         what = f"array {excerpt(name.encode('utf-8', 'replace'), 40)!r}"
         if dtype not in DTYPES:
             raise broken(f"{what}: dtype {excerpt(str(dtype).encode(), 40)!r}; must be one of {', '.join(DTYPES)}")
-        sizes = isinstance(shape, list) and all(isinstance(n, int) and not isinstance(n, bool) for n in shape)
-        if not isinstance(shape, list) or not sizes or len(shape) > MAX_DIMENSIONS or not _in_range(shape):
+        lengths: list[Any] = shape if isinstance(shape, list) else [None]
+        is_sound = all(isinstance(n, int) and not isinstance(n, bool) and 0 <= n <= MAX_ARRAY_BYTES for n in lengths)
+        if not is_sound or len(lengths) > MAX_DIMENSIONS:
             told = excerpt(json.dumps(shape).encode(), 40)
             raise broken(f"{what}: shape {told}; must be at most {MAX_DIMENSIONS} lengths from 0 to {MAX_ARRAY_BYTES}")
-        yield name, np.dtype(dtype), tuple(shape)
-
-
-def _in_range(shape: list[int]) -> bool:
-    return all(0 <= length <= MAX_ARRAY_BYTES for length in shape)
+        yield name, np.dtype(dtype), tuple(lengths)
 
 
 END_S = 2.0

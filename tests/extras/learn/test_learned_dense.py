@@ -22,8 +22,8 @@ from simtest.estimators.learned_dense import (
     LearnedDense,
     camera_values,
     dense_inputs,
+    log_deviation,
     output_centres,
-    stated_deviation,
 )
 from simtest.geometry import BrownConrady, Camera
 from simtest.geometry.vectors import angle_deg
@@ -150,7 +150,7 @@ def test_scales_put_95_percent_of_the_validation_split_inside(made):
     stated = values.double().numpy()
     # 16 frames: the share that holds a seventeenth frame's at 95 % is larger.
     factors = np.repeat(inflated, cells_of(judged).numpy())
-    inside = squared_distance(values, rotation).numpy() / base.at(stated_deviation(stated)) / factors < 5.991
+    inside = squared_distance(values, rotation).numpy() / base.at(log_deviation(stated)) / factors < 5.991
     assert 0.95 < inside.mean() <= 1
     logarithm = np.clip(stated[:, 6], -5, 2)
     off = (log_distance.numpy() - stated[:, 5]) / np.exp(logarithm)
@@ -192,7 +192,6 @@ def test_the_pipeline_runs_it_beside_the_others(made):
         column, row = result.look_px.astype(int)
         assert angle_deg(result.normal[None], maps.normal[row, column].astype(float)[None])[0] < 3
         assert np.all(np.linalg.eigvalsh(result.covariance) > 0)
-    assert isinstance(learned.estimate_frame(found.detection.frame, calibration().camera, Priors()), Failure)
     with pytest.raises(InputError, match=r"other.onnx: (no such file|cannot be read)"):
         learned.with_model("other.onnx")
 
