@@ -43,9 +43,12 @@ class PatchRenderer:
         """Compute intensities, shape (m,), and their derivatives by those of the seven parameters that are kept."""
         # lanes: a copy of all pixels for each parameter
         columns, count = int(sum(kept)), self._opaque(self.count, mi.UInt32)
-        lane = self._lanes(self.count * columns)
-        direct = _Surface(self, patch, self._parameters(patch, kept, lane // count)).radiance(self._seen(lane % count))
-        image, slopes = (values.reshape(columns, self.count) for values in self._evaluated(direct))
+        lane = dr.arange(mi.UInt32, self.count * columns)
+        sightlines = mi.Vector3f(*(dr.gather(mi.Float, part, lane % count) for part in self._rays))
+        direct = _Surface(self, patch, self._parameters(patch, kept, lane // count)).radiance(sightlines)
+        slope = dr.forward_to(direct) if dr.grad_enabled(direct) else dr.zeros(type(direct), dr.width(direct))
+        dr.eval(direct, slope)
+        image, slopes = (np.array(values, dtype=np.float64).reshape(columns, self.count) for values in (direct, slope))
         # Mitsuba's virtual calls trace every existing BSDF: this one must not keep the copies alive.
         self._bsdf.exponent = self._opaque(float(np.exp(patch.log_exponent)))
         return image[0], slopes.T
@@ -62,20 +65,6 @@ class PatchRenderer:
                 lane += 1
             parameters.append(parameter)
         return parameters
-
-    def _evaluated(self, radiance: Any) -> tuple[Array, Array]:
-        """Return the values of all lanes and their derivatives by the parameter that varies in each."""
-        slope = dr.forward_to(radiance) if dr.grad_enabled(radiance) else dr.zeros(type(radiance), dr.width(radiance))
-        dr.eval(radiance, slope)
-        return np.array(radiance, dtype=np.float64), np.array(slope, dtype=np.float64)
-
-    def _lanes(self, width: int) -> Any:
-        """Return the lane numbers."""
-        return dr.arange(mi.UInt32, width)
-
-    def _seen(self, pixel: Any) -> Any:
-        """Return the sightlines of pixels by their number."""
-        return mi.Vector3f(*(dr.gather(mi.Float, part, pixel) for part in self._rays))
 
     def _opaque(self, value: Any, kind: Any = None) -> Any:
         """Return a value that the kernel reads from memory, so that changing it compiles nothing."""
@@ -120,7 +109,13 @@ class _Surface:
 
     def radiance(self, rays: Any) -> Any:
         """Return the radiance along rays from the camera that comes straight from the lights."""
-        return self.direct(self.first_hit(rays)) * dr.exp(self.log_scale)
+        si, radiance = self.first_hit(rays), mi.Float(0)
+        for light in self.lights:
+            towards = light - si.p
+            squared = dr.squared_norm(towards)
+            lobe, base = self.material.parts(si, si.to_local(towards * dr.rsqrt(squared)), mi.Bool(True))
+            radiance += (channel_mean(lobe) + self.base * channel_mean(base)) / squared * self.distance**2
+        return radiance * dr.exp(self.log_scale)
 
     def local(self, vector: Any) -> tuple[Any, Any, Any]:
         """Return a vector's components along e, f and N."""
@@ -156,16 +151,6 @@ class _Surface:
         si.sh_frame = mi.Frame3f(si.n)
         si.wi = si.to_local(-direction)
         return si
-
-    def direct(self, si: Any) -> Any:
-        """Return the radiance of surface points lit by the lights, per unit of their power."""
-        radiance = mi.Float(0)
-        for light in self.lights:
-            towards = light - si.p
-            squared = dr.squared_norm(towards)
-            lobe, base = self.material.parts(si, si.to_local(towards * dr.rsqrt(squared)), mi.Bool(True))
-            radiance += (channel_mean(lobe) + self.base * channel_mean(base)) / squared * self.distance**2
-        return radiance
 
 
 @dataclass(frozen=True)

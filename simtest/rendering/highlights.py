@@ -294,15 +294,14 @@ def _is_lit(session: "Session", positions: Array, lights: IntArray) -> Mask:
     towards = positions - sources[lights]
     distance = np.linalg.norm(towards, axis=1)
     directions = towards / distance[:, None]
-    # Shadow rays from the lights; one at the camera reaches all that is seen.
-    hits = session.exact_hits(session.to_model(sources[lights]), directions @ pose[:3, :3].T)
-    # A blocker stands clearly in front of the point; the point's own triangle does not count.
-    reached = hits.distance > distance * (1 - 1e-3)
     lit = np.zeros(len(lights), dtype=bool)
     for light in np.unique(lights):
-        of_light = lights == light
-        emitted = rig.lights[light].factor(directions[of_light]) > 0
-        lit[of_light] = emitted & (reached[of_light] | is_at_camera(sources[light]))
+        lit[lights == light] = rig.lights[light].factor(directions[lights == light]) > 0
+    # Shadow rays from the lights; one at the camera reaches all that is seen.
+    aside = np.flatnonzero(~np.array([is_at_camera(source) for source in sources])[lights])
+    hits = session.exact_hits(session.to_model(sources[lights[aside]]), directions[aside] @ pose[:3, :3].T)
+    # A blocker stands clearly in front of the point; the point's own triangle does not count.
+    lit[aside] &= hits.distance > distance[aside] * (1 - 1e-3)
     return lit
 
 

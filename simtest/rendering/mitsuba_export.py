@@ -78,24 +78,22 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
 
 def _inexpressible(scene: Scene) -> Iterator[tuple[str, Any, str]]:
     """Yield key, value and reason of everything that Mitsuba's camera and lights cannot express."""
-    camera = scene.camera
-    if camera.fx != camera.fy:
-        yield "camera.fx", camera.fx, f"Mitsuba's camera has square pixels: must equal camera.fy = {camera.fy:g}"
-    if camera.skew != 0:
-        yield "camera.skew", camera.skew, "Mitsuba's camera has no skew: must be 0"
-    for index in scene.shown_instruments:
-        yield f"instruments.{index}.present", True, "Mitsuba does not know simtest's instruments: must be false"
-    relief = scene.surface.relief
-    if relief is not None:
-        yield (
-            "surface.relief",
-            relief.model_dump(exclude_defaults=True),
-            "Mitsuba does not know simtest's relief: must be left out",
-        )
-    if scene.translucency is not None:
-        yield "reflectance.translucency", "a table", "it acts on simtest's picture: must be left out"
-    if scene.albedo is not None:
-        yield "reflectance.albedo", scene.albedo.preset, "Mitsuba has no such pattern: must be left out"
+    camera, relief, albedo = scene.camera, scene.surface.relief, scene.albedo
+    square = f"Mitsuba's camera has square pixels: must equal camera.fy = {camera.fy:g}"
+    unknown = "Mitsuba does not know simtest's"
+    parts: list[tuple[bool, str, Any, str]] = [
+        (camera.fx != camera.fy, "camera.fx", camera.fx, square),
+        (camera.skew != 0, "camera.skew", camera.skew, "Mitsuba's camera has no skew: must be 0"),
+        *((True, f"instruments.{index}.present", True, f"{unknown} instruments: must be false")
+          for index in scene.shown_instruments),
+        (relief is not None, "surface.relief", relief and relief.model_dump(exclude_defaults=True),
+         f"{unknown} relief: must be left out"),
+        (scene.translucency is not None, "reflectance.translucency", "a table",
+         "it acts on simtest's picture: must be left out"),
+        (albedo is not None, "reflectance.albedo", albedo and albedo.preset,
+         "Mitsuba has no such pattern: must be left out"),
+    ]  # fmt: skip
+    yield from (part[1:] for part in parts if part[0])
     yield from _beyond(camera, _CAMERA_KEYS, "camera", "Mitsuba's perspective camera")
     yield from _beyond(scene.rig, _RIG_KEYS, "rig", "Mitsuba's point light")
     for i, light in enumerate(scene.rig.lights):
@@ -198,16 +196,8 @@ def _sampler(scene: Scene) -> MitsubaDict:
     return {"type": "independent", "sample_count": samples if samples > 1 else SAMPLES, "seed": scene.render.seed}
 
 
-def _lights(scene: Scene, surface: SurfaceModel) -> MitsubaDict:
-    pose = surface.model_from_camera
-    places = zip(scene.rig.lights, scene.rig.true_mm(), strict=True)
-    return {
-        f"light_{i}": _light(light, pose[:3, :3] @ position + pose[:3, 3]) for i, (light, position) in enumerate(places)
-    }
-
-
 def _light(light: LightSpec, position: Array) -> MitsubaDict:
-    """Describe a point light, or a disc; `_xml` writes the place of the latter."""
+    """Describe a point light at a place of the model frame, or a disc; `_xml` writes the place of the latter."""
     if light.source is None:
         intensity = {"type": "uniform", "value": light.power}
         return {"type": "point", "position": position.tolist(), "intensity": intensity}
@@ -230,14 +220,14 @@ def _disc_pose(light: LightSpec, position_mm: Array, surface: SurfaceModel) -> A
 
 def _xml(scene: Scene, surface: SurfaceModel, shape: Shape) -> str:
     # Describe.
-    bsdf = scene.reflectance.kernel
-    effort = scene.render
+    bsdf, effort, pose = scene.reflectance.kernel, scene.render, surface.model_from_camera
+    lights = list(zip(scene.rig.lights, scene.rig.true_mm(), strict=True))
     described = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": effort.path_depth, "rr_depth": effort.path_depth},
         "sensor": _sensor(scene, surface, shape),
         "surface": {"type": "ply", "filename": MESH_FILE, "bsdf": bsdf} if shape.mesh else make_shape(shape, bsdf),
-        **_lights(scene, surface),
+        **{f"light_{i}": _light(light, pose[:3, :3] @ at + pose[:3, 3]) for i, (light, at) in enumerate(lights)},
     }
     # Let Mitsuba write its XML.
     state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), described)
@@ -248,11 +238,11 @@ def _xml(scene: Scene, surface: SurfaceModel, shape: Shape) -> str:
     written = mi.parser.write_string(state, add_section_headers=True)
     # Replace the transforms, add the comment at the head. Mitsuba itself has just written this text.
     root = ET.fromstring(written, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))  # nosec B314
-    _set_transform(root, "sensor", surface.model_from_camera @ MITSUBA_FROM_CAMERA)
+    _set_transform(root, "sensor", pose @ MITSUBA_FROM_CAMERA)
     # A mesh is stored in the model frame already.
     if not shape.mesh:
         _set_transform(root, "surface", shape.to_model)
-    for i, (light, position) in enumerate(zip(scene.rig.lights, scene.rig.true_mm(), strict=True)):
+    for i, (light, position) in enumerate(lights):
         if light.source is not None:
             _set_transform(root, f"light_{i}", _disc_pose(light, position, surface))
     root.insert(0, ET.Comment(_head(scene)))

@@ -58,8 +58,9 @@ def test_the_number_of_rays_is_in_no_kernel():
     rng = np.random.default_rng(4)
 
     def cast(count):
-        rays = session.sightlines.in_model(rng.uniform(100, 200, (count, 2)))
-        return lambda: (session.exact_hits(*rays), session._cast(*rays, None))
+        pixels = rng.uniform(100, 200, (count, 2))
+        rays = session.sightlines.in_model(pixels)
+        return lambda: (session.exact_hits(*rays), session.exact_points(pixels))
 
     first = kernels(cast(3))
     assert first
