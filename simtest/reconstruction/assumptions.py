@@ -117,46 +117,33 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
 
     `encoding` is the one that was told beside the calibration, if any. A default of `Priors` counts as told by nobody.
     """
-    priors = calibration.priors
-    made = []
+    priors, key = calibration.priors, "in a calibration file"
+    made: list[Assumption] = []
+
+    def add(what: str, distribution: str, how_to_narrow: str, given: bool = False) -> None:
+        made.append(Assumption(what, distribution, how_to_narrow, given))
+
     if not priors.lights_mm:
-        made.append(
-            Assumption(
-                LIGHT, f"{priors.light_offset_mm} mm beside the camera, in any direction across the optical axis",
-                "[rig] lights_mm or light_offset_mm in a calibration file",
-                priors.light_offset_mm != UNTOLD_OFFSET_MM,
-            )
-        )  # fmt: skip
+        beside = f"{priors.light_offset_mm} mm beside the camera, in any direction across the optical axis"
+        add(LIGHT, beside, f"[rig] lights_mm or light_offset_mm {key}", priors.light_offset_mm != UNTOLD_OFFSET_MM)
     if priors.lights_covariance is not None:
         worst = float(np.sqrt(np.linalg.eigvalsh(priors.lights_covariance)[:, -1].max()))
-        made.append(
-            Assumption(
-                "light positions", f"as given, normal, ± {worst:.2g} mm along the least certain axis",
-                "[rig] lights_mm and lights_covariance_mm2 in a calibration file", True,
-            )
-        )  # fmt: skip
+        spread = f"as given, normal, ± {worst:.2g} mm along the least certain axis"
+        add("light positions", spread, f"[rig] lights_mm and lights_covariance_mm2 {key}", True)
     if priors.distance.sd > 0:
-        made.append(
-            Assumption(
-                "distance of the tissue", f"{priors.distance} mm along the sightline",
-                "[rig] distance_mm or distance_range_mm in a calibration file", priors.distance_mm is not None,
-            )
-        )  # fmt: skip
+        how = f"[rig] distance_mm or distance_range_mm {key}"
+        add("distance of the tissue", f"{priors.distance} mm along the sightline", how, priors.distance_mm is not None)
     made += _of_camera(calibration.camera, priors.camera)
     if calibration.response is None and encoding is None:
-        made.append(Assumption("response", "sRGB, sharpened or not", "[response] in a calibration file, or --encoding"))
+        add("response", "sRGB, sharpened or not", f"[response] {key}, or --encoding")
     if priors.falloff_power is not None:
-        made.append(
-            Assumption(
-                "falloff towards the border", f"cos^k over the angle from the optical axis, k {priors.falloff_power}",
-                "[vignetting] and [emission] in a calibration file, or [uncertainty] falloff_power",
-                priors.falloff_power != UNTOLD_FALLOFF_POWER,
-            )
-        )  # fmt: skip
+        falloff = f"cos^k over the angle from the optical axis, k {priors.falloff_power}"
+        how = f"[vignetting] and [emission] {key}, or [uncertainty] falloff_power"
+        add("falloff towards the border", falloff, how, priors.falloff_power != UNTOLD_FALLOFF_POWER)
     if target == "base":
-        slope = "[surface] relief_slope_deg in a calibration file"
-        told = priors.relief_slope != UNTOLD_SLOPE_RAD
-        made.append(Assumption("slope of the relief", f"{_in_degrees(priors.relief_slope)} deg an axis", slope, told))
+        slope = f"{_in_degrees(priors.relief_slope)} deg an axis"
+        given_slope = priors.relief_slope != UNTOLD_SLOPE_RAD
+        add("slope of the relief", slope, f"[surface] relief_slope_deg {key}", given_slope)
     if not priors.plane:
         made.append(NEAR_MISSES)
     return made
@@ -169,25 +156,22 @@ def light_note(assumed: Iterable[Assumption]) -> str:
 
 def _of_camera(camera: Camera, prior: CameraPrior) -> list[Assumption]:
     """List what is not known exactly of the camera's geometry."""
-    told = not prior.guessed
-    key = "in a calibration file"
+    given, key = not prior.guessed, "in a calibration file"
     made = []
     if prior.focal_sd > 0:
-        deviation = f"{camera.fx:.0f} px, normal, ± {100 * prior.focal_sd:g} %"
-        made.append(Assumption("focal length", deviation, f"[camera] fx, fy and [uncertainty] focal_sd {key}", told))
+        spread = f"{camera.fx:.0f} px, normal, ± {100 * prior.focal_sd:g} %"
+        made.append(Assumption("focal length", spread, f"[camera] fx, fy and [uncertainty] focal_sd {key}", given))
     if prior.centre_sd_px > 0:
-        deviation = f"({camera.cx:.0f}, {camera.cy:.0f}) px, normal, ± {prior.centre_sd_px:.0f} px an axis"
-        made.append(
-            Assumption("principal point", deviation, f"[camera] cx, cy and [uncertainty] centre_sd_px {key}", told)
-        )
+        spread = f"({camera.cx:.0f}, {camera.cy:.0f}) px, normal, ± {prior.centre_sd_px:.0f} px an axis"
+        how = f"[camera] cx, cy and [uncertainty] centre_sd_px {key}"
+        made.append(Assumption("principal point", spread, how, given))
     if prior.distortion_sd > 0:
-        lens = "none" if camera.distortion is None else "as given" if told else "equidistant"
-        deviation = f"{lens}, its k1 normal, ± {prior.distortion_sd:g}"
+        lens = "none" if camera.distortion is None else "as given" if given else "equidistant"
+        spread = f"{lens}, its k1 normal, ± {prior.distortion_sd:g}"
         if prior.edge_reach:
-            deviation += f", unchanged {prior.edge_reach:.2f} focal lengths from the principal point"
-        made.append(
-            Assumption("distortion", deviation, f"[camera.distortion] and [uncertainty] distortion_sd {key}", told)
-        )
+            spread += f", unchanged {prior.edge_reach:.2f} focal lengths from the principal point"
+        how = f"[camera.distortion] and [uncertainty] distortion_sd {key}"
+        made.append(Assumption("distortion", spread, how, given))
     return made
 
 
@@ -214,9 +198,8 @@ def visible_box(picture: npt.NDArray[np.floating], view: View) -> tuple[Span, Sp
     beside it does not count; else a border is a run of rows or columns that are dark along their whole length.
     """
     height, width = picture.shape[:2]
-    if view.circle is not None:
-        circle = view.circle
-        return _span(circle.cx, circle.radius, width), _span(circle.cy, circle.radius, height)
+    if (circle := view.circle) is not None:
+        return _within(circle.cx, circle.radius, width), _within(circle.cy, circle.radius, height)
     lit = (picture >= DARK).reshape(height, width, -1)
     return _lit_span(np.asarray(lit.any(axis=(0, 2)))), _lit_span(np.asarray(lit.any(axis=(1, 2))))
 
@@ -239,8 +222,7 @@ def border_note(picture: npt.NDArray[np.floating], view: View) -> str:
     )
 
 
-def _span(centre: float, radius: float, size: int) -> Span:
-    """Return the first and the end of the pixels within a radius of a centre, px."""
+def _within(centre: float, radius: float, size: int) -> Span:
     return max(int(np.floor(centre - radius)), 0), min(int(np.ceil(centre + radius)), size)
 
 

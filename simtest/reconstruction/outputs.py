@@ -129,11 +129,14 @@ def constraints_arrays(found: Specularities) -> dict[str, npt.NDArray[np.generic
     ]
     pixels = np.array([best.look_px for _, _, best in made], dtype=float).reshape(-1, 2)
     normals = np.array([best.normal for _, _, best in made], dtype=float).reshape(-1, 3)
-    unknown = np.full((2, 2), np.nan)
+    stated, at_pixel = np.full((2, len(made), 2, 2), np.nan)
     candidates = np.full((len(made), 2, 3), np.nan)
-    for pair, (spot, _, best) in zip(candidates, made, strict=True):
-        listed = spot.normals.get("circle_pose", best).candidates
-        pair[: len(listed)] = listed[:2]
+    for i, (spot, _, best) in enumerate(made):
+        if best.covariance is not None:
+            stated[i] = best.covariance
+        at_pixel[i] = _at_pixel(spot, best)
+        listed = spot.normals.get("circle_pose", best).candidates[:2]
+        candidates[i, : len(listed)] = listed
     return {
         "version": np.array(VERSION),
         "id": np.array([spot.id for spot, _, _ in made], dtype=int),
@@ -141,8 +144,8 @@ def constraints_arrays(found: Specularities) -> dict[str, npt.NDArray[np.generic
         "sightline": found.camera.unproject(pixels),
         "normal": normals,
         "basis": np.stack(tangent_basis(normals), axis=1),
-        "covariance": _stacked([unknown if best.covariance is None else best.covariance for _, _, best in made]),
-        "covariance_at_pixel": _stacked([_at_pixel(spot, best) for spot, _, best in made]),
+        "covariance": stated,
+        "covariance_at_pixel": at_pixel,
         "candidates": candidates,
         "estimator": np.array([name for _, name, _ in made], dtype=str),
         "target": np.array([best.target for _, _, best in made], dtype=str),
@@ -164,7 +167,3 @@ def _at_pixel(spot: Specularity, best: Estimate) -> Array:
     M = axes.T @ np.diag(np.abs(known.hypotheses).max(axis=0)) @ axes
     parts = [M @ part @ M.T if name in MISPLACED else part for name, part in best.budget.items()]
     return np.asarray(np.sum(parts, axis=0))
-
-
-def _stacked(matrices: Sequence[Array]) -> Array:
-    return np.array(matrices, dtype=float).reshape(-1, 2, 2)

@@ -64,10 +64,11 @@ def write_picture_page(path: Path, spots: Specularities, picture: Image) -> None
     height, width = picture.shape[:2]
     best, stated = Counter(spot.best for spot in spots if spot.best), spots.stated
     parts = {} if stated is None else stated.shown_parts_deg
+    clouds = any(each.cloud is not None for spot in spots for each in spot.normals.values())
     write_page(
         path, "picture.html.j2", data, record=spots, stated=stated, told=list(parts.items()), picture=_address(picture),
         title=Path(spots.image).name, width=width, height=height, palette=palette, best=best,
-        answered=sum(best.values()), clouds=any(_clouds(spot) for spot in spots), terms=explanations.TERMS,
+        answered=sum(best.values()), clouds=clouds, terms=explanations.TERMS,
         others=len(data["others"]), left_out=len(spots.detection.others),
         left_out_kinds=explanations.kinds_counted(h.kind for h in spots.detection.others),
         light_note=light_note(spots.choices.assumed), parts=explanations.PARTS, outline=OUTLINE,
@@ -179,11 +180,6 @@ def _cloud(result: Estimate) -> JsonObject | None:
     slope = [round(float(np.degrees(v)), 2) for v in (cloud.slope.value, cloud.slope.low, cloud.slope.high)]
     points = _rounded(cloud.points_px, 1)
     return {"points": points, "seen": cloud.seen, "ratio": round(cloud.axis_ratio, 3), "slope": slope}
-
-
-def _clouds(spot: Specularity) -> list[str]:
-    """Return the names of the estimates of a specularity that stand on a cloud."""
-    return [name for name, result in spot.normals.items() if result.cloud is not None]
 
 
 def _rounded(points: npt.ArrayLike, digits: int) -> Points:

@@ -393,7 +393,7 @@ ROWS = (
     row("motion between frames of a sequence inverted", "transposes", "reconstruction.motion:_judge",
         "np.linalg.inv(other) @ pose", "np.linalg.inv(pose) @ other", "motion_sequence"),
     row("constraints without their second candidate", "labels", "reconstruction.outputs:constraints_arrays",
-        "pair[: len(listed)] = listed[:2]", "pair[:1] = listed[:1]",
+        "candidates[i, : len(listed)] = listed", "candidates[i, :1] = listed[:1]",
         "imaging picture_page"),
     # validation
     row("the published protocol's noise 20 % too small", "noise width",
