@@ -165,6 +165,13 @@ class Estimate:
         """Return the estimate without covariance and budget: it states no uncertainty."""
         return replace(self, budget=None, covariance=None)
 
+    def contours(self, patch: Patch | Failure) -> list[tuple[float, Array]]:
+        """Return the isophotes that were used on a patch: isovalue and closed polygon, shape (N, 2), px."""
+        if isinstance(patch, Failure):
+            return []
+        traced = [(isophote.isovalue, patch.isophote(isophote.isovalue)) for isophote in self.isophotes]
+        return [(t, points) for t, points in traced if not isinstance(points, Failure)]
+
 
 @runtime_checkable
 class Estimator(Protocol):

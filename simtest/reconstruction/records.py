@@ -155,7 +155,7 @@ class Specularity:
             if result.cloud is not None and self.camera is not None:
                 look = self.camera.unproject(result.look_px)
                 outlines.append(drawable(self.camera.project(result.cloud.outline(result.normal, look))))
-            traced = [(t, np.round(points, 3).tolist()) for t, points in contours(result, self.patch)]
+            traced = [(t, np.round(points, 3).tolist()) for t, points in result.contours(self.patch)]
             made[name] = Drawing(traced, outlines)
         return made
 
@@ -283,14 +283,6 @@ class Specularities(list[Specularity]):
         from simtest.reconstruction.page import specularities_html
 
         return specularities_html(self)
-
-
-def contours(result: Estimate, patch: Patch | Failure) -> list[tuple[float, Array]]:
-    """Return the isophotes that an estimate used on a patch: isovalue and closed polygon, shape (N, 2), px."""
-    if isinstance(patch, Failure):
-        return []
-    traced = [(isophote.isovalue, patch.isophote(isophote.isovalue)) for isophote in result.isophotes]
-    return [(t, points) for t, points in traced if not isinstance(points, Failure)]
 
 
 def drawable(curve: Array) -> Points:

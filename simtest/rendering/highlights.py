@@ -33,7 +33,11 @@ SMOOTH_STRIDE_PX = 2
 """Between the pixels whose misfit is traced where there is no relief."""
 
 MIN_GAIN = 0.05
-"""Where abs(1 + d k) of the base is smaller its highlight is a streak, not a point: such seeds are dropped."""
+"""Where abs(1 + d k) of the base is smaller its highlight is a streak, not a point."""
+
+SPARED = 0.25
+"""Seeds are dropped below this share of it: they know it by differences, and pixels off the axis span less of an angle
+than those on it (a quarter at 60 deg)."""
 
 NEAR_CELLS = 2.0
 """A cell is a seed where its Newton step, along rows and columns, is shorter than this."""
@@ -75,7 +79,8 @@ RATIOS, BISECTIONS = np.geomspace(1e-3, 30.0, 200), 40
 def search(session: "Session", base: bool) -> list[HighlightPoint]:
     """Find all lights' highlight points, of the base or of the fine surface, in a dark frame, light by light."""
     fine = session.surface.relief is not None and not base
-    return describe(session, *find_zeros(session, fine), fine)
+    points = describe(session, *find_zeros(session, fine), fine)
+    return points if fine else [point for point in points if point.min_gain > MIN_GAIN]
 
 
 def lit_by(radiance: Radiance, points: Sequence[HighlightPoint]) -> list[HighlightPoint]:
@@ -114,7 +119,7 @@ def find_zeros(session: "Session", fine: bool) -> tuple[Array, IntArray]:
         seeds = [_fine_seeds(session, light) for light in range(count)]
     else:
         maps = session.misfits(1 if session.surface.relief is not None else SMOOTH_STRIDE_PX)
-        least = MIN_GAIN * maps.stride / max(session.camera.fx, session.camera.fy)
+        least = SPARED * MIN_GAIN * maps.stride / max(session.camera.fx, session.camera.fy)
         thin = _thin_parts(maps.distance)
         seeds = [
             maps.pixels(np.concatenate([grid_seeds(w[:, None], np.zeros((1, 2), dtype=np.int64), least), thin]))

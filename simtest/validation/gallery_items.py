@@ -14,7 +14,7 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.records import contours, drawable
+from simtest.reconstruction.records import drawable
 from simtest.rendering import Session
 from simtest.runtime.files import Json, write_atomically
 from simtest.spec import Experiment, camera_table
@@ -97,7 +97,7 @@ class DrawnEstimate:
             look_px=result.look_px.tolist() if np.isfinite(result.look_px).all() else None,
             isophotes=[
                 {"t": t, "points": np.round(points[:: max(1, len(points) // CONTOUR_POINTS)], 2).tolist()}
-                for t, points in contours(result, patch)
+                for t, points in result.contours(patch)
             ],
             curves=[drawable(isophote.ellipse_px(camera)) for isophote in result.isophotes],
         )

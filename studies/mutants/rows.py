@@ -195,7 +195,7 @@ ROWS = (
         "x = np.array([np.cos(spin), np.sin(spin), 0.0])", "x = np.array([1.0, 0.0, 0.0])",
         "analytic_surfaces render"),
     row("second band of a relief lost", "tissue", "surfaces.relief_field:ReliefField.tissue_jets",
-        "for band in self.bands", "for band in self.bands[:1]", "relief"),
+        "for band in self.bands", "for band in self.bands[:1]", "relief twins"),
     row("meniscus of the film bends half as much", "tissue", "surfaces.relief_field:ReliefField.fill",
         "bend = share * (1 - share) / self.meniscus", "bend = share * (1 - share) / self.meniscus / 2", "relief"),
     row("seed of a relief ignored", "seeds", "surfaces.relief_field:_drawn", "np.random.SeedSequence(spec.seed)",

@@ -370,20 +370,24 @@ def test_nouns_agree_with_their_number(number, text):
     assert common.counted(number, "frame") == text
 
 
-def spots(count):
-    """Return specularities without an estimate: two of three isolated, the others clusters."""
-    return [
-        SimpleNamespace(id=i, kind="cluster" if i % 3 == 0 else "isolated", score=0.5, best=None, best_estimate=None,
-                        peak_px=(1.0, 2.0), normals={})
-        for i in range(count)
-    ]  # fmt: skip
+class Spots(list):
+    """Specularities without an estimate or a reference: two of three isolated, the others clusters."""
+
+    reference = None
+
+    def __init__(self, count):
+        super().__init__(
+            SimpleNamespace(id=i, kind="cluster" if i % 3 == 0 else "isolated", score=0.5, best=None,
+                            best_estimate=None, peak_px=(1.0, 2.0), normals={})
+            for i in range(count)
+        )  # fmt: skip
 
 
 def test_many_specularities_become_a_summary(capsys, monkeypatch):
     from simtest.cli.pictures import record_tables
 
     def printed(count):
-        common.Told(parts=record_tables(SimpleNamespace(specularities=spots(count), reference=None))).print(False)
+        common.Told(parts=record_tables(Spots(count))).print(False)
         return capsys.readouterr().out
 
     assert printed(20).count("isolated") == 13

@@ -91,8 +91,7 @@ import simtest
 from simtest.calibration import Calibration, Frame, Priors
 from simtest.detection import load_detector
 from simtest.detection.detector import DETECTORS
-from simtest.estimators.installed import ESTIMATORS
-from simtest.estimators.registry import load_estimators
+from simtest.estimators.names import ESTIMATORS, load_estimators
 from simtest.reconstruction.options import Options
 from simtest.reconstruction.pipeline import reconstruct_values
 

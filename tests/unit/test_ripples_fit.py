@@ -64,6 +64,6 @@ def test_a_region_needs_no_factor_or_none_suffices():
 
 
 def test_the_table_has_each_axis_and_each_picture():
-    text = "\n".join(_table([each for axis in AXES for each in drawn(STATED[axis], 200, axis)]))
+    text = "\n".join(_table([each for axis in AXES for each in drawn(STATED[axis].ripples, 200, axis)]))
     for name in (*AXES, "8 bits", "all", "colonoscope_hd"):
         assert name in text

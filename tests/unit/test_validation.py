@@ -107,7 +107,7 @@ def context(look_normal=NORTH):
     """Return a session whose surface has one normal wherever an estimate looks, and what its rows share."""
     seen = SimpleNamespace(valid=np.array([True]), normal=look_normal[None])
     described = scene_from_dict({"surface": {"type": "plane"}})
-    session = SimpleNamespace(scene=described, cast=lambda points: (seen, None, None))
+    session = SimpleNamespace(scene=described, exact_points=lambda points: seen)
     return session, dict(experiment="e", setting="s", realisation=3, seed=11)
 
 
