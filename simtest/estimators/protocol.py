@@ -167,10 +167,8 @@ class Estimate:
 
     def contours(self, patch: Patch | Failure) -> list[tuple[float, Array]]:
         """Return the isophotes that were used on a patch: isovalue and closed polygon, shape (N, 2), px."""
-        if isinstance(patch, Failure):
-            return []
-        traced = [(isophote.isovalue, patch.isophote(isophote.isovalue)) for isophote in self.isophotes]
-        return [(t, points) for t, points in traced if not isinstance(points, Failure)]
+        isovalues = [isophote.isovalue for isophote in self.isophotes]
+        return [] if isinstance(patch, Failure) else patch.contours(isovalues)
 
 
 @runtime_checkable

@@ -5,7 +5,7 @@ reconstruct.
 """
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -243,6 +243,11 @@ class Patch:
         """
         found = self._closed(isovalue)
         return found if isinstance(found, Failure) else found.polygon + PIXEL_CENTRE + self.origin_px
+
+    def contours(self, isovalues: Iterable[float]) -> list[tuple[float, Array]]:
+        """Return isovalue and polygon of each isophote that closes."""
+        traced = [(isovalue, self.isophote(isovalue)) for isovalue in isovalues]
+        return [(isovalue, points) for isovalue, points in traced if not isinstance(points, Failure)]
 
     @property
     def _level_sets(self) -> _LevelSets:

@@ -155,8 +155,9 @@ class Specularity:
             if result.cloud is not None and self.camera is not None:
                 look = self.camera.unproject(result.look_px)
                 outlines.append(drawable(self.camera.project(result.cloud.outline(result.normal, look))))
-            traced = [(t, np.round(points, 3).tolist()) for t, points in result.contours(self.patch)]
-            made[name] = Drawing(traced, outlines)
+            isovalues = (isophote.isovalue for isophote in result.isophotes)
+            traced = [] if isinstance(self.patch, Failure) else self.patch.contours(isovalues)
+            made[name] = Drawing([(t, np.round(points, 3).tolist()) for t, points in traced], outlines)
         return made
 
     def to_json(self, drawn: bool = True) -> JsonObject:
