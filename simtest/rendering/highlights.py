@@ -45,7 +45,9 @@ NEAR_CELLS = 2.0
 SAME_SEED = 0.5
 """Seeds closer than this many cells are one."""
 
-NEWTON_STEPS = 40
+NEWTON_STEPS = 60
+"""Where the misfit's derivative is not exact, as on a mesh with relief, steps fall by a factor of 0.75 alone."""
+
 CONVERGED_PX = 1e-6
 PATIENCE, LEAST_FALL = 5, 0.7
 """A seed whose least misfit has not fallen to this share within so many steps strays, and is given up."""

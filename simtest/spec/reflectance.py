@@ -148,7 +148,7 @@ KernelTable = dict[str, Any]
 class _Reflectance(Spec):
     """What the renderer takes of a reflectance beside its parameters is `kernel`, `updates`, `compiled`, `base_kernel`.
 
-    Each class gives `kernel`, its description, and `updates`, the values that change without a rebuild.
+    Each class gives `kernel`, its description, `updates`, the values that change without a rebuild, and `half_width`.
     """
 
     diffuse: Share = Field(0.0, description="share of the diffuse base, its albedo")
@@ -162,6 +162,11 @@ class _Reflectance(Spec):
     @property
     def base_kernel(self) -> KernelTable | None:
         """Description without the lobe; None where components 0 and 1 of the BSDF are lobe and base."""
+        return None
+
+    @property
+    def lobe_curvature(self) -> float | None:
+        """Curvature -(log f)''(0) of the lobe with the light at the camera; None where it has no closed form."""
         return None
 
     @property

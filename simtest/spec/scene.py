@@ -196,9 +196,7 @@ class Scene(Spec):
         if self.known.distance_error is not None and distance_mm is not None:
             mean = distance_mm * (1 + self.known.distance_error)
         # lobe, where one number states it
-        curvature = None
-        if self.known.lobe and isinstance(self.reflectance, PhongReflectance | TissueReflectance):
-            curvature = self.reflectance.lobe_curvature
+        curvature = self.reflectance.lobe_curvature if self.known.lobe else None
         # A falloff that they are not told is still in the frame.
         emitted = self.rig.known_emission() is not None or all(light.is_isotropic for light in self.rig.lights)
         told = self.sensor.vignetting_known and self.rig.emission_known and emitted

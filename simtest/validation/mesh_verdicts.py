@@ -43,7 +43,7 @@ def mesh_verdicts(experiment: Experiment) -> list[MeshVerdict]:
     for scene in (scene for group in experiment.groups for scene in _scenes(group)):
         surface = scene.surface
         assert isinstance(surface, AnatomySurface)
-        curvature = getattr(scene.reflectance, "lobe_curvature", None)
+        curvature = scene.reflectance.lobe_curvature
         key = (surface.file(), surface.kind, surface.edge_mm, curvature)
         if key not in verdicts:
             verdicts[key] = _judge(surface, curvature)

@@ -10,7 +10,7 @@ from simtest.estimators.protocol import Law
 from simtest.rendering import HighlightPoint
 from simtest.runtime.arrays import Array
 from simtest.spec.lights import CosineProfile, is_at_camera
-from simtest.spec.reflectance import PhongReflectance, TissueReflectance
+from simtest.spec.reflectance import PhongReflectance
 from simtest.spec.scene import Scene
 from simtest.spec.surfaces import Relief
 from simtest.validation import laws, relief_laws
@@ -71,9 +71,7 @@ def _vignetting_law_deg(scene: Scene, estimate: Estimate, highlight: HighlightPo
 
 def lobe_curvature(scene: Scene) -> float:
     """Return c = -(log f)''(0) of a scene's lobe; that of a very narrow lobe where it has no closed form."""
-    reflectance = scene.reflectance
-    known = isinstance(reflectance, PhongReflectance | TissueReflectance) and reflectance.lobe_curvature
-    return known or 1e6
+    return scene.reflectance.lobe_curvature or 1e6
 
 
 def _offset_law_deg(

@@ -11,7 +11,7 @@ from studies.corners import checks, formulas
 from studies.corners.case import Case
 from studies.corners.coverage import Answer, share_by_scene, table
 from studies.corners.design import covering_array, whole_from
-from studies.corners.scenes import FACTORS, SMOOTH, refusals, rows
+from studies.corners.scenes import FACTORS, MESH, SMOOTH, refusals, rows
 
 QUICK = ("law", "projection", "surface", "search", "mirror", "turn", "answers", "calibration", "flow")
 
@@ -67,6 +67,15 @@ def case():
 @pytest.mark.parametrize("check", QUICK)
 def test_a_smooth_scene_is_right(case, check):
     verdict, reasons = checks.run(check, case)
+    assert verdict == "green", reasons
+
+
+@pytest.mark.render
+@pytest.mark.skipif(not MESH.is_file(), reason="needs ../shared/data/meshes")
+def test_a_turned_camera_finds_the_glints_of_a_mesh_whose_steps_fall_slowly():
+    made = Case(1, rows()[1])
+    verdict, reasons = checks.run("turn", made)
+    made.close()
     assert verdict == "green", reasons
 
 
