@@ -202,7 +202,8 @@ def grid_seeds(w: Image, first: IntArray, least_slope: float = 0.0) -> Array:
         y = np.concatenate([(c - a + d - b) / 2, np.stack([part[short] for part in along_y])], axis=1)
         # The smaller singular value, without cancellation.
         area, squares = np.abs(x[0] * y[1] - x[1] * y[0]), np.sum(x**2 + y**2, axis=0)
-        steep = area * np.sqrt(2 / (squares + np.sqrt(np.maximum(squares**2 - 4 * area**2, 0)))) > least_slope
+        with np.errstate(divide="ignore", invalid="ignore"):
+            steep = area * np.sqrt(2 / (squares + np.sqrt(np.maximum(squares**2 - 4 * area**2, 0)))) > least_slope
         seeds, is_stepped = seeds[steep], is_stepped[steep]
     # Row by row, whatever the grids; cells that hold a zero come before those near one.
     order = np.lexsort((*seeds.T, is_stepped))

@@ -137,6 +137,12 @@ def test_a_streak_is_no_point():
     assert Session(scene_from_dict({**tables, "rig": {"lights": [{"position_mm": [0, 0, 0]}]}})).highlights() == []
 
 
+def test_inside_a_sphere_about_the_camera_nothing_is_a_point():
+    """Its misfit is 0 everywhere, with its slope."""
+    tables = {"surface": {"type": "sphere", "distance_mm": 20, "radius_mm": 20, "side": "inside"}, "camera": CAMERA}
+    assert Session(scene_from_dict({**tables, "rig": {"lights": [{"position_mm": [0, 0, 0]}]}})).highlights() == []
+
+
 def test_first_of_each_keeps_the_earliest_of_each_light():
     points = np.array([[1.0, 1.0], [1.3, 1.0], [1.0, 1.0], [9.0, 1.0], [9.2, 1.4], [9.2, 1.5]])
     kept = highlights.first_of_each(points, 0.5, np.array([0, 0, 1, 0, 0, 0]))
