@@ -345,7 +345,7 @@ class Told:
 
 
 def command(function: Callable[..., Told]) -> Callable[..., int]:
-    """Give a command the option --json, print what it returns, and return its exit code."""
+    """Return a command with the option --json that prints what it returns, and returns its exit code."""
 
     @wraps(function)
     def run(*arguments: Any, as_json: bool = False, **options: Any) -> int:

@@ -107,7 +107,7 @@ def _sequence(source: Path, out: Path, options: "Options") -> Told:
 
 
 def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]":
-    """Tell the best normals, what they state, what is assumed, and how many highlights have one."""
+    """Yield the best normals, what they state, what is assumed, and how many highlights have one."""
     yield from record_tables(spots)
     if spots.stated is not None:
         yield f"reported: {spots.stated}"
@@ -118,7 +118,7 @@ def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]
 
 
 def record_tables(spots: "Specularities") -> "Iterator[str | Table]":
-    """Tell the best normals, or a summary of many, and how the estimators compare with a reference."""
+    """Yield the best normals, or a summary of many, and how the estimators compare with a reference."""
     if len(spots) > MOST_ROWS and not MANNERS.verbose:
         yield _summary(spots)
         yield f"--verbose prints a row for each of the {len(spots)}; normals.csv and index.html hold them"
@@ -156,7 +156,7 @@ def _summary(spots: "Sequence[Specularity]") -> Table:
 
 
 def silent_lines(spots: "Sequence[Specularity]") -> "Iterator[str]":
-    """Tell why best normals have no ±, and how many."""
+    """Yield why best normals have no ±, and how many."""
     from collections import Counter
 
     from simtest.reconstruction.explanations import why_no_error
@@ -168,7 +168,7 @@ def silent_lines(spots: "Sequence[Specularity]") -> "Iterator[str]":
 
 
 def assumed_lines(assumed: "Sequence[Assumption]") -> "Iterator[str]":
-    """Tell what the normals are without the light's position; what is given with a spread; what is assumed."""
+    """Yield what the normals are without the light's position; what is given with a spread; what is assumed."""
     from simtest.reconstruction.assumptions import light_note
 
     if note := light_note(assumed):
@@ -178,7 +178,7 @@ def assumed_lines(assumed: "Sequence[Assumption]") -> "Iterator[str]":
 
 
 def count_lines(spots: "Specularities", image: Path) -> "Iterator[str]":
-    """Tell how many highlights were found, how many have a normal, and what the others are."""
+    """Yield how many highlights were found, how many have a normal, and what the others are."""
     from simtest.reconstruction.assumptions import BORDERED
     from simtest.reconstruction.explanations import kinds_counted
     from simtest.reconstruction.pipeline import REFUSED
@@ -251,7 +251,7 @@ def twin(
 
 
 def _twin_parts(result: "TwinResult") -> "Iterator[str | Table]":
-    """Tell the highlights, the bank and what was drawn."""
+    """Yield the highlights, the bank and what was drawn."""
     columns = ("no.", "x (px)", "y (px)", "radius (px)", "best", "± deg", "twins deg", "95 % interval", "held")
     spots = sorted(result.spots, key=lambda each: -each.spot.radius_px)
     yield Table(columns, [_twin_cells(each) for each in spots[:MOST_ROWS]])
@@ -389,7 +389,7 @@ def show(file: Path, /, *, view_radius: ViewRadius = None) -> Told:
 
 
 def _camera_parts(shown: "dict[str, Any]") -> "Iterator[str | Table]":
-    """Tell a camera's summary as lines and a table."""
+    """Yield a camera's summary as lines and a table."""
     (fx, skew, cx), (_, fy, cy), _ = shown["K"]
     yield f"{shown['file']}: {shown['format']}, {shown['width']} x {shown['height']} px"
     yield f"fx {fx:.8g}, fy {fy:.8g}, cx {cx:.8g}, cy {cy:.8g}{f', skew {skew:.6g}' if skew else ''} px"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from simtest.cli.main import MANNERS
 from simtest.pages import WRITTEN
+from simtest.runtime.stops import STOP
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -69,18 +70,17 @@ LINE_EVERY_S = 10.0
 def stop_between_steps() -> Iterator[Callable[[], None]]:
     """Yield a callable that raises KeyboardInterrupt if Ctrl-C was pressed meanwhile; a second press stops at once.
 
-    Raised anywhere else, KeyboardInterrupt can be lost in a callback, or break the renderer while it is imported.
+    Raised anywhere else, KeyboardInterrupt can be lost in a callback, or break the renderer while it is imported. A
+    wait for another process (`breakable`) is stopped by the first press.
     """
-    presses = 0
 
     def press(*_: object) -> None:
-        nonlocal presses
-        presses += 1
-        if presses > 1:
+        if STOP.is_wanted or STOP.is_breakable:
             raise KeyboardInterrupt
+        STOP.is_wanted = True
 
     def check() -> None:
-        if presses:
+        if STOP.is_wanted:
             raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGINT, press)
@@ -88,6 +88,7 @@ def stop_between_steps() -> Iterator[Callable[[], None]]:
         yield check
     finally:
         signal.signal(signal.SIGINT, before)
+        STOP.is_wanted = False
 
 
 @contextmanager

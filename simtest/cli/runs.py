@@ -362,7 +362,7 @@ def _verdict(outcome: "Outcome") -> dict[str, Any]:
 
 
 def _night_parts(outcome: "Outcome") -> "Iterator[str | Table]":
-    """Tell what the gate says, and a table by experiment."""
+    """Yield what the gate says, and a table by experiment."""
     from simtest.nightly.phrases import headline
     from simtest.nightly.records import OUTCOMES
 
@@ -472,7 +472,7 @@ def cases(*, suite: SuiteVersion = "v1") -> Told:
 
 
 def _part_rows(content: dict[str, Any]) -> "Iterator[str | Table]":
-    """Tell a row for each part, the reasons of its refusals, and the headline."""
+    """Yield a row for each part, the reasons of its refusals, and the headline."""
     from simtest.bench.table import COLUMNS, part_cells, refusals
 
     rows = [(part, *part_cells(told)) for part, told in content["parts"].items()]

@@ -89,7 +89,10 @@ class Options:
 
     def __post_init__(self) -> None:
         if isinstance(self.detector, str) and self.detector != AUTO:
-            load_detector(self.detector)
+            try:
+                load_detector(self.detector)
+            except InputError as error:
+                raise InputError(f"{error}; {AUTO} chooses among those of simtest") from error
         if self.target not in TARGETS:
             raise InputError(f"target = {self.target!s:.80}: must be one of {', '.join(TARGETS)}")
         width = self.smoothing_px

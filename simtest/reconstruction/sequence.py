@@ -9,7 +9,7 @@ import json
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -86,6 +86,8 @@ def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Prog
         is kept.
     """
     options.require_camera()
+    if isinstance(options.estimators, Mapping) or not isinstance(options.detector, str | None):
+        raise InputError(f"{path}: the estimators and the detector of a folder or a film must be given by name")
     source, calibration, poses = open_source(path), None, None
     if options.camera is not None:
         # Imported here: the models of files are slow to load.
@@ -186,11 +188,13 @@ class _Run:
         # done by an earlier run: only the tracks are counted anew
         done = None if self._is_made else _read_done(self.file(frame.index), frame.name)
         if done is not None:
-            spots = done["specularities"]
-            peaks = [spot["peak_px"] for spot in spots]
-            middles = [np.add(spot["box_px"][:2], np.divide(spot["box_px"][2:], 2)) for spot in spots]
-            positions = [middle if peak is None else peak for peak, middle in zip(peaks, middles, strict=True)]
-            self._keep(frame.index, done, self._track_numbers(positions, done["size"], frame.index))
+            numbers = self._track_numbers(_positions(done), done["size"], frame.index)
+            # They are others where a frame before this one was lost since.
+            if numbers != [spot["track"] for spot in done["specularities"]]:
+                for spot, number in zip(done["specularities"], numbers, strict=True):
+                    spot["track"] = number
+                write_json(self.file(frame.index), done, compact=True)
+            self._keep(frame.index, done, numbers)
             return
         try:
             self._reconstruct(frame)
@@ -214,7 +218,7 @@ class _Run:
         if self._calibration is None:
             self._calibration, self._cautions = calibration_for(self.options, picture)
             for caution in self._cautions:
-                warnings.warn(caution, stacklevel=5)
+                warnings.warn(caution, stacklevel=6)
         found = reconstruct_values(frame.name, picture, self._calibration, self.options, self._cautions)
         self.assumed = found.choices.assumed
         numbers = self._track_numbers([spot.position_px for spot in found], size, frame.index)
@@ -248,12 +252,23 @@ class _Run:
         return self._tracker.update(positions_px, index)
 
 
+def _positions(entry: JsonObject) -> list[npt.ArrayLike]:
+    """Return where a frame's file has its specularities, px: their peaks, or the middles of their boxes."""
+    spots = entry["specularities"]
+    boxes = [spot["box_px"] for spot in spots]
+    middles = [np.add(box[:2], np.divide(box[2:], 2)) for box in boxes]
+    return [middle if spot["peak_px"] is None else spot["peak_px"] for spot, middle in zip(spots, middles, strict=True)]
+
+
 def _read_done(path: Path, name: str) -> JsonObject | None:
     """Read what an earlier run wrote of a frame; None where there is nothing, or it cannot be used."""
     try:
         entry: JsonObject = read_json(path)
-        # The rows of the tables need what a frame's file must hold.
+        # The tables, the tracks and the motion need what a frame's file must hold.
         tuple(_rows(0, None, entry))
+        np.asarray(_positions(entry), dtype=float).reshape(-1, 2)
+        for spot in entry["specularities"]:
+            TrackedHighlight.from_json(0, spot)
         return entry if (entry["image"], len(entry["size"])) == (name, 2) and "time_s" in entry else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -28,6 +28,7 @@ from typing import Any, Protocol, TypeVar
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.boundary import explain, plain
 from simtest.runtime.files import check_count
+from simtest.runtime.stops import breakable
 
 T = TypeVar("T")
 
@@ -123,7 +124,9 @@ class _Pool:
             while self._left:
                 self._assign_tasks()
                 pipes = {worker.pipe: worker for worker in self._workers}
-                for pipe in wait(list(pipes), timeout=1.0):
+                with breakable():
+                    ready = wait(list(pipes), timeout=1.0)
+                for pipe in ready:
                     assert isinstance(pipe, Connection)
                     yield from self._receive(pipes[pipe], on_step)
                 # Without workers no message arrives, and Ctrl-C is answered in the callback.

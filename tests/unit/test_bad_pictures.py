@@ -144,7 +144,7 @@ ARGUMENTS = {
         {"encoding": "srgb", "camera": Calibration(EYE, Response("gamma", 2.2))},
         "encoding = 'srgb': the calibration states the response; give one of them",
     ),
-    "detector unknown": ({"detector": "magic"}, "detector 'magic': not installed; allowed: "),
+    "detector unknown": ({"detector": "magic"}, "allowed: colour, peaks; auto chooses among those of simtest"),
     "detector of a region": ({"detector": "colour", "roi": (0, 0, 9, 9)}, "the region of interest is named"),
     "detector of grey": ({"detector": "colour"}, "detector colour: the picture is grey; must be peaks"),
     "field of view out of range": ({"camera": 200.0}, "200"),

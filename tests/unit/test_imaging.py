@@ -14,6 +14,7 @@ from test_colour_detection import HEIGHT, WIDTH, lobe, picture
 
 import simtest
 from simtest.api import Extras, reconstruct_picture
+from simtest.detection.detector import load_detector
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.reconstruction.images import is_coloured, open_source, read_picture
@@ -236,6 +237,44 @@ def test_a_stopped_run_goes_on(folder, tmp_path):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     other = Options(fov_deg=FOV, every=True)
     told(lambda: reconstruct_sequence(folder, tmp_path / "out", other), "holds a run with another every")
+
+
+def test_where_the_first_frame_is_lost_all_files_have_one_numbering(folder, tmp_path):
+    # One step lies within the reach of a track, two lie beyond: without frame 0 the tracks are counted otherwise.
+    out = tmp_path / "out"
+    for i in (1, 2, 10):
+        save(folder / f"frame{i}.png", frame(8.0 * i))
+    run(folder, out)
+    (folder / "frame1.png").write_text("no picture")
+    (out / "frames" / "000000.json").unlink()
+    with pytest.warns(UserWarning, match="frame 0: "):
+        reconstruct_sequence(folder, out, Options(fov_deg=FOV))
+    rows = list(csv.DictReader((out / "timeline.csv").read_text().splitlines()))
+    in_table = {(int(row["frame"]), int(row["track"])) for row in rows}
+    tracks = json.loads((out / "tracks.json").read_text())
+    assert {(index, track["track"]) for track in tracks for index in track["frames"]} == in_table
+    stored = [json.loads(path.read_text()) for path in sorted((out / "frames").glob("*.json"))]
+    assert {(each["frame_index"], spot["track"]) for each in stored for spot in each["specularities"]} == in_table
+    assert min(track["track"] for track in tracks) == 0
+
+
+@pytest.mark.parametrize("key", ["peak_px", "box_px", "track", "estimates", "best"])
+def test_a_frame_whose_file_lacks_what_the_tables_need_is_done_again(folder, tmp_path, key):
+    out = tmp_path / "out"
+    run(folder, out)
+    whole = (out / "tracks.json").read_bytes()
+    path = out / "frames" / "000001.json"
+    content = json.loads(path.read_text())
+    del content["specularities"][0][key]
+    path.write_text(json.dumps(content))
+    run(folder, out)
+    assert (out / "tracks.json").read_bytes() == whole
+    assert key in json.loads(path.read_text())["specularities"][0]
+
+
+@pytest.mark.parametrize("given", [{"estimators": {"mine": object()}}, {"detector": load_detector("peaks")}])
+def test_objects_that_no_later_run_can_compare_are_refused_for_a_folder(folder, tmp_path, given):
+    told(lambda: reconstruct_sequence(folder, tmp_path / "out", Options(fov_deg=FOV, **given)), "given by name")
 
 
 def test_another_calibration_is_another_run(folder, tmp_path):

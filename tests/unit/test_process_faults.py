@@ -4,6 +4,7 @@ import os
 import resource
 import sys
 import tempfile
+import threading
 
 import numpy as np
 import pytest
@@ -263,6 +264,32 @@ for line in sys.stdin:
     core.close()
     assert {each.reason for each in failures} == {Reason.CORE_PROTOCOL}
     assert words in failures[0].detail
+
+
+def test_an_answer_to_a_request_that_was_not_read_counts_for_nothing(folder):
+    script = folder / "early_core.py"
+    script.write_text("""import json, os
+hello = {"type": "hello", "protocol": 1, "name": "early", "kind": "frame", "arrays": ["intensity", "noise"]}
+def line():
+    text = b""
+    while not text.endswith(bytes([10])):
+        text += os.read(0, 1)
+    return json.loads(text)
+def send(message):
+    os.write(1, json.dumps(message).encode() + bytes([10]))
+line()
+send(hello)
+number = line()["id"]
+send({"type": "estimates", "id": number, "estimates": [{"normal": [0, 0, -1], "look_px": [320, 240]}]})
+""")
+    held, threads = len(os.listdir("/proc/self/fd")), threading.active_count()
+    core = Core(CoreCommand("early core", "early", (sys.executable, "-S", str(script)), (script,)))
+    core.start()
+    failure = answer_of(core)
+    core.close()
+    assert isinstance(failure, Failure)
+    assert (failure.reason, "exit code 0" in failure.detail) == (Reason.CORE_DIED, True), failure
+    assert (len(os.listdir("/proc/self/fd")), threading.active_count()) == (held, threads)
 
 
 def test_an_empty_line_after_an_answer_is_named(folder):

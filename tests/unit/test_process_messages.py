@@ -256,6 +256,18 @@ def test_a_covariance_of_few_digits_is_made_symmetric():
     np.testing.assert_allclose(found, given, atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("part", "told"),
+    [
+        ([1, 2], "shape: [1, 2]; must be numbers of shape (2, 2)"),
+        ([[1, 0], [0, np.nan]], "shape holds NaN or infinity"),
+    ],
+)
+def test_a_malformed_part_of_a_budget_is_told_by_its_name(part, told):
+    failure = answered(budget={"noise": [[1e-4, 0], [0, 1e-4]], "shape": part})
+    assert failure.detail == told
+
+
 def test_a_budget_is_kept_part_by_part():
     found = answered(budget={"noise": [[1e-4, 0], [0, 1e-4]], "shape": [[2e-4, 0], [0, 0]]})
     assert set(found.budget) == {"noise", "shape"}

@@ -208,7 +208,7 @@ def parent(then, core):
 
 @pytest.mark.parametrize("fault", ["stays", "ignores_term"])
 def test_a_core_dies_with_a_parent_that_is_killed(tmp_path, fault):
-    mark = f"--mark={tmp_path.name}-{fault}"
+    mark = f"--mark={tmp_path}-{fault}"
     started = parent("time.sleep(60)", command(BAD_CORE, fault, mark))
     folder = started.stdout.readline().strip()
     assert len(processes_with(mark)) == 2  # the parent's own command line holds it too
@@ -221,7 +221,7 @@ def test_a_core_dies_with_a_parent_that_is_killed(tmp_path, fault):
 
 
 def test_a_guard_is_no_child_so_that_who_kills_all_children_leaves_it(tmp_path):
-    mark = f"--mark={tmp_path.name}"
+    mark = f"--mark={tmp_path}"
     started = parent("time.sleep(60)", command(BAD_CORE, "stays", mark))
     folder = started.stdout.readline().strip()
     process = psutil.Process(started.pid)
@@ -238,7 +238,7 @@ def test_a_guard_is_no_child_so_that_who_kills_all_children_leaves_it(tmp_path):
     "then", marked(["", "raise SystemExit(1)", "import os; os._exit(0)"], ci=["", "import os; os._exit(0)"])
 )
 def test_a_core_ends_with_its_parent(tmp_path, then):
-    mark = f"--mark={tmp_path.name}"
+    mark = f"--mark={tmp_path}"
     started = parent(then, command(BAD_CORE, "none", mark))
     folder = started.stdout.readline().strip()
     started.wait()
@@ -252,7 +252,7 @@ def test_a_core_ends_with_its_parent(tmp_path, then):
 )
 @pytest.mark.slow
 def test_a_run_that_is_stopped_leaves_no_process(tmp_path, number, workers):
-    mark = f"--mark={tmp_path.name}"
+    mark = f"--mark={tmp_path}"
     line = [
         sys.executable,
         "-m",
@@ -278,7 +278,7 @@ def test_a_run_that_is_stopped_leaves_no_process(tmp_path, number, workers):
 @pytest.mark.filterwarnings("ignore:bad_core:RuntimeWarning")
 @pytest.mark.parametrize("kind", ["published", pytest.param("experiment", marks=pytest.mark.ci)])
 def test_a_run_closes_its_cores(tmp_path, kind, request):
-    mark = f"--mark={tmp_path.name}"
+    mark = f"--mark={tmp_path}"
     core = command(BAD_CORE, "none", mark)
     simtest.validate(request.getfixturevalue(kind), tmp_path / "run", realisations=1, estimators=[core])
     assert processes_with(mark) == []

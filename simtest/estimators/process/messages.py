@@ -19,7 +19,6 @@ from pydantic import (
     Field,
     PlainValidator,
     ValidationError,
-    ValidationInfo,
 )
 from pydantic.dataclasses import dataclass
 
@@ -122,28 +121,35 @@ def _only_numbers(given: object) -> object:
     return given
 
 
-def _numbers(*shape: int | None) -> PlainValidator:
-    """Read a field as an array of finite numbers of this shape, None standing for any length, () for a number."""
+def _read_numbers(given: Any, name: str | None, shape: tuple[int | None, ...]) -> Array | float:
+    """Return an array of finite numbers, or a number where the shape is (); raise `Refused` where it is none."""
     wanted = f"numbers of shape ({', '.join('n' if n is None else str(n) for n in shape)})" if shape else "a number"
+    is_array = isinstance(given, np.ndarray | np.generic)
+    try:
+        values = given if is_array else np.array(_only_numbers(given), dtype=float)
+    except (TypeError, ValueError, OverflowError, RecursionError):
+        raise Refused(f"{name}: {shown_value(given)}; must be {wanted}") from None
+    if values.dtype.kind == "b":
+        raise Refused(f"{name}: holds true or false; must be {wanted}")
+    if values.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, values.shape, strict=True)):
+        raise Refused(f"{name}: {shown_value(given)}; must be {wanted}")
+    numbers: Array = np.array(values, dtype=float)
+    # `Refused` is no ValueError: pydantic lets it pass with its reason.
+    if not np.isfinite(numbers).all():
+        raise Refused(f"{name} holds NaN or infinity", Reason.NOT_FINITE)
+    return numbers if shape else float(numbers)
 
-    def read(given: Any, info: ValidationInfo) -> Array | float:
-        name = info.field_name
-        is_array = isinstance(given, np.ndarray | np.generic)
-        try:
-            values = given if is_array else np.array(_only_numbers(given), dtype=float)
-        except (TypeError, ValueError, OverflowError, RecursionError):
-            raise Refused(f"{name}: {shown_value(given)}; must be {wanted}") from None
-        if values.dtype.kind == "b":
-            raise Refused(f"{name}: holds true or false; must be {wanted}")
-        if values.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, values.shape, strict=True)):
-            raise Refused(f"{name}: {shown_value(given)}; must be {wanted}")
-        numbers: Array = np.array(values, dtype=float)
-        # `Refused` is no ValueError: pydantic lets it pass with its reason.
-        if not np.isfinite(numbers).all():
-            raise Refused(f"{name} holds NaN or infinity", Reason.NOT_FINITE)
-        return numbers if shape else float(numbers)
 
-    return PlainValidator(read)
+def _numbers(*shape: int | None) -> PlainValidator:
+    """Read a field as finite numbers of this shape, None standing for any length, () for a number."""
+    return PlainValidator(lambda given, info: _read_numbers(given, info.field_name, shape))
+
+
+def _read_budget(given: Any) -> dict[str, Array]:
+    """Read the covariances of a budget; a malformed one is told by its own name."""
+    if not isinstance(given, dict):
+        raise ValueError
+    return {name: np.asarray(_read_numbers(part, name, (2, 2))) for name, part in given.items()}
 
 
 Number = Annotated[float, _numbers()]
@@ -195,7 +201,7 @@ class AnsweredEstimate(BaseModel):
     look_ray: Vector | None = None
     basis: Directions | None = None
     covariance: Square | None = None
-    budget: dict[str, Square] | None = Field(None, description="an object of covariances")
+    budget: Annotated[dict[str, Array], PlainValidator(_read_budget)] | None = Field(None, description="an object")
     axis_ratio: Number | None = None
     axis_ratio_deviation: Number | None = None
     choice_margin: Number | None = None

@@ -1,10 +1,12 @@
 """A core's process: started apart from everything else, spoken to with deadlines, and ended with all its children.
 
-A message is one JSON object on a line, followed by the raw bytes of the arrays it lists. Cores that read no binary
-streams get files: JSON, NPY and PNG in a folder a request.
+Messages between simtest and a core: one JSON object on a line, followed by the raw bytes of the arrays it lists.
+
+Requests and answers as files, for cores that read no binary streams: JSON, NPY and PNG in a folder a request.
 """
 
 import contextlib
+import fcntl
 import io
 import json
 import math
@@ -20,14 +22,13 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from threading import Thread
 from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Reason, SimtestError
+from simtest.runtime.stops import breakable
 
 PROTOCOL = 1
 """Version of the protocol."""
@@ -197,6 +198,8 @@ LOOK_S = 0.05
 """Time between two looks whether the process still lives, where another one holds its pipes open."""
 
 CHUNK_BYTES = 1 << 18
+PIPE_BYTES = 1 << 20
+"""Size asked for pipes: a frame passes in a few pieces."""
 
 KEPT_STDERR_BYTES = 4096
 SHOWN_STDERR = 300
@@ -209,21 +212,39 @@ of this process: a cluster kills those of its workers with them."""
 
 
 @dataclass
+class _Outgoing:
+    """What is left to be written."""
+
+    parts: Sequence[memoryview]
+    index: int = 0
+    start: int = 0
+
+    @property
+    def is_done(self) -> bool:
+        return self.index >= len(self.parts)
+
+    def write(self, pipe: int) -> None:
+        """Write as much as the pipe takes."""
+        while not self.is_done:
+            part = self.parts[self.index]
+            try:
+                self.start += os.write(pipe, part[self.start :])
+            except BlockingIOError:
+                return
+            if self.start >= len(part):
+                self.index, self.start = self.index + 1, 0
+
+
+@dataclass
 class Child:
-    """A running core, whose outputs two threads read."""
+    """A running core."""
 
     folder: str  # its own temporary folder, in which it runs
     process: "subprocess.Popen[bytes]"  # the core, leader of its process group
     guard: IO[bytes]  # input of the shell that watches over it
     owner: int = field(default_factory=os.getpid)  # process that started it; a fork of that one must not use its pipes
-
-    def __post_init__(self) -> None:
-        self._reader, self._said = MessageReader(), SimpleQueue[Message | CoreFault | str]()
-        self._is_asked = self._is_closing = False
-        self._stderr = b""
-        self._threads = [Thread(target=read, daemon=True) for read in (self._read, self._listen)]
-        for thread in self._threads:
-            thread.start()
+    _stderr: bytes = b""
+    _stderr_open: bool = True
 
     @classmethod
     def start(cls, arguments: Sequence[str], environment: Mapping[str, str]) -> "Child":
@@ -241,14 +262,30 @@ class Child:
                 _release(guard)
             shutil.rmtree(folder, ignore_errors=True)
             raise
+        child = cls(folder, process, guard)
         with contextlib.suppress(OSError):
             guard.write(b"%d\n" % process.pid)
-        return cls(folder, process, guard)
+        for pipe in child._pipes:
+            os.set_blocking(pipe, False)
+            with contextlib.suppress(OSError):
+                fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+        return child
+
+    @property
+    def _pipes(self) -> tuple[int, int, int]:
+        """Our ends of the core's standard input, output and error."""
+        process = self.process
+        pipes = (process.stdin, process.stdout, process.stderr)
+        stdin, stdout, stderr = (pipe.fileno() for pipe in pipes if pipe is not None)
+        return stdin, stdout, stderr
 
     def check_silent(self) -> None:
         """Raise `CoreFault` where the core has written without being asked, or has ended."""
-        with contextlib.suppress(Empty):
-            self._message(self._said.get_nowait())
+        _, stdout, _ = self._pipes
+        with contextlib.suppress(BlockingIOError):
+            data = os.read(stdout, CHUNK_BYTES)
+            told = excerpt(data) or "an empty line"
+            raise broken(f"an answer that nobody asked for: {told}") if data else self._ended()
 
     def exchange(self, parts: Sequence[memoryview], limit_s: float) -> Message:
         """Write a request and read its answer, the two at once, so that neither side can block the other.
@@ -256,81 +293,53 @@ class Child:
         Raises `CoreFault` if the answer is malformed or late, or the process ends. The process must then be ended: its
         pipes may hold a part of a message.
         """
-        deadline, self._is_asked = time.monotonic() + limit_s, True
-        writer = self._write(parts)
-        answer, has_ended = None, False
-        while answer is None:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                raise CoreFault(Reason.CORE_TIMEOUT, self._late(limit_s, writer.is_alive()))
-            try:
-                answer = self._message(self._said.get(timeout=min(left, LOOK_S)))
-            except Empty:
-                # Its own children may hold the pipes open, so the end of the process may not show there; and it may
-                # have answered just before its end.
-                if has_ended:
-                    raise self._ended() from None
-                has_ended = self.has_ended()
-                if not has_ended and self._input_is_closed():
-                    raise self._ended("closed its standard input") from None
-        writer.join(max(deadline - time.monotonic(), 0))
-        if writer.is_alive():
-            raise CoreFault(Reason.CORE_TIMEOUT, self._late(limit_s, True))
+        stdin, stdout, stderr = self._pipes
+        outgoing, reader, answer = _Outgoing(parts), MessageReader(), None
+        poll = select.poll()
+        poll.register(stdout, select.POLLIN)
+        poll.register(stdin, select.POLLOUT)
+        if self._stderr_open:
+            poll.register(stderr, select.POLLIN)
+        deadline, looked = time.monotonic() + limit_s, time.monotonic()
+        while answer is None or not outgoing.is_done:
+            now = time.monotonic()
+            if now >= deadline:
+                raise CoreFault(Reason.CORE_TIMEOUT, self._late(limit_s, outgoing, reader))
+            # A core that hangs must not hold up a stop.
+            with breakable():
+                ready = dict(poll.poll(1000 * min(deadline - now, LOOK_S)))
+            if stderr in ready and not self._drain():
+                poll.unregister(stderr)
+            if stdin in ready and not outgoing.is_done:
+                self._write(outgoing, stdin)
+                # From now on it is watched for its other end alone.
+                poll.modify(stdin, 0 if outgoing.is_done else select.POLLOUT)
+            elif stdin in ready and stdout not in ready:
+                raise self._ended("closed its standard input")
+            if stdout in ready:
+                data = self._read(stdout)
+                if answer is not None:
+                    raise broken(f"more than one answer to a request: {excerpt(data) or 'an empty line'}")
+                answer = reader.feed(data)
+            elif now - looked > LOOK_S:
+                # Its own children may hold the pipes open, so the end of the process may not show there.
+                looked = now
+                # ... and it may have answered just before its end.
+                if self.has_ended() and not _is_readable(stdout):
+                    raise self._ended()
         return answer
 
-    def _message(self, said: "Message | CoreFault | str") -> Message:
-        """Return a message that the core said; raise `CoreFault` for a fault, or the name of a pipe that it closed."""
-        if isinstance(said, str):
-            raise self._ended(f"closed its {said}")
-        if isinstance(said, CoreFault):
-            raise said
-        return said
+    def _write(self, outgoing: _Outgoing, stdin: int) -> None:
+        try:
+            outgoing.write(stdin)
+        except OSError:
+            raise self._ended("closed its standard input") from None
 
-    def _write(self, parts: Sequence[memoryview]) -> Thread:
-        """Write a request in a thread."""
-        pipe = self.process.stdin
-        assert pipe is not None
-
-        def write() -> None:
-            try:
-                for part in parts:
-                    while part:
-                        part = part[pipe.write(part) :]
-            except (OSError, ValueError):
-                self._said.put("standard input")
-
-        thread = Thread(target=write, daemon=True)
-        thread.start()
-        return thread
-
-    def _read(self) -> None:
-        """Read the messages of the core, one a request; nothing is read after a fault."""
-        assert self.process.stdout is not None
-        with self.process.stdout as pipe:
-            try:
-                while data := pipe.read(CHUNK_BYTES):
-                    if not self._is_asked and not self._is_closing:
-                        raise broken(f"an answer that nobody asked for: {excerpt(data) or 'an empty line'}")
-                    if self._is_asked and (message := self._reader.feed(data)) is not None:
-                        self._is_asked = False
-                        self._said.put(message)
-                self._said.put("standard output")
-            except CoreFault as fault:
-                self._said.put(fault)
-
-    def _listen(self) -> None:
-        """Keep the last of what the core writes to standard error."""
-        assert self.process.stderr is not None
-        with self.process.stderr as pipe:
-            while data := pipe.read(CHUNK_BYTES):
-                self._stderr = (self._stderr + data)[-KEPT_STDERR_BYTES:]
-
-    def _input_is_closed(self) -> bool:
-        """Return whether the core has closed its standard input; unlike `select`, poll takes descriptors above 1023."""
-        poll, pipe = select.poll(), self.process.stdin
-        assert pipe is not None
-        poll.register(pipe, 0)
-        return bool(poll.poll(0))
+    def _read(self, stdout: int) -> bytes:
+        data = os.read(stdout, CHUNK_BYTES)
+        if not data:
+            raise self._ended("closed its standard output")
+        return data
 
     def has_ended(self) -> bool:
         """Return whether the process has ended; it stays as a zombie, so that its group's number is not used again."""
@@ -347,11 +356,11 @@ class Child:
         if self.owner != os.getpid():
             return
         assert self.process.stdin is not None
-        self._is_closing = True
+        outputs = self._pipes[1:]
         self.process.stdin.close()
         end = time.monotonic() + wait_s
-        while not self.has_ended() and time.monotonic() < end:
-            time.sleep(0.002)
+        while not self.has_ended() and (left := end - time.monotonic()) > 0:
+            _discard(outputs, min(left, 0.01))
         self.kill()
 
     def kill(self) -> None:
@@ -362,46 +371,75 @@ class Child:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()
-        assert self.process.stdin is not None
-        with contextlib.suppress(OSError):
-            self.process.stdin.close()
-        # Where the core's own children hold its outputs open, the threads read on until these end.
-        for thread in self._threads:
-            thread.join(LOOK_S)
+        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
+            assert pipe is not None
+            with contextlib.suppress(OSError):
+                pipe.close()
         shutil.rmtree(self.folder, ignore_errors=True)
         _release(self.guard)
 
-    def _ended(self, what: str = "closed its standard output") -> CoreFault:
+    def _drain(self) -> bool:
+        """Read what there is of standard error; return whether it is still open."""
+        try:
+            data = os.read(self._pipes[2], CHUNK_BYTES)
+        except BlockingIOError:
+            return True
+        self._stderr = (self._stderr + data)[-KEPT_STDERR_BYTES:]
+        self._stderr_open = bool(data)
+        return self._stderr_open
+
+    def _ended(self, what: str = "") -> CoreFault:
         """Return the fault of a core that has closed a pipe; the process itself ends a moment later, or not at all."""
         end = time.monotonic() + 0.5
         while not self.has_ended() and time.monotonic() < end:
             time.sleep(0.002)
         if not self.has_ended():
-            return broken(f"the core {what} but did not end{self.said()}")
+            return broken(f"the core {what or 'closed its standard output'} but did not end{self.said()}")
         # Killed here already, so that its exit code can be read while its group's number is still its own.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid, signal.SIGKILL)
         return CoreFault(Reason.CORE_DIED, f"{_exit(self.process.wait())}{self.said()}")
 
-    def _late(self, limit_s: float, is_unread: bool) -> str:
-        waiting = self._reader.waiting
-        if is_unread:
+    def _late(self, limit_s: float, outgoing: _Outgoing, reader: MessageReader) -> str:
+        if not outgoing.is_done:
             what = "the request was not read"
         else:
-            what = f"an answer was begun ({waiting} bytes) but not ended" if waiting else "no answer"
+            what = f"an answer was begun ({reader.waiting} bytes) but not ended" if reader.waiting else "no answer"
         # The likeliest cause of silence.
         hint = " (nothing was written: is standard output flushed?)" if what == "no answer" else ""
         return f"{what} within {limit_s:g} s{hint}{self.said()}"
 
     def said(self) -> str:
         """Return the last of what the core wrote to standard error, as the end of a sentence."""
-        self._threads[1].join(LOOK_S)
+        for _ in range(16):
+            if not self._stderr_open or not _is_readable(self._pipes[2]):
+                break
+            self._drain()
         text = self._stderr.replace(self.folder.encode(), b".")
         if len(text) > SHOWN_STDERR:
             # Three bytes less, and from the next word on: what is cut off shows.
             kept = text[-SHOWN_STDERR + 3 :]
             text = b"..." + (re.sub(rb"^\S*\s+", b"", kept) or kept)
         return f"; its last words: {excerpt(text, SHOWN_STDERR)}" if text.strip() else ""
+
+
+def _is_readable(pipe: int) -> bool:
+    """Return whether a pipe holds something or has closed; unlike `select`, poll takes descriptors above 1023."""
+    poll = select.poll()
+    poll.register(pipe, select.POLLIN)
+    return bool(poll.poll(0))
+
+
+def _discard(pipes: Sequence[int], wait_s: float) -> None:
+    """Read what an ending core still writes, so that it is not held up."""
+    poll = select.poll()
+    for pipe in pipes:
+        poll.register(pipe, select.POLLIN)
+    for pipe, event in poll.poll(1000 * wait_s):
+        if event & select.POLLIN:
+            os.read(pipe, CHUNK_BYTES)
+        else:
+            time.sleep(min(wait_s, 0.001))
 
 
 def _start_guard(folder: str) -> IO[bytes]:
