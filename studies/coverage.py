@@ -1,7 +1,8 @@
 """Stated 95 % regions on highlights of the generated colon: how many hold the truth, and how large they are.
 
-`python -m studies.coverage`: 2,000 different highlights with one realisation of the noise each, about ten minutes
-of one core to itself. No viewpoint of these was used to set what the estimators add to the noise.
+`python -m studies.coverage`: 2,000 different highlights with one realisation of the noise each. No viewpoint of these
+was used to set what the estimators add to the noise. `python -m studies.coverage 300 surface.path=liver` takes another
+number of highlights, and other settings of the scene.
 """
 
 import sys
@@ -26,6 +27,7 @@ from simtest.rendering import Session
 from simtest.simulation.frame import render_view
 from simtest.simulation.highlights import TrueHighlight
 from simtest.spec import load_scene
+from simtest.spec.toml_files import parse_settings
 from simtest.validation.matching import match
 from simtest.validation.metrics import mahalanobis2
 
@@ -46,15 +48,16 @@ SAID_EVERY = 300
 Judged = tuple[Estimate | Failure, TrueHighlight]
 
 
-def figures(highlights: int = HIGHLIGHTS, aside: int = ASIDE_HIGHLIGHTS) -> list[Figure]:
-    """Return coverage and size of each estimator's regions."""
+def figures(highlights: int = HIGHLIGHTS, settings: list[str] | None = None) -> list[Figure]:
+    """Return coverage and size of each estimator's regions; ``KEY=VALUE`` sets the scene."""
+    aside = highlights * ASIDE_HIGHLIGHTS // HIGHLIGHTS
     judged: dict[str, list[Judged]] = {name: [] for name in ("cone_axis", "curved", "photometric", "bisector")}
-    for patch, calibration, truth in _highlights(highlights, ()):
+    for patch, calibration, truth in _highlights(highlights, (), settings or []):
         for name, estimator in (("cone_axis", cone_axis), ("curved", curved), ("photometric", photometric)):
             judged[name].append((estimator.estimate(patch, calibration.camera, calibration.priors), truth))
         _say_so_far(judged)
     light = {"offset_mm": ASIDE_MM, "azimuth_deg": 45.0}
-    for patch, calibration, truth in _highlights(aside, (light,)):
+    for patch, calibration, truth in _highlights(aside, (light,), settings or []):
         priors = replace(calibration.priors, distance_mm=exactly(truth.distance))
         judged["bisector"].append((bisector.estimate(patch, calibration.camera, priors), truth))
         _say_so_far(judged)
@@ -69,12 +72,13 @@ def _say_so_far(judged: Mapping[str, Sequence[Judged]]) -> None:
 
 
 def _highlights(
-    count: int, lights: Sequence[Mapping[str, float]]
+    count: int, lights: Sequence[Mapping[str, float]], settings: list[str]
 ) -> Iterator[tuple[Patch, Calibration, TrueHighlight]]:
     """Return detected highlights that are matched to the truth, of as many viewpoints as it takes."""
     session, found, viewpoint = None, 0, FIRST_VIEWPOINT
     while found < count:
         values = {"surface.path": "colon", "surface.viewpoint": viewpoint, "sensor.seed": viewpoint}
+        values |= parse_settings(settings)
         scene = load_scene("anatomy", values | ({"rig.lights": list(lights)} if lights else {}))
         session = session or Session(scene)
         seen = render_view(session, scene)
@@ -108,4 +112,5 @@ def _figures(name: str, judged: Sequence[Judged]) -> list[Figure]:
 
 
 if __name__ == "__main__":
-    sys.exit(print_figures(figures()))
+    count, *settings = sys.argv[1:] or [str(HIGHLIGHTS)]
+    sys.exit(print_figures(figures(int(count), settings)))

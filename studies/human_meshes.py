@@ -34,6 +34,7 @@ from studies.hard.measure import semi_axis_deg
 MESHES = Path(__file__).resolve().parents[2] / "shared" / "data" / "meshes"
 ESTIMATORS = ("cone_axis", "curved", "brightest_point", "photometric")
 COLOUR = "llvm_ad_rgb"
+TISSUE = [0.85, 0.45, 0.40]
 NEAR_PX = 1.5
 """A detection shows the visible highlight whose peak its isophote encloses, or lies so near to its own peak."""
 
@@ -99,7 +100,7 @@ def _scored(path: Path, viewpoints: range) -> Score:
     for viewpoint in viewpoints:
         values = {
             "surface.path": str(path), "surface.viewpoint": viewpoint, "sensor": {"preset": "colonoscope_hd"},
-            "reflectance.exponent": 300.0,
+            "reflectance.exponent": 300.0, "reflectance.diffuse": 0.3, "reflectance.colour": TISSUE,
         }  # fmt: skip
         try:
             scene = load_scene("anatomy", values)

@@ -133,9 +133,12 @@ def check_figures(pages: Sequence[Path] | None, cheap: bool, timeout_s: float) -
     tables = [table for page in pages or manual_pages() for table in tables_of(page)]
     failed = 0
     with tempfile.TemporaryDirectory(prefix="manual-") as folder:
-        scratch = Path(folder)
-        (scratch / "out").mkdir()
+        # Data that is not ours lies beside the checkout.
+        scratch, data = Path(folder) / ROOT.name, ROOT.parent / "shared"
+        (scratch / "out").mkdir(parents=True)
         copy_checkout(scratch)
+        if data.is_dir():
+            (Path(folder) / data.name).symlink_to(data)
         printed: dict[str, tuple[bool, str]] = {}
         for table in tables:
             if cheap and table.minutes > CHEAP:

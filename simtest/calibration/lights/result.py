@@ -14,7 +14,7 @@ from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array, Index
 from simtest.runtime.statistics import NORMAL_QUANTILE
 
-UNLIKELY = 1e-3
+UNLIKELY = 0.01
 """Residuals that are so unlikely to be as large by chance are told."""
 
 MOST_INFLATION = 2.25
