@@ -45,6 +45,10 @@ OUTLINE_FLOOR_PX = 0.02
 COMMON_PX, COMMON_RADIUS_PX = 0.015, 0.012
 """Error that the outlines of all pictures share, px: of their position an axis, and of their radius."""
 
+UNSURE = 1.5
+"""The same, in standard deviations of each outline's own error: where the ball is about as bright as the room behind it,
+that is so on the same side in all pictures. Set on mirror balls of `studies.light_calibration`, seeds 9000 to 9119."""
+
 SHADED_PX = 0.03
 """The ball's shadow beside its outline moves all outlines away from the lights, by so many px for each mm that the
 middle of the lights lies beside the camera: a standard deviation."""
@@ -175,8 +179,8 @@ class Ball:
 
     def variations(self, views: Sequence[View], camera: Camera, lights: Array) -> Iterator[Balls]:
         """Return the balls with each error of the outlines that all pictures share, of one standard deviation."""
-        for dx, dy, wider in common_outline_errors(lights):
-            moved = [moved_outline(view, camera, np.array([dx, dy]), wider) for view in views]
+        for errors in common_outline_errors(views, camera, lights):
+            moved = [moved_outline(view, camera, shift) for view, shift in zip(views, errors, strict=True)]
             yield self._of_outlines(moved, camera)
         for outlines in unlit_outline_errors(views, camera, self.radius_mm):
             yield self._of_outlines(outlines, camera)
@@ -517,13 +521,13 @@ def unlit_outline_errors(views: Sequence[View], camera: Camera, radius_mm: float
     if any(strips):
         for dx, dy, wider in np.eye(3):
             yield [
-                moved_outline(view, camera, strip * np.array([dx, dy]), strip * wider)
+                moved_outline(view, camera, strip * np.array([dx, dy, wider]))
                 for view, strip in zip(views, strips, strict=True)
             ]
 
 
-def common_outline_errors(lights: Array) -> Array:
-    """Return independent errors that all outlines share, shape (4, 3): shift along x and y and of the radius, px.
+def common_outline_errors(views: Sequence[View], camera: Camera, lights: Array) -> Array:
+    """Return independent errors that all outlines share, shape (4, V, 3): shift along x and y and of the radius, px.
 
     `lights`, shape (S, 3), mm, are all lights found; far lamps cast no shadow that moves with the camera.
     """
@@ -531,16 +535,24 @@ def common_outline_errors(lights: Array) -> Array:
     beside = near[:, :2].mean(axis=0) if len(near) else np.zeros(2)
     length = float(np.linalg.norm(beside))
     shaded = SHADED_PX * beside * min(1.0, MOST_SHADED_MM / max(length, 1e-9))
-    return np.array([[COMMON_PX, 0, 0], [0, COMMON_PX, 0], [0, 0, COMMON_RADIUS_PX], [*shaded, 0]])
+    errors = np.zeros((4, len(views), 3))
+    for i, view in enumerate(views):
+        own = np.sqrt(np.diag(view.seen_outline.covariance)) / _pixel(view, camera)
+        errors[range(3), i, range(3)] = np.hypot(UNSURE * own, [COMMON_PX, COMMON_PX, COMMON_RADIUS_PX])
+    errors[3, :, :2] = shaded
+    return errors
 
 
-def moved_outline(view: View, camera: Camera, shift_px: Array, wider_px: float) -> BallOutline:
-    """Return the outline of a view, shifted in the picture and with a larger radius, px."""
+def _pixel(view: View, camera: Camera) -> float:
+    """Return the angle of a pixel at a ball's centre, rad."""
+    return float(np.linalg.norm(camera.step_of_pixels(camera.project(view.seen_outline.direction))) / np.sqrt(2))
+
+
+def moved_outline(view: View, camera: Camera, shift_px: Array) -> BallOutline:
+    """Return the outline of a view, shifted in the picture and with a larger radius, shape (3,), px."""
     outline = view.seen_outline
-    at = camera.project(outline.direction)
-    pixel = float(np.linalg.norm(camera.step_of_pixels(at)) / np.sqrt(2))
-    direction = camera.unproject(at + shift_px)
-    return replace(outline, direction=direction, half_angle=outline.half_angle + wider_px * pixel)
+    direction = camera.unproject(camera.project(outline.direction) + shift_px[:2])
+    return replace(outline, direction=direction, half_angle=outline.half_angle + shift_px[2] * _pixel(view, camera))
 
 
 def circles_of(path: Path) -> dict[str, Circle]:
