@@ -19,11 +19,8 @@ from simtest.estimators.small_spots import HighlightAxis
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
 
-LARGEST_MISFIT = 0.25
-"""Largest misfit of the offsets that the mirror geometry predicts, as a share of their length."""
-
-CLEAR = 2.0
-"""The next best light must fit this many times worse for the choice to be clear."""
+LARGEST_MISFIT = 0.25  # largest misfit of the offsets that the mirror geometry predicts, as a share of their length
+CLEAR = 2.0  # the next best light must fit this many times worse for the choice to be clear
 
 ALONE = 3.0
 """The highlights of one place must lie this many times nearer together than the next one does. On rough tissue glints
@@ -31,15 +28,13 @@ meet the lights' arrangement by chance: of two lights 16 times in 100, half of t
 which are half of all choices that seem clear there."""
 
 
-STEP = 1e-4
-"""Step of the differences of the normal, rad, and as a share of the distance."""
+STEP = 1e-4  # step of the differences of the normal, rad, and as a share of the distance
 
 NARROW = 0.15
 """Standard deviation of a told distance, as a share of it, up to which the light's angle is taken as linear in it; at
 0.3 a surface at half the distance would lie three stated deviations off."""
 
-DISTANCES = (np.arange(32) + 0.5) / 32
-"""Shares of a prior on the distance at which the normal's moves are computed."""
+DISTANCES = (np.arange(32) + 0.5) / 32  # shares of a prior on the distance at which the normal's moves are computed
 
 
 @dataclass(frozen=True)

@@ -52,11 +52,8 @@ STATED = "stated"
 MISPLACED = ("noise", "resolution", "shape", "response", STATED)
 """Parts that stand for a highlight's brightest point lying elsewhere than where the normal looks."""
 
-LARGEST_VARIANCE = math.pi**2
-"""rad^2; no direction is less certain. What states more has other units."""
-
-Budget = Mapping[str, Array]
-"""Covariance of each part, shape (2, 2), rad^2, in the basis ``tangent_basis(normal)``."""
+LARGEST_VARIANCE = math.pi**2  # rad^2; no direction is less certain, and what states more has other units
+Budget = Mapping[str, Array]  # covariance of each part, shape (2, 2), rad^2, in the basis ``tangent_basis(normal)``
 
 
 def total(budget: Budget) -> Array:
@@ -152,8 +149,7 @@ def _below(values: Array) -> Array:
 
 Rows = npt.NDArray[np.float32]
 
-KERNEL_SIGMAS = 4.0
-"""Half-width of the smoothing kernel over its standard deviation."""
+KERNEL_SIGMAS = 4.0  # half-width of the smoothing kernel over its standard deviation
 
 
 def conics_by_crossings(
@@ -242,8 +238,7 @@ alone exceed it."""
 BY_PIXELS = 3e-4
 """Power that linear interpolation between pixels leaves in a harmonic, times the fourth power of the radius in px."""
 
-LARGEST_GAP = 3.0
-"""A point of a cut isophote stands for so many mean distances between points at most."""
+LARGEST_GAP = 3.0  # a point of a cut isophote stands for so many mean distances between points at most
 
 _ANGLES = (np.arange(256) + 0.5) * np.pi / 256
 

@@ -17,15 +17,13 @@ from simtest.geometry import Array, Camera, CirclePoses, Mask, Patch, circle_pos
 from simtest.geometry.cones import PoseRegion
 from simtest.geometry.patch import slope_divisor_px2
 
-STEP = 1e-5
-"""Step of the differences between conic and ellipse, as a share of the largest of their parameters."""
+STEP = 1e-5  # step of the differences between conic and ellipse, as a share of the largest of their parameters
 
 
 POOLED_ISOVALUES = (0.1, 0.2, 0.3)
 """Low ones: the distance of the circles' projected centres grows with the square of the isophote's size."""
 
-CLEAR_MARGIN = 3.0
-"""Where the isovalue's own choice is as clear as this, in standard deviations, no others are used."""
+CLEAR_MARGIN = 3.0  # where the isovalue's own choice is as clear as this, in standard deviations, no others are used
 
 AMBIGUOUS_MARGIN = 2.0
 

@@ -62,11 +62,8 @@ class AxisErrors(NamedTuple):
 OF_MEAN = AxisErrors(fitted_number("ripples.mean"), fitted_number("bends.mean"), fitted_number("drift.mean_grid_px2"))
 OF_PEAK = AxisErrors(fitted_number("ripples.peak"), fitted_number("bends.peak"), fitted_number("drift.peak_grid_px2"))
 
-STREAK_RATIO = 0.1
-"""An isophote with a smaller axis ratio is a streak."""
-
-MIN_CLIPPED_PX = 3
-"""Fewer clipped pixels change a smoothed peak by less than its noise."""
+STREAK_RATIO = 0.1  # an isophote with a smaller axis ratio is a streak
+MIN_CLIPPED_PX = 3  # fewer clipped pixels change a smoothed peak by less than its noise
 
 NOISE_FACTOR = 2.0
 """Standard deviations of a contour's noise that its distance from the ellipse may have on top, added in squares."""
@@ -401,8 +398,7 @@ def _summed(covariance: Array) -> Array:
     return np.asarray(both @ covariance @ both.T)
 
 
-MIN_ISOPHOTES = 2
-"""One isophote alone may be an accident of the background."""
+MIN_ISOPHOTES = 2  # one isophote alone may be an accident of the background
 
 OTHERS_RESIDUAL, OTHERS_RATIO = 0.1, 2.5
 """A lower isophote that differs from its ellipse by more than this share of its radius, and so many times more than the

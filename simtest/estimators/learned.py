@@ -29,8 +29,7 @@ from simtest.runtime.resources import data_root
 LEAST_LIT, BRIGHT_PERCENT = 0.05, 95.0
 """Pixels with less than this share of the light at this percentile count as unlit (`median_of_lit`)."""
 
-LIGHT_SCALE_MM = 5.0
-"""Position of a light, mm, for an input of 1."""
+LIGHT_SCALE_MM = 5.0  # position of a light, mm, for an input of 1
 
 LOG_RANGE = (-5.0, 2.0)
 """Of the logarithms of deviations: outside it they are clipped, so that no example decides the fit."""
@@ -72,8 +71,7 @@ def median_of_lit(light: Image) -> float:
     return max(float(np.median(lit)), 1e-6) if lit.size else 1.0
 
 
-MARGIN = 0.05
-"""Share of a range, and absolute part, by which an input may leave it."""
+MARGIN = 0.05  # share of a range, and absolute part, by which an input may leave it
 
 
 @dataclass(frozen=True)
@@ -155,8 +153,7 @@ def inflation(distances: Array, usual: float) -> Array:
     return np.maximum(1.0, distances / usual)
 
 
-DIGITS = 7
-"""Of the numbers of the metadata: those of the weights have no more."""
+DIGITS = 7  # of the numbers of the metadata: those of the weights have no more
 
 
 def rounded(values: AnyArray | Sequence[float]) -> list[float]:
@@ -203,11 +200,8 @@ class CovarianceScale:
         return np.asarray(np.exp(np.interp(log_deviation, self.log_deviation, np.log(self.factor))))
 
 
-METADATA = "simtest"
-"""Key of the metadata, a JSON object, in the file."""
-
-WEIGHTS = ("learning", "weights")
-"""Where networks lie below the shipped scenes."""
+METADATA = "simtest"  # key of the metadata, a JSON object, in the file
+WEIGHTS = ("learning", "weights")  # where networks lie below the shipped scenes
 
 LARGEST_MODEL_BYTES = 256 * 2**20
 
@@ -288,8 +282,7 @@ def _bytes(path: Path) -> bytes:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-STEP = 1e-5
-"""Step of the differences of the normal, rad."""
+STEP = 1e-5  # step of the differences of the normal, rad
 
 
 def turned_normals(rays: Array, rotation: Array, root: Array) -> tuple[Array, Array]:

@@ -31,23 +31,12 @@ from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Mask
 from simtest.runtime.arrays import Image
 
-GRID = (96, 128)
-"""Rows and columns of the planes."""
-
-STRIDE = 2
-"""Cells of the planes, along each axis, for one cell of the outputs."""
-
-CELLS = (GRID[0] // STRIDE, GRID[1] // STRIDE)
-"""Rows and columns of the outputs."""
-
-DARKEST = 0.02
-"""Share of the lit pixels' median light that is added before the logarithm."""
-
-LEAST_LIT = 0.1
-"""Cells with less light than this share of the view's median have no colour of their own."""
-
-LEAST_SEEN = 0.02
-"""A cell of which a smaller share is seen is empty."""
+GRID = (96, 128)  # rows and columns of the planes
+STRIDE = 2  # cells of the planes, along each axis, for one cell of the outputs
+CELLS = (GRID[0] // STRIDE, GRID[1] // STRIDE)  # rows and columns of the outputs
+DARKEST = 0.02  # share of the lit pixels' median light that is added before the logarithm
+LEAST_LIT = 0.1  # cells with less light than this share of the view's median have no colour of their own
+LEAST_SEEN = 0.02  # a cell of which a smaller share is seen is empty
 
 PLANES = (
     "logarithm of the light over its median", "logarithm of the mean light over that mean",
@@ -63,8 +52,7 @@ CAMERA = (
 )  # fmt: skip
 """What a network answers for a limited range of; lights in units of `LIGHT_SCALE_MM`."""
 
-VIEWED = PLANES[:5]
-"""The planes that change from frame to frame of one camera."""
+VIEWED = PLANES[:5]  # the planes that change from frame to frame of one camera
 
 # What a network returns
 
@@ -72,8 +60,7 @@ OUTPUTS = ("rotation, first", "rotation, second", "logarithm of L11", "L21", "lo
            "logarithm of the distance", "logarithm of that one's deviation")  # fmt: skip
 """In each cell. L is the Cholesky factor of the rotation's covariance, in units of `ROTATION_SCALE`."""
 
-ROTATION_SCALE = 0.5
-"""Rotation, rad, for an output of 1."""
+ROTATION_SCALE = 0.5  # rotation, rad, for an output of 1
 
 DISTANCE_MM, DISTANCE_SCALE = 30.0, 0.5
 """A distance of `DISTANCE_MM` along the ray is an output of 0; an output of 1 is a logarithm of `DISTANCE_SCALE`."""
@@ -176,11 +163,8 @@ def _centred(values: Image, lit: Mask) -> Image:
 
 FORMAT = "simtest dense_normals, version 2"
 
-ASPECTS = (1.0, 1.9)
-"""Width over height: what the training's cut views cover."""
-
-CELL_PX = (1.5, 20.0)
-"""Pixels of a cell along x: resampling covers these."""
+ASPECTS = (1.0, 1.9)  # width over height: what the training's cut views cover
+CELL_PX = (1.5, 20.0)  # pixels of a cell along x: resampling covers these
 
 LEAST_HIGHLIGHTS, REFLECTION_LIMIT = 4, 2.0
 """From so many highlights a frame's normals are checked against the law of reflection, and refused beyond the limit.
@@ -397,5 +381,4 @@ class DenseNetwork(TaughtNetwork):
         return refused or (np.asarray(outputs[0], dtype=float), float(inflation(distances, self._usual)[0]))
 
 
-learned_dense = LearnedDense()
-"""The shipped network; it is read at its first use."""
+learned_dense = LearnedDense()  # the shipped network; it is read at its first use

@@ -31,11 +31,8 @@ from simtest.geometry import Array, Camera
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Image
 
-SIDE = 32
-"""Side of a crop, px of the crop."""
-
-STEPS = (1, 3, 9)
-"""Pixels of the frame for one of each crop: the highlight, its neighbours, the shading around."""
+SIDE = 32  # side of a crop, px of the crop
+STEPS = (1, 3, 9)  # pixels of the frame for one of each crop: the highlight, its neighbours, the shading around
 
 DARKEST = 0.02
 """Share of the frame's median light that is added before the logarithm; what lies outside the view is this dark."""
@@ -51,8 +48,7 @@ EXTRAS = (
 
 # What a network returns
 
-ROTATION_SCALE = 0.1
-"""Rotation, rad, for an output of 1."""
+ROTATION_SCALE = 0.1  # rotation, rad, for an output of 1
 
 SURFACES = ("base", "fine")
 
@@ -60,8 +56,7 @@ OUTPUTS = ("rotation, first", "rotation, second", "logarithm of L11", "L21", "lo
            "logarithm of the axis ratio's deviation")  # fmt: skip
 """Of each surface. L is the Cholesky factor of the rotation's covariance, both in units of `ROTATION_SCALE`."""
 
-RATIO, RATIO_DEVIATION = 5, 6
-"""Columns of the axis ratio and of its deviation."""
+RATIO, RATIO_DEVIATION = 5, 6  # columns of the axis ratio and of its deviation
 
 
 def spot_inputs(frame: Frame, peaks_px: Sequence[Array] | Array) -> tuple[Image, Image]:
@@ -125,8 +120,7 @@ FORMAT = "simtest spot_normals, version 3"
 _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 """Extras whose range is checked: focal length and lights. The others differ from frame to frame."""
 
-STEP = 1e-5
-"""Step of the differences of the normal, rad."""
+STEP = 1e-5  # step of the differences of the normal, rad
 
 
 @dataclass(frozen=True)
@@ -216,5 +210,4 @@ class SpotNetwork(TaughtNetwork):
         return np.asarray(outputs, dtype=float), inflated, refusals
 
 
-learned_spot = LearnedSpot()
-"""The shipped network; it is read at its first use."""
+learned_spot = LearnedSpot()  # the shipped network; it is read at its first use

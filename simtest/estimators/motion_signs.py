@@ -134,20 +134,14 @@ def _place(K: Array, v: Array) -> Array | None:
     return None
 
 
-GAIN_SD = 0.03
-"""Default relative standard deviation of the first picture's abs(1 + d k)."""
-
-LEAST_SD = 1e-4
-"""Least allowance for the patch's third order, rad."""
+GAIN_SD = 0.03  # default relative standard deviation of the first picture's abs(1 + d k)
+LEAST_SD = 1e-4  # least allowance for the patch's third order, rad
 
 CHANGE_SD = 0.3
 """Standard deviation of the relative change of the curvatures over one working distance along the surface."""
 
-WRONG_SHARE = 0.02
-"""Stated probability that a sign is told, and is wrong."""
-
-RIVALS = 2
-"""Hypotheses, of four, whose sign along a direction is wrong."""
+WRONG_SHARE = 0.02  # stated probability that a sign is told, and is wrong
+RIVALS = 2  # hypotheses, of four, whose sign along a direction is wrong
 
 CLEAR = -2 * float(np.log(WRONG_SHARE / RIVALS))
 """Least difference of two deviances for the better one to be told.

@@ -23,22 +23,16 @@ from simtest.geometry.vectors import basis_across, tangent_coordinates
 from simtest.runtime.arrays import Index
 from simtest.runtime.fitted import fitted_number
 
-DARK = 1e-6
-"""Least cosine of the lobe's angle: below it the specular term is 0 and has no logarithm."""
+DARK = 1e-6  # least cosine of the lobe's angle: below it the specular term is 0 and has no logarithm
 
 
 RINGS, SECTORS = 6, 8
 """The lobe is divided by the model's intensity into rings of equally many pixels, each ring into sectors."""
 
 MIN_IN_BIN = 8
-LEVEL = 1e-3
-"""A fit is a misfit if noise alone would leave as much structure in less than this share of fits."""
-
-FLOOR = 2e-3
-"""Structure below this share of the peak does not count: rendering and sampling leave as much."""
-
-INNER = 0.5
-"""Near the peak all smooth lobes agree: pixels above this share of it are fitted for comparison."""
+LEVEL = 1e-3  # a fit is a misfit if noise alone would leave as much structure in less than this share of fits
+FLOOR = 2e-3  # structure below this share of the peak does not count: rendering and sampling leave as much
+INNER = 0.5  # near the peak all smooth lobes agree: pixels above this share of it are fitted for comparison
 
 CORRELATED_PX, SUMMED_DEVIATIONS = 4, 2.0
 """Coding and demosaicing correlate the noise of pixels this far apart along an axis at most. The sum of white noise's
@@ -48,11 +42,8 @@ correlations exceeds 1 by so many of its standard deviations once in 40 highligh
 REGIONS = (0.05, 0.1, 0.2, 0.3, 0.5)
 """The pixels inside the first of these isophotes that closes are fitted. Further out there is little but noise."""
 
-CUT_REGION = 0.3
-"""For a highlight that the border or the view cuts: seen pixels are fitted down to this isovalue."""
-
-MAX_PIXELS = 16384
-"""In a larger region every second, third ... pixel is fitted, evenly spread."""
+CUT_REGION = 0.3  # for a highlight that the border or the view cuts: seen pixels are fitted down to this isovalue
+MAX_PIXELS = 16384  # in a larger region every second, third ... pixel is fitted, evenly spread
 
 
 MISFIT_SHARE = fitted_number("misfit.share")

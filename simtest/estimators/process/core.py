@@ -198,11 +198,8 @@ def _program(what: str, word: str, folder: Path) -> Path:
     raise InputError(f"{what}: {word!s:.200} is not executable; must be a program ({called or 'chmod +x'})")
 
 
-MAX_FAULTS = 5
-"""After so many faults in a row a core is not started again."""
-
-KEPT_CORES = 8
-"""Cores that are kept at once; the one that was named last stays longest."""
+MAX_FAULTS = 5  # after so many faults in a row a core is not started again
+KEPT_CORES = 8  # cores that are kept at once; the one that was named last stays longest
 
 
 class Core:

@@ -36,8 +36,7 @@ PATCH_ARRAYS = ("values", "raw", "noise", "saturated", "seen", "rays")
 
 FRAME_ARRAYS = ("encoded", "channels", "intensity", "smoothed", "noise", "clipped", "seen", "rays")
 
-OUTLINES = ("isophote_", "isophote_rays_")
-"""Names of the arrays of an isovalue, without it."""
+OUTLINES = ("isophote_", "isophote_rays_")  # names of the arrays of an isovalue, without it
 
 MAX_ISOPHOTES = 16
 
@@ -257,8 +256,7 @@ class AnsweredEstimate(BaseModel):
 
 
 MAX_ESTIMATES = 10_000
-OWN_REASONS = ("core_", "estimator_error")
-"""How the reasons begin that simtest alone gives."""
+OWN_REASONS = ("core_", "estimator_error")  # how the reasons begin that simtest alone gives
 
 
 def estimate_of(answer: Message, camera: Camera, hello: Hello) -> Estimate | Failure:
@@ -321,8 +319,7 @@ Named = dict[str, npt.NDArray[Any]]
 Offer = Mapping[str, Callable[[], npt.NDArray[Any] | str]]
 """How each array on offer is made; the making returns a text where there is none, which says why."""
 
-MOST_KEPT_RAYS = 1_000_000
-"""Pixels of the largest camera whose sightlines are kept: they take 24 bytes each."""
+MOST_KEPT_RAYS = 1_000_000  # pixels of the largest camera whose sightlines are kept: they take 24 bytes each
 
 
 @lru_cache(maxsize=8)
