@@ -102,6 +102,11 @@ def is_narrow(distance: Distribution) -> TypeGuard[Normal]:
     return isinstance(distance, Normal) and distance.sd <= NARROW * distance.mean
 
 
+def _sampled(distance: Distribution) -> Array:
+    """Return the distances, mm, over which a part of the budget is the mean: one where it is known well, shape (D,)."""
+    return np.array([_middle(distance)]) if is_narrow(distance) else distance.quantile(DISTANCES)
+
+
 def _middle(distance: Distribution) -> float:
     """Return the distance, mm, that the normal is taken at: the median, also the mean of a small normal error."""
     return distance.mean if is_narrow(distance) else float(distance.quantile(np.array([0.5]))[0])
@@ -151,8 +156,7 @@ def _light_part(family: HighlightAxis, lights: Sequence[Array], distance: Distri
 
     It is the mean square over the lights and the distances, since the angle between two lights goes with 1/d.
     """
-    distances = np.array([_middle(distance)]) if is_narrow(distance) else distance.quantile(DISTANCES)
-    first, *single = (_normals(family, light, distances)[0] for light in lights)
+    first, *single = (_normals(family, light, _sampled(distance))[0] for light in lights)
     moved = np.concatenate([normals - first for normals in single]) @ basis_across(normal).T
     return np.asarray(moved.T @ moved / len(moved))
 
@@ -164,11 +168,8 @@ def _with_light_error(
     assert priors.lights_covariance is not None
     # The mean of lights whose errors are alike, as a wrong scale makes them, is as uncertain as one of them.
     covariance = priors.lights_covariance.mean(axis=0) if own is None else priors.lights_covariance[own]
-    distances = np.array([_middle(priors.distance)])
-    if not is_narrow(priors.distance):
-        distances = priors.distance.quantile(DISTANCES)
     normal, sightline = found
-    part = told_light_part(sightline, normal, light, covariance, distances)
+    part = told_light_part(sightline, normal, light, covariance, _sampled(priors.distance))
     return {**budget, "light_offset": budget.get("light_offset", 0.0) + part}
 
 
@@ -197,7 +198,8 @@ def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     # observed offsets, turned by M into those of the lights up to a factor
     peaks = _other_peaks(family)
     others = peaks[: len(priors.lights_mm) - 1]
-    if not _stand_alone(peaks, len(others)):
+    gaps, count = np.linalg.norm(peaks, axis=1), len(others)
+    if len(peaks) > count and not gaps[count] > ALONE * gaps[count - 1]:
         return None
     values, vectors = np.linalg.eigh(family.moments)
     if not len(others) or values[0] <= 0:
@@ -210,12 +212,6 @@ def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     first, second = np.argsort(misfits, kind="stable")[:2]
     clear = misfits[first] < LARGEST_MISFIT and misfits[second] > max(CLEAR * misfits[first], LARGEST_MISFIT)
     return int(first) if clear else None
-
-
-def _stand_alone(peaks: Array, count: int) -> bool:
-    """Return whether the first so many of other peaks, nearest first, shape (K, 2), are far nearer than the next."""
-    gaps = np.linalg.norm(peaks[: count + 1], axis=1)
-    return len(gaps) <= count or bool(gaps[count] > ALONE * gaps[count - 1])
 
 
 def _misfit(seen: Array, offsets: Array) -> float:

@@ -25,7 +25,6 @@ look no less like an ellipse than to 2 or 3 %.
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -241,6 +240,7 @@ BY_PIXELS = 3e-4
 LARGEST_GAP = 3.0  # a point of a cut isophote stands for so many mean distances between points at most
 
 _ANGLES = (np.arange(256) + 0.5) * np.pi / 256
+_COSINES = np.cos(np.outer(np.append(1, HARMONICS), _ANGLES))
 
 
 def ripples(tangents: Array, conics: Array, counts: Index) -> AnyArray:
@@ -308,13 +308,8 @@ def spectrum(radius2: float) -> Array:
     if not np.isfinite(radius2) or radius2 > 2e4:
         return np.ones(len(HARMONICS))
     z = max(radius2 / 2, 1e-6)
-    terms = _cosines() @ np.exp(z * (np.cos(_ANGLES) - 1))
+    terms = _COSINES @ np.exp(z * (np.cos(_ANGLES) - 1))
     return np.asarray(np.maximum(terms[1:] / terms[0], 0.0))
-
-
-@lru_cache(maxsize=1)
-def _cosines() -> Array:
-    return np.cos(np.outer(np.append(1, HARMONICS), _ANGLES))
 
 
 MELTED, MELTED_RESIDUAL = fitted_number("bends.melted"), fitted_number("bends.melted_residual")

@@ -9,6 +9,7 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.errors import Failure
+from simtest.estimators.budget import gram
 from simtest.estimators.family import IsophoteFamily
 from simtest.estimators.highlight import fit_small, isophote_of_each
 from simtest.estimators.isophotes import FittedIsophote
@@ -214,9 +215,9 @@ def pose_region(patch: Patch, camera: Camera, isophote: FittedIsophote) -> PoseR
 
 
 def _region(family: IsophoteFamily) -> PoseRegion | None:
-    conic, noise = family.conics[0], family.conic_covariance(0)  # as seen, after smoothing
+    conic, noise = family.conics[0], gram(family.moved_by_noise(np.eye(5)[None]))  # as seen, after smoothing
     # the ellipse before smoothing: same centre, smaller moments
-    shrink = np.append(np.zeros(2), -family.widening()[np.triu_indices(2)])
+    shrink = np.append(np.zeros(2), -(family.added_px2(family.levels)[0] * family.px2)[np.triu_indices(2)])
     ellipse, turn = _ellipse(conic), _jacobian(_ellipse, conic)
     own = ellipse + shrink
     if np.linalg.eigvalsh(_matrix(own))[0] <= 0:

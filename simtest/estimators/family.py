@@ -199,7 +199,7 @@ class IsophoteFamily(IsophotesAcross):
 
     def _narrowed(self, levels: Array) -> Array:
         """Return E(t) of each isophote without the widening by smoothing and interpolation, shape (K, 2, 2)."""
-        return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self.px2)
+        return np.asarray(self._tangent_moments - self.added_px2(levels)[:, None, None] * self.px2)
 
     @cached_property
     def _tangent_moments(self) -> Array:
@@ -240,17 +240,8 @@ class IsophoteFamily(IsophotesAcross):
         by_shift = (self._moments_at(step) - self._moments_at(-step))[_UPPER] / (2 * step)
         return gram(self.moved_by_noise(self._moments_by_conic, (by_shift, self._peak)))
 
-    def conic_covariance(self, k: int) -> Array:
-        """Return the covariance by noise of an isophote's conic, shape (5, 5); the noise must be known."""
-        alone = IsophotesAcross(self.patch, self.camera, self.isophotes[k : k + 1], self.frame)
-        return gram(alone.moved_by_noise(np.eye(5)[None]))
-
-    def widening(self, k: int = 0) -> Array:
-        """Return what smoothing and linear interpolation add to an isophote's E(t), rad^2, in the basis, (2, 2)."""
-        return self._added_px2(self.levels)[k] * self.px2
-
-    def _added_px2(self, levels: Array) -> Array:
-        """Return the widening at each level, px^2."""
+    def added_px2(self, levels: Array) -> Array:
+        """Return what smoothing and linear interpolation add to E(t) at each level, px^2."""
         return np.asarray(2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1))
 
     @cached_property
@@ -353,20 +344,18 @@ class IsophoteFamily(IsophotesAcross):
         ``not_elliptic``: an isophote is no ellipse, as where two highlights touch or the curvature changes under one.
         """
         missing = any(failure.reason == Reason.NO_CLOSED_ISOPHOTE for failure in self.failures)
-        conditions = {
-            "missing_isovalues": bool(self.failures),
-            "partial_arc": missing or any(isophote.cut for isophote in self.isophotes),
-            "streak": self.axis_ratio < STREAK_RATIO,
-            "not_elliptic": bool(self.is_bent.any()),
-        }
-        return tuple(flag for flag, holds in conditions.items() if holds)
+        return _flags(
+            missing_isovalues=bool(self.failures),
+            partial_arc=missing or any(isophote.cut for isophote in self.isophotes),
+            streak=self.axis_ratio < STREAK_RATIO,
+            not_elliptic=bool(self.is_bent.any()),
+        )
 
     def flags_at(self, isovalue: float) -> tuple[str, ...] | None:
         """Return the flags of one of the isophotes alone; None if it is not among the whole ones."""
         for isophote, pose, bent in zip(self.isophotes, self.poses, self.is_bent, strict=True):
             if isophote.isovalue == isovalue and not isophote.cut:
-                conditions = {"streak": pose.axis_ratio < STREAK_RATIO, "not_elliptic": bool(bent)}
-                return tuple(flag for flag, holds in conditions.items() if holds)
+                return _flags(streak=pose.axis_ratio < STREAK_RATIO, not_elliptic=bool(bent))
         return None
 
     @property
@@ -390,6 +379,10 @@ class IsophoteFamily(IsophotesAcross):
 
 
 _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
+
+
+def _flags(**conditions: bool) -> tuple[str, ...]:
+    return tuple(flag for flag, holds in conditions.items() if holds)
 
 
 def _summed(covariance: Array) -> Array:

@@ -78,20 +78,13 @@ class FittedIsophote:
         return camera.project(self.rays())
 
 
-def fit_isophotes(
-    patch: Patch, camera: Camera, isovalues: Sequence[float]
-) -> tuple[list[FittedIsophote], list[Failure]]:
-    """Trace isophotes at t in (0, 1) and fit their ellipses [MB, section 2.3, steps 1 to 3].
-
-    Returns those that succeeded and the failures of the others.
-    """
-    return fit_isophotes_of_each([patch], camera, isovalues)[0]
-
-
 def fit_isophotes_of_each(
     patches: Sequence[Patch], camera: Camera, isovalues: Sequence[float]
 ) -> list[tuple[list[FittedIsophote], list[Failure]]]:
-    """Return what `fit_isophotes` returns of each patch, all ellipses fitted at once."""
+    """Trace isophotes at t in (0, 1) and fit their ellipses, all at once [MB, section 2.3, steps 1 to 3].
+
+    Returns those of each patch that succeeded, and the failures of its others.
+    """
     contours = [contour for patch in patches for contour in patch.crossings_of(isovalues)]
     results = iter(_fit([*isovalues] * len(patches), contours, camera))
     fitted: list[tuple[list[FittedIsophote], list[Failure]]] = []

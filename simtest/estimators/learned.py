@@ -47,10 +47,7 @@ def image_basis(rays: Array) -> Array:
 
 def rotation_of(rays: Array, normals: Array) -> Array:
     """Return the rotation from the direction to the camera, -ray, to a unit normal, rad in `image_basis`, (N, 2)."""
-    across = np.einsum("nij,nj->ni", image_basis(rays), normals)
-    sine = np.linalg.norm(across, axis=1)
-    angle = np.arctan2(sine, -np.sum(rays * normals, axis=1))
-    return across * (angle / np.maximum(sine, 1e-12))[:, None]
+    return _across(image_basis(rays), -rays, normals)
 
 
 def normal_of(rays: Array, rotation: Array) -> Array:
@@ -124,13 +121,11 @@ class TrainingRange:
 
     def refusals(self, features: AnyArray) -> list[Failure | None]:
         """Return for each row of features why it is refused, or None."""
-        return [self._refusal(distance) for distance in self.distances(features)]
-
-    def _refusal(self, distance: float) -> Failure | None:
-        if distance <= self.limit:
-            return None
-        told = f"unlike the network's training: features at {distance:.3g}, limit {self.limit:.3g}"
-        return Failure(Reason.NO_ESTIMATE, told)
+        told = "unlike the network's training: features at {:.3g}, limit {:.3g}"
+        return [
+            None if distance <= self.limit else Failure(Reason.NO_ESTIMATE, told.format(distance, self.limit))
+            for distance in self.distances(features)
+        ]
 
 
 def read_usual(content: JsonObject) -> float:

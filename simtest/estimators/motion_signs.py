@@ -26,6 +26,8 @@ STEP = 1e-5
 SOURCES = ("rotation", "rotation", "log distance", "log gain", "log gain", "turn of the principal directions")
 """What predictions of one first picture share, in the order of `FirstPicture.jacobian`; rad, or shares."""
 
+UNCHANGED = np.zeros(6)
+
 MOST_TURN = 0.5
 """Greatest standard deviation of the principal directions, rad; those of a round highlight are not known at all."""
 
@@ -57,15 +59,11 @@ class FirstPicture:
     distance: float  # of the surface, mm
     gains: Array  # (2,): 1 + d k along its principal directions
 
-    def predict(self, position: Array) -> Prediction | None:
-        """Solve for the patch's normal that points at a position; None where Newton's method finds none."""
-        return self._predict(position, np.zeros(6))
-
     def jacobian(self, at: Prediction) -> Array | None:
         """Differentiate a predicted normal, in its tangent basis, by `SOURCES`, shape (2, 6)."""
         basis, columns = basis_across(at.normal), []
         for step in STEP * np.eye(6):
-            moved = self._predict(at.position, step)
+            moved = self.predict(at.position, step)
             if moved is None:
                 return None
             columns.append(basis @ (moved.normal - at.normal) / STEP)
@@ -75,7 +73,7 @@ class FirstPicture:
         """Differentiate a predicted normal, in its tangent basis, by the camera's position, 1/mm, shape (2, 3)."""
         basis, columns = basis_across(at.normal), []
         for step in STEP * self.distance * np.eye(3):
-            moved = self._predict(at.position + step, np.zeros(6))
+            moved = self.predict(at.position + step)
             columns.append(np.zeros(2) if moved is None else basis @ (moved.normal - at.normal))
         return np.stack(columns, axis=1) / (STEP * self.distance)
 
@@ -94,8 +92,11 @@ class FirstPicture:
         made[3:5, 3:5] += lobe_sd**2
         return made
 
-    def _predict(self, position: Array, change: Array) -> Prediction | None:
-        """Predict with the sources changed, in the order of `SOURCES`."""
+    def predict(self, position: Array, change: Array = UNCHANGED) -> Prediction | None:
+        """Solve for the patch's normal that points at a position; None where Newton's method finds none.
+
+        `change`, (6,): of the sources, in the order of `SOURCES`.
+        """
         assert self.first.curvature is not None
         distance, gains = self.distance * (1 + change[2]), self.gains * (1 + change[3:5])
         N = self.first.normal + change[:2] @ basis_across(self.first.normal)

@@ -118,8 +118,6 @@ def describe_estimators(names: Sequence[str]) -> dict[str, str]:
     A foreign estimator is imported, as a run has done anyway; one without a docstring has an empty description. A core
     stands under its short name.
     """
-    from simtest.estimators.names import load_estimators
-
     described = {}
     for name in names:
         if own := DESCRIPTIONS.get(name.removeprefix(f"{OWN}:")):

@@ -218,10 +218,7 @@ class SmallSpot:
         parts = {"noise": self.by_noise_px2, "resolution": self.by_shape_px2}
         return {name: np.asarray(self._by_pixel @ part @ self._by_pixel.T) for name, part in parts.items()}
 
-    @property
-    def peak_budget(self) -> Budget | None:
-        """The same."""
-        return self.axis_budget
+    peak_budget = axis_budget
 
     @property
     def no_shape(self) -> Failure:
