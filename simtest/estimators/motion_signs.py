@@ -22,11 +22,10 @@ from simtest.geometry.vectors import basis_across, tangent_coordinates
 
 STEPS = 30
 STEP = 1e-5
+UNCHANGED = np.zeros(6)
 
 SOURCES = ("rotation", "rotation", "log distance", "log gain", "log gain", "turn of the principal directions")
 """What predictions of one first picture share, in the order of `FirstPicture.jacobian`; rad, or shares."""
-
-UNCHANGED = np.zeros(6)
 
 MOST_TURN = 0.5
 """Greatest standard deviation of the principal directions, rad; those of a round highlight are not known at all."""
@@ -196,30 +195,15 @@ class MovedView:
 
 @dataclass(frozen=True)
 class RankedHypotheses:
-    """The curvatures that one picture allows, ordered by how well they explain the others.
+    """The curvatures that one picture allows, ordered by how well they explain the others."""
 
-    Parameters
-    ----------
-    hypotheses : ndarray, shape (H, 2)
-        1 + d k along the first picture's principal directions, the best first.
-    distance2 : ndarray, shape (H,)
-        Squared Mahalanobis distance of the other pictures' normals from the predicted ones.
-    predicted : ndarray, shape (H, 3)
-        Predicted normals in the frame of the first other picture that was used.
-    deviance : ndarray, shape (H,)
-        Twice the negative log-likelihood, up to a constant: `distance2` and the log of the covariance's determinant.
-    freedom : int
-        Degrees of freedom of `distance2`: 2 for each further picture.
-    gain_sd : float
-        Relative standard deviation of the sizes of the hypotheses.
-    """
-
-    hypotheses: Array
-    distance2: Array
-    predicted: Array
+    hypotheses: Array  # (H, 2): 1 + d k along the first picture's principal directions, the best first
+    distance2: Array  # (H,): squared Mahalanobis distance of the other pictures' normals from the predicted ones
+    predicted: Array  # (H, 3): predicted normals in the frame of the first other picture that was used
+    # (H,): twice the negative log-likelihood, up to a constant: `distance2` and the log of the covariance's determinant
     deviance: Array
-    freedom: int = 2
-    gain_sd: float = GAIN_SD
+    freedom: int = 2  # degrees of freedom of `distance2`: 2 for each further picture
+    gain_sd: float = GAIN_SD  # relative standard deviation of the sizes of the hypotheses
 
     @property
     def margin(self) -> float:
@@ -275,38 +259,6 @@ class RankedHypotheses:
         return first, second
 
 
-def rank_by_motion(
-    first: Estimate,
-    second: Estimate,
-    second_from_first: npt.ArrayLike,
-    priors: Priors,
-    gain_sd: float = GAIN_SD,
-    pose_error: PoseError = EXACT,
-) -> RankedHypotheses | Failure:
-    """Rank the first picture's curvature hypotheses by the highlight's position in a second picture.
-
-    A motion along one principal direction determines that direction's sign alone: two hypotheses then remain equally
-    good. See `rank_by_motions`.
-
-    Parameters
-    ----------
-    first : Estimate
-        Of `curved` or `inverse_rendering` with the lobe known, so that it has hypotheses.
-    second : Estimate
-        Of the same highlight, of any estimator for a light at the camera.
-    second_from_first : array_like, shape (4, 4)
-        The camera's motion: from the first camera's frame to the second one's, mm.
-    priors : Priors
-        For the distance in the first picture; without it, or hypotheses, a Failure ``not_known``.
-    gain_sd : float
-        Relative standard deviation of the first picture's abs(1 + d k), > 0.
-    pose_error : PoseError
-        Of the motion.
-    """
-    T = rigid(second_from_first, "second_from_first")
-    return rank_by_motions(first, [MovedView([second], T, pose_error)], priors, gain_sd)
-
-
 def rank_by_motions(
     first: Estimate, views: Sequence[MovedView], priors: Priors, gain_sd: float = GAIN_SD
 ) -> RankedHypotheses | Failure:
@@ -314,15 +266,20 @@ def rank_by_motions(
 
     Each hypothesis is a quadric patch, on which the point is solved whose normal points at each further camera. What
     all predictions share, the first picture's normal, distance, gains and principal directions, moves all of them at
-    once: the pictures' distances are not added, but taken together with their joint covariance.
+    once: the pictures' distances are not added, but taken together with their joint covariance. A motion along one
+    principal direction determines that direction's sign alone: two hypotheses then remain equally good.
 
     Parameters
     ----------
     first : Estimate
-        See `rank_by_motion`, as for `priors` and `gain_sd`.
+        Of `curved` or `inverse_rendering` with the lobe known, so that it has hypotheses.
     views : sequence of MovedView
         Those without an estimate that states its uncertainty, and those too far off for the patch, are passed over.
         Where none is left a Failure ``no_estimate`` or ``undecided``.
+    priors : Priors
+        For the distance in the first picture; without it, or hypotheses, a Failure ``not_known``.
+    gain_sd : float
+        Relative standard deviation of the first picture's abs(1 + d k), > 0.
     """
     if first.curvature is None or first.curvature.hypotheses is None or priors.distance_mm is None:
         return Failure(Reason.NOT_KNOWN, "needs curvature hypotheses of the first picture, and its distance")
