@@ -7,6 +7,7 @@ normals at highlights agree with the law of reflection: a test of a method that 
 """
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -126,17 +127,6 @@ class TrainingRange:
             None if distance <= self.limit else Failure(Reason.NO_ESTIMATE, told.format(distance, self.limit))
             for distance in self.distances(features)
         ]
-
-
-def read_usual(content: JsonObject) -> float:
-    """Return the usual squared distance of a network's metadata (`inflation`).
-
-    Raises `KeyError`, `TypeError`, `ValueError` if it is missing or not a number above 0.
-    """
-    usual = float(content["feature_usual"])
-    if not 0 < usual < np.inf:
-        raise ValueError(f"feature_usual = {usual}: must be above 0")
-    return usual
 
 
 def inflation(distances: Array, usual: float) -> Array:
@@ -296,6 +286,19 @@ def turned_normals(rays: Array, rotation: Array, root: Array) -> tuple[Array, Ar
     return normals, np.asarray(whole @ whole.transpose(0, 2, 1))
 
 
+def stated_normals(rays: Array, outputs: Array, unit: float, factors: Array | float) -> tuple[Array, Array]:
+    """Return the normals that a network states, and their covariances times factors (`turned_normals`).
+
+    The first five columns of `outputs`, (N, 5 or more), are a rotation, and the Cholesky factor of its covariance with
+    the logarithm of its diagonal, both in units of `unit`, rad.
+    """
+    first, second = (np.exp(np.clip(outputs[:, column], *LOG_RANGE)) for column in (2, 4))
+    root = np.zeros((len(outputs), 2, 2))
+    root[:, 0, 0], root[:, 1, 0], root[:, 1, 1] = first, outputs[:, 3], second
+    root *= unit * np.sqrt(factors)[:, None, None]
+    return turned_normals(rays, outputs[:, :2] * unit, root)
+
+
 RELIEF_RAD = fitted_number("reflection.relief")
 
 
@@ -340,21 +343,28 @@ def log_deviation(outputs: Array) -> Array:
 class TaughtNetwork:
     """A network in ONNX Runtime, with the range that it was taught and the scales of what it states."""
 
-    def __init__(self, path: Path, form: str, core: str, inputs: Sequence[str], scales: Mapping[str, Sequence[str]]):
-        self._model = OnnxModel(path, form, core)
+    form: ClassVar[str]  # of its file
+    core: ClassVar[str]  # that needs it
+    inputs: ClassVar[tuple[str, ...]]  # whose range is known
+    scaled: ClassVar[Mapping[str, tuple[str, ...]]]  # names of the scales of each kind
+
+    def __init__(self, path: Path) -> None:
+        self._model = OnnxModel(path, self.form, self.core)
         with self._model.reading():
             content = self._model.content
-            self._scales = {
+            scales = {
                 kind: {name: CovarianceScale.read(content[kind][name]) for name in names}
-                for kind, names in scales.items()
+                for kind, names in self.scaled.items()
             }
-            self._range = TrainingRange.read(content, inputs)
-            self._usual = read_usual(content)
-        self.scales = self._scales["scales"]
+            self.scales, self.ratio_scales = scales["scales"], scales.get("ratio_scales", {})
+            self._range = TrainingRange.read(content, self.inputs)
+            self._usual = float(content["feature_usual"])  # squared distance of usual features (`inflation`)
+            if not 0 < self._usual < np.inf:
+                raise ValueError(f"feature_usual = {self._usual}: must be above 0")
 
 
 @dataclass(frozen=True)
-class LearnedNormals:
+class LearnedNormals(ABC):
     """What networks that state normals share as estimators.
 
     They answer for each detection, and need the lights told. They refuse with ``no_estimate`` what lies outside the
@@ -368,6 +378,7 @@ class LearnedNormals:
 
     model: str | Path | None = None
     shipped: ClassVar[str]  # name of the file beside which its card lies
+    network: ClassVar[type[TaughtNetwork]]
 
     def check(self) -> None:
         """Load the network; raise `InputError` where it cannot be used."""
@@ -381,11 +392,7 @@ class LearnedNormals:
 
     @cached_property
     def _network(self) -> Any:
-        return self._load(Path(self.model or data_root("scenes").joinpath(*WEIGHTS, self.shipped)))
-
-    def _load(self, path: Path) -> TaughtNetwork:
-        """Return the network of a file."""
-        raise NotImplementedError
+        return self.network(Path(self.model or data_root("scenes").joinpath(*WEIGHTS, self.shipped)))
 
     def estimate_regions(
         self, frame: Frame, patches: Sequence[Patch | Failure], /
@@ -400,6 +407,6 @@ class LearnedNormals:
         made = iter([found] * len(peaks) if isinstance(found, Failure) else found)
         return [patch if isinstance(patch, Failure) else next(made) for patch in patches], []
 
+    @abstractmethod
     def _at(self, frame: Frame, peaks: Array) -> Sequence[Estimate | Failure] | Failure:
         """Return an estimate or a failure for each peak of a frame whose lights are told, or why there is none."""
-        raise NotImplementedError

@@ -7,7 +7,6 @@ direction to the camera that is aligned with the frame (`simtest.estimators.lear
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import cv2
@@ -25,7 +24,7 @@ from simtest.estimators.learned import (
     log_deviation,
     median_of_lit,
     reflection_distances,
-    turned_normals,
+    stated_normals,
 )
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Mask
@@ -199,6 +198,24 @@ class DenseMaps:
     deviation_mm: Image
 
 
+class DenseNetwork(TaughtNetwork):
+    """A network of whole frames."""
+
+    form, core, inputs = FORMAT, "learned_dense", CAMERA
+    scaled: ClassVar = {"scales": ("base", "distance")}
+
+    def run(self, frame: Frame) -> tuple[Array, float] | Failure:
+        """Return the outputs of a frame, shape (7, 48, 64), and the covariances' factor, or why it is refused."""
+        told = dict(zip(CAMERA, camera_values(frame).tolist(), strict=True))
+        if refused := self._range.refusal(told):
+            return refused
+        shapes = {"outputs": (1, len(OUTPUTS), *CELLS), "features": (1, len(self._range.mean))}
+        outputs, features = self._model.run({"planes": dense_inputs(frame)[None]}, shapes)
+        distances = self._range.distances(features)
+        (refused,) = self._range.refusals(features)
+        return refused or (np.asarray(outputs[0], dtype=float), float(inflation(distances, self._usual)[0]))
+
+
 @dataclass(frozen=True)
 class LearnedDense(LearnedNormals):
     """A network that states normals all over a frame (`studies.networks.dense`) as an estimator.
@@ -218,15 +235,13 @@ class LearnedDense(LearnedNormals):
     """
 
     shipped: ClassVar[str] = "learned_dense.onnx"
+    network: ClassVar = DenseNetwork
 
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
         network = str(self.model or self.shipped)
         return f"The normal of the base surface at each highlight, by the network {network} of the whole frame."
-
-    def _load(self, path: Path) -> "DenseNetwork":
-        return DenseNetwork(path)
 
     def maps(
         self, values: Image, calibration: Calibration, highlights_px: Array | None = None, seen: Mask | None = None
@@ -300,11 +315,8 @@ class LearnedDense(LearnedNormals):
         """Return normals, covariances, distances, mm, and their deviations, mm, at pixel positions, shape (N, 2)."""
         layout, scales = Layout.of(camera.width, camera.height), self._network.scales
         made = interpolated(outputs, layout.to_cells(points_px, camera) / STRIDE - 0.5).T
-        first, second = (np.exp(np.clip(made[:, column], *LOG_RANGE)) for column in (2, 4))
-        root = np.zeros((len(made), 2, 2))
-        root[:, 0, 0], root[:, 1, 0], root[:, 1, 1] = first, made[:, 3], second
-        root *= ROTATION_SCALE * np.sqrt(inflated * scales["base"].at(log_deviation(made)))[:, None, None]
-        normals, covariances = turned_normals(camera.unproject(points_px), made[:, :2] * ROTATION_SCALE, root)
+        factors = inflated * scales["base"].at(log_deviation(made))
+        normals, covariances = stated_normals(camera.unproject(points_px), made, ROTATION_SCALE, factors)
         distance = DISTANCE_MM * np.exp(DISTANCE_SCALE * made[:, 5])
         logarithm = np.clip(made[:, 6], *LOG_RANGE)
         share = DISTANCE_SCALE * np.exp(logarithm) * np.sqrt(inflated * scales["distance"].at(logarithm))
@@ -361,24 +373,6 @@ def _unfit(frame: Frame) -> Failure | None:
         if not CELL_PX[0] <= cell <= CELL_PX[1]:
             told = f"a cell has {cell:.3g} px, may have {CELL_PX[0]:g} to {CELL_PX[1]:g}"
     return Failure(Reason.NO_ESTIMATE, f"outside the network's training: {told}") if told else None
-
-
-class DenseNetwork(TaughtNetwork):
-    """A network of whole frames."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, FORMAT, "learned_dense", CAMERA, {"scales": ("base", "distance")})
-
-    def run(self, frame: Frame) -> tuple[Array, float] | Failure:
-        """Return the outputs of a frame, shape (7, 48, 64), and the covariances' factor, or why it is refused."""
-        told = dict(zip(CAMERA, camera_values(frame).tolist(), strict=True))
-        if refused := self._range.refusal(told):
-            return refused
-        shapes = {"outputs": (1, len(OUTPUTS), *CELLS), "features": (1, len(self._range.mean))}
-        outputs, features = self._model.run({"planes": dense_inputs(frame)[None]}, shapes)
-        distances = self._range.distances(features)
-        (refused,) = self._range.refusals(features)
-        return refused or (np.asarray(outputs[0], dtype=float), float(inflation(distances, self._usual)[0]))
 
 
 learned_dense = LearnedDense()  # the shipped network; it is read at its first use
