@@ -77,18 +77,13 @@ class Bisector(OfHighlight):
             flags = (*flags, "ambiguous_light")
         found = [_normal(highlight, light, priors.distance) for light in order]
         normal, sightline = found[0]
-        budget = _budget(highlight, order[0], priors.distance, normal)
-        if budget is not None and own is None:
-            budget = {**budget, "light_offset": _light_part(highlight, order, priors.distance, normal)}
-        if budget is not None and priors.lights_covariance is not None:
-            budget = _with_light_error(budget, found[0], order[0], own, priors)
         estimate = Estimate(
             normal=normal,
             candidates=np.array([candidate for candidate, _ in found]),
             look_px=highlight.camera.project(sightline),
             axis_ratio=highlight.axis_ratio,
             isophotes=highlight.isophotes,
-            budget=budget,
+            budget=_budget(highlight, order, own, found[0], priors),
             flags=flags,
         )
         return add_common_parts(estimate, highlight.camera, priors, highlight)
@@ -139,16 +134,30 @@ def _normals(family: HighlightAxis, light: Array, distances: Array, turn: Array 
     return bisect(d * sightlines, light), sightlines
 
 
-def _budget(family: HighlightAxis, light: Array, distance: Distribution, normal: Array) -> Budget | None:
-    """Return the budget of the normal: that of the axis at the peak, and the distance."""
+def _budget(
+    family: HighlightAxis, lights: Sequence[Array], own: int | None, found: tuple[Array, Array], priors: Priors
+) -> Budget | None:
+    """Return the budget of normal and sightline by the first light: of the axis at the peak, the distance, the lights.
+
+    `own` is that light's index among those told, None where it is not clear which one made the highlight.
+    """
     if family.peak_budget is None:
         return None
+    (normal, sightline), light, distance = found, lights[0], priors.distance
     across, middle = basis_across(normal), np.array([_middle(distance)])
     unturned = _normals(family, light, middle)[0][0]
     turned = [_normals(family, light, middle, STEP * unit)[0][0] for unit in np.eye(2)]
     J = across @ (np.array(turned) - unturned).T / STEP
-    own = {name: J @ part @ J.T for name, part in family.peak_budget.items()}
-    return {**own, "distance": _distance_part(family, light, distance, across)}
+    budget = {name: J @ part @ J.T for name, part in family.peak_budget.items()}
+    budget["distance"] = _distance_part(family, light, distance, across)
+    if own is None:
+        budget["light_offset"] = _light_part(family, lights, distance, normal)
+    if (told := priors.lights_covariance) is not None:
+        # The mean of lights whose errors are alike, as a wrong scale makes them, is as uncertain as one of them.
+        covariance = told.mean(axis=0) if own is None else told[own]
+        part = told_light_part(sightline, normal, light, covariance, _sampled(distance))
+        budget["light_offset"] = budget.get("light_offset", 0.0) + part
+    return budget
 
 
 def _light_part(family: HighlightAxis, lights: Sequence[Array], distance: Distribution, normal: Array) -> Array:
@@ -159,18 +168,6 @@ def _light_part(family: HighlightAxis, lights: Sequence[Array], distance: Distri
     first, *single = (_normals(family, light, _sampled(distance))[0] for light in lights)
     moved = np.concatenate([normals - first for normals in single]) @ basis_across(normal).T
     return np.asarray(moved.T @ moved / len(moved))
-
-
-def _with_light_error(
-    budget: Budget, found: tuple[Array, Array], light: Array, own: int | None, priors: Priors
-) -> Budget:
-    """Add what the told covariance of the lights' positions does to the part ``light_offset``."""
-    assert priors.lights_covariance is not None
-    # The mean of lights whose errors are alike, as a wrong scale makes them, is as uncertain as one of them.
-    covariance = priors.lights_covariance.mean(axis=0) if own is None else priors.lights_covariance[own]
-    normal, sightline = found
-    part = told_light_part(sightline, normal, light, covariance, _sampled(priors.distance))
-    return {**budget, "light_offset": budget.get("light_offset", 0.0) + part}
 
 
 def _distance_part(family: HighlightAxis, light: Array, distance: Distribution, across: Array) -> Array:

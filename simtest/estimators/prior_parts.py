@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Normal, Priors
 from simtest.calibration.priors import AT_CAMERA_MM
-from simtest.estimators.budget import Budget, equivalent_covariance
+from simtest.estimators.budget import equivalent_covariance
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spots import HighlightAxis
 from simtest.geometry import Array, Camera, Patch, chi_squared
@@ -103,12 +103,6 @@ would hold 99 % and more."""
 
 UNTOLD_FAINTNESS = 1.0
 """ln(I0 / I) where the patch does not know how bright the others are; two thirds of the spots have less."""
-
-
-def near_miss_parts(patch: Patch, priors: Priors) -> Budget:
-    """Return the part ``shape`` of a highlight that may be a near miss; a plane that is told has none."""
-    variance = 0.0 if priors.plane else near_miss_variance(patch, max(len(priors.lights_mm), 1))
-    return {"shape": variance * np.eye(2)} if variance > 0 else {}
 
 
 def near_miss_variance(patch: Patch, lights: int) -> float:
@@ -217,7 +211,10 @@ def add_common_parts(
     """
     if estimate.budget is None:
         return estimate
-    parts = {} if family is None else dict(near_miss_parts(family.patch, priors))
+    parts: dict[str, Array] = {}
+    if family is not None and not priors.plane:
+        variance = near_miss_variance(family.patch, max(len(priors.lights_mm), 1))
+        parts |= {"shape": variance * np.eye(2)} if variance > 0 else {}
     if not priors.camera.is_exact:
         if (turned := camera_part(estimate, camera, priors.camera)) is None:
             return estimate.without_uncertainty()

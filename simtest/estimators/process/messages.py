@@ -184,10 +184,6 @@ class AnsweredCurvature(BaseModel):
     axis_ratio: Number
     hypotheses: Annotated[Array, _numbers(None, 2)] | None = None
 
-    def estimated(self) -> EstimatedCurvature:
-        """Return the curvature of an estimate."""
-        return EstimatedCurvature(self.directions, self.axis_ratio, self.hypotheses)
-
 
 class AnsweredEstimate(BaseModel):
     """What a core answers of one highlight: an `Estimate`, in the basis that it names."""
@@ -224,7 +220,7 @@ class AnsweredEstimate(BaseModel):
             isophotes=tuple(each.fitted() for each in self.isophotes or ()),
             choice_margin=self.choice_margin,
             flags=tuple(self.flags or ()),
-            curvature=None if self.curvature is None else self.curvature.estimated(),
+            curvature=None if self.curvature is None else EstimatedCurvature(**dict(self.curvature)),
             target=target if self.target is None else self.target,
             **self.uncertainty(normal),
         )
