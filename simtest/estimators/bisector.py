@@ -190,8 +190,8 @@ def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     frame's other highlights, which the patch names, the nearest are used, one for each other light; with them the
     highlight must stand alone (`ALONE`).
     """
-    if len(priors.lights_mm) == 1:
-        return 0
+    if not np.ptp(priors.lights, axis=0).any():
+        return 0  # all at one place
     # observed offsets, turned by M into those of the lights up to a factor
     peaks = _other_peaks(family)
     others = peaks[: len(priors.lights_mm) - 1]
@@ -227,7 +227,8 @@ def _misfit(seen: Array, offsets: Array) -> float:
         matched = offsets[taken]
         # refine the factor with all pairs
         factor = max(float(np.sum(seen * matched) / np.sum(seen * seen)), 0.0)
-        best = min(best, float(np.linalg.norm(factor * seen - matched) / np.linalg.norm(matched)))
+        if (size := float(np.linalg.norm(matched))) > 0:
+            best = min(best, float(np.linalg.norm(factor * seen - matched)) / size)
     return best
 
 
