@@ -27,7 +27,6 @@ ALONE = 3.0
 meet the lights' arrangement by chance: of two lights 16 times in 100, half of them wrongly; of three 3 times in 100,
 which are half of all choices that seem clear there."""
 
-
 STEP = 1e-4  # step of the differences of the normal, rad, and as a share of the distance
 
 NARROW = 0.15

@@ -20,7 +20,6 @@ from simtest.geometry.patch import slope_divisor_px2
 
 STEP = 1e-5  # step of the differences between conic and ellipse, as a share of the largest of their parameters
 
-
 POOLED_ISOVALUES = (0.1, 0.2, 0.3)
 """Low ones: the distance of the circles' projected centres grows with the square of the isophote's size."""
 

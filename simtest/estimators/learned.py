@@ -365,18 +365,9 @@ class TaughtNetwork:
 
 @dataclass(frozen=True)
 class LearnedNormals(ABC):
-    """What networks that state normals share as estimators.
+    """What networks that state normals share: they answer for each detection, and need the lights told."""
 
-    They answer for each detection, and need the lights told. They refuse with ``no_estimate`` what lies outside the
-    range that they were taught.
-
-    Parameters
-    ----------
-    model : str or Path, optional
-        The file model.onnx. Default: the shipped network.
-    """
-
-    model: str | Path | None = None
+    model: str | Path | None = None  # the file; the shipped one by default
     shipped: ClassVar[str]  # name of the file beside which its card lies
     network: ClassVar[type[TaughtNetwork]]
 

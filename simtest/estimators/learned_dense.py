@@ -178,24 +178,12 @@ far where both states hold."""
 
 @dataclass(frozen=True)
 class DenseMaps:
-    """What a network states of each pixel of a frame; NaN out of view.
+    """What a network states of each pixel of a frame, in float32; NaN out of view."""
 
-    Parameters
-    ----------
-    normal : ndarray of float32, shape (H, W, 3)
-        Unit normal of the base surface, camera frame.
-    covariance : ndarray of float32, shape (H, W, 2, 2)
-        Of the normal in the basis `simtest.geometry.vectors.tangent_basis(normal)`, rad^2.
-    distance_mm : ndarray of float32, shape (H, W)
-        Along the ray.
-    deviation_mm : ndarray of float32, shape (H, W)
-        Standard deviation of the distance, to first order.
-    """
-
-    normal: Image
-    covariance: Image
-    distance_mm: Image
-    deviation_mm: Image
+    normal: Image  # (H, W, 3): unit normal of the base surface, camera frame
+    covariance: Image  # (H, W, 2, 2): of it in the basis `simtest.geometry.vectors.tangent_basis(normal)`, rad^2
+    distance_mm: Image  # (H, W): along the ray
+    deviation_mm: Image  # (H, W): standard deviation of the distance, to first order
 
 
 class DenseNetwork(TaughtNetwork):

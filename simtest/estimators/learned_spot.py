@@ -35,7 +35,6 @@ STEPS = (1, 3, 9)  # pixels of the frame for one of each crop: the highlight, it
 DARKEST = 0.02
 """Share of the frame's median light that is added before the logarithm; what lies outside the view is this dark."""
 
-
 EXTRAS = (
     "log of the focal length over 300 px",
     "optical axis, first", "optical axis, second",

@@ -156,18 +156,10 @@ FITS_SHARE = 0.999
 
 @dataclass(frozen=True)
 class PoseError:
-    """Standard deviations of a camera's motion from one picture to another, independent between motions.
+    """Standard deviations of a camera's motion from one picture to another, independent between motions."""
 
-    Parameters
-    ----------
-    translation : float
-        Of the translation along each axis, as a share of its length.
-    rotation : float
-        About each axis, rad.
-    """
-
-    translation: float = 0.0
-    rotation: float = 0.0
+    translation: float = 0.0  # of the translation along each axis, as a share of its length
+    rotation: float = 0.0  # about each axis, rad
 
 
 EXACT = PoseError()
@@ -175,22 +167,13 @@ EXACT = PoseError()
 
 @dataclass(frozen=True)
 class MovedView:
-    """A further picture of a highlight, from another position.
+    """A further picture of a highlight, from another position."""
 
-    Parameters
-    ----------
-    estimates : sequence of Estimate
-        Of what may be the same highlight, of any estimator for a light at the camera. Each hypothesis takes the one
-        that it explains best, so that a false one is no evidence.
-    view_from_first : array_like, shape (4, 4)
-        The camera's motion: from the first camera's frame to this one's, mm.
-    error : PoseError
-        Of the motion.
-    """
-
+    # Of what may be the same highlight, of any estimator for a light at the camera. Each hypothesis takes the one that
+    # it explains best, so that a false one is no evidence.
     estimates: Sequence[Estimate]
-    view_from_first: npt.ArrayLike
-    error: PoseError = EXACT
+    view_from_first: npt.ArrayLike  # (4, 4): the camera's motion, from the first camera's frame to this one's, mm
+    error: PoseError = EXACT  # of the motion
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,6 @@ def forgive_cores() -> None:
 
 ESTIMATORS = EntryPointGroup("simtest.estimators", "estimator")
 
-
 DESCRIPTIONS: dict[str, str] = {
     "cone_axis": "The axis of the cone from the camera through the highlight's isophotes, averaged over several.",
     "circle_pose": "The published method: takes one isophote for a circle and solves for its pose; two candidates.",

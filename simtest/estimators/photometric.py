@@ -25,7 +25,6 @@ from simtest.runtime.fitted import fitted_number
 
 DARK = 1e-6  # least cosine of the lobe's angle: below it the specular term is 0 and has no logarithm
 
-
 RINGS, SECTORS = 6, 8
 """The lobe is divided by the model's intensity into rings of equally many pixels, each ring into sectors."""
 
@@ -38,13 +37,11 @@ CORRELATED_PX, SUMMED_DEVIATIONS = 4, 2.0
 """Coding and demosaicing correlate the noise of pixels this far apart along an axis at most. The sum of white noise's
 correlations exceeds 1 by so many of its standard deviations once in 40 highlights."""
 
-
 REGIONS = (0.05, 0.1, 0.2, 0.3, 0.5)
 """The pixels inside the first of these isophotes that closes are fitted. Further out there is little but noise."""
 
 CUT_REGION = 0.3  # for a highlight that the border or the view cuts: seen pixels are fitted down to this isovalue
 MAX_PIXELS = 16384  # in a larger region every second, third ... pixel is fitted, evenly spread
-
 
 MISFIT_SHARE = fitted_number("misfit.share")
 
