@@ -123,8 +123,8 @@ def equivalent_variance(moves: Array) -> float:
     # Bisection: more variance holds more.
     for _ in range(60):
         v = (low + high) / 2
-        left = limit - squares / max(v, 1e-300)
-        held = float(np.mean(_below(left)))
+        left = np.sqrt(np.maximum(limit - squares / max(v, 1e-300), 0.0))
+        held = float(np.mean(np.interp(left, _ROOTS, _SHARES)))  # by chi-squared of one degree of freedom
         low, high = (v, high) if held < CONFIDENCE else (low, v)
     return high
 
@@ -139,11 +139,6 @@ def line_covariance(moves: Array) -> Array:
 
 _ROOTS = np.linspace(0.0, 4.0, 401)
 _SHARES = np.array([math.erf(root / math.sqrt(2)) for root in _ROOTS.tolist()])
-
-
-def _below(values: Array) -> Array:
-    """Return the probability that a chi-squared variable of one degree of freedom stays below each value."""
-    return np.interp(np.sqrt(np.maximum(values, 0.0)), _ROOTS, _SHARES)
 
 
 Rows = npt.NDArray[np.float32]

@@ -365,16 +365,12 @@ def _with_told_lights(estimate: Estimate, priors: Priors) -> Estimate:
         return estimate
     if estimate.covariance is not None:
         near = float(priors.distance.quantile(np.array(NEAR_SHARE)))
-        moved = half_angles(estimate.normal, near, priors.lights)
+        # how far each light moves the normal from the reversed sightline
+        bisectors = [bisect(-near * estimate.normal, light) for light in priors.lights]
+        moved = np.array([tangent_coordinates(estimate.normal, each) for each in bisectors])
         if float(np.max(np.sum(moved**2, axis=1))) < NEGLIGIBLE * np.trace(estimate.covariance):
             return estimate
     return replace(estimate, flags=(*estimate.flags, "light_offset")).without_uncertainty()
-
-
-def half_angles(normal: Array, distance: float, lights: Array) -> Array:
-    """Return how far each light moves the normal from the reversed sightline, rad, tangent basis, shape (L, 2)."""
-    position = -distance * normal
-    return np.array([tangent_coordinates(normal, bisect(position, light)) for light in lights])
 
 
 @lru_cache(maxsize=16)
