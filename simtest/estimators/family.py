@@ -344,18 +344,20 @@ class IsophoteFamily(IsophotesAcross):
         ``not_elliptic``: an isophote is no ellipse, as where two highlights touch or the curvature changes under one.
         """
         missing = any(failure.reason == Reason.NO_CLOSED_ISOPHOTE for failure in self.failures)
-        return _flags(
-            missing_isovalues=bool(self.failures),
-            partial_arc=missing or any(isophote.cut for isophote in self.isophotes),
-            streak=self.axis_ratio < STREAK_RATIO,
-            not_elliptic=bool(self.is_bent.any()),
-        )
+        conditions = {
+            "missing_isovalues": bool(self.failures),
+            "partial_arc": missing or any(isophote.cut for isophote in self.isophotes),
+            "streak": self.axis_ratio < STREAK_RATIO,
+            "not_elliptic": bool(self.is_bent.any()),
+        }
+        return tuple(flag for flag, holds in conditions.items() if holds)
 
     def flags_at(self, isovalue: float) -> tuple[str, ...] | None:
         """Return the flags of one of the isophotes alone; None if it is not among the whole ones."""
         for isophote, pose, bent in zip(self.isophotes, self.poses, self.is_bent, strict=True):
             if isophote.isovalue == isovalue and not isophote.cut:
-                return _flags(streak=pose.axis_ratio < STREAK_RATIO, not_elliptic=bool(bent))
+                conditions = {"streak": pose.axis_ratio < STREAK_RATIO, "not_elliptic": bool(bent)}
+                return tuple(flag for flag, holds in conditions.items() if holds)
         return None
 
     @property
@@ -379,10 +381,6 @@ class IsophoteFamily(IsophotesAcross):
 
 
 _UPPER = (np.array([0, 0, 1]), np.array([0, 1, 1]))
-
-
-def _flags(**conditions: bool) -> tuple[str, ...]:
-    return tuple(flag for flag, holds in conditions.items() if holds)
 
 
 def _summed(covariance: Array) -> Array:
