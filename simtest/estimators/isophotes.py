@@ -78,6 +78,13 @@ class FittedIsophote:
         return camera.project(self.rays())
 
 
+def fit_isophotes(
+    patch: Patch, camera: Camera, isovalues: Sequence[float]
+) -> tuple[list[FittedIsophote], list[Failure]]:
+    """Trace and fit a patch's isophotes, for other packages' estimators (see `fit_isophotes_of_each`)."""
+    return fit_isophotes_of_each([patch], camera, isovalues)[0]
+
+
 def fit_isophotes_of_each(
     patches: Sequence[Patch], camera: Camera, isovalues: Sequence[float]
 ) -> list[tuple[list[FittedIsophote], list[Failure]]]:

@@ -11,7 +11,7 @@ import pytest
 
 import simtest
 from simtest.errors import Reason
-from simtest.estimators.isophotes import fit_isophotes_of_each
+from simtest.estimators.isophotes import fit_isophotes
 from studies.authors_core import Agreement
 
 CORES = Path(__file__).resolve().parents[2] / "examples" / "cores"
@@ -48,7 +48,7 @@ def test_the_python_core_states_the_cone_axis(asked, of_python):
         axis, ratio = np.array(answer["look_ray"]), answer["axis_ratio"]
         assert answer["normal"] == [-x for x in answer["look_ray"]]
         assert np.linalg.norm(axis) == pytest.approx(1, abs=1e-12)
-        (((ours,), _),) = fit_isophotes_of_each([patch], camera, [0.5])
+        (ours,), _ = fit_isophotes(patch, camera, [0.5])
         pose = ours.pose()
         # Two ways to fit an ellipse to points with noise.
         assert np.degrees(np.arccos(min(pose.axis @ axis, 1.0))) < 0.1
