@@ -22,7 +22,7 @@ from simtest.dataset.reader import read_samples, sample_positions
 from simtest.dataset.sample import Sample
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
-from simtest.estimators.learned_spot import LearnedSpot, rays_of
+from simtest.estimators.learned_spot import LearnedSpot
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import reconstruct
@@ -105,7 +105,7 @@ def _rows(sample: Sample, estimators: dict[str, object]) -> Iterator[Row]:
             continue
         for name, result in each.estimates.items():
             row = Row(name, (sample.index, number), anatomy["family"], anatomy["number"], kind=kinds[number])
-            row.tilt_deg = float(angle_deg(base, -rays_of(frame.camera, peak[None])[0]))
+            row.tilt_deg = float(angle_deg(base, -frame.camera.unproject(peak[None])[0]))
             if isinstance(result, Estimate) and result.axis_ratio_deviation and result.target == "base":
                 off = abs((result.axis_ratio or np.nan) - _base_ratio(sample, peak))
                 row.ratio_inside = (

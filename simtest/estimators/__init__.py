@@ -1,9 +1,8 @@
 """Estimators of the surface normal at a highlight; they see a frame and its calibration, never the truth.
 
 `protocol` declares what an estimator is and returns, `names` finds it, `dispatch` runs it. Each estimator is a file of
-its name: `cone_axis`, `brightest_point`, `circle_pose`, `curved`, `bisector`, `photometric`, `cloud`, and the networks
-`learned_spot` and `learned_dense`. Those of single highlights share what `highlight` fits: ellipses (`isophotes`),
-these together, extrapolated to the peak (`family`), or the centre of a spot of a few pixels (`small_spots`).
+its name. Those of single highlights share what `highlight` fits: ellipses (`isophotes`), these together, extrapolated
+to the peak (`family`), or the centre of a spot of a few pixels (`small_spots`).
 """
 
 from typing import TYPE_CHECKING

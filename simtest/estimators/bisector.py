@@ -19,27 +19,21 @@ from simtest.estimators.small_spots import HighlightAxis
 from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.vectors import basis_across, bisect
 
-LARGEST_MISFIT = 0.25
-"""Largest misfit of the offsets that the mirror geometry predicts, as a share of their length."""
-
-CLEAR = 2.0
-"""The next best light must fit this many times worse for the choice to be clear."""
+LARGEST_MISFIT = 0.25  # largest misfit of the offsets that the mirror geometry predicts, as a share of their length
+CLEAR = 2.0  # the next best light must fit this many times worse for the choice to be clear
 
 ALONE = 3.0
 """The highlights of one place must lie this many times nearer together than the next one does. On rough tissue glints
 meet the lights' arrangement by chance: of two lights 16 times in 100, half of them wrongly; of three 3 times in 100,
 which are half of all choices that seem clear there."""
 
-
-STEP = 1e-4
-"""Step of the differences of the normal, rad, and as a share of the distance."""
+STEP = 1e-4  # step of the differences of the normal, rad, and as a share of the distance
 
 NARROW = 0.15
 """Standard deviation of a told distance, as a share of it, up to which the light's angle is taken as linear in it; at
 0.3 a surface at half the distance would lie three stated deviations off."""
 
-DISTANCES = (np.arange(32) + 0.5) / 32
-"""Shares of a prior on the distance at which the normal's moves are computed."""
+DISTANCES = (np.arange(32) + 0.5) / 32  # shares of a prior on the distance at which the normal's moves are computed
 
 
 @dataclass(frozen=True)
@@ -82,18 +76,13 @@ class Bisector(OfHighlight):
             flags = (*flags, "ambiguous_light")
         found = [_normal(highlight, light, priors.distance) for light in order]
         normal, sightline = found[0]
-        budget = _budget(highlight, order[0], priors.distance, normal)
-        if budget is not None and own is None:
-            budget = {**budget, "light_offset": _light_part(highlight, order, priors.distance, normal)}
-        if budget is not None and priors.lights_covariance is not None:
-            budget = _with_light_error(budget, found[0], order[0], own, priors)
         estimate = Estimate(
             normal=normal,
             candidates=np.array([candidate for candidate, _ in found]),
             look_px=highlight.camera.project(sightline),
             axis_ratio=highlight.axis_ratio,
             isophotes=highlight.isophotes,
-            budget=budget,
+            budget=_budget(highlight, order, own, found[0], priors),
             flags=flags,
         )
         return add_common_parts(estimate, highlight.camera, priors, highlight)
@@ -105,6 +94,11 @@ bisector = Bisector()
 def is_narrow(distance: Distribution) -> TypeGuard[Normal]:
     """Whether a distance is known so well that the normal moves with it along a line."""
     return isinstance(distance, Normal) and distance.sd <= NARROW * distance.mean
+
+
+def _sampled(distance: Distribution) -> Array:
+    """Return the distances, mm, over which a part of the budget is the mean: one where it is known well, shape (D,)."""
+    return np.array([_middle(distance)]) if is_narrow(distance) else distance.quantile(DISTANCES)
 
 
 def _middle(distance: Distribution) -> float:
@@ -139,16 +133,30 @@ def _normals(family: HighlightAxis, light: Array, distances: Array, turn: Array 
     return bisect(d * sightlines, light), sightlines
 
 
-def _budget(family: HighlightAxis, light: Array, distance: Distribution, normal: Array) -> Budget | None:
-    """Return the budget of the normal: that of the axis at the peak, and the distance."""
+def _budget(
+    family: HighlightAxis, lights: Sequence[Array], own: int | None, found: tuple[Array, Array], priors: Priors
+) -> Budget | None:
+    """Return the budget of normal and sightline by the first light: of the axis at the peak, the distance, the lights.
+
+    `own` is that light's index among those told, None where it is not clear which one made the highlight.
+    """
     if family.peak_budget is None:
         return None
+    (normal, sightline), light, distance = found, lights[0], priors.distance
     across, middle = basis_across(normal), np.array([_middle(distance)])
     unturned = _normals(family, light, middle)[0][0]
     turned = [_normals(family, light, middle, STEP * unit)[0][0] for unit in np.eye(2)]
     J = across @ (np.array(turned) - unturned).T / STEP
-    own = {name: J @ part @ J.T for name, part in family.peak_budget.items()}
-    return {**own, "distance": _distance_part(family, light, distance, across)}
+    budget = {name: J @ part @ J.T for name, part in family.peak_budget.items()}
+    budget["distance"] = _distance_part(family, light, distance, across)
+    if own is None:
+        budget["light_offset"] = _light_part(family, lights, distance, normal)
+    if (told := priors.lights_covariance) is not None:
+        # The mean of lights whose errors are alike, as a wrong scale makes them, is as uncertain as one of them.
+        covariance = told.mean(axis=0) if own is None else told[own]
+        part = told_light_part(sightline, normal, light, covariance, _sampled(distance))
+        budget["light_offset"] = budget.get("light_offset", 0.0) + part
+    return budget
 
 
 def _light_part(family: HighlightAxis, lights: Sequence[Array], distance: Distribution, normal: Array) -> Array:
@@ -156,25 +164,9 @@ def _light_part(family: HighlightAxis, lights: Sequence[Array], distance: Distri
 
     It is the mean square over the lights and the distances, since the angle between two lights goes with 1/d.
     """
-    distances = np.array([_middle(distance)]) if is_narrow(distance) else distance.quantile(DISTANCES)
-    first, *single = (_normals(family, light, distances)[0] for light in lights)
+    first, *single = (_normals(family, light, _sampled(distance))[0] for light in lights)
     moved = np.concatenate([normals - first for normals in single]) @ basis_across(normal).T
     return np.asarray(moved.T @ moved / len(moved))
-
-
-def _with_light_error(
-    budget: Budget, found: tuple[Array, Array], light: Array, own: int | None, priors: Priors
-) -> Budget:
-    """Add what the told covariance of the lights' positions does to the part ``light_offset``."""
-    assert priors.lights_covariance is not None
-    # The mean of lights whose errors are alike, as a wrong scale makes them, is as uncertain as one of them.
-    covariance = priors.lights_covariance.mean(axis=0) if own is None else priors.lights_covariance[own]
-    distances = np.array([_middle(priors.distance)])
-    if not is_narrow(priors.distance):
-        distances = priors.distance.quantile(DISTANCES)
-    normal, sightline = found
-    part = told_light_part(sightline, normal, light, covariance, distances)
-    return {**budget, "light_offset": budget.get("light_offset", 0.0) + part}
 
 
 def _distance_part(family: HighlightAxis, light: Array, distance: Distribution, across: Array) -> Array:
@@ -197,12 +189,13 @@ def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     frame's other highlights, which the patch names, the nearest are used, one for each other light; with them the
     highlight must stand alone (`ALONE`).
     """
-    if len(priors.lights_mm) == 1:
-        return 0
+    if not np.ptp(priors.lights, axis=0).any():
+        return 0  # all at one place
     # observed offsets, turned by M into those of the lights up to a factor
     peaks = _other_peaks(family)
     others = peaks[: len(priors.lights_mm) - 1]
-    if not _stand_alone(peaks, len(others)):
+    gaps, count = np.linalg.norm(peaks, axis=1), len(others)
+    if len(peaks) > count and not gaps[count] > ALONE * gaps[count - 1]:
         return None
     values, vectors = np.linalg.eigh(family.moments)
     if not len(others) or values[0] <= 0:
@@ -215,12 +208,6 @@ def light_of_highlight(family: HighlightAxis, priors: Priors) -> int | None:
     first, second = np.argsort(misfits, kind="stable")[:2]
     clear = misfits[first] < LARGEST_MISFIT and misfits[second] > max(CLEAR * misfits[first], LARGEST_MISFIT)
     return int(first) if clear else None
-
-
-def _stand_alone(peaks: Array, count: int) -> bool:
-    """Return whether the first so many of other peaks, nearest first, shape (K, 2), are far nearer than the next."""
-    gaps = np.linalg.norm(peaks[: count + 1], axis=1)
-    return len(gaps) <= count or bool(gaps[count] > ALONE * gaps[count - 1])
 
 
 def _misfit(seen: Array, offsets: Array) -> float:
@@ -239,7 +226,8 @@ def _misfit(seen: Array, offsets: Array) -> float:
         matched = offsets[taken]
         # refine the factor with all pairs
         factor = max(float(np.sum(seen * matched) / np.sum(seen * seen)), 0.0)
-        best = min(best, float(np.linalg.norm(factor * seen - matched) / np.linalg.norm(matched)))
+        if (size := float(np.linalg.norm(matched))) > 0:
+            best = min(best, float(np.linalg.norm(factor * seen - matched)) / size)
     return best
 
 

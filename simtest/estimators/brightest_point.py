@@ -21,8 +21,7 @@ from simtest.runtime.fitted import fitted_number
 OF_APEX = AxisErrors(fitted_number("ripples.brightest"), OF_MEAN.bends, fitted_number("ripples.brightest_px2"))
 GAP_SHARE = fitted_number("ripples.brightest_gap")
 
-TOP_ISOVALUE = 0.9
-"""Where the border cuts even the isophote at this value, it may cut off the peak."""
+TOP_ISOVALUE = 0.9  # where the border cuts even the isophote at this value, it may cut off the peak
 
 
 @dataclass(frozen=True)

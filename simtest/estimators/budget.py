@@ -25,7 +25,6 @@ look no less like an ellipse than to 2 or 3 %.
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -52,11 +51,8 @@ STATED = "stated"
 MISPLACED = ("noise", "resolution", "shape", "response", STATED)
 """Parts that stand for a highlight's brightest point lying elsewhere than where the normal looks."""
 
-LARGEST_VARIANCE = math.pi**2
-"""rad^2; no direction is less certain. What states more has other units."""
-
-Budget = Mapping[str, Array]
-"""Covariance of each part, shape (2, 2), rad^2, in the basis ``tangent_basis(normal)``."""
+LARGEST_VARIANCE = math.pi**2  # rad^2; no direction is less certain, and what states more has other units
+Budget = Mapping[str, Array]  # covariance of each part, shape (2, 2), rad^2, in the basis ``tangent_basis(normal)``
 
 
 def total(budget: Budget) -> Array:
@@ -127,8 +123,8 @@ def equivalent_variance(moves: Array) -> float:
     # Bisection: more variance holds more.
     for _ in range(60):
         v = (low + high) / 2
-        left = limit - squares / max(v, 1e-300)
-        held = float(np.mean(_below(left)))
+        left = np.sqrt(np.maximum(limit - squares / max(v, 1e-300), 0.0))
+        held = float(np.mean(np.interp(left, _ROOTS, _SHARES)))  # by chi-squared of one degree of freedom
         low, high = (v, high) if held < CONFIDENCE else (low, v)
     return high
 
@@ -145,15 +141,9 @@ _ROOTS = np.linspace(0.0, 4.0, 401)
 _SHARES = np.array([math.erf(root / math.sqrt(2)) for root in _ROOTS.tolist()])
 
 
-def _below(values: Array) -> Array:
-    """Return the probability that a chi-squared variable of one degree of freedom stays below each value."""
-    return np.interp(np.sqrt(np.maximum(values, 0.0)), _ROOTS, _SHARES)
-
-
 Rows = npt.NDArray[np.float32]
 
-KERNEL_SIGMAS = 4.0
-"""Half-width of the smoothing kernel over its standard deviation."""
+KERNEL_SIGMAS = 4.0  # half-width of the smoothing kernel over its standard deviation
 
 
 def conics_by_crossings(
@@ -242,10 +232,10 @@ alone exceed it."""
 BY_PIXELS = 3e-4
 """Power that linear interpolation between pixels leaves in a harmonic, times the fourth power of the radius in px."""
 
-LARGEST_GAP = 3.0
-"""A point of a cut isophote stands for so many mean distances between points at most."""
+LARGEST_GAP = 3.0  # a point of a cut isophote stands for so many mean distances between points at most
 
 _ANGLES = (np.arange(256) + 0.5) * np.pi / 256
+_COSINES = np.cos(np.outer(np.append(1, HARMONICS), _ANGLES))
 
 
 def ripples(tangents: Array, conics: Array, counts: Index) -> AnyArray:
@@ -313,13 +303,8 @@ def spectrum(radius2: float) -> Array:
     if not np.isfinite(radius2) or radius2 > 2e4:
         return np.ones(len(HARMONICS))
     z = max(radius2 / 2, 1e-6)
-    terms = _cosines() @ np.exp(z * (np.cos(_ANGLES) - 1))
+    terms = _COSINES @ np.exp(z * (np.cos(_ANGLES) - 1))
     return np.asarray(np.maximum(terms[1:] / terms[0], 0.0))
-
-
-@lru_cache(maxsize=1)
-def _cosines() -> Array:
-    return np.cos(np.outer(np.append(1, HARMONICS), _ANGLES))
 
 
 MELTED, MELTED_RESIDUAL = fitted_number("bends.melted"), fitted_number("bends.melted_residual")

@@ -9,6 +9,7 @@ import numpy as np
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CIRCLE_POSE_ISOVALUE
 from simtest.errors import Failure
+from simtest.estimators.budget import gram
 from simtest.estimators.family import IsophoteFamily
 from simtest.estimators.highlight import fit_small, isophote_of_each
 from simtest.estimators.isophotes import FittedIsophote
@@ -17,15 +18,12 @@ from simtest.geometry import Array, Camera, CirclePoses, Mask, Patch, circle_pos
 from simtest.geometry.cones import PoseRegion
 from simtest.geometry.patch import slope_divisor_px2
 
-STEP = 1e-5
-"""Step of the differences between conic and ellipse, as a share of the largest of their parameters."""
-
+STEP = 1e-5  # step of the differences between conic and ellipse, as a share of the largest of their parameters
 
 POOLED_ISOVALUES = (0.1, 0.2, 0.3)
 """Low ones: the distance of the circles' projected centres grows with the square of the isophote's size."""
 
-CLEAR_MARGIN = 3.0
-"""Where the isovalue's own choice is as clear as this, in standard deviations, no others are used."""
+CLEAR_MARGIN = 3.0  # where the isovalue's own choice is as clear as this, in standard deviations, no others are used
 
 AMBIGUOUS_MARGIN = 2.0
 
@@ -216,9 +214,9 @@ def pose_region(patch: Patch, camera: Camera, isophote: FittedIsophote) -> PoseR
 
 
 def _region(family: IsophoteFamily) -> PoseRegion | None:
-    conic, noise = family.conics[0], family.conic_covariance(0)  # as seen, after smoothing
+    conic, noise = family.conics[0], gram(family.moved_by_noise(np.eye(5)[None]))  # as seen, after smoothing
     # the ellipse before smoothing: same centre, smaller moments
-    shrink = np.append(np.zeros(2), -family.widening()[np.triu_indices(2)])
+    shrink = np.append(np.zeros(2), -(family.added_px2(family.levels)[0] * family.px2)[np.triu_indices(2)])
     ellipse, turn = _ellipse(conic), _jacobian(_ellipse, conic)
     own = ellipse + shrink
     if np.linalg.eigvalsh(_matrix(own))[0] <= 0:

@@ -97,10 +97,6 @@ class CloudShape:
         around = look / (look @ -normal) + across
         return np.asarray(around / np.linalg.norm(around, axis=1)[:, None])
 
-    def slope_with(self, gains: tuple[float, float]) -> Slope:
-        """Return the slope for gains 1 + d k of the base that are told, in any order."""
-        return slope_of(self.covariance, self.independent, self.lobe, gains)
-
 
 def slope_of(
     covariance: Array, independent: float, lobe: Distribution, gains: tuple[float, float] | None = None

@@ -17,8 +17,7 @@ from simtest.geometry import Array
 STREAK_GAIN = 0.1
 """A highlight with an abs(1 + d k) below this is a streak; where the lobe is not known `STREAK_RATIO` decides."""
 
-ROUND_SHARE = 3.0
-"""Squared difference of the moments over its noise: -ln 0.05, which 5 % of round highlights exceed."""
+ROUND_SHARE = 3.0  # squared difference of the moments over its noise: -ln 0.05, which 5 % of round highlights exceed
 
 
 @dataclass(frozen=True)

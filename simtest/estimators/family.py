@@ -62,11 +62,8 @@ class AxisErrors(NamedTuple):
 OF_MEAN = AxisErrors(fitted_number("ripples.mean"), fitted_number("bends.mean"), fitted_number("drift.mean_grid_px2"))
 OF_PEAK = AxisErrors(fitted_number("ripples.peak"), fitted_number("bends.peak"), fitted_number("drift.peak_grid_px2"))
 
-STREAK_RATIO = 0.1
-"""An isophote with a smaller axis ratio is a streak."""
-
-MIN_CLIPPED_PX = 3
-"""Fewer clipped pixels change a smoothed peak by less than its noise."""
+STREAK_RATIO = 0.1  # an isophote with a smaller axis ratio is a streak
+MIN_CLIPPED_PX = 3  # fewer clipped pixels change a smoothed peak by less than its noise
 
 NOISE_FACTOR = 2.0
 """Standard deviations of a contour's noise that its distance from the ellipse may have on top, added in squares."""
@@ -202,7 +199,7 @@ class IsophoteFamily(IsophotesAcross):
 
     def _narrowed(self, levels: Array) -> Array:
         """Return E(t) of each isophote without the widening by smoothing and interpolation, shape (K, 2, 2)."""
-        return np.asarray(self._tangent_moments - self._added_px2(levels)[:, None, None] * self.px2)
+        return np.asarray(self._tangent_moments - self.added_px2(levels)[:, None, None] * self.px2)
 
     @cached_property
     def _tangent_moments(self) -> Array:
@@ -243,17 +240,8 @@ class IsophoteFamily(IsophotesAcross):
         by_shift = (self._moments_at(step) - self._moments_at(-step))[_UPPER] / (2 * step)
         return gram(self.moved_by_noise(self._moments_by_conic, (by_shift, self._peak)))
 
-    def conic_covariance(self, k: int) -> Array:
-        """Return the covariance by noise of an isophote's conic, shape (5, 5); the noise must be known."""
-        alone = IsophotesAcross(self.patch, self.camera, self.isophotes[k : k + 1], self.frame)
-        return gram(alone.moved_by_noise(np.eye(5)[None]))
-
-    def widening(self, k: int = 0) -> Array:
-        """Return what smoothing and linear interpolation add to an isophote's E(t), rad^2, in the basis, (2, 2)."""
-        return self._added_px2(self.levels)[k] * self.px2
-
-    def _added_px2(self, levels: Array) -> Array:
-        """Return the widening at each level, px^2."""
+    def added_px2(self, levels: Array) -> Array:
+        """Return what smoothing and linear interpolation add to E(t) at each level, px^2."""
         return np.asarray(2 * levels * self.patch.smoothing_px**2 + LINEAR_INTERPOLATION_PX2 * (2 * levels - 1))
 
     @cached_property
@@ -401,8 +389,7 @@ def _summed(covariance: Array) -> Array:
     return np.asarray(both @ covariance @ both.T)
 
 
-MIN_ISOPHOTES = 2
-"""One isophote alone may be an accident of the background."""
+MIN_ISOPHOTES = 2  # one isophote alone may be an accident of the background
 
 OTHERS_RESIDUAL, OTHERS_RATIO = 0.1, 2.5
 """A lower isophote that differs from its ellipse by more than this share of its radius, and so many times more than the

@@ -2,7 +2,7 @@
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from simtest.calibration import NO_PRIORS, Priors
 from simtest.conventions import CONE_AXIS_ISOVALUES
@@ -80,7 +80,8 @@ def fit_highlights(patches: Sequence[Patch], camera: Camera, isovalues: Sequence
     ]
     for patch, family in zip(pending, fit_isophote_families(pending, camera, isovalues), strict=True):
         _keep(patch, name, camera, family)
-    return [spot or _family(patch, name, camera) for patch, spot in zip(patches, small, strict=True)]
+    fitted = (_recall(patch, name, camera) for patch in patches)
+    return [spot or cast(IsophoteFamily | Failure, found) for found, spot in zip(fitted, small, strict=True)]
 
 
 def isophote_of_each(
@@ -111,12 +112,6 @@ def fit_small(patches: Sequence[Patch], camera: Camera) -> list[SmallSpot | None
         _keep(patch, "small", camera, spot)
     found = [_recall(patch, "small", camera) for patch in patches]
     return [spot if isinstance(spot, SmallSpot) else None for spot in found]
-
-
-def _family(patch: Patch, isovalues: tuple[float, ...], camera: Camera) -> IsophoteFamily | Failure:
-    found = _recall(patch, isovalues, camera)
-    assert isinstance(found, IsophoteFamily | Failure)
-    return found
 
 
 _NOTHING = object()

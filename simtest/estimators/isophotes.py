@@ -33,8 +33,7 @@ from simtest.geometry.ellipse_fit import MIN_ARC_RAD, MIN_POINTS, angular_extent
 from simtest.geometry.level_sets import LINEAR_INTERPOLATION_PX2, Crossings
 from simtest.runtime.arrays import AnyArray, short_repr
 
-MAX_ARC_RESIDUAL = 0.1
-"""An arc that misses its ellipse by more, RMS over the radius, noise included, is no part of one."""
+MAX_ARC_RESIDUAL = 0.1  # an arc that misses its ellipse by more, RMS over the radius, noise included, is no part of one
 
 
 @dataclass(frozen=True)
@@ -82,17 +81,17 @@ class FittedIsophote:
 def fit_isophotes(
     patch: Patch, camera: Camera, isovalues: Sequence[float]
 ) -> tuple[list[FittedIsophote], list[Failure]]:
-    """Trace isophotes at t in (0, 1) and fit their ellipses [MB, section 2.3, steps 1 to 3].
-
-    Returns those that succeeded and the failures of the others.
-    """
+    """Trace and fit a patch's isophotes, for other packages' estimators (see `fit_isophotes_of_each`)."""
     return fit_isophotes_of_each([patch], camera, isovalues)[0]
 
 
 def fit_isophotes_of_each(
     patches: Sequence[Patch], camera: Camera, isovalues: Sequence[float]
 ) -> list[tuple[list[FittedIsophote], list[Failure]]]:
-    """Return what `fit_isophotes` returns of each patch, all ellipses fitted at once."""
+    """Trace isophotes at t in (0, 1) and fit their ellipses, all at once [MB, section 2.3, steps 1 to 3].
+
+    Returns those of each patch that succeeded, and the failures of its others.
+    """
     contours = [contour for patch in patches for contour in patch.crossings_of(isovalues)]
     results = iter(_fit([*isovalues] * len(patches), contours, camera))
     fitted: list[tuple[list[FittedIsophote], list[Failure]]] = []
@@ -200,8 +199,7 @@ def weights_of_axes(conics: Array, isovalues: Array, px2: Array, smoothing_px: f
     return weights_at_zero(areas + float(beyond))
 
 
-TOP_ISOVALUE = 0.8
-"""Above it the logarithm of a glossy lobe is quadratic to a part in a thousand."""
+TOP_ISOVALUE = 0.8  # above it the logarithm of a glossy lobe is quadratic to a part in a thousand
 
 CLIPPED_ISOVALUE = 0.5
 """The same where the top is clipped: the rest must be wide enough to show the paraboloid's curvature."""
@@ -209,8 +207,7 @@ CLIPPED_ISOVALUE = 0.5
 CLIPPED_NEAR = 0.05
 """Largest share of clipped pixels around a fitted one: with more, clipping has lowered its smoothed value."""
 
-MIN_PIXELS = 12
-"""Twice the number of the paraboloid's coefficients."""
+MIN_PIXELS = 12  # twice the number of the paraboloid's coefficients
 
 
 @dataclass(frozen=True)
@@ -285,8 +282,7 @@ def _region(patch: Patch) -> Mask:
     return np.asarray(patch.inside(CLIPPED_ISOVALUE, cut=True) & (near < CLIPPED_NEAR))
 
 
-STEP_PX = 0.1
-"""Step of the central differences of a distorting lens's sightlines."""
+STEP_PX = 0.1  # step of the central differences of a distorting lens's sightlines
 
 _OUTLINE = 2 * np.pi * np.arange(24) / 24
 _CIRCLE = np.array([np.cos(_OUTLINE), np.sin(_OUTLINE)])

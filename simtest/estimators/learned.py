@@ -7,6 +7,7 @@ normals at highlights agree with the law of reflection: a test of a method that 
 """
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -29,8 +30,7 @@ from simtest.runtime.resources import data_root
 LEAST_LIT, BRIGHT_PERCENT = 0.05, 95.0
 """Pixels with less than this share of the light at this percentile count as unlit (`median_of_lit`)."""
 
-LIGHT_SCALE_MM = 5.0
-"""Position of a light, mm, for an input of 1."""
+LIGHT_SCALE_MM = 5.0  # position of a light, mm, for an input of 1
 
 LOG_RANGE = (-5.0, 2.0)
 """Of the logarithms of deviations: outside it they are clipped, so that no example decides the fit."""
@@ -48,10 +48,7 @@ def image_basis(rays: Array) -> Array:
 
 def rotation_of(rays: Array, normals: Array) -> Array:
     """Return the rotation from the direction to the camera, -ray, to a unit normal, rad in `image_basis`, (N, 2)."""
-    across = np.einsum("nij,nj->ni", image_basis(rays), normals)
-    sine = np.linalg.norm(across, axis=1)
-    angle = np.arctan2(sine, -np.sum(rays * normals, axis=1))
-    return across * (angle / np.maximum(sine, 1e-12))[:, None]
+    return _across(image_basis(rays), -rays, normals)
 
 
 def normal_of(rays: Array, rotation: Array) -> Array:
@@ -72,8 +69,7 @@ def median_of_lit(light: Image) -> float:
     return max(float(np.median(lit)), 1e-6) if lit.size else 1.0
 
 
-MARGIN = 0.05
-"""Share of a range, and absolute part, by which an input may leave it."""
+MARGIN = 0.05  # share of a range, and absolute part, by which an input may leave it
 
 
 @dataclass(frozen=True)
@@ -126,24 +122,11 @@ class TrainingRange:
 
     def refusals(self, features: AnyArray) -> list[Failure | None]:
         """Return for each row of features why it is refused, or None."""
-        return [self._refusal(distance) for distance in self.distances(features)]
-
-    def _refusal(self, distance: float) -> Failure | None:
-        if distance <= self.limit:
-            return None
-        told = f"unlike the network's training: features at {distance:.3g}, limit {self.limit:.3g}"
-        return Failure(Reason.NO_ESTIMATE, told)
-
-
-def read_usual(content: JsonObject) -> float:
-    """Return the usual squared distance of a network's metadata (`inflation`).
-
-    Raises `KeyError`, `TypeError`, `ValueError` if it is missing or not a number above 0.
-    """
-    usual = float(content["feature_usual"])
-    if not 0 < usual < np.inf:
-        raise ValueError(f"feature_usual = {usual}: must be above 0")
-    return usual
+        told = "unlike the network's training: features at {:.3g}, limit {:.3g}"
+        return [
+            None if distance <= self.limit else Failure(Reason.NO_ESTIMATE, told.format(distance, self.limit))
+            for distance in self.distances(features)
+        ]
 
 
 def inflation(distances: Array, usual: float) -> Array:
@@ -155,8 +138,7 @@ def inflation(distances: Array, usual: float) -> Array:
     return np.maximum(1.0, distances / usual)
 
 
-DIGITS = 7
-"""Of the numbers of the metadata: those of the weights have no more."""
+DIGITS = 7  # of the numbers of the metadata: those of the weights have no more
 
 
 def rounded(values: AnyArray | Sequence[float]) -> list[float]:
@@ -203,11 +185,8 @@ class CovarianceScale:
         return np.asarray(np.exp(np.interp(log_deviation, self.log_deviation, np.log(self.factor))))
 
 
-METADATA = "simtest"
-"""Key of the metadata, a JSON object, in the file."""
-
-WEIGHTS = ("learning", "weights")
-"""Where networks lie below the shipped scenes."""
+METADATA = "simtest"  # key of the metadata, a JSON object, in the file
+WEIGHTS = ("learning", "weights")  # where networks lie below the shipped scenes
 
 LARGEST_MODEL_BYTES = 256 * 2**20
 
@@ -288,8 +267,7 @@ def _bytes(path: Path) -> bytes:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-STEP = 1e-5
-"""Step of the differences of the normal, rad."""
+STEP = 1e-5  # step of the differences of the normal, rad
 
 
 def turned_normals(rays: Array, rotation: Array, root: Array) -> tuple[Array, Array]:
@@ -306,6 +284,19 @@ def turned_normals(rays: Array, rotation: Array, root: Array) -> tuple[Array, Ar
     jacobian = basis @ np.stack(steps, axis=2)
     whole = jacobian @ root
     return normals, np.asarray(whole @ whole.transpose(0, 2, 1))
+
+
+def stated_normals(rays: Array, outputs: Array, unit: float, factors: Array | float) -> tuple[Array, Array]:
+    """Return the normals that a network states, and their covariances times factors (`turned_normals`).
+
+    The first five columns of `outputs`, (N, 5 or more), are a rotation, and the Cholesky factor of its covariance with
+    the logarithm of its diagonal, both in units of `unit`, rad.
+    """
+    first, second = (np.exp(np.clip(outputs[:, column], *LOG_RANGE)) for column in (2, 4))
+    root = np.zeros((len(outputs), 2, 2))
+    root[:, 0, 0], root[:, 1, 0], root[:, 1, 1] = first, outputs[:, 3], second
+    root *= unit * np.sqrt(factors)[:, None, None]
+    return turned_normals(rays, outputs[:, :2] * unit, root)
 
 
 RELIEF_RAD = fitted_number("reflection.relief")
@@ -352,34 +343,33 @@ def log_deviation(outputs: Array) -> Array:
 class TaughtNetwork:
     """A network in ONNX Runtime, with the range that it was taught and the scales of what it states."""
 
-    def __init__(self, path: Path, form: str, core: str, inputs: Sequence[str], scales: Mapping[str, Sequence[str]]):
-        self._model = OnnxModel(path, form, core)
+    form: ClassVar[str]  # of its file
+    core: ClassVar[str]  # that needs it
+    inputs: ClassVar[tuple[str, ...]]  # whose range is known
+    scaled: ClassVar[Mapping[str, tuple[str, ...]]]  # names of the scales of each kind
+
+    def __init__(self, path: Path) -> None:
+        self._model = OnnxModel(path, self.form, self.core)
         with self._model.reading():
             content = self._model.content
-            self._scales = {
+            scales = {
                 kind: {name: CovarianceScale.read(content[kind][name]) for name in names}
-                for kind, names in scales.items()
+                for kind, names in self.scaled.items()
             }
-            self._range = TrainingRange.read(content, inputs)
-            self._usual = read_usual(content)
-        self.scales = self._scales["scales"]
+            self.scales, self.ratio_scales = scales["scales"], scales.get("ratio_scales", {})
+            self._range = TrainingRange.read(content, self.inputs)
+            self._usual = float(content["feature_usual"])  # squared distance of usual features (`inflation`)
+            if not 0 < self._usual < np.inf:
+                raise ValueError(f"feature_usual = {self._usual}: must be above 0")
 
 
 @dataclass(frozen=True)
-class LearnedNormals:
-    """What networks that state normals share as estimators.
+class LearnedNormals(ABC):
+    """What networks that state normals share: they answer for each detection, and need the lights told."""
 
-    They answer for each detection, and need the lights told. They refuse with ``no_estimate`` what lies outside the
-    range that they were taught.
-
-    Parameters
-    ----------
-    model : str or Path, optional
-        The file model.onnx. Default: the shipped network.
-    """
-
-    model: str | Path | None = None
+    model: str | Path | None = None  # the file; the shipped one by default
     shipped: ClassVar[str]  # name of the file beside which its card lies
+    network: ClassVar[type[TaughtNetwork]]
 
     def check(self) -> None:
         """Load the network; raise `InputError` where it cannot be used."""
@@ -393,11 +383,7 @@ class LearnedNormals:
 
     @cached_property
     def _network(self) -> Any:
-        return self._load(Path(self.model or data_root("scenes").joinpath(*WEIGHTS, self.shipped)))
-
-    def _load(self, path: Path) -> TaughtNetwork:
-        """Return the network of a file."""
-        raise NotImplementedError
+        return self.network(Path(self.model or data_root("scenes").joinpath(*WEIGHTS, self.shipped)))
 
     def estimate_regions(
         self, frame: Frame, patches: Sequence[Patch | Failure], /
@@ -412,6 +398,6 @@ class LearnedNormals:
         made = iter([found] * len(peaks) if isinstance(found, Failure) else found)
         return [patch if isinstance(patch, Failure) else next(made) for patch in patches], []
 
+    @abstractmethod
     def _at(self, frame: Frame, peaks: Array) -> Sequence[Estimate | Failure] | Failure:
         """Return an estimate or a failure for each peak of a frame whose lights are told, or why there is none."""
-        raise NotImplementedError

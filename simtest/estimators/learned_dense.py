@@ -7,7 +7,6 @@ direction to the camera that is aligned with the frame (`simtest.estimators.lear
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import cv2
@@ -25,29 +24,18 @@ from simtest.estimators.learned import (
     log_deviation,
     median_of_lit,
     reflection_distances,
-    turned_normals,
+    stated_normals,
 )
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import Array, Camera, Mask
 from simtest.runtime.arrays import Image
 
-GRID = (96, 128)
-"""Rows and columns of the planes."""
-
-STRIDE = 2
-"""Cells of the planes, along each axis, for one cell of the outputs."""
-
-CELLS = (GRID[0] // STRIDE, GRID[1] // STRIDE)
-"""Rows and columns of the outputs."""
-
-DARKEST = 0.02
-"""Share of the lit pixels' median light that is added before the logarithm."""
-
-LEAST_LIT = 0.1
-"""Cells with less light than this share of the view's median have no colour of their own."""
-
-LEAST_SEEN = 0.02
-"""A cell of which a smaller share is seen is empty."""
+GRID = (96, 128)  # rows and columns of the planes
+STRIDE = 2  # cells of the planes, along each axis, for one cell of the outputs
+CELLS = (GRID[0] // STRIDE, GRID[1] // STRIDE)  # rows and columns of the outputs
+DARKEST = 0.02  # share of the lit pixels' median light that is added before the logarithm
+LEAST_LIT = 0.1  # cells with less light than this share of the view's median have no colour of their own
+LEAST_SEEN = 0.02  # a cell of which a smaller share is seen is empty
 
 PLANES = (
     "logarithm of the light over its median", "logarithm of the mean light over that mean",
@@ -63,8 +51,7 @@ CAMERA = (
 )  # fmt: skip
 """What a network answers for a limited range of; lights in units of `LIGHT_SCALE_MM`."""
 
-VIEWED = PLANES[:5]
-"""The planes that change from frame to frame of one camera."""
+VIEWED = PLANES[:5]  # the planes that change from frame to frame of one camera
 
 # What a network returns
 
@@ -72,8 +59,7 @@ OUTPUTS = ("rotation, first", "rotation, second", "logarithm of L11", "L21", "lo
            "logarithm of the distance", "logarithm of that one's deviation")  # fmt: skip
 """In each cell. L is the Cholesky factor of the rotation's covariance, in units of `ROTATION_SCALE`."""
 
-ROTATION_SCALE = 0.5
-"""Rotation, rad, for an output of 1."""
+ROTATION_SCALE = 0.5  # rotation, rad, for an output of 1
 
 DISTANCE_MM, DISTANCE_SCALE = 30.0, 0.5
 """A distance of `DISTANCE_MM` along the ray is an output of 0; an output of 1 is a logarithm of `DISTANCE_SCALE`."""
@@ -176,11 +162,8 @@ def _centred(values: Image, lit: Mask) -> Image:
 
 FORMAT = "simtest dense_normals, version 2"
 
-ASPECTS = (1.0, 1.9)
-"""Width over height: what the training's cut views cover."""
-
-CELL_PX = (1.5, 20.0)
-"""Pixels of a cell along x: resampling covers these."""
+ASPECTS = (1.0, 1.9)  # width over height: what the training's cut views cover
+CELL_PX = (1.5, 20.0)  # pixels of a cell along x: resampling covers these
 
 LEAST_HIGHLIGHTS, REFLECTION_LIMIT = 4, 2.0
 """From so many highlights a frame's normals are checked against the law of reflection, and refused beyond the limit.
@@ -195,24 +178,30 @@ far where both states hold."""
 
 @dataclass(frozen=True)
 class DenseMaps:
-    """What a network states of each pixel of a frame; NaN out of view.
+    """What a network states of each pixel of a frame, in float32; NaN out of view."""
 
-    Parameters
-    ----------
-    normal : ndarray of float32, shape (H, W, 3)
-        Unit normal of the base surface, camera frame.
-    covariance : ndarray of float32, shape (H, W, 2, 2)
-        Of the normal in the basis `simtest.geometry.vectors.tangent_basis(normal)`, rad^2.
-    distance_mm : ndarray of float32, shape (H, W)
-        Along the ray.
-    deviation_mm : ndarray of float32, shape (H, W)
-        Standard deviation of the distance, to first order.
-    """
+    normal: Image  # (H, W, 3): unit normal of the base surface, camera frame
+    covariance: Image  # (H, W, 2, 2): of it in the basis `simtest.geometry.vectors.tangent_basis(normal)`, rad^2
+    distance_mm: Image  # (H, W): along the ray
+    deviation_mm: Image  # (H, W): standard deviation of the distance, to first order
 
-    normal: Image
-    covariance: Image
-    distance_mm: Image
-    deviation_mm: Image
+
+class DenseNetwork(TaughtNetwork):
+    """A network of whole frames."""
+
+    form, core, inputs = FORMAT, "learned_dense", CAMERA
+    scaled: ClassVar = {"scales": ("base", "distance")}
+
+    def run(self, frame: Frame) -> tuple[Array, float] | Failure:
+        """Return the outputs of a frame, shape (7, 48, 64), and the covariances' factor, or why it is refused."""
+        told = dict(zip(CAMERA, camera_values(frame).tolist(), strict=True))
+        if refused := self._range.refusal(told):
+            return refused
+        shapes = {"outputs": (1, len(OUTPUTS), *CELLS), "features": (1, len(self._range.mean))}
+        outputs, features = self._model.run({"planes": dense_inputs(frame)[None]}, shapes)
+        distances = self._range.distances(features)
+        (refused,) = self._range.refusals(features)
+        return refused or (np.asarray(outputs[0], dtype=float), float(inflation(distances, self._usual)[0]))
 
 
 @dataclass(frozen=True)
@@ -234,15 +223,13 @@ class LearnedDense(LearnedNormals):
     """
 
     shipped: ClassVar[str] = "learned_dense.onnx"
+    network: ClassVar = DenseNetwork
 
     @property
     def description(self) -> str:
         """What the estimator is, in one line for a reader who chooses one."""
         network = str(self.model or self.shipped)
         return f"The normal of the base surface at each highlight, by the network {network} of the whole frame."
-
-    def _load(self, path: Path) -> "DenseNetwork":
-        return DenseNetwork(path)
 
     def maps(
         self, values: Image, calibration: Calibration, highlights_px: Array | None = None, seen: Mask | None = None
@@ -316,11 +303,8 @@ class LearnedDense(LearnedNormals):
         """Return normals, covariances, distances, mm, and their deviations, mm, at pixel positions, shape (N, 2)."""
         layout, scales = Layout.of(camera.width, camera.height), self._network.scales
         made = interpolated(outputs, layout.to_cells(points_px, camera) / STRIDE - 0.5).T
-        first, second = (np.exp(np.clip(made[:, column], *LOG_RANGE)) for column in (2, 4))
-        root = np.zeros((len(made), 2, 2))
-        root[:, 0, 0], root[:, 1, 0], root[:, 1, 1] = first, made[:, 3], second
-        root *= ROTATION_SCALE * np.sqrt(inflated * scales["base"].at(log_deviation(made)))[:, None, None]
-        normals, covariances = turned_normals(camera.unproject(points_px), made[:, :2] * ROTATION_SCALE, root)
+        factors = inflated * scales["base"].at(log_deviation(made))
+        normals, covariances = stated_normals(camera.unproject(points_px), made, ROTATION_SCALE, factors)
         distance = DISTANCE_MM * np.exp(DISTANCE_SCALE * made[:, 5])
         logarithm = np.clip(made[:, 6], *LOG_RANGE)
         share = DISTANCE_SCALE * np.exp(logarithm) * np.sqrt(inflated * scales["distance"].at(logarithm))
@@ -379,23 +363,4 @@ def _unfit(frame: Frame) -> Failure | None:
     return Failure(Reason.NO_ESTIMATE, f"outside the network's training: {told}") if told else None
 
 
-class DenseNetwork(TaughtNetwork):
-    """A network of whole frames."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, FORMAT, "learned_dense", CAMERA, {"scales": ("base", "distance")})
-
-    def run(self, frame: Frame) -> tuple[Array, float] | Failure:
-        """Return the outputs of a frame, shape (7, 48, 64), and the covariances' factor, or why it is refused."""
-        told = dict(zip(CAMERA, camera_values(frame).tolist(), strict=True))
-        if refused := self._range.refusal(told):
-            return refused
-        shapes = {"outputs": (1, len(OUTPUTS), *CELLS), "features": (1, len(self._range.mean))}
-        outputs, features = self._model.run({"planes": dense_inputs(frame)[None]}, shapes)
-        distances = self._range.distances(features)
-        (refused,) = self._range.refusals(features)
-        return refused or (np.asarray(outputs[0], dtype=float), float(inflation(distances, self._usual)[0]))
-
-
-learned_dense = LearnedDense()
-"""The shipped network; it is read at its first use."""
+learned_dense = LearnedDense()  # the shipped network; it is read at its first use

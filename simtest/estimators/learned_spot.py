@@ -7,7 +7,6 @@ aligned with the crops' axes (`image_basis`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 import cv2
@@ -24,22 +23,17 @@ from simtest.estimators.learned import (
     inflation,
     log_deviation,
     median_of_lit,
-    normal_of,
+    stated_normals,
 )
 from simtest.estimators.protocol import Estimate, Target
-from simtest.geometry import Array, Camera
-from simtest.geometry.vectors import basis_across
+from simtest.geometry import Array
 from simtest.runtime.arrays import Image
 
-SIDE = 32
-"""Side of a crop, px of the crop."""
-
-STEPS = (1, 3, 9)
-"""Pixels of the frame for one of each crop: the highlight, its neighbours, the shading around."""
+SIDE = 32  # side of a crop, px of the crop
+STEPS = (1, 3, 9)  # pixels of the frame for one of each crop: the highlight, its neighbours, the shading around
 
 DARKEST = 0.02
 """Share of the frame's median light that is added before the logarithm; what lies outside the view is this dark."""
-
 
 EXTRAS = (
     "log of the focal length over 300 px",
@@ -51,8 +45,7 @@ EXTRAS = (
 
 # What a network returns
 
-ROTATION_SCALE = 0.1
-"""Rotation, rad, for an output of 1."""
+ROTATION_SCALE = 0.1  # rotation, rad, for an output of 1
 
 SURFACES = ("base", "fine")
 
@@ -60,8 +53,7 @@ OUTPUTS = ("rotation, first", "rotation, second", "logarithm of L11", "L21", "lo
            "logarithm of the axis ratio's deviation")  # fmt: skip
 """Of each surface. L is the Cholesky factor of the rotation's covariance, both in units of `ROTATION_SCALE`."""
 
-RATIO, RATIO_DEVIATION = 5, 6
-"""Columns of the axis ratio and of its deviation."""
+RATIO, RATIO_DEVIATION = 5, 6  # columns of the axis ratio and of its deviation
 
 
 def spot_inputs(frame: Frame, peaks_px: Sequence[Array] | Array) -> tuple[Image, Image]:
@@ -92,7 +84,7 @@ def spot_inputs(frame: Frame, peaks_px: Sequence[Array] | Array) -> tuple[Image,
 
 def _extras(frame: Frame, peaks: Array, crops: Image) -> Image:
     camera, lights = frame.calibration.camera, frame.calibration.priors.lights
-    rays = rays_of(camera, peaks)
+    rays = camera.unproject(peaks)
     basis = image_basis(rays)
     mean, offsets = lights.mean(axis=0) / LIGHT_SCALE_MM, (lights - lights.mean(axis=0)) / LIGHT_SCALE_MM
     spread = np.einsum("nij,jk,nlk->nil", basis, offsets.T @ offsets / len(lights), basis)
@@ -108,11 +100,6 @@ def _extras(frame: Frame, peaks: Array, crops: Image) -> Image:
     return np.stack(columns, axis=1).astype(np.float32)
 
 
-def rays_of(camera: Camera, peaks: Array) -> Array:
-    """Return the unit sightlines through pixels, shape (N, 3)."""
-    return np.array([camera.unproject(peak) for peak in peaks]).reshape(-1, 3)
-
-
 def _clipped_near(frame: Frame, peak: Array) -> int:
     """Return the number of clipped pixels of the smallest crop."""
     x, y = (int(v) for v in peak)
@@ -125,8 +112,24 @@ FORMAT = "simtest spot_normals, version 3"
 _CHECKED = tuple(EXTRAS[:1]) + tuple(EXTRAS[3:9])
 """Extras whose range is checked: focal length and lights. The others differ from frame to frame."""
 
-STEP = 1e-5
-"""Step of the differences of the normal, rad."""
+
+class SpotNetwork(TaughtNetwork):
+    """A network of single highlights."""
+
+    form, core, inputs = FORMAT, "learned_spot", EXTRAS
+    scaled: ClassVar = {"scales": SURFACES, "ratio_scales": SURFACES}
+
+    def run(self, crops: Image, extras: Image) -> tuple[Array, Array, list[Failure | None]]:
+        """Return outputs, shape (N, 2, 7), factors of the covariances, and for each row why it is refused, or None."""
+        shapes = {"outputs": (None, len(SURFACES), len(OUTPUTS)), "features": (None, len(self._range.mean))}
+        outputs, features = self._model.run({"crops": crops, "extras": extras}, shapes)
+        checked = ({name: float(row[EXTRAS.index(name)]) for name in _CHECKED} for row in extras)
+        refusals = [
+            self._range.refusal(values) or unlike
+            for values, unlike in zip(checked, self._range.refusals(features), strict=True)
+        ]
+        inflated = inflation(self._range.distances(features), self._usual)
+        return np.asarray(outputs, dtype=float), inflated, refusals
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,7 @@ class LearnedSpot(LearnedNormals):
 
     target: Target = "base"
     shipped: ClassVar[str] = "learned_spot.onnx"
+    network: ClassVar = SpotNetwork
 
     def __post_init__(self) -> None:
         if self.target not in SURFACES:
@@ -158,63 +162,28 @@ class LearnedSpot(LearnedNormals):
         network = str(self.model or self.shipped)
         return f"The normal of the {self.target} surface at each highlight, by the network {network}."
 
-    def _load(self, path: Path) -> "SpotNetwork":
-        return SpotNetwork(path)
-
     def _at(self, frame: Frame, peaks: Array) -> Sequence[Estimate | Failure] | Failure:
         if frame.camera.distortion is not None:
             # Checked before the network is loaded: it would not help.
             return Failure(Reason.NO_ESTIMATE, "outside the network's training: a lens with distortion")
         crops, extras = spot_inputs(frame, peaks)
-        outputs, inflations, refusals = self._network.run(crops, extras)
-        rays, number = rays_of(frame.camera, peaks), SURFACES.index(self.target)
-        rows = zip(rays, peaks, outputs[:, number], inflations, refusals, strict=True)
-        return [refusal or self._estimate(*row) for *row, refusal in rows]
-
-    def _estimate(self, ray: Array, peak: Array, made: Array, inflated: float) -> Estimate:
-        """Return the estimate of one row of outputs, whose covariance is inflated by a factor."""
-        turn = made[:2] * ROTATION_SCALE
-        steps = turn + STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        normals = normal_of(np.repeat(ray[None], 3, axis=0), steps)
-        jacobian = basis_across(normals[0]) @ (normals[1:] - normals[0]).T / STEP
-        first, second = np.exp(np.clip(made[[2, 4]], *LOG_RANGE))
-        factor = ROTATION_SCALE * np.array([[first, 0.0], [made[3], second]])
-        covariance = (
-            jacobian
-            @ factor
-            @ factor.T
-            @ jacobian.T
-            * (self._network.scales[self.target].at(log_deviation(made)) * inflated)
-        )
-        sure = float(np.clip(made[RATIO_DEVIATION], *LOG_RANGE))
-        deviation = np.exp(sure) * np.sqrt(self._network.ratio_scales[self.target].at(sure) * inflated)
-        return Estimate(
-            normal=normals[0], candidates=normals[:1], look_px=peak,
-            axis_ratio=float(1 / (1 + np.exp(-made[5]))), covariance=covariance, target=self.target,
-            axis_ratio_deviation=float(deviation),
-        )  # fmt: skip
+        outputs, inflated, refusals = self._network.run(crops, extras)
+        made = outputs[:, SURFACES.index(self.target)]
+        scales, ratio_scales = self._network.scales[self.target], self._network.ratio_scales[self.target]
+        factors = scales.at(log_deviation(made)) * inflated
+        normals, covariances = stated_normals(frame.camera.unproject(peaks), made, ROTATION_SCALE, factors)
+        sure = np.clip(made[:, RATIO_DEVIATION], *LOG_RANGE)
+        deviations = np.exp(sure) * np.sqrt(ratio_scales.at(sure) * inflated)
+        return [
+            refusal
+            or Estimate(
+                normal=normal, candidates=normal[None], look_px=peak, axis_ratio=float(1 / (1 + np.exp(-ratio))),
+                covariance=covariance, target=self.target, axis_ratio_deviation=float(deviation),
+            )
+            for refusal, normal, covariance, peak, ratio, deviation in zip(
+                refusals, normals, covariances, peaks, made[:, RATIO], deviations, strict=True
+            )
+        ]  # fmt: skip
 
 
-class SpotNetwork(TaughtNetwork):
-    """A network of single highlights."""
-
-    def __init__(self, path: Path) -> None:
-        kinds = {"scales": SURFACES, "ratio_scales": SURFACES}
-        super().__init__(path, FORMAT, "learned_spot", EXTRAS, kinds)
-        self.ratio_scales = self._scales["ratio_scales"]
-        self._shapes = {"outputs": (None, len(SURFACES), len(OUTPUTS)), "features": (None, len(self._range.mean))}
-
-    def run(self, crops: Image, extras: Image) -> tuple[Array, Array, list[Failure | None]]:
-        """Return outputs, shape (N, 2, 7), factors of the covariances, and for each row why it is refused, or None."""
-        outputs, features = self._model.run({"crops": crops, "extras": extras}, self._shapes)
-        checked = ({name: float(row[EXTRAS.index(name)]) for name in _CHECKED} for row in extras)
-        refusals = [
-            self._range.refusal(values) or unlike
-            for values, unlike in zip(checked, self._range.refusals(features), strict=True)
-        ]
-        inflated = inflation(self._range.distances(features), self._usual)
-        return np.asarray(outputs, dtype=float), inflated, refusals
-
-
-learned_spot = LearnedSpot()
-"""The shipped network; it is read at its first use."""
+learned_spot = LearnedSpot()  # the shipped network; it is read at its first use

@@ -23,9 +23,7 @@ class Descent(NamedTuple):
 
 OF_LOBES = Descent(1e-3, 1e-7, 5e7, 30, 1e-8)
 
-EXACT = 1e-24
-"""Share of the observed power that rounding alone leaves as residual."""
-
+EXACT = 1e-24  # share of the observed power that rounding alone leaves as residual
 
 Equations = tuple[Array, Array, Array, Mask]
 """Of n fits: sums of squares, (n,), normal equations, (n, p, p) and (n, p), and whether the states may be taken."""

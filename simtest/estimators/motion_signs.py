@@ -22,6 +22,7 @@ from simtest.geometry.vectors import basis_across, tangent_coordinates
 
 STEPS = 30
 STEP = 1e-5
+UNCHANGED = np.zeros(6)
 
 SOURCES = ("rotation", "rotation", "log distance", "log gain", "log gain", "turn of the principal directions")
 """What predictions of one first picture share, in the order of `FirstPicture.jacobian`; rad, or shares."""
@@ -57,15 +58,11 @@ class FirstPicture:
     distance: float  # of the surface, mm
     gains: Array  # (2,): 1 + d k along its principal directions
 
-    def predict(self, position: Array) -> Prediction | None:
-        """Solve for the patch's normal that points at a position; None where Newton's method finds none."""
-        return self._predict(position, np.zeros(6))
-
     def jacobian(self, at: Prediction) -> Array | None:
         """Differentiate a predicted normal, in its tangent basis, by `SOURCES`, shape (2, 6)."""
         basis, columns = basis_across(at.normal), []
         for step in STEP * np.eye(6):
-            moved = self._predict(at.position, step)
+            moved = self.predict(at.position, step)
             if moved is None:
                 return None
             columns.append(basis @ (moved.normal - at.normal) / STEP)
@@ -75,7 +72,7 @@ class FirstPicture:
         """Differentiate a predicted normal, in its tangent basis, by the camera's position, 1/mm, shape (2, 3)."""
         basis, columns = basis_across(at.normal), []
         for step in STEP * self.distance * np.eye(3):
-            moved = self._predict(at.position + step, np.zeros(6))
+            moved = self.predict(at.position + step)
             columns.append(np.zeros(2) if moved is None else basis @ (moved.normal - at.normal))
         return np.stack(columns, axis=1) / (STEP * self.distance)
 
@@ -94,8 +91,11 @@ class FirstPicture:
         made[3:5, 3:5] += lobe_sd**2
         return made
 
-    def _predict(self, position: Array, change: Array) -> Prediction | None:
-        """Predict with the sources changed, in the order of `SOURCES`."""
+    def predict(self, position: Array, change: Array = UNCHANGED) -> Prediction | None:
+        """Solve for the patch's normal that points at a position; None where Newton's method finds none.
+
+        `change`, (6,): of the sources, in the order of `SOURCES`.
+        """
         assert self.first.curvature is not None
         distance, gains = self.distance * (1 + change[2]), self.gains * (1 + change[3:5])
         N = self.first.normal + change[:2] @ basis_across(self.first.normal)
@@ -134,20 +134,14 @@ def _place(K: Array, v: Array) -> Array | None:
     return None
 
 
-GAIN_SD = 0.03
-"""Default relative standard deviation of the first picture's abs(1 + d k)."""
-
-LEAST_SD = 1e-4
-"""Least allowance for the patch's third order, rad."""
+GAIN_SD = 0.03  # default relative standard deviation of the first picture's abs(1 + d k)
+LEAST_SD = 1e-4  # least allowance for the patch's third order, rad
 
 CHANGE_SD = 0.3
 """Standard deviation of the relative change of the curvatures over one working distance along the surface."""
 
-WRONG_SHARE = 0.02
-"""Stated probability that a sign is told, and is wrong."""
-
-RIVALS = 2
-"""Hypotheses, of four, whose sign along a direction is wrong."""
+WRONG_SHARE = 0.02  # stated probability that a sign is told, and is wrong
+RIVALS = 2  # hypotheses, of four, whose sign along a direction is wrong
 
 CLEAR = -2 * float(np.log(WRONG_SHARE / RIVALS))
 """Least difference of two deviances for the better one to be told.
@@ -162,18 +156,10 @@ FITS_SHARE = 0.999
 
 @dataclass(frozen=True)
 class PoseError:
-    """Standard deviations of a camera's motion from one picture to another, independent between motions.
+    """Standard deviations of a camera's motion from one picture to another, independent between motions."""
 
-    Parameters
-    ----------
-    translation : float
-        Of the translation along each axis, as a share of its length.
-    rotation : float
-        About each axis, rad.
-    """
-
-    translation: float = 0.0
-    rotation: float = 0.0
+    translation: float = 0.0  # of the translation along each axis, as a share of its length
+    rotation: float = 0.0  # about each axis, rad
 
 
 EXACT = PoseError()
@@ -181,50 +167,26 @@ EXACT = PoseError()
 
 @dataclass(frozen=True)
 class MovedView:
-    """A further picture of a highlight, from another position.
+    """A further picture of a highlight, from another position."""
 
-    Parameters
-    ----------
-    estimates : sequence of Estimate
-        Of what may be the same highlight, of any estimator for a light at the camera. Each hypothesis takes the one
-        that it explains best, so that a false one is no evidence.
-    view_from_first : array_like, shape (4, 4)
-        The camera's motion: from the first camera's frame to this one's, mm.
-    error : PoseError
-        Of the motion.
-    """
-
+    # Of what may be the same highlight, of any estimator for a light at the camera. Each hypothesis takes the one that
+    # it explains best, so that a false one is no evidence.
     estimates: Sequence[Estimate]
-    view_from_first: npt.ArrayLike
-    error: PoseError = EXACT
+    view_from_first: npt.ArrayLike  # (4, 4): the camera's motion, from the first camera's frame to this one's, mm
+    error: PoseError = EXACT  # of the motion
 
 
 @dataclass(frozen=True)
 class RankedHypotheses:
-    """The curvatures that one picture allows, ordered by how well they explain the others.
+    """The curvatures that one picture allows, ordered by how well they explain the others."""
 
-    Parameters
-    ----------
-    hypotheses : ndarray, shape (H, 2)
-        1 + d k along the first picture's principal directions, the best first.
-    distance2 : ndarray, shape (H,)
-        Squared Mahalanobis distance of the other pictures' normals from the predicted ones.
-    predicted : ndarray, shape (H, 3)
-        Predicted normals in the frame of the first other picture that was used.
-    deviance : ndarray, shape (H,)
-        Twice the negative log-likelihood, up to a constant: `distance2` and the log of the covariance's determinant.
-    freedom : int
-        Degrees of freedom of `distance2`: 2 for each further picture.
-    gain_sd : float
-        Relative standard deviation of the sizes of the hypotheses.
-    """
-
-    hypotheses: Array
-    distance2: Array
-    predicted: Array
+    hypotheses: Array  # (H, 2): 1 + d k along the first picture's principal directions, the best first
+    distance2: Array  # (H,): squared Mahalanobis distance of the other pictures' normals from the predicted ones
+    predicted: Array  # (H, 3): predicted normals in the frame of the first other picture that was used
+    # (H,): twice the negative log-likelihood, up to a constant: `distance2` and the log of the covariance's determinant
     deviance: Array
-    freedom: int = 2
-    gain_sd: float = GAIN_SD
+    freedom: int = 2  # degrees of freedom of `distance2`: 2 for each further picture
+    gain_sd: float = GAIN_SD  # relative standard deviation of the sizes of the hypotheses
 
     @property
     def margin(self) -> float:
@@ -280,38 +242,6 @@ class RankedHypotheses:
         return first, second
 
 
-def rank_by_motion(
-    first: Estimate,
-    second: Estimate,
-    second_from_first: npt.ArrayLike,
-    priors: Priors,
-    gain_sd: float = GAIN_SD,
-    pose_error: PoseError = EXACT,
-) -> RankedHypotheses | Failure:
-    """Rank the first picture's curvature hypotheses by the highlight's position in a second picture.
-
-    A motion along one principal direction determines that direction's sign alone: two hypotheses then remain equally
-    good. See `rank_by_motions`.
-
-    Parameters
-    ----------
-    first : Estimate
-        Of `curved` or `inverse_rendering` with the lobe known, so that it has hypotheses.
-    second : Estimate
-        Of the same highlight, of any estimator for a light at the camera.
-    second_from_first : array_like, shape (4, 4)
-        The camera's motion: from the first camera's frame to the second one's, mm.
-    priors : Priors
-        For the distance in the first picture; without it, or hypotheses, a Failure ``not_known``.
-    gain_sd : float
-        Relative standard deviation of the first picture's abs(1 + d k), > 0.
-    pose_error : PoseError
-        Of the motion.
-    """
-    T = rigid(second_from_first, "second_from_first")
-    return rank_by_motions(first, [MovedView([second], T, pose_error)], priors, gain_sd)
-
-
 def rank_by_motions(
     first: Estimate, views: Sequence[MovedView], priors: Priors, gain_sd: float = GAIN_SD
 ) -> RankedHypotheses | Failure:
@@ -319,15 +249,20 @@ def rank_by_motions(
 
     Each hypothesis is a quadric patch, on which the point is solved whose normal points at each further camera. What
     all predictions share, the first picture's normal, distance, gains and principal directions, moves all of them at
-    once: the pictures' distances are not added, but taken together with their joint covariance.
+    once: the pictures' distances are not added, but taken together with their joint covariance. A motion along one
+    principal direction determines that direction's sign alone: two hypotheses then remain equally good.
 
     Parameters
     ----------
     first : Estimate
-        See `rank_by_motion`, as for `priors` and `gain_sd`.
+        Of `curved` or `inverse_rendering` with the lobe known, so that it has hypotheses.
     views : sequence of MovedView
         Those without an estimate that states its uncertainty, and those too far off for the patch, are passed over.
         Where none is left a Failure ``no_estimate`` or ``undecided``.
+    priors : Priors
+        For the distance in the first picture; without it, or hypotheses, a Failure ``not_known``.
+    gain_sd : float
+        Relative standard deviation of the first picture's abs(1 + d k), > 0.
     """
     if first.curvature is None or first.curvature.hypotheses is None or priors.distance_mm is None:
         return Failure(Reason.NOT_KNOWN, "needs curvature hypotheses of the first picture, and its distance")

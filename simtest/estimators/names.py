@@ -91,7 +91,6 @@ def forgive_cores() -> None:
 
 ESTIMATORS = EntryPointGroup("simtest.estimators", "estimator")
 
-
 DESCRIPTIONS: dict[str, str] = {
     "cone_axis": "The axis of the cone from the camera through the highlight's isophotes, averaged over several.",
     "circle_pose": "The published method: takes one isophote for a circle and solves for its pose; two candidates.",
@@ -118,8 +117,6 @@ def describe_estimators(names: Sequence[str]) -> dict[str, str]:
     A foreign estimator is imported, as a run has done anyway; one without a docstring has an empty description. A core
     stands under its short name.
     """
-    from simtest.estimators.names import load_estimators
-
     described = {}
     for name in names:
         if own := DESCRIPTIONS.get(name.removeprefix(f"{OWN}:")):

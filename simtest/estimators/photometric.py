@@ -23,37 +23,25 @@ from simtest.geometry.vectors import basis_across, tangent_coordinates
 from simtest.runtime.arrays import Index
 from simtest.runtime.fitted import fitted_number
 
-DARK = 1e-6
-"""Least cosine of the lobe's angle: below it the specular term is 0 and has no logarithm."""
-
+DARK = 1e-6  # least cosine of the lobe's angle: below it the specular term is 0 and has no logarithm
 
 RINGS, SECTORS = 6, 8
 """The lobe is divided by the model's intensity into rings of equally many pixels, each ring into sectors."""
 
 MIN_IN_BIN = 8
-LEVEL = 1e-3
-"""A fit is a misfit if noise alone would leave as much structure in less than this share of fits."""
-
-FLOOR = 2e-3
-"""Structure below this share of the peak does not count: rendering and sampling leave as much."""
-
-INNER = 0.5
-"""Near the peak all smooth lobes agree: pixels above this share of it are fitted for comparison."""
+LEVEL = 1e-3  # a fit is a misfit if noise alone would leave as much structure in less than this share of fits
+FLOOR = 2e-3  # structure below this share of the peak does not count: rendering and sampling leave as much
+INNER = 0.5  # near the peak all smooth lobes agree: pixels above this share of it are fitted for comparison
 
 CORRELATED_PX, SUMMED_DEVIATIONS = 4, 2.0
 """Coding and demosaicing correlate the noise of pixels this far apart along an axis at most. The sum of white noise's
 correlations exceeds 1 by so many of its standard deviations once in 40 highlights."""
 
-
 REGIONS = (0.05, 0.1, 0.2, 0.3, 0.5)
 """The pixels inside the first of these isophotes that closes are fitted. Further out there is little but noise."""
 
-CUT_REGION = 0.3
-"""For a highlight that the border or the view cuts: seen pixels are fitted down to this isovalue."""
-
-MAX_PIXELS = 16384
-"""In a larger region every second, third ... pixel is fitted, evenly spread."""
-
+CUT_REGION = 0.3  # for a highlight that the border or the view cuts: seen pixels are fitted down to this isovalue
+MAX_PIXELS = 16384  # in a larger region every second, third ... pixel is fitted, evenly spread
 
 MISFIT_SHARE = fitted_number("misfit.share")
 
@@ -73,10 +61,21 @@ class HighlightPixels:
     places: Index
 
     def correlation(self, fitted: LobeFit[Model]) -> float:
-        """Return by how much the noise's correlation raises the covariance of a fit (`correlation_of_noise`)."""
-        if self.noise is None:
+        """Return by how much the noise's correlation between pixels raises the covariance of a fit; 1: not at all.
+
+        A smooth model takes from correlated noise the sum of its correlations over all distances. Both the smoothed
+        frame's noise and the residuals must show more than chance; the larger one counts.
+        """
+        raised = float(np.mean(np.square(0.0 if self.noise is None else self.noise))) / max(fitted.sigma**2, 1e-300)
+        if raised < COLOURED**2:
             return 1.0
-        return correlation_of_noise(fitted, self.observed, self.clipped, self.noise, self.places)
+        rows, columns = self.places - self.places.min(axis=1, keepdims=True)
+        kept = np.ones(len(self.observed)) if self.clipped is None else (~self.clipped).astype(float)
+        residual = kept * (self.observed - fitted.model.evaluate()[0])
+        sums, pairs = (_products(values, rows, columns) for values in (residual, kept))
+        summed = float((sums / np.maximum(pairs, 1.0)).sum()) / fitted.sigma**2
+        chance = SUMMED_DEVIATIONS * math.sqrt((2 * CORRELATED_PX + 1) ** 2 / len(self.observed))
+        return max(raised, summed) if summed > 1 + chance else 1.0
 
     def covariance(self, fitted: LobeFit[Model]) -> Array:
         """Return the covariance of a fit's parameters, whose pixels differ in noise as told; its size is measured."""
@@ -127,9 +126,8 @@ class Photometric(OfHighlight):
         e, f, s = fitted.model.frame
         covariance = in_tangent_basis(pixels.covariance(fitted)[:2, :2], fitted.model.normal, np.stack([e, f]))
         excess, misfit = 0.0, False
-        if pixels.noise is not None and is_misfit(fitted, pixels.observed, pixels.clipped, pixels.noise):
-            misfit = True
-            excess = excess_of_misfit(fitted, pixels.observed, pixels.clipped)
+        if is_misfit(fitted, pixels):
+            misfit, excess = True, excess_of_misfit(fitted, pixels)
         else:
             covariance = covariance * pixels.correlation(fitted)
         budget = {"noise": covariance, **beyond_noise(highlight, excess)}
@@ -288,18 +286,20 @@ def in_tangent_basis(covariance: Array, normal: Array, basis: Array) -> Array:
     return np.asarray(turn @ covariance @ turn.T)
 
 
-def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None, noise: float | Array) -> bool:
+def is_misfit(fitted: LobeFit[ColocatedQuadric], pixels: HighlightPixels) -> bool:
     """Test whether the residuals hold more structure than the frame's noise: a chi-square test of their local means.
 
     A sum over single pixels would detect less, since misfits are smooth, and would need the noise to within a percent.
-    Pixels have intensities `observed`, shape (m,), and noise of standard deviation `noise`; clipped ones are left out.
+    Clipped pixels are left out; where the noise is not known nothing is tested.
     """
+    if pixels.noise is None:
+        return False
     model, _ = fitted.model.evaluate()
     e, f = fitted.model.frame[:2]
     rays = fitted.model.rays
-    kept = np.ones(len(model), dtype=bool) if clipped is None else ~clipped
-    residual, level = (observed - model)[kept], model[kept]
-    variance = np.broadcast_to(np.square(noise), model.shape)[kept]
+    kept = np.ones(len(model), dtype=bool) if pixels.clipped is None else ~pixels.clipped
+    residual, level = (pixels.observed - model)[kept], model[kept]
+    variance = np.broadcast_to(np.square(pixels.noise), model.shape)[kept]
     if len(residual) < RINGS * SECTORS * MIN_IN_BIN:
         return False
     # bins: rings by intensity, sectors by direction from the axis
@@ -317,27 +317,6 @@ def is_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask 
     return bool(np.sum(mean**2 / allowed) > chi_squared.quantile(1 - LEVEL, int(np.count_nonzero(used))))
 
 
-def correlation_of_noise(
-    fitted: LobeFit[Model], observed: Array, clipped: Mask | None, noise: float | Array, places: Index
-) -> float:
-    """Return by how much the noise's correlation between pixels raises a covariance of white residuals; 1: not at all.
-
-    A smooth model takes from correlated noise the sum of its correlations over all distances. Both the smoothed frame's
-    noise, `noise`, and the residuals must show more than chance; the larger one counts. `places` are the residuals'
-    rows and columns, shape (2, m).
-    """
-    raised = float(np.mean(np.square(noise))) / max(fitted.sigma**2, 1e-300)
-    if raised < COLOURED**2:
-        return 1.0
-    rows, columns = places - places.min(axis=1, keepdims=True)
-    kept = np.ones(len(observed)) if clipped is None else (~clipped).astype(float)
-    residual = kept * (observed - fitted.model.evaluate()[0])
-    sums, pairs = (_products(values, rows, columns) for values in (residual, kept))
-    summed = float((sums / np.maximum(pairs, 1.0)).sum()) / fitted.sigma**2
-    chance = SUMMED_DEVIATIONS * math.sqrt((2 * CORRELATED_PX + 1) ** 2 / len(observed))
-    return max(raised, summed) if summed > 1 + chance else 1.0
-
-
 def _products(values: Array, rows: Index, columns: Index) -> Array:
     """Return the sums of products of values at pixels up to `CORRELATED_PX` apart along both axes."""
     grid = np.zeros((int(rows.max()) + 1 + CORRELATED_PX, int(columns.max()) + 1 + CORRELATED_PX))
@@ -347,7 +326,7 @@ def _products(values: Array, rows: Index, columns: Index) -> Array:
     return np.asarray(products[np.ix_(near, near)])
 
 
-def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped: Mask | None) -> float:
+def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], pixels: HighlightPixels) -> float:
     """Return how far the normal moves, beyond noise, when only the pixels near the peak are fitted, squared, rad^2.
 
     It is 0 where these pixels alone do not determine a fit.
@@ -355,7 +334,7 @@ def excess_of_misfit(fitted: LobeFit[ColocatedQuadric], observed: Array, clipped
     model, _ = fitted.model.evaluate()
     near = model > INNER * model.max()
     part = replace(fitted.model, rays=fitted.model.rays[near])
-    inner = fit_lobe(part, observed[near], None if clipped is None else clipped[near])
+    inner = fit_lobe(part, pixels.observed[near], None if pixels.clipped is None else pixels.clipped[near])
     if inner is None:
         return 0.0
     moved = tangent_coordinates(fitted.model.normal, inner.model.normal)

@@ -13,7 +13,7 @@ import numpy as np
 
 from simtest.calibration import CameraPrior, Distribution, Normal, Priors
 from simtest.calibration.priors import AT_CAMERA_MM
-from simtest.estimators.budget import Budget, equivalent_covariance
+from simtest.estimators.budget import equivalent_covariance
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spots import HighlightAxis
 from simtest.geometry import Array, Camera, Patch, chi_squared
@@ -22,8 +22,7 @@ from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
 from simtest.runtime.fitted import fitted_number
 from simtest.runtime.statistics import CONFIDENCE
 
-SIDE = 40
-"""Shares of the offset, and of the distance, that are combined; fewer would miss the tail of near surfaces."""
+SIDE = 40  # shares of the offset, and of the distance, that are combined; fewer would miss the tail of near surfaces
 
 ANGLES = np.radians([0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 89.0, 105.0, 120.0])
 """Sightline's angles from the optical axis; a fisheye's go beyond 90 deg, where the moves would lie along one line."""
@@ -88,16 +87,14 @@ def _moves(angle: float, lights: Array, distance: Array) -> Array:
 CROWD = 3
 """A frame with more highlights than this for each light shows relief or folds: a smooth patch shows one for each."""
 
-AROUND = 12
-"""The brightest of so many nearest highlights stands for a highlight point's radiance."""
+AROUND = 12  # the brightest of so many nearest highlights stands for a highlight point's radiance
 
 BRIGHT = np.radians(fitted_number("near_misses.bright")) ** 2
 FAINT = np.radians(fitted_number("near_misses.faint")) ** 2
 USUAL, MOST = fitted_number("near_misses.usual"), fitted_number("near_misses.most")
 RARER = fitted_number("near_misses.rarer")
 
-APART = 3
-"""Lights of a larger number are a ring, whose highlights melt: it counts as so many."""
+APART = 3  # lights of a larger number are a ring, whose highlights melt: it counts as so many
 
 SEVERAL = 0.5
 """Share of the variance under two or three lights. Which light made a highlight is then seldom known, and that error is
@@ -106,12 +103,6 @@ would hold 99 % and more."""
 
 UNTOLD_FAINTNESS = 1.0
 """ln(I0 / I) where the patch does not know how bright the others are; two thirds of the spots have less."""
-
-
-def near_miss_parts(patch: Patch, priors: Priors) -> Budget:
-    """Return the part ``shape`` of a highlight that may be a near miss; a plane that is told has none."""
-    variance = 0.0 if priors.plane else near_miss_variance(patch, max(len(priors.lights_mm), 1))
-    return {"shape": variance * np.eye(2)} if variance > 0 else {}
 
 
 def near_miss_variance(patch: Patch, lights: int) -> float:
@@ -152,8 +143,7 @@ def _faintness(patch: Patch) -> float:
 NEAR_SHARE = 0.05
 """Share of the distances that are nearer than the one at which a told light's offset must be negligible."""
 
-NEGLIGIBLE = 0.1
-"""A squared error below this share of the stated variance is left out."""
+NEGLIGIBLE = 0.1  # a squared error below this share of the stated variance is left out
 
 SPOT_SPREAD = math.radians(fitted_number("spots_on_relief.spread"))
 SPOT_ONSET = math.radians(fitted_number("spots_on_relief.onset"))
@@ -163,18 +153,14 @@ STEEPER = fitted_number("steeper.share")
 1.07 (colon), 1.80 (liver) and 2.42 times (stomach; `studies.clouds.glint_slope`). A view that cuts a cloud may also
 show its steep side alone. A plane shows the whole cloud of a relief that is alike everywhere, so that it is 1 there."""
 
-STEP_MM = 1e-3
-"""Step of a light's position, mm, for the differences of the normal."""
-
-SHARES = (np.arange(64) + 0.5) / 64
-"""At these shares a prior of one number is sampled."""
+STEP_MM = 1e-3  # step of a light's position, mm, for the differences of the normal
+SHARES = (np.arange(64) + 0.5) / 64  # at these shares a prior of one number is sampled
 
 TILT = math.radians(10.0)
 """Standard deviation an axis of the angle between a falloff's axis and the optical axis: light guides beside an oblique
 lens or with lenses of their own shine up to 25 deg aside."""
 
-LEAST_COSINE = 0.1
-"""Cosine of the angle from its axis down to which a falloff is followed; little light is left there."""
+LEAST_COSINE = 0.1  # cosine of the angle from its axis down to which a falloff is followed; little light is left there
 
 _LATTICE = (np.arange(64)[:, None] * [1, 41, 49, 37, 53] % 64 + 0.5) / 64
 _TURNS = np.repeat(np.arange(4.0), 2)[:, None] + np.tile([0.5, -0.5], 4)[:, None] * _LATTICE[:, 2]
@@ -225,7 +211,10 @@ def add_common_parts(
     """
     if estimate.budget is None:
         return estimate
-    parts = {} if family is None else dict(near_miss_parts(family.patch, priors))
+    parts: dict[str, Array] = {}
+    if family is not None and not priors.plane:
+        variance = near_miss_variance(family.patch, max(len(priors.lights_mm), 1))
+        parts |= {"shape": variance * np.eye(2)} if variance > 0 else {}
     if not priors.camera.is_exact:
         if (turned := camera_part(estimate, camera, priors.camera)) is None:
             return estimate.without_uncertainty()
@@ -376,16 +365,12 @@ def _with_told_lights(estimate: Estimate, priors: Priors) -> Estimate:
         return estimate
     if estimate.covariance is not None:
         near = float(priors.distance.quantile(np.array(NEAR_SHARE)))
-        moved = half_angles(estimate.normal, near, priors.lights)
+        # how far each light moves the normal from the reversed sightline
+        bisectors = [bisect(-near * estimate.normal, light) for light in priors.lights]
+        moved = np.array([tangent_coordinates(estimate.normal, each) for each in bisectors])
         if float(np.max(np.sum(moved**2, axis=1))) < NEGLIGIBLE * np.trace(estimate.covariance):
             return estimate
     return replace(estimate, flags=(*estimate.flags, "light_offset")).without_uncertainty()
-
-
-def half_angles(normal: Array, distance: float, lights: Array) -> Array:
-    """Return how far each light moves the normal from the reversed sightline, rad, tangent basis, shape (L, 2)."""
-    position = -distance * normal
-    return np.array([tangent_coordinates(normal, bisect(position, light)) for light in lights])
 
 
 @lru_cache(maxsize=16)

@@ -262,11 +262,8 @@ ROUNDED, EXACT = 1e-3, 1e-9
 """A unit vector or covariance that is off by less than the first was printed with few digits, and is made exact; one
 that is off by less than the second keeps its last digits. Shares of the length and of the largest element."""
 
-LEAST_VARIANCE = 1e-24
-"""rad^2; below it a normal is more certain than its own digits."""
-
-LEAST_SHARE = 1e-12
-"""Of the largest variance squared: a determinant below it is rounding."""
+LEAST_VARIANCE = 1e-24  # rad^2; below it a normal is more certain than its own digits
+LEAST_SHARE = 1e-12  # of the largest variance squared: a determinant below it is rounding
 
 OUTSIDE = 0.5
 """An estimate looks at a pixel at most this share of the frame outside: the border may cut off a highlight's peak."""

@@ -25,18 +25,14 @@ from simtest.runtime.fitted import fitted_number
 
 OF_SPOTS = Descent(1e-2, 1e-9, 1e8, 40, 1e-9, ridge=(1e-12, 1e-30))
 
-EXACT = 1e-20
-"""Sum of squares, over the peak squared, that rounding alone leaves."""
-
-LEAST_VARIANCE_PX2 = 0.1
-"""A spot is no narrower than its pixel, whose own variance is 1/12 px^2."""
+EXACT = 1e-20  # sum of squares, over the peak squared, that rounding alone leaves
+LEAST_VARIANCE_PX2 = 0.1  # a spot is no narrower than its pixel, whose own variance is 1/12 px^2
 
 BACKGROUND_SLOPE = 0.01
 """Standard deviation of the background's slope, share of the spot's height per px: it has a prior, because the flank of
 a wide spot looks like a slope."""
 
-PRIOR_RESIDUAL = 0.02
-"""Residual, share of the height, against which that prior is weighed."""
+PRIOR_RESIDUAL = 0.02  # residual, share of the height, against which that prior is weighed
 
 HEIGHT, X, Y, XX, XY, YY, LEVEL, RIGHT, DOWN = range(9)
 """Parameters: height; centre, px; inverse covariance, 1/px^2; background at the window's centre, and its slope."""
@@ -145,15 +141,13 @@ def _stated(windows: SpotWindows, p: Array, squares: Array, normal: Array, sound
     return SpotFits(p, covariance, residual, sound)
 
 
-RESOLVED_PX = 3.0
-"""Least radius at half height, before smoothing, of a highlight whose isophotes are used."""
+RESOLVED_PX = 3.0  # least radius at half height, before smoothing, of a highlight whose isophotes are used
 
 SURROUNDINGS_SHARE = 0.2
 """The value that this share of a region's pixels stay below is that of its surroundings: the region is more than twice
 as wide as its highlight."""
 
-GAUSSIAN_RADIUS2 = 2 * math.log(2)
-"""Squared radius of a Gaussian at half height, over its variance."""
+GAUSSIAN_RADIUS2 = 2 * math.log(2)  # squared radius of a Gaussian at half height, over its variance
 
 WINDOW_RADII, WINDOW_PX = 1.3, 0.7
 """Pixels are fitted within so many radii of the smoothed spot, and so many px, of its peak."""
@@ -165,11 +159,8 @@ PIXEL_PX2, RADIUS_SHARE = fitted_number("small_spot.constant"), fitted_number("s
 MOMENTS_SHARE, RESIDUAL_SHARE = fitted_number("small_spot.moments"), fitted_number("small_spot.residual")
 NEIGHBOUR_PX4 = fitted_number("small_spot.neighbour")
 
-LEAST_GAP_PX = 4.0
-"""A neighbour that is nearer is part of the spot."""
-
-UNRESOLVED = "unresolved"
-"""Flag of estimates that state a small highlight's centre, and no shape."""
+LEAST_GAP_PX = 4.0  # a neighbour that is nearer is part of the spot
+UNRESOLVED = "unresolved"  # flag of estimates that state a small highlight's centre, and no shape
 
 
 @dataclass(frozen=True)
@@ -227,10 +218,7 @@ class SmallSpot:
         parts = {"noise": self.by_noise_px2, "resolution": self.by_shape_px2}
         return {name: np.asarray(self._by_pixel @ part @ self._by_pixel.T) for name, part in parts.items()}
 
-    @property
-    def peak_budget(self) -> Budget | None:
-        """The same."""
-        return self.axis_budget
+    peak_budget = axis_budget
 
     @property
     def no_shape(self) -> Failure:
@@ -246,8 +234,7 @@ class SmallSpot:
         return np.asarray((rays @ self.basis.T) / (rays @ self.axis)[:, None])
 
 
-HighlightAxis = IsophoteFamily | SmallSpot
-"""What states a highlight's axis, with its moments and its budget."""
+HighlightAxis = IsophoteFamily | SmallSpot  # what states a highlight's axis, with its moments and its budget
 
 
 def radius_before_smoothing_px(patch: Patch) -> float | None:

@@ -8,6 +8,7 @@ import numpy as np
 from simtest.calibration import Frame
 from simtest.errors import Failure
 from simtest.estimators.cloud import cloud
+from simtest.estimators.cloud_shape import slope_of
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
@@ -92,7 +93,7 @@ def _answer(frame: BaseFrame, estimate: Estimate) -> Answer:
     truth = frame.normals[matched].mean(axis=0)
     truth /= np.linalg.norm(truth)
     first, second = frame.gains[matched[0]].tolist()
-    told = shape.slope_with((first, second))
+    told = slope_of(shape.covariance, shape.independent, shape.lobe, (first, second))
     return Answer(
         spots=count,
         error_deg=float(angle_deg(estimate.normal, truth)),

@@ -15,7 +15,7 @@ from simtest.detection.detector import load_detector, run_detector
 from simtest.errors import Failure, InputError
 from simtest.estimators.learned import rotation_of
 from simtest.estimators.learned_dense import camera_values, dense_inputs, output_centres
-from simtest.estimators.learned_spot import rays_of, spot_inputs
+from simtest.estimators.learned_spot import spot_inputs
 from simtest.geometry import Camera
 from simtest.runtime.arrays import AnyArray, Array, Image
 from simtest.validation.runner import Progress
@@ -76,7 +76,7 @@ def _spots(sample: Sample, most: int) -> Examples:
     known &= np.isfinite(sample.images["curvature_base"][rows, columns]).all(axis=1)
     peaks, rows, columns = peaks[known], rows[known], columns[known]
     crops, extras = spot_inputs(frame, peaks)
-    rays = rays_of(frame.camera, peaks)
+    rays = frame.camera.unproject(peaks)
     gains = np.abs(1 + depth[rows, columns, None] * sample.images["curvature_base"][rows, columns])
     fine, fine_ratio = _fine(sample, peaks, rays)
     anatomy = sample.meta["anatomy"]

@@ -75,3 +75,17 @@ def test_neighbours_on_rough_tissue_hardly_ever_choose_one_of_three_lights(monke
     # Negative control.
     monkeypatch.setattr("simtest.estimators.bisector.ALONE", 1.0)
     assert chosen() >= 9
+
+
+@pytest.mark.filterwarnings("error")
+def test_lights_at_one_place_are_one_light():
+    patch, one = among([(-60, 0)]), Priors(LIGHTS[:1], exactly(20.0), falloff_power=None)
+    alone, twice = (
+        bisector.estimate(patch, CAMERA, replace(one, lights_mm=lights)) for lights in (LIGHTS[:1], LIGHTS[:1] * 2)
+    )
+    np.testing.assert_array_equal(twice.candidates, alone.candidates)
+    assert twice.flags == alone.flags
+    assert twice.budget.keys() == alone.budget.keys()
+    # Beside another one they are two that nothing tells apart.
+    both = bisector.estimate(patch, CAMERA, replace(one, lights_mm=LIGHTS[:1] + LIGHTS))
+    assert "ambiguous_light" in both.flags

@@ -10,7 +10,7 @@ from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Normal, Priors, ex
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved, sign_hypotheses
-from simtest.estimators.motion_signs import rank_by_motion
+from simtest.estimators.motion_signs import MovedView, rank_by_motions
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
@@ -29,6 +29,10 @@ SHAPES = {
     "saddle": (0.6, -0.5),
     "saddle beyond the centre": (0.6, -3.2),
 }
+
+
+def rank_by_motion(first, second, second_from_first, priors):
+    return rank_by_motions(first, [MovedView([second], second_from_first)], priors)
 
 
 def signs_of(kd):
@@ -152,8 +156,8 @@ def test_what_is_missing_or_malformed_is_said():
         assert isinstance(result, Failure)
         assert result.reason == Reason.NOT_KNOWN
     for motion in (np.eye(3), np.diag([1.0, 1, 2, 1]), np.diag([1.0, 1, -1, 1]), np.full((4, 4), np.nan)):
-        with pytest.raises(InputError, match="second_from_first"):
-            rank_by_motion(full, bare, motion, Priors(distance_mm=exactly(D)))
+        with pytest.raises(InputError, match="view_from_first"):
+            rank_by_motion(full, exact(bare.normal), motion, Priors(distance_mm=exactly(D)))
 
 
 def test_without_an_uncertainty_nothing_is_told():

@@ -1,7 +1,6 @@
 """Cores in any language: estimators that run in a process of their own and are asked over pipes or files."""
 
-PREFIX = "command:"
-"""What a name of an estimator begins with where it is a command."""
+PREFIX = "command:"  # what a name of an estimator begins with where it is a command
 
 
 def is_core(name: str) -> bool:

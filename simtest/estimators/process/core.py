@@ -198,11 +198,8 @@ def _program(what: str, word: str, folder: Path) -> Path:
     raise InputError(f"{what}: {word!s:.200} is not executable; must be a program ({called or 'chmod +x'})")
 
 
-MAX_FAULTS = 5
-"""After so many faults in a row a core is not started again."""
-
-KEPT_CORES = 8
-"""Cores that are kept at once; the one that was named last stays longest."""
+MAX_FAULTS = 5  # after so many faults in a row a core is not started again
+KEPT_CORES = 8  # cores that are kept at once; the one that was named last stays longest
 
 
 class Core:
@@ -367,6 +364,12 @@ class _Process:
 
     core: Core = field(repr=False)  # started once at least, so that its greeting is known
 
+    def _answer(self, request: tuple[Mapping[str, Any], Mapping[str, npt.NDArray[Any]]]) -> Message | Failure:
+        try:
+            return self.core.ask(*request)
+        except CoreFault as fault:
+            return Failure(fault.reason, fault.detail)
+
     @property
     def description(self) -> str:
         """What the core is, in one line for a reader who chooses an estimator."""
@@ -386,11 +389,8 @@ class ProcessEstimator(_Process):
 
     def estimate(self, patch: Patch, camera: Camera, priors: Priors = NO_PRIORS) -> Estimate | Failure:
         """Ask the core (see `simtest.estimators.Estimator`); its breakdown is a Failure ``core_...``."""
-        try:
-            answer = self.core.ask(*patch_request(patch, camera, priors, self._hello))
-        except CoreFault as fault:
-            return Failure(fault.reason, fault.detail)
-        return estimate_of(answer, camera, self._hello)
+        answer = self._answer(patch_request(patch, camera, priors, self._hello))
+        return answer if isinstance(answer, Failure) else estimate_of(answer, camera, self._hello)
 
 
 @dataclass(frozen=True)
@@ -401,11 +401,8 @@ class ProcessFrameEstimator(_Process):
         self, frame: Frame, camera: Camera, priors: Priors = NO_PRIORS
     ) -> list[Estimate | Failure] | Failure:
         """Ask the core (see `simtest.estimators.FrameEstimator`); its breakdown is a Failure ``core_...``."""
-        try:
-            answer = self.core.ask(*frame_request(frame, camera, priors, self._hello))
-        except CoreFault as fault:
-            return Failure(fault.reason, fault.detail)
-        return estimates_of(answer, camera, self._hello)
+        answer = self._answer(frame_request(frame, camera, priors, self._hello))
+        return answer if isinstance(answer, Failure) else estimates_of(answer, camera, self._hello)
 
 
 def load_core(text: str) -> ProcessEstimator | ProcessFrameEstimator:

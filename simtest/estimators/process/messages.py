@@ -36,8 +36,7 @@ PATCH_ARRAYS = ("values", "raw", "noise", "saturated", "seen", "rays")
 
 FRAME_ARRAYS = ("encoded", "channels", "intensity", "smoothed", "noise", "clipped", "seen", "rays")
 
-OUTLINES = ("isophote_", "isophote_rays_")
-"""Names of the arrays of an isovalue, without it."""
+OUTLINES = ("isophote_", "isophote_rays_")  # names of the arrays of an isovalue, without it
 
 MAX_ISOPHOTES = 16
 
@@ -185,10 +184,6 @@ class AnsweredCurvature(BaseModel):
     axis_ratio: Number
     hypotheses: Annotated[Array, _numbers(None, 2)] | None = None
 
-    def estimated(self) -> EstimatedCurvature:
-        """Return the curvature of an estimate."""
-        return EstimatedCurvature(self.directions, self.axis_ratio, self.hypotheses)
-
 
 class AnsweredEstimate(BaseModel):
     """What a core answers of one highlight: an `Estimate`, in the basis that it names."""
@@ -225,7 +220,7 @@ class AnsweredEstimate(BaseModel):
             isophotes=tuple(each.fitted() for each in self.isophotes or ()),
             choice_margin=self.choice_margin,
             flags=tuple(self.flags or ()),
-            curvature=None if self.curvature is None else self.curvature.estimated(),
+            curvature=None if self.curvature is None else EstimatedCurvature(**dict(self.curvature)),
             target=target if self.target is None else self.target,
             **self.uncertainty(normal),
         )
@@ -257,8 +252,7 @@ class AnsweredEstimate(BaseModel):
 
 
 MAX_ESTIMATES = 10_000
-OWN_REASONS = ("core_", "estimator_error")
-"""How the reasons begin that simtest alone gives."""
+OWN_REASONS = ("core_", "estimator_error")  # how the reasons begin that simtest alone gives
 
 
 def estimate_of(answer: Message, camera: Camera, hello: Hello) -> Estimate | Failure:
@@ -321,8 +315,7 @@ Named = dict[str, npt.NDArray[Any]]
 Offer = Mapping[str, Callable[[], npt.NDArray[Any] | str]]
 """How each array on offer is made; the making returns a text where there is none, which says why."""
 
-MOST_KEPT_RAYS = 1_000_000
-"""Pixels of the largest camera whose sightlines are kept: they take 24 bytes each."""
+MOST_KEPT_RAYS = 1_000_000  # pixels of the largest camera whose sightlines are kept: they take 24 bytes each
 
 
 @lru_cache(maxsize=8)

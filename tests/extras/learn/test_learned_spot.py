@@ -14,7 +14,7 @@ from simtest.calibration import Calibration, Priors
 from simtest.errors import Failure, InputError
 from simtest.estimators import Estimate
 from simtest.estimators.learned import METADATA, CovarianceScale, TrainingRange, inflation
-from simtest.estimators.learned_spot import EXTRAS, LearnedSpot, log_deviation, rays_of, spot_inputs
+from simtest.estimators.learned_spot import EXTRAS, LearnedSpot, log_deviation, spot_inputs
 from simtest.geometry import BrownConrady, Camera
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
@@ -153,7 +153,7 @@ def test_the_pipeline_runs_it_beside_the_others(made):
     with torch.no_grad():
         outputs = network(torch.from_numpy(crops), torch.from_numpy(extras))[0].numpy()[:, 0]
     inflated = learned._network.run(crops, extras)[1]
-    rays = rays_of(calibration().camera, peaks)
+    rays = calibration().camera.unproject(peaks)
     for result, ray, row, more in zip(results, rays, outputs, inflated, strict=True):
         assert result.target == "base"
         assert 0 < result.axis_ratio < 1

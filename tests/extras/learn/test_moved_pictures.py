@@ -7,7 +7,7 @@ import torch
 from test_spot_inputs import LIGHTS, PEAK, WIDTH, frame
 
 from simtest.estimators.learned import rotation_of
-from simtest.estimators.learned_spot import rays_of, spot_inputs
+from simtest.estimators.learned_spot import spot_inputs
 from studies.networks.spots import moved as moved_batch
 
 picture = test_spot_inputs.picture
@@ -35,7 +35,7 @@ def test_a_moved_picture_gives_moved_inputs(picture, change, moved):
     batch = {}
     for name, seen, at, true in (("before", before, PEAK, normal), ("after", after, peak, matrix @ normal)):
         crops, extras = spot_inputs(seen, [at])
-        rotation = rotation_of(rays_of(seen.camera, at[None]), true[None])
+        rotation = rotation_of(seen.camera.unproject(at[None]), true[None])
         batch[name] = {
             "crops": torch.from_numpy(crops), "extras": torch.from_numpy(extras),
             "base": torch.from_numpy(rotation), "fine": torch.from_numpy(rotation),
