@@ -132,8 +132,14 @@ class Body:
         """Return two opposite corners, mm, of a box that holds the body with a margin."""
         reach = np.array([np.sqrt(np.diagonal(np.linalg.inv(A))) for _, A, _ in self._lobes])
         centres = np.array([centre for centre, _, _ in self._lobes])
-        margin = 4.0 + self.recipe.blend_mm * math.log(len(self._lobes) + 1) + 2 * _WAVES * self.recipe.relief_mm
-        return (centres - reach).min(axis=0) - margin, (centres + reach).max(axis=0) + margin
+        waves = _WAVES * self.recipe.relief_mm
+        margin = 4.0 + self.recipe.blend_mm * math.log(len(self._lobes) + 1) + 2 * waves
+        # F < 0 only where some B_i is below h log n and the waves' height: in an ellipsoid, longer than the lobe by more
+        # than the margin where that is long and thin.
+        above = self.recipe.blend_mm * math.log(len(self._lobes)) + waves
+        far = reach * np.sqrt([[1 + 2 * above / scale] for _, _, scale in self._lobes])
+        low = np.minimum((centres - reach).min(axis=0) - margin, (centres - far).min(axis=0) - 1.0)
+        return low, np.maximum((centres + reach).max(axis=0) + margin, (centres + far).max(axis=0) + 1.0)
 
     def normals(self, points: Array) -> Array:
         """Return the unit outward normals of the level sets through points, shape (N, 3)."""
