@@ -14,7 +14,6 @@ All are lengths in mm; F < 0 in the tissue.
 
 import math
 from collections.abc import Callable
-from hashlib import blake2b
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, IntArray, Mask, kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
-from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows, remembered
+from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, outer, remembered
 from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
 from simtest.surfaces.triangles import MeshedSurface, face_edges, halve, rough_edges
 
@@ -102,14 +101,10 @@ def _soft_max(parts: list[Jet], width: float) -> Jet:
     gradient = sum((w[:, None] * part.gradient for w, part in zip(weights, parts, strict=True)), np.zeros(()))
     if len(parts[0].parts) < 3:
         return Jet(value, gradient)
-    hessian = -_outer(gradient) / width
+    hessian = -outer(gradient, gradient) / width
     for w, part in zip(weights, parts, strict=True):
-        hessian = hessian + w[:, None, None] * (part.hessian + _outer(part.gradient) / width)
+        hessian = hessian + w[:, None, None] * (part.hessian + outer(part.gradient, part.gradient) / width)
     return Jet(value, gradient, hessian)
-
-
-def _outer(vectors: Array) -> Array:
-    return vectors[:, :, None] * vectors[:, None, :]
 
 
 class Body:
@@ -134,8 +129,8 @@ class Body:
         centres = np.array([centre for centre, _, _ in self._lobes])
         waves = _WAVES * self.recipe.relief_mm
         margin = 4.0 + self.recipe.blend_mm * math.log(len(self._lobes) + 1) + 2 * waves
-        # F < 0 only where some B_i is below h log n and the waves' height: in an ellipsoid, longer than the lobe by more
-        # than the margin where that is long and thin.
+        # F < 0 only where some B_i is below h log n and the waves' height: in an ellipsoid, which is longer than the
+        # lobe by more than the margin where that is long and thin.
         above = self.recipe.blend_mm * math.log(len(self._lobes)) + waves
         far = reach * np.sqrt([[1 + 2 * above / scale] for _, _, scale in self._lobes])
         low = np.minimum((centres - reach).min(axis=0) - margin, (centres - far).min(axis=0) - 1.0)
@@ -240,33 +235,26 @@ class Liver(MeshedSurface):
     """A generated liver with the camera outside."""
 
     def __init__(self, mesh: TriangleMesh, key: str, body: Body) -> None:
-        super().__init__(mesh, key)
+        super().__init__(mesh, "liver", key)
         self.body = body
 
     def vertex_shape_operators(self) -> Array:
         """Return S by the level set (see `SurfaceModel.vertex_shape_operators`)."""
-
-        def operators(points: Array) -> Array:
-            at = self.body.evaluate(points)
-            return implicit_shape_operator(at.gradient, at.hessian)[1]
-
-        return in_blocks(operators, self.mesh.vertices)
+        return in_blocks(lambda some: self.form(some)[1], self.mesh.vertices)
 
     def clearance(self, points: Array) -> Array:
         """Return the distance to the mesh, mm, with the exact sign of F (see `SurfaceModel.clearance`)."""
         return np.where(self.body.values(points) > 0, 1.0, -1.0) * self.probe.distance(points)
 
-    def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return exact points by Newton's method on F along the rays; a ray that only grazes the mesh has none."""
-        distance = self.distances_at_hits(origins, directions, hits)
-        good = np.flatnonzero(np.isfinite(distance))
-        at = self.body.evaluate(origins[good] + distance[good, None] * directions[good])
-        normals, operators = in_rows(len(distance), good, *implicit_shape_operator(at.gradient, at.hessian))
-        return distance, normals, operators
+    def solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array]:
+        """Solve for distance and point by Newton's method on F; a ray that only grazes the mesh has none."""
+        distance = self.body.solve(origins, directions, hits.distance)
+        return distance, origins + distance[:, None] * directions
 
-    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Return exact distances (see `MeshedSurface.distances_at_hits`)."""
-        return self.body.solve(origins, directions, hits.distance)
+    def form(self, points: Array) -> tuple[Array, Array]:
+        """Return normals and S of the level sets through points (see `MeshedSurface.form`)."""
+        at = self.body.evaluate(points)
+        return implicit_shape_operator(at.gradient, at.hessian)
 
 
 @remembered
@@ -279,8 +267,7 @@ def build(recipe: LiverRecipe, edge_mm: float | None = None) -> Liver:
     """
     body, key = Body(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = kept("liver", key, lambda: vars(_mesh(body, edge_mm)))
-    digest = blake2b(key.encode(), digest_size=12).hexdigest()
-    return Liver(TriangleMesh(**arrays), f"liver-{digest}", body)
+    return Liver(TriangleMesh(**arrays), key, body)
 
 
 def _mesh(body: Body, edge_mm: float | None) -> TriangleMesh:

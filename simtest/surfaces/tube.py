@@ -389,7 +389,7 @@ class Tube:
         sine, cosine = np.sin(angle), np.cos(angle)
         zero = np.zeros_like(u)
         f, fu, fv = self.recipe.radius_mm + amplitude * cosine, zero.copy(), -3 * amplitude * sine
-        fuu, fuv, fvv = (zero.copy(), zero.copy(), -9 * amplitude * cosine) if second else (zero[:0],) * 3
+        fuu, fuv, fvv = zero.copy(), zero.copy(), -9 * amplitude * cosine
         # folds and sessile polyps
         sine_v, cosine_v = np.sin(v), np.cos(v)
         for fold in self._folds:
@@ -422,8 +422,8 @@ class Tube:
             fuu -= q * q * cosine
             fuv -= q * m * cosine
             fvv -= m * m * cosine
-        parts = [f, np.stack([fu, fv], axis=1), np.stack([fuu, fuv, fuv, fvv], axis=1).reshape(-1, 2, 2)]
-        return Jet(*parts[: 3 if second else 2])
+        hessian = [np.stack([fuu, fuv, fuv, fvv], axis=1).reshape(-1, 2, 2)] if second else []
+        return Jet(f, np.stack([fu, fv], axis=1), *hessian)
 
     def numbers(self) -> TubeNumbers:
         """Return the tube as numbers, without its pedunculated polyps."""
