@@ -139,9 +139,8 @@ def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
 
 def _positions(tube: Tube, parameters: Array) -> tuple[Array, Array]:
     """Return positions, mm, and unit normals into the lumen at (u, v), each of shape (N, 3)."""
-    positions, along, around = tube.tangents(parameters[:, 0], parameters[:, 1])
-    normals = np.cross(along, around)
-    return positions, unit(normals)
+    positions, along, around = tube.tangents(*parameters.T)
+    return positions, unit(np.cross(along, around))
 
 
 def _split(

@@ -23,7 +23,7 @@ from simtest.runtime.arrays import Array, IntArray, Mask, kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
 from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, outer, remembered
-from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
+from simtest.surfaces.recipe import LiverLobe, LiverRecipe
 from simtest.surfaces.triangles import MeshedSurface, face_edges, halve, rough_edges
 
 SIDE = 4
@@ -146,16 +146,13 @@ class Body:
         # B, then D with V
         blend, edge = self.recipe.blend_mm, self.recipe.edge_mm
         union = np.full(len(points), -np.inf)
-        for centre, A, scale in self._lobes:
-            d = points - centre
-            union = np.logaddexp(union, -0.5 * scale * (((d @ A) * d).sum(axis=1) - 1) / blend)
+        for lobe in self._lobes:
+            union = np.logaddexp(union, -_ellipsoid(points, lobe)[0] / blend)
         face, _ = self._face(points)
         f = edge * np.logaddexp(-blend * union / edge, face / edge)
         # G
         if self._fossa and self.recipe.fossa:
-            centre, A, scale = self._fossa
-            d = points - centre
-            bed = 0.5 * scale * (((d @ A) * d).sum(axis=1) - 1)
+            bed, _ = _ellipsoid(points, self._fossa)
             f = self.recipe.fossa.edge_mm * np.logaddexp(*(part / self.recipe.fossa.edge_mm for part in (f, -bed)))
         return f + self.recipe.relief_mm * np.cos(points @ self._waves.T + self._phases).sum(axis=1)
 
@@ -167,9 +164,9 @@ class Body:
         """
         rest = self._face(points)[1]
         steepest = np.linalg.norm(rest, axis=1) + radius / self.recipe.visceral_radius_mm
-        for centre, A, scale in (*self._lobes, *([self._fossa] if self._fossa else [])):
-            slope = scale * (np.linalg.norm((points - centre) @ A, axis=1) + radius * np.linalg.norm(A, 2))
-            steepest = np.maximum(steepest, slope)
+        for lobe in (*self._lobes, *([self._fossa] if self._fossa else [])):
+            slope = np.linalg.norm(_ellipsoid(points, lobe)[1], axis=1) + radius * np.linalg.norm(lobe[1], 2)
+            steepest = np.maximum(steepest, lobe[2] * slope)
         return np.asarray(steepest + self.recipe.relief_mm * np.linalg.norm(self._waves, axis=1).sum())
 
     def evaluate(self, points: Array, second: bool = True) -> Jet:
@@ -180,10 +177,8 @@ class Body:
             return Jet(value, gradient, *same)
 
         def ellipsoid(part: tuple[Array, Array, float], sign: float = 1.0) -> Jet:
-            centre, A, scale = part
-            d, scale = points - centre, sign * scale
-            Ad = d @ A
-            return quadratic(0.5 * scale * ((Ad * d).sum(axis=1) - 1), scale * Ad, scale * A)
+            value, across = _ellipsoid(points, part)
+            return quadratic(sign * value, sign * part[2] * across, sign * part[2] * part[1])
 
         # B, V, D and G of the module's head, then the waves
         lobes = _soft_max([ellipsoid(lobe) for lobe in self._lobes], -self.recipe.blend_mm)
@@ -224,11 +219,19 @@ class Body:
         return np.where(solved, t, np.nan)
 
 
-def _lobe(lobe: LiverLobe | LiverFossa) -> tuple[Array, Array, float]:
+def _lobe(lobe: LiverLobe) -> tuple[Array, Array, float]:
     """Return centre, matrix A of the unit level set, 1/mm^2, and scale a, mm, of a lobe."""
     angle, axes = math.radians(lobe.turn_deg), np.array(lobe.semi_axes_mm)
     turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
     return np.array(lobe.centre_mm), turn @ np.diag(axes**-2.0) @ turn.T, float(np.cbrt(axes.prod()))
+
+
+def _ellipsoid(points: Array, lobe: tuple[Array, Array, float]) -> tuple[Array, Array]:
+    """Return B_i, mm, of a lobe, and its gradient over a_i, at points of shape (N, 3)."""
+    centre, A, scale = lobe
+    d = points - centre
+    Ad = d @ A
+    return 0.5 * scale * ((Ad * d).sum(axis=1) - 1), Ad
 
 
 class Liver(MeshedSurface):

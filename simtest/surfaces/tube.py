@@ -33,6 +33,7 @@ from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
+from simtest.surfaces.model import outer
 from simtest.surfaces.recipe import ColonRecipe
 
 NECK_AT = 0.3
@@ -503,7 +504,7 @@ class Tube:
         first = (G / det)[:, None] * pu - (F / det)[:, None] * pv
         second = (E / det)[:, None] * pv - (F / det)[:, None] * pu
         along, across = L[:, None] * first + M[:, None] * second, M[:, None] * first + N[:, None] * second
-        return normal, first[:, :, None] * along[:, None, :] + second[:, :, None] * across[:, None, :]
+        return normal, outer(first, along) + outer(second, across)
 
     def solve(
         self, origins: Array, directions: Array, distance: Array, u: Array, v: Array
