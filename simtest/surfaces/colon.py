@@ -1,7 +1,6 @@
 """A generated colon, seen from inside: exact points on rays, and the mesh that is rendered."""
 
 import math
-from hashlib import blake2b
 
 import numpy as np
 from numpy.random import Generator
@@ -9,7 +8,7 @@ from numpy.random import Generator
 from simtest.errors import InputError
 from simtest.geometry.vectors import unit
 from simtest.runtime.arrays import AnyArray, Array, IntArray, kept
-from simtest.surfaces.model import RayHits, TriangleMesh, in_rows, remembered
+from simtest.surfaces.model import RayHits, TriangleMesh, remembered
 from simtest.surfaces.recipe import ColonRecipe
 from simtest.surfaces.triangles import (
     MeshedSurface,
@@ -47,7 +46,7 @@ class Colon(MeshedSurface):
     solid = False
 
     def __init__(self, mesh: TriangleMesh, key: str, tube: Tube, corners: Array) -> None:
-        super().__init__(mesh, key)
+        super().__init__(mesh, "colon", key)
         self.tube = tube
         self.corners = corners  # (F, 3, 2): (u, v) of each triangle's corners
 
@@ -60,7 +59,7 @@ class Colon(MeshedSurface):
         """Return S by the tube's formulas (see `SurfaceModel.vertex_shape_operators`)."""
         parameters = np.empty((len(self.mesh.vertices), 2))
         parameters[self.mesh.faces.ravel()] = self.corners.reshape(-1, 2)
-        return self.tube.normal_and_shape_operator(parameters[:, 0], parameters[:, 1])[1]
+        return self.form(*parameters.T)[1]
 
     def clearance(self, points: Array) -> Array:
         """Return the signed distance to the wall, mm; positive in the lumen (see `SurfaceModel.clearance`).
@@ -69,30 +68,23 @@ class Colon(MeshedSurface):
         perpendicular to T(u), in which the lumen is the disc below r(u, v).
         """
         u, v, radial = self.tube.slice_of(points)
-        free = (radial < self.tube.radius(u, v).value) & (u >= 0) & (u <= self.tube.recipe.length_mm)
+        free = (radial < self.tube.radius(u, v, second=False).value) & (u >= 0) & (u <= self.tube.recipe.length_mm)
         return np.where(free, 1.0, -1.0) * self.probe.distance(points)
 
-    def _solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
+    def solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
         """Solve for distance, u and v by Newton's method from the hits; a ray that only grazes the mesh has none."""
         u, v = np.einsum("nc,nck->kn", hits.weights, self.corners[hits.face])
         return self.tube.solve(origins, directions, hits.distance, u, v)
 
-    def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return exact points (see `MeshedSurface.at_hits`)."""
-        distance, u, v = self._solved(origins, directions, hits)
-        good = np.flatnonzero(np.isfinite(distance))
-        normals, operators = in_rows(len(u), good, *self.tube.normal_and_shape_operator(u[good], v[good]))
-        return distance, normals, operators
-
-    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Return exact distances (see `MeshedSurface.distances_at_hits`)."""
-        return self._solved(origins, directions, hits)[0]
+    def form(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Return normals and S by the tube's formulas (see `MeshedSurface.form`)."""
+        return self.tube.normal_and_shape_operator(u, v)
 
     def sites(self, rng: Generator) -> Array:
         """Draw sites around the middle part of the centreline, shape (N, 3), mm."""
         recipe, count = self.tube.recipe, 32
         u, v = recipe.length_mm * rng.uniform(0.2, 0.8, count), rng.uniform(0, 2 * math.pi, count)
-        radial = 0.6 * np.sqrt(rng.random(count)) * self.tube.radius(u, v).value
+        radial = 0.6 * np.sqrt(rng.random(count)) * self.tube.radius(u, v, second=False).value
         return self.tube.centreline(u) + radial[:, None] * self.tube.frame(u, v)[1]
 
 
@@ -106,8 +98,7 @@ def build(recipe: ColonRecipe, edge_mm: float | None = None) -> Colon:
     tube, key = Tube(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = {**kept("colon", key, lambda: _mesh(tube, edge_mm))}
     corners = arrays.pop("corners")
-    digest = blake2b(key.encode(), digest_size=12).hexdigest()
-    return Colon(TriangleMesh(**arrays), f"colon-{digest}", tube, corners)
+    return Colon(TriangleMesh(**arrays), key, tube, corners)
 
 
 def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
@@ -148,9 +139,8 @@ def _mesh(tube: Tube, edge_mm: float | None) -> dict[str, AnyArray]:
 
 def _positions(tube: Tube, parameters: Array) -> tuple[Array, Array]:
     """Return positions, mm, and unit normals into the lumen at (u, v), each of shape (N, 3)."""
-    positions, along, around = tube.tangents(parameters[:, 0], parameters[:, 1])
-    normals = np.cross(along, around)
-    return positions, unit(normals)
+    positions, along, around = tube.tangents(*parameters.T)
+    return positions, unit(np.cross(along, around))
 
 
 def _split(

@@ -14,7 +14,6 @@ All are lengths in mm; F < 0 in the tissue.
 
 import math
 from collections.abc import Callable
-from hashlib import blake2b
 
 import numpy as np
 
@@ -23,8 +22,8 @@ from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, IntArray, Mask, kept
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
-from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, in_rows, remembered
-from simtest.surfaces.recipe import LiverFossa, LiverLobe, LiverRecipe
+from simtest.surfaces.model import RayHits, TriangleMesh, implicit_shape_operator, outer, remembered
+from simtest.surfaces.recipe import LiverLobe, LiverRecipe
 from simtest.surfaces.triangles import MeshedSurface, face_edges, halve, rough_edges
 
 SIDE = 4
@@ -102,14 +101,10 @@ def _soft_max(parts: list[Jet], width: float) -> Jet:
     gradient = sum((w[:, None] * part.gradient for w, part in zip(weights, parts, strict=True)), np.zeros(()))
     if len(parts[0].parts) < 3:
         return Jet(value, gradient)
-    hessian = -_outer(gradient) / width
+    hessian = -outer(gradient, gradient) / width
     for w, part in zip(weights, parts, strict=True):
-        hessian = hessian + w[:, None, None] * (part.hessian + _outer(part.gradient) / width)
+        hessian = hessian + w[:, None, None] * (part.hessian + outer(part.gradient, part.gradient) / width)
     return Jet(value, gradient, hessian)
-
-
-def _outer(vectors: Array) -> Array:
-    return vectors[:, :, None] * vectors[:, None, :]
 
 
 class Body:
@@ -132,8 +127,14 @@ class Body:
         """Return two opposite corners, mm, of a box that holds the body with a margin."""
         reach = np.array([np.sqrt(np.diagonal(np.linalg.inv(A))) for _, A, _ in self._lobes])
         centres = np.array([centre for centre, _, _ in self._lobes])
-        margin = 4.0 + self.recipe.blend_mm * math.log(len(self._lobes) + 1) + 2 * _WAVES * self.recipe.relief_mm
-        return (centres - reach).min(axis=0) - margin, (centres + reach).max(axis=0) + margin
+        waves = _WAVES * self.recipe.relief_mm
+        margin = 4.0 + self.recipe.blend_mm * math.log(len(self._lobes) + 1) + 2 * waves
+        # F < 0 only where some B_i is below h log n and the waves' height: in an ellipsoid, which is longer than the
+        # lobe by more than the margin where that is long and thin.
+        above = self.recipe.blend_mm * math.log(len(self._lobes)) + waves
+        far = reach * np.sqrt([[1 + 2 * above / scale] for _, _, scale in self._lobes])
+        low = np.minimum((centres - reach).min(axis=0) - margin, (centres - far).min(axis=0) - 1.0)
+        return low, np.maximum((centres + reach).max(axis=0) + margin, (centres + far).max(axis=0) + 1.0)
 
     def normals(self, points: Array) -> Array:
         """Return the unit outward normals of the level sets through points, shape (N, 3)."""
@@ -145,16 +146,13 @@ class Body:
         # B, then D with V
         blend, edge = self.recipe.blend_mm, self.recipe.edge_mm
         union = np.full(len(points), -np.inf)
-        for centre, A, scale in self._lobes:
-            d = points - centre
-            union = np.logaddexp(union, -0.5 * scale * (((d @ A) * d).sum(axis=1) - 1) / blend)
+        for lobe in self._lobes:
+            union = np.logaddexp(union, -_ellipsoid(points, lobe)[0] / blend)
         face, _ = self._face(points)
         f = edge * np.logaddexp(-blend * union / edge, face / edge)
         # G
         if self._fossa and self.recipe.fossa:
-            centre, A, scale = self._fossa
-            d = points - centre
-            bed = 0.5 * scale * (((d @ A) * d).sum(axis=1) - 1)
+            bed, _ = _ellipsoid(points, self._fossa)
             f = self.recipe.fossa.edge_mm * np.logaddexp(*(part / self.recipe.fossa.edge_mm for part in (f, -bed)))
         return f + self.recipe.relief_mm * np.cos(points @ self._waves.T + self._phases).sum(axis=1)
 
@@ -166,9 +164,9 @@ class Body:
         """
         rest = self._face(points)[1]
         steepest = np.linalg.norm(rest, axis=1) + radius / self.recipe.visceral_radius_mm
-        for centre, A, scale in (*self._lobes, *([self._fossa] if self._fossa else [])):
-            slope = scale * (np.linalg.norm((points - centre) @ A, axis=1) + radius * np.linalg.norm(A, 2))
-            steepest = np.maximum(steepest, slope)
+        for lobe in (*self._lobes, *([self._fossa] if self._fossa else [])):
+            slope = np.linalg.norm(_ellipsoid(points, lobe)[1], axis=1) + radius * np.linalg.norm(lobe[1], 2)
+            steepest = np.maximum(steepest, lobe[2] * slope)
         return np.asarray(steepest + self.recipe.relief_mm * np.linalg.norm(self._waves, axis=1).sum())
 
     def evaluate(self, points: Array, second: bool = True) -> Jet:
@@ -179,10 +177,8 @@ class Body:
             return Jet(value, gradient, *same)
 
         def ellipsoid(part: tuple[Array, Array, float], sign: float = 1.0) -> Jet:
-            centre, A, scale = part
-            d, scale = points - centre, sign * scale
-            Ad = d @ A
-            return quadratic(0.5 * scale * ((Ad * d).sum(axis=1) - 1), scale * Ad, scale * A)
+            value, across = _ellipsoid(points, part)
+            return quadratic(sign * value, sign * part[2] * across, sign * part[2] * part[1])
 
         # B, V, D and G of the module's head, then the waves
         lobes = _soft_max([ellipsoid(lobe) for lobe in self._lobes], -self.recipe.blend_mm)
@@ -223,44 +219,45 @@ class Body:
         return np.where(solved, t, np.nan)
 
 
-def _lobe(lobe: LiverLobe | LiverFossa) -> tuple[Array, Array, float]:
+def _lobe(lobe: LiverLobe) -> tuple[Array, Array, float]:
     """Return centre, matrix A of the unit level set, 1/mm^2, and scale a, mm, of a lobe."""
     angle, axes = math.radians(lobe.turn_deg), np.array(lobe.semi_axes_mm)
     turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
     return np.array(lobe.centre_mm), turn @ np.diag(axes**-2.0) @ turn.T, float(np.cbrt(axes.prod()))
 
 
+def _ellipsoid(points: Array, lobe: tuple[Array, Array, float]) -> tuple[Array, Array]:
+    """Return B_i, mm, of a lobe, and its gradient over a_i, at points of shape (N, 3)."""
+    centre, A, scale = lobe
+    d = points - centre
+    Ad = d @ A
+    return 0.5 * scale * ((Ad * d).sum(axis=1) - 1), Ad
+
+
 class Liver(MeshedSurface):
     """A generated liver with the camera outside."""
 
     def __init__(self, mesh: TriangleMesh, key: str, body: Body) -> None:
-        super().__init__(mesh, key)
+        super().__init__(mesh, "liver", key)
         self.body = body
 
     def vertex_shape_operators(self) -> Array:
         """Return S by the level set (see `SurfaceModel.vertex_shape_operators`)."""
-
-        def operators(points: Array) -> Array:
-            at = self.body.evaluate(points)
-            return implicit_shape_operator(at.gradient, at.hessian)[1]
-
-        return in_blocks(operators, self.mesh.vertices)
+        return in_blocks(lambda some: self.form(some)[1], self.mesh.vertices)
 
     def clearance(self, points: Array) -> Array:
         """Return the distance to the mesh, mm, with the exact sign of F (see `SurfaceModel.clearance`)."""
         return np.where(self.body.values(points) > 0, 1.0, -1.0) * self.probe.distance(points)
 
-    def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return exact points by Newton's method on F along the rays; a ray that only grazes the mesh has none."""
-        distance = self.distances_at_hits(origins, directions, hits)
-        good = np.flatnonzero(np.isfinite(distance))
-        at = self.body.evaluate(origins[good] + distance[good, None] * directions[good])
-        normals, operators = in_rows(len(distance), good, *implicit_shape_operator(at.gradient, at.hessian))
-        return distance, normals, operators
+    def solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array]:
+        """Solve for distance and point by Newton's method on F; a ray that only grazes the mesh has none."""
+        distance = self.body.solve(origins, directions, hits.distance)
+        return distance, origins + distance[:, None] * directions
 
-    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Return exact distances (see `MeshedSurface.distances_at_hits`)."""
-        return self.body.solve(origins, directions, hits.distance)
+    def form(self, points: Array) -> tuple[Array, Array]:
+        """Return normals and S of the level sets through points (see `MeshedSurface.form`)."""
+        at = self.body.evaluate(points)
+        return implicit_shape_operator(at.gradient, at.hessian)
 
 
 @remembered
@@ -273,8 +270,7 @@ def build(recipe: LiverRecipe, edge_mm: float | None = None) -> Liver:
     """
     body, key = Body(recipe), f"{recipe.model_dump_json()} {edge_mm}"
     arrays = kept("liver", key, lambda: vars(_mesh(body, edge_mm)))
-    digest = blake2b(key.encode(), digest_size=12).hexdigest()
-    return Liver(TriangleMesh(**arrays), f"liver-{digest}", body)
+    return Liver(TriangleMesh(**arrays), key, body)
 
 
 def _mesh(body: Body, edge_mm: float | None) -> TriangleMesh:

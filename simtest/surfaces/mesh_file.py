@@ -302,8 +302,8 @@ def _outward(vertices: Array, faces: IntArray) -> tuple[IntArray, int, int]:
     return np.ascontiguousarray(outward, dtype=np.int64), int(against), int(turned.sum())
 
 
-def examine(vertices: Array, faces: IntArray, crossings: bool = True) -> Condition:
-    """Find the faults of a mesh from `repair`; `crossings`, the search for self-intersections, takes longest."""
+def examine(vertices: Array, faces: IntArray) -> Condition:
+    """Find the faults of a mesh from `repair`; the search for self-intersections takes longest."""
     import igl
     from igl import predicates
 
@@ -311,7 +311,7 @@ def examine(vertices: Array, faces: IntArray, crossings: bool = True) -> Conditi
     # Connected by shared vertices: two pieces that touch in one vertex count as one.
     pieces = int(np.max(igl.vertex_components(faces))) + 1
     crossing = None
-    if crossings and len(faces) <= MAX_CROSSING_FACES:
+    if len(faces) <= MAX_CROSSING_FACES:
         crossed, pairs, _ = predicates.find_self_intersections(vertices, faces)
         crossing = len(np.unique(pairs)) if crossed else 0
     return Condition(pieces, int((uses == 1).sum()), int((uses > 2).sum()), crossing)

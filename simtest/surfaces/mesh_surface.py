@@ -3,7 +3,6 @@
 import math
 import warnings
 from collections.abc import Iterator
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +16,7 @@ from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.resources import find
 from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces.mesh_file import MESH_SUFFIXES, Repairs, examine, other_unit, read_mesh
-from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, principal_curvatures, remembered
+from simtest.surfaces.model import RayHits, SurfacePoints, TriangleMesh, outer, principal_curvatures, remembered
 from simtest.surfaces.poses import at_viewpoint, nearest_mm
 from simtest.surfaces.triangles import (
     MeshedSurface,
@@ -148,9 +147,7 @@ def shape_operators(vertices: Array, faces: IntArray) -> Array:
     fitted: Any = igl.principal_curvature(vertices, faces, CURVATURE_RINGS, True)
     first, second, k1, k2 = fitted[:4]
     # S = k1 d1 d1^T + k2 d2 d2^T
-    operators = k1[:, None, None] * first[:, :, None] * first[:, None, :]
-    operators += k2[:, None, None] * second[:, :, None] * second[:, None, :]
-    return np.asarray(operators)
+    return np.asarray(outer(k1[:, None] * first, first) + outer(k2[:, None] * second, second))
 
 
 LUMEN_QUOTIENT = 0.1
@@ -185,7 +182,7 @@ class MeshSurface(MeshedSurface):
     def __init__(
         self, mesh: TriangleMesh, key: str, operators: Array, lumen: bool, subdivisions: int, shortest_mm: float
     ) -> None:
-        super().__init__(mesh, key)
+        super().__init__(mesh, "mesh", key)
         self._operators = operators  # (V, 3, 3): S at the vertices, 1/mm, for the mesh's normals; NaN: the fit failed
         self.lumen, self.solid = lumen, not lumen
         self.subdivisions = subdivisions  # How often the mesh was subdivided
@@ -200,24 +197,17 @@ class MeshSurface(MeshedSurface):
         """Return the signed distance to the mesh (see `SurfaceModel.clearance`)."""
         return self.probe.clearance(points)
 
-    def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return what the mesh holds at the hits themselves (see `MeshedSurface.at_hits`).
-
-        The normal is the normalised barycentric mean of the vertex normals; S is that of the vertices' tensors,
-        projected on the plane perpendicular to that normal.
-        """
+    def solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, IntArray, Array]:
+        """Return the hits themselves, with the vertices and weights of their triangles' corners."""
         # The renderer's hits are single precision: too coarse for the derivatives of a fine relief.
         hits = on_triangles(origins, directions, hits, self.mesh)
-        # Linear between the corners, as the renderer shades it
-        corners = self.mesh.faces[hits.face]
-        normal = unit(np.einsum("nc,nci->ni", hits.weights, self.mesh.normals[corners]))
-        operator = np.einsum("nc,ncij->nij", hits.weights, self._operators[corners])
-        across = projector(normal)
-        return hits.distance, normal, across @ operator @ across
+        return hits.distance, self.mesh.faces[hits.face], hits.weights
 
-    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Return the distances of the hits on the triangles, in double precision."""
-        return on_triangles(origins, directions, hits, self.mesh).distance
+    def form(self, corners: IntArray, weights: Array) -> tuple[Array, Array]:
+        """Return what the mesh holds between its vertices, linear as the renderer shades it, S across the normal."""
+        normal = unit(np.einsum("nc,nci->ni", weights, self.mesh.normals[corners]))
+        across = projector(normal)
+        return normal, across @ np.einsum("nc,ncij->nij", weights, self._operators[corners]) @ across
 
     def motion(self, points: SurfacePoints, hits: RayHits) -> tuple[Array, Array]:
         """Return how points and normals move within the hit triangles (see `SurfaceModel.motion`)."""
@@ -230,18 +220,13 @@ class MeshSurface(MeshedSurface):
         # The mean of the corners' normals is linear: its gradient from those of the second and third weights.
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = 1 / dot(plane, plane)[:, None]
-        gradient = _outer(b - a, np.cross(second_edge, plane) * scale) + _outer(
-            c - a, np.cross(plane, first_edge) * scale
-        )
+        gradient = outer(b - a, np.cross(second_edge, plane) * scale)
+        gradient += outer(c - a, np.cross(plane, first_edge) * scale)
         mean = np.einsum("nc,nci->ni", hits.weights, mesh.normals[faces])
         # Turned as the points' normals are, which face the rays.
         length = np.linalg.norm(mean, axis=1) * np.sign(dot(mean, points.normal_base))
         across = projector(points.normal_base)
         return plane, across @ gradient / length[:, None, None]
-
-
-def _outer(a: Array, b: Array) -> Array:
-    return np.asarray(a[:, :, None] * b[:, None, :])
 
 
 def on_triangles(origins: Array, directions: Array, hits: RayHits, mesh: TriangleMesh) -> RayHits:
@@ -323,9 +308,8 @@ def _prepare(
     if lumen:
         # Everything turned inward, to the camera's side
         faces, normals, operators = np.ascontiguousarray(faces[:, ::-1]), -normals, -operators
-    digest = blake2b(repr((*file, times, smoothing, lumen)).encode(), digest_size=12).hexdigest()
-    mesh = TriangleMesh(vertices, faces, normals)
-    return MeshSurface(mesh, f"mesh-{digest}", operators, lumen, times, max(smoothing, own_wave))
+    mesh, key = TriangleMesh(vertices, faces, normals), repr((*file, times, smoothing, lumen))
+    return MeshSurface(mesh, key, operators, lumen, times, max(smoothing, own_wave))
 
 
 def is_lumen(vertices: Array, faces: IntArray, kind: str) -> bool:

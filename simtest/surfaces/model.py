@@ -295,11 +295,13 @@ def principal(a: Array, b: Array, c: Array, tangents: tuple[Array, Array]) -> tu
 
 def shape_operator(points: SurfacePoints) -> Array:
     """Return S, shape (N, 3, 3), of the principal curvatures and directions of points."""
-    parts = [
-        (k[:, None] * direction)[:, :, None] * direction[:, None, :]
-        for k, direction in ((points.k_min, points.direction_min), (points.k_max, points.direction_max))
-    ]
-    return np.asarray(parts[0] + parts[1])
+    first, second = points.direction_min, points.direction_max
+    return outer(points.k_min[:, None] * first, first) + outer(points.k_max[:, None] * second, second)
+
+
+def outer(a: Array, b: Array) -> Array:
+    """Return the outer products of vectors, both of shape (N, 3), shape (N, 3, 3)."""
+    return np.asarray(a[:, :, None] * b[:, None, :])
 
 
 def principal_curvatures(shape_operator: Array) -> tuple[Array, Array]:

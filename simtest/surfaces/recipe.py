@@ -96,12 +96,10 @@ class LiverLobe(Spec):
     turn_deg: float = Field(0.0, ge=-180, le=180, description="turn about z, deg from x to y")
 
 
-class LiverFossa(Spec):
+class LiverFossa(LiverLobe):
     """The bed of the gallbladder: an ellipsoid taken out of the visceral face."""
 
-    centre_mm: Vector = Field(description="centre, mm")
     semi_axes_mm: tuple[FossaExtent, FossaExtent, FossaExtent] = Field(description="half extents, mm")
-    turn_deg: float = Field(0.0, ge=-180, le=180, description="turn about z, deg from x to y")
     edge_mm: float = Field(2.5, ge=0.5, le=20, description="length over which its rim is rounded, mm")
 
 

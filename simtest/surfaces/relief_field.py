@@ -19,7 +19,7 @@ from simtest.geometry.vectors import projector, tangent_basis, unit
 from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.surfaces import Relief, ReliefBand
 from simtest.surfaces.jets import Jet
-from simtest.surfaces.model import SurfacePoints, in_rows, principal, remembered, shape_operator
+from simtest.surfaces.model import SurfacePoints, in_rows, outer, principal, remembered, shape_operator
 
 NODES = 96
 """Nodes of the lattice along each side; the field repeats after as many."""
@@ -160,7 +160,7 @@ def normal_derivative(N: Array, S: Array, jets: Jet) -> tuple[Array, Array]:
     length = np.linalg.norm(m, axis=1)
     normal = m / length[:, None]
     rest = np.einsum("ni,nij->nj", G, S) + np.einsum("ni,nij->nj", N, H)
-    derivative = (1 + along)[:, None, None] * S + N[:, :, None] * rest[:, None, :] - H
+    derivative = (1 + along)[:, None, None] * S + outer(N, rest) - H
     across = projector(normal)
     return normal, across @ derivative / length[:, None, None]
 
@@ -222,11 +222,9 @@ def _unscaled(kind: str, width: float, entropy: int, spawn_key: tuple[int, ...])
     """
     # Imported here: slow to load, and smooth scenes have no relief.
     from scipy import ndimage
-    from scipy.spatial.transform import Rotation
 
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(entropy, spawn_key=spawn_key)))
-    # A uniformly random rotation; by itself, as scipy changed the name of its generator's argument.
-    turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
+    turn = random_turn(rng)
     # The shell's radius, for which sections have about NODES_PER_WAVE nodes a wave.
     w = width
     k0 = 2 * np.pi / NODES_PER_WAVE * np.sqrt(1.25 * (1 + w**2) / (1 + 6 * w**2 + 3 * w**4))
@@ -255,6 +253,14 @@ def _make_band(spec: ReliefBand, branch: np.random.SeedSequence, diffusion_mm: f
     height = np.radians(spec.slope_deg) / slope * (spec.wavelength_mm / wave)
     coefficients = unscaled * height
     return BandField(lattice_from_model, coefficients, _diffused(coefficients, lattice_from_model, diffusion_mm))
+
+
+def random_turn(rng: np.random.Generator) -> Array:
+    """Draw a uniformly random rotation, shape (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    # From a quaternion, as scipy changed the name of its generator's argument.
+    return np.asarray(Rotation.from_quat(rng.standard_normal(4)).as_matrix())
 
 
 def _wave_numbers(nodes: int) -> list[Array]:

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from simtest.runtime.arrays import AnyArray, Array, kept
 from simtest.spec.reflectance import TissueColour
 from simtest.surfaces.model import SurfaceModel, remembered
-from simtest.surfaces.relief_field import shell_noise
+from simtest.surfaces.relief_field import random_turn, shell_noise
 from simtest.surfaces.vessels import (
     NO_VESSELS,
     PatternPatch,
@@ -209,8 +208,7 @@ def _mottling(wavelength: float, rng: np.random.Generator) -> Lattice:
     k0 = 2 * np.pi / MOTTLING_NODES
     field = shell_noise(rng, NODES, lambda k: np.exp(-(((k / k0 - 1) / MOTTLING_WIDTH) ** 2) / 4))
     field = np.clip(field, -MOTTLING_LIMIT, MOTTLING_LIMIT)
-    turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
-    return Lattice(turn * (MOTTLING_NODES / wavelength), _float32(field))
+    return Lattice(random_turn(rng) * (MOTTLING_NODES / wavelength), _float32(field))
 
 
 def _net(spacing: float, rng: np.random.Generator) -> Lattice:
@@ -224,8 +222,7 @@ def _net(spacing: float, rng: np.random.Generator) -> Lattice:
     # Distance to the plane halfway between the two nearest centres
     to_wall = (distance[:, 1] ** 2 - distance[:, 0] ** 2) / (2 * np.linalg.norm(apart, axis=1))
     wall = np.exp(-((to_wall / WALL) ** 2)).reshape((NODES,) * 3)
-    turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
-    return Lattice(turn * (MESH_NODES / spacing), _float32(wall))
+    return Lattice(random_turn(rng) * (MESH_NODES / spacing), _float32(wall))
 
 
 def _apart(rng: np.random.Generator, side: float) -> Array:

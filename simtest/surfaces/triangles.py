@@ -5,7 +5,8 @@ from abc import abstractmethod
 from collections.abc import Callable
 from copy import copy
 from functools import cached_property
-from typing import Self
+from hashlib import blake2b
+from typing import Any, Self
 
 import numpy as np
 from numpy.random import Generator
@@ -139,10 +140,12 @@ class MeshProbe:
 
     def clearance(self, points: Array) -> Array:
         """Return signed distances of points, mm, by the interpolated normal: also of an open mesh."""
+        import igl
+
         squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points))
         # The normal at the closest point, interpolated in its triangle
         corners = self._mesh.vertices[self._mesh.faces[face]]
-        weights = _barycentric(closest, corners)
+        weights = igl.barycentric_coordinates(closest, *np.ascontiguousarray(corners.swapaxes(0, 1)))
         normal = np.einsum("nc,nci->ni", weights, self._mesh.normals[self._mesh.faces[face]])
         side = dot(points - closest, normal)
         return np.where(side >= 0, 1.0, -1.0) * np.sqrt(squared)
@@ -182,22 +185,13 @@ class MeshProbe:
         return sites.reshape(-1, 3)
 
 
-def _barycentric(points: Array, corners: Array) -> Array:
-    """Return barycentric weights, shape (N, 3), of points in triangles with corners of shape (N, 3, 3)."""
-    a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
-    aa, ab, bb = (dot(*pair) for pair in ((a, a), (a, b), (b, b)))
-    pa, pb = dot(p, a), dot(p, b)
-    determinant = np.maximum(aa * bb - ab * ab, np.finfo(float).tiny)
-    second, third = (bb * pa - ab * pb) / determinant, (aa * pb - ab * pa) / determinant
-    return np.stack([1 - second - third, second, third], axis=1)
-
-
 class MeshedSurface(SurfaceModel):
     """A surface that is rendered as a mesh; it is built once, and copied for each of its poses."""
 
-    def __init__(self, mesh: TriangleMesh, key: str) -> None:
+    def __init__(self, mesh: TriangleMesh, kind: str, key: str) -> None:
         self.mesh = mesh  # mm; normals and winding on the camera's side
-        self.key = key  # Identity of recipe or file, and settings
+        # Identity of recipe or file, and settings
+        self.key = f"{kind}-{blake2b(key.encode(), digest_size=12).hexdigest()}"
 
     @cached_property
     def probe(self) -> MeshProbe:
@@ -223,20 +217,23 @@ class MeshedSurface(SurfaceModel):
         """Return S at the mesh's vertices for its normals, 1/mm, shape (V, 3, 3)."""
 
     @abstractmethod
-    def at_hits(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Array, Array, Array]:
-        """Return distance, normal and S of the surface on rays that hit the mesh; NaN if there is no solution."""
+    def solved(self, origins: Array, directions: Array, hits: RayHits) -> tuple[Any, ...]:
+        """Return distances along rays that hit the mesh, NaN without a solution, and what `form` takes there."""
 
     @abstractmethod
-    def distances_at_hits(self, origins: Array, directions: Array, hits: RayHits) -> Array:
-        """Return the distances of `at_hits` alone."""
+    def form(self, *place: Any) -> tuple[Array, Array]:
+        """Return unit normals and S, 1/mm, at places of the surface."""
 
     def distances(self, origins: Array, directions: Array, hits: RayHits) -> Array:
         """Return how far along rays the surface lies (see `SurfaceModel.distances`)."""
         hit = np.flatnonzero(np.isfinite(hits.distance))
-        return in_rows(len(origins), hit, self.distances_at_hits(origins[hit], directions[hit], hits.rows(hit)))[0]
+        return in_rows(len(origins), hit, self.solved(origins[hit], directions[hit], hits.rows(hit))[0])[0]
 
     def points(self, origins: Array, directions: Array, hits: RayHits) -> SurfacePoints:
         """Return the points where rays meet the surface (see `SurfaceModel.points`)."""
         hit = np.flatnonzero(np.isfinite(hits.distance))
-        at_hits = self.at_hits(origins[hit], directions[hit], hits.rows(hit))
-        return pack_points(origins, directions, *in_rows(len(origins), hit, *at_hits))
+        distance, *place = self.solved(origins[hit], directions[hit], hits.rows(hit))
+        good = np.flatnonzero(np.isfinite(distance))
+        form = self.form(*(part[good] for part in place))
+        [distance] = in_rows(len(origins), hit, distance)
+        return pack_points(origins, directions, distance, *in_rows(len(origins), hit[good], *form))

@@ -33,6 +33,7 @@ from simtest.geometry.vectors import dot, unit
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import Stage, generator
 from simtest.surfaces.jets import Jet
+from simtest.surfaces.model import outer
 from simtest.surfaces.recipe import ColonRecipe
 
 NECK_AT = 0.3
@@ -389,7 +390,7 @@ class Tube:
         sine, cosine = np.sin(angle), np.cos(angle)
         zero = np.zeros_like(u)
         f, fu, fv = self.recipe.radius_mm + amplitude * cosine, zero.copy(), -3 * amplitude * sine
-        fuu, fuv, fvv = (zero.copy(), zero.copy(), -9 * amplitude * cosine) if second else (zero[:0],) * 3
+        fuu, fuv, fvv = zero.copy(), zero.copy(), -9 * amplitude * cosine
         # folds and sessile polyps
         sine_v, cosine_v = np.sin(v), np.cos(v)
         for fold in self._folds:
@@ -422,8 +423,8 @@ class Tube:
             fuu -= q * q * cosine
             fuv -= q * m * cosine
             fvv -= m * m * cosine
-        parts = [f, np.stack([fu, fv], axis=1), np.stack([fuu, fuv, fuv, fvv], axis=1).reshape(-1, 2, 2)]
-        return Jet(*parts[: 3 if second else 2])
+        hessian = [np.stack([fuu, fuv, fuv, fvv], axis=1).reshape(-1, 2, 2)] if second else []
+        return Jet(f, np.stack([fu, fv], axis=1), *hessian)
 
     def numbers(self) -> TubeNumbers:
         """Return the tube as numbers, without its pedunculated polyps."""
@@ -503,7 +504,7 @@ class Tube:
         first = (G / det)[:, None] * pu - (F / det)[:, None] * pv
         second = (E / det)[:, None] * pv - (F / det)[:, None] * pu
         along, across = L[:, None] * first + M[:, None] * second, M[:, None] * first + N[:, None] * second
-        return normal, first[:, :, None] * along[:, None, :] + second[:, :, None] * across[:, None, :]
+        return normal, outer(first, along) + outer(second, across)
 
     def solve(
         self, origins: Array, directions: Array, distance: Array, u: Array, v: Array

@@ -297,20 +297,7 @@ def _mesh(mesh: TriangleMesh, key: str) -> PatternPatch:
 
 
 def spread_points(patch: PatternPatch, distance_mm: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Draw points no two of which are nearer than a distance, about as dense as that allows.
-
-    Returns points, mm, and unit normals, shape (N, 3). The distance is wider, with a warning, where there would be more
-    than `MAX_POINTS`.
-    """
-    # Random dart throwing reaches about 0.7 points per square of the distance.
-    least = math.sqrt(0.7 * patch.area / MAX_POINTS)
-    if distance_mm < least:
-        warnings.warn(
-            f"reflectance.albedo.vessels.spacing_mm: a surface of {patch.area:.0f} mm^2 would need more than "
-            f"{MAX_POINTS} points; the vessels stand {least / distance_mm:.2g} times as far apart",
-            stacklevel=2,
-        )
-        distance_mm = least
+    """Draw points, mm, and unit normals, shape (N, 3), no two nearer than a distance, about as dense as that allows."""
     count = max(16, math.ceil(CANDIDATES * patch.area / distance_mm**2))
     points, normals = patch.draw(rng, count)
     kept = thinned(points, distance_mm)
@@ -387,8 +374,19 @@ class VesselSegments:
 @remembered
 def grow_vessels(patch: PatternPatch, spec: Vessels, seed: int) -> Forest:
     """Grow the vessels of a surface; the last few are cached."""
+    # The systems share the surface: the ends of one are farther apart than those of both.
+    spacing = spec.spacing_mm * math.sqrt(SYSTEMS)
+    # Random dart throwing reaches about 0.7 points per square of the distance.
+    least = NODES_PER_SPACING * math.sqrt(0.7 * patch.area / MAX_POINTS)
+    if spacing < least:
+        warnings.warn(
+            f"reflectance.albedo.vessels.spacing_mm: a surface of {patch.area:.0f} mm^2 would need more than "
+            f"{MAX_POINTS} points; the vessels stand {least / spacing:.2g} times as far apart",
+            stacklevel=2,
+        )
+        spacing = least
     branches = np.random.SeedSequence(seed).spawn(SYSTEMS)
-    parts = [_grow(patch, spec, np.random.Generator(np.random.SFC64(branch))) for branch in branches]
+    parts = [_grow(patch, spec, spacing, np.random.Generator(np.random.SFC64(branch))) for branch in branches]
     # One list of nodes: parents are numbered from its start.
     first = np.concatenate([[0], np.cumsum([len(part[0]) for part in parts])])
     position, normal, parent, radius = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -396,10 +394,10 @@ def grow_vessels(patch: PatternPatch, spec: Vessels, seed: int) -> Forest:
     return Forest(position, normal, np.where(parent >= 0, parent + first[system], -1), radius, system == 1)
 
 
-def _grow(patch: PatternPatch, spec: Vessels, rng: np.random.Generator) -> tuple[Array, Array, IntArray, Array]:
-    """Grow one system; return positions, normals, parents and radii."""
-    # The systems share the surface: the ends of one are farther apart than those of both.
-    spacing = spec.spacing_mm * math.sqrt(SYSTEMS)
+def _grow(
+    patch: PatternPatch, spec: Vessels, spacing: float, rng: np.random.Generator
+) -> tuple[Array, Array, IntArray, Array]:
+    """Grow one system, whose ends are so far apart, mm; return positions, normals, parents and radii."""
     points, normals = spread_points(patch, spacing / NODES_PER_SPACING, rng)
     ends = thinned(points, spacing * 0.8)
     graph = _neighbours(points, normals, spec.tortuosity, rng)

@@ -171,3 +171,16 @@ def test_the_fossa_is_a_hollow_and_the_size_is_that_of_a_liver(recipe):
     centre = np.array(recipe.fossa.centre_mm)
     hollow = mesh.vertices[without.values(mesh.vertices) < -2]
     assert np.linalg.norm(hollow - centre, axis=1).max() < 40
+
+
+def test_long_thin_lobes_that_melt_into_each_other_stay_whole():
+    """Far out on its long axis a level set leaves the ellipsoid by much more than the depth of the blend."""
+    import trimesh
+
+    lobes = [
+        {"centre_mm": (0, 0, 0), "semi_axes_mm": (150, 12, 12)},
+        {"centre_mm": (-20, 5, 0), "semi_axes_mm": (150, 14, 12)},
+    ]
+    recipe = LiverRecipe.model_validate({"lobes": lobes, "blend_mm": 20.0, "relief_mm": 1.0})
+    mesh = build(recipe, 3.0).mesh
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight

@@ -6,7 +6,7 @@ import pytest
 from simtest.rendering import Session, trace
 from simtest.spec import scene_from_dict
 from simtest.spec.reflectance import TISSUE_PRESETS, TissueColour
-from simtest.surfaces import make_surface
+from simtest.surfaces import make_surface, vessels
 from simtest.surfaces.tissue_pattern import BLUR_PER_DEPTH, _make, blood_absorption, make_pattern, reach
 from simtest.surfaces.vessels import (
     ENDLESS,
@@ -467,3 +467,17 @@ def test_a_surface_too_small_for_two_nodes_has_no_vessels():
     pattern = make_pattern(surface, TissueColour())
     points, _ = surface_patch(surface).draw(np.random.default_rng(1), 50)
     assert not pattern.vessels.chords(points).any()
+
+
+def test_a_large_surface_gets_vessels_as_far_apart_as_its_warning_says(monkeypatch):
+    monkeypatch.setattr(vessels, "MAX_POINTS", 2000)
+    spec = TissueColour(vessels={"spacing_mm": 1.0}).vessels
+    with pytest.warns(UserWarning, match=r"vessels stand 2 times as far apart") as caught:
+        forest = grow_vessels(surface_patch(surface_of("plane")), spec, 1)
+    factor = float(str(caught[0].message).split("stand ")[1].split()[0])
+    ends = np.setdiff1d(np.arange(len(forest.parent)), forest.parent)
+    for vein in (False, True):
+        points = forest.position[ends[forest.vein[ends] == vein]]
+        gap = np.linalg.norm(points[:, None] - points, axis=2)
+        # Of one system; both share the surface.
+        assert gap[gap > 0].min() > 0.95 * 0.8 * factor * np.sqrt(2)
