@@ -396,7 +396,8 @@ def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Visib
 
     light = np.where(np.isfinite(light), light, 0.0).astype(np.float64)
     if seen is not None:
-        light = np.where(seen, light, 0.0)
+        # The lens spreads light over the border of the view.
+        light, specular = np.where(seen, light, 0.0), np.where(seen, specular, np.float32(0))
     none = np.empty(0, dtype=np.int64)
     empty = VisibleSpots(none, none, np.zeros(light.shape, dtype=np.int64))
     if light.max() <= 0:
