@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration
-from simtest.conventions import HIGHLIGHT_MIN_GAIN
+from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_MIN_GAIN
 from simtest.errors import InputError
-from simtest.geometry import Camera
+from simtest.geometry import Camera, smooth
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
 from simtest.rendering.highlights import radii_px
 from simtest.runtime.arrays import Array, Image, Mask, short_repr
@@ -112,8 +112,8 @@ class RenderedView:
 
     @cached_property
     def _specular(self) -> Image:
-        """Mean of the channels of the lobe's light behind the lens, shape (H, W)."""
-        return _mean(collect(self.radiance.specular, self.scene.sensor, self.camera))
+        """The lobe's light behind the lens, shape (H, W) or (H, W, 3)."""
+        return collect(self.radiance.specular, self.scene.sensor, self.camera)
 
     @cached_property
     def _judged_light(self) -> Image:
@@ -123,7 +123,7 @@ class RenderedView:
     @cached_property
     def spots(self) -> VisibleSpots:
         """The pixels of the spots that can be seen in the noise-free frame, also of those on instruments."""
-        return find_spots(_mean(self._judged_light), self._specular, self.camera.seen)
+        return find_spots(_mean(self._judged_light), _mean(self._specular), self.camera.seen)
 
     @cached_property
     def visible_highlights(self) -> list[VisibleHighlight]:
@@ -132,7 +132,7 @@ class RenderedView:
         sigma = noise_at(light, self.full_scale, sensor, spots.rows, spots.columns, FEW_DRAWS)
         clip = self.full_scale if sensor.clips else math.inf
         seen = self.camera.seen
-        return describe(spots, _mean(light), self._specular, sigma, self.highlights, seen, self.instruments, clip)
+        return describe(spots, light, self._specular, sigma, self.highlights, seen, self.instruments, clip)
 
     def frame(self, seed: int) -> Image:
         """Return the sensor's frame with the noise of a seed."""
@@ -301,7 +301,12 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
     ):
         rows, columns = np.array([examined[i].peak for i in indices], dtype=int).reshape(-1, 2).T
         sigmas[indices] = noise_at(direct, full_scale, scene.sensor, rows, columns, draws)
-    return verdicts(points, examined, sigmas, full_scale if scene.sensor.clips else math.inf), full_scale
+    clip = full_scale if scene.sensor.clips else math.inf
+    if direct.ndim == 3 and direct.max() > clip:
+        # Tissue's red is clipped long before its green: each channel shows the height that is left to it.
+        limited = smooth(_mean(np.minimum(direct, np.float32(clip))), DEFAULT_SMOOTHING_PX, camera.seen)
+        examined = [each.clipped(limited, camera.seen) for each in examined]
+    return verdicts(points, examined, sigmas, clip), full_scale
 
 
 def _placed(

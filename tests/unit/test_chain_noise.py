@@ -81,7 +81,9 @@ def test_scaling_a_small_highlight_is_no_noise(factor, coding):
     found = noise_at(light, 1.0, sensor, rows, columns, 32)
     rng = np.random.default_rng(0)
     variance = np.var([capture(light, 1.0, sensor, rng) for _ in range(40)], axis=0, ddof=1)
-    around = [variance[row - 1 : row + 2, column - 1 : column + 2].mean() for row, column in zip(rows, columns)]
+    around = [
+        variance[row - 1 : row + 2, column - 1 : column + 2].mean() for row, column in zip(rows, columns, strict=True)
+    ]
     assert np.median(found / np.sqrt(around)) == pytest.approx(1, abs=0.15)
 
 
