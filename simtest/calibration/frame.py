@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration.calibration import Calibration, CorrectedFrame
+from simtest.calibration.calibration import Calibration, CorrectedFrame, mean_channel
 from simtest.errors import Failure
 from simtest.geometry.camera import Camera
 from simtest.geometry.patch import Patch, share_of_noise, smooth
@@ -214,17 +214,26 @@ class Frame:
         corrected, model, white = self.corrected, self.calibration.noise, self._white
         if model.is_silent and corrected.gain is None:
             return white
-        known = model.at(smooth(corrected.linear, self.smoothing_px, self.seen), corrected.channels)
+        # Shot noise and steps are those of all the light, also where `light` is a part of it.
+        whole = corrected.linear if self.light is None else mean_channel(self.channels)
+        known = model.at(smooth(whole, self.smoothing_px, self.seen), corrected.channels)
+        if self.light is not None:
+            # Such a part has more noise than the mean of the channels, at most that of one channel.
+            own, most = estimate_noise(whole, self.seen, self._ends), math.sqrt(corrected.channels)
+            known = known * min(max(white / own, 1.0), most) if own > 0 else known * most
         noise = np.maximum(white, known)
         return np.asarray(noise if corrected.gain is None else noise * corrected.gain, dtype=np.float32)
 
     @cached_property
     def _white(self) -> float:
         """Noise at the finest scale, where it is white, before the falloff's correction amplifies it."""
+        return estimate_noise(self.corrected.linear, self.seen, self._ends)
+
+    @property
+    def _ends(self) -> Mask | None:
+        """Pixels at either end of the sensor's range: one that clips at full scale clips at 0 as well."""
         corrected = self.corrected
-        # A sensor that clips at full scale clips at 0 as well.
-        clipped = None if corrected.saturated is None else corrected.saturated | (corrected.linear <= 0)
-        return estimate_noise(corrected.linear, self.seen, clipped)
+        return None if corrected.saturated is None else corrected.saturated | (corrected.linear <= 0)
 
     @cached_property
     def noise_as_smoothed(self) -> float | Image:

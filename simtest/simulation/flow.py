@@ -116,13 +116,6 @@ class Flow:
     flow_px: Array
     state: npt.NDArray[np.uint8]
 
-    @property
-    def covisible(self) -> float:
-        """Share of the pixels with a surface point whose point the other frame sees; NaN without any."""
-        counts = np.bincount(self.state.ravel(), minlength=len(STATES))
-        surface = int(counts[SEEN] + counts[OUT] + counts[HIDDEN])
-        return float(counts[SEEN] / surface) if surface else float("nan")
-
 
 def flow_between(session: Session, first: SeenSurface, second: SeenSurface, moved: Moved | None = None) -> Flow:
     """Compute the flow from the first frame to the second, in either order of time.
@@ -164,10 +157,7 @@ def hides(session: Session, centre: Array, points: Array) -> Mask:
 
     `centre` is that of one camera, shape (3,), or of each point's, shape (N, 3).
     """
-    towards = points - centre
-    distance = np.sqrt(np.einsum("ij,ij->i", towards, towards))
-    directions = towards / distance[:, None]
-    origins = np.broadcast_to(centre, points.shape)
+    origins, directions, distance = _rays(centre, points)
     hidden = session.blocked(origins, directions, distance * (1 - SLACK))
     # Grazing rays may meet the mesh where the exact surface is free.
     doubtful = np.flatnonzero(hidden)
@@ -183,11 +173,17 @@ def hides(session: Session, centre: Array, points: Array) -> Mask:
     return hidden
 
 
-def _not_shown(session: Session, centre: Array, points: Array) -> Mask:
-    """Return which points, world frame, mm, are not the exact surface's points on the rays from a camera centre."""
+def _rays(centre: Array, points: Array) -> tuple[Array, Array, Array]:
+    """Return origins, unit directions and lengths of the ways from a centre to points, shape (N, 3)."""
     towards = points - centre
     distance = np.sqrt(np.einsum("ij,ij->i", towards, towards))
-    exact = session.exact_distances(np.broadcast_to(centre, points.shape), towards / distance[:, None])
+    return np.broadcast_to(centre, points.shape), towards / distance[:, None], distance
+
+
+def _not_shown(session: Session, centre: Array, points: Array) -> Mask:
+    """Return which points, world frame, mm, are not the exact surface's points on the rays from a camera centre."""
+    origins, directions, distance = _rays(centre, points)
+    exact = session.exact_distances(origins, directions)
     # Another point, nearer, or farther where the mesh lets the ray pass; a ray without a solution touches at best.
     return ~(np.abs(exact - distance) < EXACT * distance)
 

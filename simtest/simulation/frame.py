@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.calibration import Calibration
-from simtest.conventions import HIGHLIGHT_MIN_GAIN
+from simtest.calibration.calibration import mean_channel
+from simtest.conventions import DEFAULT_SMOOTHING_PX, HIGHLIGHT_MIN_GAIN
 from simtest.errors import InputError
-from simtest.geometry import Camera
+from simtest.geometry import Camera, smooth
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
 from simtest.rendering.highlights import radii_px
 from simtest.runtime.arrays import Array, Image, Mask, short_repr
@@ -108,12 +109,12 @@ class RenderedView:
     @cached_property
     def lobe(self) -> Image:
         """Mean of the channels of the lobe's direct light before the lens, shape (H, W)."""
-        return _mean(self.radiance.specular)
+        return mean_channel(self.radiance.specular)
 
     @cached_property
     def _specular(self) -> Image:
-        """Mean of the channels of the lobe's light behind the lens, shape (H, W)."""
-        return _mean(collect(self.radiance.specular, self.scene.sensor, self.camera))
+        """The lobe's light behind the lens, shape (H, W) or (H, W, 3)."""
+        return collect(self.radiance.specular, self.scene.sensor, self.camera)
 
     @cached_property
     def _judged_light(self) -> Image:
@@ -123,7 +124,7 @@ class RenderedView:
     @cached_property
     def spots(self) -> VisibleSpots:
         """The pixels of the spots that can be seen in the noise-free frame, also of those on instruments."""
-        return find_spots(_mean(self._judged_light), self._specular, self.camera.seen)
+        return find_spots(mean_channel(self._judged_light), mean_channel(self._specular), self.camera.seen)
 
     @cached_property
     def visible_highlights(self) -> list[VisibleHighlight]:
@@ -132,7 +133,7 @@ class RenderedView:
         sigma = noise_at(light, self.full_scale, sensor, spots.rows, spots.columns, FEW_DRAWS)
         clip = self.full_scale if sensor.clips else math.inf
         seen = self.camera.seen
-        return describe(spots, _mean(light), self._specular, sigma, self.highlights, seen, self.instruments, clip)
+        return describe(spots, light, self._specular, sigma, self.highlights, seen, self.instruments, clip)
 
     def frame(self, seed: int) -> Image:
         """Return the sensor's frame with the noise of a seed."""
@@ -232,7 +233,7 @@ def render_picture(session: Session, scene: Scene, radiance: Radiance | None = N
         session.update(scene)
         radiance = session.radiance()
     light, seen = collect(radiance.total, scene.sensor, session.camera), session.camera.seen
-    full_scale = _metered(scene, _mean(light), seen)
+    full_scale = _metered(scene, mean_channel(light), seen)
     if full_scale is None:
         full_scale = _judged(session, scene, radiance, light)[1]
     return capture(light, full_scale, scene.sensor, from_integer(scene.sensor.seed), seen)
@@ -285,14 +286,14 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
     camera = session.camera
     direct = _direct(radiance, light, scene, camera)
     points, rough = session.highlights(radiance), session.surface.relief is not None
-    examined = examine(points, _mean(direct), camera.seen, single=rough)
-    full_scale = _metered(scene, _mean(light), camera.seen)
+    examined = examine(points, mean_channel(direct), camera.seen, single=rough)
+    full_scale = _metered(scene, mean_channel(light), camera.seen)
     if full_scale is None:
         # Which highlights are isolated is judged without noise first.
-        mean = _mean(direct)
+        mean = mean_channel(direct)
         shown = [h.bp_px for h in verdicts(points, examined, np.zeros(len(points))) if h.isolated]
         pixels = np.minimum(np.array(shown).reshape(-1, 2).astype(int), [mean.shape[1] - 1, mean.shape[0] - 1])
-        peak = float(mean.max()) or float(_mean(light).max())
+        peak = float(mean.max()) or float(mean_channel(light).max())
         full_scale = max(mean[pixels[:, 1], pixels[:, 0]].tolist(), default=peak) / scene.sensor.exposure.gain
     sigmas = np.zeros(len(points))
     for draws, indices in (
@@ -301,7 +302,12 @@ def _judged(session: Session, scene: Scene, radiance: Radiance, light: Image) ->
     ):
         rows, columns = np.array([examined[i].peak for i in indices], dtype=int).reshape(-1, 2).T
         sigmas[indices] = noise_at(direct, full_scale, scene.sensor, rows, columns, draws)
-    return verdicts(points, examined, sigmas, full_scale if scene.sensor.clips else math.inf), full_scale
+    clip = full_scale if scene.sensor.clips else math.inf
+    if direct.ndim == 3 and direct.max() > clip:
+        # Tissue's red is clipped long before its green: each channel shows the height that is left to it.
+        limited = smooth(mean_channel(np.minimum(direct, np.float32(clip))), DEFAULT_SMOOTHING_PX, camera.seen)
+        examined = [each.clipped(limited, camera.seen) for each in examined]
+    return verdicts(points, examined, sigmas, clip), full_scale
 
 
 def _placed(
@@ -322,11 +328,6 @@ def _placed(
         for h, radius, number in zip(highlights, radii, numbers, strict=True)
     ]
     return placed, centres
-
-
-def _mean(image: Image) -> Image:
-    """Return the mean of an image's channels, shape (H, W)."""
-    return image if image.ndim == 2 else image.mean(axis=2, dtype=np.float32)
 
 
 def _metered(scene: Scene, light: Image, seen: Mask | None) -> float | None:

@@ -189,7 +189,7 @@ def _description(frame: LabelledFrame) -> Json:
 def thumbnail(picture: Picture) -> Picture:
     """Return a picture, shape (H, W, 3), at the size it has on a sheet."""
     width = SHEET_WIDTH // SHEET_COLUMNS
-    size = (width, round(width * picture.shape[0] / picture.shape[1]))
+    size = (width, max(round(width * picture.shape[0] / picture.shape[1]), 1))
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 

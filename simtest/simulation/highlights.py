@@ -9,11 +9,12 @@ the truth shares no code with what it judges.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from simtest.calibration.calibration import mean_channel
 from simtest.conventions import (
     DEFAULT_SMOOTHING_PX,
     HIGHLIGHT_CONTRAST_SIGMA,
@@ -172,13 +173,22 @@ class Examined:
     """What a highlight point makes of the noise-free frame, whatever the noise.
 
     Row and column of the maximum that it makes, the smoothed light there, its height above its surroundings (None where
-    it has no closed region of its own), and why it is not isolated even if it stands above the noise; empty: it is.
+    it has no closed region of its own), why it is not isolated even if it stands above the noise (empty: it is), and
+    its region above half height.
     """
 
     peak: Pixel
     level: float
     height: float | None
     why_not: str
+    component: Component | None = None
+
+    def clipped(self, smoothed: Image, seen: Mask | None) -> "Examined":
+        """Return what it makes of light whose channels are clipped, smoothed, in the same region."""
+        if self.component is None:
+            return self
+        level = float(smoothed[self.peak])
+        return replace(self, level=level, height=contrast(smoothed, self.component, level, seen))
 
 
 def examine(
@@ -199,8 +209,7 @@ def examine(
     examined = []
     for point, peak in zip(points, peaks, strict=True):
         others = pixels[[other is not point for other in lit]] if single and owners.get(peak) is point else pixels[:0]
-        height, why_not = _examined(point, smoothed, seen, peak, owners.get(peak) is point, others)
-        examined.append(Examined(peak, float(smoothed[peak]), height, why_not))
+        examined.append(_examined(point, smoothed, seen, peak, owners.get(peak) is point, others))
     return examined
 
 
@@ -257,26 +266,27 @@ def _owners(points: Sequence[HighlightPoint], peaks: list[Pixel]) -> dict[Pixel,
 
 def _examined(
     point: HighlightPoint, smoothed: Image, seen: Mask | None, peak: Pixel, owns_peak: bool, others: IntArray
-) -> tuple[float | None, str]:
-    """Return the height of a highlight point's maximum and the first condition but that of noise that it fails.
+) -> Examined:
+    """Examine a highlight point, whose maximum is at a peak, by all conditions but that of noise.
 
     `others` are columns and rows, shape (N, 2), of the points that may not lie in its half-height region.
     """
+    level = float(smoothed[peak])
     if not point.lit:
-        return None, "hidden by an instrument" if point.hidden else "in shadow"
+        return Examined(peak, level, None, "hidden by an instrument" if point.hidden else "in shadow")
     component = half_height_component(smoothed, *peak, seen) if owns_peak else None
     # Uphill may lead far: to another highlight, or to where the base is brightest.
     if component is None or not component.holds(point.bp_px[None]).all():
-        return None, "part of a brighter one"
-    height = contrast(smoothed, component, float(smoothed[peak]), seen)
-    if component.holds(others).any():
-        return height, "holds several glints"
+        return Examined(peak, level, None, "part of a brighter one")
     # Shape, frame, noise: in the order of theory.md section 6.
-    if point.min_gain <= HIGHLIGHT_MIN_GAIN:
-        return height, f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}"
-    if not component.closed:
-        return height, "isophote at t = 0.5 leaves the frame"
-    return height, ""
+    why_not = ""
+    if component.holds(others).any():
+        why_not = "holds several glints"
+    elif point.min_gain <= HIGHLIGHT_MIN_GAIN:
+        why_not = f"min abs(1 + d k) at most {HIGHLIGHT_MIN_GAIN:g}"
+    elif not component.closed:
+        why_not = "isophote at t = 0.5 leaves the frame"
+    return Examined(peak, level, contrast(smoothed, component, level, seen), why_not, component)
 
 
 def _peak_pixel(smoothed: Image, point: HighlightPoint) -> Pixel:
@@ -396,7 +406,8 @@ def find_spots(light: Image, specular: Image, seen: Mask | None = None) -> Visib
 
     light = np.where(np.isfinite(light), light, 0.0).astype(np.float64)
     if seen is not None:
-        light = np.where(seen, light, 0.0)
+        # The lens spreads light over the border of the view.
+        light, specular = np.where(seen, light, 0.0), np.where(seen, specular, np.float32(0))
     none = np.empty(0, dtype=np.int64)
     empty = VisibleSpots(none, none, np.zeros(light.shape, dtype=np.int64))
     if light.max() <= 0:
@@ -453,11 +464,13 @@ def describe(
 ) -> list[VisibleHighlight]:  # fmt: skip
     """Describe the spots of a frame, the brightest first.
 
-    `light`, `specular` and `seen` are those of `find_spots`, `sigma`, shape (N,), is the noise at each peak, radiance.
-    Of the `glints`, all of the frame, the brightest that a spot holds gives its light and cloud, or else the nearest
-    lit one. `instruments`, shape (H, W), is 1 + the index of the instrument that is seen, 0 where none is; `clip` the
-    radiance at which the sensor's values end.
+    `light`, `specular` and `seen` are those of `find_spots`, the first two with their channels, if any, `sigma`, shape
+    (N,), is the noise at each peak, radiance. Of the `glints`, all of the frame, the brightest that a spot holds gives
+    its light and cloud, or else the nearest lit one. `instruments`, shape (H, W), is 1 + the index of the instrument
+    that is seen, 0 where none is; `clip` the radiance at which the values of each of the sensor's channels end.
     """
+    channels, light = (light, specular), mean_channel(light)
+    specular = mean_channel(specular)
     lit = [number for number, glint in enumerate(glints) if glint.lit]
     at = np.array([glints[number].bp_px for number in lit]).reshape(-1, 2)
     # the pixels of each spot, row by row
@@ -475,7 +488,10 @@ def describe(
         if not (held or owner) and lit:
             nearest = lit[int(np.linalg.norm(at - peak, axis=1).argmin())]
         value, lobe = float(light[row, column]), float(specular[row, column])
-        shown = min(value, clip) - min(value - lobe, clip)
+        every, own = (np.asarray(part[row, column], dtype=float) for part in channels)
+        shown = lobe
+        if every.max() > clip:
+            shown = float(np.mean(np.minimum(every, clip) - np.minimum(every - own, clip)))
         centroid, axis_ratio, whole = _shape(*np.divmod(pixels[number], light.shape[1]), specular, seen)
         described.append(
             VisibleHighlight(

@@ -76,8 +76,9 @@ CELL, BLOCK = 32, 16
 """Pixels along a side of what is drawn around a pixel, and of the blocks of lossy coding, with which it keeps step: at
 least 8 px are around the pixel, as far as sharpening reaches."""
 
-UNCLIPPED = 0.7
-"""Of full scale: so bright the light is made where more would be clipped, which has no noise."""
+UNCLIPPED, NEARLY_CLIPPED = 0.7, 0.9
+"""Of full scale: so bright the light is made where more would be clipped, which has no noise, and its brightest channel
+where that alone would be."""
 
 CELLS = 2**10
 """Cells of one picture."""
@@ -470,7 +471,14 @@ def noise_at(light: Image, full_scale: float, sensor: Sensor, rows: IntArray, co
         noise = sensor.noise_model().at(np.minimum(level, 1) if sensor.clips else level, colour.shape[2])
         return np.asarray(noise) * full_scale
     share = np.minimum(1, UNCLIPPED / np.maximum(level, 1e-12)) if sensor.clips else np.ones(len(rows))
+    if sensor.clips:
+        brightest = colour[rows, columns].max(axis=1) / full_scale
+        share = np.where(share * brightest < 1, share, NEARLY_CLIPPED / np.maximum(brightest, 1e-12))
     plain, rng, at_once = sensor.model_copy(update={"overlay": None}), from_integer(0), max(1, CELLS // draws)
+    if plain.scaling is not None:
+        # All cells are scaled alike: where a pixel falls between those recorded is no noise.
+        whole = plain.scaling.model_copy(update={"factor": round(CELL * plain.scaling.factor) / CELL})
+        plain = plain.model_copy(update={"scaling": whole})
     deviations = []
     for first in range(0, len(rows), at_once):
         batch = slice(first, first + at_once)

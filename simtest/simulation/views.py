@@ -241,20 +241,17 @@ class ViewWriter:
         shown = to_uint8(sensor.response.model().decode(frame).astype(np.float32))
         shown = np.ascontiguousarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR) if shown.ndim == 2 else shown[:, :, ::-1])
         if self._fps is not None:
-            self._write(shown, self._fps)
+            if self._film is None:
+                # Motion JPEG is the codec that OpenCV writes everywhere.
+                file, codec = str(self._folder / PART), cv2.VideoWriter.fourcc(*"MJPG")
+                self._film = cv2.VideoWriter(file, codec, self._fps, (shown.shape[1], shown.shape[0]))
+                if not self._film.isOpened():
+                    raise InputError(f"{self._folder / FILM}: no film can be written here (OpenCV has no Motion JPEG)")
+            self._film.write(shown)
         self._thumbnails.append(thumbnail(np.asarray(shown, dtype=np.uint8)))
         if self._labels is not None:
             self._labels.add(session, view)
         return name, seed
-
-    def _write(self, picture: Picture, fps: float) -> None:
-        if self._film is None:
-            # Motion JPEG is the codec that OpenCV writes everywhere.
-            file, codec = str(self._folder / PART), cv2.VideoWriter.fourcc(*"MJPG")
-            self._film = cv2.VideoWriter(file, codec, fps, (picture.shape[1], picture.shape[0]))
-            if not self._film.isOpened():
-                raise InputError(f"{self._folder / FILM}: no film can be written here (OpenCV has no Motion JPEG)")
-        self._film.write(picture)
 
     def close(self) -> None:
         """Finish the film, and write the sheet and the labels."""

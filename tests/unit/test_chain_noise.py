@@ -6,7 +6,7 @@ import pytest
 from simtest.rendering import Session
 from simtest.simulation.frame import render_view
 from simtest.simulation.highlights import examine
-from simtest.simulation.sensor import noise_at
+from simtest.simulation.sensor import capture, noise_at
 from simtest.spec import load_scene
 from simtest.spec.sensor import PRESETS, Sensor
 
@@ -67,3 +67,28 @@ def test_a_chain_that_draws_no_noise_has_that_of_its_steps():
     light = np.linspace(0.1, 0.9, 1600, dtype=np.float32).reshape(40, 40)
     found = noise_at(light, 1.0, sensor, np.array([20]), np.array([20]), 8)
     assert found == pytest.approx(1 / 255 / np.sqrt(12), rel=1e-3)
+
+
+@pytest.mark.parametrize("factor", [0.45, 0.6, 1.5])
+@pytest.mark.parametrize("coding", [None, {"type": "jpeg", "quality": 85}])
+def test_scaling_a_small_highlight_is_no_noise(factor, coding):
+    # Each draw falls otherwise between the recorded pixels of a row of cells that were scaled as one picture.
+    sensor = Sensor(full_well=5000, scaling={"factor": factor}, coding=coding, bits=8 if coding else None)
+    at, (y, x) = np.arange(24, 200, 24), np.mgrid[:216, :216]
+    spots = sum(np.exp(-((x - i) ** 2 + (y - j) ** 2) / 3) for i in at for j in at)
+    light = (0.2 + 0.6 * spots).astype(np.float32)
+    rows, columns = (each.ravel() for each in np.meshgrid(at, at))
+    found = noise_at(light, 1.0, sensor, rows, columns, 32)
+    rng = np.random.default_rng(0)
+    variance = np.var([capture(light, 1.0, sensor, rng) for _ in range(40)], axis=0, ddof=1)
+    around = [
+        variance[row - 1 : row + 2, column - 1 : column + 2].mean() for row, column in zip(rows, columns, strict=True)
+    ]
+    assert np.median(found / np.sqrt(around)) == pytest.approx(1, abs=0.15)
+
+
+def test_a_clipped_channel_has_the_noise_below_the_clip():
+    light = np.full((40, 40, 3), [1.3, 0.5, 0.4], dtype=np.float32)
+    sensor = Sensor(full_well=5000, saturation=True, colour={})
+    found = noise_at(light, 1.0, sensor, np.array([20]), np.array([20]), 200)
+    assert found == pytest.approx(np.sqrt((1 + 0.5 + 0.4) / 5000) / 3, rel=0.15)

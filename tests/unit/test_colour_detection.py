@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from simtest.calibration import srgb_decode, srgb_encode
+from simtest.calibration import Calibration, Frame, NoiseModel, srgb_decode, srgb_encode
 from simtest.detection import colour as colour_detection
 from simtest.detection.classify import _around, _isophotes
 from simtest.detection.detector import Kind
@@ -127,6 +127,21 @@ def test_the_split_gives_the_specular_light_whatever_the_shading():
     light = split_light(linear, np.zeros(linear.shape[:2], dtype=bool))
     assert np.sqrt(np.mean((light.specular - specular) ** 2)) < 0.006
     np.testing.assert_allclose(light.specular + light.tissue, linear.mean(axis=2), atol=1e-6)
+
+
+def test_the_noise_of_a_highlight_is_that_of_all_light_at_it():
+    # Shot noise goes by the whole light, of which the specular part is less than a half here.
+    well, rng = 500.0, np.random.default_rng(0)
+    ground = 0.05 + lobe(150, 120, 60.0)
+    light = TISSUE * ground[..., None] + lobe(150, 120, 4.0, peak=0.3)[..., None]
+    camera, model = Camera.from_fov(70.0, WIDTH, HEIGHT), NoiseModel(full_well=well)
+    around, parts = np.s_[118:123, 148:153], []
+    for _ in range(12):
+        values = (rng.poisson(light * well) / well).astype(np.float32)
+        frame = colour_detection.colour.detect(Frame(values, Calibration(camera, noise=model), 2.0), camera).frame
+        parts.append(frame.light[around])
+    drawn = np.sqrt(np.var(parts, axis=0, ddof=1).mean())
+    assert frame.noise[around].mean() == pytest.approx(drawn, rel=0.25)
 
 
 def test_specular_light_is_in_all_channels_also_where_one_is_clipped():

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from simtest.simulation.frame_files import encoded_png
+from simtest.simulation.frame_files import encoded_png, thumbnail
 from simtest.spec.sensor import Sensor
 
 RADIUS, SIZE, FOCAL = 15.0, 48, 60.0
@@ -40,3 +40,7 @@ def test_the_truths_curvatures_and_depth_are_those_of_the_tube(here, tmp_path):
     along = position / position[..., 2:]
     np.testing.assert_allclose(along[..., 0], np.broadcast_to(x, (SIZE, SIZE)), atol=1e-5)
     np.testing.assert_allclose(along[..., 1], np.broadcast_to(x[:, None], (SIZE, SIZE)), atol=1e-5)
+
+
+def test_a_picture_of_one_row_has_a_thumbnail():
+    assert thumbnail(np.full((1, 400, 3), 7, np.uint8)).tolist() == [[[7, 7, 7]] * 160]

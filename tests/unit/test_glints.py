@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from simtest.geometry import smooth
 from simtest.rendering import Session, highlights
 from simtest.simulation.frame import render_view
 from simtest.simulation.highlights import describe, find_spots, glints_of
@@ -271,6 +272,13 @@ def test_equal_spots_are_numbered_row_by_row():
 
 def test_a_dark_frame_has_no_spots():
     assert len(find_spots(np.zeros((20, 20)), np.zeros((20, 20))).rows) == 0
+
+
+def test_what_the_lens_spreads_beyond_the_view_mask_is_no_part_of_a_spot():
+    y, x = np.mgrid[:40, :40]
+    seen = x < 25
+    lobe = smooth((np.exp(-((x - 27) ** 2 + (y - 20) ** 2) / 30) * seen).astype(np.float32), 3.0)
+    assert not find_spots(lobe, lobe, seen).regions[~seen].any()
 
 
 def test_spot_shape():

@@ -51,6 +51,22 @@ def test_light_counts_up_to_the_clip():
 
 
 @pytest.mark.render
+@pytest.mark.parametrize("gain", [1.0, 2.0, 3.0])
+def test_a_highlight_on_tissue_whose_red_is_clipped_stands_as_high_as_its_channels_show(gain):
+    red = {"type": "phong", "specular": 0.2, "diffuse": 0.8, "colour": [0.9, 0.1, 0.1]}
+    sensor = {"saturation": True, "full_well": 2000, "exposure": {"gain": gain}}
+    scene = load_scene("sphere", {**SMALL, "reflectance": red, "sensor": sensor})
+    view = render_view(Session(scene), scene)
+    (highlight,), spot = view.highlights, view.visible_highlights[0]
+    column, row = spot.peak_px.astype(int)
+    light, lobe = view.light[row, column] / view.full_scale, view.radiance.specular[row, column] / view.full_scale
+    height = (np.minimum(light, 1) - np.minimum(light - lobe, 1)).mean()
+    sigma = np.sqrt(min(light.mean(), 1) / 2000 / 3)
+    for snr in (highlight.peak_snr, spot.peak_snr):
+        assert snr == pytest.approx(height / sigma, rel=0.15)
+
+
+@pytest.mark.render
 def test_a_white_frame_shows_no_highlight():
     scene = load_scene("plane", {**SMALL, "reflectance.diffuse": 0.5, "sensor.saturation": True,
                                  "sensor.exposure.gain": 100.0})  # fmt: skip
