@@ -221,6 +221,8 @@ def specularity_html(spot: Specularity) -> str:
 def _picture(values: Image, encoding: str) -> Image:
     """Return values in [0, 1] for the eye: linear light gets the display's gamma."""
     scaled = np.asarray(values, dtype=np.float32)
+    if scaled.ndim == 3 and scaled.shape[2] not in (1, 3, 4):
+        scaled = scaled.mean(axis=2)  # channels that are no colours of a display
     if encoding != "linear":
         return np.clip(scaled, 0, 1)
     return displayed(scaled / max(float(scaled.max()), 1e-12))

@@ -248,8 +248,11 @@ class Specularities(list[Specularity]):
         """What the best estimates state, with the medians of their budgets; None where none states anything."""
         return stated_errors([best for each in self if (best := each.best_estimate) is not None])
 
-    def to_json(self, drawn: bool = True) -> JsonObject:
-        """Return the content of normals.json; without isophotes and curves where it is not `drawn`."""
+    def to_json(self, drawn: bool = True, origin: provenance.Environment | None = None) -> JsonObject:
+        """Return the content of normals.json; without isophotes and curves where it is not `drawn`.
+
+        `origin` is what a run of many frames asked for once; asking costs a call of git.
+        """
         others = [
             {"box_px": h.region.box, "peak_px": [v + PIXEL_CENTRE for v in h.region.peak], **_highlight_json(h)}
             for h in self.detection.others
@@ -269,7 +272,7 @@ class Specularities(list[Specularity]):
             "specularities": [spot.to_json(drawn) for spot in self],
             "clouds": [entry for spot in self for entry in spot.clouds_json(drawn)],
             "other_highlights": others,
-            "provenance": provenance.environment(),
+            "provenance": origin or provenance.environment(),
             **({} if self.reference is None else {"reference": self.reference}),
         }
 

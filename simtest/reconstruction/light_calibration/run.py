@@ -23,7 +23,7 @@ from simtest.errors import InputError
 from simtest.geometry import Array, Image, Mask
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_integer, check_number
-from simtest.reconstruction.images import is_sequence, open_source, read_picture
+from simtest.reconstruction.images import open_source, read_picture
 from simtest.reconstruction.light_calibration.highlights import MeasuredHighlight, measure_highlights
 from simtest.reconstruction.light_calibration.outline import (
     BallOutline,
@@ -289,7 +289,7 @@ def picture_readers(paths: Sequence[Path]) -> list[tuple[str, Callable[[], Image
     """
     found: dict[str, tuple[str, Callable[[], Image]]] = {}
     for path in paths:
-        if is_sequence(path):
+        if path.is_dir():
             for frame in open_source(path).frames():
                 found.setdefault(str(path / frame.name), (frame.name, frame.read))
         else:
