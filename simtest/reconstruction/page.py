@@ -5,7 +5,7 @@ A page is one file that needs nothing else, but for a sequence's pictures.
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -213,8 +213,7 @@ def specularity_html(spot: Specularity) -> str:
     if isinstance(spot.patch, Failure):
         return spot.patch._repr_html_() + table
     picture = _picture(np.asarray(spot.patch.values, dtype=np.float32), "linear")
-    # Without the camera the isophote is drawn alone, without its ellipse.
-    drawn = cv2.cvtColor(draw_overlay(picture, [replace(spot, camera=None)], spot.patch.origin_px), cv2.COLOR_BGR2RGB)
+    drawn = cv2.cvtColor(draw_overlay(picture, [spot], spot.patch.origin_px, with_curves=False), cv2.COLOR_BGR2RGB)
     return picture_html(drawn, "the highlight with its best normal", PATCH_PX) + table
 
 

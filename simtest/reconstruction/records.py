@@ -5,8 +5,9 @@ docs/howto/reconstruct.md explains the keys of their JSON. It is what the tables
 
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -60,8 +61,8 @@ class Specularity:
         Where it is.
     patch : Patch or Failure
         The smoothed crop.
-    estimates : dict
-        `Estimate` or `Failure` by estimator name.
+    estimates : mapping
+        `Estimate` or `Failure` by estimator name; read-only, as what follows from them is kept.
     highlight : Highlight, optional
         How the detector judged it, if it judges any.
     camera : Camera, optional
@@ -87,13 +88,21 @@ class Specularity:
 
     region: Region
     patch: Patch | Failure
-    estimates: dict[str, Estimate | Failure]
+    estimates: Mapping[str, Estimate | Failure]
     highlight: Highlight | None = None
     camera: Camera | None = None
     target: Target = "fine"
     id: int = 0
     track: int | None = None
     reference: Any = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "estimates", MappingProxyType(dict(self.estimates)))
+
+    def __reduce__(self) -> tuple[type, tuple[object, ...]]:
+        """Return what a copy is made of: a view of a dictionary travels to no other process."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return type(self), tuple({**values, "estimates": dict(self.estimates)}.values())
 
     @property
     def peak_px(self) -> Array | None:
@@ -347,16 +356,9 @@ def _rank(name: str) -> int:
 
 @dataclass(frozen=True)
 class StatedErrors:
-    """What the best estimates of a picture state, deg: medians of the standard deviation and of each part's.
+    """How many best estimates of a picture state an uncertainty, and how many do not; the medians of those, deg.
 
-    Parameters
-    ----------
-    count, silent : int
-        Best estimates that state an uncertainty, and others.
-    median_deg : float
-        Of the square root of the covariance's trace.
-    parts_deg : dict
-        The same of each part of the budget, the largest first.
+    They are of the square root of the covariance's trace, and of each part of the budget, the largest first.
     """
 
     count: int
