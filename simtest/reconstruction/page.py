@@ -198,8 +198,7 @@ def specularities_html(spots: Specularities) -> str:
     """Return the frame with its best normals, and the rows of the brightest specularities."""
     picture = _picture(spots.detection.frame.encoded, spots.choices.encoding)
     drawn = cv2.cvtColor(draw_overlay(picture, spots), cv2.COLOR_BGR2RGB)
-    what = "specularity" if len(spots) == 1 else "specularities"
-    more = f"{len(spots)} {what}; the best normal of each is drawn"
+    more = f"{spots.counted}; the best normal of each is drawn"
     more += f", the brightest {MOST_ROWS} are listed." if len(spots) > MOST_ROWS else "."
     rows = [_best_cells(spot) for spot in spots[:MOST_ROWS]]
     return picture_html(drawn, more) + note_html(more) + table_html(("No.", "kind", "best estimator", *HEADS), rows)

@@ -156,14 +156,15 @@ class Specularity:
         curves: dict[int, Points] = {}
         made = {}
         for name, result in self.normals.items():
-            fitted = [] if self.camera is None else [*result.isophotes]
-            for isophote in fitted:
-                if id(isophote) not in curves and self.camera is not None:
-                    curves[id(isophote)] = drawable(isophote.ellipse_px(self.camera))
-            outlines = [curves[id(isophote)] for isophote in fitted]
-            if result.cloud is not None and self.camera is not None:
-                look = self.camera.unproject(result.look_px)
-                outlines.append(drawable(self.camera.project(result.cloud.outline(result.normal, look))))
+            outlines = list[Points]()
+            if (camera := self.camera) is not None:
+                for isophote in result.isophotes:
+                    if id(isophote) not in curves:
+                        curves[id(isophote)] = drawable(isophote.ellipse_px(camera))
+                    outlines.append(curves[id(isophote)])
+                if result.cloud is not None:
+                    look = camera.unproject(result.look_px)
+                    outlines.append(drawable(camera.project(result.cloud.outline(result.normal, look))))
             isovalues = (isophote.isovalue for isophote in result.isophotes)
             traced = [] if isinstance(self.patch, Failure) else self.patch.contours(isovalues)
             made[name] = Drawing([(t, np.round(points, 3).tolist()) for t, points in traced], outlines)
@@ -207,11 +208,9 @@ class Specularity:
         ]
 
     def __repr__(self) -> str:
-        x, y, width, height = self.region.box
         failed = [f"{name} ({each.reason})" for name, each in self.estimates.items() if isinstance(each, Failure)]
-        where = f"at ({x + width / 2:.1f}, {y + height / 2:.1f}) px"
-        if self.peak_px is not None:
-            where = f"peak {vector(self.peak_px)} px"
+        x, y = self.position_px
+        where = f"at ({x:.1f}, {y:.1f}) px" if self.peak_px is None else f"peak {vector(self.peak_px)} px"
         text = f"{where}, normals: {' '.join(self.normals) or 'none'}" + f", failed: {', '.join(failed)}" * bool(failed)
         return f"Specularity({clipped(text, LONGEST - 13)})"
 
@@ -253,6 +252,11 @@ class Specularities(list[Specularity]):
         return self.choices.calibration.camera
 
     @property
+    def counted(self) -> str:
+        """How many there are, in words."""
+        return "1 specularity" if len(self) == 1 else f"{len(self)} specularities"
+
+    @property
     def stated(self) -> "StatedErrors | None":
         """What the best estimates state, with the medians of their budgets; None where none states anything."""
         return stated_errors([best for each in self if (best := each.best_estimate) is not None])
@@ -287,8 +291,7 @@ class Specularities(list[Specularity]):
 
     def __repr__(self) -> str:
         answered = sum(bool(each.normals) for each in self)
-        what = "specularity" if len(self) == 1 else "specularities"
-        text = f"{len(self)} {what}, {answered} with a normal; {self.choices}"
+        text = f"{self.counted}, {answered} with a normal; {self.choices}"
         return f"<Specularities: {clipped(text, LONGEST - 18)}>"
 
     def _repr_html_(self) -> str:

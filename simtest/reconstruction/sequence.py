@@ -258,7 +258,7 @@ def _read_done(path: Path, name: str) -> JsonObject | None:
     try:
         entry: JsonObject = read_json(path)
         # The tables, the tracks and the motion need what a frame's file must hold.
-        tuple(_rows(0, None, entry))
+        tuple(_rows(entry))
         np.asarray(_positions(entry), dtype=float).reshape(-1, 2)
         for spot in entry["specularities"]:
             TrackedHighlight.from_json(0, spot)
@@ -293,8 +293,7 @@ def _told_by_motion(judged: Sequence[MotionRecord], poses: Poses, is_flipped: bo
     counts = ", ".join(f"{count} {shape}" for shape, count in shapes.most_common())
     compared = [each for each in judged if each.distance2 is not None]
     misfits = sum(not each.fits for each in compared)
-    error = poses.error
-    stated = f"{error.translation:.1%} and {math.degrees(error.rotation):.2g} deg"
+    stated = f"{poses.error.translation:.1%} and {math.degrees(poses.error.rotation):.2g} deg"
     told = (
         f"bends of {len(judged)} highlights: {counts}; {misfits} fit no curvature; "
         f"error of the poses {'given' if poses.error_told else 'assumed'}: {stated}"
@@ -348,21 +347,17 @@ def _write(run: _Run, tracks: Sequence[Track]) -> list[Path]:
     judged = any(track.shapes for track in tracks)
     files = [run.out / name for name in ("timeline.csv", "tracks.json", "index.html")]
     columns = (*TIMELINE, *MOTION_COLUMNS) if judged else TIMELINE
-    write_atomically(files[0], lambda part: write_csv(part, columns, _timeline(run)))
+    # One frame's file after the other: a film's rows do not fit into memory.
+    rows = (row for frame in run.frames for row in _rows(read_json(run.file(frame.index))))
+    write_atomically(files[0], lambda part: write_csv(part, columns, rows))
     write_json(files[1], tracks, compact=True)
     write_atomically(files[2], lambda part: write_sequence_page(part, run.frames, tracks))
     return files
 
 
-def _timeline(run: _Run) -> Iterator[tuple[object, ...]]:
-    """Yield the rows of timeline.csv, from one frame's file after the other."""
-    for frame in run.frames:
-        yield from _rows(frame.index, frame.time_s, read_json(run.file(frame.index)))
-
-
-def _rows(index: int, time_s: float | None, frame: JsonObject) -> Iterator[tuple[object, ...]]:
+def _rows(frame: JsonObject) -> Iterator[tuple[object, ...]]:
     """Yield the rows of timeline.csv of a frame's file."""
     for entry in frame["specularities"]:
         motion = motion_row(entry["motion"]) if "motion" in entry else ()
         for row in normals_rows([entry]):
-            yield (index, time_s, entry["track"], *row, *motion)
+            yield (frame["frame_index"], frame["time_s"], entry["track"], *row, *motion)
