@@ -72,6 +72,8 @@ SURELY = 3.0
 FARTHEST_PX = 1e5
 """Largest number of a rough outline, px."""
 
+MERGED = "wider than on a ball that looks larger: several highlights that merge"
+
 INSIDE = 0.97
 """Highlights are searched within this share of the cone's half-angle."""
 
@@ -175,11 +177,11 @@ class Ball:
 
     def variations(self, views: Sequence[View], camera: Camera, lights: Array) -> Iterator[Balls]:
         """Return the balls with each error of the outlines that all pictures share, of one standard deviation."""
-        for dx, dy, wider in common_outline_errors(lights):
-            moved = [moved_outline(view, camera, np.array([dx, dy]), wider) for view in views]
+        outlines = [view.seen_outline for view in views]
+        errors = [[error] * len(outlines) for error in common_outline_errors(lights)]
+        for moves in (*errors, *unlit_outline_errors(outlines, camera, self.radius_mm)):
+            moved = [moved_outline(each, camera, move) for each, move in zip(outlines, moves, strict=True)]
             yield self._of_outlines(moved, camera)
-        for outlines in unlit_outline_errors(views, camera, self.radius_mm):
-            yield self._of_outlines(outlines, camera)
 
     def notes(self, result: LightCalibration) -> tuple[str, ...]:
         """Return what a reader of the result must know of the ball."""
@@ -345,13 +347,15 @@ def _read(
 ) -> Views:  # fmt: skip
     """Read pictures: `shown` makes a view of a name and its linear light, or says why not."""
     seen, camera = Views(), calibration.camera
-    contents: dict[bytes, str] = {}
+    contents: dict[str, str] = {}
     for name, read in pictures:
         if name in refused:
             seen.left_out[name] = refused[name]
             continue
-        values = read()
-        if (first := _first_of(contents, name, values)) != name:
+        values = np.ascontiguousarray(read())
+        content = repr((values.shape, values.dtype.str)).encode() + values.tobytes()
+        # A copy would count as a second measurement.
+        if (first := contents.setdefault(sha256(content).hexdigest(), name)) != name:
             seen.left_out[name] = f"the same picture as {first}; it counts once"
             continue
         if values.shape[:2] != (camera.height, camera.width):
@@ -394,13 +398,17 @@ def _too_few(seen: Views, given: int) -> str:
 
 def with_lights(calibration: Calibration, result: LightCalibration) -> Calibration:
     """Return a calibration with the measured lights that travel with the camera."""
-    positions = tuple(_triple(light.position_mm.round(5)) for light in result.own)
-    matrices = tuple(_matrix((light.covariance_mm2 + light.covariance_mm2.T) / 2) for light in result.own)
-    if not positions:
+    if not result.own:
         return calibration
+    positions, matrices = [], list[Matrix]()
+    for light in result.own:
+        positions.append(_triple(light.position_mm.round(5)))
+        first, second, third = (_triple(row) for row in (light.covariance_mm2 + light.covariance_mm2.T) / 2)
+        matrices.append((first, second, third))
     told = replace(
-        calibration.priors, lights_mm=positions, lights_covariance_mm2=matrices, light_offset_mm=UNTOLD_OFFSET_MM
-    )
+        calibration.priors, lights_mm=tuple(positions), lights_covariance_mm2=tuple(matrices),
+        light_offset_mm=UNTOLD_OFFSET_MM,
+    )  # fmt: skip
     if told.falloff_power is None and not calibration.emission.is_uniform:
         # An emission is undone for a light at the camera alone.
         told = replace(told, falloff_power=UNTOLD_FALLOFF_POWER)
@@ -410,11 +418,6 @@ def with_lights(calibration: Calibration, result: LightCalibration) -> Calibrati
 def _triple(values: Array) -> tuple[float, float, float]:
     x, y, z = (float(f"{value:.10g}") for value in values)
     return x, y, z
-
-
-def _matrix(values: Array) -> Matrix:
-    first, second, third = (_triple(row) for row in values)
-    return first, second, third
 
 
 # What a picture shows ------------------------------------------------------------------------------------------------
@@ -431,15 +434,11 @@ def without_merged(views: Sequence[View]) -> list[View]:
     marked = []
     for view, angle in zip(views, angles, strict=True):
         most = WIDER * float(narrow[angles >= angle].min(initial=np.inf))
-        marked.append(replace(view, highlights=[_if_narrow(each, most) for each in view.highlights]))
+        # Noise alone makes a dim spot wide.
+        wide = [not each.problem and each.width_px - SURELY * each.width_sd_px > most for each in view.highlights]
+        spots = [replace(s, problem=MERGED) if is_wide else s for s, is_wide in zip(view.highlights, wide, strict=True)]
+        marked.append(replace(view, highlights=spots))
     return marked
-
-
-def _if_narrow(highlight: MeasuredHighlight, most_px: float) -> MeasuredHighlight:
-    # Noise alone makes a dim spot wide.
-    if highlight.problem or highlight.width_px - SURELY * highlight.width_sd_px <= most_px:
-        return highlight
-    return replace(highlight, problem="wider than on a ball that looks larger: several highlights that merge")
 
 
 def _plane(world_from_camera: Array) -> tuple[Array, float] | None:
@@ -449,13 +448,6 @@ def _plane(world_from_camera: Array) -> tuple[Array, float] | None:
         return None
     side = 1.0 if height > 0 else -1.0
     return side * normal / np.linalg.norm(normal), -abs(height) / float(np.linalg.norm(normal))
-
-
-def _first_of(contents: dict[bytes, str], name: str, values: Image) -> str:
-    """Return the name of the first picture with the same values; a copy would count as a second measurement."""
-    content = np.ascontiguousarray(values)
-    digest = sha256(repr((content.shape, content.dtype.str)).encode() + content.tobytes()).digest()
-    return contents.setdefault(digest, name)
 
 
 def _outline(intensity: Array, camera: Camera, circle: Circle | None) -> BallOutline | str:
@@ -471,17 +463,14 @@ def _outline(intensity: Array, camera: Camera, circle: Circle | None) -> BallOut
     outline = refine_outline(intensity, camera, searched[0])
     if outline is None:
         return "too little of the ball's outline shows an edge"
-    if has_dark_ring(intensity, camera, outline):
-        return (
-            "a dark ring inside the outline: the ball's shadow on the wall hides its edge; light the wall by the room"
-        )
-    return outline
+    ring = "a dark ring inside the outline: the ball's shadow on the wall hides its edge; light the wall by the room"
+    return ring if has_dark_ring(intensity, camera, outline) else outline
 
 
 def _inside(camera: Camera, outline: BallOutline) -> Mask:
-    border = outline.pixels(camera, 180)
-    low, high = np.floor(border.min(axis=0)).astype(int), np.ceil(border.max(axis=0)).astype(int)
-    low, high = np.clip(low, 0, [camera.width, camera.height]), np.clip(high, 0, [camera.width, camera.height])
+    border, size = outline.pixels(camera, 180), [camera.width, camera.height]
+    low = np.clip(np.floor(border.min(axis=0)).astype(int), 0, size)
+    high = np.clip(np.ceil(border.max(axis=0)).astype(int), 0, size)
     inside = np.zeros((camera.height, camera.width), dtype=bool)
     x, y = (np.arange(a, b) + 0.5 for a, b in zip(low, high, strict=True))
     cosine = camera.unproject(np.stack(np.meshgrid(x, y), axis=-1)) @ outline.direction
@@ -491,9 +480,8 @@ def _inside(camera: Camera, outline: BallOutline) -> Mask:
 
 def with_floor(outline: BallOutline, camera: Camera, radius_mm: float) -> BallOutline:
     """Return an outline with the errors that its fit cannot see: of pixels, and of a shadow at a dark background."""
-    pixel = float(np.linalg.norm(camera.step_of_pixels(camera.project(outline.direction))) / np.sqrt(2))
-    strip = _unlit_strip(outline, radius_mm)
-    error = np.diag([SHADOW * strip, SHADOW * strip, SHADOW * strip]) ** 2 + (OUTLINE_FLOOR_PX * pixel) ** 2 * np.eye(3)
+    strip, floor = SHADOW * _unlit_strip(outline, radius_mm), OUTLINE_FLOOR_PX * outline.pixel_rad(camera)
+    error = np.diag([strip, strip, strip]) ** 2 + floor**2 * np.eye(3)
     return replace(outline, covariance=outline.covariance + error)
 
 
@@ -503,23 +491,14 @@ def _unlit_strip(outline: BallOutline, radius_mm: float) -> float:
     return float(outline.dark_share * outline.half_angle * (LIGHT_MM / distance) ** 2 / 2)
 
 
-def unlit_outline_errors(views: Sequence[View], camera: Camera, radius_mm: float) -> Iterator[list[BallOutline]]:
-    """Return all outlines, moved by what the unlit rim may do to all of them alike; none where every rim is seen.
+def unlit_outline_errors(outlines: Sequence[BallOutline], camera: Camera, radius_mm: float) -> list[list[Array]]:
+    """Return how the unlit rim may move all outlines alike (`moved_outline`); nothing where every rim is seen.
 
     The lights stay where they are, so a dark background moves the outlines of all pictures to the same side, each by
     its own strip (`with_floor` counts what differs between the pictures). They move along x, along y, and in radius.
     """
-    strips = []
-    for view in views:
-        outline = view.seen_outline
-        pixel = np.linalg.norm(camera.step_of_pixels(camera.project(outline.direction))) / np.sqrt(2)
-        strips.append(SHADOW * _unlit_strip(outline, radius_mm) / float(pixel))
-    if any(strips):
-        for dx, dy, wider in np.eye(3):
-            yield [
-                moved_outline(view, camera, strip * np.array([dx, dy]), strip * wider)
-                for view, strip in zip(views, strips, strict=True)
-            ]
+    strips = [SHADOW * _unlit_strip(each, radius_mm) / each.pixel_rad(camera) for each in outlines]
+    return [[strip * error for strip in strips] for error in np.eye(3)] if any(strips) else []
 
 
 def common_outline_errors(lights: Array) -> Array:
@@ -534,13 +513,11 @@ def common_outline_errors(lights: Array) -> Array:
     return np.array([[COMMON_PX, 0, 0], [0, COMMON_PX, 0], [0, 0, COMMON_RADIUS_PX], [*shaded, 0]])
 
 
-def moved_outline(view: View, camera: Camera, shift_px: Array, wider_px: float) -> BallOutline:
-    """Return the outline of a view, shifted in the picture and with a larger radius, px."""
-    outline = view.seen_outline
-    at = camera.project(outline.direction)
-    pixel = float(np.linalg.norm(camera.step_of_pixels(at)) / np.sqrt(2))
-    direction = camera.unproject(at + shift_px)
-    return replace(outline, direction=direction, half_angle=outline.half_angle + wider_px * pixel)
+def moved_outline(outline: BallOutline, camera: Camera, move_px: Array) -> BallOutline:
+    """Return an outline shifted in the picture along x and y, and with a larger radius, px."""
+    direction = camera.unproject(camera.project(outline.direction) + move_px[:2])
+    half_angle = outline.half_angle + float(move_px[2]) * outline.pixel_rad(camera)
+    return replace(outline, direction=direction, half_angle=half_angle)
 
 
 def circles_of(path: Path) -> dict[str, Circle]:
