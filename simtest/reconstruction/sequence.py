@@ -11,6 +11,7 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -181,14 +182,13 @@ class _Run:
                 # A field of view is that of the first picture, also of frames that are made in a later run.
                 with contextlib.suppress(InputError):
                     self._calibration, self._cautions = calibration_for(self.options, frame.read())
+            before = deepcopy(self._tracker)
             numbers = self._track_numbers(_positions(done), done["size"], frame.index)
-            # They are others where a frame before this one was lost since.
-            if numbers != [spot["track"] for spot in done["specularities"]]:
-                for spot, number in zip(done["specularities"], numbers, strict=True):
-                    spot["track"] = number
-                write_json(self.file(frame.index), done, compact=True)
-            self._keep(frame.index, done, numbers)
-            return
+            if numbers == [spot["track"] for spot in done["specularities"]]:
+                self._keep(frame.index, done, numbers)
+                return
+            # A frame before this one was lost since: its file and its picture have other numbers.
+            self._tracker = before
         picture = None
         try:
             picture = frame.read()

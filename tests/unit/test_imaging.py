@@ -249,7 +249,7 @@ def test_where_the_first_frame_is_lost_all_files_have_one_numbering(folder, tmp_
     run(folder, out)
     (folder / "frame1.png").write_text("no picture")
     (out / "frames" / "000000.json").unlink()
-    with pytest.warns(UserWarning, match="frame 0: "):
+    with pytest.warns(UserWarning, match="frame 0: |angles depend"):
         reconstruct_sequence(folder, out, Options(fov_deg=FOV))
     rows = list(csv.DictReader((out / "timeline.csv").read_text().splitlines()))
     in_table = {(int(row["frame"]), int(row["track"])) for row in rows}
@@ -258,6 +258,11 @@ def test_where_the_first_frame_is_lost_all_files_have_one_numbering(folder, tmp_
     stored = [json.loads(path.read_text()) for path in sorted((out / "frames").glob("*.json"))]
     assert {(each["frame_index"], spot["track"]) for each in stored for spot in each["specularities"]} == in_table
     assert min(track["track"] for track in tracks) == 0
+    # So has what is drawn: all files are those of a run that never saw the frame.
+    with pytest.warns(UserWarning, match="frame 0: |angles depend"):
+        reconstruct_sequence(folder, tmp_path / "whole", Options(fov_deg=FOV))
+    for name in ("000001.json", "000001.jpg", "000002.json", "000002.jpg"):
+        assert (out / "frames" / name).read_bytes() == (tmp_path / "whole" / "frames" / name).read_bytes(), name
 
 
 @pytest.mark.parametrize("key", ["peak_px", "box_px", "track", "estimates", "best"])
