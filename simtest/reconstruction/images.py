@@ -328,9 +328,8 @@ def check_frame(frame: npt.ArrayLike, camera: Camera, encoding: str | None = Non
     is_picture = image is not None or encoding == "srgb"
     if image is None:
         if given.dtype.kind != "f":
-            raise InputError(
-                f"frame holds integers of type {given.dtype}, whose range is not known: must be uint8, uint16 or real"
-            )
+            needed = "must be uint8, uint16 or real"
+            raise InputError(f"frame holds integers of type {given.dtype}, whose range is not known: {needed}")
         # What float32 cannot hold becomes infinite and is refused below.
         with np.errstate(all="ignore"):
             image = given.astype(np.float32)
@@ -359,10 +358,8 @@ def check_finite(image: Image) -> None:
 def check_size(image: Image, camera: Camera) -> None:
     """Raise `InputError` where a frame is not of the camera's size."""
     if image.shape[:2] != (camera.height, camera.width):
-        raise InputError(
-            f"frame is {image.shape[1]} x {image.shape[0]} px: must be {camera.width} x {camera.height}, "
-            "the size of the camera's calibration"
-        )
+        needed = f"must be {camera.width} x {camera.height}, the size of the camera's calibration"
+        raise InputError(f"frame is {image.shape[1]} x {image.shape[0]} px: {needed}")
 
 
 def check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:

@@ -88,9 +88,8 @@ def check_priors(priors: Priors, camera: Path) -> None:
     """Raise `InputError` where a calibration lacks what the method needs."""
     where = f"--camera {camera}: --poses needs"
     if priors.distance_mm is None:
-        raise InputError(
-            f"{where} the working distance; give rig.distance_mm with distance_sd_mm, or distance_range_mm"
-        )
+        keys = "rig.distance_mm with distance_sd_mm, or distance_range_mm"
+        raise InputError(f"{where} the working distance; give {keys}")
     if priors.lobe_curvature is None:
         raise InputError(f"{where} the width of the lobe; give surface.phong_exponent or surface.lobe_curvature")
     offset = max((float(np.linalg.norm(light)) for light in priors.lights_mm), default=np.inf)

@@ -60,12 +60,11 @@ def normals_rows(entries: Iterable[JsonObject]) -> Iterator[tuple[object, ...]]:
         judged = (*peak, entry.get("kind"), entry.get("score"))
         for name, each in entry["estimates"].items():
             start, best = (entry["id"], name, each["status"]), int(name == entry["best"])
-            if each["status"] != "ok":
-                # candidate, normal, look and axis ratio; then margin and covariance
-                nothing = (None,) * 7
-                yield (*start, *nothing, "", best, *nothing[:4], *judged, None, None)
-                continue
             covariance, deviation = (None,) * 3, None
+            if each["status"] != "ok":
+                # candidate, normal, look and axis ratio; then margin
+                yield (*start, *(None,) * 7, "", best, None, *covariance, *judged, None, deviation)
+                continue
             if each["covariance"] is not None:
                 matrix = np.array(each["covariance"])
                 covariance, deviation = matrix[np.triu_indices(2)].tolist(), deviation_deg(matrix)

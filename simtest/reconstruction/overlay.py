@@ -44,9 +44,7 @@ class _Sheet:
         values = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
         self.pixels: Picture = cv2.cvtColor(values, cv2.COLOR_GRAY2BGR if values.ndim == 2 else cv2.COLOR_RGB2BGR)
         if self.scale > 1:
-            self.pixels = cv2.resize(
-                self.pixels, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_CUBIC
-            )  # fmt: skip
+            self.pixels = cv2.resize(self.pixels, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_CUBIC)
 
     def at(self, points: npt.ArrayLike) -> npt.NDArray[np.int32]:
         """Return points, shape (..., 2), in OpenCV's fractions of a px of the drawing."""

@@ -73,19 +73,15 @@ class Poses:
     def of_frames(self, names: Sequence[str], indices: Sequence[int]) -> list[Array | None]:
         """Return the pose of each frame by its file's name, or by its number where the poses have no names."""
         if self.names:
-            table = {name: pose for name, pose in zip(self.names, self.world_from_camera, strict=True)}
+            table = dict(zip(self.names, self.world_from_camera, strict=True))
             found = [table.get(name) for name in names]
             if all(pose is None for pose in found):
-                raise InputError(
-                    f"--poses {self.path}: names {self.names[0]!s:.60}; must name frames of the folder, "
-                    f"such as {names[0]!s:.60}"
-                )
+                wanted = f"must name frames of the folder, such as {names[0]!s:.60}"
+                raise InputError(f"--poses {self.path}: names {self.names[0]!s:.60}; {wanted}")
             return found
-        count = len(self.world_from_camera)
-        if max(indices) >= count:
-            raise InputError(
-                f"--poses {self.path}: {count} poses; must be one for each of the {max(indices) + 1} frames"
-            )
+        count, needed = len(self.world_from_camera), max(indices) + 1
+        if needed > count:
+            raise InputError(f"--poses {self.path}: {count} poses; must be one for each of the {needed} frames")
         return [self.world_from_camera[index] for index in indices]
 
     def of_files(self, names: Sequence[str]) -> list[Array | None]:
@@ -97,9 +93,8 @@ class Poses:
         check_names(where, self.names, names)
         found = self.of_frames(names, range(len(names)))
         if not self.names and count != len(names):
-            raise InputError(
-                f"{where}: {count} poses of frames without names; must be one for each of the {len(names)} frames"
-            )
+            needed = f"must be one for each of the {len(names)} frames"
+            raise InputError(f"{where}: {count} poses of frames without names; {needed}")
         return found
 
     def of_film(self, least: int) -> "Poses":
@@ -342,11 +337,8 @@ def _simcol3d(path: Path, text: str, where: str) -> list[Array]:
 
 def _rows(text: str, count: int, separator: str | None, where: str) -> list[list[float]]:
     """Return the numbers of each line that is not empty."""
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    return [
-        _numbers(line.split(separator), count, f"{where}: line {number}", f"{line.strip()!s:.60}")
-        for number, line in lines
-    ]
+    lines = ((f"{where}: line {number}", line) for number, line in enumerate(text.splitlines(), 1) if line.strip())
+    return [_numbers(line.split(separator), count, at, f"{line.strip()!s:.60}") for at, line in lines]
 
 
 def _numbers(words: Sequence[str], count: int, at: str, shown: str, named: str = "") -> list[float]:

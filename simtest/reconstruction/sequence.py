@@ -133,18 +133,15 @@ def _reconstruct(
     # The count of a whole film may be off by one.
     if source.is_video and (run.taken < source.count - 1 or source.is_cut):
         how = "its file is cut short; " if source.is_cut else ""
-        warnings.warn(
-            f"{path}: {how}ends after {run.taken} of {source.count} frames; what was read is kept", stacklevel=2
-        )
+        told = f"{how}ends after {run.taken} of {source.count} frames; what was read is kept"
+        warnings.warn(f"{path}: {told}", stacklevel=2)
     motion = None
     if poses is not None and calibration is not None:
         # The count of a film is not known before it is read.
-        if source.is_video and not source.is_cut and len(poses.world_from_camera) > run.taken:
-            warnings.warn(
-                f"--poses {poses.path}: {len(poses.world_from_camera)} poses for {run.taken} frames; the first "
-                "ones are taken in their order",
-                stacklevel=2,
-            )
+        count = len(poses.world_from_camera)
+        if source.is_video and not source.is_cut and count > run.taken:
+            told = f"{count} poses for {run.taken} frames; the first ones are taken in their order"
+            warnings.warn(f"--poses {poses.path}: {told}", stacklevel=2)
         motion = _judge_by_motion(run, poses, calibration)
     tracks = [run.tracks[number] for number in sorted(run.tracks)]
     files = _write(run, tracks)
@@ -338,9 +335,8 @@ def _check_settings(path: Path, settings: JsonObject) -> None:
         before = None
     if before != settings:
         keys = [key for key in settings if not isinstance(before, dict) or before.get(key) != settings[key]]
-        raise InputError(
-            f"--out {path.parent}: holds a run with another {', '.join(keys) or 'set of settings'}; give another folder"
-        )
+        other = ", ".join(keys) or "set of settings"
+        raise InputError(f"--out {path.parent}: holds a run with another {other}; give another folder")
 
 
 def _write(run: _Run, tracks: Sequence[Track]) -> list[Path]:

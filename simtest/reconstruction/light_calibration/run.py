@@ -140,9 +140,8 @@ class Ball:
         check_number("--ball-radius", self.radius_mm, above=0)
         check_number("--ball-radius-sd", self.radius_sd_mm, least=0)
         if self.radius_sd_mm >= self.radius_mm:
-            raise InputError(
-                f"--ball-radius-sd = {self.radius_sd_mm:g}: must be less than the radius, {self.radius_mm:g}"
-            )
+            needed = f"must be less than the radius, {self.radius_mm:g}"
+            raise InputError(f"--ball-radius-sd = {self.radius_sd_mm:g}: {needed}")
 
     @property
     def scale_share(self) -> float:
@@ -359,10 +358,8 @@ def _read(
             seen.left_out[name] = f"the same picture as {first}; it counts once"
             continue
         if values.shape[:2] != (camera.height, camera.width):
-            raise InputError(
-                f"{name}: {values.shape[1]} x {values.shape[0]} px; must be {camera.width} x {camera.height} px as "
-                "the calibration's camera"
-            )
+            needed = f"must be {camera.width} x {camera.height} px as the calibration's camera"
+            raise InputError(f"{name}: {values.shape[1]} x {values.shape[0]} px; {needed}")
         light = calibration.correct(np.asarray(values, dtype=np.float32))
         view = shown(name, np.asarray(light.intensity, dtype=float))
         if isinstance(view, str):
@@ -536,11 +533,8 @@ def circles_of(path: Path) -> dict[str, Circle]:
             if not (max(abs(x), abs(y), radius) <= FARTHEST_PX and radius > 0):
                 raise ValueError
         except ValueError:
-            text = f"{','.join(row)!s:.60}"
-            raise InputError(
-                f"--outlines {path}: line {number}: {text}: must be name,x,y,radius, px, radius > 0, all "
-                f"within {FARTHEST_PX:g}"
-            ) from None
+            needed = f"must be name,x,y,radius, px, radius > 0, all within {FARTHEST_PX:g}"
+            raise InputError(f"--outlines {path}: line {number}: {','.join(row)!s:.60}: {needed}") from None
         if name in found:
             raise InputError(f"--outlines {path}: line {number}: {name} is given twice")
         found[name] = (x, y, radius)
