@@ -164,15 +164,17 @@ class Ball:
         seen = _read(pictures, calibration, {}, shown)
         return replace(seen, views=without_merged(seen.views))
 
-    def mirrors(self, views: Sequence[View], camera: Camera) -> Balls:
-        """Return the balls of pictures, with the errors of their outlines."""
-        return self._of_outlines([view.seen_outline for view in views], camera)
+    def mirrors(self, views: Sequence[View], camera: Camera, other: Camera | None = None) -> Balls:
+        """Return the balls of pictures, with the errors of their outlines; or what another camera sees in their place.
 
-    def seen_by(self, views: Sequence[View], camera: Camera, other: Camera) -> Balls:
-        """Return the balls that another camera sees at the same pixels."""
-        traced = [outline_through(other, view.seen_outline.pixels(camera)) for view in views]
-        kept = [replace(each, covariance=v.seen_outline.covariance) for each, v in zip(traced, views, strict=True)]
-        return self._of_outlines(kept, other)
+        That sees the same pixels.
+        """
+        outlines = [view.seen_outline for view in views]
+        if other is not None:
+            outlines = [
+                replace(outline_through(other, each.pixels(camera)), covariance=each.covariance) for each in outlines
+            ]
+        return self._of_outlines(outlines, other or camera)
 
     def variations(self, views: Sequence[View], camera: Camera, lights: Array) -> Iterator[Balls]:
         """Return the balls with each error of the outlines that all pictures share, of one standard deviation."""
@@ -240,8 +242,11 @@ class Plate:
 
         return _read(pictures, calibration, refused, shown)
 
-    def mirrors(self, views: Sequence[View], camera: Camera) -> Plates:
-        """Return the plates of pictures; their poses are uncertain by a turn about each tangent axis, and along z."""
+    def mirrors(self, views: Sequence[View], camera: Camera, other: Camera | None = None) -> Plates:
+        """Return the plates of pictures, for any camera: the poses tell where they are.
+
+        They are uncertain by a turn about each tangent axis, and along z.
+        """
         planes = [view.plane for view in views if view.plane is not None]
         sd_rad = float(np.radians(self.sd_deg))
         factor = np.diag([sd_rad, sd_rad, self.sd_mm])
@@ -250,10 +255,6 @@ class Plate:
             np.array([offset for _, offset in planes]),
             np.broadcast_to(factor, (len(planes), 3, 3)).copy(),
         )
-
-    def seen_by(self, views: Sequence[View], camera: Camera, other: Camera) -> Plates:
-        """Return the plates that another camera sees: the poses tell where they are."""
-        return self.mirrors(views, other)
 
     def variations(self, views: Sequence[View], camera: Camera, lights: Array) -> Iterator[Plates]:
         """Return nothing: no error of the plates is known to be shared."""
@@ -380,7 +381,7 @@ def _variations(
             other = replace(
                 camera, fx=camera.fx * (1 + focal), fy=camera.fy * (1 + focal), cx=camera.cx + dx, cy=camera.cy + dy
             ).with_radial_error(radial, prior.edge_reach)
-            yield other, mirror.seen_by(views, camera, other)
+            yield other, mirror.mirrors(views, camera, other)
     for mirrors in mirror.variations(views, camera, lights.bundle.lights):
         yield camera, mirrors
 
