@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from simtest.calibration import Calibration, CameraPrior, Distribution, Priors
+from simtest.calibration import Calibration, CameraPrior, Priors
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
 from simtest.detection.view import DARK, View
 from simtest.errors import InputError
@@ -74,8 +74,7 @@ def calibration_of_view(fov_deg: float, width: int, height: int, across: Extent 
     """Return the calibration of a camera of which the field of view alone is known, deg, across the whole picture.
 
     `across` names the extent that the angle spans: the picture's width, height or diagonal; for its round view see
-    `calibration_of_round_view`. Raises `InputError` if the
-    angle or the extent is none of those allowed.
+    `calibration_of_round_view`. Raises `InputError` if the angle or the extent is none of those allowed.
     """
     extents = {"width": width, "height": height, "diagonal": math.hypot(width, height)}
     if across not in extents:
@@ -133,7 +132,19 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
     if priors.distance.sd > 0:
         how = f"[rig] distance_mm or distance_range_mm {key}"
         add("distance of the tissue", f"{priors.distance} mm along the sightline", how, priors.distance_mm is not None)
-    made += _of_camera(calibration.camera, priors.camera)
+    camera, prior = calibration.camera, priors.camera
+    told = not prior.guessed
+    if prior.focal_sd > 0:
+        spread = f"{camera.fx:.0f} px, normal, ± {100 * prior.focal_sd:g} %"
+        add("focal length", spread, f"[camera] fx, fy and [uncertainty] focal_sd {key}", told)
+    if prior.centre_sd_px > 0:
+        spread = f"({camera.cx:.0f}, {camera.cy:.0f}) px, normal, ± {prior.centre_sd_px:.0f} px an axis"
+        add("principal point", spread, f"[camera] cx, cy and [uncertainty] centre_sd_px {key}", told)
+    if prior.distortion_sd > 0:
+        lens = "none" if camera.distortion is None else "as given" if told else "equidistant"
+        edge = f", unchanged {prior.edge_reach:.2f} focal lengths from the principal point" if prior.edge_reach else ""
+        spread = f"{lens}, its k1 normal, ± {prior.distortion_sd:g}{edge}"
+        add("distortion", spread, f"[camera.distortion] and [uncertainty] distortion_sd {key}", told)
     if calibration.response is None and encoding is None:
         add("response", "sRGB, sharpened or not", f"[response] {key}, or --encoding")
     if priors.falloff_power is not None:
@@ -141,9 +152,10 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
         how = f"[vignetting] and [emission] {key}, or [uncertainty] falloff_power"
         add("falloff towards the border", falloff, how, priors.falloff_power != UNTOLD_FALLOFF_POWER)
     if target == "base":
-        slope = f"{_in_degrees(priors.relief_slope)} deg an axis"
-        given_slope = priors.relief_slope != UNTOLD_SLOPE_RAD
-        add("slope of the relief", slope, f"[surface] relief_slope_deg {key}", given_slope)
+        slope = priors.relief_slope
+        in_degrees = type(slope)(*map(math.degrees, vars(slope).values()))
+        how = f"[surface] relief_slope_deg {key}"
+        add("slope of the relief", f"{in_degrees} deg an axis", how, slope != UNTOLD_SLOPE_RAD)
     if not priors.plane:
         made.append(NEAR_MISSES)
     return made
@@ -152,33 +164,6 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
 def light_note(assumed: Iterable[Assumption]) -> str:
     """Return what the normals are if the light is among what is assumed; else an empty text."""
     return LIGHT_AT_CAMERA if any(each.what == LIGHT for each in assumed) else ""
-
-
-def _of_camera(camera: Camera, prior: CameraPrior) -> list[Assumption]:
-    """List what is not known exactly of the camera's geometry."""
-    given, key = not prior.guessed, "in a calibration file"
-    made = []
-    if prior.focal_sd > 0:
-        spread = f"{camera.fx:.0f} px, normal, ± {100 * prior.focal_sd:g} %"
-        made.append(Assumption("focal length", spread, f"[camera] fx, fy and [uncertainty] focal_sd {key}", given))
-    if prior.centre_sd_px > 0:
-        spread = f"({camera.cx:.0f}, {camera.cy:.0f}) px, normal, ± {prior.centre_sd_px:.0f} px an axis"
-        how = f"[camera] cx, cy and [uncertainty] centre_sd_px {key}"
-        made.append(Assumption("principal point", spread, how, given))
-    if prior.distortion_sd > 0:
-        lens = "none" if camera.distortion is None else "as given" if given else "equidistant"
-        spread = f"{lens}, its k1 normal, ± {prior.distortion_sd:g}"
-        if prior.edge_reach:
-            spread += f", unchanged {prior.edge_reach:.2f} focal lengths from the principal point"
-        how = f"[camera.distortion] and [uncertainty] distortion_sd {key}"
-        made.append(Assumption("distortion", spread, how, given))
-    return made
-
-
-def _in_degrees(slope: Distribution) -> str:
-    """Describe a distribution of angles, rad, in deg."""
-    scaled = (math.degrees(value) for value in vars(slope).values())
-    return str(type(slope)(*scaled))
 
 
 BORDERED = "the picture has dark borders"
@@ -191,23 +176,18 @@ from one are known to 10 %."""
 Span = tuple[int, int]
 
 
-def visible_box(picture: npt.NDArray[np.floating], view: View) -> tuple[Span, Span]:
-    """Return the columns and the rows between the dark borders of a picture, each as first and end.
+def border_note(picture: npt.NDArray[np.floating], view: View) -> str:
+    """Return a note of the dark borders' columns and rows, and what to do; empty where there are none to speak of.
 
     The picture has shape (H, W) or (H, W, 3), values as encoded in [0, 1]. A round view spans its circle, so that text
     beside it does not count; else a border is a run of rows or columns that are dark along their whole length.
     """
     height, width = picture.shape[:2]
     if (circle := view.circle) is not None:
-        return _within(circle.cx, circle.radius, width), _within(circle.cy, circle.radius, height)
-    lit = (picture >= DARK).reshape(height, width, -1)
-    return _lit_span(np.asarray(lit.any(axis=(0, 2)))), _lit_span(np.asarray(lit.any(axis=(1, 2))))
-
-
-def border_note(picture: npt.NDArray[np.floating], view: View) -> str:
-    """Return a note of the dark borders' columns and rows, and what to do; empty where there are none to speak of."""
-    columns, rows = visible_box(picture, view)
-    height, width = picture.shape[:2]
+        columns, rows = _within(circle.cx, circle.radius, width), _within(circle.cy, circle.radius, height)
+    else:
+        lit = (picture >= DARK).reshape(height, width, -1)
+        columns, rows = (_lit_span(np.asarray(lit.any(axis=axes))) for axes in ((0, 2), (1, 2)))
     named = [
         f"{name} {first} to {end - 1} of {size}"
         for name, (first, end), size in (("columns", columns, width), ("rows", rows, height))

@@ -108,8 +108,3 @@ def kinds_counted(kinds: Iterable[str]) -> str:
     """Count highlights by kind, the most frequent first: "12 cluster, 3 border"."""
     counts = Counter(kind_name(kind) for kind in kinds)
     return ", ".join(f"{count} {name}" for name, count in counts.most_common())
-
-
-def known(table: dict[str, str], name: str) -> str:
-    """Return the sentence of a name; that of another package is told as such."""
-    return table.get(name, "defined by another package")

@@ -48,15 +48,10 @@ def read_picture(path: Path) -> Image:
     `InputError` as `read_raw` does, and for other depths.
     """
     picture = read_raw(path, "a picture (PNG, JPEG, BMP, TIFF)")
-    if (
-        picture.ndim == 3
-        and picture.shape[2] == 4
-        and (clear := float((picture[..., 3] < picture[..., 3].max()).mean()))
-    ):
-        warnings.warn(
-            f"{path}: its alpha channel is ignored, by which {clear:.2g} of the pixels are transparent",
-            stacklevel=3,
-        )
+    alpha = picture[..., 3] if picture.ndim == 3 and picture.shape[2] == 4 else None
+    if alpha is not None and (clear := float((alpha < alpha.max()).mean())):
+        told = f"{path}: its alpha channel is ignored, by which {clear:.2g} of the pixels are transparent"
+        warnings.warn(told, stacklevel=3)
     scaled = scale_picture(picture, str(path))
     if scaled is None:
         raise InputError(f"{path}: pixels are {picture.dtype}; must be 8 or 16 bits")
@@ -105,12 +100,9 @@ def _check_header(path: Path) -> None:
     share = bits / MOST_BITS
     check_limit("picture_pixels", width * height * share, f"{path}: {bits} bits a pixel", f"times {MOST_BITS} bits")
     if turned != 1:
-        how = TURNED.get(str(header.format), "")
-        warnings.warn(
-            f"{path}: its orientation tag is {turned}: pixels are taken {how}, and the calibration must be of "
-            "such pictures",
-            stacklevel=4,
-        )
+        tag = f"{path}: its orientation tag is {turned}"
+        how = f"pixels are taken {TURNED.get(str(header.format), '')}, and the calibration must be of such pictures"
+        warnings.warn(f"{tag}: {how}", stacklevel=4)
     if animated:
         warnings.warn(f"{path}: holds several pictures; the first is used", stacklevel=4)
 
@@ -326,9 +318,8 @@ def check_frame(frame: npt.ArrayLike, camera: Camera, encoding: str | None = Non
     try:
         given = np.asarray(frame)
     except (TypeError, ValueError):
-        raise InputError(
-            "frame: must be an array of numbers; its rows differ in length or hold something else"
-        ) from None
+        text = "frame: must be an array of numbers; its rows differ in length or hold something else"
+        raise InputError(text) from None
     if given.dtype.kind not in "biuf":
         raise InputError(f"frame holds values of type {given.dtype}: must be an array of real numbers")
     if given.ndim not in (2, 3) or given.size == 0:
@@ -337,9 +328,8 @@ def check_frame(frame: npt.ArrayLike, camera: Camera, encoding: str | None = Non
     is_picture = image is not None or encoding == "srgb"
     if image is None:
         if given.dtype.kind != "f":
-            raise InputError(
-                f"frame holds integers of type {given.dtype}, whose range is not known: must be uint8, uint16 or real"
-            )
+            needed = "must be uint8, uint16 or real"
+            raise InputError(f"frame holds integers of type {given.dtype}, whose range is not known: {needed}")
         # What float32 cannot hold becomes infinite and is refused below.
         with np.errstate(all="ignore"):
             image = given.astype(np.float32)
@@ -368,10 +358,8 @@ def check_finite(image: Image) -> None:
 def check_size(image: Image, camera: Camera) -> None:
     """Raise `InputError` where a frame is not of the camera's size."""
     if image.shape[:2] != (camera.height, camera.width):
-        raise InputError(
-            f"frame is {image.shape[1]} x {image.shape[0]} px: must be {camera.width} x {camera.height}, "
-            "the size of the camera's calibration"
-        )
+        needed = f"must be {camera.width} x {camera.height}, the size of the camera's calibration"
+        raise InputError(f"frame is {image.shape[1]} x {image.shape[0]} px: {needed}")
 
 
 def check_roi(roi: tuple[int, int, int, int]) -> tuple[int, int, int, int]:

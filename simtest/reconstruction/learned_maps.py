@@ -7,9 +7,8 @@ from simtest.detection.detector import Detector, load_detector, run_detector
 from simtest.detection.view import find_view
 from simtest.errors import Failure
 from simtest.estimators.learned_dense import DenseMaps, LearnedDense, learned_dense
-from simtest.geometry import Array
 from simtest.reconstruction.options import complete
-from simtest.runtime.arrays import Image, Mask
+from simtest.runtime.arrays import Image
 
 SMOOTHING_PX = 1.0
 """Of the detection, as in the dataset that the shipped network learned from."""
@@ -36,12 +35,8 @@ def learned_maps(
     """
     seen = find_view(picture).seen if calibration.camera.seen is None else calibration.camera.seen
     known = complete(calibration, None)
-    return network.maps(picture, known, _peaks(picture, known, seen, detector), seen)
-
-
-def _peaks(picture: Image, calibration: Calibration, seen: Mask | None, detector: str | Detector) -> Array:
-    """Return the peaks of the highlights of a picture, px, shape (N, 2)."""
     finder = load_detector(detector) if isinstance(detector, str) else detector
-    found = run_detector(finder, Frame(picture, calibration, SMOOTHING_PX, seen))
+    found = run_detector(finder, Frame(picture, known, SMOOTHING_PX, seen))
     patches = [found.frame.patch(region.box, region.peak) for region in found.regions]
-    return np.array([patch.peak_px for patch in patches if not isinstance(patch, Failure)], dtype=float).reshape(-1, 2)
+    peaks = [patch.peak_px for patch in patches if not isinstance(patch, Failure)]
+    return network.maps(picture, known, np.array(peaks, dtype=float).reshape(-1, 2), seen)

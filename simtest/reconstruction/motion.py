@@ -45,27 +45,13 @@ COLUMNS = ("motion", "motion_frames", "bend_1", "bend_2", "sign_1", "sign_2", "m
 
 @dataclass(frozen=True)
 class MotionRecord:
-    """What motion tells of a highlight.
+    """What motion tells of a highlight: "ok" where both signs are told, else the `Reason`; `detail` says more.
 
-    Parameters
-    ----------
-    status : str
-        "ok" where both signs are told, else the `Reason`; `detail` says more.
-    frames : tuple of int
-        Frames that judged it.
-    signs : tuple of int
-        Of 1 + d k along both principal directions of the estimate `curved`; 0 where it is not told.
-    margins : tuple of float
-        Twice the log of the likelihood ratio of each sign and the other one.
-    gains : tuple of float
-        1 + d k of the hypothesis that explains the frames best, told or not.
-    bends : tuple of str
-        "convex", "concave" or "undecided" along both directions.
-    distance2, freedom : float, int
-        Squared Mahalanobis distance of that hypothesis, and its degrees of freedom; `fits` says whether it is one that
-        chance explains.
-    motions : tuple of float, optional
-        Shortest and longest motion to another frame of its track, as shares of the distance; None where there is none.
+    `signs` are those of 1 + d k along both principal directions of the estimate `curved`, 0 where it is not told, with
+    `margins`, twice the log of the likelihood ratio of each sign and the other one. `gains` are 1 + d k of the
+    hypothesis that explains the `frames` best, told or not, at the squared Mahalanobis distance `distance2` with so
+    many degrees of `freedom`; it `fits` where chance explains that. `motions` are the shortest and the longest one to
+    another frame of its track, as shares of the distance; None where there is none.
     """
 
     status: str
@@ -102,9 +88,8 @@ def check_priors(priors: Priors, camera: Path) -> None:
     """Raise `InputError` where a calibration lacks what the method needs."""
     where = f"--camera {camera}: --poses needs"
     if priors.distance_mm is None:
-        raise InputError(
-            f"{where} the working distance; give rig.distance_mm with distance_sd_mm, or distance_range_mm"
-        )
+        keys = "rig.distance_mm with distance_sd_mm, or distance_range_mm"
+        raise InputError(f"{where} the working distance; give {keys}")
     if priors.lobe_curvature is None:
         raise InputError(f"{where} the width of the lobe; give surface.phong_exponent or surface.lobe_curvature")
     offset = max((float(np.linalg.norm(light)) for light in priors.lights_mm), default=np.inf)
@@ -161,7 +146,7 @@ def fits_flipped_axes(
     """
     flipped = {frame: None if pose is None else pose @ _FLIPPED for frame, pose in poses.items()}
     turned = judge_by_motion(highlights, flipped, error, priors)
-    pairs = [(given.distance2, other.distance2) for given, other in zip(judged, turned, strict=True)]
+    pairs = ((given.distance2, other.distance2) for given, other in zip(judged, turned, strict=True))
     gained = [given - other for given, other in pairs if given is not None and other is not None]
     return bool(gained) and float(np.median(gained)) > CLEAR
 
@@ -187,11 +172,7 @@ def _judge(
         return replace(undecided, motions=motions)
     spread = np.unique(np.linspace(0, len(near) - 1, MOST_VIEWS).round().astype(int))
     chosen = [seen[i] for i in near[spread]]
-    views = [
-        MovedView([estimate], np.linalg.inv(other) @ pose, error)
-        for _, other, estimate in chosen
-        if estimate is not None
-    ]
+    views = [MovedView([e], np.linalg.inv(other) @ pose, error) for _, other, e in chosen if e is not None]
     ranked = rank_by_motions(first, views, priors)
     indices = tuple(frame for frame, _, _ in chosen)
     record = _undecided(ranked, indices) if isinstance(ranked, Failure) else _record(ranked, indices)

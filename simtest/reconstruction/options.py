@@ -120,38 +120,40 @@ def parse_roi(text: str) -> tuple[int, int, int, int]:
     return x, y, width, height
 
 
+def stated_calibration(options: Options) -> Calibration | None:
+    """Read the camera's file; None where a field of view stands in its place.
+
+    Raises `InputError` if the file is malformed, or states the response and the options do too.
+    """
+    options.require_camera()
+    if options.camera is None:
+        return None
+    # Imported here: the models of files are slow to load, and a field of view needs none.
+    from simtest.spec.calibration_file import load_calibration
+
+    calibration = load_calibration(options.camera)
+    if calibration.response is not None and options.encoding is not None:
+        raise InputError(f"--encoding {options.encoding}: the calibration states the response; give one of them")
+    return calibration
+
+
 def calibration_for(options: Options, picture: Image) -> tuple[Calibration, list[str]]:
     """Return the calibration of pictures of this size, and warnings about it.
 
-    What every picture has, an encoding and a largest value, is added where it is reconstructed. Raises `InputError` if
-    the camera's file is malformed, or states the response and the options do too.
+    What every picture has, an encoding and a largest value, is added where it is reconstructed.
     """
-    options.require_camera()
-    if options.camera is not None:
-        # Imported here: the models of files are slow to load, and a field of view needs none.
-        from simtest.spec.calibration_file import load_calibration
-
-        calibration, cautions = load_calibration(options.camera), []
-    else:
-        assert options.fov_deg is not None
-        calibration = _calibration_of_view(options, options.fov_deg, picture)
-        extent = "round view" if options.fov_of == "view" else options.fov_of
-        angle = f"the field of view of {options.fov_deg:g} deg across the picture's {extent}"
-        cautions = [f"no calibration: all angles depend on {angle} being right"]
-    if calibration.response is not None and options.encoding is not None:
-        raise InputError(f"--encoding {options.encoding}: the calibration states the response; give one of them")
-    return calibration, cautions
-
-
-def _calibration_of_view(options: Options, fov_deg: float, picture: Image) -> Calibration:
-    """Return the calibration that follows from the stated field of view."""
-    height, width = picture.shape[:2]
+    if (stated := stated_calibration(options)) is not None:
+        return stated, []
+    assert options.fov_deg is not None
+    (height, width), extent = picture.shape[:2], str(options.fov_of)
     if options.fov_of != "view":
-        return calibration_of_view(fov_deg, width, height, options.fov_of)
-    circle = find_view(picture).circle
-    if circle is None:
+        calibration = calibration_of_view(options.fov_deg, width, height, options.fov_of)
+    elif (circle := find_view(picture).circle) is not None:
+        calibration, extent = calibration_of_round_view(options.fov_deg, width, height, circle), "round view"
+    else:
         raise InputError("--fov-of view: no round view was found in the picture; give width, height or diagonal")
-    return calibration_of_round_view(fov_deg, width, height, circle)
+    angle = f"the field of view of {options.fov_deg:g} deg across the picture's {extent}"
+    return calibration, [f"no calibration: all angles depend on {angle} being right"]
 
 
 @dataclass(frozen=True)

@@ -60,12 +60,11 @@ def normals_rows(entries: Iterable[JsonObject]) -> Iterator[tuple[object, ...]]:
         judged = (*peak, entry.get("kind"), entry.get("score"))
         for name, each in entry["estimates"].items():
             start, best = (entry["id"], name, each["status"]), int(name == entry["best"])
-            if each["status"] != "ok":
-                # candidate, normal, look and axis ratio; then margin and covariance
-                nothing = (None,) * 7
-                yield (*start, *nothing, "", best, *nothing[:4], *judged, None, None)
-                continue
             covariance, deviation = (None,) * 3, None
+            if each["status"] != "ok":
+                # candidate, normal, look and axis ratio; then margin
+                yield (*start, *(None,) * 7, "", best, None, *covariance, *judged, None, deviation)
+                continue
             if each["covariance"] is not None:
                 matrix = np.array(each["covariance"])
                 covariance, deviation = matrix[np.triu_indices(2)].tolist(), deviation_deg(matrix)
@@ -90,9 +89,13 @@ def normals_ply(spots: Sequence[Specularity], camera: Camera, depths_mm: Sequenc
     """
     # Estimators are numbered by name, so that the file does not depend on the order in which they ran.
     lines, names = [], sorted({name for spot in spots for name in spot.estimates})
+    is_perspective = camera.distortion is None or isinstance(camera.distortion, BrownConrady)
     for spot, depth in zip(spots, depths_mm, strict=True):
         for name, result in spot.normals.items():
-            if (point := _surface_point(result, camera, depth)) is not None:
+            ray = camera.unproject(result.look_px)
+            # Depth is along the optical axis of a perspective lens, along the sightline of one that sees sideways.
+            point = depth * (ray / ray[2] if is_perspective else ray)
+            if np.isfinite(point).all():
                 values = [*point.tolist(), *result.normal.tolist()]
                 lines.append(" ".join(f"{v:.9g}" for v in values) + f" {spot.id} {names.index(name)}")
     header = [
@@ -101,14 +104,6 @@ def normals_ply(spots: Sequence[Specularity], camera: Camera, depths_mm: Sequenc
         "property int specularity", "property int estimator", "end_header",
     ]  # fmt: skip
     return "\n".join([*header, *lines]) + "\n"
-
-
-def _surface_point(result: Estimate, camera: Camera, depth_mm: float) -> Array | None:
-    """Return the point at a depth on the sightline of a normal; None where there is no such sightline or depth."""
-    ray, lens = camera.unproject(result.look_px), camera.distortion
-    # Depth is along the optical axis of a perspective lens, along the sightline of one that sees sideways.
-    point = depth_mm * (ray / ray[2] if lens is None or isinstance(lens, BrownConrady) else ray)
-    return np.asarray(point) if np.isfinite(point).all() else None
 
 
 VERSION = 2
@@ -121,12 +116,8 @@ def constraints_arrays(found: Specularities) -> dict[str, npt.NDArray[np.generic
     pixel, at which the best normal looks, is where it is estimated. Of the surface on the sightline through that pixel
     the normal is the same, with `covariance_at_pixel`. docs/howto/constraints.md lists the arrays.
     """
-    made = [
-        (spot, spot.best, best)
-        for spot in found
-        if spot.best is not None and (best := spot.best_estimate) is not None
-        if np.isfinite(found.camera.unproject(best.look_px)).all()
-    ]
+    answered = ((spot, spot.best, best) for spot in found if (best := spot.best_estimate) is not None)
+    made = [each for each in answered if np.isfinite(found.camera.unproject(each[2].look_px)).all()]
     pixels = np.array([best.look_px for _, _, best in made], dtype=float).reshape(-1, 2)
     normals = np.array([best.normal for _, _, best in made], dtype=float).reshape(-1, 3)
     stated, at_pixel = np.full((2, len(made), 2, 2), np.nan)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.pages.style import colours
+from simtest.pages.style import colours, rgb
 from simtest.reconstruction.records import Points, Specularity
 from simtest.runtime.arrays import Array, Image, Picture
 
@@ -44,9 +44,7 @@ class _Sheet:
         values = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
         self.pixels: Picture = cv2.cvtColor(values, cv2.COLOR_GRAY2BGR if values.ndim == 2 else cv2.COLOR_RGB2BGR)
         if self.scale > 1:
-            self.pixels = cv2.resize(
-                self.pixels, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_CUBIC
-            )  # fmt: skip
+            self.pixels = cv2.resize(self.pixels, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_CUBIC)
 
     def at(self, points: npt.ArrayLike) -> npt.NDArray[np.int32]:
         """Return points, shape (..., 2), in OpenCV's fractions of a px of the drawing."""
@@ -84,13 +82,16 @@ class _Sheet:
             cv2.fillConvexPoly(self.pixels, self.at(centre) + half * corners, shade, cv2.LINE_AA, FRACTION_BITS)
 
 
-def draw_overlay(picture: Image, spots: Sequence[Specularity], origin_px: tuple[int, int] = (0, 0)) -> Picture:
+def draw_overlay(
+    picture: Image, spots: Sequence[Specularity], origin_px: tuple[int, int] = (0, 0), with_curves: bool = True
+) -> Picture:
     """Draw a picture with the best normal of each specularity: its isophote, fitted ellipse, candidates and number.
 
     A cloud of highlights is drawn as its centre and base normal, with a line to each of its glints. The picture, shape
     (H, W) or (H, W, 3), is RGB in [0, 1], as encoded, and may be a part of the frame with its first pixel at
     `origin_px`; the drawing is in OpenCV's order of channels, with a legend below. Specularities are numbered by their
-    tracks where they have one, else by their ids; a number that would cover another is left out.
+    tracks where they have one, else by their ids; a number that would cover another is left out. Fitted curves are left
+    out where they are not wanted.
     """
     sheet = _Sheet(picture, CROWDED_PX if len(spots) > MANY else SHORTEST_PX, origin_px)
     palette = {name: _bgr(colour) for name, colour in colours(n for s in spots for n in s.estimates).items()}
@@ -104,17 +105,18 @@ def draw_overlay(picture: Image, spots: Sequence[Specularity], origin_px: tuple[
         if (result := spot.best_estimate) is None or spot.best is None:
             continue
         colour, drawing = palette[spot.best], spot.drawings[spot.best]
+        curves = drawing.curves if with_curves else []
         shown[spot.best] = colour
         if drawing.isophotes:
             # The isophote nearest to half height; curves stand in the isophotes' order where each isophote has one.
             nearest = min(range(len(drawing.isophotes)), key=lambda i: abs(drawing.isophotes[i][0] - HALF))
             sheet.line(drawing.isophotes[nearest][1], ISOPHOTE)
             shown["isophote"] = ISOPHOTE
-            if len(drawing.curves) == len(drawing.isophotes):
-                sheet.line(drawing.curves[nearest], colour)
+            if len(curves) == len(drawing.isophotes):
+                sheet.line(curves[nearest], colour)
         if result.cloud is not None:
             sheet.cloud(result.look_px, result.cloud.points_px, colour)
-            for curve in drawing.curves:
+            for curve in curves:
                 for shade, width in ((RAY, 4), (colour, 2)):
                     sheet.line(curve, shade, width)
         if np.isfinite(result.look_px).all():
@@ -152,10 +154,11 @@ def _draw_numbers(sheet: _Sheet, spots: Sequence[Specularity]) -> None:
         edges = area + np.array([-2, -2, 2, 2])
         first, top, end, bottom = np.clip(edges, 0, np.tile(canvas.shape[1::-1], 2))
         canvas[top:bottom, first:end] = (PLATE_SHARE * canvas[top:bottom, first:end]).astype(np.uint8)
-        _text(canvas, text, (left, low), NUMBER, 0.42)
+        write_text(canvas, text, (left, low), NUMBER, 0.42)
 
 
-def _text(canvas: Picture, text: str, corner: tuple[int, int], colour: Colour, size: float) -> None:
+def write_text(canvas: Picture, text: str, corner: tuple[int, int], colour: Colour, size: float) -> None:
+    """Write on a picture from a lower left corner, with a dark edge."""
     for shade, width in (((0, 0, 0), 3), (colour, 1)):
         cv2.putText(canvas, text, corner, cv2.FONT_HERSHEY_SIMPLEX, size, shade, width, cv2.LINE_AA)
 
@@ -171,13 +174,13 @@ def _legend(width: int, count: int, shown: dict[str, Colour]) -> Picture:
         entries.append((x, LINE_PX * line + 20, name, colour))
         x += wide
     strip = np.full((LINE_PX * line + 30, width, 3), 32, dtype=np.uint8)
-    _text(strip, f"{count} {what}", (8, 20), (255, 255, 255), 0.45)
+    write_text(strip, f"{count} {what}", (8, 20), (255, 255, 255), 0.45)
     for x, y, name, colour in entries:
         cv2.line(strip, (x, y - 4), (x + 18, y - 4), colour, 2, cv2.LINE_AA)
-        _text(strip, name, (x + 24, y), (230, 230, 230), 0.42)
+        write_text(strip, name, (x + 24, y), (230, 230, 230), 0.42)
     return strip
 
 
 def _bgr(colour: str) -> Colour:
-    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    red, green, blue = rgb(colour)
     return blue, green, red

@@ -5,7 +5,6 @@ A page is one file that needs nothing else, but for a sequence's pictures.
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -98,32 +97,21 @@ def write_sequence_page(path: Path, frames: Sequence[DoneFrame], tracks: Sequenc
 def _address(picture: Image) -> str:
     """Return the picture as a JPEG's data address, of lower quality where it would be large."""
     values = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
-    address = ""
-    # lower the quality until the page is small enough
-    for quality in (92, 80, 65, 45):
-        address = jpeg_address(values, quality)
-        if len(address) <= MAX_ADDRESS:
-            break
-    return address
+    addresses = (jpeg_address(values, quality) for quality in (92, 80, 65))
+    return next((each for each in addresses if len(each) <= MAX_ADDRESS), None) or jpeg_address(values, 45)
 
 
-@dataclass
-class _Lines:
-    """Lines to draw, each kept once: estimators share isophotes and fitted curves."""
-
-    kept: list[Points] = field(default_factory=list)
-
-    def index(self, line: Points) -> int:
-        """Return the index of a line, px, after rounding to what can be seen."""
-        # A tenth of a pixel cannot be seen, and the digits would double the page.
-        rounded = _rounded(line, 1)
-        if rounded not in self.kept:
-            self.kept.append(rounded)
-        return self.kept.index(rounded)
+def _index(line: Points, kept: list[Points]) -> int:
+    """Return the index of a line to draw, px; each is kept once, as estimators share isophotes and fitted curves."""
+    # A tenth of a pixel cannot be seen, and the digits would double the page.
+    rounded = _rounded(line, 1)
+    if rounded not in kept:
+        kept.append(rounded)
+    return kept.index(rounded)
 
 
 def _spot(spot: Specularity, cloud_id: int | None) -> JsonObject:
-    lines = _Lines()
+    lines: list[Points] = []
     rows = [{"name": name, **_row(name, result, spot, lines)} for name, result in spot.estimates.items()]
     return {
         "id": spot.id,
@@ -134,16 +122,20 @@ def _spot(spot: Specularity, cloud_id: int | None) -> JsonObject:
         "best": spot.best,
         "because": spot.best_because,
         "cloud": cloud_id,
-        "lines": lines.kept,
+        "lines": lines,
         "rows": rows,
     }
 
 
-def _row(name: str, result: Estimate | Failure, spot: Specularity, lines: _Lines) -> JsonObject:
+def _row(name: str, result: Estimate | Failure, spot: Specularity, lines: list[Points]) -> JsonObject:
     if isinstance(result, Failure):
         return {"status": str(result.reason), "detail": result.detail}
     error = spot.reference.errors.get(name) if spot.reference else None
-    drawing = spot.drawings[name]
+    drawing, across = spot.drawings[name], None
+    if result.covariance is not None:
+        # Of the normal's part across the view: xx, xy and yy.
+        seen = covariance_across(result.normal, result.covariance)
+        across = [float(f"{v:.4g}") for v in seen[np.triu_indices(2)]]
     traced = sorted(drawing.isophotes, key=lambda each: abs(each[0] - HALF))
     # nearest to half height first, which is drawn of every highlight
     return {
@@ -152,25 +144,17 @@ def _row(name: str, result: Estimate | Failure, spot: Specularity, lines: _Lines
         "tilt": round(tilt_deg(result.normal), 2),
         "margin": result.choice_margin,
         "look": [v if np.isfinite(v) else None for v in _rounded(result.look_px, 2)],
-        "isophotes": [lines.index(points) for _, points in traced],
-        "curves": [lines.index(curve) for curve in drawing.curves],
+        "isophotes": [_index(points, lines) for _, points in traced],
+        "curves": [_index(curve, lines) for curve in drawing.curves],
         "deviation": result.deviation_deg,
         "silent": explanations.why_no_error(name, result),
-        "across": _across(result),
+        "across": across,
         "target": result.target,
         "parts": {name: round(float(np.degrees(v)), 4) for name, v in deviations(result.budget or {}).items()},
         "flags": result.flags,
         "error": error and error.error_deg,
         "cloud": _cloud(result),
     }
-
-
-def _across(result: Estimate) -> list[float] | None:
-    """Return the covariance of the normal's part across the view: xx, xy and yy."""
-    if result.covariance is None:
-        return None
-    seen = covariance_across(result.normal, result.covariance)
-    return [float(f"{seen[i, j]:.4g}") for i, j in ((0, 0), (0, 1), (1, 1))]
 
 
 def _cloud(result: Estimate) -> JsonObject | None:
@@ -198,8 +182,7 @@ def specularities_html(spots: Specularities) -> str:
     """Return the frame with its best normals, and the rows of the brightest specularities."""
     picture = _picture(spots.detection.frame.encoded, spots.choices.encoding)
     drawn = cv2.cvtColor(draw_overlay(picture, spots), cv2.COLOR_BGR2RGB)
-    what = "specularity" if len(spots) == 1 else "specularities"
-    more = f"{len(spots)} {what}; the best normal of each is drawn"
+    more = f"{spots.counted}; the best normal of each is drawn"
     more += f", the brightest {MOST_ROWS} are listed." if len(spots) > MOST_ROWS else "."
     rows = [_best_cells(spot) for spot in spots[:MOST_ROWS]]
     return picture_html(drawn, more) + note_html(more) + table_html(("No.", "kind", "best estimator", *HEADS), rows)
@@ -213,14 +196,15 @@ def specularity_html(spot: Specularity) -> str:
     if isinstance(spot.patch, Failure):
         return spot.patch._repr_html_() + table
     picture = _picture(np.asarray(spot.patch.values, dtype=np.float32), "linear")
-    # Without the camera the isophote is drawn alone, without its ellipse.
-    drawn = cv2.cvtColor(draw_overlay(picture, [replace(spot, camera=None)], spot.patch.origin_px), cv2.COLOR_BGR2RGB)
+    drawn = cv2.cvtColor(draw_overlay(picture, [spot], spot.patch.origin_px, with_curves=False), cv2.COLOR_BGR2RGB)
     return picture_html(drawn, "the highlight with its best normal", PATCH_PX) + table
 
 
 def _picture(values: Image, encoding: str) -> Image:
     """Return values in [0, 1] for the eye: linear light gets the display's gamma."""
     scaled = np.asarray(values, dtype=np.float32)
+    if scaled.ndim == 3 and scaled.shape[2] not in (1, 3, 4):
+        scaled = scaled.mean(axis=2)  # channels that are no colours of a display
     if encoding != "linear":
         return np.clip(scaled, 0, 1)
     return displayed(scaled / max(float(scaled.max()), 1e-12))

@@ -165,9 +165,8 @@ def run(image: Image, calibration: Calibration, options: Options, is_picture: bo
     if options.roi is not None:
         detection, beside = _cut_region(frame, options.roi, detection)
     # estimate
-    numbered = enumerate(_estimate(detection, chosen, beside, options))
-    spots = [replace(spot, camera=calibration.camera, target=options.target, id=i) for i, spot in numbered]
-    return Specularities(spots, detection, choices)
+    spots = _estimate(detection, chosen, beside, options)
+    return Specularities([replace(spot, id=i) for i, spot in enumerate(spots)], detection, choices)
 
 
 @dataclass(frozen=True)
@@ -259,10 +258,10 @@ def _estimate(
             small = highlight is not None and math.sqrt(highlight.area_px / math.pi) < SMALL_RADIUS * frame.smoothing_px
             dim = highlight is not None and highlight.dim
             results = {name: _flagged(each, patch, frame, small, dim) for name, each in results.items()}
-        spots.append(Specularity(region, patch, results, highlight))
+        spots.append(Specularity(region, patch, results, highlight, frame.camera, options.target))
     box = options.roi
     undetected = [
-        _undetected(name, estimate, frame)
+        _undetected(name, estimate, frame, options.target)
         for name, each in answers.items()
         for estimate in each.elsewhere
         if box is None or _is_inside(estimate.look_px, box)
@@ -271,7 +270,7 @@ def _estimate(
     spots.extend(sorted(undetected, key=lambda spot: any(each.cloud is not None for each in spot.normals.values())))
     if options.target == "base":
         spots = [
-            replace(spot, estimates=spot.estimates | {name: to_base(e, priors) for name, e in spot.normals.items()})
+            replace(spot, estimates={**spot.estimates, **{n: to_base(e, priors) for n, e in spot.normals.items()}})
             for spot in spots
         ]
     return spots
@@ -281,20 +280,17 @@ def _is_inside(point_px: Array, box: Box) -> bool:
     return bool((np.array(box[:2]) <= point_px).all() and (point_px < np.add(box[:2], box[2:])).all())
 
 
-def _undetected(name: str, estimate: Estimate, frame: Frame) -> Specularity:
-    """Return the specularity of a frame estimator's result that no patch takes: it has none.
-
-    Its region is one pixel, or the box around a cloud's highlights.
-    """
+def _undetected(name: str, estimate: Estimate, frame: Frame, target: Target) -> Specularity:
+    """Return the specularity of a frame estimator's result that no patch takes: at a pixel, or around a cloud."""
     height, width = frame.encoded.shape[:2]
     x, y = (min(max(int(v), 0), size - 1) for v, size in zip(estimate.look_px, (width, height), strict=True))
-    if estimate.cloud is None:
-        no_patch = Failure(Reason.NO_PEAK, "no region was detected here")
-        return Specularity(Region((x, y, 1, 1), (x, y), None), no_patch, {name: estimate})
-    low, high = (end(estimate.cloud.points_px, axis=0).astype(int).tolist() for end in (np.min, np.max))
-    box = (low[0], low[1], min(high[0] + 1, width) - low[0], min(high[1] + 1, height) - low[1])
-    no_patch = Failure(Reason.NO_PEAK, f"a cloud of {len(estimate.cloud.points_px)} highlights, no single one")
-    return Specularity(Region(box, (x, y), None), no_patch, {name: estimate})
+    box, why = (x, y, 1, 1), "no region was detected here"
+    if estimate.cloud is not None:
+        low, high = (end(estimate.cloud.points_px, axis=0).astype(int).tolist() for end in (np.min, np.max))
+        box = (low[0], low[1], min(high[0] + 1, width) - low[0], min(high[1] + 1, height) - low[1])
+        why = f"a cloud of {len(estimate.cloud.points_px)} highlights, no single one"
+    region, no_patch = Region(box, (x, y), None), Failure(Reason.NO_PEAK, why)
+    return Specularity(region, no_patch, {name: estimate}, camera=frame.camera, target=target)
 
 
 def _flagged(result: Estimate | Failure, patch: Patch, frame: Frame, small: bool, dim: bool) -> Estimate | Failure:

@@ -13,7 +13,7 @@ left-handed frame of its game engine, whose y axis points up.
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -58,20 +58,10 @@ DOWN = np.diag([1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class Poses:
-    """Where the camera was at each frame.
+    """Where the camera was at each frame, mm, shape (N, 4, 4), and the error of the motion between two frames.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    world_from_camera : ndarray, shape (N, 4, 4)
-        Poses, mm.
-    names : tuple of str
-        Of the frames' files; empty where the file names none, and poses go with frames by their order.
-    error : PoseError
-        Of the motion between two frames.
-    error_told : bool
-        Whether the file states both errors; one that it does not state is that of `UNTOLD_ERROR`.
+    `names` are those of the frames' files; where the file has none, poses go with frames by their order. An error that
+    it does not state is that of `UNTOLD_ERROR`; `error_told` is whether it states both.
     """
 
     path: Path
@@ -83,19 +73,15 @@ class Poses:
     def of_frames(self, names: Sequence[str], indices: Sequence[int]) -> list[Array | None]:
         """Return the pose of each frame by its file's name, or by its number where the poses have no names."""
         if self.names:
-            table = {name: pose for name, pose in zip(self.names, self.world_from_camera, strict=True)}
+            table = dict(zip(self.names, self.world_from_camera, strict=True))
             found = [table.get(name) for name in names]
             if all(pose is None for pose in found):
-                raise InputError(
-                    f"--poses {self.path}: names {self.names[0]!s:.60}; must name frames of the folder, "
-                    f"such as {names[0]!s:.60}"
-                )
+                wanted = f"must name frames of the folder, such as {names[0]!s:.60}"
+                raise InputError(f"--poses {self.path}: names {self.names[0]!s:.60}; {wanted}")
             return found
-        count = len(self.world_from_camera)
-        if max(indices) >= count:
-            raise InputError(
-                f"--poses {self.path}: {count} poses; must be one for each of the {max(indices) + 1} frames"
-            )
+        count, needed = len(self.world_from_camera), max(indices) + 1
+        if needed > count:
+            raise InputError(f"--poses {self.path}: {count} poses; must be one for each of the {needed} frames")
         return [self.world_from_camera[index] for index in indices]
 
     def of_files(self, names: Sequence[str]) -> list[Array | None]:
@@ -107,9 +93,8 @@ class Poses:
         check_names(where, self.names, names)
         found = self.of_frames(names, range(len(names)))
         if not self.names and count != len(names):
-            raise InputError(
-                f"{where}: {count} poses of frames without names; must be one for each of the {len(names)} frames"
-            )
+            needed = f"must be one for each of the {len(names)} frames"
+            raise InputError(f"{where}: {count} poses of frames without names; {needed}")
         return found
 
     def of_film(self, least: int) -> "Poses":
@@ -191,9 +176,8 @@ def _unit_mm(unit: object, where: str) -> float:
         return UNITS_MM[unit]
     number = _number(unit)
     if not 0 < number < np.inf:
-        raise InputError(
-            f"{where}: unit = {unit!s}; must be one of {', '.join(UNITS_MM)}, or the millimetres of one unit"
-        )
+        known = ", ".join(UNITS_MM)
+        raise InputError(f"{where}: unit = {unit!s}; must be one of {known}, or the millimetres of one unit")
     return number
 
 
@@ -222,8 +206,7 @@ def _from_json(text: str, where: str) -> Read:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: no JSON ({str(error)[:80]})") from error
     table = data if isinstance(data, dict) else {}
-    for key in table:
-        _check_setting(key, where)
+    settings = _settings_in(table, where)
     lists = [key for key in LISTS if key in table]
     if len(lists) > 1:
         raise InputError(f"{where}: holds {' and '.join(lists)}; must hold one list of poses")
@@ -248,7 +231,7 @@ def _from_json(text: str, where: str) -> Read:
         poses.append(_matrix(matrix, at))
     if names and len(names) < len(poses):
         raise InputError(f"{where}: {len(names)} of {len(poses)} poses name their frame; must be all or none")
-    return poses, names, {key: table[key] for key in SETTINGS if key in table}
+    return poses, names, settings
 
 
 def _is_foreign(text: str, is_json: bool) -> bool:
@@ -268,32 +251,26 @@ def _from_others(path: Path, text: str, is_json: bool, where: str) -> Read:
         found = read_foreign(path)
     except InputError as error:
         raise InputError(f"--poses {error}") from None
-    settings: dict[str, Any] = {}
-    if is_json:
-        table = parse_json(text)
-        for key in table:
-            _check_setting(key, where)
-        settings = {key: table[key] for key in SETTINGS if key in table}
-    else:
-        for number, line in enumerate(text.splitlines(), 1):
-            settings |= _setting(line, f"{where}: line {number}")
+    settings = _settings_in(parse_json(text), where) if is_json else _settings_of_lines(text, where)
     poses = [_matrix(T.tolist(), f"{where}: pose {number}") for number, (_, T) in enumerate(found)]
     return poses, [Path(name).name for name, _ in found], settings
 
 
-def _setting(line: str, at: str) -> dict[str, Any]:
-    """Return the setting that a comment states, as key: value; none of any other line."""
-    if not (stated := re.match(r"#\s*([A-Za-z_]+)\s*[:=]\s*(\S+)\s*$", line)):
-        return {}
-    key = stated[1].lower()
-    _check_setting(key, at)
-    return {key: stated[2]} if key in SETTINGS else {}
+def _settings_of_lines(text: str, where: str) -> dict[str, Any]:
+    """Return the settings that comments state as key: value."""
+    settings: dict[str, Any] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        if stated := re.match(r"#\s*([A-Za-z_]+)\s*[:=]\s*(\S+)\s*$", line):
+            settings |= _settings_in({stated[1].lower(): stated[2]}, f"{where}: line {number}")
+    return settings
 
 
-def _check_setting(key: str, where: str) -> None:
-    """Raise `InputError` for a key that is nearly a setting: what it says would be passed over."""
-    if key not in SETTINGS and (meant := close_names(key.lower(), SETTINGS)):
-        raise InputError(f"{where}: {key}: unknown; did you mean {meant[0]}?")
+def _settings_in(table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return the settings of a table; raise `InputError` for a key that is nearly one, and would be passed over."""
+    for key in table:
+        if key not in SETTINGS and (meant := close_names(key.lower(), SETTINGS)):
+            raise InputError(f"{where}: {key}: unknown; did you mean {meant[0]}?")
+    return {key: table[key] for key in SETTINGS if key in table}
 
 
 def _matrix(value: object, at: str) -> Array:
@@ -320,11 +297,9 @@ def _matrix(value: object, at: str) -> Array:
 
 def _from_tum(text: str, where: str) -> Read:
     """Read lines of timestamp tx ty tz qx qy qz qw; comments begin with # and may state a setting as key: value."""
-    poses: list[Array] = []
-    settings: dict[str, Any] = {}
+    poses, settings = list[Array](), _settings_of_lines(text, where)
     for number, line in enumerate(text.splitlines(), 1):
         at = f"{where}: line {number}"
-        settings |= _setting(line, at)
         if words := line.partition("#")[0].replace(",", " ").split():
             values = _numbers(words, 8, at, f"{line.strip()!s:.60}", ": time tx ty tz qx qy qz qw")
             T = np.eye(4)
@@ -362,11 +337,8 @@ def _simcol3d(path: Path, text: str, where: str) -> list[Array]:
 
 def _rows(text: str, count: int, separator: str | None, where: str) -> list[list[float]]:
     """Return the numbers of each line that is not empty."""
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    return [
-        _numbers(line.split(separator), count, f"{where}: line {number}", f"{line.strip()!s:.60}")
-        for number, line in lines
-    ]
+    lines = ((f"{where}: line {number}", line) for number, line in enumerate(text.splitlines(), 1) if line.strip())
+    return [_numbers(line.split(separator), count, at, f"{line.strip()!s:.60}") for at, line in lines]
 
 
 def _numbers(words: Sequence[str], count: int, at: str, shown: str, named: str = "") -> list[float]:

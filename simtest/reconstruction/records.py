@@ -5,8 +5,9 @@ docs/howto/reconstruct.md explains the keys of their JSON. It is what the tables
 
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -60,8 +61,8 @@ class Specularity:
         Where it is.
     patch : Patch or Failure
         The smoothed crop.
-    estimates : dict
-        `Estimate` or `Failure` by estimator name.
+    estimates : mapping
+        `Estimate` or `Failure` by estimator name; read-only, as what follows from them is kept.
     highlight : Highlight, optional
         How the detector judged it, if it judges any.
     camera : Camera, optional
@@ -87,13 +88,21 @@ class Specularity:
 
     region: Region
     patch: Patch | Failure
-    estimates: dict[str, Estimate | Failure]
+    estimates: Mapping[str, Estimate | Failure]
     highlight: Highlight | None = None
     camera: Camera | None = None
     target: Target = "fine"
     id: int = 0
     track: int | None = None
     reference: Any = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "estimates", MappingProxyType(dict(self.estimates)))
+
+    def __reduce__(self) -> tuple[type, tuple[object, ...]]:
+        """Return what a copy is made of: a view of a dictionary travels to no other process."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return type(self), tuple({**values, "estimates": dict(self.estimates)}.values())
 
     @property
     def peak_px(self) -> Array | None:
@@ -147,14 +156,15 @@ class Specularity:
         curves: dict[int, Points] = {}
         made = {}
         for name, result in self.normals.items():
-            fitted = [] if self.camera is None else [*result.isophotes]
-            for isophote in fitted:
-                if id(isophote) not in curves and self.camera is not None:
-                    curves[id(isophote)] = drawable(isophote.ellipse_px(self.camera))
-            outlines = [curves[id(isophote)] for isophote in fitted]
-            if result.cloud is not None and self.camera is not None:
-                look = self.camera.unproject(result.look_px)
-                outlines.append(drawable(self.camera.project(result.cloud.outline(result.normal, look))))
+            outlines = list[Points]()
+            if (camera := self.camera) is not None:
+                for isophote in result.isophotes:
+                    if id(isophote) not in curves:
+                        curves[id(isophote)] = drawable(isophote.ellipse_px(camera))
+                    outlines.append(curves[id(isophote)])
+                if result.cloud is not None:
+                    look = camera.unproject(result.look_px)
+                    outlines.append(drawable(camera.project(result.cloud.outline(result.normal, look))))
             isovalues = (isophote.isovalue for isophote in result.isophotes)
             traced = [] if isinstance(self.patch, Failure) else self.patch.contours(isovalues)
             made[name] = Drawing([(t, np.round(points, 3).tolist()) for t, points in traced], outlines)
@@ -198,11 +208,9 @@ class Specularity:
         ]
 
     def __repr__(self) -> str:
-        x, y, width, height = self.region.box
         failed = [f"{name} ({each.reason})" for name, each in self.estimates.items() if isinstance(each, Failure)]
-        where = f"at ({x + width / 2:.1f}, {y + height / 2:.1f}) px"
-        if self.peak_px is not None:
-            where = f"peak {vector(self.peak_px)} px"
+        x, y = self.position_px
+        where = f"at ({x:.1f}, {y:.1f}) px" if self.peak_px is None else f"peak {vector(self.peak_px)} px"
         text = f"{where}, normals: {' '.join(self.normals) or 'none'}" + f", failed: {', '.join(failed)}" * bool(failed)
         return f"Specularity({clipped(text, LONGEST - 13)})"
 
@@ -244,12 +252,20 @@ class Specularities(list[Specularity]):
         return self.choices.calibration.camera
 
     @property
+    def counted(self) -> str:
+        """How many there are, in words."""
+        return "1 specularity" if len(self) == 1 else f"{len(self)} specularities"
+
+    @property
     def stated(self) -> "StatedErrors | None":
         """What the best estimates state, with the medians of their budgets; None where none states anything."""
         return stated_errors([best for each in self if (best := each.best_estimate) is not None])
 
-    def to_json(self, drawn: bool = True) -> JsonObject:
-        """Return the content of normals.json; without isophotes and curves where it is not `drawn`."""
+    def to_json(self, drawn: bool = True, origin: provenance.Environment | None = None) -> JsonObject:
+        """Return the content of normals.json; without isophotes and curves where it is not `drawn`.
+
+        `origin` is what a run of many frames asked for once; asking costs a call of git.
+        """
         others = [
             {"box_px": h.region.box, "peak_px": [v + PIXEL_CENTRE for v in h.region.peak], **_highlight_json(h)}
             for h in self.detection.others
@@ -269,14 +285,13 @@ class Specularities(list[Specularity]):
             "specularities": [spot.to_json(drawn) for spot in self],
             "clouds": [entry for spot in self for entry in spot.clouds_json(drawn)],
             "other_highlights": others,
-            "provenance": provenance.environment(),
+            "provenance": origin or provenance.environment(),
             **({} if self.reference is None else {"reference": self.reference}),
         }
 
     def __repr__(self) -> str:
         answered = sum(bool(each.normals) for each in self)
-        what = "specularity" if len(self) == 1 else "specularities"
-        text = f"{len(self)} {what}, {answered} with a normal; {self.choices}"
+        text = f"{self.counted}, {answered} with a normal; {self.choices}"
         return f"<Specularities: {clipped(text, LONGEST - 18)}>"
 
     def _repr_html_(self) -> str:
@@ -344,16 +359,9 @@ def _rank(name: str) -> int:
 
 @dataclass(frozen=True)
 class StatedErrors:
-    """What the best estimates of a picture state, deg: medians of the standard deviation and of each part's.
+    """How many best estimates of a picture state an uncertainty, and how many do not; the medians of those, deg.
 
-    Parameters
-    ----------
-    count, silent : int
-        Best estimates that state an uncertainty, and others.
-    median_deg : float
-        Of the square root of the covariance's trace.
-    parts_deg : dict
-        The same of each part of the budget, the largest first.
+    They are of the square root of the covariance's trace, and of each part of the budget, the largest first.
     """
 
     count: int

@@ -4,12 +4,14 @@ What a frame gave stands in its JSON file alone, and the tables are made of thes
 holds its tracks.
 """
 
+import contextlib
 import hashlib
 import json
 import math
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -33,17 +35,18 @@ from simtest.reconstruction.motion import (
     judge_by_motion,
     motion_row,
 )
-from simtest.reconstruction.options import Options, calibration_for, default_estimators
+from simtest.reconstruction.options import Options, calibration_for, default_estimators, stated_calibration
 from simtest.reconstruction.outputs import COLUMNS, normals_rows, write_csv
 from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.page import write_sequence_page
 from simtest.reconstruction.pipeline import reconstruct_values
 from simtest.reconstruction.poses import Poses, read_poses
 from simtest.reconstruction.tracking import DoneFrame, Track, Tracker
+from simtest.runtime.arrays import Image
 from simtest.runtime.boundary import plain_errors
 from simtest.runtime.files import JsonObject, make_folder, read_json, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
-from simtest.runtime.provenance import environment
+from simtest.runtime.provenance import environment, version
 
 Progress = Callable[[int, int, str], None]
 
@@ -70,30 +73,17 @@ class SequenceResult:
 
 @plain_errors
 def reconstruct_sequence(path: Path, out: Path, options: Options, progress: Progress | None = None) -> SequenceResult:
-    """Reconstruct the frames of a folder or a video.
+    """Reconstruct the pictures of a folder, in the order of their names, or the frames of a video that OpenCV reads.
 
-    Parameters
-    ----------
-    path : Path
-        Folder of pictures, in the order of their names, or a video that OpenCV reads.
-    out : Path
-        Folder: run.json, frames/NNNNNN.json and .jpg, timeline.csv, tracks.json, index.html. Frames that are there
-        already are not done again.
-    options : Options
-        Camera, detector and estimators.
-    progress : callable, optional
-        Called with frames done, frames in all, and the frame's name; what it raises stops the run, and what is done
-        is kept.
+    The folder `out` gets run.json, frames/NNNNNN.json and .jpg, timeline.csv, tracks.json and index.html; frames that
+    are there already are not done again. `progress` is called with frames done, frames in all, and the frame's name;
+    what it raises stops the run, and what is done is kept.
     """
     options.require_camera()
     if isinstance(options.estimators, Mapping) or not isinstance(options.detector, str | None):
         raise InputError(f"{path}: the estimators and the detector of a folder or a film must be given by name")
-    source, calibration, poses = open_source(path), None, None
-    if options.camera is not None:
-        # Imported here: the models of files are slow to load.
-        from simtest.spec.calibration_file import load_calibration
-
-        calibration = load_calibration(options.camera)
+    source, poses = open_source(path), None
+    calibration = stated_calibration(options)
     if options.poses is not None:
         poses, options = _checked_poses(options.poses, source, options, calibration)
     with exclusive_folder(out):
@@ -130,7 +120,7 @@ def _reconstruct(
 ) -> SequenceResult:
     path, settings = source.path, _settings(source.path, options, calibration)
     _check_settings(out / SETTINGS, settings)
-    run = _Run(out, options, settings)
+    run = _Run(out, options, settings, calibration)
     if poses is not None and poses.names:
         run.strangers = frozenset(file.name for file in source.files) - frozenset(poses.names)
     for frame in source.frames():
@@ -143,18 +133,15 @@ def _reconstruct(
     # The count of a whole film may be off by one.
     if source.is_video and (run.taken < source.count - 1 or source.is_cut):
         how = "its file is cut short; " if source.is_cut else ""
-        warnings.warn(
-            f"{path}: {how}ends after {run.taken} of {source.count} frames; what was read is kept", stacklevel=2
-        )
+        told = f"{how}ends after {run.taken} of {source.count} frames; what was read is kept"
+        warnings.warn(f"{path}: {told}", stacklevel=2)
     motion = None
     if poses is not None and calibration is not None:
         # The count of a film is not known before it is read.
-        if source.is_video and not source.is_cut and len(poses.world_from_camera) > run.taken:
-            warnings.warn(
-                f"--poses {poses.path}: {len(poses.world_from_camera)} poses for {run.taken} frames; the first "
-                "ones are taken in their order",
-                stacklevel=2,
-            )
+        count = len(poses.world_from_camera)
+        if source.is_video and not source.is_cut and count > run.taken:
+            told = f"{count} poses for {run.taken} frames; the first ones are taken in their order"
+            warnings.warn(f"--poses {poses.path}: {told}", stacklevel=2)
         motion = _judge_by_motion(run, poses, calibration)
     tracks = [run.tracks[number] for number in sorted(run.tracks)]
     files = _write(run, tracks)
@@ -169,8 +156,9 @@ def _reconstruct(
 class _Run:
     """The frames of a sequence that are done so far, with what carries over from one to the next."""
 
-    def __init__(self, out: Path, options: Options, settings: JsonObject) -> None:
+    def __init__(self, out: Path, options: Options, settings: JsonObject, calibration: Calibration | None) -> None:
         self.out, self.folder, self.options, self.settings = out, out / "frames", options, settings
+        self._calibration, self._origin = calibration, environment()
         self.frames: list[DoneFrame] = []
         self.tracks: dict[int, Track] = {}
         self.taken = self.failed = 0
@@ -178,7 +166,6 @@ class _Run:
         self.strangers: frozenset[str] = frozenset()  # files that the poses do not name, such as a contact sheet
         self.assumed: Sequence[Assumption] = ()
         self._is_made = False  # a frame of this run; those behind it that an earlier one did have other tracks
-        self._calibration: Calibration | None = None
         self._cautions: list[str] = []
         self._tracker: Tracker | None = None
 
@@ -188,20 +175,26 @@ class _Run:
         # done by an earlier run: only the tracks are counted anew
         done = None if self._is_made else _read_done(self.file(frame.index), frame.name)
         if done is not None:
+            if self._calibration is None:
+                # A field of view is that of the first picture, also of frames that are made in a later run.
+                with contextlib.suppress(InputError):
+                    self._calibration, self._cautions = calibration_for(self.options, frame.read())
+            before = deepcopy(self._tracker)
             numbers = self._track_numbers(_positions(done), done["size"], frame.index)
-            # They are others where a frame before this one was lost since.
-            if numbers != [spot["track"] for spot in done["specularities"]]:
-                for spot, number in zip(done["specularities"], numbers, strict=True):
-                    spot["track"] = number
-                write_json(self.file(frame.index), done, compact=True)
-            self._keep(frame.index, done, numbers)
-            return
+            if numbers == [spot["track"] for spot in done["specularities"]]:
+                self._keep(frame.index, done, numbers)
+                return
+            # A frame before this one was lost since: its file and its picture have other numbers.
+            self._tracker = before
+        picture = None
         try:
-            self._reconstruct(frame)
+            picture = frame.read()
+            self._reconstruct(frame, picture)
             self._is_made = True
         except InputError as error:
             # The first frame shows a wrong camera or estimator; a file that is no picture is passed over.
-            if not self.frames and self._calibration is not None and frame.name not in self.strangers:
+            refused = picture is not None and self._calibration is not None
+            if refused and not self.frames and frame.name not in self.strangers:
                 raise
             self.failed += 1
             self.first_error = self.first_error or str(error)
@@ -211,14 +204,13 @@ class _Run:
         """Return the JSON file of a frame."""
         return self.folder / f"{index:06d}.json"
 
-    def _reconstruct(self, frame: SequenceFrame) -> None:
-        picture = frame.read()
+    def _reconstruct(self, frame: SequenceFrame, picture: Image) -> None:
         size = (picture.shape[1], picture.shape[0])
         # The first picture's size completes a camera that is known by its field of view alone.
         if self._calibration is None:
             self._calibration, self._cautions = calibration_for(self.options, picture)
-            for caution in self._cautions:
-                warnings.warn(caution, stacklevel=6)
+        for caution in () if self._is_made else self._cautions:
+            warnings.warn(caution, stacklevel=6)
         found = reconstruct_values(frame.name, picture, self._calibration, self.options, self._cautions)
         self.assumed = found.choices.assumed
         numbers = self._track_numbers([spot.position_px for spot in found], size, frame.index)
@@ -230,7 +222,7 @@ class _Run:
             write_json(self.out / SETTINGS, self.settings)
         file = self.file(frame.index)
         write_atomically(file.with_suffix(".jpg"), lambda part: cv2.imwrite(str(part), overlay))
-        entry = {**found.to_json(drawn=False), "frame_index": frame.index, "time_s": frame.time_s, "size": size}
+        entry = {**found.to_json(False, self._origin), "frame_index": frame.index, "time_s": frame.time_s, "size": size}
         # Last: a frame whose JSON is there is done.
         write_json(file, entry, compact=True)
         self._keep(frame.index, entry, numbers)
@@ -254,10 +246,8 @@ class _Run:
 
 def _positions(entry: JsonObject) -> list[npt.ArrayLike]:
     """Return where a frame's file has its specularities, px: their peaks, or the middles of their boxes."""
-    spots = entry["specularities"]
-    boxes = [spot["box_px"] for spot in spots]
-    middles = [np.add(box[:2], np.divide(box[2:], 2)) for box in boxes]
-    return [middle if spot["peak_px"] is None else spot["peak_px"] for spot, middle in zip(spots, middles, strict=True)]
+    spots = ((spot["peak_px"], spot["box_px"]) for spot in entry["specularities"])
+    return [np.add(box[:2], np.divide(box[2:], 2)) if peak is None else peak for peak, box in spots]
 
 
 def _read_done(path: Path, name: str) -> JsonObject | None:
@@ -265,7 +255,7 @@ def _read_done(path: Path, name: str) -> JsonObject | None:
     try:
         entry: JsonObject = read_json(path)
         # The tables, the tracks and the motion need what a frame's file must hold.
-        tuple(_rows(0, None, entry))
+        tuple(_rows(entry))
         np.asarray(_positions(entry), dtype=float).reshape(-1, 2)
         for spot in entry["specularities"]:
             TrackedHighlight.from_json(0, spot)
@@ -300,8 +290,7 @@ def _told_by_motion(judged: Sequence[MotionRecord], poses: Poses, is_flipped: bo
     counts = ", ".join(f"{count} {shape}" for shape, count in shapes.most_common())
     compared = [each for each in judged if each.distance2 is not None]
     misfits = sum(not each.fits for each in compared)
-    error = poses.error
-    stated = f"{error.translation:.1%} and {math.degrees(error.rotation):.2g} deg"
+    stated = f"{poses.error.translation:.1%} and {math.degrees(poses.error.rotation):.2g} deg"
     told = (
         f"bends of {len(judged)} highlights: {counts}; {misfits} fit no curvature; "
         f"error of the poses {'given' if poses.error_told else 'assumed'}: {stated}"
@@ -330,7 +319,7 @@ def _settings(source: Path, options: Options, calibration: Calibration | None) -
         content = json.dumps(asdict(calibration), default=str)
         given["calibration"] = hashlib.sha256(content.encode()).hexdigest()
     settings = json.dumps(
-        {"source": source, **given, "version": environment()["version"]},
+        {"source": source, **given, "version": version()},
         default=lambda value: str(value.resolve()) if isinstance(value, Path) else str(value),
     )
     return dict(json.loads(settings))
@@ -346,30 +335,25 @@ def _check_settings(path: Path, settings: JsonObject) -> None:
         before = None
     if before != settings:
         keys = [key for key in settings if not isinstance(before, dict) or before.get(key) != settings[key]]
-        raise InputError(
-            f"--out {path.parent}: holds a run with another {', '.join(keys) or 'set of settings'}; give another folder"
-        )
+        other = ", ".join(keys) or "set of settings"
+        raise InputError(f"--out {path.parent}: holds a run with another {other}; give another folder")
 
 
 def _write(run: _Run, tracks: Sequence[Track]) -> list[Path]:
     judged = any(track.shapes for track in tracks)
     files = [run.out / name for name in ("timeline.csv", "tracks.json", "index.html")]
     columns = (*TIMELINE, *MOTION_COLUMNS) if judged else TIMELINE
-    write_atomically(files[0], lambda part: write_csv(part, columns, _timeline(run)))
+    # One frame's file after the other: a film's rows do not fit into memory.
+    rows = (row for frame in run.frames for row in _rows(read_json(run.file(frame.index))))
+    write_atomically(files[0], lambda part: write_csv(part, columns, rows))
     write_json(files[1], tracks, compact=True)
     write_atomically(files[2], lambda part: write_sequence_page(part, run.frames, tracks))
     return files
 
 
-def _timeline(run: _Run) -> Iterator[tuple[object, ...]]:
-    """Yield the rows of timeline.csv, from one frame's file after the other."""
-    for frame in run.frames:
-        yield from _rows(frame.index, frame.time_s, read_json(run.file(frame.index)))
-
-
-def _rows(index: int, time_s: float | None, frame: JsonObject) -> Iterator[tuple[object, ...]]:
+def _rows(frame: JsonObject) -> Iterator[tuple[object, ...]]:
     """Yield the rows of timeline.csv of a frame's file."""
     for entry in frame["specularities"]:
         motion = motion_row(entry["motion"]) if "motion" in entry else ()
         for row in normals_rows([entry]):
-            yield (index, time_s, entry["track"], *row, *motion)
+            yield (frame["frame_index"], frame["time_s"], entry["track"], *row, *motion)

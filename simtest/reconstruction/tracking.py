@@ -59,10 +59,6 @@ class _Moving:
     step: Array = field(default_factory=lambda: np.zeros(2))
     unseen: int = 0
 
-    @property
-    def expected(self) -> Array:
-        return self.position + DAMPING * self.step
-
 
 class Tracker:
     """Assigns the specularities of each frame, of a width and height in px, to tracks.
@@ -90,7 +86,7 @@ class Tracker:
         self._next = index + 1
         # continue tracks
         if len(points) and self._tracks:
-            expected = np.array([track.expected for track in self._tracks])
+            expected = np.array([track.position + DAMPING * track.step for track in self._tracks])
             gaps = np.linalg.norm(points[:, None] - expected[None], axis=2)
             # Beyond its reach a pairing is worth no more than none.
             for i, j in zip(*linear_sum_assignment(np.minimum(gaps, self.reach)), strict=True):

@@ -1,6 +1,7 @@
 """The best estimate and why; what is assumed where nobody told, and the keys that narrow it."""
 
 import json
+import pickle
 import re
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import pytest
 
 import simtest
 from simtest.calibration import NO_PRIORS, CameraPrior, Priors, Uniform, exactly
+from simtest.detection import Region
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.process.messages import priors_message
 from simtest.estimators.protocol import Estimate
@@ -25,7 +27,7 @@ from simtest.reconstruction.assumptions import (
 )
 from simtest.reconstruction.options import Options, calibration_for
 from simtest.reconstruction.pipeline import reconstruct_values
-from simtest.reconstruction.records import best_of, stated_errors
+from simtest.reconstruction.records import Specularity, best_of, stated_errors
 from simtest.runtime.files import write_json
 from simtest.spec import load_calibration, save_calibration
 
@@ -53,6 +55,18 @@ def test_the_smallest_expected_error_is_the_best():
     assert best == "other"
     assert because == "smallest expected error, 0.5 deg; next bisector with 2 deg"
     assert best_of({**two, "other": Failure(Reason.NO_PEAK)})[0] == "bisector"
+
+
+def test_the_best_is_that_of_the_estimates():
+    """What follows from the estimates is kept, so nobody changes them in place; a copy with others judges anew."""
+    nowhere = Failure(Reason.NO_PEAK, "none")
+    made = Specularity(Region((0, 0, 1, 1), (0, 0), None), nowhere, {"curved": stating(1.0)})
+    assert made.best == "curved"
+    with pytest.raises(TypeError):
+        made.estimates["cone_axis"] = stating(0.5)
+    changed = replace(made, estimates={**made.estimates, "cone_axis": stating(0.5)})
+    for copy in (changed, pickle.loads(pickle.dumps(changed))):
+        assert copy.best == "cone_axis"
 
 
 def test_what_states_no_uncertainty_comes_last():

@@ -14,6 +14,7 @@ from test_colour_detection import HEIGHT, WIDTH, lobe, picture
 
 import simtest
 from simtest.api import Extras, reconstruct_picture
+from simtest.calibration import Normal, Priors, Response
 from simtest.detection.detector import load_detector
 from simtest.errors import InputError
 from simtest.geometry import Camera
@@ -22,6 +23,7 @@ from simtest.reconstruction.options import Options
 from simtest.reconstruction.outputs import constraints_arrays
 from simtest.reconstruction.sequence import reconstruct_sequence
 from simtest.reconstruction.tracking import Tracker
+from simtest.runtime import provenance
 from simtest.validation.depth_maps import depth_normals, depth_points, depth_problems, depths_at, read_depth
 from simtest.validation.reference_surface import load_reference, read_pose
 
@@ -247,7 +249,7 @@ def test_where_the_first_frame_is_lost_all_files_have_one_numbering(folder, tmp_
     run(folder, out)
     (folder / "frame1.png").write_text("no picture")
     (out / "frames" / "000000.json").unlink()
-    with pytest.warns(UserWarning, match="frame 0: "):
+    with pytest.warns(UserWarning, match="frame 0: |angles depend"):
         reconstruct_sequence(folder, out, Options(fov_deg=FOV))
     rows = list(csv.DictReader((out / "timeline.csv").read_text().splitlines()))
     in_table = {(int(row["frame"]), int(row["track"])) for row in rows}
@@ -256,6 +258,11 @@ def test_where_the_first_frame_is_lost_all_files_have_one_numbering(folder, tmp_
     stored = [json.loads(path.read_text()) for path in sorted((out / "frames").glob("*.json"))]
     assert {(each["frame_index"], spot["track"]) for each in stored for spot in each["specularities"]} == in_table
     assert min(track["track"] for track in tracks) == 0
+    # So has what is drawn: all files are those of a run that never saw the frame.
+    with pytest.warns(UserWarning, match="frame 0: |angles depend"):
+        reconstruct_sequence(folder, tmp_path / "whole", Options(fov_deg=FOV))
+    for name in ("000001.json", "000001.jpg", "000002.json", "000002.jpg"):
+        assert (out / "frames" / name).read_bytes() == (tmp_path / "whole" / "frames" / name).read_bytes(), name
 
 
 @pytest.mark.parametrize("key", ["peak_px", "box_px", "track", "estimates", "best"])
@@ -290,6 +297,51 @@ def test_another_calibration_is_another_run(folder, tmp_path):
     simtest.save_calibration(simtest.Calibration(replace(CAMERA, fx=2 * CAMERA.fx)), camera)
     (tmp_path / "out" / "frames" / "000002.json").unlink()
     told(lambda: reconstruct_sequence(folder, tmp_path / "out", options), "holds a run with another calibration")
+
+
+def test_an_encoding_beside_a_stated_response_is_refused_before_the_work(folder, tmp_path):
+    simtest.save_calibration(simtest.Calibration(CAMERA, Response("srgb")), tmp_path / "camera.toml")
+    options = Options(camera=tmp_path / "camera.toml", encoding="linear")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError, match=r"^--encoding linear: the calibration states the response"):
+            reconstruct_sequence(folder, tmp_path / "out", options)
+
+
+def test_a_later_run_takes_the_field_of_view_from_the_first_picture(folder, tmp_path):
+    """The round view moves a little from frame to frame; all frames are of one camera."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    for shift, name in enumerate(("frame1.png", "frame2.png", "frame10.png")):
+        save(folder / name, frame() * (np.hypot(x - 160 - 3 * shift, y - 120) < 110)[..., None])
+    run(folder, tmp_path / "out", fov_of="view")
+    done = sorted((tmp_path / "out" / "frames").glob("*.json"))
+    before = [path.read_bytes() for path in done]
+    done[1].unlink()
+    run(folder, tmp_path / "out", fov_of="view")
+    assert [path.read_bytes() for path in done] == before
+
+
+def test_a_run_asks_once_for_its_commit(folder, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(provenance, "commit", lambda: asked.append(1))
+    run(folder, tmp_path / "out")
+    assert len(asked) == 1
+
+
+def test_a_broken_picture_behind_a_stranger_is_passed_over(folder, tmp_path):
+    """Files that the poses do not name may come first; what cannot be read behind them stops nothing."""
+    rig = Priors(lights_mm=((0.0, 0.0, 0.0),), distance_mm=Normal(30.0, 1.0))
+    simtest.save_calibration(simtest.Calibration(CAMERA, priors=rig), tmp_path / "camera.toml")
+    with (tmp_path / "camera.toml").open("a") as file:
+        file.write("\n[surface]\nlobe_curvature = 50.0\n")
+    save(folder / "a_sheet.png", frame()[:100])
+    (folder / "frame1.png").write_text("no picture")
+    poses = [{"frame": f"frame{i}.png", "world_from_camera": np.eye(4).tolist()} for i in (1, 2, 10)]
+    (tmp_path / "poses.json").write_text(json.dumps(poses))
+    options = Options(camera=tmp_path / "camera.toml", poses=tmp_path / "poses.json")
+    with pytest.warns(UserWarning, match="frame 0: .* must be 320 x 240|frame 1: .* no picture"):
+        made = reconstruct_sequence(folder, tmp_path / "out", options)
+    assert (made.frames, made.failed) == (4, 2)
 
 
 def test_tracks_behind_a_repaired_picture_are_those_of_a_whole_run(folder, tmp_path):

@@ -356,6 +356,16 @@ def test_picture_of_another_size_is_named(tmp_path: Path) -> None:
         calibrate_lights(small, Calibration(CAMERA), Ball(RADIUS))
 
 
+def test_a_film_is_no_picture(tmp_path: Path) -> None:
+    writer = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (240, 200))  # type: ignore[attr-defined]
+    writer.write(np.full((200, 240, 3), 100, np.uint8))
+    writer.release()
+    ((name, read),) = picture_readers([tmp_path / "film.avi"])
+    assert name == "film.avi"
+    with pytest.raises(InputError, match="must be PNG, JPEG, BMP or TIFF"):
+        read()
+
+
 def test_pictures_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
     for folder, value in (("a", 100), ("b", 120)):
         (tmp_path / folder).mkdir()

@@ -103,6 +103,15 @@ def test_pictures_of_a_reconstruction(found):
     assert "<ellipse" not in estimate.without_uncertainty()._repr_html_()
 
 
+@pytest.mark.parametrize("channels", [2, 5])
+def test_a_frame_of_any_number_of_channels_has_a_picture(channels):
+    y, x = np.mgrid[:SIZE, :SIZE] + 0.5
+    lobe = np.exp(-(((x - 90) / 12) ** 2 + ((y - 70) / 9) ** 2) / 2).astype(np.float32)
+    (spot,) = found = simtest.reconstruct(np.repeat(lobe[..., None], channels, axis=2), 60.0)
+    for record in (found, spot):
+        assert record._repr_html_().count("data:image/jpeg;base64,") == 1
+
+
 def test_a_failure_says_what_it_means():
     html = Failure(Reason.STREAK, "1 < 2")._repr_html_()
     assert Reason.STREAK.meaning in html

@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from simtest.geometry import Array
+from simtest.geometry import Array, Index, Mask
 
 MOST_SPOTS = 5
 """A blob of so many spots is a lamp or window: a rig has four lights at most."""
@@ -66,7 +65,7 @@ class _Blob:
     points: Array
     values: Array
     sd: Array
-    is_clipped: npt.NDArray[np.bool_]
+    is_clipped: Mask
     ceiling: float
 
     def model(self, unknown: Array) -> Array:
@@ -86,12 +85,17 @@ class _Blob:
         return np.concatenate([(self.model(unknown) - self.values) / self.sd, known])
 
 
-def separate(values: Array, where: npt.NDArray[np.bool_], noise: float, base: float) -> Spots | None:
+def separate(values: Array, where: Mask, noise: float, base: float) -> Spots | None:
     """Return the spots of a blob of linear light, shape (H, W); None where spots of one profile do not explain it.
 
     `where` are its pixels and some of what surrounds it, where the light is `base`; `noise` is a pixel's deviation.
     """
-    blob = _blob(values, where, noise, base)
+    rows, columns = np.nonzero(where)
+    light = np.asarray(values[where], dtype=float)
+    clipped = light > CLIPPED * light.max()
+    sd = np.sqrt(max(noise, 1e-6) ** 2 + (MISFIT * np.maximum(light - base, 0)) ** 2)
+    points = np.stack([columns + 0.5, rows + 0.5], axis=1).astype(np.float64)
+    blob = _Blob(points, light, sd, clipped, float(np.median(light[clipped])))
     best = _start(blob, base)
     if best is None:
         return None
@@ -105,15 +109,6 @@ def separate(values: Array, where: npt.NDArray[np.bool_], noise: float, base: fl
             break
         best = chosen
     return _spots(blob, *best) if _count(best[0]) < MOST_SPOTS else None
-
-
-def _blob(values: Array, where: npt.NDArray[np.bool_], noise: float, base: float) -> _Blob:
-    rows, columns = np.nonzero(where)
-    light = np.asarray(values[where], dtype=float)
-    clipped = light > CLIPPED * light.max()
-    ceiling = float(np.median(light[clipped]))
-    sd = np.sqrt(max(noise, 1e-6) ** 2 + (MISFIT * np.maximum(light - base, 0)) ** 2)
-    return _Blob(np.stack([columns + 0.5, rows + 0.5], axis=1).astype(np.float64), light, sd, clipped, ceiling)
 
 
 def _count(unknown: Array) -> int:
@@ -203,22 +198,12 @@ def _spots(blob: _Blob, fitted: Array, chi2: float) -> Spots | None:
             if gap @ np.linalg.solve(spread, gap) < LEAST_APART**2:
                 return None
     blocks = [covariance[SHAPE + 3 * i :, SHAPE + 3 * i :][:2, :2] for i in kept]
-    width = _half_height(fitted)
-    return Spots(spots[kept, :2], np.array(blocks), width, width * float(np.sqrt(covariance[0, 0])))
-
-
-def _half_height(fitted: Array) -> float:
-    """Return the radius at which a spot has half its height, px."""
-    width, tail = np.exp(fitted[0]), np.exp(fitted[3])
-    return float(width * np.sqrt(2 * np.expm1(tail * np.log(2)) / tail))
+    tail = np.exp(fitted[3])
+    half_height = float(np.exp(fitted[0]) * np.sqrt(2 * np.expm1(tail * np.log(2)) / tail))
+    return Spots(spots[kept, :2], np.array(blocks), half_height, half_height * float(np.sqrt(covariance[0, 0])))
 
 
 # Highlights, alone or touching ----------------------------------------------------------------------------------------
-
-Peaks = npt.NDArray[np.intp]
-"""Row and column of each peak, shape (K, 2)."""
-
-Mask = npt.NDArray[np.bool_]
 
 SMOOTHING_PX = 0.7
 MOST = 12
@@ -263,7 +248,7 @@ class MeasuredHighlight:
     width_sd_px: float = 0.0
 
 
-def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px: float) -> list[MeasuredHighlight]:
+def measure_highlights(intensity: Array, where: Mask, widest_px: float) -> list[MeasuredHighlight]:
     """Return the highlights of a picture of linear light on the pixels of ball or plate, the brightest first.
 
     A spot that is longer than `widest_px` is no highlight of a light.
@@ -275,7 +260,10 @@ def measure_highlights(intensity: Array, where: npt.NDArray[np.bool_], widest_px
     window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     values, inside = np.asarray(intensity[window], dtype=float), where[window]
     smooth = np.asarray(cv2.GaussianBlur(values, (0, 0), SMOOTHING_PX), dtype=float)
-    around = _surroundings(smooth, widest_px)
+    # Without what is narrower than a highlight may be: the grey-scale opening.
+    size = 2 * int(min(widest_px, MOST_OPENED_PX) / 2) + 3
+    opened = cv2.morphologyEx(np.asarray(smooth, np.float32), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
+    around = np.asarray(opened)
     above = np.where(inside, smooth - around, 0.0)
     noise = noise_of(values, inside)
     # candidates: the highest pixel of each neighbourhood
@@ -339,17 +327,13 @@ def _several(spots: Spots, corner: Array, blob: Mask) -> list[MeasuredHighlight]
         column, row = np.clip(centre.astype(int), 0, [blob.shape[1] - 1, blob.shape[0] - 1])
         if not blob[row, column]:
             continue
-        poor = float(np.linalg.eigvalsh(covariance)[1]) > MOST_SD_PX**2
-        floor = CENTRE_FLOOR_PX**2 * np.eye(2)
-        found.append(
-            MeasuredHighlight(
-                centre + corner, covariance + floor, TOUCH if poor else "", spots.width_px, spots.width_sd_px
-            )
-        )
+        problem = TOUCH if float(np.linalg.eigvalsh(covariance)[1]) > MOST_SD_PX**2 else ""
+        known = covariance + CENTRE_FLOOR_PX**2 * np.eye(2)
+        found.append(MeasuredHighlight(centre + corner, known, problem, spots.width_px, spots.width_sd_px))
     return found
 
 
-def noise_of(values: Array, inside: npt.NDArray[np.bool_]) -> float:
+def noise_of(values: Array, inside: Mask) -> float:
     """Return the standard deviation of the noise, from the differences of neighbours."""
     pairs = inside[:, 1:] & inside[:, :-1]
     if not pairs.any():
@@ -358,21 +342,15 @@ def noise_of(values: Array, inside: npt.NDArray[np.bool_]) -> float:
     return float(np.median(differences) / 0.6745 / np.sqrt(2))
 
 
-def _surroundings(smooth: Array, widest_px: float) -> Array:
-    """Return the brightness without what is narrower than a highlight may be: the grey-scale opening."""
-    size = 2 * int(min(widest_px, MOST_OPENED_PX) / 2) + 3
-    return np.asarray(cv2.morphologyEx(np.asarray(smooth, np.float32), cv2.MORPH_OPEN, np.ones((size, size), np.uint8)))
-
-
-def _region(mask: npt.NDArray[np.bool_], row: int, column: int) -> npt.NDArray[np.bool_]:
+def _region(mask: Mask, row: int, column: int) -> Mask:
     """Return the connected part of a mask that holds a pixel."""
     _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     return np.asarray(labels == labels[row, column]) & mask
 
 
 def _measured(
-    values: Array, region: npt.NDArray[np.bool_], level: float, noise: float, corner: Array, peaks: Peaks,
-    smooth: Array, widest_px: float,
+    values: Array, region: Mask, level: float, noise: float, corner: Array, peaks: Index, smooth: Array,
+    widest_px: float,
 ) -> MeasuredHighlight:  # fmt: skip
     """Return the centroid of what stands above half height, with its error by the noise."""
     y, x = np.nonzero(region)
@@ -386,7 +364,7 @@ def _measured(
     return MeasuredHighlight(centre + corner, covariance, _problem(region, peaks, smooth, spread, widest_px))
 
 
-def _problem(region: npt.NDArray[np.bool_], peaks: Peaks, smooth: Array, spread: Array, widest_px: float) -> str:
+def _problem(region: Mask, peaks: Index, smooth: Array, spread: Array, widest_px: float) -> str:
     """Return why a spot is no single highlight of a light; empty where it is one."""
     border = np.concatenate([region[0], region[-1], region[:, 0], region[:, -1]])
     if border.any():
@@ -394,18 +372,12 @@ def _problem(region: npt.NDArray[np.bool_], peaks: Peaks, smooth: Array, spread:
     length = 4 * float(np.sqrt(np.linalg.eigvalsh(spread)[1]))
     if length > widest_px:
         return "too large for a light"
-    several = [smooth[r, c] for r, c in peaks if region[r, c]]
-    # A flat, clipped top has many equal maxima.
-    if len(several) > 1 and _is_split(smooth, region, np.array(several)):
-        return TOUCH
+    heights = sorted(smooth[r, c] for r, c in peaks if region[r, c])
+    if len(heights) > 1:
+        # A flat, clipped top has many equal maxima: does the spot fall apart below the second highest one?
+        base = float(smooth[region].min())
+        cut = (smooth > base + 0.95 * (heights[-2] - base)) & region
+        if cv2.connectedComponents(cut.astype(np.uint8), connectivity=8)[0] > 2:
+            return TOUCH
     small, large = np.linalg.eigvalsh(spread)
     return "long: several highlights that touch, or a lamp" if large > LONGEST**2 * small else ""
-
-
-def _is_split(smooth: Array, region: npt.NDArray[np.bool_], heights: Array) -> bool:
-    """Return whether a spot falls apart below its second highest maximum by more than rounding and clipping do."""
-    base = float(smooth[region].min())
-    second = np.sort(heights)[-2]
-    cut = (smooth > base + 0.95 * (second - base)) & region
-    count, _ = cv2.connectedComponents(cut.astype(np.uint8), connectivity=8)
-    return bool(count > 2)

@@ -129,6 +129,10 @@ class BallOutline:
         J = np.column_stack([distance * basis_across(self.direction).T, along * self.direction])
         return distance * self.direction, J @ self.covariance @ J.T
 
+    def pixel_rad(self, camera: Camera) -> float:
+        """Return the angle of a pixel at the ball's centre, rad: the mean over its two directions."""
+        return float(np.linalg.norm(camera.step_of_pixels(camera.project(self.direction))) / np.sqrt(2))
+
     def pixels(self, camera: Camera, count: int = 72) -> Array:
         """Return points of the outline, shape (count, 2), px."""
         phase = np.linspace(0, 2 * np.pi, count, endpoint=False)
@@ -149,7 +153,9 @@ def outline_through(camera: Camera, pixels: npt.ArrayLike, sd_px: float = 0.5) -
         raise InputError(f"outline: {len(points)} points lie on no ball's outline; must be px on its edge")
     direction, half_angle = cone
     first, second = basis_across(direction)
-    J = np.column_stack([-_unit_across(rays, direction) @ np.array([first, second]).T, -np.ones(len(rays))])
+    across = rays - (rays @ direction)[:, None] * direction
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    J = np.column_stack([-across @ np.array([first, second]).T, -np.ones(len(rays))])
     along, down = np.eye(2)
     pixel = camera.unproject(points + along) - rays, camera.unproject(points + down) - rays
     step = np.sqrt(np.linalg.norm(np.cross(*pixel), axis=1))
@@ -165,12 +171,6 @@ def cone_through(rays: Array) -> tuple[Array, float] | None:
     m: Array = np.asarray(np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0], dtype=float)
     length = float(np.linalg.norm(m))
     return (m / length, float(np.arccos(1 / length))) if length > 1 else None
-
-
-def _unit_across(rays: Array, direction: Array) -> Array:
-    """Return the unit vectors from a direction towards rays, perpendicular to the direction."""
-    across = rays - (rays @ direction)[:, None] * direction
-    return np.asarray(across / np.linalg.norm(across, axis=1)[:, None])
 
 
 @dataclass(frozen=True)
@@ -276,20 +276,15 @@ def _fit(intensity: Array, camera: Camera, start: BallOutline, is_fine: bool) ->
         r = residuals(at)
     J = np.stack([(residuals(at + d) - residuals(at - d)) / (2 * d.sum()) for d in steps], axis=1)
     covariance = _covariance(J, r, used)
-    outside = [_is_darker_outside(band, outline_at(at), rows) for rows in used]
     if covariance is None or not np.abs(at[:3]).max() < 2 * BAND_PX:
         return None
     direction, half_angle, blur = outline_at(at)
-    return BallOutline(direction, half_angle, covariance[:3, :3] * scale**2, blur, len(used), float(np.mean(outside)))
-
-
-def _is_darker_outside(band: _Band, at: tuple[Array, float, float], rows: npt.NDArray[np.intp]) -> bool:
-    """Return whether a sector's pixels are darker outside the outline than inside, some px from it."""
-    direction, half_angle, _ = at
-    s = (angles_to(band.rays[rows], direction) - half_angle) / band.pixel_rad[rows]
-    values = band.values[rows]
-    inside, outside = values[(s < -BESIDE_PX)], values[s > BESIDE_PX]
-    return bool(len(inside) and len(outside) and np.median(outside) < np.median(inside))
+    # Sectors that are darker outside the outline than inside, some px from it.
+    s, dark = (angles_to(band.rays, direction) - half_angle) / band.pixel_rad, 0
+    for rows in used:
+        inside, outside = (band.values[rows][beyond[rows]] for beyond in (s < -BESIDE_PX, s > BESIDE_PX))
+        dark += bool(len(inside) and len(outside) and np.median(outside) < np.median(inside))
+    return BallOutline(direction, half_angle, covariance[:3, :3] * scale**2, blur, len(used), dark / len(used))
 
 
 def _projected(
@@ -435,10 +430,9 @@ def trace_outline(
         if radius_px < LEAST_RADIUS_PX:
             return None
     try:
-        outline = outline_through(camera, edges[agreeing])
+        return outline_through(camera, edges[agreeing]), float(agreeing.sum() / DIRECTIONS)
     except (InputError, np.linalg.LinAlgError):
         return None
-    return outline, float(agreeing.sum() / DIRECTIONS)
 
 
 def _circles(intensity: Array) -> list[tuple[float, float, float]]:

@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from simtest.calibration.lights.result import LightCalibration, MeasuredLight
 from simtest.pages import palette, pixels
 from simtest.pages.html import environment
 from simtest.reconstruction.light_calibration.run import Calibrated, View
+from simtest.reconstruction.overlay import write_text
 from simtest.runtime import provenance
 from simtest.runtime.files import make_folder, write_atomically, write_json
 
@@ -98,10 +98,9 @@ def _page(made: Calibrated, command: str) -> str:
     result = made.result
     drawn, row = [], 0
     for number, view in enumerate(made.views.views):
-        usable = len(view.usable)
-        rows = range(row, row + usable)
-        drawn.append((view, _drawn(made, view, number, rows), _worst(result, rows)))
-        row += usable
+        rows = range(row, row := row + len(view.usable))
+        sizes = (float(np.linalg.norm(result.residuals_px[i])) for i in rows if result.source[i] >= 0)
+        drawn.append((view, _drawn(made, view, number, rows), max(sizes, default=None)))
     about = provenance.environment()
     return environment().get_template("light.html.j2").render(
         result=result, made=made, command=command, drawn=drawn,
@@ -109,11 +108,6 @@ def _page(made: Calibrated, command: str) -> str:
         colours={"measured centre": MEASURED, "predicted centre": PREDICTED, "outline of the ball": OUTLINE},
         provenance={"commit": about["commit"] or "–", "simtest": about["version"], "python": about["python"]},
     )  # fmt: skip
-
-
-def _worst(result: LightCalibration, rows: range) -> float | None:
-    sizes = [float(np.linalg.norm(result.residuals_px[row])) for row in rows if result.source[row] >= 0]
-    return max(sizes, default=None)
 
 
 def _drawn(made: Calibrated, view: View, number: int, rows: range) -> str:
@@ -138,8 +132,5 @@ def _drawn(made: Calibrated, view: View, number: int, rows: range) -> str:
             point = result.predicted_px[number, source]
             canvas.ring(point, PREDICTED, 10)
             at = ((point - canvas.corner) * canvas.scale).round().astype(int)
-            place = (int(at[0]) + 12, int(at[1]) - 8)
-            for shade, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-                font = (cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, width, cv2.LINE_AA)
-                cv2.putText(canvas.pixels, str(source + 1), place, *font)
+            write_text(canvas.pixels, str(source + 1), (int(at[0]) + 12, int(at[1]) - 8), (255, 255, 255), 0.5)
     return pixels.data_address(canvas.pixels)

@@ -23,7 +23,7 @@ from simtest.errors import InputError
 from simtest.geometry import Array, Image, Mask
 from simtest.geometry.camera import Camera
 from simtest.geometry.checks import check_integer, check_number
-from simtest.reconstruction.images import is_sequence, open_source, read_picture
+from simtest.reconstruction.images import open_source, read_picture
 from simtest.reconstruction.light_calibration.highlights import MeasuredHighlight, measure_highlights
 from simtest.reconstruction.light_calibration.outline import (
     BallOutline,
@@ -75,6 +75,8 @@ SURELY = 3.0
 
 FARTHEST_PX = 1e5
 """Largest number of a rough outline, px."""
+
+MERGED = "wider than on a ball that looks larger: several highlights that merge"
 
 INSIDE = 0.97
 """Highlights are searched within this share of the cone's half-angle."""
@@ -142,9 +144,8 @@ class Ball:
         check_number("--ball-radius", self.radius_mm, above=0)
         check_number("--ball-radius-sd", self.radius_sd_mm, least=0)
         if self.radius_sd_mm >= self.radius_mm:
-            raise InputError(
-                f"--ball-radius-sd = {self.radius_sd_mm:g}: must be less than the radius, {self.radius_mm:g}"
-            )
+            needed = f"must be less than the radius, {self.radius_mm:g}"
+            raise InputError(f"--ball-radius-sd = {self.radius_sd_mm:g}: {needed}")
 
     @property
     def scale_share(self) -> float:
@@ -167,23 +168,25 @@ class Ball:
         seen = _read(pictures, calibration, {}, shown)
         return replace(seen, views=without_merged(seen.views))
 
-    def mirrors(self, views: Sequence[View], camera: Camera) -> Balls:
-        """Return the balls of pictures, with the errors of their outlines."""
-        return self._of_outlines([view.seen_outline for view in views], camera)
+    def mirrors(self, views: Sequence[View], camera: Camera, other: Camera | None = None) -> Balls:
+        """Return the balls of pictures, with the errors of their outlines; or what another camera sees in their place.
 
-    def seen_by(self, views: Sequence[View], camera: Camera, other: Camera) -> Balls:
-        """Return the balls that another camera sees at the same pixels."""
-        traced = [outline_through(other, view.seen_outline.pixels(camera)) for view in views]
-        kept = [replace(each, covariance=v.seen_outline.covariance) for each, v in zip(traced, views, strict=True)]
-        return self._of_outlines(kept, other)
+        That sees the same pixels.
+        """
+        outlines = [view.seen_outline for view in views]
+        if other is not None:
+            outlines = [
+                replace(outline_through(other, each.pixels(camera)), covariance=each.covariance) for each in outlines
+            ]
+        return self._of_outlines(outlines, other or camera)
 
     def variations(self, views: Sequence[View], camera: Camera, lights: Array) -> Iterator[Balls]:
         """Return the balls with each error of the outlines that all pictures share, of one standard deviation."""
-        for errors in common_outline_errors(views, camera, lights):
-            moved = [moved_outline(view, camera, shift) for view, shift in zip(views, errors, strict=True)]
+        outlines = [view.seen_outline for view in views]
+        common = common_outline_errors(outlines, camera, lights)
+        for moves in (*common, *unlit_outline_errors(outlines, camera, self.radius_mm)):
+            moved = [moved_outline(each, camera, move) for each, move in zip(outlines, moves, strict=True)]
             yield self._of_outlines(moved, camera)
-        for outlines in unlit_outline_errors(views, camera, self.radius_mm):
-            yield self._of_outlines(outlines, camera)
 
     def notes(self, result: LightCalibration) -> tuple[str, ...]:
         """Return what a reader of the result must know of the ball."""
@@ -243,8 +246,11 @@ class Plate:
 
         return _read(pictures, calibration, refused, shown)
 
-    def mirrors(self, views: Sequence[View], camera: Camera) -> Plates:
-        """Return the plates of pictures; their poses are uncertain by a turn about each tangent axis, and along z."""
+    def mirrors(self, views: Sequence[View], camera: Camera, other: Camera | None = None) -> Plates:
+        """Return the plates of pictures, for any camera: the poses tell where they are.
+
+        They are uncertain by a turn about each tangent axis, and along z.
+        """
         planes = [view.plane for view in views if view.plane is not None]
         sd_rad = float(np.radians(self.sd_deg))
         factor = np.diag([sd_rad, sd_rad, self.sd_mm])
@@ -253,10 +259,6 @@ class Plate:
             np.array([offset for _, offset in planes]),
             np.broadcast_to(factor, (len(planes), 3, 3)).copy(),
         )
-
-    def seen_by(self, views: Sequence[View], camera: Camera, other: Camera) -> Plates:
-        """Return the plates that another camera sees: the poses tell where they are."""
-        return self.mirrors(views, other)
 
     def variations(self, views: Sequence[View], camera: Camera, lights: Array) -> Iterator[Plates]:
         """Return nothing: no error of the plates is known to be shared."""
@@ -293,7 +295,7 @@ def picture_readers(paths: Sequence[Path]) -> list[tuple[str, Callable[[], Image
     """
     found: dict[str, tuple[str, Callable[[], Image]]] = {}
     for path in paths:
-        if is_sequence(path):
+        if path.is_dir():
             for frame in open_source(path).frames():
                 found.setdefault(str(path / frame.name), (frame.name, frame.read))
         else:
@@ -349,20 +351,20 @@ def _read(
 ) -> Views:  # fmt: skip
     """Read pictures: `shown` makes a view of a name and its linear light, or says why not."""
     seen, camera = Views(), calibration.camera
-    contents: dict[bytes, str] = {}
+    contents: dict[str, str] = {}
     for name, read in pictures:
         if name in refused:
             seen.left_out[name] = refused[name]
             continue
-        values = read()
-        if (first := _first_of(contents, name, values)) != name:
+        values = np.ascontiguousarray(read())
+        content = repr((values.shape, values.dtype.str)).encode() + values.tobytes()
+        # A copy would count as a second measurement.
+        if (first := contents.setdefault(sha256(content).hexdigest(), name)) != name:
             seen.left_out[name] = f"the same picture as {first}; it counts once"
             continue
         if values.shape[:2] != (camera.height, camera.width):
-            raise InputError(
-                f"{name}: {values.shape[1]} x {values.shape[0]} px; must be {camera.width} x {camera.height} px as "
-                "the calibration's camera"
-            )
+            needed = f"must be {camera.width} x {camera.height} px as the calibration's camera"
+            raise InputError(f"{name}: {values.shape[1]} x {values.shape[0]} px; {needed}")
         light = calibration.correct(np.asarray(values, dtype=np.float32))
         view = shown(name, np.asarray(light.intensity, dtype=float))
         if isinstance(view, str):
@@ -383,7 +385,7 @@ def _variations(
             other = replace(
                 camera, fx=camera.fx * (1 + focal), fy=camera.fy * (1 + focal), cx=camera.cx + dx, cy=camera.cy + dy
             ).with_radial_error(radial, prior.edge_reach)
-            yield other, mirror.seen_by(views, camera, other)
+            yield other, mirror.mirrors(views, camera, other)
     for mirrors in mirror.variations(views, camera, lights.bundle.lights):
         yield camera, mirrors
 
@@ -398,13 +400,17 @@ def _too_few(seen: Views, given: int) -> str:
 
 def with_lights(calibration: Calibration, result: LightCalibration) -> Calibration:
     """Return a calibration with the measured lights that travel with the camera."""
-    positions = tuple(_triple(light.position_mm.round(5)) for light in result.own)
-    matrices = tuple(_matrix((light.covariance_mm2 + light.covariance_mm2.T) / 2) for light in result.own)
-    if not positions:
+    if not result.own:
         return calibration
+    positions, matrices = [], list[Matrix]()
+    for light in result.own:
+        positions.append(_triple(light.position_mm.round(5)))
+        first, second, third = (_triple(row) for row in (light.covariance_mm2 + light.covariance_mm2.T) / 2)
+        matrices.append((first, second, third))
     told = replace(
-        calibration.priors, lights_mm=positions, lights_covariance_mm2=matrices, light_offset_mm=UNTOLD_OFFSET_MM
-    )
+        calibration.priors, lights_mm=tuple(positions), lights_covariance_mm2=tuple(matrices),
+        light_offset_mm=UNTOLD_OFFSET_MM,
+    )  # fmt: skip
     if told.falloff_power is None and not calibration.emission.is_uniform:
         # An emission is undone for a light at the camera alone.
         told = replace(told, falloff_power=UNTOLD_FALLOFF_POWER)
@@ -414,11 +420,6 @@ def with_lights(calibration: Calibration, result: LightCalibration) -> Calibrati
 def _triple(values: Array) -> tuple[float, float, float]:
     x, y, z = (float(f"{value:.10g}") for value in values)
     return x, y, z
-
-
-def _matrix(values: Array) -> Matrix:
-    first, second, third = (_triple(row) for row in values)
-    return first, second, third
 
 
 # What a picture shows ------------------------------------------------------------------------------------------------
@@ -435,15 +436,11 @@ def without_merged(views: Sequence[View]) -> list[View]:
     marked = []
     for view, angle in zip(views, angles, strict=True):
         most = WIDER * float(narrow[angles >= angle].min(initial=np.inf))
-        marked.append(replace(view, highlights=[_if_narrow(each, most) for each in view.highlights]))
+        # Noise alone makes a dim spot wide.
+        wide = [not each.problem and each.width_px - SURELY * each.width_sd_px > most for each in view.highlights]
+        spots = [replace(s, problem=MERGED) if is_wide else s for s, is_wide in zip(view.highlights, wide, strict=True)]
+        marked.append(replace(view, highlights=spots))
     return marked
-
-
-def _if_narrow(highlight: MeasuredHighlight, most_px: float) -> MeasuredHighlight:
-    # Noise alone makes a dim spot wide.
-    if highlight.problem or highlight.width_px - SURELY * highlight.width_sd_px <= most_px:
-        return highlight
-    return replace(highlight, problem="wider than on a ball that looks larger: several highlights that merge")
 
 
 def _plane(world_from_camera: Array) -> tuple[Array, float] | None:
@@ -453,13 +450,6 @@ def _plane(world_from_camera: Array) -> tuple[Array, float] | None:
         return None
     side = 1.0 if height > 0 else -1.0
     return side * normal / np.linalg.norm(normal), -abs(height) / float(np.linalg.norm(normal))
-
-
-def _first_of(contents: dict[bytes, str], name: str, values: Image) -> str:
-    """Return the name of the first picture with the same values; a copy would count as a second measurement."""
-    content = np.ascontiguousarray(values)
-    digest = sha256(repr((content.shape, content.dtype.str)).encode() + content.tobytes()).digest()
-    return contents.setdefault(digest, name)
 
 
 def _outline(intensity: Array, camera: Camera, circle: Circle | None) -> BallOutline | str:
@@ -475,17 +465,14 @@ def _outline(intensity: Array, camera: Camera, circle: Circle | None) -> BallOut
     outline = refine_outline(intensity, camera, searched[0])
     if outline is None:
         return "too little of the ball's outline shows an edge"
-    if has_dark_ring(intensity, camera, outline):
-        return (
-            "a dark ring inside the outline: the ball's shadow on the wall hides its edge; light the wall by the room"
-        )
-    return outline
+    ring = "a dark ring inside the outline: the ball's shadow on the wall hides its edge; light the wall by the room"
+    return ring if has_dark_ring(intensity, camera, outline) else outline
 
 
 def _inside(camera: Camera, outline: BallOutline) -> Mask:
-    border = outline.pixels(camera, 180)
-    low, high = np.floor(border.min(axis=0)).astype(int), np.ceil(border.max(axis=0)).astype(int)
-    low, high = np.clip(low, 0, [camera.width, camera.height]), np.clip(high, 0, [camera.width, camera.height])
+    border, size = outline.pixels(camera, 180), [camera.width, camera.height]
+    low = np.clip(np.floor(border.min(axis=0)).astype(int), 0, size)
+    high = np.clip(np.ceil(border.max(axis=0)).astype(int), 0, size)
     inside = np.zeros((camera.height, camera.width), dtype=bool)
     x, y = (np.arange(a, b) + 0.5 for a, b in zip(low, high, strict=True))
     cosine = camera.unproject(np.stack(np.meshgrid(x, y), axis=-1)) @ outline.direction
@@ -495,9 +482,8 @@ def _inside(camera: Camera, outline: BallOutline) -> Mask:
 
 def with_floor(outline: BallOutline, camera: Camera, radius_mm: float) -> BallOutline:
     """Return an outline with the errors that its fit cannot see: of pixels, and of a shadow at a dark background."""
-    pixel = float(np.linalg.norm(camera.step_of_pixels(camera.project(outline.direction))) / np.sqrt(2))
-    strip = _unlit_strip(outline, radius_mm)
-    error = np.diag([SHADOW * strip, SHADOW * strip, SHADOW * strip]) ** 2 + (OUTLINE_FLOOR_PX * pixel) ** 2 * np.eye(3)
+    strip, floor = SHADOW * _unlit_strip(outline, radius_mm), OUTLINE_FLOOR_PX * outline.pixel_rad(camera)
+    error = np.diag([strip, strip, strip]) ** 2 + floor**2 * np.eye(3)
     return replace(outline, covariance=outline.covariance + error)
 
 
@@ -507,26 +493,17 @@ def _unlit_strip(outline: BallOutline, radius_mm: float) -> float:
     return float(outline.dark_share * outline.half_angle * (LIGHT_MM / distance) ** 2 / 2)
 
 
-def unlit_outline_errors(views: Sequence[View], camera: Camera, radius_mm: float) -> Iterator[list[BallOutline]]:
-    """Return all outlines, moved by what the unlit rim may do to all of them alike; none where every rim is seen.
+def unlit_outline_errors(outlines: Sequence[BallOutline], camera: Camera, radius_mm: float) -> list[list[Array]]:
+    """Return how the unlit rim may move all outlines alike (`moved_outline`); nothing where every rim is seen.
 
     The lights stay where they are, so a dark background moves the outlines of all pictures to the same side, each by
     its own strip (`with_floor` counts what differs between the pictures). They move along x, along y, and in radius.
     """
-    strips = []
-    for view in views:
-        outline = view.seen_outline
-        pixel = np.linalg.norm(camera.step_of_pixels(camera.project(outline.direction))) / np.sqrt(2)
-        strips.append(SHADOW * _unlit_strip(outline, radius_mm) / float(pixel))
-    if any(strips):
-        for dx, dy, wider in np.eye(3):
-            yield [
-                moved_outline(view, camera, strip * np.array([dx, dy, wider]))
-                for view, strip in zip(views, strips, strict=True)
-            ]
+    strips = [SHADOW * _unlit_strip(each, radius_mm) / each.pixel_rad(camera) for each in outlines]
+    return [[strip * error for strip in strips] for error in np.eye(3)] if any(strips) else []
 
 
-def common_outline_errors(views: Sequence[View], camera: Camera, lights: Array) -> Array:
+def common_outline_errors(outlines: Sequence[BallOutline], camera: Camera, lights: Array) -> Array:
     """Return independent errors that all outlines share, shape (4, V, 3): shift along x and y and of the radius, px.
 
     `lights`, shape (S, 3), mm, are all lights found; far lamps cast no shadow that moves with the camera.
@@ -535,24 +512,19 @@ def common_outline_errors(views: Sequence[View], camera: Camera, lights: Array) 
     beside = near[:, :2].mean(axis=0) if len(near) else np.zeros(2)
     length = float(np.linalg.norm(beside))
     shaded = SHADED_PX * beside * min(1.0, MOST_SHADED_MM / max(length, 1e-9))
-    errors = np.zeros((4, len(views), 3))
-    for i, view in enumerate(views):
-        own = np.sqrt(np.diag(view.seen_outline.covariance)) / _pixel(view, camera)
+    errors = np.zeros((4, len(outlines), 3))
+    for i, outline in enumerate(outlines):
+        own = np.sqrt(np.diag(outline.covariance)) / outline.pixel_rad(camera)
         errors[range(3), i, range(3)] = np.hypot(UNSURE * own, [COMMON_PX, COMMON_PX, COMMON_RADIUS_PX])
     errors[3, :, :2] = shaded
     return errors
 
 
-def _pixel(view: View, camera: Camera) -> float:
-    """Return the angle of a pixel at a ball's centre, rad."""
-    return float(np.linalg.norm(camera.step_of_pixels(camera.project(view.seen_outline.direction))) / np.sqrt(2))
-
-
-def moved_outline(view: View, camera: Camera, shift_px: Array) -> BallOutline:
-    """Return the outline of a view, shifted in the picture and with a larger radius, shape (3,), px."""
-    outline = view.seen_outline
-    direction = camera.unproject(camera.project(outline.direction) + shift_px[:2])
-    return replace(outline, direction=direction, half_angle=outline.half_angle + shift_px[2] * _pixel(view, camera))
+def moved_outline(outline: BallOutline, camera: Camera, move_px: Array) -> BallOutline:
+    """Return an outline shifted in the picture along x and y, and with a larger radius, px."""
+    direction = camera.unproject(camera.project(outline.direction) + move_px[:2])
+    half_angle = outline.half_angle + float(move_px[2]) * outline.pixel_rad(camera)
+    return replace(outline, direction=direction, half_angle=half_angle)
 
 
 def circles_of(path: Path) -> dict[str, Circle]:
@@ -571,11 +543,8 @@ def circles_of(path: Path) -> dict[str, Circle]:
             if not (max(abs(x), abs(y), radius) <= FARTHEST_PX and radius > 0):
                 raise ValueError
         except ValueError:
-            text = f"{','.join(row)!s:.60}"
-            raise InputError(
-                f"--outlines {path}: line {number}: {text}: must be name,x,y,radius, px, radius > 0, all "
-                f"within {FARTHEST_PX:g}"
-            ) from None
+            needed = f"must be name,x,y,radius, px, radius > 0, all within {FARTHEST_PX:g}"
+            raise InputError(f"--outlines {path}: line {number}: {','.join(row)!s:.60}: {needed}") from None
         if name in found:
             raise InputError(f"--outlines {path}: line {number}: {name} is given twice")
         found[name] = (x, y, radius)
