@@ -46,7 +46,7 @@ COMMON_PX, COMMON_RADIUS_PX = 0.015, 0.012
 """Error that the outlines of all pictures share, px: of their position an axis, and of their radius."""
 
 UNSURE = 1.5
-"""The same, in standard deviations of each outline's own error: where the ball is about as bright as the room behind it,
+"""The same, in standard deviations of each outline's own error: where the ball is as bright as the room behind it,
 that is so on the same side in all pictures. Set on mirror balls of `studies.light_calibration`, seeds 9000 to 9119."""
 
 SHADED_PX = 0.03
