@@ -61,8 +61,8 @@ class Metal:
         return dr.select(active, fresnel * (lobe * (1 - self.share)), 0), dr.select(active, base, 0)
 
 
-class _Blockers:
-    """What stands before lights: the scene's surface and the instruments."""
+class Blockers:
+    """What shadow rays ask in place of a scene: its surface and the instruments."""
 
     def __init__(self, scene: Any, kernel: "InstrumentKernel") -> None:
         self._scene, self._kernel = scene, kernel
@@ -191,10 +191,6 @@ class InstrumentKernel:
         # As `spectrum` makes it of numbers: the luminance.
         weights = [spectrum(unit) for unit in np.eye(3).tolist()]
         return mi.Spectrum(sum(value * weight for value, weight in zip(rgb, weights, strict=True)))
-
-    def before(self, scene: Any) -> Any:
-        """Return what shadow rays ask in place of a scene: its surface and the instruments."""
-        return _Blockers(scene, self)
 
     # Single rays -------------------------------------------------------------------------------------------------
 

@@ -400,7 +400,7 @@ class Session:
         fine.wi = fine.to_local(-rays.traced.d)
         drawer = tracer.light.drawer(None)
         draw = None if drawer is None else drawer.at(0)
-        lobe, _ = tracer.light.radiance(tracer.scene, tracer.material, replace(hit, fine=fine), draw)
+        lobe, _ = tracer.light.radiance(tracer.blockers, tracer.material, replace(hit, fine=fine), draw)
         return np.mean(evaluate([*lobe], len(points)), axis=0, dtype=float)
 
     @_at_its_variant

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.frames import Radiance
-from simtest.rendering.instruments import InstrumentKernel
+from simtest.rendering.instruments import Blockers, InstrumentKernel
 from simtest.rendering.kernel_values import channels, to_kernel
 from simtest.rendering.lighting import DirectLight, Drawer, LightDraw, Material
 from simtest.rendering.rays import Hit, HitRefinement, Lanes, Pixels, Rays, Sightlines, make_hit, untile
@@ -98,6 +98,11 @@ class Tracer:
         """How many sets of channels the radiance has: that of the surface, and that of instruments if there are any."""
         return 1 if self.instruments is None else 2
 
+    @property
+    def blockers(self) -> Any:
+        """What shadow rays ask: the scene's surface, and the instruments if there are any."""
+        return self.scene if self.instruments is None else Blockers(self.scene, self.instruments)
+
     def hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Rays, Any, Hit]:
         """Trace pixel positions; return rays, hits and surface points, if `bent` with the normals' derivatives."""
         rays = self.sightlines.rays(x, y)
@@ -113,7 +118,7 @@ class Tracer:
 
     def _direct(self, rays: Rays, hit: Hit, draw: LightDraw | None) -> list[Any]:
         """Compute the channels of direct light off lobe and base, then of metal; each is 0 behind the other."""
-        blockers = self.scene if self.instruments is None else self.instruments.before(self.scene)
+        blockers = self.blockers
         with self.material.painted(hit):
             tissue = self.light.radiance(blockers, self.material, hit, draw)
         if self.instruments is None:
