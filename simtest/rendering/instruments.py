@@ -90,7 +90,6 @@ class InstrumentKernel:
         metals = [(one.alpha, one.diffuse, *one.metal, *one.colour) for one in instruments.values()]
         self._data = mi.Float64(np.concatenate([numbers.ravel(), np.ravel(metals)]))
         self._count = mi.UInt32(len(numbers))
-        self._names = np.array(list(instruments), dtype=np.int64)
         dr.make_opaque(self._data, self._count)
 
     def first(self, origin: Any, direction: Any, active: Any) -> tuple[Any, Any]:

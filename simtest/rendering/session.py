@@ -398,9 +398,8 @@ class Session:
         fine = mi.SurfaceInteraction3f(hit.fine)
         fine.sh_frame = mi.Frame3f(mi.Normal3f((normals @ rotation.T).T.astype(np.float32)))
         fine.wi = fine.to_local(-rays.traced.d)
-        drawer = tracer.light.drawer(None)
-        draw = None if drawer is None else drawer.at(0)
-        lobe, _ = tracer.light.radiance(tracer.blockers, tracer.material, replace(hit, fine=fine), draw)
+        seen = replace(hit, fine=fine)
+        lobe, _ = tracer.light.radiance(tracer.blockers, tracer.material, seen, tracer.light.fixed_points())
         return np.mean(evaluate([*lobe], len(points)), axis=0, dtype=float)
 
     @_at_its_variant
