@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.rendering.backend import dr, mi
-from simtest.rendering.elements.base import facet_density, visible_over_cosine
+from simtest.rendering.elements.base import reflected
 from simtest.rendering.frames import HighlightPoint, Maps, Real
-from simtest.rendering.kernel_values import channels, spectrum
+from simtest.rendering.kernel_values import channels, spectrum, vectors_to_kernel
 from simtest.rendering.placement_checks import check_instruments
 from simtest.rendering.rays import Hit
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
@@ -50,13 +50,8 @@ class Metal:
         active &= (wi.z > 0) & (wo.z > 0)
         up = mi.Vector3f(0, 0, 1)
         wi, wo = dr.select(active, wi, up), dr.select(active, wo, up)
-        both = wi + wo
-        squared = (dr.square(both.x) + dr.square(both.y)) / dr.square(both.z)
-        # 1 minus the cosine at the facet, without cancellation.
-        grazing = 1 - dr.minimum(dr.norm(both) / 2, 1)
-        fresnel = self.metal + (1 - self.metal) * grazing**5
-        seen, lit = visible_over_cosine(wi, self.alpha, True), visible_over_cosine(wo, self.alpha, True)
-        lobe = facet_density(squared, self.alpha, True) * seen * lit * wo.z / 4
+        _, lobe, facing = reflected(wi, wo, self.alpha, True)
+        fresnel = self.metal + (1 - self.metal) * (1 - facing) ** 5
         base = self.matt * (self.share * dr.inv_pi * wo.z)
         return dr.select(active, fresnel * (lobe * (1 - self.share)), 0), dr.select(active, base, 0)
 
@@ -203,8 +198,9 @@ class InstrumentKernel:
             return np.empty(0), np.empty((0, 3)), np.empty(0, dtype=np.int64)
         asked = np.isfinite(directions).all(axis=1)
         whole = np.where(np.reshape(asked, (-1, 1)), directions, [0.0, 0.0, 1.0])
-        o = mi.Vector3d(np.ascontiguousarray(np.broadcast_to(origins, whole.shape).T))
-        d, active = mi.Vector3d(np.ascontiguousarray(whole.T)), mi.Bool(asked)
+        both = np.broadcast_to(origins, whole.shape), whole
+        o, d = (vectors_to_kernel(mi.Vector3d, mi.Float64, rays, np.float64) for rays in both)
+        active = mi.Bool(asked)
         distance, part = self.first(o, d, active)
         is_hit = active & dr.isfinite(distance)
         normal = self.normal(o + d * dr.select(is_hit, distance, 1), part, is_hit)
