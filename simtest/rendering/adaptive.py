@@ -263,7 +263,7 @@ _AROUND = np.ones((3, 3), np.uint8)
 
 def mean_of_pixel(centres: Image) -> Image:
     """Return the mean over each pixel of a smooth function, from its values at the centres, shape (H, W)."""
-    across, down = _curves(centres)
+    across, down = _filtered(centres, _CURVE)
     return np.asarray(centres + (across + down) * np.float32(1 / 24))
 
 
@@ -273,16 +273,14 @@ def uneven(centres: Image, whole: Image) -> Mask:
     A kink of the slope errs by up to a twelfth of what it changes second differences by between neighbours; with both
     directions and both signs a 24th of their spread among the pixels around.
     """
-    spread = sum(cv2.dilate(curve, _AROUND) - cv2.erode(curve, _AROUND) for curve in _curves(centres))
-    slopes = (cv2.filter2D(centres, -1, kernel, borderType=cv2.BORDER_REPLICATE) for kernel in (_SLOPE, _SLOPE.T))
-    change = cv2.blur(cv2.magnitude(*slopes), (3, 3))
+    spread = sum(cv2.dilate(curve, _AROUND) - cv2.erode(curve, _AROUND) for curve in _filtered(centres, _CURVE))
+    change = cv2.blur(cv2.magnitude(*_filtered(centres, _SLOPE)), (3, 3))
     return np.asarray(spread > 24 * (ALLOWED * change + ROUNDING * whole))
 
 
-def _curves(centres: Image) -> tuple[Image, Image]:
-    """Return second differences along x and y."""
-    across, down = (cv2.filter2D(centres, -1, kernel, borderType=cv2.BORDER_REPLICATE) for kernel in (_CURVE, _CURVE.T))
-    return across, down
+def _filtered(centres: Image, kernel: Image) -> list[Image]:
+    """Return differences along x and y."""
+    return [cv2.filter2D(centres, -1, each, borderType=cv2.BORDER_REPLICATE) for each in (kernel, kernel.T)]
 
 
 def pixels_per_rad(camera: Camera) -> float:

@@ -312,22 +312,20 @@ def shade(session: "Session", kernel: InstrumentKernel, points: list[HighlightPo
     if not points:
         return []
     positions = np.stack([point.position for point in points])
-    hidden = _blocked(session, kernel, np.zeros(3), positions)
-    shaded = np.zeros(len(points), dtype=bool)
-    lights = np.array([point.light for point in points])
-    for index, source in enumerate(session.scene.rig.true_mm()):
-        of_light = lights == index
-        if of_light.any() and not is_at_camera(source):
-            shaded[of_light] = _blocked(session, kernel, source, positions[of_light])
+    sources = session.scene.rig.true_mm()[[point.light for point in points]]
+    hidden = _blocked(session, kernel, np.zeros((1, 3)), positions)
+    # A light at the camera reaches all that is seen.
+    shaded = ~np.array([is_at_camera(source) for source in sources])
+    shaded[shaded] = _blocked(session, kernel, sources[shaded], positions[shaded])
     return [
         replace(point, lit=point.lit and not (behind or dark), hidden=bool(behind))
         for point, behind, dark in zip(points, hidden.tolist(), shaded.tolist(), strict=True)
     ]
 
 
-def _blocked(session: "Session", kernel: InstrumentKernel, source: Array, positions: Array) -> Mask:
-    """Return which positions, shape (N, 3), an instrument hides from a source, shape (3,), camera frame, mm."""
-    towards = positions - source
+def _blocked(session: "Session", kernel: InstrumentKernel, sources: Array, positions: Array) -> Mask:
+    """Return which positions, shape (N, 3), an instrument hides from sources, (1, 3) or (N, 3), camera frame, mm."""
+    towards = positions - sources
     distance = np.linalg.norm(towards, axis=1)
     directions = towards / distance[:, None] @ session.surface.model_from_camera[:3, :3].T
-    return np.asarray(kernel.cast(session.to_model(source[None]), directions)[0] < distance * (1 - ROUNDING))
+    return np.asarray(kernel.cast(session.to_model(sources), directions)[0] < distance * (1 - ROUNDING))

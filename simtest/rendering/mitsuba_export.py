@@ -210,14 +210,6 @@ def _light(light: LightSpec, position: Array) -> MitsubaDict:
     }
 
 
-def _disc_pose(light: LightSpec, position_mm: Array, surface: SurfaceModel) -> Array:
-    """Return the matrix, shape (4, 4), from Mitsuba's unit disc to a light's disc in the model frame."""
-    assert light.source is not None
-    local = np.eye(4)
-    local[:3, :2], local[:3, 2], local[:3, 3] = light.source.radius_mm * light.across.T, light.axis, position_mm
-    return np.asarray(surface.model_from_camera @ local)
-
-
 def _xml(scene: Scene, surface: SurfaceModel, shape: Shape) -> str:
     # Describe.
     bsdf, effort, pose = scene.reflectance.kernel, scene.render, surface.model_from_camera
@@ -244,7 +236,8 @@ def _xml(scene: Scene, surface: SurfaceModel, shape: Shape) -> str:
         _set_transform(root, "surface", shape.to_model)
     for i, (light, position) in enumerate(lights):
         if light.source is not None:
-            _set_transform(root, f"light_{i}", _disc_pose(light, position, surface))
+            columns = np.column_stack([light.source.radius_mm * light.across.T, light.axis, position])
+            _set_transform(root, f"light_{i}", pose @ np.vstack([columns, [0, 0, 0, 1]]))
     root.insert(0, ET.Comment(_head(scene)))
     ET.indent(root, " " * 4)
     return ET.tostring(root, encoding="unicode") + "\n"

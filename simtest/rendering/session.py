@@ -117,10 +117,10 @@ class Session:
         key = self._structure()
         if self._built.key != key:
             self._built = self._build(key)
+        self._write_values()
+        # Of the mesh as it is written now.
         if self._labelled:
             self._shape_labels()
-        # Values.
-        self._write_values()
         try:
             self._instruments, self._cover = place(self), None
         except InputError:
