@@ -321,11 +321,6 @@ class Clues:
             scale = dr.minimum(scale, beam * distance * per_mm)
         return [*channels, scale]
 
-    def split(self, channels: list[Image]) -> tuple[list[Image], list[Image], Image]:
-        """Return the labels' channels, the gaps and the scale, of what `trace` computed."""
-        gaps = 3 * len(self.lights)
-        return channels[: -gaps - 1], channels[-gaps - 1 : -1], channels[-1]
-
 
 def choose(parts: list[Image], depth: Image, gaps: list[Image], scale: Image, half_width: float) -> Mask:
     """Return the pixels that need samples, shape (H, W), by the rays through the centres.
@@ -387,21 +382,23 @@ def beam(light: LightSpec) -> float:
 
 
 def render(
-    tracer: Tracer, scene: Scene, labels: ShapeLabels, shape: Shape, edges: MeshEdges | None, progress: Progress | None
+    tracer: Tracer, scene: Scene, shape: Shape, edges: MeshEdges | None, progress: Progress | None
 ) -> tuple[list[Image], list[Image]]:
     """Return the channels of the mean radiance, and of the labels without curvatures, shape (H, W) each.
 
-    `applies` is true for the scene; `labels` are of its shape, `edges` of a mesh.
+    `applies` is true for the scene; `edges` are those of a mesh.
     """
     effort, camera = scene.render, tracer.sightlines.camera
     pixels = camera.width * camera.height
     total = pixels * effort.samples_per_pixel
     # The rays through the centres.
     beams = [beam(light) for light in scene.rig.lights]
+    labels = ShapeLabels(tracer.scene.shapes()[0], None, curved=False)
     clues = Clues(labels, scene.rig.true_mm(), beams, pixels_per_rad(camera))
     begun: Progress | None = progress and (lambda done, _, what: progress(done, total, what))
     parts, channels = tracer.centres(None, True, clues, begun)
-    centres, gaps, scale = clues.split(channels)
+    first = -1 - 3 * len(clues.lights)
+    centres, gaps, scale = channels[:first], channels[first:-1], channels[-1]
     # What follows from them, and which pixels need more.
     depth, width = centres[CHANNELS.index("depth")], scene.reflectance.half_width
     if _is_small(shape, tracer.sightlines.pose, clues.px_per_rad):

@@ -65,7 +65,7 @@ class BuiltScene:
     base: Any
     base_parameters: Any
     labels: ShapeLabels | None = None  # What traces the labels of its shape; made when first needed
-    edges: MeshEdges | None = None  # Edges of its mesh; made when first needed
+    edges: MeshEdges | None = None  # Of its mesh, see `mesh_edges`
     mesh: TriangleMesh | None = None  # The mesh as it was written last
 
     def write(self, shape: Shape, reflectance: Reflectance) -> None:
@@ -92,6 +92,12 @@ class BuiltScene:
         self._set("surface.vertex_normals", flat(mesh.normals, np.float32))
         self.parameters.update()
         self.mesh, self.labels, self.edges = mesh, None, None
+
+    def mesh_edges(self) -> MeshEdges | None:
+        """Return the edges of the mesh, made when first needed; None of other shapes."""
+        if self.edges is None and self.mesh is not None:
+            self.edges = MeshEdges(self.scene, self.mesh)
+        return self.edges
 
     def place_lights(self, rig: Rig, model_from_camera: Array) -> DirectLight:
         """Write the lights of a rig at a pose of the camera, and all set before; return their own kernel."""
