@@ -171,13 +171,11 @@ class InstrumentKernel:
         si.t = dr.select(is_hit, mi.Float(distance), mi.Float(dr.inf))
         si.p, si.n, si.sh_frame = mi.Point3f(position), normal, mi.Frame3f(normal)
         si.wi = si.to_local(-mi.Vector3f(rays.direction))
-        return Hit(si, si, si), self._metal(part, is_hit)
-
-    def _metal(self, part: Any, active: Any) -> Metal:
-        owner = mi.UInt32(self._number(part * PER_PART + PER_PART - 1, active))
+        # Its metal.
+        owner = mi.UInt32(self._number(part * PER_PART + PER_PART - 1, is_hit))
         first = self._count * PER_PART + owner * PER_METAL
-        n = [mi.Float(self._number(first + k, active)) for k in range(PER_METAL)]
-        return Metal(n[0], n[1], self._colour(n[2:5]), self._colour(n[5:8]))
+        n = [mi.Float(self._number(first + k, is_hit)) for k in range(PER_METAL)]
+        return Hit(si, si, si), Metal(n[0], n[1], self._colour(n[2:5]), self._colour(n[5:8]))
 
     def _colour(self, rgb: list[Any]) -> Any:
         if channels() == 3:

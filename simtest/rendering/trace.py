@@ -17,7 +17,7 @@ from simtest.rendering.frames import Radiance
 from simtest.rendering.instruments import Blockers, InstrumentKernel
 from simtest.rendering.kernel_values import channels, to_kernel
 from simtest.rendering.lighting import DirectLight, Drawer, LightDraw, Material
-from simtest.rendering.rays import Hit, HitRefinement, Lanes, Pixels, Rays, Sightlines, make_hit, untile
+from simtest.rendering.rays import TILE, Hit, HitRefinement, Lanes, Pixels, Rays, Sightlines, make_hit, untile
 from simtest.rendering.tissue_kernels import ReliefKernel
 from simtest.rendering.truth import CHANNELS, ShapeLabels
 from simtest.runtime.arrays import Array, Image
@@ -211,8 +211,9 @@ class Tracer:
         `numbers` are those of the samples that are traced, one after the other; default all.
         """
         numbers = range(samples) if numbers is None else numbers
-        height, width = self.sightlines.tiled_size
         camera = self.sightlines.camera
+        # Of the frame in whole tiles.
+        height, width = (-(-size // TILE) * TILE for size in (camera.height, camera.width))
         # Trace: sums over the samples of each block of pixels.
         blocks = list(blocks_of(height * width))
         lanes = ((self.sightlines.lanes(first, count, True, seed), count) for first, count in blocks)
