@@ -162,6 +162,10 @@ def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> MitsubaDict:
     else:
         scale = float(np.linalg.norm(surface.model_from_camera[:3, 3]))
     near, far = (scale * share for share in CLIP)
+    # One stratum without jitter: the ray through the pixel's centre.
+    centres = {"type": "stratified", "sample_count": 1, "jitter": False}
+    samples, seed = scene.render.samples_per_pixel, scene.render.seed
+    spread = {"type": "independent", "sample_count": samples if samples > 1 else SAMPLES, "seed": seed}
     return {
         "type": "perspective",
         "fov_axis": "x",
@@ -177,7 +181,7 @@ def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> MitsubaDict:
             "component_format": "float32",
             "rfilter": {"type": "box"},
         },
-        "sampler": _sampler(scene),
+        "sampler": centres if _through_centres(scene) else spread,
     }
 
 
@@ -186,14 +190,6 @@ def _through_centres(scene: Scene) -> bool:
     effort = scene.render
     points = len(scene.rig.lights) == 1 and scene.rig.lights[0].source is None
     return effort.samples_per_pixel == 1 and effort.path_depth == 2 and points
-
-
-def _sampler(scene: Scene) -> MitsubaDict:
-    if _through_centres(scene):
-        # One stratum without jitter: the ray through the pixel's centre.
-        return {"type": "stratified", "sample_count": 1, "jitter": False}
-    samples = scene.render.samples_per_pixel
-    return {"type": "independent", "sample_count": samples if samples > 1 else SAMPLES, "seed": scene.render.seed}
 
 
 def _light(light: LightSpec, position: Array) -> MitsubaDict:
