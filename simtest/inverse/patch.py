@@ -39,13 +39,13 @@ class PatchRenderer:
             {"type": "simtest_phong", "specular": 1.0, "diffuse_reflectance": {"type": "rgb", "value": [1.0] * 3}}
         )
 
-    def radiance(self, patch: "RenderedQuadric", kept: list[bool]) -> tuple[Array, Array]:
-        """Compute intensities, shape (m,), and their derivatives by those of the seven parameters that are kept."""
+    def radiance(self, patch: "RenderedQuadric") -> tuple[Array, Array]:
+        """Compute intensities, shape (m,), and their derivatives by the parameters, shape (m, p)."""
         # lanes: a copy of all pixels for each parameter
-        columns, count = int(sum(kept)), self._opaque(self.count, mi.UInt32)
+        columns, count = 6 + patch.open_base, self._opaque(self.count, mi.UInt32)
         lane = dr.arange(mi.UInt32, self.count * columns)
         sightlines = mi.Vector3f(*(dr.gather(mi.Float, part, lane % count) for part in self._rays))
-        direct = _Surface(self, patch, self._parameters(patch, kept, lane // count)).radiance(sightlines)
+        direct = _Surface(self, patch, self._parameters(patch, columns, lane // count)).radiance(sightlines)
         slope = dr.forward_to(direct) if dr.grad_enabled(direct) else dr.zeros(type(direct), dr.width(direct))
         dr.eval(direct, slope)
         image, slopes = (np.array(values, dtype=np.float64).reshape(columns, self.count) for values in (direct, slope))
@@ -53,16 +53,14 @@ class PatchRenderer:
         self._bsdf.exponent = self._opaque(float(np.exp(patch.log_exponent)))
         return image[0], slopes.T
 
-    def _parameters(self, patch: "RenderedQuadric", kept: list[bool], which: Any) -> list[Any]:
-        """Return the seven parameters; each kept one has gradient 1 in its own copy of the pixels."""
-        parameters, lane = [], 0
-        values = [0.0, 0.0, *patch.stretch, patch.log_scale, patch.base]
-        for value, is_kept in zip(values, kept, strict=True):
+    def _parameters(self, patch: "RenderedQuadric", columns: int, which: Any) -> list[Any]:
+        """Return the seven parameters; each of the first ones has gradient 1 in its own copy of the pixels."""
+        parameters = []
+        for lane, value in enumerate([0.0, 0.0, *patch.stretch, patch.log_scale, patch.base]):
             parameter = dr.zeros(mi.Float, dr.width(which)) + self._opaque(value)
-            if is_kept:
+            if lane < columns:
                 dr.enable_grad(parameter)
                 dr.set_grad(parameter, dr.select(which == lane, mi.Float(1), mi.Float(0)))
-                lane += 1
             parameters.append(parameter)
         return parameters
 
@@ -216,4 +214,4 @@ class RenderedQuadric:
 
     def evaluate(self) -> tuple[Array, Array]:
         """Return the pixels' intensities, shape (m,), and their derivatives, shape (m, p)."""
-        return self.renderer.radiance(self, [True] * 6 + [self.open_base])
+        return self.renderer.radiance(self)

@@ -263,7 +263,7 @@ _AROUND = np.ones((3, 3), np.uint8)
 
 def mean_of_pixel(centres: Image) -> Image:
     """Return the mean over each pixel of a smooth function, from its values at the centres, shape (H, W)."""
-    across, down = _curves(centres)
+    across, down = _filtered(centres, _CURVE)
     return np.asarray(centres + (across + down) * np.float32(1 / 24))
 
 
@@ -273,16 +273,14 @@ def uneven(centres: Image, whole: Image) -> Mask:
     A kink of the slope errs by up to a twelfth of what it changes second differences by between neighbours; with both
     directions and both signs a 24th of their spread among the pixels around.
     """
-    spread = sum(cv2.dilate(curve, _AROUND) - cv2.erode(curve, _AROUND) for curve in _curves(centres))
-    slopes = (cv2.filter2D(centres, -1, kernel, borderType=cv2.BORDER_REPLICATE) for kernel in (_SLOPE, _SLOPE.T))
-    change = cv2.blur(cv2.magnitude(*slopes), (3, 3))
+    spread = sum(cv2.dilate(curve, _AROUND) - cv2.erode(curve, _AROUND) for curve in _filtered(centres, _CURVE))
+    change = cv2.blur(cv2.magnitude(*_filtered(centres, _SLOPE)), (3, 3))
     return np.asarray(spread > 24 * (ALLOWED * change + ROUNDING * whole))
 
 
-def _curves(centres: Image) -> tuple[Image, Image]:
-    """Return second differences along x and y."""
-    across, down = (cv2.filter2D(centres, -1, kernel, borderType=cv2.BORDER_REPLICATE) for kernel in (_CURVE, _CURVE.T))
-    return across, down
+def _filtered(centres: Image, kernel: Image) -> list[Image]:
+    """Return differences along x and y."""
+    return [cv2.filter2D(centres, -1, each, borderType=cv2.BORDER_REPLICATE) for each in (kernel, kernel.T)]
 
 
 def pixels_per_rad(camera: Camera) -> float:
@@ -322,11 +320,6 @@ class Clues:
             channels += [dr.select(hit.base.is_valid(), gap, dr.nan) for gap in normal - bisector]
             scale = dr.minimum(scale, beam * distance * per_mm)
         return [*channels, scale]
-
-    def split(self, channels: list[Image]) -> tuple[list[Image], list[Image], Image]:
-        """Return the labels' channels, the gaps and the scale, of what `trace` computed."""
-        gaps = 3 * len(self.lights)
-        return channels[: -gaps - 1], channels[-gaps - 1 : -1], channels[-1]
 
 
 def choose(parts: list[Image], depth: Image, gaps: list[Image], scale: Image, half_width: float) -> Mask:
@@ -389,21 +382,23 @@ def beam(light: LightSpec) -> float:
 
 
 def render(
-    tracer: Tracer, scene: Scene, labels: ShapeLabels, shape: Shape, edges: MeshEdges | None, progress: Progress | None
+    tracer: Tracer, scene: Scene, shape: Shape, edges: MeshEdges | None, progress: Progress | None
 ) -> tuple[list[Image], list[Image]]:
     """Return the channels of the mean radiance, and of the labels without curvatures, shape (H, W) each.
 
-    `applies` is true for the scene; `labels` are of its shape, `edges` of a mesh.
+    `applies` is true for the scene; `edges` are those of a mesh.
     """
     effort, camera = scene.render, tracer.sightlines.camera
     pixels = camera.width * camera.height
     total = pixels * effort.samples_per_pixel
     # The rays through the centres.
     beams = [beam(light) for light in scene.rig.lights]
+    labels = ShapeLabels(tracer.scene.shapes()[0], None, curved=False)
     clues = Clues(labels, scene.rig.true_mm(), beams, pixels_per_rad(camera))
     begun: Progress | None = progress and (lambda done, _, what: progress(done, total, what))
     parts, channels = tracer.centres(None, True, clues, begun)
-    centres, gaps, scale = clues.split(channels)
+    first = -1 - 3 * len(clues.lights)
+    centres, gaps, scale = channels[:first], channels[first:-1], channels[-1]
     # What follows from them, and which pixels need more.
     depth, width = centres[CHANNELS.index("depth")], scene.reflectance.half_width
     if _is_small(shape, tracer.sightlines.pose, clues.px_per_rad):

@@ -57,13 +57,10 @@ def read_bitmap(path: Path, variant: str | None = None) -> Image:
             bitmap = mi.Bitmap(str(path))
     except Exception as error:
         # Mitsuba hands on whatever OpenEXR runs into.
-        raise InputError(f"{path}: cannot be read ({_last_line(error)!s:.120})") from None
+        last = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+        raise InputError(f"{path}: cannot be read ({last:.120})") from None
     # Converted here: Mitsuba converts no image of one channel that is called Z, as depth is.
     return np.array(np.array(bitmap), dtype=np.float32)
-
-
-def _last_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[-1]
 
 
 def _check_size(path: Path) -> None:

@@ -65,7 +65,7 @@ class BuiltScene:
     base: Any
     base_parameters: Any
     labels: ShapeLabels | None = None  # What traces the labels of its shape; made when first needed
-    edges: MeshEdges | None = None  # Edges of its mesh; made when first needed
+    edges: MeshEdges | None = None  # Of its mesh, see `mesh_edges`
     mesh: TriangleMesh | None = None  # The mesh as it was written last
 
     def write(self, shape: Shape, reflectance: Reflectance) -> None:
@@ -74,7 +74,13 @@ class BuiltScene:
         if shape.mesh is None:
             self._set("surface.to_world", mi.AffineTransform4f(shape.to_model.tolist()))
         elif not _same(shape.mesh, self.mesh):
-            self._deform(shape.mesh)
+            # Move the vertices; the triangles stay.
+            self._set("surface.vertex_positions", flat(shape.mesh.vertices, np.float32))
+            self.parameters.update()
+            # Mitsuba has recomputed the normals from the triangles.
+            self._set("surface.vertex_normals", flat(shape.mesh.normals, np.float32))
+            self.parameters.update()
+            self.mesh, self.labels, self.edges = shape.mesh, None, None
         # Material: the whole and its base alone.
         for name, given in reflectance.updates.items():
             value = spectrum(given) if isinstance(given, list) else given
@@ -84,14 +90,11 @@ class BuiltScene:
         if self.base is not None:
             self.base_parameters.update()
 
-    def _deform(self, mesh: TriangleMesh) -> None:
-        """Move the vertices of the mesh; the triangles stay."""
-        self._set("surface.vertex_positions", flat(mesh.vertices, np.float32))
-        self.parameters.update()
-        # Mitsuba has recomputed the normals from the triangles.
-        self._set("surface.vertex_normals", flat(mesh.normals, np.float32))
-        self.parameters.update()
-        self.mesh, self.labels, self.edges = mesh, None, None
+    def mesh_edges(self) -> MeshEdges | None:
+        """Return the edges of the mesh, made when first needed; None of other shapes."""
+        if self.edges is None and self.mesh is not None:
+            self.edges = MeshEdges(self.scene, self.mesh)
+        return self.edges
 
     def place_lights(self, rig: Rig, model_from_camera: Array) -> DirectLight:
         """Write the lights of a rig at a pose of the camera, and all set before; return their own kernel."""

@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.rendering.backend import dr, mi
-from simtest.rendering.elements.base import facet_density, visible_over_cosine
+from simtest.rendering.elements.base import reflected
 from simtest.rendering.frames import HighlightPoint, Maps, Real
-from simtest.rendering.kernel_values import channels, spectrum
+from simtest.rendering.kernel_values import channels, spectrum, vectors_to_kernel
 from simtest.rendering.placement_checks import check_instruments
 from simtest.rendering.rays import Hit
 from simtest.runtime.arrays import Array, Image, IntArray, Mask
@@ -50,19 +50,14 @@ class Metal:
         active &= (wi.z > 0) & (wo.z > 0)
         up = mi.Vector3f(0, 0, 1)
         wi, wo = dr.select(active, wi, up), dr.select(active, wo, up)
-        both = wi + wo
-        squared = (dr.square(both.x) + dr.square(both.y)) / dr.square(both.z)
-        # 1 minus the cosine at the facet, without cancellation.
-        grazing = 1 - dr.minimum(dr.norm(both) / 2, 1)
-        fresnel = self.metal + (1 - self.metal) * grazing**5
-        seen, lit = visible_over_cosine(wi, self.alpha, True), visible_over_cosine(wo, self.alpha, True)
-        lobe = facet_density(squared, self.alpha, True) * seen * lit * wo.z / 4
+        _, lobe, facing = reflected(wi, wo, self.alpha, True)
+        fresnel = self.metal + (1 - self.metal) * (1 - facing) ** 5
         base = self.matt * (self.share * dr.inv_pi * wo.z)
         return dr.select(active, fresnel * (lobe * (1 - self.share)), 0), dr.select(active, base, 0)
 
 
-class _Blockers:
-    """What stands before lights: the scene's surface and the instruments."""
+class Blockers:
+    """What shadow rays ask in place of a scene: its surface and the instruments."""
 
     def __init__(self, scene: Any, kernel: "InstrumentKernel") -> None:
         self._scene, self._kernel = scene, kernel
@@ -90,7 +85,6 @@ class InstrumentKernel:
         metals = [(one.alpha, one.diffuse, *one.metal, *one.colour) for one in instruments.values()]
         self._data = mi.Float64(np.concatenate([numbers.ravel(), np.ravel(metals)]))
         self._count = mi.UInt32(len(numbers))
-        self._names = np.array(list(instruments), dtype=np.int64)
         dr.make_opaque(self._data, self._count)
 
     def first(self, origin: Any, direction: Any, active: Any) -> tuple[Any, Any]:
@@ -177,13 +171,11 @@ class InstrumentKernel:
         si.t = dr.select(is_hit, mi.Float(distance), mi.Float(dr.inf))
         si.p, si.n, si.sh_frame = mi.Point3f(position), normal, mi.Frame3f(normal)
         si.wi = si.to_local(-mi.Vector3f(rays.direction))
-        return Hit(si, si, si), self._metal(part, is_hit)
-
-    def _metal(self, part: Any, active: Any) -> Metal:
-        owner = mi.UInt32(self._number(part * PER_PART + PER_PART - 1, active))
+        # Its metal.
+        owner = mi.UInt32(self._number(part * PER_PART + PER_PART - 1, is_hit))
         first = self._count * PER_PART + owner * PER_METAL
-        n = [mi.Float(self._number(first + k, active)) for k in range(PER_METAL)]
-        return Metal(n[0], n[1], self._colour(n[2:5]), self._colour(n[5:8]))
+        n = [mi.Float(self._number(first + k, is_hit)) for k in range(PER_METAL)]
+        return Hit(si, si, si), Metal(n[0], n[1], self._colour(n[2:5]), self._colour(n[5:8]))
 
     def _colour(self, rgb: list[Any]) -> Any:
         if channels() == 3:
@@ -191,10 +183,6 @@ class InstrumentKernel:
         # As `spectrum` makes it of numbers: the luminance.
         weights = [spectrum(unit) for unit in np.eye(3).tolist()]
         return mi.Spectrum(sum(value * weight for value, weight in zip(rgb, weights, strict=True)))
-
-    def before(self, scene: Any) -> Any:
-        """Return what shadow rays ask in place of a scene: its surface and the instruments."""
-        return _Blockers(scene, self)
 
     # Single rays -------------------------------------------------------------------------------------------------
 
@@ -208,8 +196,9 @@ class InstrumentKernel:
             return np.empty(0), np.empty((0, 3)), np.empty(0, dtype=np.int64)
         asked = np.isfinite(directions).all(axis=1)
         whole = np.where(np.reshape(asked, (-1, 1)), directions, [0.0, 0.0, 1.0])
-        o = mi.Vector3d(np.ascontiguousarray(np.broadcast_to(origins, whole.shape).T))
-        d, active = mi.Vector3d(np.ascontiguousarray(whole.T)), mi.Bool(asked)
+        both = np.broadcast_to(origins, whole.shape), whole
+        o, d = (vectors_to_kernel(mi.Vector3d, mi.Float64, rays, np.float64) for rays in both)
+        active = mi.Bool(asked)
         distance, part = self.first(o, d, active)
         is_hit = active & dr.isfinite(distance)
         normal = self.normal(o + d * dr.select(is_hit, distance, 1), part, is_hit)
@@ -321,22 +310,20 @@ def shade(session: "Session", kernel: InstrumentKernel, points: list[HighlightPo
     if not points:
         return []
     positions = np.stack([point.position for point in points])
-    hidden = _blocked(session, kernel, np.zeros(3), positions)
-    shaded = np.zeros(len(points), dtype=bool)
-    lights = np.array([point.light for point in points])
-    for index, source in enumerate(session.scene.rig.true_mm()):
-        of_light = lights == index
-        if of_light.any() and not is_at_camera(source):
-            shaded[of_light] = _blocked(session, kernel, source, positions[of_light])
+    sources = session.scene.rig.true_mm()[[point.light for point in points]]
+    hidden = _blocked(session, kernel, np.zeros((1, 3)), positions)
+    # A light at the camera reaches all that is seen.
+    shaded = ~np.array([is_at_camera(source) for source in sources])
+    shaded[shaded] = _blocked(session, kernel, sources[shaded], positions[shaded])
     return [
         replace(point, lit=point.lit and not (behind or dark), hidden=bool(behind))
         for point, behind, dark in zip(points, hidden.tolist(), shaded.tolist(), strict=True)
     ]
 
 
-def _blocked(session: "Session", kernel: InstrumentKernel, source: Array, positions: Array) -> Mask:
-    """Return which positions, shape (N, 3), an instrument hides from a source, shape (3,), camera frame, mm."""
-    towards = positions - source
+def _blocked(session: "Session", kernel: InstrumentKernel, sources: Array, positions: Array) -> Mask:
+    """Return which positions, shape (N, 3), an instrument hides from sources, (1, 3) or (N, 3), camera frame, mm."""
+    towards = positions - sources
     distance = np.linalg.norm(towards, axis=1)
     directions = towards / distance[:, None] @ session.surface.model_from_camera[:3, :3].T
-    return np.asarray(kernel.cast(session.to_model(source[None]), directions)[0] < distance * (1 - ROUNDING))
+    return np.asarray(kernel.cast(session.to_model(sources), directions)[0] < distance * (1 - ROUNDING))

@@ -152,6 +152,11 @@ class DirectLight:
         """Return what draws points of the sources of finite size for the pixels of a launch; None if all are points."""
         return Drawer(lanes, samples) if any(kind.source != "point" for kind in self.kinds) else None
 
+    def fixed_points(self) -> LightDraw | None:
+        """Return the draw of the sources' fixed points; None if all are points."""
+        drawer = self.drawer(None)
+        return None if drawer is None else drawer.at(0)
+
     def radiance(self, scene: Any, material: Reflecting, hit: Hit, draw: LightDraw | None) -> tuple[Any, Any]:
         """Compute the radiance off lobe and base at surface points; `draw` chooses points of finite sources."""
         specular, diffuse = mi.Spectrum(0), mi.Spectrum(0)

@@ -162,6 +162,10 @@ def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> MitsubaDict:
     else:
         scale = float(np.linalg.norm(surface.model_from_camera[:3, 3]))
     near, far = (scale * share for share in CLIP)
+    # One stratum without jitter: the ray through the pixel's centre.
+    centres = {"type": "stratified", "sample_count": 1, "jitter": False}
+    samples, seed = scene.render.samples_per_pixel, scene.render.seed
+    spread = {"type": "independent", "sample_count": samples if samples > 1 else SAMPLES, "seed": seed}
     return {
         "type": "perspective",
         "fov_axis": "x",
@@ -177,7 +181,7 @@ def _sensor(scene: Scene, surface: SurfaceModel, shape: Shape) -> MitsubaDict:
             "component_format": "float32",
             "rfilter": {"type": "box"},
         },
-        "sampler": _sampler(scene),
+        "sampler": centres if _through_centres(scene) else spread,
     }
 
 
@@ -186,14 +190,6 @@ def _through_centres(scene: Scene) -> bool:
     effort = scene.render
     points = len(scene.rig.lights) == 1 and scene.rig.lights[0].source is None
     return effort.samples_per_pixel == 1 and effort.path_depth == 2 and points
-
-
-def _sampler(scene: Scene) -> MitsubaDict:
-    if _through_centres(scene):
-        # One stratum without jitter: the ray through the pixel's centre.
-        return {"type": "stratified", "sample_count": 1, "jitter": False}
-    samples = scene.render.samples_per_pixel
-    return {"type": "independent", "sample_count": samples if samples > 1 else SAMPLES, "seed": scene.render.seed}
 
 
 def _light(light: LightSpec, position: Array) -> MitsubaDict:
@@ -208,14 +204,6 @@ def _light(light: LightSpec, position: Array) -> MitsubaDict:
         "emitter": {"type": "area", "radiance": radiance},
         "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
     }
-
-
-def _disc_pose(light: LightSpec, position_mm: Array, surface: SurfaceModel) -> Array:
-    """Return the matrix, shape (4, 4), from Mitsuba's unit disc to a light's disc in the model frame."""
-    assert light.source is not None
-    local = np.eye(4)
-    local[:3, :2], local[:3, 2], local[:3, 3] = light.source.radius_mm * light.across.T, light.axis, position_mm
-    return np.asarray(surface.model_from_camera @ local)
 
 
 def _xml(scene: Scene, surface: SurfaceModel, shape: Shape) -> str:
@@ -244,7 +232,8 @@ def _xml(scene: Scene, surface: SurfaceModel, shape: Shape) -> str:
         _set_transform(root, "surface", shape.to_model)
     for i, (light, position) in enumerate(lights):
         if light.source is not None:
-            _set_transform(root, f"light_{i}", _disc_pose(light, position, surface))
+            columns = np.column_stack([light.source.radius_mm * light.across.T, light.axis, position])
+            _set_transform(root, f"light_{i}", pose @ np.vstack([columns, [0, 0, 0, 1]]))
     root.insert(0, ET.Comment(_head(scene)))
     ET.indent(root, " " * 4)
     return ET.tostring(root, encoding="unicode") + "\n"

@@ -80,11 +80,6 @@ class Sightlines:
         dr.make_opaque(self._origin, self._rotation, self.camera_from_model, self._numbers)
         dr.make_opaque(self._mask, self._width, self._tiles)
 
-    @property
-    def tiled_size(self) -> tuple[int, int]:
-        """Height and width of the frame in whole tiles, px."""
-        return -(-self.camera.height // TILE) * TILE, -(-self.camera.width // TILE) * TILE
-
     def lanes(self, first: int, count: int, tiled: bool, seed: int) -> Lanes:
         """Return `count` pixels from `first` on, in tiles or rows; samples depend on seed and pixel alone."""
         start, salt = mi.UInt32(first), mi.UInt32(seed)

@@ -14,7 +14,6 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.rendering import adaptive, backend, elements, highlights, truth
-from simtest.rendering.adaptive import MeshEdges
 from simtest.rendering.backend import mi
 from simtest.rendering.built_scene import BuiltScene, build
 from simtest.rendering.elements.lights import kind_of
@@ -117,10 +116,10 @@ class Session:
         key = self._structure()
         if self._built.key != key:
             self._built = self._build(key)
+        self._write_values()
+        # Of the mesh as it is written now.
         if self._labelled:
             self._shape_labels()
-        # Values.
-        self._write_values()
         try:
             self._instruments, self._cover = place(self), None
         except InputError:
@@ -231,20 +230,20 @@ class Session:
     def _render(self, labels: ShapeLabels | None, progress: Progress | None) -> tuple[Radiance, list[Any]]:
         effort, tracer = self.scene.render, self._tracer()
         # Direct light is traced here; a path depth above 2 adds bounces.
-        bounces = None
-        if effort.path_depth > 2:
-            bounces = Bounces(self._built.scene, effort.path_depth, effort.seed)
+        bounces = Bounces(self._built.scene, effort.path_depth, effort.seed) if effort.path_depth > 2 else None
+        channels: list[Image] = []
         if (motion := self.scene.camera.moving) is not None:
             parts = self._mean_over(motion, bounces, progress)
-            channels = tracer.centres(None, False, labels)[1] if labels else []
         elif effort.samples_per_pixel == 1:
             parts, channels = tracer.centres(bounces, True, labels, progress)
         elif adaptive.applies(self.scene):
-            parts, self._centre = self._adaptive(tracer, progress)
+            edges = self._built.mesh_edges()
+            parts, self._centre = adaptive.render(tracer, self.scene, self._shape, edges, progress)
             channels = tracer.relabelled(self._centre, labels) if labels else []
         else:
             parts = tracer.mean(effort.samples_per_pixel, effort.seed, bounces, progress)
-            channels = tracer.centres(None, False, labels)[1] if labels else []
+        if labels and not channels:
+            channels = tracer.centres(None, False, labels)[1]
         per_layer = len(parts) // tracer.layers
         radiance = as_radiance(parts[:per_layer])
         if self.scene.translucency is not None:
@@ -270,13 +269,6 @@ class Session:
             return mean_over(motion, self.scene.render, at, bounces, progress)
         finally:
             self._place_lights(middle)
-
-    def _adaptive(self, tracer: Tracer, progress: Progress | None) -> tuple[list[Image], list[Image]]:
-        built, mesh = self._built, self._shape.mesh
-        if built.edges is None and mesh is not None:
-            built.edges = MeshEdges(built.scene, mesh)
-        labels = ShapeLabels(built.scene.shapes()[0], None, curved=False)
-        return adaptive.render(tracer, self.scene, labels, self._shape, built.edges, progress)
 
     def _translucent(self, radiance: Radiance, channels: list[Image], spec: Translucency) -> Radiance:
         """Return radiance whose diffuse part has spread below the surface."""
@@ -398,9 +390,8 @@ class Session:
         fine = mi.SurfaceInteraction3f(hit.fine)
         fine.sh_frame = mi.Frame3f(mi.Normal3f((normals @ rotation.T).T.astype(np.float32)))
         fine.wi = fine.to_local(-rays.traced.d)
-        drawer = tracer.light.drawer(None)
-        draw = None if drawer is None else drawer.at(0)
-        lobe, _ = tracer.light.radiance(tracer.scene, tracer.material, replace(hit, fine=fine), draw)
+        seen = replace(hit, fine=fine)
+        lobe, _ = tracer.light.radiance(tracer.blockers, tracer.material, seen, tracer.light.fixed_points())
         return np.mean(evaluate([*lobe], len(points)), axis=0, dtype=float)
 
     @_at_its_variant

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from simtest.surfaces.tissue_pattern import Lattice, TissuePattern
 
 
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Of a symmetric matrix: xx, xy, xz, yy, yz, zz."""
+
 Order = tuple[int, ...]
 """Orders of a derivative along x, y and z of the lattice."""
 
@@ -100,8 +103,7 @@ class ReliefKernel:
         hessian = jets.hessian
         if hessian is not None:
             bend, g = share * (1 - share) / meniscus, jets.gradient
-            outer = (g.x * g.x, g.x * g.y, g.x * g.z, g.y * g.y, g.y * g.z, g.z * g.z)
-            hessian = tuple(share * second + bend * product for second, product in zip(hessian, outer, strict=True))
+            hessian = tuple(share * h + bend * (g[i] * g[j]) for h, (i, j) in zip(hessian, UPPER, strict=True))
         return KernelJets(jets.height, share * jets.gradient, jets.diffused, hessian)
 
 
@@ -152,7 +154,7 @@ def _band(band: _Band, p: Any, active: Any, bent: bool) -> KernelJets:
         orders = [[tuple((axis == i) + (axis == j) for axis in range(3)) for j in range(3)] for i in range(3)]
         rows = [[fine[order] for order in row] for row in orders]
         whole = back @ mi.Matrix3f(*rows[0], *rows[1], *rows[2]) @ band.lattice
-        hessian = tuple(whole[i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+        hessian = tuple(whole[i, j] for i, j in UPPER)
     return KernelJets(fine[0, 0, 0], back @ _gradient(fine), diffused, hessian)
 
 
@@ -316,8 +318,6 @@ def _packets(lattice: "Lattice") -> npt.NDArray[np.float32]:
 ROW = 8
 """Packets of a vertex: its position at rest, J^-T, and the second derivatives, upper triangles, padded."""
 
-_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-
 
 class RestMap:
     """Finds points at rest on a deformed surface, whose mesh is rendered, and carries derivatives from there."""
@@ -325,7 +325,7 @@ class RestMap:
     def __init__(self, surface: DeformedSurface) -> None:
         mesh, jets = surface.rest.shape().mesh, surface.vertex_jets
         assert mesh is not None
-        rows, columns = np.transpose(_UPPER)
+        rows, columns = np.transpose(UPPER)
         upper = jets.hessian[:, :, rows, columns].reshape(-1, 18)
         parts = [mesh.vertices, inverse_transpose(jets).reshape(-1, 9), upper]
         packed = np.zeros((len(mesh.vertices), PACKET * ROW), dtype=np.float32)
@@ -346,7 +346,7 @@ class RestMap:
             upper = [h - sum(gradient[i] * second[6 * i + n] for i in range(3)) for n, h in enumerate(hessian)]
             xx, xy, xz, yy, yz, zz = upper
             whole = K @ mi.Matrix3f(xx, xy, xz, xy, yy, yz, xz, yz, zz) @ K.T
-            hessian = tuple(whole[i, j] for i, j in _UPPER)
+            hessian = tuple(whole[i, j] for i, j in UPPER)
         return KernelJets(jets.height, gradient, K @ jets.diffused, hessian)
 
     def _numbers(self, si: Any, active: Any, first: int, last: int) -> list[Any]:

@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from simtest.rendering.backend import dr, mi
 from simtest.rendering.frames import Radiance
-from simtest.rendering.instruments import InstrumentKernel
+from simtest.rendering.instruments import Blockers, InstrumentKernel
 from simtest.rendering.kernel_values import channels, to_kernel
 from simtest.rendering.lighting import DirectLight, Drawer, LightDraw, Material
-from simtest.rendering.rays import Hit, HitRefinement, Lanes, Pixels, Rays, Sightlines, make_hit, untile
+from simtest.rendering.rays import TILE, Hit, HitRefinement, Lanes, Pixels, Rays, Sightlines, make_hit, untile
 from simtest.rendering.tissue_kernels import ReliefKernel
 from simtest.rendering.truth import CHANNELS, ShapeLabels
 from simtest.runtime.arrays import Array, Image
@@ -98,6 +98,11 @@ class Tracer:
         """How many sets of channels the radiance has: that of the surface, and that of instruments if there are any."""
         return 1 if self.instruments is None else 2
 
+    @property
+    def blockers(self) -> Any:
+        """What shadow rays ask: the scene's surface, and the instruments if there are any."""
+        return self.scene if self.instruments is None else Blockers(self.scene, self.instruments)
+
     def hit(self, x: Any, y: Any, bent: bool = False) -> tuple[Rays, Any, Hit]:
         """Trace pixel positions; return rays, hits and surface points, if `bent` with the normals' derivatives."""
         rays = self.sightlines.rays(x, y)
@@ -113,7 +118,7 @@ class Tracer:
 
     def _direct(self, rays: Rays, hit: Hit, draw: LightDraw | None) -> list[Any]:
         """Compute the channels of direct light off lobe and base, then of metal; each is 0 behind the other."""
-        blockers = self.scene if self.instruments is None else self.instruments.before(self.scene)
+        blockers = self.blockers
         with self.material.painted(hit):
             tissue = self.light.radiance(blockers, self.material, hit, draw)
         if self.instruments is None:
@@ -129,22 +134,6 @@ class Tracer:
         metallic = dr.if_stmt(dark, in_front, shine, lambda specular, diffuse: (specular, diffuse))
         seen = [dr.select(in_front, 0, channel) for part in tissue for channel in part]
         return seen + [dr.select(in_front, channel, 0) for part in metallic for channel in part]
-
-    def _parts(
-        self,
-        rays: Rays,
-        hit: Hit,
-        draw: LightDraw | None,
-        bounces: Bounces | None,
-        count: int,
-        block: int,
-        sample: int,
-    ) -> list[Any]:
-        """Compute the channels of direct light and, if asked for, of further bounces."""
-        parts = self._direct(rays, hit, draw)
-        if bounces is not None:
-            parts += [*bounces.radiance(hit.fine, count, block, sample)]
-        return parts
 
     # One sample --------------------------------------------------------------------------------------------------
 
@@ -170,9 +159,10 @@ class Tracer:
             lanes = self.sightlines.lanes(first, count, False, 0)
             rays, preliminary, hit = self.hit(*self.sightlines.centre(lanes), labels is not None)
             # Radiance and labels of one launch go into one kernel.
-            drawer = self.light.drawer(None)
-            draw = None if drawer is None else drawer.at(0)
-            parts = self._parts(rays, hit, draw, bounces, count, block, sample) if radiance else []
+            draw = self.light.fixed_points()
+            parts = self._direct(rays, hit, draw) if radiance else []
+            if bounces is not None:
+                parts = [*parts, *bounces.radiance(hit.fine, count, block, sample)]
             count_of_parts = len(parts)
             if labels is not None:
                 parts = parts + labels.trace(preliminary, hit, rays, self.sightlines.camera_from_model, self.relief)
@@ -203,8 +193,7 @@ class Tracer:
     def _maps(self, rows: list[list[Image]]) -> list[Image]:
         """Make maps, shape (H, W), of the channels of launches, row after row."""
         shape = (self.sightlines.camera.height, self.sightlines.camera.width)
-        return [np.concatenate(pieces).reshape(shape) if len(rows) > 1 else pieces[0].reshape(shape)
-                for pieces in zip(*rows, strict=True)]  # fmt: skip
+        return [np.concatenate(pieces).reshape(shape) for pieces in zip(*rows, strict=True)]
 
     # Several samples ---------------------------------------------------------------------------------------------
 
@@ -222,8 +211,9 @@ class Tracer:
         `numbers` are those of the samples that are traced, one after the other; default all.
         """
         numbers = range(samples) if numbers is None else numbers
-        height, width = self.sightlines.tiled_size
         camera = self.sightlines.camera
+        # Of the frame in whole tiles.
+        height, width = (-(-size // TILE) * TILE for size in (camera.height, camera.width))
         # Trace: sums over the samples of each block of pixels.
         blocks = list(blocks_of(height * width))
         lanes = ((self.sightlines.lanes(first, count, True, seed), count) for first, count in blocks)
@@ -249,14 +239,22 @@ class Tracer:
         """Compute channels, shape (C, N), of the mean over samples, by number of `samples`, of blocks of lanes."""
         means: list[Image] = []
         traced = 0
+        # Bounces draw new random numbers for each sample, other cameras unproject on the host: one sample a launch.
+        looped = bounces is None and self.sightlines.in_kernel
         for block, (lanes, count) in enumerate(blocks):
             drawer = self.light.drawer(lanes, samples)
             sums: Sums | None = None
-            for start, stop in self._runs(numbers, count, bounces):
-                if bounces is None and self.sightlines.in_kernel:
-                    parts = self._looped(lanes, drawer, start, stop)
+            step = max(1, min(SUMMED, RAYS // count)) if looped else 1
+            for start in numbers[::step]:
+                stop = min(start + step, numbers.stop)
+                number, end = mi.UInt32(start), mi.UInt32(stop)
+                dr.make_opaque(number, end)
+                if looped:
+                    parts = self._looped(lanes, drawer, number, end)
                 else:
-                    parts = self._single(lanes, drawer, start, bounces, count, block)
+                    hit, parts = self._sample(lanes, drawer, number)
+                if bounces is not None:
+                    parts = [*parts, *bounces.radiance(hit.fine, count, block, start)]
                 added = np.stack(evaluate(parts, count)).astype(np.float64)
                 sums = added if sums is None else sums + added
                 traced += count * (stop - start)
@@ -266,37 +264,20 @@ class Tracer:
             means.append((sums / len(numbers)).astype(np.float32))
         return np.concatenate(means, axis=1)
 
-    def _runs(self, numbers: range, count: int, bounces: Bounces | None) -> Iterator[tuple[int, int]]:
-        """Split the numbers of a pixel's samples into the runs of single launches."""
-        # Bounces draw new random numbers for each sample, other cameras unproject on the host: one sample a launch.
-        looped = bounces is None and self.sightlines.in_kernel
-        step = max(1, min(SUMMED, RAYS // count)) if looped else 1
-        for start in range(numbers.start, numbers.stop, step):
-            yield start, min(start + step, numbers.stop)
-
-    def _looped(self, lanes: Lanes, drawer: Drawer | None, start: int, stop: int) -> list[Any]:
+    def _looped(self, lanes: Lanes, drawer: Drawer | None, start: Any, end: Any) -> list[Any]:
         """Sum direct light over samples by a loop inside the kernel."""
-        zeros = [mi.Float(0) for _ in range(2 * self.layers * channels())]
-        number, end = mi.UInt32(start), mi.UInt32(stop)
-        dr.make_opaque(number, end)
 
         def step(number: Any, *sums: Any) -> tuple[Any, ...]:
-            rays, _, hit = self.hit(*self.sightlines.sample(lanes, number))
-            parts = self._direct(rays, hit, None if drawer is None else drawer.at(number))
+            parts = self._sample(lanes, drawer, number)[1]
             return number + 1, *(total + part for total, part in zip(sums, parts, strict=True))
 
-        _, *sums = dr.while_loop((number, *zeros), lambda number, *_: number < end, step)
-        return sums
+        zeros = [mi.Float(0) for _ in range(2 * self.layers * channels())]
+        return list(dr.while_loop((start, *zeros), lambda number, *_: number < end, step)[1:])
 
-    def _single(
-        self, lanes: Lanes, drawer: Drawer | None, number: int, bounces: Bounces | None, count: int, block: int
-    ) -> list[Any]:
-        """Trace the sample of one number of each pixel."""
-        which = mi.UInt32(number)
-        dr.make_opaque(which)
-        rays, _, hit = self.hit(*self.sightlines.sample(lanes, which))
-        draw = None if drawer is None else drawer.at(which)
-        return self._parts(rays, hit, draw, bounces, count, block, number)
+    def _sample(self, lanes: Lanes, drawer: Drawer | None, number: Any) -> tuple[Hit, list[Any]]:
+        """Trace the sample of one number of each pixel; return where, and the channels of direct light."""
+        rays, _, hit = self.hit(*self.sightlines.sample(lanes, number))
+        return hit, self._direct(rays, hit, None if drawer is None else drawer.at(number))
 
 
 def blocks_of(pixels: int) -> Iterator[tuple[int, int]]:

@@ -8,6 +8,7 @@ and the curvatures of a ray stay in registers. In the orthonormal basis (T, rho,
 """
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -173,14 +174,15 @@ class TubeKernel:
         inverse = 1 / (E * G - F * F)
         duals = (G * inverse) * pu - (F * inverse) * pv, (E * inverse) * pv - (F * inverse) * pu
         # Model frame, turned to face the origin; S changes its sign with the normal.
-        normal, first, second = (self._in_model(frame, w) for w in (inward, *duals))
+        normal, first, second = (w.x * frame.T + w.y * frame.rho + w.z * frame.tau for w in (inward, *duals))
         sign = dr.select(dr.dot(normal, direction) > 0, mi.Float64(-1), mi.Float64(1))
         normal = normal * sign
         # Eigenvalues and eigenvectors of S in a tangent basis, S = sum of II_ij d_i d_j^T
         tangent, other = _tangent_basis(normal)
+        along = [(dr.dot(first, w), dr.dot(second, w)) for w in (tangent, other)]
         a, b, c = (
             sign * (L * (f1 * f2) + M * (f1 * s2 + s1 * f2) + N * (s1 * s2))
-            for (f1, s1), (f2, s2) in _pairs([(dr.dot(first, w), dr.dot(second, w)) for w in (tangent, other)])
+            for (f1, s1), (f2, s2) in combinations_with_replacement(along, 2)
         )
         mean, half = (a + c) / 2, dr.sqrt(dr.square((a - c) / 2) + dr.square(b))
         turned_sine, turned_cosine = dr.sincos(dr.atan2(b, (a - c) / 2) / 2)
@@ -198,10 +200,6 @@ class TubeKernel:
             "direction_max": rotation @ (turned_cosine * tangent + turned_sine * other),
         }
         return _arrays(values, solved)
-
-    @staticmethod
-    def _in_model(frame: _Frame, local: Any) -> Any:
-        return local.x * frame.T + local.y * frame.rho + local.z * frame.tau
 
     def _frame(self, u: Any, v: Any) -> _Frame:
         """Compute C(u) and the basis (see `Tube.heading`, `Tube.centreline` and `Tube.frame`)."""
@@ -264,12 +262,6 @@ class TubeKernel:
         names = ("i", *(f"sum_{i}" for i in range(len(sums))))
         state = (mi.UInt32(0), *(mi.Float64(part) for part in sums))
         return list(dr.while_loop(state, lambda i, *_: i < count, term, labels=names)[1:])
-
-
-def _pairs(rows: list[tuple[Any, Any]]) -> tuple[tuple[Any, Any], ...]:
-    """Return which of two vectors enter a, b and c of the matrix (a b; b c)."""
-    tangent, other = rows
-    return (tangent, tangent), (tangent, other), (other, other)
 
 
 def _tangent_basis(normal: Any) -> tuple[Any, Any]:

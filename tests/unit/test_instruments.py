@@ -255,6 +255,24 @@ def test_shaded_highlight_is_seen_and_not_lit(session):
     assert not shaded.hidden
 
 
+def test_lobe_at_a_highlight_is_without_the_lights_that_an_instrument_keeps_away(session):
+    """As in the frame: of two lights whose lobes overlap the other one is shaded at the first one's highlight."""
+    other = np.array([-2.0, 6.0, 0.0])
+    lights = [{"position_mm": place, "power": 1000.0} for place in (LIGHT, tuple(other))]
+    session.update(described(rig={"lights": lights}))
+    first = next(point for point in session.highlights() if point.light == 0)
+    middle = (first.position + other) / 2
+    pixel, depth = middle[:2] / middle[2] * F + [WIDTH / 2, HEIGHT / 2], float(np.linalg.norm(middle))
+    away = {"azimuth_deg": float(np.degrees(np.arctan2(other[1], other[0])))}
+    shaft = over(pixel, depth_mm=depth, diameter_mm=2.0, **away)
+    session.update(described(shaft, rig={"lights": lights}))
+    radiance = session.radiance()
+    lit = [point for point in session.highlights(radiance) if point.lit and point.light == 0]
+    assert len(lit) == 1
+    column, row = lit[0].bp_px.astype(int)
+    np.testing.assert_allclose(session.lobe_at(lit), radiance.specular[row, column], rtol=0.01)
+
+
 def test_frame_names_why_a_hidden_highlight_does_not_count_and_whose_a_spot_is(session):
     session.update(described())
     (free,) = session.highlights()

@@ -79,6 +79,19 @@ def lobe_over_base(variant: str) -> Any:
     return LobeOverBase
 
 
+def reflected(wi: Any, wo: Any, alpha: Any, ggx: bool) -> tuple[Any, Any, Any]:
+    """Compute of facets that reflect from one direction to another above the surface what a microfacet lobe takes.
+
+    The density of the directions that they are drawn with, f cos(theta) over Fresnel's term, and Fresnel's cosine.
+    """
+    # Slope and Fresnel's cosine from the sum of both directions: a cosine of the facet's angle would lose the
+    # digits that matter next to 1.
+    both = wi + wo
+    squared = (dr.square(both.x) + dr.square(both.y)) / dr.square(both.z)
+    density = facet_density(squared, alpha, ggx) * visible_over_cosine(wi, alpha, ggx) / 4
+    return density, density * visible_over_cosine(wo, alpha, ggx) * wo.z, dr.minimum(dr.norm(both) / 2, 1)
+
+
 def facet_density(squared: Any, alpha: Any, ggx: bool) -> Any:
     """Compute the density D of the facets' normals per solid angle, from the squared tangent of their angle.
 

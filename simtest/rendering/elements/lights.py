@@ -109,12 +109,9 @@ def kind_of(light: LightSpec) -> LightKind:
     """Return the kind of a light."""
     source = "point" if light.source is None else light.source.type
     plain = light.is_isotropic and len(set(light.colour)) == 1 and source == "point"
-    match light.profile:
-        case TableProfile():
-            return LightKind("table", len(light.profile.angle_deg), light.spot_deg is not None, plain, source)
-        case CosineProfile():
-            uniform = light.profile.power == 0
-            return LightKind("uniform" if uniform else "cosine", 0, light.spot_deg is not None, plain, source)
+    entries = len(light.profile.angle_deg) if isinstance(light.profile, TableProfile) else 0
+    profile = "table" if entries else "uniform" if light.profile.model().is_uniform else "cosine"
+    return LightKind(profile, entries, light.spot_deg is not None, plain, source)
 
 
 def parameters(light: LightSpec, pose: LightPose) -> MitsubaDict:

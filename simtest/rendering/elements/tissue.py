@@ -4,7 +4,7 @@ from functools import cache
 from typing import Any
 
 from simtest.rendering.backend import dr, mi
-from simtest.rendering.elements.base import facet_density, lobe_over_base, visible_over_cosine
+from simtest.rendering.elements.base import lobe_over_base, reflected
 from simtest.rendering.kernel_values import channel_mean
 
 MARGIN = 1 / 40
@@ -38,15 +38,9 @@ def _lift(bsdf: Any, albedo: Any) -> Any:
 
 def _film(bsdf: Any, wi: Any, wo: Any) -> tuple[Any, Any]:
     """Compute f cos(theta) and the sampling density of the film's reflection, of directions above it."""
-    # Slope and Fresnel's cosine from the sum of both directions: a cosine of the facet's angle would lose the
-    # digits that matter next to 1.
-    both = wi + wo
-    squared = (dr.square(both.x) + dr.square(both.y)) / dr.square(both.z)
-    facing = dr.minimum(dr.norm(both) / 2, 1)
-    seen, lit = visible_over_cosine(wi, bsdf.alpha, bsdf.ggx), visible_over_cosine(wo, bsdf.alpha, bsdf.ggx)
-    density = facet_density(squared, bsdf.alpha, bsdf.ggx) * seen / 4
+    density, lobe, facing = reflected(wi, wo, bsdf.alpha, bsdf.ggx)
     # Gradients must not flow through the choice of samples.
-    return density * lit * wo.z * mi.fresnel(facing, bsdf.index)[0], dr.detach(density)
+    return lobe * mi.fresnel(facing, bsdf.index)[0], dr.detach(density)
 
 
 def _values(bsdf: Any, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
