@@ -1,5 +1,6 @@
 """What `simtest mesh check` says of the mesh files that an experiment runs on."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,10 +44,11 @@ def mesh_verdicts(experiment: Experiment) -> list[MeshVerdict]:
     for scene in (scene for group in experiment.groups for scene in _scenes(group)):
         surface = scene.surface
         assert isinstance(surface, AnatomySurface)
-        curvature = scene.reflectance.lobe_curvature
-        key = (surface.file(), surface.kind, surface.edge_mm, curvature)
+        # A lobe without a closed form counts as the Gaussian that is as wide at half its height.
+        lobe = scene.reflectance.lobe_curvature or 2 * math.log(2) / scene.reflectance.half_width**2
+        key = (surface.file(), surface.kind, surface.edge_mm, lobe)
         if key not in verdicts:
-            verdicts[key] = _judge(surface, curvature)
+            verdicts[key] = _judge(surface, lobe)
     return list(dict.fromkeys(verdicts.values()))
 
 
@@ -64,12 +66,10 @@ def _scenes(group: Group) -> Iterator[Scene]:
                 yield scene
 
 
-def _judge(surface: AnatomySurface, curvature: float | None) -> MeshVerdict:
+def _judge(surface: AnatomySurface, lobe: float) -> MeshVerdict:
     # Loaded where there is a mesh: most experiments have none.
     from simtest.surfaces.mesh_check import check_mesh
-    from simtest.surfaces.mesh_surface import concentration
 
-    lobe = concentration() if curvature is None else curvature
     found = check_mesh(surface.file(), None, lobe, surface.kind)
     # At the distance of the nearest viewpoints, which see the narrowest highlights.
     needed, fine, at = found.needed_edge_mm, found.fine, f" at {found.distance_mm:g} mm"

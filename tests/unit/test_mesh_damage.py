@@ -157,6 +157,16 @@ def test_a_mesh_is_judged_at_the_distance_of_its_nearest_viewpoints(tmp_path, ki
     )
 
 
+@pytest.mark.parametrize("alpha", [0.03, 0.15])
+def test_a_ggx_lobe_needs_edges_for_its_own_width(tmp_path, alpha):
+    path = tmp_path / "ball.ply"
+    ball().export(path)
+    lobe = {"reflectance.type": "rough_plastic", "reflectance.alpha": alpha}
+    (verdict,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.kind": "organ"}, **lobe))
+    needed = float(re.search(r"edges of (\S+) mm are needed", verdict.text)[1])
+    assert needed == pytest.approx(check_mesh(path, 40, concentration(None, alpha), "organ").needed_edge_mm, rel=0.1)
+
+
 def test_an_experiment_judges_its_mesh_files_once(tmp_path, monkeypatch):
     path = tmp_path / "ball.ply"
     ball().export(path)
