@@ -247,7 +247,7 @@ def _estimate(
         else replace(patch, others_px=(*peaks[:i], *peaks[i + 1 :]), others_value=(*values[:i], *values[i + 1 :]))
         for i, patch in enumerate(cut[: len(regions)])
     ]
-    prepare(list(estimators.values()), patches, frame.camera)
+    prepare(list(estimators.values()), patches, frame.calibration.camera)
     priors = frame.calibration.priors
     answers = {name: run_in_frame(each, frame, patches, priors) for name, each in estimators.items()}
     spots = []
@@ -258,7 +258,7 @@ def _estimate(
             small = highlight is not None and math.sqrt(highlight.area_px / math.pi) < SMALL_RADIUS * frame.smoothing_px
             dim = highlight is not None and highlight.dim
             results = {name: _flagged(each, patch, frame, small, dim) for name, each in results.items()}
-        spots.append(Specularity(region, patch, results, highlight, frame.camera, options.target))
+        spots.append(Specularity(region, patch, results, highlight, frame.calibration.camera, options.target))
     box = options.roi
     undetected = [
         _undetected(name, estimate, frame, options.target)
@@ -290,7 +290,7 @@ def _undetected(name: str, estimate: Estimate, frame: Frame, target: Target) -> 
         box = (low[0], low[1], min(high[0] + 1, width) - low[0], min(high[1] + 1, height) - low[1])
         why = f"a cloud of {len(estimate.cloud.points_px)} highlights, no single one"
     region, no_patch = Region(box, (x, y), None), Failure(Reason.NO_PEAK, why)
-    return Specularity(region, no_patch, {name: estimate}, camera=frame.camera, target=target)
+    return Specularity(region, no_patch, {name: estimate}, camera=frame.calibration.camera, target=target)
 
 
 def _flagged(result: Estimate | Failure, patch: Patch, frame: Frame, small: bool, dim: bool) -> Estimate | Failure:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from simtest.errors import InputError, SimtestError
 from simtest.runtime.boundary import plain
 from simtest.runtime.files import make_folder
 from simtest.simulation import views
+from simtest.spec.sensor import Sensor
 from tests.refusals import refused
 
 MAIN = "from simtest.cli.main import main; main()"
@@ -173,15 +175,18 @@ def test_a_stopped_film_leaves_no_half_of_it(tmp_path, monkeypatch):
     """The list of an earlier call's views goes too, since their pictures have gone."""
 
     def stopped(scene, count, viewpoints, variant, progress, rate, write):
-        write.__self__._write(np.zeros((48, 64, 3), np.uint8), rate)
-        assert [path.suffix for path in tmp_path.iterdir()] == [".avi"]
+        view = SimpleNamespace(
+            scene=SimpleNamespace(sensor=Sensor()), frame=lambda seed: np.zeros((48, 64, 3), np.float32)
+        )
+        write(None, view)
+        assert {path.suffix for path in tmp_path.iterdir()} == {".avi", ".png"}
         raise KeyboardInterrupt
 
     monkeypatch.setattr(views, "sample_views", stopped)
     (tmp_path / "views.json").write_text("{}")
     with pytest.raises(KeyboardInterrupt):
         views.sample_into(tmp_path, None, 3, [0.1], None, None, sequence=True)
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["view_0000.png"]
 
 
 @pytest.mark.parametrize(
