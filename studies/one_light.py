@@ -185,6 +185,14 @@ def report(rows: Sequence[Row]) -> int:
     lines = [_line(name, [row for row in rows if row[key] == value]) for name, (key, value) in cells.items()]
     head = ["highlights", "frames", "n", "RMS error, deg", "stated, deg", "held", "stated before, deg", "held before"]
     print_markdown([head, *(line for line in lines if line), _line("all", rows)])
+    cases: dict[tuple[float | str, float | str], list[float]] = {}
+    for row in (row for row in rows if row["crowd"] != "none"):
+        cases.setdefault((row["frame"], row["told"]), []).append(float(row["held"]))
+    worst = [share for share in sorted(map(_mean, cases.values())) if share < LEAST]
+    print(
+        f"cases, each a frame of more than three highlights with one statement of its distance: {len(cases)}; "
+        f"{len(worst)} hold less than {LEAST:.0%}, the worst {min(worst, default=math.nan):.0%}\n"
+    )
     of = {"single highlights": "single", "clouds": "cloud", "clouds about no highlight point": "none"}
     lines = [_line(name, [row for row in base if row["of"] == value]) for name, value in of.items()]
     print_markdown([["against the base's normal", *head[1:6]], *(line[:6] for line in lines if line)])

@@ -17,6 +17,7 @@ from studies.light_calibration.plantings import Planting, plant, write_pictures
 from studies.light_calibration.points import about, measured_points
 
 WITHIN_MM = 0.2
+LIMIT = chi_squared.quantile(0.95, 3)
 
 
 def measured(planting: Planting, told_radius: float | None = None, lights: Any = None) -> Calibrated:
@@ -79,7 +80,7 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
         halves = np.array([light["half_mm"] for light in lights])
         length, inside = np.linalg.norm(errors, axis=1), np.abs(errors) <= halves
         squares = np.array([light["mahalanobis2"] for light in lights])
-        share = float((squares <= chi_squared.quantile(0.95, 3)).mean())
+        share = float((squares <= LIMIT).mean())
         good = ((np.abs(errors) <= np.maximum(halves, WITHIN_MM)).all(axis=1)).mean()
         lines.append(
             f"{name}: {len(group)} answered, {len(lights)} lights, error median {np.median(length):.3f}, "
@@ -87,7 +88,22 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
             f"within 0.2 mm {np.mean(length <= WITHIN_MM):.1%}; within 0.2 mm or the interval {good:.1%}; "
             f"intervals cover {inside.mean():.1%} of {inside.size} coordinates, 95 % regions {share:.1%}"
         )
-    return lines
+    lines += [_outside(e) for e in sure if any(light["mahalanobis2"] > LIMIT for light in e["lights"])]
+    return [
+        *lines,
+        *(f"rig {e['seed']}, {e['kind']}, {e['planted']} planted: {_why(e)}" for e in rows if e not in sure),
+    ]
+
+
+def _outside(row: dict[str, Any]) -> str:
+    """Return a line about a rig whose lights lie outside their 95 % region."""
+    lengths = ", ".join(f"{np.linalg.norm(light['error_mm']):.2f}" for light in row["lights"])
+    return f"rig {row['seed']}, {row['kind']}, {row['planted']} planted: outside a region; off by {lengths} mm"
+
+
+def _why(row: dict[str, Any]) -> str:
+    """Return why a rig has no answer."""
+    return "; ".join(row.get("problems") or [row["status"]])
 
 
 def main() -> None:

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from simtest.cli.main import INTERRUPTED, TERMINATED, main
+from simtest.cli.progress import stop_between_steps
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.boundary import plain
 from simtest.runtime.files import make_folder
+from simtest.runtime.stops import breakable
 from simtest.simulation import views
 from simtest.spec.sensor import Sensor
 from tests.refusals import refused
@@ -187,6 +189,21 @@ def test_a_stopped_film_leaves_no_half_of_it(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         views.sample_into(tmp_path, None, 3, [0.1], None, None, sequence=True)
     assert [path.name for path in tmp_path.iterdir()] == ["view_0000.png"]
+
+
+def test_a_stop_breaks_into_a_wait_and_else_waits_for_the_end_of_a_step():
+    """One that came within a step is raised by the next wait, as by the next check."""
+    with stop_between_steps() as check:
+        signal.raise_signal(signal.SIGINT)
+        for waits in (check, lambda: breakable().__enter__()):
+            with pytest.raises(KeyboardInterrupt):
+                waits()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    with stop_between_steps() as check:
+        check()
+        with pytest.raises(KeyboardInterrupt), breakable():
+            signal.raise_signal(signal.SIGINT)
 
 
 @pytest.mark.parametrize(
