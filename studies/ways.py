@@ -1,29 +1,35 @@
-"""Trace the way of a picture through the packages of simtest, from the file to index.html, and count its climbs.
+"""Trace what a picture or an experiment passes through on its way to its page, and count files, climbs and names.
 
-    python -m studies.picture_way FILE --fov DEG [options of simtest reconstruct]
+    python -m studies.ways reconstruct FILE --fov DEG [options of simtest reconstruct]
+    python -m studies.ways validate EXPERIMENT [options of simtest validate]
 
-One real `simtest reconstruct` is run under `sys.setprofile`. A step of the way is a call from one package below
-simtest/ into another with the picture in hand: an argument is, or holds, its file, an array of its height and width, or
-one of the records that earlier steps made of it (region, patch, highlight, estimate, specularity, description). Filling
-a record is no step. Two kinds of packages are looked through:
+One real command is run under `sys.setprofile`. A step of the way is a call from one package below simtest/ into another
+with the thing in hand: an argument is, or holds, the picture or the experiment itself, or a record that earlier steps
+made of it. Of a picture these are its file, arrays of its height and width, regions, patches, highlights, estimates and
+specularities; of an experiment `Experiment`, the records of validation and report, and tables of rows. Filling a
+record is no step. Two kinds of packages are looked through:
 
 - the doors, cli and api, which hold the file's name and call one stage after the other;
 - the ground, geometry and runtime: mathematics and file writing on behalf of the stage that calls them.
 
 Calls that follow each other from one package into the same other package are one step. The way climbs where a step
 returns to a package of a higher layer, which then takes the next step; layers are those that import-linter checks.
+Files and names count all calls that pass the thing on, inside a package too: the files of the functions that take it,
+and the names of the parameters that hold it.
 """
 
 import sys
 import tempfile
 import tomllib
 from collections import Counter
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 from simtest.cli.commands import APP
 from simtest.detection import Region
@@ -32,11 +38,17 @@ from simtest.estimators import Estimate
 from simtest.geometry import Patch
 from simtest.reconstruction import Specularities, Specularity
 from simtest.reconstruction.images import read_picture
+from simtest.spec import Experiment
 
 ROOT = Path(__file__).resolve().parents[1]
 DOORS, GROUND = ("cli", "api"), ("geometry", "runtime", "errors", "conventions")
-MADE_OF_IT = (Region, Patch, Highlight, Estimate, Specularity, Specularities)
+OF_A_PICTURE = (Region, Patch, Highlight, Estimate, Specularity, Specularities)
+OF_AN_EXPERIMENT = ("simtest.validation.", "simtest.report.")
 CONSTRUCTORS = ("__init__", "__post_init__", "__new__")
+BELOW = ("<lambda>", "<genexpr>", "<listcomp>", "<dictcomp>", "<setcomp>")
+"""Frames of parts of a function, which take nothing by a name of their own."""
+
+Is = Callable[[Any], bool]
 
 
 def layers() -> dict[str, int]:
@@ -48,23 +60,42 @@ def layers() -> dict[str, int]:
     }
 
 
+def picture(file: Path) -> Is:
+    """Return the test whether a value is a picture or was made of it."""
+    size = read_picture(file).shape[:2]
+
+    def is_it(value: Any) -> bool:
+        if isinstance(value, np.ndarray):
+            return bool(value.shape[:2] == size)
+        return isinstance(value, OF_A_PICTURE) or (isinstance(value, Path) and value == file)
+
+    return is_it
+
+
+def experiment(value: Any) -> bool:
+    """Check whether a value is an experiment or was made of it."""
+    return isinstance(value, Experiment | pl.DataFrame) or type(value).__module__.startswith(OF_AN_EXPERIMENT)
+
+
 class Way:
-    """The steps of a picture's way, recorded as a profile function.
+    """The steps of a way, recorded as a profile function.
 
     Parameters
     ----------
-    file : Path
-        The picture.
+    is_it : callable
+        Whether a value is what is followed, or was made of it.
     page : Path
         Where the way ends: steps after this file is there do not count.
     """
 
-    def __init__(self, file: Path, page: Path) -> None:
-        self.file, self.page, self.size = file, page, read_picture(file).shape[:2]
+    def __init__(self, is_it: Is, page: Path) -> None:
+        self.is_it, self.page = is_it, page
         self.height = layers()
         self.steps: list[tuple[str, str]] = []
         self.ground: Counter[str] = Counter()
-        # The package that holds the picture in each frame that is being run.
+        self.files: Counter[str] = Counter()
+        self.names: Counter[str] = Counter()
+        # The package that holds the thing in each frame that is being run.
         self._stack = [""]
 
     def __call__(self, frame: FrameType, event: str, _: object) -> None:
@@ -77,27 +108,29 @@ class Way:
     def _holder(self, frame: FrameType, caller: str) -> str:
         root, _, rest = str(frame.f_globals.get("__name__")).partition(".")
         package, code = rest.partition(".")[0], frame.f_code
-        if root != "simtest" or package in ("", caller, *DOORS) or code.co_name in CONSTRUCTORS:
+        if root != "simtest" or package in ("", *DOORS) or code.co_name in (*CONSTRUCTORS, *BELOW):
             return caller
         # At a call, the local variables are the arguments. What an answer says of itself is no step of the picture.
-        made = frame.f_locals.get("self")
-        if isinstance(made, Estimate) and isinstance(getattr(Estimate, code.co_name, None), property):
+        owner = frame.f_locals.get("self")
+        if isinstance(owner, Estimate) and isinstance(getattr(Estimate, code.co_name, None), property):
             return caller
-        if not any(self._holds(argument) for argument in frame.f_locals.values()) or self.page.exists():
+        held = [name for name, value in frame.f_locals.items() if self._holds(value)]
+        if not held or self.page.exists():
             return caller
         if package in GROUND:
             self.ground[package] += 1
             return caller
-        self.steps.append((caller, package))
+        self.files[rest] += 1
+        self.names.update(name for name in held if name != "self")
+        if package != caller:
+            self.steps.append((caller, package))
         return package
 
     def _holds(self, value: Any, depth: int = 3) -> bool:
-        """Check whether a value is the picture, was made of it, or holds such."""
-        if isinstance(value, np.ndarray):
-            return value.shape[:2] == self.size
-        if isinstance(value, MADE_OF_IT) or (isinstance(value, Path) and value == self.file):
+        """Check whether a value is the thing, was made of it, or holds such."""
+        if self.is_it(value):
             return True
-        if depth == 0:
+        if depth == 0 or isinstance(value, type):
             return False
         if isinstance(value, list | tuple):
             return any(self._holds(item, depth - 1) for item in value[:3])
@@ -108,7 +141,7 @@ class Way:
 
     @property
     def passed(self) -> list[str]:
-        """The packages in the order in which the picture passes from one to the next, returns included."""
+        """The packages in the order in which the thing passes from one to the next, returns included."""
         passed: list[str] = []
         before = ("", "")
         for caller, package in self.steps:
@@ -124,14 +157,14 @@ class Way:
         return sum(self.height[one] < self.height[other] for one, other in pairwise(self.passed))
 
 
-def trace(file: Path, options: list[str]) -> Way:
-    """Run `simtest reconstruct` on a picture and return its way."""
+def trace(command: str, thing: str, options: list[str]) -> Way:
+    """Run a command on a picture or an experiment and return its way."""
     with tempfile.TemporaryDirectory() as out:
-        way = Way(file, Path(out, "index.html"))
+        way = Way(picture(Path(thing)) if command == "reconstruct" else experiment, Path(out, "index.html"))
         sys.setprofile(way)
         try:
             APP(
-                ["reconstruct", str(file), "--out", out, *options],
+                [command, thing, "--out", out, *options],
                 exit_on_error=False, print_error=False, result_action="return_value",
             )  # fmt: skip
         finally:
@@ -140,13 +173,15 @@ def trace(file: Path, options: list[str]) -> Way:
 
 
 def main() -> None:
-    """Trace the picture of the command line and print its way."""
-    if len(sys.argv) < 2:
+    """Trace the way of the command line's picture or experiment and print it."""
+    if len(sys.argv) < 3 or sys.argv[1] not in ("reconstruct", "validate"):
         sys.exit(__doc__)
-    way = trace(Path(sys.argv[1]), sys.argv[2:])
+    way = trace(sys.argv[1], sys.argv[2], sys.argv[3:])
     print("\nway:", " > ".join(way.passed))
-    print(f"packages: {len(set(way.passed))}, climbs: {way.climbs}")
-    print("looked through, calls with the picture:", *(f"{name} {n}" for name, n in sorted(way.ground.items())))
+    print(f"packages: {len(set(way.passed))}, climbs: {way.climbs}, files: {len(way.files)}, names: {len(way.names)}")
+    print("looked through, calls with it:", *(f"{name} {n}" for name, n in sorted(way.ground.items())))
+    print("files:", *sorted(way.files))
+    print("names:", *sorted(way.names))
 
 
 if __name__ == "__main__":
