@@ -15,7 +15,7 @@ from benchmarks.nights import run_of
 from benchmarks.transfers import smooth_scene
 from simtest.calibration import Calibration
 from simtest.geometry import Camera
-from simtest.nightly.gate.quantities import setting_figures
+from simtest.nightly.quantities import setting_figures
 from simtest.nightly.run import verdict_on
 from simtest.reconstruction import detect_in_picture
 from simtest.reconstruction.options import default_estimators

@@ -10,9 +10,9 @@ import polars as pl
 from benchmarks.browser import OPENINGS, openings
 from benchmarks.measuring import Figure
 from benchmarks.nights import history_of, run_of, verdict_of
-from simtest.nightly.history import NEWEST
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
+from simtest.nightly.store import NEWEST
 from simtest.spec import load_experiment
 from simtest.validation.runner import run_experiment
 

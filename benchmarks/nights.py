@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest.nightly.gate.quantities import setting_figures
-from simtest.nightly.history import HISTORY, TREND_COLUMNS, trend_rows
+from simtest.nightly.quantities import setting_figures
 from simtest.nightly.records import CELL, COMPARISONS, NightlyRun, RunRecord, Verdict
+from simtest.nightly.store import HISTORY, TREND_COLUMNS, trend_rows
 from simtest.runtime import provenance
 
 FIRST = datetime(2024, 2, 1, 2, 30, tzinfo=UTC)

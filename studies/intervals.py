@@ -18,8 +18,8 @@ import polars as pl
 from scipy import stats
 
 from simtest.dataset.scoring.dense.tally import joined_figures
-from simtest.nightly.gate.contrasts import paired, unit_sums, unpaired
-from simtest.nightly.gate.quantities import Quantity
+from simtest.nightly.contrasts import paired, unit_sums, unpaired
+from simtest.nightly.quantities import Quantity
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.statistics import Interval, mean_interval, median_interval, share_interval
 

@@ -363,8 +363,8 @@ def _verdict(outcome: "Outcome") -> dict[str, Any]:
 
 def _night_parts(outcome: "Outcome") -> "Iterator[str | Table]":
     """Yield what the gate says, and a table by experiment."""
-    from simtest.nightly.phrases import headline
     from simtest.nightly.records import OUTCOMES
+    from simtest.nightly.words import headline
 
     judged, verdict = outcome.judged, outcome.judged.verdict
     counts = OUTCOMES if verdict.baseline is not None else ()

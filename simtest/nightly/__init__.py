@@ -3,8 +3,10 @@
 `run` calls the three stages, each of which hands one record of `records` to the next:
 
     run = measure_run(...)      # experiments -> NightlyRun
-    judged = judge(run, ...)    # gate/ against the baseline, history -> JudgedRun
-    draw(judged, ...)           # reports, page/, `outputs` (JSON, Markdown)
+    judged = judge(run, ...)    # `compare` against the baseline, history -> JudgedRun
+    draw(judged, ...)           # reports, `page`, `outputs` (JSON, Markdown)
 
-`store` names the folders, writes a run and accepts a baseline, `history` keeps the figures of all.
+`compare` pairs the rows of the cells that differ, tests them (`contrasts`) for the `quantities` against their margins,
+and corrects the p-values; the tests' error rates are measured (docs/gallery/gate_measured.md). `words` says in
+sentences what was found. `store` names the folders, writes a run, keeps the history and accepts a baseline.
 """

@@ -7,8 +7,8 @@ from typing import Any
 
 import polars as pl
 
-from simtest.nightly.phrases import cell_name, headline, plain, short_commit
 from simtest.nightly.records import OUTCOMES, JudgedRun, Verdict
+from simtest.nightly.words import cell_name, headline, plain, short_commit
 from simtest.pages.markdown import escaped
 from simtest.runtime.files import write_atomically, write_json
 

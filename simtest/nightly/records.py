@@ -156,7 +156,7 @@ class JudgedRun:
 
     run: NightlyRun
     verdict: Verdict
-    history: pl.DataFrame  # columns `simtest.nightly.history.HISTORY`, the run's own rows among them
+    history: pl.DataFrame  # columns `simtest.nightly.store.HISTORY`, the run's own rows among them
     reports: tuple[str, ...] = ()  # experiments with findings whose own page lies in reports/NAME, the worst first
 
     def by_experiment(self) -> pl.DataFrame:

@@ -12,23 +12,27 @@ import polars as pl
 
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
-from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.quantities import setting_figures
-from simtest.nightly.history import append, clock_note, history_rows, read_history, trend_rows
+from simtest.nightly.compare import compare
 from simtest.nightly.outputs import FILES, write_outputs
 from simtest.nightly.page import REPORTS, write_nightly_page
+from simtest.nightly.quantities import setting_figures
 from simtest.nightly.records import JudgedRun, NightlyRun, RunRecord, Verdict, to_explain
 from simtest.nightly.store import (
     LATEST_ROWS,
     Reports,
+    append,
+    clock_note,
     disk_errors_in_one_line,
     exclusive_replacement,
+    history_rows,
     load_baseline,
     log_note,
     new_run_id,
     only_night,
+    read_history,
     replace_folder,
     save_run,
+    trend_rows,
 )
 from simtest.rendering import backend
 from simtest.report import write_report

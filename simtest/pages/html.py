@@ -22,7 +22,7 @@ TEMPLATES = [
             "advice/twin",
             "realism",
             "reconstruction",
-            "nightly/page",
+            "nightly",
             "bench",
             "dataset/scoring/dense",
         )

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.quantities import setting_figures
+from simtest.nightly.compare import compare
+from simtest.nightly.quantities import setting_figures
 from simtest.nightly.records import NightlyRun, RunRecord, Verdict
 from simtest.nightly.store import LATEST_ROWS, load_run
 from simtest.validation.columns import SCHEMA

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from simtest.nightly.gate.compare import compare
+from simtest.nightly.compare import compare
 from simtest.nightly.records import CELL, FIGURES, NightlyRun, RunRecord
 
 SETTING = ("experiment", "setting")

@@ -10,8 +10,8 @@ import polars as pl
 
 from benchmarks.measuring import Figure
 from simtest.errors import SimtestError
-from simtest.nightly.gate.contrasts import margin_of
-from simtest.nightly.gate.quantities import QUANTITIES
+from simtest.nightly.contrasts import margin_of
+from simtest.nightly.quantities import QUANTITIES
 from simtest.runtime.processes import make_engine
 from simtest.spec import Experiment
 from simtest.validation.runner import run_experiment

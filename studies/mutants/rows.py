@@ -553,7 +553,7 @@ ROWS = (
     row("law's gap has the wrong sign", "columns", "report.error_laws:LawResult.gap", "self.measured - self.predicted",
         "self.predicted - self.measured", "laws_section"),
     # nightly
-    row("Holm without the running maximum", "statistics", "nightly.gate.contrasts:holm",
+    row("Holm without the running maximum", "statistics", "nightly.contrasts:holm",
         "np.maximum.accumulate(own[order] * left / share[order])", "own[order] * left / share[order]",
         "gate_statistics"),
     # bench

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from scipy import stats
 
-from simtest.nightly.gate.quantities import ANSWERED, IS_TRUE, REGION_DEG
+from simtest.nightly.quantities import ANSWERED, IS_TRUE, REGION_DEG
 from simtest.nightly.records import CELL
 from simtest.runtime.arrays import Array, Mask
 from simtest.validation.columns import BUDGET_COLUMNS, SCHEMA

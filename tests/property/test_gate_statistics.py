@@ -9,9 +9,9 @@ from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.contrasts import holm, paired, pooled, unit_sums, unpaired
-from simtest.nightly.gate.quantities import QUANTITIES, setting_figures
+from simtest.nightly.compare import compare
+from simtest.nightly.contrasts import holm, paired, pooled, unit_sums, unpaired
+from simtest.nightly.quantities import QUANTITIES, setting_figures
 from simtest.nightly.records import OUTCOMES, NightlyRun, RunRecord
 from simtest.runtime.statistics import mean_interval
 from simtest.validation.columns import SCHEMA

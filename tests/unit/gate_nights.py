@@ -3,7 +3,7 @@
 import numpy as np
 import polars as pl
 
-from simtest.nightly.gate.quantities import setting_figures
+from simtest.nightly.quantities import setting_figures
 from simtest.nightly.records import NightlyRun, RunRecord
 from simtest.validation.columns import SCHEMA
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from gate_nights import RUN, night, whole
 
-from simtest.nightly.gate.compare import compare
+from simtest.nightly.compare import compare
 from studies.gate.edits import EDITS
 
 FILE = Path(__file__).with_suffix(".json")

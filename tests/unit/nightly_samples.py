@@ -5,7 +5,7 @@ from itertools import product
 
 import polars as pl
 
-from simtest.nightly.gate.quantities import setting_figures
+from simtest.nightly.quantities import setting_figures
 from simtest.nightly.records import CELL, COMPARISONS, JudgedRun, NightlyRun, RunRecord, Verdict
 from simtest.validation.columns import SCHEMA
 

@@ -5,8 +5,8 @@ import polars as pl
 import pytest
 from gate_nights import changed, night, raised, rows, whole
 
-from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.quantities import digests_of, setting_figures
+from simtest.nightly.compare import compare
+from simtest.nightly.quantities import digests_of, setting_figures
 from simtest.nightly.records import COMPARISONS, FIGURES, OUTCOMES, POOLED
 from tests.marked import marked
 

@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 from gate_nights import night, whole
 
-from simtest.nightly.gate.compare import compare
+from simtest.nightly.compare import compare
 from studies.gate.edits import EDITS, edited, run_of
 from tests.laws.results import broken_rules
 

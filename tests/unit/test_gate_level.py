@@ -5,7 +5,7 @@ import pytest
 from gate_nights import night, rows
 from scipy import stats
 
-from simtest.nightly.gate.compare import compare
+from simtest.nightly.compare import compare
 
 
 def alarms(nights, factor, seed):

@@ -6,8 +6,8 @@ import polars as pl
 import pytest
 from gate_nights import changed, night, raised, rows, whole
 
-from simtest.nightly.gate.compare import compare, with_all_frames
-from simtest.nightly.gate.quantities import setting_figures
+from simtest.nightly.compare import compare, with_all_frames
+from simtest.nightly.quantities import setting_figures
 from simtest.nightly.run import frames_of
 from simtest.spec import Experiment
 from simtest.validation.cases import expand

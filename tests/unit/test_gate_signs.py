@@ -6,8 +6,8 @@ import pytest
 from gate_nights import night, rows
 
 from simtest.conventions import MOTION, MOTION_COLUMNS
-from simtest.nightly.gate.compare import compare
-from simtest.nightly.gate.quantities import digests_of
+from simtest.nightly.compare import compare
+from simtest.nightly.quantities import digests_of
 
 SETTINGS = tuple("abcdefghijkl")
 

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 from scipy import stats
 
-from simtest.nightly.gate.quantities import setting_figures
+from simtest.nightly.quantities import setting_figures
 from simtest.report.curves import bar
 from simtest.report.pairs import pairs
 from simtest.report.run_folder import Run

@@ -13,25 +13,31 @@ from polars.testing import assert_frame_equal
 
 from simtest.errors import InputError
 from simtest.nightly import store
-from simtest.nightly.gate.quantities import OLDEST_COLUMNS
-from simtest.nightly.history import HISTORY, TREND_COLUMNS, TRENDS, append, clock_note, history_rows, read_history
-from simtest.nightly.phrases import short_commit
+from simtest.nightly.quantities import OLDEST_COLUMNS
 from simtest.nightly.records import CELL
 from simtest.nightly.run import judge
 from simtest.nightly.store import (
     BASELINE_ROWS,
+    HISTORY,
     LATEST_ROWS,
+    TREND_COLUMNS,
+    TRENDS,
     Reports,
     accept,
+    append,
+    clock_note,
     exclusive_replacement,
+    history_rows,
     load_baseline,
     load_run,
     log_note,
     new_run_id,
     only_night,
+    read_history,
     replace_folder,
     save_run,
 )
+from simtest.nightly.words import short_commit
 from tests.unit.nightly_samples import STARTED, make_rows, make_run, no_baseline
 
 

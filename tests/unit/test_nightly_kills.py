@@ -12,8 +12,7 @@ from contextlib import contextmanager
 import polars as pl
 import pytest
 
-from simtest.nightly.history import read_history
-from simtest.nightly.store import LATEST_ROWS, Reports, load_baseline, load_run
+from simtest.nightly.store import LATEST_ROWS, Reports, load_baseline, load_run, read_history
 
 MAIN = "from simtest.cli.main import main; main()"
 ROUNDS = 2

@@ -14,12 +14,10 @@ import pytest
 from test_report import EVIL, make_rows
 
 from benchmarks.nights import history_of, run_of, verdict_of
-from simtest.nightly.gate.compare import compare
-from simtest.nightly.page import write_nightly_page
-from simtest.nightly.page.run_tables import comparisons
-from simtest.nightly.page.trends import trends
-from simtest.nightly.phrases import headline_sentence, measure, short_commit, signed
+from simtest.nightly.compare import compare
+from simtest.nightly.page import comparisons, trends, write_nightly_page
 from simtest.nightly.records import COMPARISONS, FIGURES, JudgedRun, NightlyRun, RunRecord, Verdict
+from simtest.nightly.words import headline_sentence, measure, short_commit, signed
 from simtest.pages.charts import packed_vega
 from simtest.validation.columns import SCHEMA
 from tests.unit.nightly_samples import make_run

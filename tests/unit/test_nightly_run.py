@@ -19,10 +19,9 @@ import pytest
 from simtest.cli import main as command_line
 from simtest.errors import BackendError, InputError, SimtestError
 from simtest.nightly import run as run_module
-from simtest.nightly.gate.quantities import setting_figures
-from simtest.nightly.history import read_history
+from simtest.nightly.quantities import setting_figures
 from simtest.nightly.run import RunOptions, run_nightly
-from simtest.nightly.store import BASELINE_ROWS, Reports, accept, load_baseline, save_run
+from simtest.nightly.store import BASELINE_ROWS, Reports, accept, load_baseline, read_history, save_run
 from simtest.runtime.resources import data_root
 from simtest.spec import Profile, experiments_of, load_profile
 from simtest.validation.cases import expand

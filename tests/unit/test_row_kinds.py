@@ -8,8 +8,8 @@ import pytest
 from nightly_samples import judged, make_run, no_baseline
 
 from simtest.advice.figures import _counted
-from simtest.nightly.gate.quantities import harms
-from simtest.nightly.page.run_tables import results
+from simtest.nightly.page import results
+from simtest.nightly.quantities import harms
 from simtest.nightly.records import CELL
 from simtest.report.coverage import coverage
 from simtest.report.run_folder import Run, completed

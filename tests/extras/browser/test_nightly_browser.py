@@ -8,7 +8,7 @@ from playwright.sync_api import expect
 from test_nightly_page import rows_of
 
 from benchmarks.nights import history_of, run_of, verdict_of
-from simtest.nightly.gate.compare import compare
+from simtest.nightly.compare import compare
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
 

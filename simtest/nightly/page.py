@@ -1,14 +1,24 @@
-"""The page's tables: comparisons, results, provenance."""
+"""The page of a judged run: the verdict first, then what changed, trends, results and provenance."""
 
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime, timedelta
+from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import polars as pl
 
-from simtest.nightly.gate.quantities import COVERED
-from simtest.nightly.phrases import MEANINGS, interval, measure, signed
-from simtest.nightly.records import JudgedRun, NightlyRun, Verdict
-from simtest.pages.style import estimator_order, number
+from simtest.nightly import words
+from simtest.nightly.quantities import COVERED
+from simtest.nightly.records import JudgedRun, NightlyRun, RunRecord, Verdict
+from simtest.nightly.store import TRENDS
+from simtest.nightly.words import MEANINGS, interval, measure, short_commit, signed
+from simtest.pages import style
+from simtest.pages.charts import Axis, Chart, Mark, Panel, embedded
+from simtest.pages.html import environment
+from simtest.pages.style import NEUTRAL, estimator_order, number
 from simtest.report.run_folder import flattened
+from simtest.runtime.files import write_atomically
 from simtest.validation.row_kinds import counts, row_kind
 
 MOST_ROWS = 800
@@ -129,3 +139,120 @@ def provenance(judged: JudgedRun) -> Table:
         codes = [Entry(value, "text wrap-short code") for value in values]
         entries.append([Entry(mark + name, "text", head=True), *codes])
     return Table("Provenance", ("=of", *texts), entries)
+
+
+TITLES = dict(zip(TRENDS, ("mean error (deg)", "unanswered", "in the 95 % region"), strict=True))
+"""What the panels show, by quantity."""
+
+_TICKS = 4
+"""As many dates stand side by side on a phone."""
+
+_DAY_S = 86_400.0
+_POINT, _CROSS = "●", "✖"
+
+
+def trends(history: pl.DataFrame, baseline: RunRecord | None, colours: Mapping[str, str]) -> list[Chart]:
+    """Describe a chart for each experiment, with a panel a quantity, of a history (`read_history`)."""
+    if history.is_empty():
+        return []
+    first = history["started"].min()
+    assert isinstance(first, datetime)
+    key = ("experiment", "estimator", "quantity", "run_id", "started", "commit", "state")
+    medians = history.group_by(key).agg(pl.col("value").median()).sort(*key[:3], "started", "run_id")
+    medians = medians.with_columns(day=(pl.col("started") - first).dt.total_seconds() / _DAY_S)
+    accepted = None if baseline is None else (baseline.start - first).total_seconds() / _DAY_S
+    # A run alone has no span.
+    low, high = -0.5, float(medians["day"].to_numpy().max()) + 0.5
+    days = np.unique(np.linspace(0, np.floor(high), _TICKS).round())
+    x = Axis("", limits=(low, high), named=tuple((day, f"{first + timedelta(days=day):%Y-%m-%d}") for day in days))
+    return [
+        Chart(f"trend{i}", str(name), tuple(_panels(own, x, accepted, colours)), height=640)
+        for i, ((name,), own) in enumerate(medians.group_by("experiment", maintain_order=True))
+    ]
+
+
+def _panels(medians: pl.DataFrame, x: Axis, accepted: float | None, colours: Mapping[str, str]) -> Iterator[Panel]:
+    for quantity, title in TITLES.items():
+        shown = medians.filter(pl.col("quantity") == quantity)
+        if shown.is_empty():
+            continue
+        least, most = float(shown["value"].to_numpy().min()), float(shown["value"].to_numpy().max())
+        marks = [mark for (name,), own in shown.group_by("estimator", maintain_order=True)
+                 for mark in _curve(str(name), own, colours.get(str(name), NEUTRAL))]  # fmt: skip
+        if accepted is not None:
+            marks.append(Mark([accepted] * 2, [least, most], NEUTRAL, "baseline", line="dot"))
+        yield Panel(x, Axis(title, "log" if 0 < 20 * least < most else "linear"), tuple(marks))
+
+
+def _curve(name: str, runs: pl.DataFrame, colour: str) -> Iterator[Mark]:
+    """Yield the curve of an estimator, and crosses at the runs that were a regression or changed."""
+    told = [
+        f"{name}: {number(row['value'])}\n{row['started']:%Y-%m-%d %H:%M} UTC\n"
+        f"commit {short_commit(row['commit'])}, {row['state']}"
+        for row in runs.iter_rows(named=True)
+    ]
+    day, value = runs["day"].to_numpy(), runs["value"].to_numpy()
+    yield Mark(day, value, colour, name, line="solid", width=1.3, symbol=_POINT, size=4, hover=told)
+    found = runs["state"].is_in(["regression", "changed"]).fill_null(False).to_numpy()
+    if found.any():
+        why = [text for text, is_found in zip(told, found, strict=True) if is_found]
+        yield Mark(day[found], value[found], colour, name, listed=False, symbol=_CROSS, size=10, hover=why)
+
+
+REPORTS = "reports"
+"""Folder beside the page with the run folders of experiments that have findings."""
+
+
+def write_nightly_page(folder: Path, judged: JudgedRun, files: Sequence[str] = ()) -> Path:
+    """Write the page of a run into a folder, which is made if need be.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Gets index.html.
+    judged : JudgedRun
+        The run.
+    files : sequence of str
+        Names of the files that lie beside the page, to link.
+
+    Returns
+    -------
+    pathlib.Path
+        The page.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    html = _render(judged, files)
+    page = folder / "index.html"
+    write_atomically(page, lambda part: part.write_text(html, encoding="utf-8"))
+    return page
+
+
+def _render(judged: JudgedRun, files: Sequence[str]) -> str:
+    run, verdict, record = judged.run, judged.verdict, judged.run.record
+    names = [name for name in run.rows["estimator"].drop_nulls().unique(maintain_order=True) if name]
+    past = [] if judged.history.is_empty() else judged.history["estimator"].drop_nulls().unique().sort().to_list()
+    colours = style.colours(dict.fromkeys([*names, *past]))
+    charts = trends(judged.history, verdict.baseline, colours)
+    return environment().get_template("nightly.html.j2").render(
+        title=f"Nightly accuracy, {record.profile} profile",
+        started=words.when(record.started),
+        commit=words.short_commit(record.commit),
+        duration_s=record.duration_s,
+        state=verdict.state,
+        mark=words.MARKS[verdict.state],
+        headline=words.headline_sentence(verdict),
+        lines=words.verdict_lines(verdict),
+        causes=verdict.causes,
+        notes=verdict.notes,
+        reports={name: f"{REPORTS}/{name}/index.html" for name in judged.reports},
+        counts=words.counts(verdict),
+        compared=comparisons(verdict),
+        trends=charts,
+        results=results(run),
+        results_apart=results(run, apart=True),
+        provenance=provenance(judged),
+        files=files,
+        colours={name: colours[name] for name in style.estimator_order(names)},
+        **embedded(charts),
+    )  # fmt: skip

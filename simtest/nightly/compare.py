@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from simtest.nightly.gate.contrasts import UNIT, Outcomes, holm, paired, pooled, unit_sums, unpaired
-from simtest.nightly.gate.findings import causes, large_and_undecided, notes_on, redefined
-from simtest.nightly.gate.quantities import (
+from simtest.nightly.contrasts import UNIT, Outcomes, holm, paired, pooled, unit_sums, unpaired
+from simtest.nightly.quantities import (
     ANSWERED,
     IS_TRUE,
     MIXED,
@@ -24,6 +23,7 @@ from simtest.nightly.gate.quantities import (
     told_twice,
 )
 from simtest.nightly.records import CELL, COMPARISONS, POOLED, SINGLE, Cell, NightlyRun, RunRecord, Verdict, to_explain
+from simtest.nightly.words import causes, large_and_undecided, notes_on, redefined
 from simtest.validation.columns import SCHEMA
 from simtest.validation.row_kinds import is_false
 

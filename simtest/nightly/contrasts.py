@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from simtest.nightly.gate.quantities import Quantity
+from simtest.nightly.quantities import Quantity
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.runtime.statistics import reach, student_quantile
 
