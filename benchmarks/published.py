@@ -25,10 +25,10 @@ from simtest.runtime.resources import find
 from simtest.runtime.seeds import from_integer
 from simtest.spec import load_experiment
 from simtest.spec.recipes import PaperSetting
+from simtest.validation.case_work import PAPER_CHUNK
 from simtest.validation.cases import Case, expand
 from simtest.validation.columns import Row
-from simtest.validation.execution import PAPER_CHUNK
-from simtest.validation.paper.published_pipeline import kernel_radius
+from simtest.validation.paper.protocol import kernel_radius
 from simtest.validation.paper.rows import paper_rows, pipeline_with
 
 WORKERS = 2

@@ -383,7 +383,7 @@ def _reconstruct_picture(
         found.warnings.append(NOTHING)
     depth = None
     if extras.depth is not None:
-        from simtest.validation.depth_maps import depths_at
+        from simtest.validation.reference_maps import depths_at
 
         peaks = [spot.peak_px for spot in found]
         depth = depths_at(extras.depth, peaks, (picture.shape[1], picture.shape[0]), extras.depth_scale)

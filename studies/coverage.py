@@ -28,8 +28,7 @@ from simtest.simulation.frame import render_view
 from simtest.simulation.highlights import TrueHighlight
 from simtest.spec import load_scene
 from simtest.spec.toml_files import parse_settings
-from simtest.validation.matching import match
-from simtest.validation.metrics import mahalanobis2
+from simtest.validation.scoring import mahalanobis2, match
 
 HIGHLIGHTS, ASIDE_HIGHLIGHTS = 2000, 400
 FIRST_VIEWPOINT = 60000

@@ -24,8 +24,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
 from simtest.simulation.frame import render_view
 from simtest.spec import load_scene
-from simtest.validation.matching import match
-from simtest.validation.metrics import mahalanobis2
+from simtest.validation.scoring import mahalanobis2, match
 
 SHOWN = tuple(dict.fromkeys((*DEFAULT_ESTIMATORS, "curved", "photometric")))
 NOISE = 0.01

@@ -27,8 +27,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec import load_scene
-from simtest.validation.matching import match, peak_px
-from simtest.validation.metrics import mahalanobis2
+from simtest.validation.scoring import mahalanobis2, match, peak_px
 from studies.hard.measure import semi_axis_deg
 
 MESHES = Path(__file__).resolve().parents[2] / "shared" / "data" / "meshes"

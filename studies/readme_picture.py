@@ -24,7 +24,7 @@ from simtest.pages.pixels import GAMMA, Canvas, Pixels, font, legend
 from simtest.pages.style import TRUTH, colours
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import write_atomically
-from simtest.validation.matching import match, peak_px
+from simtest.validation.scoring import match, peak_px
 
 SCENE = Path(__file__).with_suffix(".toml")
 OUT = Path("docs/images/readme_normals.jpg")

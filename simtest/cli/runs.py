@@ -279,7 +279,7 @@ def check(command: str, /) -> Told:
     command : str
         The command in quotes, such as "python core.py", or the TOML file of a core.
     """
-    from simtest.validation.core_check import check_core
+    from simtest.estimators.process.check import check_core
 
     report = check_core(command)
     return Told(data=report.to_json, parts=report.lines(), code=0 if report.is_ok else 1)

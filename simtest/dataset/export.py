@@ -39,9 +39,9 @@ from simtest.simulation.sensor import displayed
 from simtest.spec import Experiment, calibration_toml, camera_table
 from simtest.spec.sensor import Sensor
 from simtest.validation.cases import expand
-from simtest.validation.matching import peak_px
 from simtest.validation.run_folder import EXPORTING
 from simtest.validation.runner import Progress
+from simtest.validation.scoring import peak_px
 
 FRAMES, PREVIEWS, CAMERAS = "frames", "previews", "cameras"
 TABLES = {

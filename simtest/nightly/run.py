@@ -41,8 +41,7 @@ from simtest.runtime.processes import Engine, make_engine
 from simtest.spec import Experiment, Profile, experiments_of
 from simtest.validation.cases import Case, expand
 from simtest.validation.fingerprints import definition
-from simtest.validation.jobs import variant_of
-from simtest.validation.runner import Progress, run_experiments
+from simtest.validation.runner import Progress, run_experiments, variant_of
 
 
 @dataclass(frozen=True)

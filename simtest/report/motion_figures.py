@@ -11,7 +11,7 @@ from simtest.pages.palette import SERIES
 from simtest.pages.style import number, symbols
 from simtest.report.relief_figures import ReliefFigure
 from simtest.report.run_folder import Run
-from simtest.validation.motion_counts import MotionCounts, motion_counts, motion_rows
+from simtest.validation.motion import MotionCounts, motion_counts, motion_rows
 
 LENGTH = "views.length_mm"
 

@@ -20,9 +20,9 @@ from simtest.runtime.files import Json, write_atomically
 from simtest.spec import Experiment, camera_table
 from simtest.validation.cases import Case, swept_example
 from simtest.validation.columns import table
-from simtest.validation.matching import peak_px
 from simtest.validation.realisation import Realisation
 from simtest.validation.row_kinds import row_kind
+from simtest.validation.scoring import peak_px
 
 Vector = list[float]
 

@@ -16,7 +16,7 @@ from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject
 from simtest.spec.toml_files import read_toml
-from simtest.validation.depth_maps import (
+from simtest.validation.reference_maps import (
     DEPTH_SUFFIXES,
     FARTHEST_MM,
     depth_normals,
@@ -164,7 +164,7 @@ def load_reference(
         if pose is not None:
             raise InputError("--camera-from-model: a depth map is in the camera frame; leave it out")
         if map_format is not None:
-            from simtest.validation.references.read import load_map_reference
+            from simtest.validation.reference_maps import load_map_reference
 
             return load_map_reference(path, map_format, camera, depth_scale_mm)
         depth = read_depth(path, depth_scale_mm)

@@ -1,4 +1,4 @@
-"""Runs an experiment case by case; each finished case is kept, so that a stopped run can go on."""
+"""Runs experiments case by case; each finished case is kept, so that a stopped run can go on."""
 
 import time
 import warnings
@@ -16,8 +16,8 @@ from simtest.runtime import provenance
 from simtest.runtime.files import Json
 from simtest.runtime.processes import Engine, make_engine
 from simtest.spec import Experiment
-from simtest.validation.fingerprints import input_hashes
-from simtest.validation.jobs import Job, make_jobs
+from simtest.validation.cases import Case, expand
+from simtest.validation.fingerprints import fingerprint, input_hashes
 from simtest.validation.run_folder import (
     PARTS,
     RESULTS,
@@ -31,6 +31,56 @@ from simtest.validation.run_folder import (
 
 if TYPE_CHECKING:
     import polars as pl
+
+
+@dataclass(frozen=True)
+class Job:
+    """An experiment with the folder that it is run in.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        What is run.
+    folder : Path
+        Of the run.
+    cases : list of Case
+        The experiment's.
+    variant : str
+        Mitsuba variant of all its cases.
+    digest : str
+        Hash of everything that determines the results.
+    """
+
+    experiment: Experiment
+    folder: Path
+    cases: list[Case]
+    variant: str
+    digest: str
+
+    def missing(self) -> list[int]:
+        """Return the indices of the cases that are not done yet."""
+        return [index for index in range(len(self.cases)) if not part_file(self.folder / PARTS, index).exists()]
+
+
+def make_jobs(wanted: Sequence[tuple[Experiment, Path]], variant: str | None) -> list[Job]:
+    """Expand experiments, each paired with its folder, and choose the variant of each."""
+    jobs = []
+    for experiment, folder in wanted:
+        cases = expand(experiment)
+        # Chosen here: a worker on another machine may have another environment.
+        own = variant_of(cases, variant)
+        jobs.append(Job(experiment, folder, cases, own, fingerprint(experiment, cases, own)))
+    return jobs
+
+
+def variant_of(cases: Sequence[Case], variant: str | None = None) -> str:
+    """Return the Mitsuba variant of an experiment, given that which was asked for (see `backend.requested_variant`).
+
+    The variant depends on the experiment's own scenes alone, never on the other experiments of a run: in a colour
+    variant even a grey scene has three channels, each with its own noise, and their mean is less noisy.
+    """
+    return backend.requested_variant(variant, coloured=any(case.is_coloured for case in cases))
+
 
 Cores = dict[str, dict[str, object]]
 """What a record says of each core, by the estimator's name."""

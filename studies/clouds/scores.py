@@ -12,7 +12,7 @@ from simtest.estimators.cloud_shape import slope_of
 from simtest.estimators.protocol import Estimate
 from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
-from simtest.validation.metrics import mahalanobis2
+from simtest.validation.scoring import mahalanobis2
 from studies.clouds.frames import BaseFrame
 
 SMOOTHING_PX = 1.0

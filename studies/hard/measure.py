@@ -20,8 +20,7 @@ from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import key as hashed
 from simtest.simulation.frame import RenderedView, render_view
 from simtest.simulation.highlights import TrueHighlight
-from simtest.validation.matching import match, peak_px
-from simtest.validation.metrics import mahalanobis2
+from simtest.validation.scoring import mahalanobis2, match, peak_px
 from studies.hard.cases import Case, calibration_of, scene_of
 from studies.hard.rows import Row
 

@@ -14,7 +14,7 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.reconstruction.records import Specularity
 from simtest.runtime.arrays import Array
-from simtest.validation.metrics import mahalanobis2
+from simtest.validation.scoring import mahalanobis2
 from studies.hard.table import CHI2_95
 from studies.learned_transfer.frames import SMOOTHING_PX, HardFrame
 

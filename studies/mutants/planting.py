@@ -79,7 +79,7 @@ def plant(mutations: Iterable[Mutation]) -> Callable[[], None]:
 @contextlib.contextmanager
 def planted(*mutations: Mutation) -> Iterator[None]:
     """Run with changes; sessions and pipelines that hold what was made before are let go."""
-    from simtest.validation.execution import forget
+    from simtest.validation.case_work import forget
     from simtest.validation.paper.rows import pipeline_with
 
     def forget_all() -> None:

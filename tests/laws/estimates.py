@@ -18,7 +18,7 @@ from simtest.estimators.prior_parts import light_offset_part
 from simtest.geometry import Camera
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.runtime.arrays import Array
-from simtest.validation.metrics import estimate_columns
+from simtest.validation.scoring import estimate_columns
 from tests.laws import by_hand
 from tests.laws.law import Law, law
 

@@ -10,7 +10,7 @@ from simtest.simulation.frame import render_view
 from simtest.spec import Experiment, scene_from_dict
 from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import expand
-from simtest.validation.paper.published_pipeline import Pipeline
+from simtest.validation.paper.protocol import Pipeline
 from simtest.validation.paper.rows import paper_rows
 from tests.laws.law import Law, law
 

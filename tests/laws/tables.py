@@ -16,10 +16,9 @@ from simtest.spec.recipes import PaperSetting
 from simtest.validation import laws
 from simtest.validation.cases import expand
 from simtest.validation.columns import Row, table
-from simtest.validation.matching import match
-from simtest.validation.metrics import curvature_errors, mahalanobis2, rows, scene_columns
 from simtest.validation.paper.rows import paper_rows
 from simtest.validation.realisation import Realisation, realise
+from simtest.validation.scoring import curvature_errors, mahalanobis2, match, rows, scene_columns
 from simtest.validation.statistics import figures
 from tests.laws import by_hand
 from tests.laws.law import Law, law

@@ -18,8 +18,7 @@ from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 from simtest.validation import laws
 from simtest.validation.gallery_items import GalleryMeta, write_item
-from simtest.validation.matching import match, peak_px
-from simtest.validation.metrics import _look_normals
+from simtest.validation.scoring import _look_normals, match, peak_px
 
 CAMERA = Camera(120, 90, 100.0, 100.0, 60.0, 45.0)
 

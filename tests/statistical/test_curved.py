@@ -20,8 +20,8 @@ from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, from_integer, generator
 from simtest.spec import scene_from_dict
 from simtest.spec.recipes import PaperSetting
-from simtest.validation.metrics import curvature_errors, mahalanobis2
 from simtest.validation.paper.rows import pipeline_with
+from simtest.validation.scoring import curvature_errors, mahalanobis2
 
 ALPHA = 0.01
 """Level of each family of tests, shared evenly by its members."""

@@ -20,8 +20,7 @@ from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.simulation.frame import render_view
 from simtest.spec import load_scene, scene_from_dict
-from simtest.validation.matching import match
-from simtest.validation.metrics import mahalanobis2
+from simtest.validation.scoring import mahalanobis2, match
 from tests.marked import marked
 
 D = 10.0

@@ -8,8 +8,7 @@ from skimage.measure import find_contours
 
 from simtest.errors import Failure
 from simtest.spec.recipes import PaperSetting
-from simtest.validation.paper.published_pipeline import Pipeline, kernel_radius
-from simtest.validation.paper.slanted_view import draw_light, region_of_interest
+from simtest.validation.paper.protocol import Pipeline, draw_light, kernel_radius, region_of_interest
 
 
 def generator(number):

@@ -21,10 +21,10 @@ from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import render_view
 from simtest.spec import scene_from_dict
 from simtest.spec.recipes import PaperSetting
-from simtest.validation.metrics import mahalanobis2
-from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.plane_from_aside import PlaneFromAside, photometric_plane
-from simtest.validation.paper.published_pipeline import Pipeline
+from simtest.validation.paper.predictions import cramer_rao_bound
+from simtest.validation.paper.protocol import Pipeline
+from simtest.validation.scoring import mahalanobis2
 from tests.marked import marked
 
 ALPHA = 1e-3

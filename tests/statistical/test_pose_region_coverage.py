@@ -8,7 +8,7 @@ from simtest.calibration import Priors
 from simtest.estimators.circle_pose import CirclePoseEstimator, pose_region
 from simtest.runtime.seeds import from_integer
 from simtest.spec.recipes import PaperSetting
-from simtest.validation.paper.published_pipeline import Pipeline
+from simtest.validation.paper.protocol import Pipeline
 
 ALPHA = 0.01
 """Level of each family of tests, shared evenly by its members."""

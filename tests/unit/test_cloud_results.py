@@ -14,9 +14,9 @@ from simtest.simulation.highlights import CloudRegions
 from simtest.spec import Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
-from simtest.validation.cloud_rows import match_cloud
 from simtest.validation.gallery_items import save
 from simtest.validation.realisation import Realiser
+from simtest.validation.scoring import match_cloud
 
 PLANE = {
     "surface.tilt_deg": 25.0, "surface.distance_mm": 25.0, "reflectance.exponent": 400.0, "camera.width": 512,

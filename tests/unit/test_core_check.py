@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from simtest.errors import InputError
-from simtest.validation import core_check
-from simtest.validation.core_cases import core_cases
-from simtest.validation.core_check import check_core
+from simtest.estimators.process import check as checks
+from simtest.estimators.process.check import check_core, core_cases
 from tests.marked import marked
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "cores" / "python"
@@ -148,7 +147,7 @@ def test_no_highlight_found_is_an_answer(tmp_path):
 @pytest.mark.parametrize("script", ["core.py", "frame_core.py"])
 def test_a_sound_core_passes_and_is_near_the_truth(script, tmp_path, monkeypatch):
     # A busy machine ends Python slowly.
-    monkeypatch.setattr(core_check, "END_S", 30.0)
+    monkeypatch.setattr(checks, "END_S", 30.0)
     report = check(tmp_path, [sys.executable, str(EXAMPLES / script)], limit_s=10.0)
     assert report.is_ok, list(report.lines())
     assert report.hello.kind == ("patch" if script == "core.py" else "frame")

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from simtest.errors import Reason
+from simtest.estimators.process.check import core_cases
 from simtest.estimators.process.core import PASSED, THREADS, CoreTable, Hello, hello_of
 from simtest.estimators.process.messages import FRAME_ARRAYS, PATCH_ARRAYS, estimate_of, frame_request, patch_request
 from simtest.estimators.process.pipe import DTYPES, PROTOCOL, Message
 from simtest.estimators.protocol import Estimate
-from simtest.validation.core_cases import core_cases
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs/reference/cores.md").read_text(encoding="utf-8")
 

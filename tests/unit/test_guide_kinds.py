@@ -9,7 +9,7 @@ from simtest.spec import load_scene
 from simtest.spec.lights import LightSpec, Rig
 from simtest.spec.reflectance import Reflectance
 from simtest.spec.sensor import Sensor
-from simtest.validation.conditions import DEGREES, conditions
+from simtest.validation.situations import DEGREES, conditions
 
 # A change of each key that sets situations apart, with what it needs beside.
 KINDS = {

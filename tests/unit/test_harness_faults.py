@@ -23,9 +23,9 @@ from simtest.simulation.frame_files import write_frame
 from simtest.simulation.highlights import examine, verdicts
 from simtest.spec import Experiment, load_experiment, parse_settings, scene_from_dict
 from simtest.validation.cases import expand
-from simtest.validation.metrics import mahalanobis2
 from simtest.validation.realisation import realise
 from simtest.validation.runner import run_experiment
+from simtest.validation.scoring import mahalanobis2
 from tests.marked import marked
 from tests.refusals import refused
 

@@ -20,7 +20,7 @@ from simtest.rendering import Session
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import render_view
 from simtest.spec import scene_from_dict
-from simtest.validation.metrics import curvature_errors, mahalanobis2
+from simtest.validation.scoring import curvature_errors, mahalanobis2
 from tests.marked import marked
 
 pytestmark = pytest.mark.render

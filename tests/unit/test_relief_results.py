@@ -14,9 +14,9 @@ from simtest.spec import Experiment, load_scene, scene_from_dict
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
 from simtest.validation.columns import SCHEMA, table
-from simtest.validation.metrics import rows
 from simtest.validation.predicted import base_law_deg
 from simtest.validation.realisation import Realiser
+from simtest.validation.scoring import rows
 from simtest.validation.statistics import summarise
 
 SMALL = {"camera.width": 96, "camera.height": 96, "camera.fx": 120.0, "camera.fy": 120.0, "sensor.noise_sigma": 0.0}

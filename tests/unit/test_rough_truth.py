@@ -13,9 +13,9 @@ from simtest.spec.spec_model import validate
 from simtest.validation import relief_laws
 from simtest.validation.cases import expand
 from simtest.validation.columns import table
+from simtest.validation.glints import whole_clouds
 from simtest.validation.predicted import centroid_law_deg, glint_count_law
 from simtest.validation.realisation import Realiser
-from simtest.validation.rough_truth import whole_clouds
 
 CAMERA = {"width": 384, "height": 352, "fx": 320.0, "fy": 320.0, "cx": 192.0, "cy": 176.0}
 RELIEF = {"bands": [{"slope_deg": 4.0, "wavelength_mm": 2.0}], "seed": 4}

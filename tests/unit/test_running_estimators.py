@@ -20,7 +20,7 @@ from simtest.estimators.dispatch import prepare, run, run_each, run_in_frame
 from simtest.estimators.protocol import EstimatedCurvature, check
 from simtest.geometry import Camera, Patch, smooth
 from simtest.reconstruction.pipeline import UNRESOLVED, _flagged, reconstruct
-from simtest.validation.matching import match
+from simtest.validation.scoring import match
 
 CAMERA = Camera(400, 100, 406.0, 406.0, 200.0, 50.0)
 SIGMA, SMOOTHING_PX = 0.02, 2.0

@@ -23,10 +23,9 @@ from simtest.simulation.highlights import TrueHighlight
 from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example
 from simtest.validation.columns import SCHEMA, swept_columns, table
-from simtest.validation.matching import match
-from simtest.validation.metrics import mahalanobis2, rows
 from simtest.validation.realisation import realise
 from simtest.validation.runner import run_experiment
+from simtest.validation.scoring import mahalanobis2, match, rows
 from simtest.validation.statistics import figures, summarise
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
@@ -481,7 +480,7 @@ def test_highlights_of_a_frame_that_the_detector_refuses_are_missed(monkeypatch)
         assert made.detection.refusal is not None
         return made
 
-    monkeypatch.setattr("simtest.validation.realisation.reconstruct", refused)
+    monkeypatch.setattr("simtest.validation.scoring.reconstruct", refused)
     described = experiment(FIXED, realisations=1)
     (case,) = expand(described)
     scene, drawn = case.scene(described, 0)

@@ -10,8 +10,7 @@ from simtest.runtime.processes import make_engine
 from simtest.spec import load_experiment
 from simtest.validation.case_work import by_variant
 from simtest.validation.cases import expand
-from simtest.validation.jobs import make_jobs, variant_of
-from simtest.validation.runner import run_experiments
+from simtest.validation.runner import make_jobs, run_experiments, variant_of
 
 pytestmark = pytest.mark.render
 

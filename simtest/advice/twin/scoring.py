@@ -16,8 +16,7 @@ from simtest.reconstruction.records import Specularities, Specularity
 from simtest.rendering import Session
 from simtest.runtime.arrays import Array
 from simtest.simulation.frame import RenderedView
-from simtest.validation.matching import match, on_instruments, peak_px
-from simtest.validation.metrics import mahalanobis2
+from simtest.validation.scoring import mahalanobis2, match, on_instruments, peak_px
 
 NEIGHBOUR = 3
 """How crowded the surroundings are: the distance to this neighbour."""

@@ -24,10 +24,10 @@ from simtest.runtime.files import Json, are_nested
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.processes import Engine, OnStep, make_engine
 from simtest.validation import gallery_items
+from simtest.validation.case_work import forget, gallery_cases
 from simtest.validation.cases import swept_example
 from simtest.validation.columns import Row, Value
 from simtest.validation.columns import table as results_table
-from simtest.validation.execution import forget, gallery_cases
 from simtest.validation.fingerprints import input_hashes
 from simtest.validation.realisation import answer, realise
 from simtest.validation.run_folder import EXPORT, check_folder, remove_folder

@@ -16,7 +16,7 @@ from simtest.geometry.camera import Camera
 from simtest.runtime.arrays import Array, Mask
 from simtest.spec.camera import CameraSpec
 from simtest.spec.spec_model import validate
-from simtest.validation.metrics import MISSED
+from simtest.validation.scoring import MISSED
 
 LONGEST_NAME = 80
 """Characters of a method's name."""

@@ -17,9 +17,9 @@ from simtest.simulation.frame import RenderedView
 from simtest.spec import Experiment
 from simtest.spec.recipes import Dataset
 from simtest.spec.sensor import Sensor
+from simtest.validation.case_work import realiser_of
 from simtest.validation.cases import Case
 from simtest.validation.columns import Value
-from simtest.validation.execution import realiser_of
 from simtest.validation.realisation import answer
 
 

@@ -20,9 +20,8 @@ from simtest.validation.gallery_items import (
     write_item,
 )
 from simtest.validation.paper.isocurves import brightest_point
-from simtest.validation.paper.published_pipeline import Stages
+from simtest.validation.paper.protocol import Box, Stages, plane_from_image, texture, window_centre
 from simtest.validation.paper.rows import SURFACE, pipeline_with
-from simtest.validation.paper.slanted_view import Box, plane_from_image, texture, window_centre
 
 LENGTH_UNIT = "texture units"
 
@@ -81,7 +80,7 @@ def reproduce_command(setting: PaperSetting, estimators: tuple[str, ...], seed: 
     values = ", ".join(f"{key}={value!r}" for key, value in setting.model_dump(exclude_defaults=True).items())
     code = (
         "from simtest.runtime.seeds import from_integer; from simtest.spec.recipes import PaperSetting; "
-        "from simtest.validation.paper.rows import pipeline_with; "
+        "from simtest.validation.paper.protocol import pipeline_with; "
         f"print(pipeline_with(PaperSetting({values}), {estimators!r}).realise([from_integer({seed})]))"
     )
     # Double quotes are easier to read, but the command of a core may hold what a shell would replace in them.

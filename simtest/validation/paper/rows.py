@@ -15,10 +15,10 @@ from simtest.geometry.vectors import angle_deg
 from simtest.runtime.seeds import from_integer
 from simtest.spec.recipes import PaperSetting
 from simtest.validation.columns import SCHEMA, Row, Value
-from simtest.validation.metrics import mahalanobis2
 from simtest.validation.paper.plane_from_aside import photometric_plane
-from simtest.validation.paper.published_pipeline import Pipeline
-from simtest.validation.paper.smoothing import smoothing_bias
+from simtest.validation.paper.predictions import smoothing_bias
+from simtest.validation.paper.protocol import Pipeline
+from simtest.validation.scoring import mahalanobis2
 
 SURFACE = "published plane"
 

@@ -9,7 +9,7 @@ import pytest
 import test_example_cores
 from test_example_cores import CLOSE, CORES, answers_of, check_refusals
 
-from simtest.validation.core_check import check_core
+from simtest.estimators.process.check import check_core
 
 asked, of_python = test_example_cores.asked, test_example_cores.of_python
 

@@ -1,4 +1,9 @@
-"""The published pipeline on one realisation: noise, smoothing, reconstruction [MB, section 3.1]."""
+"""The published protocol [MB, section 3.1]: a slanted view without noise, and its pipeline on one realisation.
+
+Choices that the article does not state: the plane's centre lies at distance V_Z from the imaging camera; one texture
+sample is one length unit; the tilt is about the image's x axis; the texture's centre maps to (M/2, M/2) with pixel
+centres at + 0.5; the camera has f = M.
+"""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -6,8 +11,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from simtest.calibration import estimate_noise
+from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import Failure
 from simtest.estimators import Estimate, Estimator
 from simtest.estimators.circle_pose import CirclePoseEstimator
@@ -15,7 +22,86 @@ from simtest.estimators.dispatch import run_each
 from simtest.geometry import Patch
 from simtest.runtime.arrays import Array
 from simtest.spec.recipes import PaperSetting
-from simtest.validation.paper.slanted_view import Box, draw_light, picture, region_of_interest, sample_positions
+from simtest.validation.paper.isocurves import brightest_point
+
+Box = tuple[int, int, int, int]
+"""Column, row, width, height, px."""
+
+
+def draw_light(setting: PaperSetting, rng: np.random.Generator) -> Array:
+    """Draw the light L = V + eps (cos a, sin a, b), a ~ U[0, 2 pi), b ~ U[-0.5, 0.5], shape (3,)."""
+    a, b = rng.uniform(0, 2 * np.pi), rng.uniform(-0.5, 0.5)
+    return np.array([0.0, 0.0, setting.height]) + setting.eps * np.array([np.cos(a), np.sin(a), b])
+
+
+def plane_from_image(setting: PaperSetting) -> Array:
+    """Return the homography from pixels to plane coordinates about the window's centre, shape (3, 3), texture units.
+
+    The plane's point x (1, 0, 0) + y (0, cos theta, sin theta) + (0, 0, V_Z), times K, is its pixel.
+    """
+    theta = np.radians(setting.theta_deg)
+    camera_from_plane = np.array([[1, 0, 0], [0, np.cos(theta), 0], [0, np.sin(theta), setting.height]])
+    return np.asarray(np.linalg.inv(setting.camera.K @ camera_from_plane))
+
+
+def texture(setting: PaperSetting, light: Array) -> Array:
+    """Compute the texture, shape (M, M), of the specular term max(0, cos beta)^n; its largest sample is at most 1.
+
+    `light` is L, shape (3,), texture units, with the camera's foot at the origin.
+    """
+    side = np.arange(setting.size) + PIXEL_CENTRE - setting.size / 2
+    centre = window_centre(setting, light)
+    x, y = side + centre[0], (side + centre[1])[:, None]
+    # `isocurves.cosine_beta` for V over the origin: every factor is a sum of one in x and one in y.
+    product = x * (light[0] - x) + (y * (light[1] - y) + light[2] * setting.height)
+    to_mirrored = (light[0] - x) ** 2 + ((light[1] - y) ** 2 + light[2] ** 2)
+    to_camera = x**2 + (y**2 + setting.height**2)
+    return np.asarray((np.maximum(product, 0) / np.sqrt(to_mirrored * to_camera)) ** setting.exponent)
+
+
+def window_centre(setting: PaperSetting, light: Array) -> Array:
+    """Return the plane point at the texture's centre, shape (2,)."""
+    camera = np.array([0.0, 0.0, setting.height])
+    return brightest_point(light, camera) if setting.recentre else np.zeros(2)
+
+
+def sample_positions(setting: PaperSetting, box: Box) -> Array:
+    """Compute where each pixel in a box of the picture reads the texture: rows and columns, shape (2, h, w)."""
+    x0, y0, width, height = box
+    x, y = np.meshgrid(np.arange(x0, x0 + width) + PIXEL_CENTRE, np.arange(y0, y0 + height) + PIXEL_CENTRE)
+    plane = np.stack([x, y, np.ones_like(x)], axis=-1) @ plane_from_image(setting).T
+    # The plane behind the camera is not seen: such pixels read outside the texture.
+    scale = np.where(plane[..., 2] > 0, plane[..., 2], np.nan)
+    samples = plane[..., :2] / scale[..., None] + setting.size / 2 - PIXEL_CENTRE
+    return np.asarray(np.nan_to_num(np.moveaxis(samples[..., ::-1], -1, 0), nan=-2.0))
+
+
+def picture(setting: PaperSetting, light: Array, positions: Array | None = None) -> Array:
+    """Warp the texture into the slanted view, bilinear: the noise-free picture, 0 outside the window.
+
+    `positions`, shape (2, h, w), are the `sample_positions` of a part of the picture; default of all of it.
+    """
+    if positions is None:
+        positions = sample_positions(setting, (0, 0, setting.size, setting.size))
+    return np.asarray(map_coordinates(texture(setting, light), positions, order=1, cval=0.0, prefilter=False))
+
+
+def region_of_interest(setting: PaperSetting) -> Box:
+    """Return the bounding box of the texture's window in the picture.
+
+    Outside it the picture is black; the published method's region of interest is its part inside the frame.
+    """
+    half = setting.size / 2
+    corners = np.array([[x, y, 1.0] for x in (-half, half) for y in (-half, half)])
+    seen = corners @ np.linalg.inv(plane_from_image(setting)).T
+    # A corner behind the camera is not seen: then the window fills the frame towards it.
+    points = seen[:, :2] / np.where(seen[:, 2:] > 0, seen[:, 2:], np.nan)
+    low = np.nan_to_num(np.floor(points.min(axis=0)), nan=0.0)
+    high = np.nan_to_num(np.ceil(points.max(axis=0)), nan=float(setting.size))
+    x0, y0 = (int(v) for v in np.clip(low, 0, setting.size - 1))
+    x1, y1 = (int(v) for v in np.clip(high, 1, setting.size))
+    return x0, y0, x1 - x0, y1 - y0
+
 
 KERNEL_SIGMAS = 4.0
 """Half-width of the smoothing kernel over its standard deviation."""

@@ -1,26 +1,103 @@
-"""Measures estimates against the truth: a row of results for each estimator at each detected or missed highlight."""
+"""How answers are measured: detections are matched with true highlights, each estimate gives a row of results.
 
+Detections come from the frame alone; each estimator has a row at each detected or missed highlight.
+"""
+
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from simtest.conventions import HIGHLIGHT_ISOVALUE, ON_INSTRUMENT
+from simtest.conventions import HIGHLIGHT_ISOVALUE, ON_INSTRUMENT, PIXEL_CENTRE
 from simtest.errors import Failure
-from simtest.estimators import Estimate
+from simtest.estimators import AnyEstimator, Estimate
 from simtest.estimators.budget import deviations
-from simtest.estimators.protocol import Law
+from simtest.estimators.protocol import CloudEstimator, Law
 from simtest.geometry import Patch
+from simtest.geometry.patch import encloses
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.records import Specularity
 from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.arrays import Array
-from simtest.simulation.highlights import TrueHighlight
+from simtest.simulation.frame import RenderedView
+from simtest.simulation.highlights import CloudRegions, TrueHighlight
 from simtest.spec.scene import Scene
 from simtest.validation import laws
 from simtest.validation.columns import Row
+from simtest.validation.glints import Cloud, RoughTruth, cloud_columns
 from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, base_law_deg, law_deg, look_law_deg
-from simtest.validation.rough_truth import RoughTruth
+
+
+def match(specularities: Sequence[Specularity], points_px: Sequence[Array]) -> dict[int, int]:
+    """Match each detection to the nearest true point, px, inside its isophote at t = 0.5 (theory.md section 6).
+
+    The points are the BPs of true highlights, or the peaks of visible ones.
+
+    Returns
+    -------
+    dict
+        Index of the point by index of the detection; a point is matched to the nearest of its detections only.
+    """
+    points = np.asarray(points_px, dtype=float).reshape(-1, 2)
+    # Candidates: points that an isophote encloses, with their distance from its peak.
+    pairs = []
+    for i, specularity in enumerate(specularities):
+        for j in _enclosed(specularity, points):
+            distance = float(np.hypot(*(points[j] - peak_px(specularity))))
+            pairs.append((_is_undetected(specularity), distance, i, j))
+    # Detections before what a frame estimator alone saw, the nearest pair first; each detection and each point once.
+    matched: dict[int, int] = {}
+    for _, _, i, j in sorted(pairs):
+        if i not in matched and j not in matched.values():
+            matched[i] = j
+    return matched
+
+
+def on_instruments(
+    specularities: Sequence[Specularity], matched: Mapping[int, int], view: RenderedView
+) -> list[bool] | None:
+    """Return which detections that match no true highlight have their peak on an instrument; None where none is listed.
+
+    What shines there is the instrument: it is no answer about the tissue, and no false detection.
+    """
+    if not view.scene.instruments:
+        return None
+    if view.instruments is None:
+        return [False] * len(specularities)
+    height, width = view.instruments.shape
+    pixels = [peak_px(specularity).astype(int) for specularity in specularities]
+    peaks = [(min(max(row, 0), height - 1), min(max(column, 0), width - 1)) for column, row in pixels]
+    return [i not in matched and bool(view.instruments[peak]) for i, peak in enumerate(peaks)]
+
+
+def _is_undetected(specularity: Specularity) -> bool:
+    """Return whether no detector found it: it has neither a patch nor a contrast."""
+    return isinstance(specularity.patch, Failure) and specularity.region.contrast is None
+
+
+def peak_px(specularity: Specularity) -> np.ndarray:
+    """Return a detection's peak, px: sub-pixel where there is a patch."""
+    if isinstance(specularity.patch, Failure):
+        return np.array(specularity.region.peak) + PIXEL_CENTRE
+    return specularity.patch.peak_px
+
+
+def _enclosed(specularity: Specularity, points: Array) -> list[int]:
+    """Return the indices of the points, shape (N, 2), px, that a detection's isophote encloses.
+
+    Where the isophote does not close, the detection's region decides.
+    """
+    x, y, width, height = specularity.region.box
+    # The isophote lies in the region. A frame on a relief has hundreds of regions and of points, far apart.
+    inside = ((points >= [x, y]) & (points <= [x + width, y + height])).all(axis=1)
+    near, patch = np.flatnonzero(inside).tolist(), specularity.patch
+    if not near or isinstance(patch, Failure):
+        return near
+    contour = patch.isophote(HIGHLIGHT_ISOVALUE)
+    return near if isinstance(contour, Failure) else [j for j in near if encloses(contour, points[j])]
+
 
 MISSED = "missed"
 
@@ -259,3 +336,122 @@ def mahalanobis2(estimate: Estimate, truth: Array) -> float | None:
         return None
     miss = tangent_coordinates(estimate.normal, truth)
     return float(miss @ np.linalg.solve(covariance, miss))
+
+
+LEAST_VISIBLE = 15
+"""A cloud that is wholly in view and has so many visible highlights is missed where no estimate is of it."""
+
+
+def of_clouds(estimators: Mapping[str, AnyEstimator]) -> list[str]:
+    """Return the names of the estimators that state the normals of clouds."""
+    return [name for name, estimator in estimators.items() if isinstance(estimator, CloudEstimator)]
+
+
+def apart(
+    specularities: Sequence[Specularity], names: Sequence[str]
+) -> tuple[list[Specularity], dict[str, list[tuple[int, Estimate]]], dict[str, Failure]]:
+    """Part the results of cloud estimators from those of single highlights.
+
+    Returns
+    -------
+    singles : list of Specularity
+        Those of single highlights, without the cloud estimators' results; they come first in `specularities`.
+    clouds : dict
+        Number of the specularity and estimate, by estimator.
+    failures : dict
+        Why an estimator found no cloud, if it failed.
+    """
+    clouds: dict[str, list[tuple[int, Estimate]]] = {name: [] for name in names}
+    failures: dict[str, Failure] = {}
+    singles = []
+    for i, specularity in enumerate(specularities):
+        own = {name: result for name, result in specularity.estimates.items() if name in clouds}
+        for name, result in own.items():
+            if isinstance(result, Failure):
+                failures[name] = result
+            else:
+                clouds[name].append((i, result))
+        if not any(isinstance(result, Estimate) for result in own.values()):
+            others = {name: result for name, result in specularity.estimates.items() if name not in clouds}
+            singles.append(replace(specularity, estimates=others))
+    return singles, clouds, failures
+
+
+def match_cloud(regions: CloudRegions, view: RenderedView, estimate: Estimate) -> list[int]:
+    """Return the indices in `view.clouds`, whose `regions` are given, of those that an estimate is of, one a light.
+
+    Of each light it is the one that most of the estimate's spots belong to; of several, the nearest to where the
+    estimate looks. That of most spots comes first. Empty where they belong to none that is in view. A point that an
+    instrument covers or shades counts too, since the spots around it still belong to it.
+    """
+    if estimate.cloud is None or not view.clouds:
+        return []
+    points, centres = estimate.cloud.points_px, list(view.clouds)
+    votes: dict[int, int] = {}
+    for light in sorted({centre.light for centre in centres}):
+        owners = regions.assign(np.full(len(points), light), points)
+        counts = Counter(n for n in owners if n is not None)
+        if counts:
+            best = [n for n, count in counts.items() if count == max(counts.values())]
+            nearest = min(best, key=lambda n: float(np.hypot(*(centres[n].bp_px - estimate.look_px))))
+            votes[nearest] = counts[nearest]
+    return sorted(votes, key=lambda n: -votes[n])
+
+
+def cloud_rows(
+    session: Session, view: RenderedView, common: Row, found: Mapping[str, Sequence[tuple[int, Estimate]]],
+    failures: Mapping[str, Failure], whole: Mapping[int, Cloud],
+) -> list[Row]:  # fmt: skip
+    """Make the rows of cloud estimators: of each estimate, and of each whole cloud that none is of.
+
+    `found` and `failures` are those of `apart`, `whole` the clouds that are wholly in view. The column ``true_id`` is
+    the index of the base's highlight point, as ``cloud``; the errors are against the base's normal there.
+    """
+    made, regions = [], CloudRegions.of(session, view.clouds) if any(found.values()) else None
+    for name, estimates in found.items():
+        taken: set[int] = set()
+        for i, estimate in estimates:
+            assert regions is not None
+            numbers = match_cloud(regions, view, estimate)
+            taken.update(numbers)
+            row = _row(session, common, view, whole, numbers[0] if numbers else None)
+            row |= estimate_columns(estimate) | {"estimator": name, "specularity": i}
+            made.append(row | _errors(session, estimate, [view.clouds[n] for n in numbers]) if numbers else row)
+        status = MISSED if name not in failures else str(failures[name].reason)
+        detail = None if name not in failures else failures[name].detail
+        for number, cloud in whole.items():
+            if number not in taken and cloud.visible >= LEAST_VISIBLE and view.clouds[number].lit:
+                row = _row(session, common, view, whole, number)
+                made.append(row | {"estimator": name, "status": status, "flags": detail})
+    return made
+
+
+def _row(session: Session, common: Row, view: RenderedView, whole: Mapping[int, Cloud], number: int | None) -> Row:
+    """Return the row of a cloud before its estimate: scene, and the base's highlight point by number, if any."""
+    centre = None if number is None else view.clouds[number]
+    row = common | scene_columns(session.scene, centre) | {"true_id": number, "cloud": number, "target": "base"}
+    own = None if number is None else whole.get(number)
+    return row if own is None else row | cloud_columns(own)
+
+
+def _errors(session: Session, estimate: Estimate, centres: Sequence[HighlightPoint]) -> Row:
+    """Compute the errors against the base's normal at its highlight point, and where the estimate looks.
+
+    Lights that are not told apart make one cloud: the truth is the mean of the normals at their points.
+    """
+    mean = np.mean([centre.normal_base for centre in centres], axis=0)
+    truth = mean / np.linalg.norm(mean)
+    errors = angle_deg(estimate.candidates, truth)
+    look = session.exact_points(estimate.look_px[None], fine=False)
+    at_look = float(angle_deg(estimate.normal, look.normal_base[0])) if look.valid[0] else None
+    return {
+        "truth_x": float(truth[0]),
+        "truth_y": float(truth[1]),
+        "truth_z": float(truth[2]),
+        "error_deg": float(errors[0]),
+        "error_base_deg": float(errors[0]),
+        "error_oracle_deg": float(errors.min()),
+        "error_look_deg": at_look,
+        "rank_correct": int(errors.argmin()),
+        "mahalanobis2": mahalanobis2(estimate, truth),
+    }
