@@ -371,7 +371,7 @@ def _reconstruct_picture(
         warnings.warn(caution, stacklevel=2)
     reference = None
     if (extras.reference, extras.camera_from_model, extras.reference_format) != (None, None, None):
-        from simtest.validation.reference_surface import load_reference
+        from simtest.validation.references import load_reference
 
         reference = load_reference(
             extras.reference, extras.camera_from_model, calibration.camera, extras.depth_scale, extras.reference_format
@@ -383,12 +383,12 @@ def _reconstruct_picture(
         found.warnings.append(NOTHING)
     depth = None
     if extras.depth is not None:
-        from simtest.validation.reference_maps import depths_at
+        from simtest.validation.depth_maps import depths_at
 
         peaks = [spot.peak_px for spot in found]
         depth = depths_at(extras.depth, peaks, (picture.shape[1], picture.shape[0]), extras.depth_scale)
     if reference is not None:
-        from simtest.validation.reference_surface import compare
+        from simtest.validation.references import compare
 
         compare(found, reference)
     # write

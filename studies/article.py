@@ -27,7 +27,7 @@ from simtest.spec import Scene, scene_from_dict
 from simtest.spec.toml_files import read_toml
 from simtest.surfaces.factory import make_mesh
 from simtest.surfaces.recipe import load_anatomy
-from simtest.validation.reference_surface import MeshReference, Model
+from simtest.validation.references import MeshReference, Model
 from simtest.validation.scoring import match, peak_px
 from studies.registration import ARTICLE_DEG, SPECULARITIES, VIEWS, Observation, moved
 

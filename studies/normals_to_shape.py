@@ -30,7 +30,7 @@ from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Mask
 from simtest.simulation.frame import render_view
 from simtest.spec import Scene, load_scene
-from simtest.validation.reference_maps import depth_normals
+from simtest.validation.depth_maps import depth_normals
 from studies.depth_completion import CoarseError, complete
 from studies.resampling import interval_of_mean
 

@@ -24,7 +24,7 @@ from simtest.spec import scene_from_dict
 from simtest.spec.toml_files import toml_value
 from simtest.surfaces.factory import make_mesh
 from simtest.surfaces.recipe import load_anatomy
-from simtest.validation.reference_surface import MeshReference, Model
+from simtest.validation.references import MeshReference, Model
 from simtest.validation.scoring import match
 
 VIEWS, SPECULARITIES = 5, 26

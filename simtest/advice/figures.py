@@ -13,11 +13,9 @@ import polars as pl
 from simtest.advice.plan import DISTANCES
 from simtest.runtime.statistics import Interval, mean_interval, root_mean_square
 from simtest.validation.guide import Advice, MethodFigures, advice_of
-from simtest.validation.paired import targets_of
-from simtest.validation.ranking import Pair, best_of
-from simtest.validation.row_kinds import is_false
+from simtest.validation.paired import Pair, best_of, targets_of
 from simtest.validation.situations import Situation
-from simtest.validation.statistics import FRAME, units
+from simtest.validation.statistics import FRAME, is_false, units
 
 WIDE = 0.15
 """An interval that reaches farther from its mean than this share of it is called wide."""

@@ -25,7 +25,7 @@ from simtest.nightly.quantities import (
 from simtest.nightly.records import CELL, COMPARISONS, POOLED, SINGLE, Cell, NightlyRun, RunRecord, Verdict, to_explain
 from simtest.nightly.words import causes, large_and_undecided, notes_on, redefined
 from simtest.validation.columns import SCHEMA
-from simtest.validation.row_kinds import is_false
+from simtest.validation.statistics import is_false
 
 ALPHA = 0.01
 """Family-wise level: chance that a run without a change is called one, at most."""

@@ -19,7 +19,7 @@ from simtest.pages.html import environment
 from simtest.pages.style import NEUTRAL, estimator_order, number
 from simtest.report.run_folder import flattened
 from simtest.runtime.files import write_atomically
-from simtest.validation.row_kinds import counts, row_kind
+from simtest.validation.statistics import counts, row_kind
 
 MOST_ROWS = 800
 """Rows of the table; equal and equivalent ones are left out first. verdict.json holds all."""

@@ -13,8 +13,7 @@ from simtest.geometry import chi_squared
 from simtest.nightly.records import CELL, FIGURES, Cell
 from simtest.runtime.statistics import CONFIDENCE, mean_interval, share_interval
 from simtest.validation.columns import BUDGET_COLUMNS, SCHEMA
-from simtest.validation.row_kinds import is_false
-from simtest.validation.statistics import PENALTY_DEG, figures, units
+from simtest.validation.statistics import PENALTY_DEG, figures, is_false, units
 
 COVERED = chi_squared.quantile(CONFIDENCE, 2)
 """Squared Mahalanobis distance of the border of a 95 % region."""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import polars as pl
 from pydantic import BaseModel, ConfigDict
 
-from simtest.validation.row_kinds import counts
+from simtest.validation.statistics import counts
 
 
 class Cell(NamedTuple):

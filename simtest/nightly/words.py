@@ -16,7 +16,7 @@ from simtest.nightly.quantities import ANSWERED, IS_TRUE, KEY, QUANTITIES
 from simtest.nightly.records import CELL, POOLED, SINGLE, NightlyRun, RunRecord, Verdict, to_explain
 from simtest.pages.style import degrees, labelled, number
 from simtest.validation.columns import BUDGET_COLUMNS
-from simtest.validation.faults import fault_sentences, faults_of
+from simtest.validation.run_summary import fault_sentences, faults_of
 
 STATES = {
     "fine": "Fine: nothing is worse than the baseline, and nothing else needs a reason.",

@@ -74,7 +74,7 @@ class Specularity:
     track : int, optional
         Its number over the frames of a sequence.
     reference : optional
-        The reference's normal here and the errors against it (`simtest.validation.reference_surface`).
+        The reference's normal here and the errors against it (`simtest.validation.references`).
 
     Examples
     --------
@@ -235,7 +235,7 @@ class Specularities(list[Specularity]):
     warnings : list of str
         What its user should know.
     reference : optional
-        How its normals compare with a reference (`simtest.validation.reference_surface`).
+        How its normals compare with a reference (`simtest.validation.references`).
     """
 
     def __init__(

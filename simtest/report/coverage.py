@@ -8,7 +8,7 @@ from simtest.conventions import ON_INSTRUMENT
 from simtest.pages.style import estimator_order
 from simtest.report.run_folder import Run
 from simtest.report.series import LEAST_LAW, TOLERANCE_DEG, TOLERANCE_SHARE
-from simtest.validation.row_kinds import counts
+from simtest.validation.statistics import counts
 
 VIEWPOINT = "surface.viewpoint"
 PATH_SHARE = "surface.path_share"

@@ -18,8 +18,8 @@ from simtest.pages.style import degrees
 from simtest.runtime.arrays import Array, Image
 from simtest.spec.camera import CameraSpec
 from simtest.spec.recipes import PaperSetting
-from simtest.validation.faults import fault_sentence
 from simtest.validation.guide import Guide, guide_of
+from simtest.validation.run_summary import fault_sentence
 
 MAX_GALLERY = 24  # gallery items that a page shows; of a longer gallery, evenly spaced ones
 _TEXT = ("experiment", "surface", "reflectance", "setting", "label", "estimator", "status")
@@ -183,7 +183,7 @@ class JudgedMesh(BaseModel):
 
 
 class Fault(BaseModel):
-    """An error of an estimator or a core, with the number of its rows (`simtest.validation.faults`)."""
+    """An error of an estimator or a core, with the number of its rows (`simtest.validation.run_summary`)."""
 
     estimator: Text = ""
     reason: Text = ""

@@ -59,7 +59,7 @@ class RunResults:
         faults = [fault for held in self.summary["experiments"].values() for fault in held.get("faults") or ()]
         if faults:
             # Loaded where there is one: a finished run that is asked for again should answer at once.
-            from simtest.validation.faults import fault_sentences
+            from simtest.validation.run_summary import fault_sentences
 
             for sentence in fault_sentences(faults):
                 warnings.warn(sentence, RuntimeWarning, stacklevel=3)

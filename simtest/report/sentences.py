@@ -7,7 +7,7 @@ from simtest.pages.style import degrees, number
 from simtest.report.heat_maps import HeatMap
 from simtest.report.run_folder import Run
 from simtest.report.series import LineFigure, law_misses
-from simtest.validation.row_kinds import counts, row_kind
+from simtest.validation.statistics import counts, row_kind
 
 
 def headline(run: Run, figures: list[LineFigure]) -> list[str]:

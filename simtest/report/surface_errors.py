@@ -11,8 +11,8 @@ from simtest.pages.style import degrees, estimator_order
 from simtest.report.coverage import is_anatomical
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
-from simtest.validation.row_kinds import counts, row_kind
 from simtest.validation.situations import CO_LOCATED
+from simtest.validation.statistics import counts, row_kind
 
 _LEAST_DEG = 1e-6  # errors of exactly zero still show on a logarithmic axis
 STRIP_POINTS = 120  # points drawn beside a box: evenly spaced order statistics where there are more values

@@ -11,7 +11,7 @@ from simtest.pages.palette import NEUTRAL, SERIES
 from simtest.pages.style import number
 from simtest.report.relief_figures import ReliefFigure
 from simtest.report.run_folder import Run
-from simtest.validation.row_kinds import row_kind
+from simtest.validation.statistics import row_kind
 
 _NEEDED = {"visible_id", "visible_snr", "frame_visible"}
 _FOUND, _FALSE = "●", "✖"

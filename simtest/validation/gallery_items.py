@@ -21,8 +21,8 @@ from simtest.spec import Experiment, camera_table
 from simtest.validation.cases import Case, swept_example
 from simtest.validation.columns import table
 from simtest.validation.realisation import Realisation
-from simtest.validation.row_kinds import row_kind
 from simtest.validation.scoring import peak_px
+from simtest.validation.statistics import row_kind
 
 Vector = list[float]
 
@@ -66,7 +66,7 @@ class DrawnEstimate:
     bp_px : list of float or None
         The detection's peak, px.
     kind : str
-        What its row of results counts as (`simtest.validation.row_kinds`).
+        What its row of results counts as (`simtest.validation.statistics`).
     """
 
     specularity: int

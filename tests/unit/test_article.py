@@ -6,7 +6,7 @@ import trimesh
 
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
-from simtest.validation.reference_surface import Model
+from simtest.validation.references import Model
 from studies import article
 from studies.registration import Observation
 

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from simtest.validation.faults import MOST_TEXTS, fault_sentences, faults_of
+from simtest.validation.run_summary import MOST_TEXTS, fault_sentences, faults_of
 
 
 def rows(estimator, status, text, count=1):

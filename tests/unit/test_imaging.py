@@ -24,8 +24,8 @@ from simtest.reconstruction.outputs import constraints_arrays
 from simtest.reconstruction.sequence import reconstruct_sequence
 from simtest.reconstruction.tracking import Tracker
 from simtest.runtime import provenance
-from simtest.validation.reference_maps import depth_normals, depth_points, depth_problems, depths_at, read_depth
-from simtest.validation.reference_surface import load_reference, read_pose
+from simtest.validation.depth_maps import depth_normals, depth_points, depth_problems, depths_at, read_depth
+from simtest.validation.references import load_reference, read_pose
 
 SPOTS = [(90, 70, 5.0), (230, 160, 6.0)]
 FOV = 60.0

@@ -25,7 +25,7 @@ from simtest.surfaces import mesh_file
 from simtest.surfaces.mesh_file import check_ply, read_mesh, read_vtk
 from simtest.validation import run_folder
 from simtest.validation.cases import check_effort
-from simtest.validation.reference_maps import read_depth
+from simtest.validation.depth_maps import read_depth
 from studies.bad_inputs import files
 from tests.refusals import refused
 from tests.unit.engine_tasks import prints, swallows_memory

@@ -6,8 +6,7 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.geometry import Camera, KannalaBrandt
-from simtest.validation.reference_maps import FORMATS, load_map_reference
-from simtest.validation.reference_surface import load_reference
+from simtest.validation.references import FORMATS, load_map_reference, load_reference
 
 SIZES = {"c3vd": (270, 216), "simcol3d": (190, 190), "ucl": (256, 256), "endoslam": (320, 320)}
 RADIUS_MM, CENTRE_MM = 25.0, np.array([4.0, -3.0, 45.0])

@@ -16,8 +16,7 @@ from simtest.report.run_folder import Run, completed
 from simtest.report.sentences import headline
 from simtest.report.surface_errors import surface_errors
 from simtest.validation.columns import SCHEMA
-from simtest.validation.row_kinds import KINDS, counts, is_false, row_kind
-from simtest.validation.statistics import summarise
+from simtest.validation.statistics import KINDS, counts, is_false, row_kind, summarise
 
 KIND_OF = {
     "hit": "ok", "refused": "failed", "stopped": "failed", "dark": "failed", "missed": "missed", "noise": "false",

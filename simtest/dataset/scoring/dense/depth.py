@@ -8,7 +8,7 @@ from simtest.calibration.frame import MAD_TO_SIGMA
 from simtest.geometry import Camera
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.seeds import from_integer
-from simtest.validation.reference_maps import depth_normals
+from simtest.validation.depth_maps import depth_normals
 
 DepthKind = Literal["z", "ray"]
 KINDS: tuple[DepthKind, ...] = ("z", "ray")

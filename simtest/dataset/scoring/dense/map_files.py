@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.runtime.arrays import Array
-from simtest.validation.reference_maps import DEPTH_SUFFIXES, read_values
+from simtest.validation.depth_maps import DEPTH_SUFFIXES, read_values
 
 Kind = Literal["normal", "depth"]
 Encoding = Literal["components", "unit", "centred", "positive_z"]

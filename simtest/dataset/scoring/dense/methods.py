@@ -111,7 +111,7 @@ class MapFolder:
 def _peek(one: MapFile) -> Kind:
     """Return what the first file whose name does not tell holds."""
     from simtest.dataset.scoring.dense.map_files import kind_of
-    from simtest.validation.reference_maps import read_values
+    from simtest.validation.depth_maps import read_values
 
     values = read_values(one.path, "a map of normals or depths")
     if values.ndim == 3 and values.shape[0] in (1, 3) and values.shape[2] not in (1, 3, 4):

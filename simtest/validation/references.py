@@ -1,4 +1,8 @@
-"""Compare reconstructed normals with a reference: a mesh registered to the camera, or a depth map."""
+"""Compare reconstructed normals with a reference: a mesh registered to the camera, or maps of depths or normals.
+
+Units and directions of the maps of public data sets are those that a data set's own files or loaders state. A unit that
+they leave open is None, and the user must state it.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,19 +15,21 @@ import numpy.typing as npt
 
 from simtest.errors import InputError
 from simtest.geometry import Camera
+from simtest.geometry.axes import ALL, described, matrix
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.boundary import suggestion
 from simtest.runtime.files import JsonObject
 from simtest.spec.toml_files import read_toml
-from simtest.validation.reference_maps import (
+from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,
-    FARTHEST_MM,
     depth_normals,
     depth_points,
     depth_problems,
     interpolate,
     read_depth,
+    read_values,
 )
 
 ROTATION_TOLERANCE = 1e-3
@@ -164,7 +170,7 @@ def load_reference(
         if pose is not None:
             raise InputError("--camera-from-model: a depth map is in the camera frame; leave it out")
         if map_format is not None:
-            from simtest.validation.reference_maps import load_map_reference
+            from simtest.validation.references import load_map_reference
 
             return load_map_reference(path, map_format, camera, depth_scale_mm)
         depth = read_depth(path, depth_scale_mm)
@@ -275,3 +281,248 @@ def _summary(errors: Sequence[ErrorRecord]) -> ErrorSummary:
     pairs = np.array([(error.error_deg, error.error_oracle_deg) for error in errors])
     spread = pairs.std(axis=0, ddof=1).tolist() if len(pairs) > 1 else (None, None)
     return ErrorSummary(len(pairs), float(pairs[:, 0].mean()), spread[0], float(pairs[:, 1].mean()), spread[1])
+
+
+@dataclass(frozen=True)
+class MapFormat:
+    """How a data set writes its maps. Depths of all of them are along the optical axis (z).
+
+    Parameters
+    ----------
+    title : str
+        The data set, with the article that describes it.
+    depth_type : str
+        NumPy's name of the type of a depth's count.
+    step_mm : float, optional
+        mm of one count; None if the data set does not tell, so that the user must (``--depth-scale``).
+    empty : tuple of int
+        Counts that stand for no depth.
+    size_px : tuple of int
+        Width and height of a frame.
+    channels : int
+        Of a depth map; several are equal in the first three, a fourth is not read.
+    normals : str, optional
+        End of the file name of a normal map, None where the data set has none. Such a map has three channels of 16
+        bits, -1 to 1 over the whole range; all three are 0 where there is no normal. It stands beside the depth map.
+    normal_axes : str
+        The camera's axes that red, green and blue hold (`simtest.geometry.vectors`).
+    depths : str
+        End of the file name of a depth map.
+    cautions : tuple of str
+        What a user must know of the maps.
+    """
+
+    title: str
+    depth_type: str
+    step_mm: float | None
+    size_px: tuple[int, int]
+    empty: tuple[int, ...] = (0,)
+    channels: int = 1
+    normals: str | None = None
+    normal_axes: str = "x,y,z"
+    depths: str = ".png"
+    cautions: tuple[str, ...] = ()
+
+
+FORMATS = {
+    "c3vd": MapFormat(
+        "C3VD and C3VDv2 (Bobrow et al. 2023): phantoms, registered to a video",
+        "uint16",
+        100 / (2**16 - 1),
+        (1350, 1080),
+        empty=(0, 2**16 - 1),
+        normals="_normals.tiff",
+        depths="_depth.tiff",
+        cautions=("the registration is off by 0.3 mm and 0.2 deg in the mean, by its authors' simulation",),
+    ),
+    "simcol3d": MapFormat(
+        "SimCol3D (Rau et al. 2023): rendered colons, 0 to 20 cm",
+        "uint16",
+        200 / (255 * 256),
+        (475, 475),
+    ),
+    "ucl": MapFormat(
+        "UCL synthetic colon (Rau et al. 2019): rendered colons of 8 bits",
+        "uint8",
+        None,
+        (256, 256),
+    ),
+    "endoslam": MapFormat(
+        "EndoSLAM, part UnityCam (Ozyoruk et al. 2021): rendered organs, relative depths of 8 bits",
+        "uint8",
+        None,
+        (320, 320),
+        channels=4,
+        cautions=("users report that depth maps of UnityCam are shifted against their frames",),
+    ),
+}
+
+
+def map_format(name: str) -> MapFormat:
+    """Return a format by name; raise `InputError` for one that is not known."""
+    if name not in FORMATS:
+        raise InputError(
+            f"--reference-format {name}: unknown; allowed: {', '.join(FORMATS)}{suggestion(name, list(FORMATS))}"
+        )
+    return FORMATS[name]
+
+
+NEAREST_MM, FARTHEST_MM = 1e-3, 1e6
+"""Depths that are plausible: those of scenes."""
+
+
+FRONTAL_DEG, FRONTAL_SHARE = 1.0, 0.9
+"""A map holds no slopes where nine tenths of its normals point this nearly back along the optical axis."""
+
+
+FAR_DEG = 5.0
+"""Median angle between a normal map and the normals of its depths above which one of them is not what it should be."""
+
+NEAR_DEG = 1.0
+"""Median angle below which they agree. Between the two, depths along the sightline must fit twice as well."""
+
+LEAST_PIXELS = 100
+"""With fewer pixels that have both normals nothing is checked."""
+
+
+def load_map_reference(path: Path, name: str, camera: Camera, scale_mm: float | None = None) -> DepthReference:
+    """Read a depth map or normal map of a data set as a reference.
+
+    Parameters
+    ----------
+    path : Path
+        The map. Beside a depth map the data set's normal map of the frame is read too, if there is one, and the other
+        way round: each then checks the other.
+    name : str
+        Of the format (`FORMATS`).
+    camera : Camera
+        Of the frame.
+    scale_mm : float, optional
+        mm of one count, where the data set does not tell.
+
+    Returns
+    -------
+    DepthReference
+        Unit normals in the camera frame, and what a user must know of the maps.
+    """
+    form = map_format(name)
+    _check_scale(path, name, form, scale_mm)
+    _check_size(path, name, form, camera)
+    is_normals = form.normals is not None and path.name.endswith(form.normals)
+    depth_path = _beside(path, form.normals, form.depths) if is_normals else path
+    normals_path = path if is_normals else _beside(path, form.depths, form.normals)
+    notes = list(form.cautions)
+    stated = None if normals_path is None else read_normals(normals_path, form)
+    found = None
+    if depth_path is not None:
+        depth = read_depth_counts(depth_path, form, scale_mm)
+        found = depth_normals(depth_points(depth, camera))
+        if not is_normals:
+            notes += depth_problems(depth, found, camera)
+        if stated is not None:
+            notes += _disagreement(stated, found, depth_normals(depth_points(depth, camera, "distance")), form)
+    chosen = stated if is_normals else found
+    assert chosen is not None
+    return DepthReference(chosen, str(path), tuple(notes))
+
+
+def read_depth_counts(path: Path, form: MapFormat, scale_mm: float | None = None) -> Array:
+    """Read a depth map of a format, mm along the optical axis, shape (H, W); NaN where there is none."""
+    values = read_values(path)
+    _check_type(path, values, form.depth_type, "a depth map")
+    if values.ndim == 3:
+        if form.channels == 1 or (values[..., :3] != values[..., :1]).any():
+            raise InputError(f"{path}: channels differ; a depth map has one, or equal ones")
+        values = values[..., 0]
+    step = form.step_mm or scale_mm
+    assert step is not None
+    known = ~np.isin(values, form.empty)
+    if not known.any():
+        raise InputError(f"{path}: holds no depth; counts {', '.join(map(str, form.empty))} stand for none")
+    return np.where(known, values.astype(float) * step, np.nan)
+
+
+def read_normals(path: Path, form: MapFormat) -> Array:
+    """Read a normal map of a format: unit normals, camera frame, shape (H, W, 3); NaN where there is none."""
+    values = read_values(path, "a normal map")
+    _check_type(path, values, "uint16", "a normal map")
+    if values.ndim != 3 or values.shape[2] < 3:
+        raise InputError(f"{path}: has shape {values.shape}; a normal map has three channels")
+    # OpenCV's order is blue, green, red.
+    counts = values[..., 2::-1].astype(float)
+    vectors = (2 * counts / (2**16 - 1) - 1) @ matrix(form.normal_axes).T
+    length = np.linalg.norm(vectors, axis=-1)
+    known = (counts > 0).any(axis=-1) & (np.abs(length - 1) < 0.01)
+    if not known.any():
+        raise InputError(f"{path}: holds no unit vector; channels must be -1 to 1 over 16 bits")
+    return np.where(known[..., None], vectors / np.where(known, length, 1.0)[..., None], np.nan)
+
+
+def _beside(path: Path, end: str | None, other: str | None) -> Path | None:
+    """Return the other map of a frame, if it stands beside this one."""
+    if end is None or other is None or not path.name.endswith(end):
+        return None
+    found = path.with_name(path.name.removesuffix(end) + other)
+    return found if found.is_file() else None
+
+
+def _disagreement(stated: Array, found: Array, along_rays: Array, form: MapFormat) -> list[str]:
+    """Return what is wrong if a normal map and the normals of its depths differ; all have shape (H, W, 3).
+
+    `found` takes the depths along the optical axis, `along_rays` along the sightlines.
+    """
+    both = np.isfinite(stated) & np.isfinite(found) & np.isfinite(along_rays)
+    known = both.all(axis=-1)
+    if known.sum() < LEAST_PIXELS:
+        return []
+    vectors, normals = stated[known], found[known]
+    own, rays = _median_deg(vectors, normals), _median_deg(vectors, along_rays[known])
+    if own > NEAR_DEG and rays < own / 2 and rays <= FAR_DEG:
+        return [f"normal map and depth map differ by {own:.3g} deg in the median; depths along the sightline, in place "
+                f"of the optical axis, would fit to {rays:.2g} deg"]  # fmt: skip
+    if own <= FAR_DEG:
+        return []
+    medians = {axes: _median_deg(vectors @ matrix(axes).T, normals) for axes in ALL}
+    best = min(medians, key=medians.__getitem__)
+    likely = ""
+    if medians[best] <= FAR_DEG:
+        held = described(_composed(form.normal_axes, best))
+        likely = f"; channels that hold {held} would fit to {medians[best]:.2g} deg"
+    return [f"normal map and depth map differ by {own:.3g} deg in the median{likely}"]
+
+
+def _composed(first: str, second: str) -> str:
+    """Return the axes that do what two assignments do one after the other."""
+    both = matrix(second) @ matrix(first)
+    return next(axes for axes in ALL if np.array_equal(matrix(axes), both))
+
+
+def _median_deg(first: Array, second: Array) -> float:
+    cosine = np.clip(np.einsum("ni,ni->n", first, second), -1, 1)
+    return float(np.degrees(np.arccos(np.median(cosine))))
+
+
+def _check_scale(path: Path, name: str, form: MapFormat, scale_mm: float | None) -> None:
+    if form.step_mm is None and scale_mm is None:
+        raise InputError(f"{path}: {name} does not tell its unit; --depth-scale must say how many mm a count is")
+    if form.step_mm is not None and scale_mm is not None:
+        raise InputError(f"--depth-scale {scale_mm:g}: {name} has its own, {form.step_mm:.6g} mm a count; leave it out")
+    if scale_mm is not None and not 1e-9 <= scale_mm <= FARTHEST_MM:
+        raise InputError(f"--depth-scale {scale_mm:g}: must be 1e-9 to {FARTHEST_MM:g} mm")
+
+
+def _check_size(path: Path, name: str, form: MapFormat, camera: Camera) -> None:
+    """Raise `InputError` where the map is missing, or the camera has neither the frames' size nor that of a copy."""
+    width, height = form.size_px
+    if not path.exists():
+        raise InputError(f"{path}: no such file; must be a map of {name}")
+    if abs(camera.width * height - camera.height * width) > max(width, height):
+        raise InputError(
+            f"{path}: the camera is of {camera.width} x {camera.height} px; frames of {name} are of "
+            f"{width} x {height} px"
+        )
+
+
+def _check_type(path: Path, values: npt.NDArray[np.generic], wanted: str, what: str) -> None:
+    if values.dtype != np.dtype(wanted):
+        raise InputError(f"{path}: holds {values.dtype}; {what} of this format holds {wanted}")
