@@ -16,7 +16,7 @@ from simtest.nightly.quantities import ANSWERED, IS_TRUE, KEY, QUANTITIES
 from simtest.nightly.records import CELL, POOLED, SINGLE, NightlyRun, RunRecord, Verdict, to_explain
 from simtest.pages.style import degrees, labelled, number
 from simtest.validation.columns import BUDGET_COLUMNS
-from simtest.validation.run_summary import fault_sentences, faults_of
+from simtest.validation.run_summary import faults_of
 
 STATES = {
     "fine": "Fine: nothing is worse than the baseline, and nothing else needs a reason.",
@@ -181,7 +181,7 @@ def _faults(tonight: NightlyRun, baseline: NightlyRun | None) -> list[str]:
         for run in (tonight, baseline)
     )
     more = [name for name, count in now.items() if count > was.get(name, 0)]
-    return fault_sentences(faults_of(tonight.rows.filter(pl.col("estimator").is_in(more))))
+    return [str(fault) for fault in faults_of(tonight.rows.filter(pl.col("estimator").is_in(more)))]
 
 
 def _groups(comparisons: pl.DataFrame) -> list[dict[str, Any]]:

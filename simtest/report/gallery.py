@@ -5,14 +5,20 @@ from typing import NamedTuple
 
 import numpy as np
 
+from simtest.conventions import ON_INSTRUMENT
 from simtest.pages import pixels
 from simtest.pages.pixels import Canvas, Pixels, Window
-from simtest.pages.style import NEUTRAL, TRUTH, hexadecimal
-from simtest.report.run_folder import GalleryItem, KeptEstimate
+from simtest.pages.style import NEUTRAL, TRUTH, degrees, hexadecimal
 from simtest.runtime.arrays import Array
+from simtest.validation.kept_frames import KeptEstimate, KeptItem
 
 HEIGHT_PX, PAGE_PX = 400, 300  # height of a picture in its file and in the page
 _GAP_PX = 6
+
+_NO_HIGHLIGHT = {
+    "false": "false detection", "in_spot": "in a spot of several glints or of none", ON_INSTRUMENT: "on an instrument",
+}  # fmt: skip
+"""Kinds of detections that are of no true highlight, in words."""
 
 _ARROW, _ARROW_ENLARGED = 0.2, 0.4
 """Length of a normal over the distance in the frame, and over the width that the enlargement shows."""
@@ -22,10 +28,24 @@ _MOST_LEVELS = 5
 
 
 class Shown(NamedTuple):
-    """A gallery item with its pictures as the page shows them: data addresses, each with width over height."""
+    """A gallery item as the page shows it: pictures as data addresses, each with width over height, and results."""
 
-    item: GalleryItem
+    item: KeptItem
     pictures: list[tuple[str, float]]
+
+    @property
+    def results(self) -> list[tuple[KeptEstimate, str]]:
+        """Each estimate, with what it came to."""
+        return [(estimate, result_of(estimate)) for estimate in self.item.meta.estimates]
+
+
+def result_of(estimate: KeptEstimate) -> str:
+    """Return what an estimate came to: an error, a failure's reason, or that it is of no true highlight."""
+    ok, value, better = estimate.status == "ok", degrees(estimate.error_deg), degrees(estimate.error_oracle_deg)
+    if estimate.kind in _NO_HIGHLIGHT:
+        return _NO_HIGHLIGHT[estimate.kind] if ok else f"{estimate.status} ({_NO_HIGHLIGHT[estimate.kind]})"
+    told = len(estimate.normals) > 1 and better not in ("–", value)
+    return estimate.status if not ok else f"{value} (better candidate {better})" if told else value
 
 
 def file_name(index: int) -> str:
@@ -33,7 +53,7 @@ def file_name(index: int) -> str:
     return f"gallery_{index:03d}"
 
 
-def draw_shown(item: GalleryItem, colours: Mapping[str, str]) -> tuple[Shown, bytes]:
+def draw_shown(item: KeptItem, colours: Mapping[str, str]) -> tuple[Shown, bytes]:
     """Return what the page shows of a frame, and its picture with legend as PNG."""
     parts, legend = draw_item(item, colours)
     gap = np.full((HEIGHT_PX, _GAP_PX, 3), 255, np.uint8)
@@ -43,7 +63,7 @@ def draw_shown(item: GalleryItem, colours: Mapping[str, str]) -> tuple[Shown, by
     return Shown(item, pictures), pixels.png(np.vstack([whole, strip]))
 
 
-def anchor(item: GalleryItem, estimate: KeptEstimate) -> Array | None:
+def anchor(item: KeptItem, estimate: KeptEstimate) -> Array | None:
     """Return the surface point from which an estimate's normals are drawn, camera frame.
 
     It is the true highlight that the estimate was matched to; for a false detection it is the point of the truth map
@@ -63,7 +83,7 @@ def anchor(item: GalleryItem, estimate: KeptEstimate) -> Array | None:
     return point if np.isfinite(point).all() else None
 
 
-def draw_item(item: GalleryItem, colours: Mapping[str, str]) -> tuple[list[Pixels], list[tuple[str, str]]]:
+def draw_item(item: KeptItem, colours: Mapping[str, str]) -> tuple[list[Pixels], list[tuple[str, str]]]:
     """Draw one frame and the neighbourhood of its main highlight, RGB; returned with the legend as (colour, text)."""
     window = _window(item)
     whole = Canvas(item.frame, None, HEIGHT_PX)
@@ -78,7 +98,7 @@ def draw_item(item: GalleryItem, colours: Mapping[str, str]) -> tuple[list[Pixel
     return [whole.pixels, part.pixels], _legend(item, colours, window)
 
 
-def _draw_overlay(canvas: Canvas, item: GalleryItem, colours: Mapping[str, str], detailed: bool, reach: float) -> None:
+def _draw_overlay(canvas: Canvas, item: KeptItem, colours: Mapping[str, str], detailed: bool, reach: float) -> None:
     # Lines first, then the truth, then the estimates on top of it.
     seen: set[tuple[int | None, float]] = set()
     for estimate in item.meta.estimates:
@@ -104,7 +124,7 @@ def _draw_overlay(canvas: Canvas, item: GalleryItem, colours: Mapping[str, str],
             canvas.cross(estimate.bp_px, colour, _ESTIMATE_EDGE, 12, tilted=True)
 
 
-def _projected(item: GalleryItem, point: Array, normal: Array, reach: float) -> Array:
+def _projected(item: KeptItem, point: Array, normal: Array, reach: float) -> Array:
     """Return both ends of a normal drawn from a surface point, px, shape (2, 2)."""
     ends = np.stack([point, point + reach * np.linalg.norm(point) * normal])
     return np.asarray(item.camera.project(ends))
@@ -116,13 +136,13 @@ def isophote_colour(isovalue: float) -> str:
     return hexadecimal((share, 1 - share, 1))
 
 
-def isophote_keys(items: Iterable[GalleryItem]) -> list[tuple[float, str]]:
+def isophote_keys(items: Iterable[KeptItem]) -> list[tuple[float, str]]:
     """Return the isovalues that gallery items draw, sorted, with their colours."""
     drawn = {round(part.t, 3) for item in items for estimate in item.meta.estimates for part in estimate.isophotes}
     return [(t, isophote_colour(t)) for t in sorted(drawn)]
 
 
-def _window(item: GalleryItem) -> Window | None:
+def _window(item: KeptItem) -> Window | None:
     """Return the square about the main highlight; None where it fills the frame or nothing was found."""
     groups: dict[int | None, list[Array]] = {}
     for estimate in item.meta.estimates:
@@ -140,7 +160,7 @@ def _window(item: GalleryItem) -> Window | None:
     return float(x - half), float(x + half), float(y - half), float(y + half)
 
 
-def _legend(item: GalleryItem, colours: Mapping[str, str], window: Window | None) -> list[tuple[str, str]]:
+def _legend(item: KeptItem, colours: Mapping[str, str], window: Window | None) -> list[tuple[str, str]]:
     names = dict.fromkeys(estimate.estimator for estimate in item.meta.estimates)
     entries = [(TRUTH, "truth"), *((colours.get(name, NEUTRAL), name) for name in names)]
     levels = isophote_keys([item])

@@ -23,7 +23,7 @@ from simtest.report.motion_figures import motion_figures
 from simtest.report.pairs import pairs
 from simtest.report.paper.paper_section import paper_section
 from simtest.report.relief_figures import relief_figures
-from simtest.report.run_folder import GalleryItem, Run
+from simtest.report.run_folder import Run
 from simtest.report.scene3d import framed, kept_scene
 from simtest.report.series import line_chart, line_figures
 from simtest.report.summary_table import HEADINGS, table_rows
@@ -31,6 +31,7 @@ from simtest.report.surface_errors import surface_chart, surface_errors
 from simtest.report.triangle_cost import fineness_charts, read_study
 from simtest.report.visible_figures import visible_figures
 from simtest.report.write import Progress
+from simtest.validation.kept_frames import KeptItem
 
 _FIRST_CARDS, _MAX_HEAT_MAPS = 9, 18
 
@@ -110,7 +111,7 @@ def _guide(content: Mapping[str, Any]) -> dict[str, Any]:
     return {"guide": {**content, "groups": [(circumstances, list(rows)) for circumstances, rows in groups]}}
 
 
-def _draw_frame(figures: FigureFiles, index: int, item: GalleryItem, colours: Mapping[str, str]) -> Shown:
+def _draw_frame(figures: FigureFiles, index: int, item: KeptItem, colours: Mapping[str, str]) -> Shown:
     shown, content = draw_shown(item, colours)
     figures.write(file_name(index), content)
     return shown
@@ -126,7 +127,7 @@ def _render(run: Run, sections: Mapping[str, Any], figures: FigureFiles) -> str:
             "realism": summary.realism, "meshes": summary.meshes, "faults": summary.faults,
             "gallery": [card.result() for card in sections["cards"]],
             "first": _FIRST_CARDS, "isophotes": isophote_keys(run.gallery), "truth_colour": style.TRUTH,
-            "columns": HEADINGS, "chart_files": figures.chart_files, **_guide(guide_json(run)),
+            "columns": [*HEADINGS.values()], "chart_files": figures.chart_files, **_guide(guide_json(run)),
             "length_units": " or ".join(dict.fromkeys(item.meta.length_unit for item in run.gallery)) or "mm",
             **embedded(figures.charts),
         }

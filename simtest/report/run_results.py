@@ -59,10 +59,10 @@ class RunResults:
         faults = [fault for held in self.summary["experiments"].values() for fault in held.get("faults") or ()]
         if faults:
             # Loaded where there is one: a finished run that is asked for again should answer at once.
-            from simtest.validation.run_summary import fault_sentences
+            from simtest.validation.run_summary import Fault
 
-            for sentence in fault_sentences(faults):
-                warnings.warn(sentence, RuntimeWarning, stacklevel=3)
+            for fault in faults:
+                warnings.warn(str(Fault(**fault)), RuntimeWarning, stacklevel=3)
 
     def __fspath__(self) -> str:
         return str(self.page)

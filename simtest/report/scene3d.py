@@ -14,8 +14,9 @@ from simtest.conventions import PIXEL_CENTRE
 from simtest.pages.palette import LIGHT, NEUTRAL, colours, estimator_order
 from simtest.pages.style import number
 from simtest.report.gallery import anchor
-from simtest.report.run_folder import GalleryItem, Run
+from simtest.report.run_folder import Run
 from simtest.runtime.arrays import AnyArray, Array, IntArray
+from simtest.validation.kept_frames import KeptItem
 
 CAMERA, TRUE, TRUE_BASE = "camera", "true normal", "true normal of the base"
 SIGHTLINE, EVERYWHERE = "sightline from the camera", "true normals of the surface"
@@ -131,13 +132,13 @@ def kept_scene(run: Run) -> KeptScene | None:
     return None if content is None else KeptScene(title, content, chosen.meta.length_unit)
 
 
-def _interest(item: GalleryItem) -> tuple[int, float]:
+def _interest(item: KeptItem) -> tuple[int, float]:
     answered = {estimate.estimator for estimate in item.meta.estimates if estimate.status == "ok"}
     sizes = (abs(size) for truth in item.meta.truth for size in (truth.kd_min, truth.kd_max) if size)
     return len(answered), min(max(sizes, default=0.0), 2.0)
 
 
-def _content(item: GalleryItem) -> Content | None:
+def _content(item: KeptItem) -> Content | None:
     # The surface, thinned.
     step = max(1, -(-max(item.position.shape[:2]) // _GRID))
     position = item.position[::step, ::step].astype(float)
@@ -166,7 +167,7 @@ def _content(item: GalleryItem) -> Content | None:
     )  # fmt: skip
 
 
-def _intensity(item: GalleryItem, shape: tuple[int, ...], step: int) -> Array:
+def _intensity(item: KeptItem, shape: tuple[int, ...], step: int) -> Array:
     frame = item.frame if item.frame.ndim == 2 else item.frame.mean(axis=-1)
     rows, columns = item.position.shape[:2]
     y = ((np.arange(shape[0]) * step + PIXEL_CENTRE) / rows * frame.shape[0]).astype(int)
@@ -174,7 +175,7 @@ def _intensity(item: GalleryItem, shape: tuple[int, ...], step: int) -> Array:
     return np.clip(frame[np.ix_(y, x)], 0, 1).astype(float)
 
 
-def _at_highlights(item: GalleryItem, reach: float) -> list[tuple[str, Array, Array]]:
+def _at_highlights(item: KeptItem, reach: float) -> list[tuple[str, Array, Array]]:
     """Return the lines at the highlights: true normals, those of all candidates of each estimator, and sightlines."""
     true = [(np.array(t.position), np.array(t.normal)) for t in item.meta.truth if t.position and t.normal]
     # The true normal is longer, so that it shows where an estimate lies on top of it.

@@ -3,9 +3,10 @@
 from typing import NamedTuple
 
 from simtest.pages.style import number
-from simtest.report.run_folder import EstimatorFigures, Run
+from simtest.report.run_folder import Run
+from simtest.validation.statistics import Figures
 
-HEADINGS = [str(field.title) for field in EstimatorFigures.model_fields.values()]
+HEADINGS = {name: field.title for name, field in Figures.model_fields.items() if field.title}
 
 
 class TableRow(NamedTuple):
@@ -22,7 +23,7 @@ def table_rows(run: Run) -> list[TableRow]:
     rows = []
     for setting, estimator, figures in (row for experiment in run.experiments.values() for row in experiment.rows):
         reasons = {name: count for name, count in sorted(figures.n_failed_by_reason.items()) if count}
-        cells = [_cell(value) for _, value in figures]
+        cells = [_cell(getattr(figures, name)) for name in HEADINGS]
         rows.append(TableRow(setting, estimator, cells, ", ".join(f"{k} {n}" for k, n in reasons.items())))
     return rows
 

@@ -18,7 +18,7 @@ from simtest.runtime.files import write_atomically
 from simtest.runtime.processes import Engine, OnStep
 from simtest.spec import Experiment
 from simtest.spec.recipes import PaperSetting
-from simtest.validation import gallery_items as gallery
+from simtest.validation import kept_frames
 from simtest.validation.cases import Case, swept_example
 from simtest.validation.columns import Row, Value, completed, swept_columns, table
 from simtest.validation.paper.gallery_item import save_realisation
@@ -121,7 +121,7 @@ def _rendered(part: Part, tell: OnStep) -> list[Row]:
         made = realiser.make(experiment, case, number, estimators)
         rows += made.rows
         if part.item and number == part.numbers[0]:
-            gallery.save(part.item, realiser.session, experiment, case, made)
+            kept_frames.save(part.item, realiser.session, experiment, case, made)
         tell()
     return rows
 

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from simtest.runtime.files import JsonObject
+from pydantic import BaseModel, ConfigDict
+
 from simtest.runtime.resources import find
 from simtest.spec import AnatomySurface, Experiment, Group, Scene, read_toml, scene_from_dict
 from simtest.spec.keys import replace_values
@@ -16,23 +16,20 @@ if TYPE_CHECKING:
     from simtest.surfaces.mesh_check import MeshCheck
 
 
-@dataclass(frozen=True)
-class MeshVerdict:
+class MeshVerdict(BaseModel):
     """Whether a mesh file is fit for an experiment."""
+
+    model_config = ConfigDict(frozen=True)
 
     file: str
     usable: bool
     """Whether highlights on it mean something; a refinement by ``surface.edge_mm`` counts, subdivisions do not."""
 
-    text: str
+    verdict: str
     """The verdict and what is wrong, in words."""
 
-    def to_json(self) -> JsonObject:
-        """Return the verdict for a script."""
-        return {"file": self.file, "usable": self.usable, "verdict": self.text}
-
     def __str__(self) -> str:
-        return f"mesh {self.file}: {self.text}"
+        return f"mesh {self.file}: {self.verdict}"
 
 
 def mesh_verdicts(experiment: Experiment) -> list[MeshVerdict]:
@@ -88,7 +85,7 @@ def _judge(surface: AnatomySurface, lobe: float) -> MeshVerdict:
     # A lumen that is judged from outside yields plausible figures of the wrong surface.
     doubt = f"; {found.doubt} (surface.kind=lumen)" if found.doubt else ""
     text += doubt + "".join(f"; {problem}" for problem in found.problems)
-    return MeshVerdict(str(surface.path), fine and not found.problems and not doubt, text)
+    return MeshVerdict(file=str(surface.path), usable=fine and not found.problems and not doubt, verdict=text)
 
 
 def _refined_edge(found: "MeshCheck", target_mm: float) -> float:

@@ -10,6 +10,7 @@ from simtest.runtime.files import read_json, write_json
 from simtest.runtime.locks import LOCK
 
 RESULTS = "results.parquet"
+SUMMARY = "summary.json"
 MOST_DIGEST_BYTES = 1000
 PARTS = "parts"
 """Folder of the finished cases of a run that is not finished."""
@@ -30,7 +31,7 @@ def record_in(folder: Path) -> dict[str, Any] | None:
         if (folder / PARTS).is_dir():
             # Beside the parts of a stopped run anything may be incomplete.
             return None
-        record = read_json(folder / "summary.json")["run"]
+        record = read_json(folder / SUMMARY)["run"]
         return dict(record) if "fingerprint" in record else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
@@ -76,7 +77,7 @@ def check_folder(folder: Path) -> None:
         left.unlink()
     # What is no part of a run.
     held.pop(LOCK, None)
-    own = {"results.parquet", "summary.json", "gallery", "figures", "guide.json", "index.html"}
+    own = {RESULTS, SUMMARY, "gallery", "figures", "guide.json", "index.html"}
     own |= {PARTS, EXPORT, EXPORTING}
     strangers = sorted(held.keys() - own)
     # Folders of those names alone may be anyone's, and a run would replace them.

@@ -269,11 +269,12 @@ def _finish(job: Job, record: RunRecord, resumed: int) -> Run:
     """Join the parts of an experiment, and write its results and summary."""
     import polars as pl
 
-    from simtest.validation.run_summary import run_summary, write_results
+    from simtest.validation.run_summary import summarise_run, write_results
 
     folder, parts = job.folder, job.folder / PARTS
     results = pl.concat([pl.read_parquet(part_file(parts, i)) for i in range(len(job.cases))])
-    write_results(folder, record, results, run_summary(job.experiment, job.cases, results))
+    summary = summarise_run(job.experiment, job.cases, results)
+    write_results(folder, record, results, job.experiment.name, summary)
     # The parts go last: until the summary stands, a run that is stopped can go on.
     remove_folder(parts)
     return Run(folder, resumed, results)

@@ -17,6 +17,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 import polars as pl
+from pydantic import BaseModel
 
 from simtest.runtime.files import Json
 from simtest.spec import Scene, scene_from_dict
@@ -358,9 +359,19 @@ class MeasuredDistance(TypedDict):
     statistics: Json
 
 
-def realism_of(cases: Iterable[Case]) -> list[Json]:
+class SceneRealism(BaseModel):
+    """For which realism some scenes of an experiment stand; `scenes` are the labels of their curves."""
+
+    scenes: tuple[str, ...]
+    kind: str
+    camera_chain: tuple[str, ...]
+    sentence: str
+    distance: dict[str, Any] | None
+
+
+def realism_of(cases: Iterable[Case]) -> list[SceneRealism]:
     """Describe the scenes of an experiment: an entry for all labels whose scenes are alike; none for computed cases."""
-    found: dict[str, tuple[dict[str, Json], list[str]]] = {}
+    found: dict[str, tuple[dict[str, Any], list[str]]] = {}
     for case in cases:
         if case.is_paper:
             continue
@@ -368,10 +379,10 @@ def realism_of(cases: Iterable[Case]) -> list[Json]:
         _, labels = found.setdefault(json.dumps(entry, sort_keys=True), (entry, []))
         if case.label not in labels:
             labels.append(case.label)
-    return [{"scenes": labels, **entry} for entry, labels in found.values()]
+    return [SceneRealism(scenes=tuple(labels), **entry) for entry, labels in found.values()]
 
 
-def _entry(scene: Scene, random: Mapping[str, Any]) -> dict[str, Json]:
+def _entry(scene: Scene, random: Mapping[str, Any]) -> dict[str, Any]:
     kind, what = _surface_realism(scene)
     stages = ["motion"] if scene.camera.motion is not None else []
     stages += [name for name in CHAIN if getattr(scene.sensor, name) is not None]

@@ -4,16 +4,15 @@ Whoever counts rows counts these kinds, so that all counts agree and add up.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import polars as pl
+from pydantic import BaseModel, ConfigDict, Field
 
 from simtest.conventions import ON_INSTRUMENT
 from simtest.geometry import chi_squared
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.files import Json
 from simtest.runtime.statistics import CONFIDENCE, Interval, mean_interval, root_mean_square
 
 KINDS = ("ok", "failed", "missed", "false", ON_INSTRUMENT, "in_spot")
@@ -60,9 +59,8 @@ PENALTY_DEG = 90.0
 """What a failed or missed row counts in mean_penalised_deg: refusing is no way to a good figure."""
 
 
-@dataclass(frozen=True)
-class Figures:
-    """Figures of the rows of one setting and estimator; None where nothing answered.
+class Figures(BaseModel):
+    """Figures of the rows of one setting and estimator, with their headings; None where nothing answered.
 
     Parameters
     ----------
@@ -74,46 +72,42 @@ class Figures:
         Of these, how many failed.
     n_false, n_in_spot : int
         False detections, answered or not, and detections in spots of a relief that melt several glints or hold none;
-        they count nowhere else (`simtest.validation.statistics`).
+        they count nowhere else (`row_kind`).
     n_instrument : int or None
         Detections that show an instrument, which count nowhere else; None in a run without instruments.
     mean_deg, mean_oracle_deg, rms_deg, std_deg, median_deg, p95_deg, max_deg : float or None
         Of the errors of the answers.
-    mean_penalised_deg : float or None
-        Mean with `PENALTY_DEG` for each failed or missed highlight.
     mean_base_deg : float or None
         Mean error against the base's normal; `mean_deg` itself without a relief.
+    mean_penalised_deg : float or None
+        Mean with `PENALTY_DEG` for each failed or missed highlight.
     ci95_deg : tuple of float or None
         Confidence interval of the mean, frames being the independent units.
     coverage95 : float or None
         Share of the answers with an uncertainty whose 95 % region holds the true normal.
     """
 
-    n: int
-    n_ok: int
-    n_failed_by_reason: dict[str, int]
-    n_missed: int
-    n_false: int
-    n_in_spot: int
-    mean_deg: float | None
-    mean_base_deg: float | None
-    mean_oracle_deg: float | None
-    rms_deg: float | None
-    std_deg: float | None
-    median_deg: float | None
-    p95_deg: float | None
-    max_deg: float | None
-    mean_penalised_deg: float | None
-    ci95_deg: Interval
-    coverage95: float | None
-    n_instrument: int | None = None
+    model_config = ConfigDict(frozen=True)
 
-    def to_json(self) -> Json:
-        """Return the entry of summary.json."""
-        entry: dict[str, Json] = {**vars(self), "ci95_deg": list(self.ci95_deg)}
-        if self.n_instrument is None:
-            del entry["n_instrument"]
-        return entry
+    n: int = Field(title="true highlights")
+    n_ok: int = Field(title="ok")
+    n_failed_by_reason: dict[str, int] = Field(title="failed")
+    n_missed: int = Field(title="missed")
+    n_false: int = Field(title="false")
+    n_in_spot: int = Field(title="in spots")
+    n_instrument: int | None = Field(None, title="on instruments")
+    mean_deg: float | None = Field(title="mean\u00a0°")
+    # In the file alone: the page has figures of its own for it.
+    mean_base_deg: float | None = None
+    mean_oracle_deg: float | None = Field(title="mean, better candidate\u00a0°")
+    rms_deg: float | None = Field(title="RMS\u00a0°")
+    std_deg: float | None = Field(title="std\u00a0°")
+    median_deg: float | None = Field(title="median\u00a0°")
+    p95_deg: float | None = Field(title="95th pct\u00a0°")
+    max_deg: float | None = Field(title="max\u00a0°")
+    mean_penalised_deg: float | None = Field(title="mean, failures as\u00a090°")
+    ci95_deg: Interval = Field(title="95\u00a0% interval\u00a0°")
+    coverage95: float | None = Field(title="coverage 95\u00a0%")
 
 
 def summarise(results: pl.DataFrame) -> dict[str, dict[str, Figures]]:
@@ -155,7 +149,7 @@ def figures(rows: pl.DataFrame) -> Figures:
         # An angle is not negative, nor is its mean.
         ci95_deg=(None if low is None else max(low, 0.0), high),
         coverage95=float(np.mean(distances <= chi_squared.quantile(CONFIDENCE, 2))) if len(distances) else None,
-        n_instrument=count[ON_INSTRUMENT] if ON_INSTRUMENT in rows.columns else None,
+        **({"n_instrument": count[ON_INSTRUMENT]} if ON_INSTRUMENT in rows.columns else {}),
     )
 
 

@@ -17,7 +17,7 @@ from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 from simtest.validation import laws
-from simtest.validation.gallery_items import GalleryMeta, write_item
+from simtest.validation.kept_frames import write_item
 from simtest.validation.scoring import _look_normals, match, peak_px
 
 CAMERA = Camera(120, 90, 100.0, 100.0, 60.0, 45.0)
@@ -129,7 +129,10 @@ def test_all_looks_are_cast_at_once_and_each_finds_its_own_normal(monkeypatch):
 def test_a_gallery_item_holds_what_was_written(tmp_path):
     rng = np.random.default_rng(0)
     frame, maps = rng.random((30, 40)), rng.random((6, 8, 3)).astype(np.float32)
-    meta = GalleryMeta("plane", "s", "l", 0.01, "simtest", CAMERA, [], [], [[0.0, 0.0, 0.0]])
+    meta = {
+        "surface": "plane", "setting": "s", "label": "l", "sigma": 0.01, "command": "simtest", "camera": CAMERA,
+        "truth": [], "estimates": [], "lights": [[0.0, 0.0, 0.0]],
+    }  # fmt: skip
     write_item(tmp_path / "one.npz", meta, frame, maps, maps / 2, curvature=maps[..., 0])
     with np.load(tmp_path / "one.npz", allow_pickle=False) as item:
         assert set(item.files) == {"frame", "position", "normal", "curvature", "meta"}

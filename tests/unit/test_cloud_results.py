@@ -14,7 +14,7 @@ from simtest.simulation.highlights import CloudRegions
 from simtest.spec import Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
-from simtest.validation.gallery_items import save
+from simtest.validation.kept_frames import save
 from simtest.validation.realisation import Realiser
 from simtest.validation.scoring import match_cloud
 

@@ -19,7 +19,7 @@ from simtest.spec import load_experiment, load_scene
 from simtest.validation.cases import expand
 from simtest.validation.guide import guide_of
 from simtest.validation.paired import LEAST_FRAMES
-from simtest.validation.run_summary import run_summary
+from simtest.validation.run_summary import summarise_run
 from simtest.validation.situations import conditions, conditions_of
 
 FLAT = {"kd_min": 0.0, "kd_max": 0.0, "eps_over_d": 0.0, "surface": "plane"}
@@ -444,7 +444,7 @@ def test_summary_json_holds_conditions_and_descriptions():
     experiment = load_experiment("relief")
     cases = expand(experiment)
     rows = pl.DataFrame(rows_of("cone_axis", [1.0], cases[0].setting, mahalanobis2=None, error_oracle_deg=1.0))
-    (content,) = json.loads(json.dumps(run_summary(experiment, cases, rows)))["experiments"].values()
+    content = summarise_run(experiment, cases, rows).model_dump(mode="json")
     assert content["estimators"] == {name: DESCRIPTIONS[name] for name in experiment.estimators}
     assert list(content["conditions"]) == list(conditions_of(cases))
     assert content["conditions"][cases[0].setting]["relief"] == "relief"

@@ -151,7 +151,7 @@ def test_a_mesh_is_judged_at_the_distance_of_its_nearest_viewpoints(tmp_path, ki
     ball().export(path)
     (verdict,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.kind": kind}))
     at_distance = check_mesh(path, distance, concentration(200.0, None), kind)
-    assert f"edges of {at_distance.needed_edge_mm:.2g} mm are needed at {distance} mm" in verdict.text
+    assert f"edges of {at_distance.needed_edge_mm:.2g} mm are needed at {distance} mm" in verdict.verdict
     assert at_distance.needed_edge_mm != pytest.approx(
         check_mesh(path, 30.0, concentration(200.0, None), kind).needed_edge_mm, rel=0.05
     )
@@ -163,7 +163,7 @@ def test_a_ggx_lobe_needs_edges_for_its_own_width(tmp_path, alpha):
     ball().export(path)
     lobe = {"reflectance.type": "rough_plastic", "reflectance.alpha": alpha}
     (verdict,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.kind": "organ"}, **lobe))
-    needed = float(re.search(r"edges of (\S+) mm are needed", verdict.text)[1])
+    needed = float(re.search(r"edges of (\S+) mm are needed", verdict.verdict)[1])
     assert needed == pytest.approx(check_mesh(path, 40, concentration(None, alpha), "organ").needed_edge_mm, rel=0.1)
 
 
@@ -176,25 +176,25 @@ def test_an_experiment_judges_its_mesh_files_once(tmp_path, monkeypatch):
     assert not coarse.usable
     assert str(coarse).startswith(f"mesh {path}: too coarse: edges of 0.")
     assert str(coarse).endswith(" mm are needed at 40 mm (surface.edge_mm); taken for an organ, camera outside")
-    assert coarse.to_json() == {"file": str(path), "usable": False, "verdict": coarse.text}
+    assert coarse.model_dump() == {"file": str(path), "usable": False, "verdict": coarse.verdict}
     (refined,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.edge_mm": "auto"}))
     assert refined.usable
     assert re.fullmatch(
         r"refined to edges of 0\.\d+ mm by surface.edge_mm = auto, at most 0\.\d+ mm are needed at 40 mm; "
         "taken for an organ, camera outside",
-        refined.text,
+        refined.verdict,
     )
     # One that would need more faces than are allowed is not fine enough, and says so.
     monkeypatch.setattr("simtest.surfaces.mesh_surface.MAX_SUBDIVIDED_FACES", 1500)
     (limited,) = mesh_verdicts(experiment(**{"surface.path": str(path), "surface.edge_mm": "auto"}))
     assert not limited.usable
-    assert ": too coarse, 0." in limited.text
+    assert ": too coarse, 0." in limited.verdict
     # What is no table is told by whoever reads the scene.
     assert mesh_verdicts(experiment(surface=5)) == []
     # A wide lobe needs no fine mesh.
     trimesh.creation.icosphere(subdivisions=5, radius=20).export(path)
     (fine,) = mesh_verdicts(experiment(**{"surface.path": str(path), "reflectance.exponent": 2.0}))
-    assert (fine.usable, fine.text) == (True, "fine enough; taken for an organ, camera outside")
+    assert (fine.usable, fine.verdict) == (True, "fine enough; taken for an organ, camera outside")
     # Two lobes of one verdict are told once, and two verdicts of one file both.
     values = {"surface.path": str(path)}
     groups = [Group(scene="anatomy", set={**values, "reflectance.exponent": n}) for n in (2.0, 3.0, 9e4)]
@@ -219,24 +219,27 @@ def test_an_open_tube_that_is_taken_for_an_organ_is_warned_of(tmp_path):
     values = {"surface.path": str(path), "reflectance.exponent": 2.0}
     (guessed,) = mesh_verdicts(experiment(**values))
     assert not guessed.usable
-    assert "taken for an organ, camera outside; open at 2 rims, as a tube is" in guessed.text
-    assert "surface.kind=lumen" in guessed.text
+    assert "taken for an organ, camera outside; open at 2 rims, as a tube is" in guessed.verdict
+    assert "surface.kind=lumen" in guessed.verdict
     for kind, side in (("lumen", "a lumen, camera inside"), ("organ", "an organ, camera outside")):
         (stated,) = mesh_verdicts(experiment(**values, **{"surface.kind": kind}))
-        assert "rims" not in stated.text
-        assert f"taken for {side}" in stated.text
+        assert "rims" not in stated.verdict
+        assert f"taken for {side}" in stated.verdict
     # A hole of a scan is no end of a tube.
     holed = ball()
     holed.update_faces((holed.vertices[holed.faces].mean(axis=1)[:, :2] ** 2).sum(axis=1) > 4)
     holed.export(path)
     (organ,) = mesh_verdicts(experiment(**values))
-    assert "rims" not in organ.text
+    assert "rims" not in organ.verdict
 
 
 @pytest.mark.parametrize("quiet", [False, True])
 def test_the_command_tells_each_verdict_once(tmp_path, monkeypatch, capsys, quiet):
     monkeypatch.chdir(tmp_path)
-    fit, unfit = MeshVerdict("a.ply", True, "fine enough"), MeshVerdict("b.ply", False, "too coarse")
+    fit, unfit = (
+        MeshVerdict(file="a.ply", usable=True, verdict="fine enough"),
+        MeshVerdict(file="b.ply", usable=False, verdict="too coarse"),
+    )
     monkeypatch.setattr("simtest.validation.mesh_verdicts.mesh_verdicts", lambda _: [fit, unfit])
     monkeypatch.setattr("simtest.api.validate", lambda *_, **__: None)
     monkeypatch.setattr(MANNERS, "quiet", quiet)

@@ -5,7 +5,6 @@ import json
 import pytest
 from test_report import make_run
 
-from simtest.report.run_folder import Summary
 from simtest.report.write import write_report
 from simtest.spec import load_experiment, load_scene
 from simtest.validation import situations
@@ -22,9 +21,9 @@ def described(tmp_path, text):
 def test_smooth_scenes_are_a_control(tmp_path):
     found = described(tmp_path, '[[groups]]\nscene = "sphere"\nlabel = "a"\n[[groups]]\nscene = "plane"\nlabel = "b"\n')
     assert len(found) == 1
-    assert found[0]["scenes"] == ["a", "b"]
-    assert found[0]["kind"] == "smooth"
-    assert found[0]["sentence"] == "Smooth control: no relief and no texture, without a camera chain."
+    assert found[0].scenes == ("a", "b")
+    assert found[0].kind == "smooth"
+    assert found[0].sentence == "Smooth control: no relief and no texture, without a camera chain."
 
 
 @pytest.fixture
@@ -41,34 +40,34 @@ def measured(monkeypatch):
 def test_a_measured_scene_quotes_its_distance_and_a_changed_one_does_not(tmp_path, measured):
     text = '[[groups]]\nscene = "tissue_colon"\nlabel = "colon"\nset = { "surface.viewpoint" = 7 }\n'
     (same,) = described(tmp_path, text)
-    assert same["kind"] == "tissue"
-    assert "relief with slopes of 5° at 2.5 mm and 5° at 0.9 mm" in same["sentence"]
-    assert "10 of 12 statistics are near real frames (measured on 12 frames of tissue_colon" in same["sentence"]
-    assert same["distance"]["real"] == ["a.png", "b.png"]
+    assert same.kind == "tissue"
+    assert "relief with slopes of 5° at 2.5 mm and 5° at 0.9 mm" in same.sentence
+    assert "10 of 12 statistics are near real frames (measured on 12 frames of tissue_colon" in same.sentence
+    assert same.distance["real"] == ["a.png", "b.png"]
     (other,) = described(tmp_path, text.replace('"surface.viewpoint" = 7', '"reflectance.film.alpha" = 0.05'))
-    assert other["sentence"].endswith(UNKNOWN)
-    assert other["distance"] is None
+    assert other.sentence.endswith(UNKNOWN)
+    assert other.distance is None
     # What is drawn for each realisation has not one look.
     (drawn,) = described(tmp_path, text + '[groups.random]\n"reflectance.film.alpha" = { low = 0.02, high = 0.05 }\n')
-    assert drawn["distance"] is None
+    assert drawn.distance is None
 
 
 def test_too_few_real_scenes_carry_no_verdict(tmp_path, measured):
     measured["judged"] = measured["near"] = 0
     (found,) = described(tmp_path, '[[groups]]\nscene = "tissue_colon"\n')
     assert (
-        "carries no verdict: too few scenes (measured on 12 frames of tissue_colon against 2 real" in found["sentence"]
+        "carries no verdict: too few scenes (measured on 12 frames of tissue_colon against 2 real" in found.sentence
     )
 
 
 def test_camera_chain_and_relief_alone_are_named(tmp_path):
     chain = 'set = { "sensor.preset" = "colonoscope_hd" }\n'
     (found,) = described(tmp_path, f'[[groups]]\nscene = "tissue_colon"\n{chain}')
-    assert "through a camera chain (mosaic, colour, sharpening" in found["sentence"]
+    assert "through a camera chain (mosaic, colour, sharpening" in found.sentence
     band = '{ "surface.relief" = { bands = [{ slope_deg = 3.0, wavelength_mm = 1.5 }] } }'
     (found,) = described(tmp_path, f'[[groups]]\nscene = "plane"\nset = {band}\n')
-    assert found["kind"] == "partial"
-    assert found["sentence"].startswith("Parts of tissue: relief with slopes of 3° at 1.5 mm, without a camera chain.")
+    assert found.kind == "partial"
+    assert found.sentence.startswith("Parts of tissue: relief with slopes of 3° at 1.5 mm, without a camera chain.")
 
 
 def test_look_keeps_what_a_frame_shows_alone():
@@ -95,15 +94,19 @@ def test_shipped_entries_are_of_the_scenes_as_they_are():
         assert entry["look"] == look_of(load_scene(entry["scene"])), entry["scene"]
 
 
-def test_summary_of_an_earlier_version_reads_without_realism():
-    old = Summary.model_validate({"experiments": {"mine": {"title": "x", "settings": {}}}})
-    assert old.experiments["mine"].realism == ()
-
-
 def test_page_says_for_which_realism_its_scenes_stand(tmp_path):
     run = make_run(tmp_path / "run", items=0)
     summary = json.loads((run / "summary.json").read_text())
-    entries = [{"scenes": [f"curve {i}"], "sentence": f"Smooth <control> {i}."} for i in range(6)]
+    entries = [
+        {
+            "scenes": [f"curve {i}"],
+            "kind": "smooth",
+            "camera_chain": [],
+            "sentence": f"Smooth <control> {i}.",
+            "distance": None,
+        }
+        for i in range(6)
+    ]
     summary["experiments"]["overview"]["realism"] = entries
     (run / "summary.json").write_text(json.dumps(summary))
     html = write_report(run).read_text(encoding="utf-8")

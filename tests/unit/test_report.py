@@ -112,9 +112,10 @@ def summarise(rows):
                 "n": len(entry["rows"]), "n_ok": len(errors),
                 "n_failed_by_reason": {s: failed.count(s) for s in set(failed)},
                 "n_missed": sum(r["status"] == "missed" for r in entry["rows"]),
-                "n_false": sum(r["true_id"] is None for r in entry["rows"]), "mean_deg": mean, "mean_oracle_deg": mean,
+                "n_false": sum(r["true_id"] is None for r in entry["rows"]), "n_in_spot": 0,
+                "mean_deg": mean, "mean_oracle_deg": mean,
                 "rms_deg": mean, "std_deg": None, "median_deg": mean, "p95_deg": mean, "max_deg": mean,
-                "mean_penalised_deg": mean, "ci95_deg": [mean, mean] if errors else None, "coverage95": None,
+                "mean_penalised_deg": mean, "ci95_deg": [mean, mean], "coverage95": None,
             }  # fmt: skip
     return settings
 
@@ -444,11 +445,10 @@ def test_null_and_nan_everywhere(tmp_path, blank):
     assert "summary" in page.ids()
 
 
-def test_null_summary_and_empty_results(tmp_path):
+def test_empty_summary_and_results(tmp_path):
     make_run(tmp_path, "curvature", make_rows("curvature", realisations=1), items=0)
     pl.read_parquet(tmp_path / "results.parquet").head(0).write_parquet(tmp_path / "results.parquet")
-    figures = {"cone_axis": dict.fromkeys(("n", "n_ok", "n_failed_by_reason", "mean_deg", "ci95_deg")), "other": None}
-    summary = {"run": None, "experiments": {"curvature": {"title": None, "settings": {"a": figures}}}}
+    summary = {"run": {}, "experiments": {"curvature": {"settings": {}}}}
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     page = read_page(write_report(tmp_path))
     assert "nothing was measured" in " ".join(page.text)
@@ -502,7 +502,7 @@ def test_surface_without_truth_or_pixels(tmp_path):
     with np.load(tmp_path / "gallery" / "a.npz") as data:
         content = dict(data)
     meta = json.loads(str(content["meta"]))
-    meta["truth"], meta["estimates"] = [], [{"estimator": "x", "status": "ok", "bp_px": None, "isophotes": None}]
+    meta["truth"], meta["estimates"] = [], [{"estimator": "x", "status": "ok", "bp_px": None}]
     content |= {"meta": json.dumps(meta), "position": content["position"] * np.nan}
     np.savez(tmp_path / "gallery" / "a.npz", **content)
     make_run(tmp_path, "noise", items=0)

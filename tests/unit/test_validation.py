@@ -480,7 +480,7 @@ def test_highlights_of_a_frame_that_the_detector_refuses_are_missed(monkeypatch)
         assert made.detection.refusal is not None
         return made
 
-    monkeypatch.setattr("simtest.validation.scoring.reconstruct", refused)
+    monkeypatch.setattr("simtest.validation.realisation.reconstruct", refused)
     described = experiment(FIXED, realisations=1)
     (case,) = expand(described)
     scene, drawn = case.scene(described, 0)

@@ -20,10 +20,10 @@ from simtest.dataset.shard_writer import maker_of
 from simtest.errors import InputError
 from simtest.rendering import backend
 from simtest.runtime import provenance
-from simtest.runtime.files import Json, are_nested
+from simtest.runtime.files import are_nested
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.processes import Engine, OnStep, make_engine
-from simtest.validation import gallery_items
+from simtest.validation import kept_frames
 from simtest.validation.case_work import forget, gallery_cases
 from simtest.validation.cases import swept_example
 from simtest.validation.columns import Row, Value
@@ -31,9 +31,9 @@ from simtest.validation.columns import table as results_table
 from simtest.validation.fingerprints import input_hashes
 from simtest.validation.realisation import answer, realise
 from simtest.validation.run_folder import EXPORT, check_folder, remove_folder
-from simtest.validation.run_summary import run_summary, settings_summary, write_results
+from simtest.validation.run_summary import ExperimentSummary, summarise_run, write_results
 from simtest.validation.runner import Progress, Run, RunRecord
-from simtest.validation.statistics import ANATOMY
+from simtest.validation.statistics import ANATOMY, summarise
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def score_table(
             warnings.warn(f"{table}: {doubt}", stacklevel=2)
         made = _run_record(source, record.fingerprint, (table, on / EXPORT), command, started, clock)
         described = {each: f"Answers of {table.name}, made elsewhere." for each in answers}
-        write_results(out, made, results, _summary(source, results, described))
+        write_results(out, made, results, *_summary(source, results, described))
     return Run(out, 0, results)
 
 
@@ -208,19 +208,17 @@ def _parts(source: Source, record: Record, answers: Answers, out: Path) -> list[
     return parts
 
 
-def _summary(source: Source, results: pl.DataFrame, described: Mapping[str, str]) -> dict[str, Json]:
-    """Return what summary.json says of the results."""
+def _summary(source: Source, results: pl.DataFrame, described: Mapping[str, str]) -> tuple[str, ExperimentSummary]:
+    """Return the name of what was scored, and what summary.json says of the results."""
     if source.experiment is not None:
         rendered = [case for case in source.cases if not case.is_paper]
-        return run_summary(source.experiment, rendered, results, described)
+        return source.experiment.name, summarise_run(source.experiment, rendered, results, described)
     assert source.dataset is not None
-    content: dict[str, Json] = {
-        "title": source.dataset.title or source.dataset.name,
-        "description": source.dataset.description,
-        "estimators": {**described},
-        "settings": settings_summary(results),
-    }
-    return {"experiments": {source.dataset.name: content}}
+    dataset = source.dataset
+    return dataset.name, ExperimentSummary(
+        title=dataset.title or dataset.name, description=dataset.description, estimators={**described},
+        settings=summarise(results),
+    )  # fmt: skip
 
 
 # In a worker --------------------------------------------------------------------------------------------------------
@@ -246,7 +244,7 @@ def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[Row]:
         experiment, case = views.experiment, views.case
         made = realise(each.session, experiment, case, each.number, each.view, each.swept, estimators)
         if item is not None:
-            gallery_items.save(item, each.session, experiment, case, made)
+            kept_frames.save(item, each.session, experiment, case, made)
         return made.rows
     assert isinstance(views, ShardViews)
     maker = maker_of(views.dataset.model_dump_json(), views.variant)

@@ -9,9 +9,10 @@ from simtest.pages.charts import Axis, Chart, Mark, Panel, Picture
 from simtest.pages.pixels import displayed
 from simtest.pages.style import NEUTRAL, TRUTH, degrees, labelled
 from simtest.report.paper.parameters import PARAMETERS
-from simtest.report.run_folder import GalleryItem, KeptEstimate, Run
+from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array, Image
 from simtest.spec.recipes import PaperSetting
+from simtest.validation.kept_frames import KeptEstimate, KeptItem
 
 _ISOPHOTE = "#00C2D1"
 _DOT, _CROSS = "●", "✖"
@@ -70,13 +71,13 @@ def stages(run: Run) -> Stages | None:
     return _read(max(kept, key=lambda item: (item.meta.paper == PaperSetting(), _pose(item).status == "ok")))
 
 
-def _pose(item: GalleryItem) -> KeptEstimate:
+def _pose(item: KeptItem) -> KeptEstimate:
     """Return circle pose's estimate, else the first one."""
     estimates = item.meta.estimates or (KeptEstimate(estimator="", status="no estimate"),)
     return next((estimate for estimate in estimates if estimate.estimator == "circle_pose"), estimates[0])
 
 
-def _read(item: GalleryItem) -> Stages:
+def _read(item: KeptItem) -> Stages:
     meta, estimate = item.meta, _pose(item)
     assert meta.paper is not None
     x, y, width, height = meta.outer

@@ -11,12 +11,9 @@ from simtest.runtime.seeds import from_integer
 from simtest.spec import Experiment
 from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import Case
-from simtest.validation.gallery_items import (
+from simtest.validation.kept_frames import (
     MAP_SIDE,
-    DrawnEstimate,
-    DrawnTruth,
-    GalleryMeta,
-    PublishedDetails,
+    KeptEstimate,
     write_item,
 )
 from simtest.validation.paper.isocurves import brightest_point
@@ -42,32 +39,31 @@ def save_realisation(path: Path, experiment: Experiment, case: Case, number: int
     camera, normal = setting.camera, setting.normal
     bp = _on_plane(setting, _bp(setting, stages))
     peak = None if isinstance(patch, Failure) else patch.peak_px.tolist()
-    meta = GalleryMeta(
-        surface=SURFACE,
-        setting=case.setting,
-        label=case.label,
-        sigma=setting.sigma,
-        command=reproduce_command(setting, experiment.estimators, seed),
-        camera=camera,
+    meta = {
+        "surface": SURFACE,
+        "setting": case.setting,
+        "label": case.label,
+        "sigma": setting.sigma,
+        "command": reproduce_command(setting, experiment.estimators, seed),
+        "camera": camera,
         # Behind the imaging camera the BP is nowhere in the picture.
-        truth=[
-            DrawnTruth(
-                0, camera.project(bp).tolist() if bp[2] > 0 else None, normal.tolist(), bp.tolist(), 0.0, 0.0, True
-            )
+        "truth": [
+            {
+                "id": 0, "bp_px": camera.project(bp).tolist() if bp[2] > 0 else None, "normal": normal.tolist(),
+                "position": bp.tolist(), "kd_min": 0.0, "kd_max": 0.0, "isolated": True,
+            }
         ],
-        estimates=[
-            DrawnEstimate(0, 0, peak, name).answered(result, patch, camera, normal)
+        "estimates": [
+            KeptEstimate(specularity=0, true_id=0, bp_px=peak, estimator=name).answered(result, patch, camera, normal)
             for name, (result,) in pipeline.reconstruct([patch]).items()
         ],
-        published=PublishedDetails(
-            length_unit=LENGTH_UNIT,
-            paper=setting.model_dump(),
-            light=stages.light.tolist(),
-            seed=seed,
-            outer=list(pipeline.outer),
-            peak_value=None if isinstance(patch, Failure) else patch.peak_value,
-        ),
-    )
+        "length_unit": LENGTH_UNIT,
+        "paper": setting,
+        "light": stages.light.tolist(),
+        "seed": seed,
+        "outer": pipeline.outer,
+        "peak_value": None if isinstance(patch, Failure) else patch.peak_value,
+    }  # fmt: skip
     write_item(
         path, meta, _in_frame(setting, stages.noisy, pipeline.outer), *_truth_maps(setting),
         texture=texture(setting, stages.light)[::TEXTURE_STEP, ::TEXTURE_STEP],
@@ -80,7 +76,7 @@ def reproduce_command(setting: PaperSetting, estimators: tuple[str, ...], seed: 
     values = ", ".join(f"{key}={value!r}" for key, value in setting.model_dump(exclude_defaults=True).items())
     code = (
         "from simtest.runtime.seeds import from_integer; from simtest.spec.recipes import PaperSetting; "
-        "from simtest.validation.paper.protocol import pipeline_with; "
+        "from simtest.validation.paper.rows import pipeline_with; "
         f"print(pipeline_with(PaperSetting({values}), {estimators!r}).realise([from_integer({seed})]))"
     )
     # Double quotes are easier to read, but the command of a core may hold what a shell would replace in them.
