@@ -1,6 +1,4 @@
-"""Measure what triangulation alone does to a highlight: python -m studies.fineness OUT.png OUT.json [--quick].
-
-OUT.json, as shipped simtest/report/triangle_cost.json, is what the page of a run over anatomies shows.
+"""Measure what triangulation alone does to a highlight: python -m studies.fineness OUT.png [--quick].
 
 A highlight (Phong, camera and light together) on a patch of known shape is traced on triangles of several edge lengths,
 shaded with flat normals, with normals interpolated between exact vertex normals, and between vertex normals estimated
@@ -8,7 +6,6 @@ from the triangles; `cone_axis` reads the normal and the axis ratio from the pic
 mesh with exact vertex normals gives is the reference, so that only the triangles are left.
 """
 
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -164,12 +161,11 @@ def surfaces() -> dict[str, list[tuple[Patches, float]]]:
 
 
 def main() -> None:
-    """Print the table, write it as data, and draw the figure."""
+    """Print the table and draw the figure."""
     from matplotlib import pyplot as plt
 
-    target, data, repeats = Path(sys.argv[1]), Path(sys.argv[2]), 2 if "--quick" in sys.argv else 8
+    target, repeats = Path(sys.argv[1]), 2 if "--quick" in sys.argv else 8
     figure, axes = plt.subplots(2, 4, figsize=(13, 6), sharex=True, sharey="row", constrained_layout=True)
-    curves = []
     for column, (name, patches) in enumerate(surfaces().items()):
         rows: dict[tuple[str, float], list[tuple[float, float]]] = {}
         used = 0
@@ -187,8 +183,6 @@ def main() -> None:
                         rows.setdefault((shading, ratio), []).append(off)
         for shading in SHADINGS:
             cells = np.array([np.nanquantile(rows[shading, ratio], 0.9, axis=0) for ratio in RATIOS])
-            deg, share = (np.round(cells[:, i], 7).tolist() for i in (0, 1))
-            curves.append({"surface": name, "shading": shading, "normal_deg": deg, "axis_ratio": share})
             failed = [int(np.isnan(np.array(rows[shading, ratio])[:, 0]).sum()) for ratio in RATIOS]
             for row in (0, 1):
                 axes[row, column].loglog(RATIOS, np.maximum(cells[:, row], 1e-6) * (1, 100)[row], "o-", label=shading)
@@ -202,10 +196,6 @@ def main() -> None:
     axes[1, 0].set_ylabel("error of the axis ratio, % (90 %)")
     axes[0, 0].legend()
     figure.savefig(target, dpi=90)
-    content = {"edge_over_half_width": RATIOS, "distance_mm": DISTANCE_MM, "exponent": EXPONENT}
-    rows = ",\n".join("  " + json.dumps(curve) for curve in curves)
-    head = ",\n".join(f' "{name}": {json.dumps(value)}' for name, value in content.items())
-    data.write_text(f'{{\n{head},\n "curves": [\n{rows}\n ]\n}}\n', encoding="utf-8")
 
 
 if __name__ == "__main__":

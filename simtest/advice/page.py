@@ -12,8 +12,7 @@ from simtest.advice.plan import DISTANCES, MOST_ASKED
 from simtest.pages import pixels
 from simtest.pages.charts import Axis, Chart, Mark, Panel, embedded, png
 from simtest.pages.html import environment
-from simtest.pages.palette import SERIES
-from simtest.pages.style import number, symbols
+from simtest.pages.style import SERIES, number, symbols
 from simtest.runtime import provenance
 from simtest.runtime.files import make_folder, write_atomically, write_json
 from simtest.runtime.statistics import Interval

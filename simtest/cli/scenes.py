@@ -114,7 +114,7 @@ def view(
         show,
         write_scene_page,
     )
-    from simtest.report.viewer.content import PAGE_GRID
+    from simtest.report.viewer.scene_page import PAGE_GRID
     from simtest.spec import load_scene
 
     described = load_scene(scene, values_of(settings))

@@ -17,7 +17,7 @@ from simtest.dataset.metadata import has_relief
 from simtest.dataset.reader import open_manifest, read_samples, shard_names
 from simtest.dataset.sample import Sample
 from simtest.errors import InputError
-from simtest.pages import palette
+from simtest.pages import style
 from simtest.pages.pixels import jpeg_address
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.files import write_atomically
@@ -30,7 +30,7 @@ CURVATURE_END = 0.15
 
 MAX_SAMPLES = 500
 
-_FRAME_COLOUR, _HIGHLIGHT_COLOUR = palette.SERIES[0], palette.rgb(palette.TRUTH)
+_FRAME_COLOUR, _HIGHLIGHT_COLOUR = style.SERIES[0], style.rgb(style.TRUTH)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from simtest.pages import palette, style
+from simtest.pages import style
 from simtest.runtime.files import as_json
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def environment() -> "Environment":
         "code_spans": code_spans,
     }
     # The templates' own marks take the palette's colours: these stand out on both grounds.
-    made.globals |= {"neutral": palette.NEUTRAL, "accents": palette.ESTIMATOR_COLOURS}
+    made.globals |= {"neutral": style.NEUTRAL, "accents": style.ESTIMATOR_COLOURS}
     return made
 
 

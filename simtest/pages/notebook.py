@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.pages.palette import NEUTRAL, SERIES
 from simtest.pages.pixels import jpeg_address
+from simtest.pages.style import NEUTRAL, SERIES
 
 WIDEST_PX = 760
 """Pictures are made smaller to this width."""

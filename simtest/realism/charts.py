@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from simtest.pages.charts import NOTHING, Axis, Chart, Line, Mark, Panel, finite, log_range
-from simtest.pages.palette import NEUTRAL, SERIES
-from simtest.pages.style import number, symbols
+from simtest.pages.style import NEUTRAL, SERIES, number, symbols
 from simtest.realism.comparison import Comparison, Quartiles, SetOfFrames, statistic_of
 from simtest.realism.distance import NEAR, VERDICTS, StatisticDistance, distance_text, mean_distribution
 from simtest.realism.frame_statistics import COLUMNS

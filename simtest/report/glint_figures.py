@@ -8,8 +8,7 @@ import numpy as np
 import polars as pl
 
 from simtest.pages.charts import Axis, Bars, Chart, Mark, Panel, finite, log_range
-from simtest.pages.palette import NEUTRAL, SERIES
-from simtest.pages.style import number, symbols
+from simtest.pages.style import NEUTRAL, SERIES, number, symbols
 from simtest.report.relief_figures import (
     KD,
     LEVEL,

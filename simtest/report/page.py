@@ -11,25 +11,17 @@ from simtest.pages import style
 from simtest.pages.charts import embedded, packed
 from simtest.pages.html import environment
 from simtest.report import sentences
-from simtest.report.coverage import coverage, is_anatomical
-from simtest.report.error_laws import is_tested, law_results, sentence
+from simtest.report.error_figures import heat_charts, heat_maps, line_chart, line_figures
+from simtest.report.error_laws import is_tested, law_charts, law_colours, law_results, sentence
 from simtest.report.figure_files import THREADS, FigureFiles
 from simtest.report.gallery import Shown, draw_shown, file_name, isophote_keys
 from simtest.report.glint_figures import glint_figures
 from simtest.report.guide_text import guide_content
-from simtest.report.heat_maps import heat_charts, heat_maps
-from simtest.report.law_charts import law_charts, law_colours
-from simtest.report.motion_figures import motion_figures
-from simtest.report.pairs import pairs
 from simtest.report.paper.paper_section import paper_section
-from simtest.report.relief_figures import relief_figures
+from simtest.report.relief_figures import motion_figures, relief_figures, visible_figures
 from simtest.report.run_folder import Run
 from simtest.report.scene3d import framed, kept_scene
-from simtest.report.series import line_chart, line_figures
-from simtest.report.summary_table import HEADINGS, table_rows
-from simtest.report.surface_errors import surface_chart, surface_errors
-from simtest.report.triangle_cost import fineness_charts, read_study
-from simtest.report.visible_figures import visible_figures
+from simtest.report.tables import HEADINGS, coverage, pairs, surface_chart, surface_errors, table_rows
 from simtest.report.write import Progress
 from simtest.validation.kept_frames import KeptItem
 
@@ -80,8 +72,6 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
     # What runs over anatomies show beside, and those without any curve.
     surfaces = surface_errors(run, has_figures=bool(curves or maps or paper or relief))
     boxes = figures.draw("anatomy", [surface_chart(surfaces, colours)]) if surfaces and surfaces.boxes else []
-    study = read_study() if is_anatomical(run) else None
-    fineness = figures.draw("fineness", fineness_charts(study)) if study else []
     view = kept_scene(run)
     frame, parts = framed(view.content, "curvature") if view else ("", [])
 
@@ -92,7 +82,8 @@ def _sections(run: Run, figures: FigureFiles) -> dict[str, Any]:
         "law_colours": law_colours(results),
         "lines": [(curve, chart, sentences.measured(curve)) for curve, chart in lines], "relief": relief,
         "heat": [(chart, sentences.heat_line(item)) for chart, item in zip(heat, maps, strict=True)],
-        "surfaces": surfaces, "boxes": boxes, "coverage": coverage(run), "study": study, "fineness": fineness,
+        "surfaces": surfaces, "boxes": boxes,
+        "coverage": coverage(run),
         "pairs": pairs(run), "cards": cards, "view": view, "frame": packed(frame), "parts": parts,
         "summary": table_rows(run),
         "colours": {name: colours[name] for name in style.estimator_order(colours)},

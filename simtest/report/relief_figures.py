@@ -1,20 +1,23 @@
-"""The figures of runs on a relief: errors against the fine surface and against its base, with law 7.4."""
+"""The figures of runs on a relief: errors against both surfaces with law 7.4, detection, signs told by motion."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, ON_INSTRUMENT
+from simtest.estimators.motion_signs import WRONG_SHARE
 from simtest.pages.charts import NOTHING, Axis, Bars, Chart, Mark, Panel, log_range
-from simtest.pages.style import NEUTRAL, degrees, estimator_order, number
-from simtest.report.curves import bar, scattered, varies
+from simtest.pages.style import NEUTRAL, SERIES, degrees, estimator_order, number, symbols
+from simtest.report.error_figures import axis_title, bar, scattered, varies
 from simtest.report.run_folder import Run
-from simtest.report.series import axis_title
 from simtest.runtime.arrays import Array
 from simtest.spec.keys import name_key
 from simtest.validation import relief_laws
+from simtest.validation.statistics import MotionCounts, motion_counts, motion_rows, row_kind
 
 KD = "kd_base"
 """Distance times the base's principal curvature of larger size: what a swept radius is drawn over."""
@@ -233,3 +236,127 @@ def _largest_gap(values: Array) -> float:
     expected, count = relief_laws.relief_error_share(values, 1.0), len(values)
     above, below = np.arange(1, count + 1) / count - expected, expected - np.arange(count) / count
     return float(max(above.max(), below.max()))
+
+
+_NEEDED = {"visible_id", "visible_snr", "frame_visible"}
+_FOUND, _FALSE = "●", "✖"
+_FRAME = ["setting", "realisation"]
+
+
+def visible_figures(run: Run) -> list[ReliefFigure]:
+    """Compute how many of a frame's visible highlights are detected; none for runs on smooth surfaces."""
+    if not {*run.results.columns} >= _NEEDED:
+        return []
+    rows = run.results.filter(pl.col("frame_visible").is_not_null())
+    # What shines on an instrument is none of the frame's visible highlights.
+    detections = rows.filter(pl.col("specularity").is_not_null() & (row_kind(rows) != ON_INSTRUMENT))
+    detections = detections.unique([*_FRAME, "specularity"], maintain_order=True)
+    if detections.is_empty():
+        return []
+    # Without noise, no peak has a finite ratio to it, and the column is null.
+    over_noise = pl.col("visible_snr").fill_null(np.inf) >= HIGHLIGHT_CONTRAST_SIGMA
+    bright = pl.col("visible_id").is_not_null() & over_noise
+    found = detections.group_by(_FRAME).agg(
+        bright.sum().alias("found"), pl.col("visible_id").is_null().sum().alias("none")
+    )
+    frames = rows.unique(_FRAME, maintain_order=True).select(*_FRAME, "frame_visible")
+    frames = frames.join(found, on=_FRAME, how="left").with_columns(pl.col("found", "none").fill_null(0))
+    x = frames["frame_visible"].to_numpy().astype(float)
+    marks = [
+        Mark(x, frames[column].to_numpy().astype(float), colour, name, symbol=symbol,
+             hover=f"{{x}} visible, {{y}} {name}")
+        for column, name, colour, symbol in (
+            ("found", "found", SERIES[0], _FOUND), ("none", "detections of nothing visible", SERIES[1], _FALSE),
+        )
+    ]  # fmt: skip
+    ends = np.array([0.0, max(float(x.max()), 1.0)])
+    marks.insert(0, Mark(ends, ends, NEUTRAL, "all of them", line="dash", width=1.5))
+    total, seen, none = (int(frames[name].sum()) for name in ("frame_visible", "found", "none"))
+    share = number(100 * seen / total) if total else "0"
+    chart = Chart("relief_detection", "Detection: visible highlights of a frame that were found",
+                  (Panel(Axis("visible highlights of at least 10 sigma in the frame"), Axis("number in the frame"),
+                         tuple(marks)),), 400)  # fmt: skip
+    bins = [
+        f"{_share(frames, low, high)} where a frame holds {low} to {high - 1}"
+        for low, high in pairwise((1, 10, 30, 100))
+    ]
+    return [
+        ReliefFigure(
+            chart,
+            "Detection is scored on what can be seen (theory, section 7): the relief melts glints, and spots without a "
+            "glint shine too.",
+            (f"{share} % of {total} visible highlights are found ({'; '.join(bins)}); "
+             f"{none} of {detections.height} detections show nothing visible.",),
+            "A point is a frame; dashes are where all are found. A detector of isolated highlights leaves out what "
+            "stands too close to a brighter one.",
+        )
+    ]  # fmt: skip
+
+
+def _share(frames: pl.DataFrame, low: int, high: int) -> str:
+    """Return which share of their visible highlights is found in frames that hold so many, in per cent."""
+    own = frames.filter((pl.col("frame_visible") >= low) & (pl.col("frame_visible") < high))
+    total = int(own["frame_visible"].sum())
+    return f"{number(100 * int(own['found'].sum()) / total)} %" if total else "no frame"
+
+
+LENGTH = "views.length_mm"
+
+
+def motion_figures(run: Run) -> list[ReliefFigure]:
+    """Compute the figure of a run with further views; none for other runs."""
+    rows = motion_rows(run.results)
+    if rows.is_empty():
+        return []
+    pooled = motion_counts(rows)
+    share, _, high = pooled.wrong_share
+    measured = [
+        f"Of {pooled.told} told signs {pooled.wrong} are wrong: {number(100 * share)} % of those asked, at most "
+        f"{number(100 * high)} % (95 % interval); stated is at most "
+        f"{number(100 * WRONG_SHARE)} %."
+    ]
+    labels = rows["label"].unique(maintain_order=True).to_list()
+    parts = {label: rows.filter(pl.col("label") == label) for label in labels}
+    measured += [_signs_sentence(label, motion_counts(part)) for label, part in parts.items()]
+    chart = Chart(
+        "motion", "Motion: signs of the curvature that are told",
+        (Panel(Axis("motion over distance", "log"), Axis("share of signs told", limits=(0.0, 1.05)),
+               tuple(_marks({label: part for label, part in parts.items() if _is_swept(part)}))),), 440,
+    )  # fmt: skip
+    about = (
+        "A second view from a known position tells which sign 1 + d k has along each principal direction: convex or "
+        "concave. A sign is told where its likelihood is more than 100 times that of the other one, and some curvature "
+        "explains both views."
+    )
+    caption = (
+        "Each point is a setting: told signs over all signs of its true highlights, two each. A motion along one "
+        "principal direction tells one of two."
+    )
+    return [ReliefFigure(chart, about, tuple(measured), caption)]
+
+
+def _is_swept(rows: pl.DataFrame) -> bool:
+    return LENGTH in rows.columns and rows[LENGTH].drop_nulls().n_unique() > 1
+
+
+def _marks(parts: dict[str, pl.DataFrame]) -> list[Mark]:
+    """Draw the share of told signs of each label over the motion's length."""
+    made, held = [], symbols(parts)
+    for i, (label, rows) in enumerate(parts.items()):
+        by_length = [(_over_distance(own), motion_counts(own)) for _, own in rows.group_by(LENGTH, maintain_order=True)]
+        by_length.sort(key=lambda each: each[0])
+        x, y = np.array([at for at, _ in by_length]), np.array([counts.told_share for _, counts in by_length])
+        hover = [f"{label}\n{_signs_sentence(number(at), counts)}" for at, counts in by_length]
+        colour = SERIES[i % len(SERIES)]
+        made.append(Mark(x, y, colour, label, line="solid", width=0.9, symbol=held[label], hover=hover))
+    return made
+
+
+def _over_distance(rows: pl.DataFrame) -> float:
+    values: Sequence[float] = rows["motion_over_d"].drop_nulls().to_list()
+    return float(np.median(values)) if values else np.nan
+
+
+def _signs_sentence(what: str, counts: MotionCounts) -> str:
+    told = f"{what}: {counts.told} of {counts.signs} signs told, {counts.wrong} wrong"
+    return told + (f"; no curvature explains {counts.misfits} of {counts.judged} highlights" if counts.misfits else "")

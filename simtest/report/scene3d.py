@@ -11,8 +11,7 @@ from zipfile import ZipFile
 import numpy as np
 
 from simtest.conventions import PIXEL_CENTRE
-from simtest.pages.palette import LIGHT, NEUTRAL, colours, estimator_order
-from simtest.pages.style import number
+from simtest.pages.style import LIGHT, NEUTRAL, colours, estimator_order, number
 from simtest.report.gallery import anchor
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import AnyArray, Array, IntArray

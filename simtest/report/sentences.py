@@ -4,9 +4,8 @@ import polars as pl
 
 from simtest.conventions import ON_INSTRUMENT
 from simtest.pages.style import degrees, number
-from simtest.report.heat_maps import HeatMap
+from simtest.report.error_figures import HeatMap, LineFigure, law_misses
 from simtest.report.run_folder import Run
-from simtest.report.series import LineFigure, law_misses
 from simtest.validation.statistics import counts, row_kind
 
 

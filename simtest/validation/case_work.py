@@ -18,13 +18,12 @@ from simtest.runtime.files import write_atomically
 from simtest.runtime.processes import Engine, OnStep
 from simtest.spec import Experiment
 from simtest.spec.recipes import PaperSetting
-from simtest.validation import kept_frames
 from simtest.validation.cases import Case, swept_example
 from simtest.validation.columns import Row, Value, completed, swept_columns, table
 from simtest.validation.paper.gallery_item import save_realisation
 from simtest.validation.paper.predictions import cramer_rao_bound
 from simtest.validation.paper.rows import paper_rows, pipeline_with
-from simtest.validation.realisation import Realiser
+from simtest.validation.realisation import Realiser, keep_frame
 from simtest.validation.run_folder import PARTS, part_file
 from simtest.validation.runner import Job
 
@@ -121,7 +120,7 @@ def _rendered(part: Part, tell: OnStep) -> list[Row]:
         made = realiser.make(experiment, case, number, estimators)
         rows += made.rows
         if part.item and number == part.numbers[0]:
-            kept_frames.save(part.item, realiser.session, experiment, case, made)
+            keep_frame(part.item, realiser.session, experiment, case, made)
         tell()
     return rows
 

@@ -5,27 +5,22 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, field_serializer, field_validator
 
 from simtest.errors import Failure, InputError
-from simtest.estimators import Estimate
 from simtest.geometry import Camera, Patch
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.records import drawable
-from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.files import write_atomically
-from simtest.spec import CameraSpec, Experiment, camera_table
+from simtest.spec import CameraSpec, camera_table
 from simtest.spec.recipes import PaperSetting
-from simtest.validation.cases import Case, swept_example
-from simtest.validation.columns import table
-from simtest.validation.realisation import Realisation
-from simtest.validation.scoring import peak_px
-from simtest.validation.statistics import row_kind
+
+if TYPE_CHECKING:
+    from simtest.estimators import Estimate
 
 MAP_SIDE = 80
 """Truth maps are thinned to about this many samples along the longer side."""
@@ -101,11 +96,14 @@ class KeptEstimate(_Record):
         return [np.array(normal) for normal in self.candidates or single]
 
     def answered(
-        self, result: Estimate | Failure, patch: Patch | Failure, camera: Camera, truth: npt.ArrayLike | None = None
+        self, result: "Estimate | Failure", patch: Patch | Failure, camera: Camera, truth: npt.ArrayLike | None = None
     ) -> "KeptEstimate":
         """Fill in the answer on a patch, and its errors where the true normal, shape (3,), is given."""
         if isinstance(result, Failure):
             return self.model_copy(update={"status": str(result.reason)})
+        # Loaded where a frame is kept: who draws one needs no estimator.
+        from simtest.reconstruction.records import drawable
+
         found: dict[str, Any] = {
             "status": "ok",
             "normal": result.normal.tolist(),
@@ -208,47 +206,6 @@ def read_item(path: Path) -> KeptItem:
         return KeptItem(path.stem, frame, position, normal, meta.camera.model(), meta, pictures)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a gallery file ({error})") from error
-
-
-def save(path: Path, session: Session, experiment: Experiment, case: Case, realisation: Realisation) -> None:
-    """Keep the frame of a realisation, at whose scene the session must be."""
-    scene = realisation.view.scene
-    # Errors and counts are those of the results: a cloud's truth is the base's, and none of the highlights here.
-    held = table(realisation.rows, swept_example([case]))
-    rows = {
-        (row["specularity"], row["estimator"]): {name: row[name] for name in ("kind", "error_deg", "error_oracle_deg")}
-        for row in held.with_columns(kind=row_kind(held)).iter_rows(named=True)
-    }
-    # Thinned maps: enough for arrows and the 3D view.
-    truth = session.truth(stride=max(1, max(session.camera.width, session.camera.height) // MAP_SIDE))
-    meta = {
-        "surface": scene.surface.label,
-        "setting": case.setting if not case.part else f"{case.setting} (part {case.part})",
-        "label": case.label,
-        "sigma": scene.sensor.noise_sigma,
-        "command": case.reproduce_command(experiment, realisation.number),
-        "camera": session.camera,
-        "truth": [
-            {
-                "id": number, "bp_px": each.bp_px.tolist(), "normal": each.normal.tolist(),
-                "position": each.position.tolist(), "kd_min": each.kd_min, "kd_max": each.kd_max,
-                "isolated": each.isolated,
-            }
-            for number, each in enumerate(realisation.truths)
-        ],
-        "estimates": [
-            KeptEstimate(
-                specularity=i, true_id=realisation.matched.get(i), bp_px=peak_px(specularity).tolist(), estimator=name,
-                **rows.get((i, name), {"kind": "failed"}),
-            ).answered(result, specularity.patch, session.camera)
-            for i, specularity in enumerate(realisation.specularities)
-            for name, result in specularity.estimates.items()
-        ],
-        "lights": scene.rig.true_mm().tolist(),
-    }  # fmt: skip
-    # Pictures are encoded once more where they are drawn.
-    linear = scene.sensor.response.model().decode(realisation.frame)
-    write_item(path, meta, linear, truth.position, truth.normal, curvature=truth.larger_curvature)
 
 
 def write_item(

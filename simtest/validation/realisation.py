@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 
 from simtest.errors import Reason
 from simtest.estimators import AnyEstimator
@@ -14,11 +15,13 @@ from simtest.runtime.arrays import Image, Picture, only_reading
 from simtest.simulation.frame import RenderedView, render_view
 from simtest.simulation.highlights import TrueHighlight
 from simtest.spec import Experiment
-from simtest.validation.cases import Case
-from simtest.validation.columns import Row, Value, swept_columns
+from simtest.validation.cases import Case, swept_example
+from simtest.validation.columns import Row, Value, swept_columns, table
 from simtest.validation.glints import rough_truth
+from simtest.validation.kept_frames import MAP_SIDE, KeptEstimate, write_item
 from simtest.validation.motion import MOTION, FurtherView, MotionResult, further_views, with_motion
-from simtest.validation.scoring import MISSED, apart, cloud_rows, match, of_clouds, on_instruments, rows
+from simtest.validation.scoring import MISSED, apart, cloud_rows, match, of_clouds, on_instruments, peak_px, rows
+from simtest.validation.statistics import row_kind
 
 
 @dataclass(frozen=True)
@@ -192,3 +195,44 @@ def realise(
     }
     made = score(session, view, specularities, estimators, common, case.isolated, motion)
     return Realisation(number, view, made.rows, frame, specularities, made.truths, made.matched)
+
+
+def keep_frame(path: Path, session: Session, experiment: Experiment, case: Case, realisation: Realisation) -> None:
+    """Keep the frame of a realisation, at whose scene the session must be."""
+    scene = realisation.view.scene
+    # Errors and counts are those of the results: a cloud's truth is the base's, and none of the highlights here.
+    held = table(realisation.rows, swept_example([case]))
+    rows = {
+        (row["specularity"], row["estimator"]): {name: row[name] for name in ("kind", "error_deg", "error_oracle_deg")}
+        for row in held.with_columns(kind=row_kind(held)).iter_rows(named=True)
+    }
+    # Thinned maps: enough for arrows and the 3D view.
+    truth = session.truth(stride=max(1, max(session.camera.width, session.camera.height) // MAP_SIDE))
+    meta = {
+        "surface": scene.surface.label,
+        "setting": case.setting if not case.part else f"{case.setting} (part {case.part})",
+        "label": case.label,
+        "sigma": scene.sensor.noise_sigma,
+        "command": case.reproduce_command(experiment, realisation.number),
+        "camera": session.camera,
+        "truth": [
+            {
+                "id": number, "bp_px": each.bp_px.tolist(), "normal": each.normal.tolist(),
+                "position": each.position.tolist(), "kd_min": each.kd_min, "kd_max": each.kd_max,
+                "isolated": each.isolated,
+            }
+            for number, each in enumerate(realisation.truths)
+        ],
+        "estimates": [
+            KeptEstimate(
+                specularity=i, true_id=realisation.matched.get(i), bp_px=peak_px(specularity).tolist(), estimator=name,
+                **rows.get((i, name), {"kind": "failed"}),
+            ).answered(result, specularity.patch, session.camera)
+            for i, specularity in enumerate(realisation.specularities)
+            for name, result in specularity.estimates.items()
+        ],
+        "lights": scene.rig.true_mm().tolist(),
+    }  # fmt: skip
+    # Pictures are encoded once more where they are drawn.
+    linear = scene.sensor.response.model().decode(realisation.frame)
+    write_item(path, meta, linear, truth.position, truth.normal, curvature=truth.larger_curvature)

@@ -14,7 +14,7 @@ from simtest.nightly.quantities import ANSWERED, IS_TRUE, REGION_DEG
 from simtest.nightly.records import CELL
 from simtest.runtime.arrays import Array, Mask
 from simtest.validation.columns import BUDGET_COLUMNS, SCHEMA
-from simtest.validation.motion import motion_rows
+from simtest.validation.statistics import motion_rows
 
 ANGLE_DEG = 1e-5
 """Rounding of an angle between two unit normals that are kept in double precision, with room."""

@@ -14,8 +14,7 @@ from simtest.simulation.highlights import CloudRegions
 from simtest.spec import Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
-from simtest.validation.kept_frames import save
-from simtest.validation.realisation import Realiser
+from simtest.validation.realisation import Realiser, keep_frame
 from simtest.validation.scoring import match_cloud
 
 PLANE = {
@@ -63,7 +62,7 @@ def test_the_card_of_a_frame_says_what_the_results_say(tmp_path):
     experiment = validate(Experiment, {"name": "clouds", "seed": 3, "realisations": 1, "groups": [group]}, "experiment")
     realiser, (case,) = Realiser(None), expand(experiment)
     made = realiser.make(experiment, case, 0, {"cone_axis": cone_axis, "cloud": cloud})
-    save(tmp_path / "item.npz", realiser.session, experiment, case, made)
+    keep_frame(tmp_path / "item.npz", realiser.session, experiment, case, made)
     shown = {(each.specularity, each.estimator): each for each in read_item(tmp_path / "item.npz").meta.estimates}
     told = {(row.get("specularity"), row["estimator"]): row for row in made.rows if row.get("specularity") is not None}
     assert shown.keys() == told.keys()

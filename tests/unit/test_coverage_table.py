@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import polars as pl
 import pytest
 
-from simtest.report.coverage import coverage
+from simtest.report.tables import coverage
 
 
 def row(estimator, true_id, status, error=None, law=None, ratio=None, ratio_law=None, setting="a"):

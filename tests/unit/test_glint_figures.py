@@ -10,9 +10,8 @@ import pytest
 from simtest.conventions import ON_INSTRUMENT
 from simtest.report import write_report
 from simtest.report.glint_figures import LEVEL, glint_figures, pooled_ratio
-from simtest.report.relief_figures import KD
+from simtest.report.relief_figures import KD, visible_figures
 from simtest.report.run_folder import Run, completed
-from simtest.report.visible_figures import visible_figures
 
 SLOPE = "surface.relief.bands.0.slope_deg"
 FACTOR = np.sqrt(np.pi / 2)

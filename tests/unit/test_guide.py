@@ -12,8 +12,8 @@ from test_report import make_run
 from simtest.estimators.names import DESCRIPTIONS, describe_estimators
 from simtest.report import write_report
 from simtest.report.guide_text import guide_rows, method_rows, seen_sentence
-from simtest.report.pairs import pairs
 from simtest.report.run_folder import read_run
+from simtest.report.tables import pairs
 from simtest.runtime.statistics import median_interval
 from simtest.spec import load_experiment, load_scene
 from simtest.validation.cases import expand
@@ -419,7 +419,7 @@ def test_methods_say_what_they_are_and_where_they_break():
 
 
 def test_every_estimator_of_this_package_is_described():
-    from simtest.pages.palette import ESTIMATOR_COLOURS
+    from simtest.pages.style import ESTIMATOR_COLOURS
 
     assert set(DESCRIPTIONS) == {*ESTIMATOR_COLOURS, "learned_spot", "learned_dense"}
     assert describe_estimators(["cone_axis"]) == {"cone_axis": DESCRIPTIONS["cone_axis"]}

@@ -9,9 +9,9 @@ import pytest
 from scipy import stats
 
 from simtest.nightly.quantities import setting_figures
-from simtest.report.curves import bar
-from simtest.report.pairs import pairs
+from simtest.report.error_figures import bar
 from simtest.report.run_folder import Run
+from simtest.report.tables import pairs
 from simtest.runtime.statistics import (
     bootstrap_interval,
     deviation_of_mean,

@@ -7,9 +7,8 @@ import polars as pl
 import pytest
 
 from simtest.errors import InputError
-from simtest.report.error_laws import ABSENT, DEPARTS, LAWS, MET, SLOPE, law_results, sentence
-from simtest.report.law_charts import law_charts
-from simtest.report.pairs import pairs
+from simtest.report.error_laws import ABSENT, DEPARTS, LAWS, MET, SLOPE, law_charts, law_results, sentence
+from simtest.report.tables import pairs
 from simtest.spec import load_experiment
 from simtest.validation import laws
 from simtest.validation.cases import expand

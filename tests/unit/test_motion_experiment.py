@@ -11,7 +11,8 @@ from simtest.runtime.seeds import from_integer
 from simtest.spec import load_experiment, scene_from_dict
 from simtest.spec.camera import Moved, Views
 from simtest.validation.cases import expand
-from simtest.validation.motion import motion_counts, motion_rows, told_pose, true_gains
+from simtest.validation.motion import told_pose, true_gains
+from simtest.validation.statistics import motion_counts, motion_rows
 
 SADDLE = {"type": "quadric", "k1_per_mm": 0.05, "k2_per_mm": -0.05, "spin_deg": 30.0}
 

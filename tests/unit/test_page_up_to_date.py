@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from simtest.report import page, up_to_date, write_report
+from simtest.report import page, write, write_report
 from tests.marked import marked
 from tests.unit.test_report import make_run
 
@@ -114,9 +114,9 @@ def test_what_the_page_is_made_of_counts(run, monkeypatch, tmp_path):
 
 
 def test_other_code_or_versions_draw_the_page_again(run, monkeypatch):
-    monkeypatch.setattr(up_to_date, "_code", lambda: "other")
+    monkeypatch.setattr(write, "_code", lambda: "other")
     assert draws(monkeypatch, run)
-    monkeypatch.setattr(up_to_date, "versions", lambda: {"simtest": "99"})
+    monkeypatch.setattr(write, "versions", lambda: {"simtest": "99"})
     assert draws(monkeypatch, run)
 
 

@@ -9,7 +9,7 @@ import pytest
 from skimage.color import deltaE_ciede2000, rgb2lab
 
 from simtest.estimators.names import ESTIMATORS
-from simtest.pages import palette, style
+from simtest.pages import style
 
 # Machado, Oliveira and Fernandes (2009), severity 1, linear RGB: what a dichromat sees, as a normal observer sees it.
 OBSERVERS = {
@@ -24,7 +24,7 @@ OBSERVERS = {
 
 
 def linear(colour):
-    value = np.array(palette.rgb(colour)) / 255
+    value = np.array(style.rgb(colour)) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
@@ -47,39 +47,39 @@ def differences(colours, observer):
 
 @pytest.mark.parametrize("observer", OBSERVERS)
 def test_every_two_colours_differ_for_every_observer(observer):
-    apart = differences([*palette.SERIES, palette.NEUTRAL], observer)
-    assert min(apart.values()) >= palette.LEAST_DIFFERENCE, min(apart, key=apart.get)
+    apart = differences([*style.SERIES, style.NEUTRAL], observer)
+    assert min(apart.values()) >= style.LEAST_DIFFERENCE, min(apart, key=apart.get)
 
 
 def test_the_metric_finds_what_it_is_for():
     """Red and green of one lightness: far apart to a normal observer, alike to a deuteranope."""
     pair = ("#C4583C", "#6E8A32")
     assert differences(pair, "normal")[pair] > 40
-    assert differences(pair, "deuteranope")[pair] < palette.LEAST_DIFFERENCE
+    assert differences(pair, "deuteranope")[pair] < style.LEAST_DIFFERENCE
 
 
-@pytest.mark.parametrize("ground", palette.GROUNDS)
+@pytest.mark.parametrize("ground", style.GROUNDS)
 def test_colours_stand_out_on_light_and_dark(ground):
-    told = {colour: contrast(colour, ground) for colour in [*palette.SERIES, palette.NEUTRAL, *palette.FURTHER]}
-    assert min(told.values()) >= palette.LEAST_CONTRAST, min(told, key=told.get)
+    told = {colour: contrast(colour, ground) for colour in [*style.SERIES, style.NEUTRAL, *style.FURTHER]}
+    assert min(told.values()) >= style.LEAST_CONTRAST, min(told, key=told.get)
 
 
 def test_the_grounds_are_those_of_the_pages():
     """And contrast is WCAG's: black on white is 21, and a grey of 119 is the lightest that has 4.5 on white."""
     sheet = (Path(style.__file__).parent / "templates" / "base.css.j2").read_text(encoding="utf-8")
     grounds = re.findall(r"--bg: (#[0-9a-f]+);", sheet)[:2]
-    assert grounds == ["#fff", palette.GROUNDS[1]]
-    assert palette.rgb(palette.GROUNDS[0]) == (255, 255, 255)
+    assert grounds == ["#fff", style.GROUNDS[1]]
+    assert style.rgb(style.GROUNDS[0]) == (255, 255, 255)
     assert contrast("#000000", "#ffffff") == pytest.approx(21)
     assert contrast("#777777", "#ffffff") < 4.5 < contrast("#767676", "#ffffff")
 
 
 def test_every_installed_estimator_of_this_package_has_a_colour_of_its_own():
-    assert set(ESTIMATORS.names()) >= set(palette.ESTIMATOR_COLOURS)
-    assert len({*palette.SERIES, *palette.FURTHER, palette.NEUTRAL}) == len(palette.SERIES) + len(palette.FURTHER) + 1
+    assert set(ESTIMATORS.names()) >= set(style.ESTIMATOR_COLOURS)
+    assert len({*style.SERIES, *style.FURTHER, style.NEUTRAL}) == len(style.SERIES) + len(style.FURTHER) + 1
 
 
 def test_other_names_take_further_colours_in_the_order_of_the_alphabet():
-    made = palette.colours(["zeta", "cone_axis", "alpha"])
-    assert made == {"zeta": palette.FURTHER[1], "cone_axis": "#166B90", "alpha": palette.FURTHER[0]}
-    assert style.colours is palette.colours
+    made = style.colours(["zeta", "cone_axis", "alpha"])
+    assert made == {"zeta": style.FURTHER[1], "cone_axis": "#166B90", "alpha": style.FURTHER[0]}
+    assert style.colours is style.colours

@@ -12,15 +12,20 @@ from PIL import Image
 from simtest.pages import style
 from simtest.pages.charts import png, spec
 from simtest.report import write_report
-from simtest.report.paper.fits import line, offset_inside_window
-from simtest.report.paper.isocurve_figure import KAPPA, OFFSET_LIGHT, isocurve_figure
-from simtest.report.paper.parameters import DEFAULTS, PARAMETERS
-from simtest.report.paper.stages import stages
-from simtest.report.paper.statements import ABSENT, AGREES, DIFFERS, FEW, PART, statements
-from simtest.report.paper.sweep_chart import BOUND_NAME, LAW_NAME, sweep_chart
-from simtest.report.paper.sweeps import sweep_figures
+from simtest.report.error_figures import line_figures
+from simtest.report.paper.pictures import KAPPA, OFFSET_LIGHT, isocurve_figure, stages
+from simtest.report.paper.statements import (
+    ABSENT,
+    AGREES,
+    DIFFERS,
+    FEW,
+    PART,
+    fit_line,
+    offset_inside_window,
+    statements,
+)
+from simtest.report.paper.sweeps import BOUND_NAME, DEFAULTS, LAW_NAME, PARAMETERS, sweep_chart, sweep_figures
 from simtest.report.run_folder import read_run
-from simtest.report.series import line_figures
 from simtest.spec import Experiment
 from simtest.validation.runner import run_experiment
 from tests.isocurve_formulas import cosine_beta
@@ -239,7 +244,7 @@ def test_limits_are_judged(tmp_path):
 
 
 def test_line_and_window():
-    fitted = line(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, 3.0, 5.0, np.nan]), np.full(4, 0.1))
+    fitted = fit_line(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, 3.0, 5.0, np.nan]), np.full(4, 0.1))
     assert fitted.slope == pytest.approx(2)
     assert fitted.error == pytest.approx(0.1 / np.sqrt(2))
     assert fitted.worst == pytest.approx(0, abs=1e-12)

@@ -55,9 +55,7 @@ def test_a_measured_scene_quotes_its_distance_and_a_changed_one_does_not(tmp_pat
 def test_too_few_real_scenes_carry_no_verdict(tmp_path, measured):
     measured["judged"] = measured["near"] = 0
     (found,) = described(tmp_path, '[[groups]]\nscene = "tissue_colon"\n')
-    assert (
-        "carries no verdict: too few scenes (measured on 12 frames of tissue_colon against 2 real" in found.sentence
-    )
+    assert "carries no verdict: too few scenes (measured on 12 frames of tissue_colon against 2 real" in found.sentence
 
 
 def test_camera_chain_and_relief_alone_are_named(tmp_path):

@@ -17,12 +17,10 @@ from simtest.geometry.camera import Camera
 from simtest.pages.charts import Axis
 from simtest.pages.style import colours, number
 from simtest.report import write_report
-from simtest.report.curves import Curve
-from simtest.report.heat_maps import heat_maps, heat_range
+from simtest.report.error_figures import Curve, _join_mark, heat_maps, heat_range, law_misses, line_chart, line_figures
 from simtest.report.run_folder import read_run
 from simtest.report.scene3d import curvature_limit, framed, kept_scene
-from simtest.report.series import _join_mark, law_misses, line_chart, line_figures
-from simtest.report.surface_errors import _apart
+from simtest.report.tables import _apart
 from simtest.validation import laws
 
 ESTIMATORS = ("circle_pose", "brightest_point", "cone_axis")
@@ -384,10 +382,8 @@ def test_anatomy_gives_surfaces_and_bins(tmp_path):
     path = make_run(tmp_path, "anatomy", realisations=3)
     run = read_run(path)
     page = read_page(write_report(path, charts=True))
-    assert {"surfaces", "coverage", "error_vs_curvature", "fineness"} <= page.ids()
+    assert {"surfaces", "coverage", "error_vs_curvature"} <= page.ids()
     assert png_size(path / "figures" / "anatomy.png")[0] > 800
-    # What triangles alone cost is shown with every run over anatomies, and with no other.
-    assert png_size(path / "figures" / "fineness.png")[0] > 800
     figure = line_figures(run)[0]
     assert not any(curve.joined for curve in figure.curves)
     assert all(curve.x.size <= 12 for curve in figure.curves)

@@ -11,10 +11,9 @@ from simtest.advice.figures import _counted
 from simtest.nightly.page import results
 from simtest.nightly.quantities import harms
 from simtest.nightly.records import CELL
-from simtest.report.coverage import coverage
 from simtest.report.run_folder import Run, completed
 from simtest.report.sentences import headline
-from simtest.report.surface_errors import surface_errors
+from simtest.report.tables import coverage, surface_errors
 from simtest.validation.columns import SCHEMA
 from simtest.validation.statistics import KINDS, counts, is_false, row_kind, summarise
 

@@ -11,7 +11,7 @@ import trimesh
 from simtest.errors import InputError
 from simtest.report.scene3d import curvature_limit, framed
 from simtest.report.viewer import Content, make_content, save_screenshot, show, window, write_scene_page
-from simtest.report.viewer.web_page import errors_deg
+from simtest.report.viewer.scene_page import errors_deg
 from simtest.spec import load_scene
 
 SMALL = {"camera.width": 120, "camera.height": 120, "camera.fx": 120.0, "camera.fy": 120.0}

@@ -23,13 +23,12 @@ from simtest.runtime import provenance
 from simtest.runtime.files import are_nested
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.processes import Engine, OnStep, make_engine
-from simtest.validation import kept_frames
 from simtest.validation.case_work import forget, gallery_cases
 from simtest.validation.cases import swept_example
 from simtest.validation.columns import Row, Value
 from simtest.validation.columns import table as results_table
 from simtest.validation.fingerprints import input_hashes
-from simtest.validation.realisation import answer, realise
+from simtest.validation.realisation import answer, keep_frame, realise
 from simtest.validation.run_folder import EXPORT, check_folder, remove_folder
 from simtest.validation.run_summary import ExperimentSummary, summarise_run, write_results
 from simtest.validation.runner import Progress, Run, RunRecord
@@ -244,7 +243,7 @@ def _scored(part: ScorePart, each: Shown, item: Path | None) -> list[Row]:
         experiment, case = views.experiment, views.case
         made = realise(each.session, experiment, case, each.number, each.view, each.swept, estimators)
         if item is not None:
-            kept_frames.save(item, each.session, experiment, case, made)
+            keep_frame(item, each.session, experiment, case, made)
         return made.rows
     assert isinstance(views, ShardViews)
     maker = maker_of(views.dataset.model_dump_json(), views.variant)

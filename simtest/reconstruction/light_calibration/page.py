@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from simtest.calibration.lights.result import LightCalibration, MeasuredLight
-from simtest.pages import palette, pixels
+from simtest.pages import pixels, style
 from simtest.pages.html import environment
 from simtest.reconstruction.light_calibration.run import Calibrated, View
 from simtest.reconstruction.overlay import write_text
@@ -23,8 +23,8 @@ MARGIN = 0.15
 BRIGHT = 0.999
 """Share of the pixels that are darker than the picture's white on the page."""
 
-MEASURED = palette.LIGHT
-PREDICTED, OUTLINE = (palette.ESTIMATOR_COLOURS[name] for name in ("circle_pose", "brightest_point"))
+MEASURED = style.LIGHT
+PREDICTED, OUTLINE = (style.ESTIMATOR_COLOURS[name] for name in ("circle_pose", "brightest_point"))
 
 
 def write_calibration(made: Calibrated, out: Path, command: str = "") -> list[Path]:

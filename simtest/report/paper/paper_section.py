@@ -7,11 +7,9 @@ from simtest.pages import style
 from simtest.pages.charts import Chart
 from simtest.pages.style import labelled
 from simtest.report.figure_files import FigureFiles
-from simtest.report.paper.isocurve_figure import isocurve_charts, isocurve_figure
-from simtest.report.paper.stages import Stages, stage_charts, stages
+from simtest.report.paper.pictures import Stages, isocurve_charts, isocurve_figure, stage_charts, stages
 from simtest.report.paper.statements import AGREES, ARTICLE, DIFFERS, Statement, statements
-from simtest.report.paper.sweep_chart import sweep_chart
-from simtest.report.paper.sweeps import SweepFigure, sweep_figures
+from simtest.report.paper.sweeps import SweepFigure, sweep_chart, sweep_figures
 from simtest.report.run_folder import Run
 
 

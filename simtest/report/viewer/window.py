@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
-from simtest.pages.palette import LIGHT, colours
+from simtest.pages.style import LIGHT, colours
 from simtest.report.scene3d import CAMERA, TRUE, TRUE_BASE, Content, curvature_limit, estimators
 from simtest.runtime.files import write_atomically
 
