@@ -15,12 +15,12 @@ import numpy as np
 from benchmarks.measuring import print_markdown
 from simtest.calibration import Calibration
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.options import DEFAULT_ESTIMATORS
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.reconstruction.records import best_of
 from simtest.rendering import Session
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, Image
 from simtest.simulation.frame import render_view
 from simtest.spec import load_scene

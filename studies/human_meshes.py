@@ -18,12 +18,12 @@ from benchmarks.measuring import print_markdown
 from simtest.detection.colour import ColourDetector
 from simtest.errors import Failure, SimtestError
 from simtest.estimators import Estimate
-from simtest.geometry import chi_squared
 from simtest.geometry.patch import encloses
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.reconstruction.records import Specularity
 from simtest.rendering import Session
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array
 from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec import load_scene

@@ -25,9 +25,9 @@ from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.learned import normal_of
 from simtest.estimators.learned_dense import LEAST_HIGHLIGHTS, LearnedDense
-from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg, tangent_basis, tangent_coordinates
 from simtest.reconstruction.pipeline import reconstruct
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array
 from simtest.runtime.statistics import CONFIDENCE, NORMAL_QUANTILE
 from studies.networks.examples import DENSE_FIELDS, sample_frame, truth_at

@@ -23,9 +23,9 @@ from simtest.dataset.sample import Sample
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.learned_spot import LearnedSpot
-from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.pipeline import reconstruct
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array
 from simtest.runtime.statistics import CONFIDENCE, NORMAL_QUANTILE
 from studies.networks.examples import NEAR_PX, SPOT_FIELDS, only_glints, sample_frame

@@ -22,8 +22,8 @@ import torch
 from simtest.cli.progress import progress_bar
 from simtest.estimators.learned import normal_of
 from simtest.estimators.learned_spot import ROTATION_SCALE, SURFACES, LearnedSpot, SpotNetwork, log_deviation
-from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import AnyArray, Array
 from simtest.runtime.statistics import CONFIDENCE
 from studies.networks.examples import Examples, read_spots

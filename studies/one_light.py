@@ -31,12 +31,12 @@ from simtest.calibration import Calibration, Normal, Priors, Uniform, exactly
 from simtest.dataset.plan import Drawn, Plan
 from simtest.errors import Failure
 from simtest.estimators import Estimate, prior_parts
-from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.options import Options, default_estimators
 from simtest.reconstruction.pipeline import run
 from simtest.reconstruction.records import Specularities
 from simtest.rendering import Session
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import RenderedView

@@ -15,9 +15,10 @@ import numpy as np
 
 from simtest.estimators.prior_parts import camera_part
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Array, ViewMask, chi_squared
+from simtest.geometry import Array, ViewMask
 from simtest.geometry.vectors import tangent_coordinates
 from simtest.reconstruction.assumptions import CENTRE_SD_SHARE, FOCAL_SD, calibration_of_round_view
+from simtest.runtime import chi_squared
 
 FIELDS_DEG = (60.0, 90.0, 120.0, 140.0, 160.0, 170.0)
 SHARES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)

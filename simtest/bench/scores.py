@@ -8,8 +8,8 @@ import polars as pl
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from simtest.bench.suite import Layout, digest_of
-from simtest.geometry import chi_squared
 from simtest.geometry.vectors import tangent_coordinates
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import Json, JsonObject
 from simtest.runtime.statistics import (

@@ -30,7 +30,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from simtest.geometry import Array, Index, Mask, Patch, chi_squared
+from simtest.geometry import Array, Index, Mask, Patch
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import AnyArray, Image
 from simtest.runtime.fitted import fitted_number
 from simtest.runtime.statistics import CONFIDENCE

@@ -27,8 +27,9 @@ from simtest.estimators.cloud_mixture import (
 from simtest.estimators.cloud_shape import LOBE_RAD2, CloudShape, slope_of
 from simtest.estimators.prior_parts import add_common_parts, light_offset_part, mean_light_part
 from simtest.estimators.protocol import Estimate, EstimatedCurvature
-from simtest.geometry import Array, Camera, chi_squared
+from simtest.geometry import Array, Camera
 from simtest.geometry.vectors import basis_across
+from simtest.runtime import chi_squared
 from simtest.runtime.fitted import fitted_number
 from simtest.runtime.statistics import CONFIDENCE
 

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtest.calibration import Distribution, Uniform
-from simtest.geometry import Array, chi_squared
+from simtest.geometry import Array
 from simtest.geometry.vectors import basis_across
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import short_repr
 from simtest.runtime.statistics import CONFIDENCE
 

@@ -17,8 +17,9 @@ import numpy.typing as npt
 from simtest.calibration import Priors
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Array, chi_squared
+from simtest.geometry import Array
 from simtest.geometry.vectors import basis_across, tangent_coordinates
+from simtest.runtime import chi_squared
 
 STEPS = 30
 STEP = 1e-5

@@ -18,8 +18,9 @@ from simtest.estimators.highlight import OfHighlight, along, of_spot
 from simtest.estimators.least_squares import LobeFit, Model, fit_lobe
 from simtest.estimators.protocol import Estimate, Law
 from simtest.estimators.small_spots import HighlightAxis, SmallSpot
-from simtest.geometry import Array, Camera, Mask, Patch, chi_squared
+from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.geometry.vectors import basis_across, tangent_coordinates
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Index
 from simtest.runtime.fitted import fitted_number
 

@@ -16,9 +16,10 @@ from simtest.calibration.priors import AT_CAMERA_MM
 from simtest.estimators.budget import equivalent_covariance
 from simtest.estimators.protocol import Estimate
 from simtest.estimators.small_spots import HighlightAxis
-from simtest.geometry import Array, Camera, Patch, chi_squared
+from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.lenses import undistort_with_errors
 from simtest.geometry.vectors import basis_across, bisect, tangent_coordinates
+from simtest.runtime import chi_squared
 from simtest.runtime.fitted import fitted_number
 from simtest.runtime.statistics import CONFIDENCE
 

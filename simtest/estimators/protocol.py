@@ -12,9 +12,10 @@ from simtest.errors import Failure, Reason
 from simtest.estimators.budget import LARGEST_VARIANCE, STATED, Budget, bounded, deviations, total
 from simtest.estimators.cloud_shape import CloudShape
 from simtest.estimators.isophotes import FittedIsophote
-from simtest.geometry import Array, Camera, Patch, chi_squared
+from simtest.geometry import Array, Camera, Patch
 from simtest.geometry.cones import PoseRegion
 from simtest.geometry.vectors import covariance_across, deviation_deg, tilt_deg
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import LONGEST, clipped, vector
 
 Target = Literal["fine", "base"]

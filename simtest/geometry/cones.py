@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import Failure, Reason
-from simtest.geometry import chi_squared
 from simtest.geometry.camera import Camera
 from simtest.geometry.ellipse_fit import FittedConic, FittedConics
 from simtest.geometry.vectors import tangent_basis
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, Mask
 from simtest.runtime.statistics import CONFIDENCE
 

@@ -9,8 +9,8 @@ import numpy as np
 import polars as pl
 
 from simtest.conventions import MOTION, MOTION_COLUMNS, ON_INSTRUMENT
-from simtest.geometry import chi_squared
 from simtest.nightly.records import CELL, FIGURES, Cell
+from simtest.runtime import chi_squared
 from simtest.runtime.statistics import CONFIDENCE, mean_interval, share_interval
 from simtest.validation.columns import BUDGET_COLUMNS, SCHEMA
 from simtest.validation.statistics import PENALTY_DEG, figures, is_false, units

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.estimators.budget import deviations
-from simtest.geometry import chi_squared
 from simtest.geometry.vectors import covariance_across, tilt_deg
 from simtest.pages.html import write_page
 from simtest.pages.notebook import note_html, picture_html, table_html
@@ -26,6 +25,7 @@ from simtest.reconstruction.explanations import kind_name
 from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.records import Points, Specularities, Specularity, cloud_members
 from simtest.reconstruction.tracking import DoneFrame, Track
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Image
 from simtest.runtime.files import JsonObject
 

@@ -12,7 +12,7 @@ import polars as pl
 from pydantic import BaseModel, ConfigDict, Field
 
 from simtest.conventions import MOTION, MOTION_COLUMNS, ON_INSTRUMENT
-from simtest.geometry import chi_squared
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.statistics import CONFIDENCE, Interval, mean_interval, root_mean_square, share_interval
 

@@ -10,8 +10,8 @@ from simtest.errors import Failure
 from simtest.estimators.cloud import cloud
 from simtest.estimators.cloud_shape import slope_of
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
+from simtest.runtime import chi_squared
 from simtest.validation.scoring import mahalanobis2
 from studies.clouds.frames import BaseFrame
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from simtest.geometry import chi_squared
+from simtest.runtime import chi_squared
 from simtest.runtime.statistics import share_interval
 
 CHI2_95 = chi_squared.quantile(0.95, 2)

@@ -11,8 +11,8 @@ from scipy.optimize import linear_sum_assignment
 from simtest.calibration import Calibration, Response
 from simtest.calibration.lights.result import LightCalibration
 from simtest.errors import InputError
-from simtest.geometry import chi_squared
 from simtest.reconstruction.light_calibration.run import Ball, Calibrated, calibrate_lights
+from simtest.runtime import chi_squared
 from studies.light_calibration.plantings import Planting, plant, write_pictures
 from studies.light_calibration.points import about, measured_points
 

@@ -24,8 +24,9 @@ from simtest.detection.colour import ColourDetector
 from simtest.estimators.brightest_point import OF_APEX, budget_of_peak
 from simtest.estimators.family import OF_MEAN, OF_PEAK, IsophoteFamily
 from simtest.estimators.highlight import fit_highlight
-from simtest.geometry import Array, Camera, Mask, Patch, chi_squared
+from simtest.geometry import Array, Camera, Mask, Patch
 from simtest.reconstruction.pipeline import reconstruct
+from simtest.runtime import chi_squared
 from simtest.runtime.seeds import Stage, generator
 from simtest.simulation.sensor import capture, collect
 from simtest.spec.sensor import Sensor

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis.extra.numpy import array_shapes, arrays
 from scipy import ndimage, stats
 
-from simtest.geometry import chi_squared
 from simtest.geometry.patch import closed, connected, dilated, rows_and_columns
+from simtest.runtime import chi_squared
 
 SQUARE = np.ones((3, 3), dtype=bool)
 masks = arrays(np.bool_, array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=24))

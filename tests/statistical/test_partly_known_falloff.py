@@ -13,8 +13,9 @@ from simtest.calibration.photometry import AngularProfile
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER
 from simtest.estimators.names import load_estimators
 from simtest.estimators.prior_parts import TILT
-from simtest.geometry import Camera, Patch, chi_squared, smooth
+from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import tangent_coordinates
+from simtest.runtime import chi_squared
 from simtest.spec import scene_from_dict
 
 DRAWS, ALPHA, NOISE = 200, 0.01, 1e-3

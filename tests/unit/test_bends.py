@@ -11,8 +11,9 @@ from simtest.estimators.budget import MELTED, MELTED_RESIDUAL, bend_variance
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.curved import curved
 from simtest.estimators.family import OF_MEAN, OF_PEAK, fit_isophote_family
-from simtest.geometry import Camera, Patch, chi_squared, smooth
+from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import tangent_coordinates
+from simtest.runtime import chi_squared
 
 CAMERA = Camera(120, 100, 300.0, 300.0, 60.0, 50.0)
 CENTRE = np.array([58.3, 50.8])

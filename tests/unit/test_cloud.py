@@ -16,9 +16,10 @@ from simtest.estimators.cloud_mixture import fit_mixture, sampling_covariance, w
 from simtest.estimators.cloud_shape import slope_of
 from simtest.estimators.dispatch import run_in_frame
 from simtest.estimators.protocol import CloudEstimator
-from simtest.geometry import Camera, chi_squared
+from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg, basis_across, tangent_coordinates
 from simtest.reconstruction.pipeline import reconstruct
+from simtest.runtime import chi_squared
 
 CAMERA = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 FORWARD = np.array([0.0, 0.0, 1.0])

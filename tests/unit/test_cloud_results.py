@@ -9,6 +9,7 @@ from simtest.estimators.cloud import CloudCentre, cloud
 from simtest.estimators.cone_axis import cone_axis
 from simtest.geometry.vectors import angle_deg
 from simtest.pages.style import degrees
+from simtest.report.gallery import result_of
 from simtest.report.run_folder import read_item
 from simtest.simulation.highlights import CloudRegions
 from simtest.spec import Experiment
@@ -69,8 +70,8 @@ def test_the_card_of_a_frame_says_what_the_results_say(tmp_path):
     for key, row in told.items():
         assert (shown[key].error_deg, shown[key].status) == (row.get("error_deg"), row["status"])
     (of_cloud,) = [each for (_, name), each in shown.items() if name == "cloud"]
-    assert of_cloud.result == degrees(of_cloud.error_deg) != "–"
-    results = [each.result for (_, name), each in shown.items() if name == "cone_axis"]
+    assert result_of(of_cloud) == degrees(of_cloud.error_deg) != "–"
+    results = [result_of(each) for (_, name), each in shown.items() if name == "cone_axis"]
     assert sum("in a spot of several glints or of none" in result for result in results) == sum(
         row["true_id"] is None and row["visible_id"] is not None
         for row in told.values()

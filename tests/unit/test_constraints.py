@@ -12,12 +12,13 @@ from simtest.detection import Detection, Region
 from simtest.detection.view import View
 from simtest.errors import Failure, Reason
 from simtest.estimators import Estimate
-from simtest.geometry import Camera, chi_squared
+from simtest.geometry import Camera
 from simtest.reconstruction.motion import NEEDED, TrackedHighlight
 from simtest.reconstruction.options import Choices, Options
 from simtest.reconstruction.outputs import constraints_arrays
 from simtest.reconstruction.pipeline import reconstruct_values
 from simtest.reconstruction.records import Specularities, Specularity
+from simtest.runtime import chi_squared
 from simtest.runtime.files import write_json
 from simtest.validation.columns import WHOLE
 

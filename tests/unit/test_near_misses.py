@@ -23,11 +23,12 @@ from simtest.estimators.prior_parts import (
     USUAL,
     near_miss_variance,
 )
-from simtest.geometry import Camera, Patch, chi_squared, smooth
+from simtest.geometry import Camera, Patch, smooth
 from simtest.reconstruction.options import Options
 from simtest.reconstruction.pipeline import reconstruct, run
 from simtest.reconstruction.records import Specularities, best_of
 from simtest.rendering import Session
+from simtest.runtime import chi_squared
 from simtest.simulation.frame import render_view
 from simtest.spec import load_scene
 from tests.unit.core_helpers import PATCH

@@ -7,7 +7,7 @@ import pytest
 
 from simtest.calibration import Priors
 from simtest.cli.pictures import calibrate
-from simtest.geometry import chi_squared
+from simtest.runtime import chi_squared
 from simtest.spec.calibration_file import load_calibration, save_calibration
 from studies.light_calibration.closed_loop import plain_calibration, rows_of_rig
 from studies.light_calibration.plantings import plant

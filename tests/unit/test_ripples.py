@@ -11,8 +11,9 @@ from simtest.estimators.brightest_point import brightest_point
 from simtest.estimators.budget import HARMONICS, excess, ripples, spectrum
 from simtest.estimators.cone_axis import cone_axis
 from simtest.estimators.family import fit_isophote_family
-from simtest.geometry import Camera, Patch, chi_squared, smooth
+from simtest.geometry import Camera, Patch, smooth
 from simtest.geometry.vectors import tangent_coordinates
+from simtest.runtime import chi_squared
 
 CAMERA = Camera(120, 100, 300.0, 300.0, 60.0, 50.0)
 SMOOTHING_PX = 2.0

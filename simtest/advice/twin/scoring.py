@@ -10,10 +10,10 @@ import numpy as np
 from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.errors import Failure
 from simtest.estimators import Estimate
-from simtest.geometry import chi_squared
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.records import Specularities, Specularity
 from simtest.rendering import Session
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array
 from simtest.simulation.frame import RenderedView
 from simtest.validation.scoring import mahalanobis2, match, on_instruments, peak_px

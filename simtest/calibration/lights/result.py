@@ -9,8 +9,8 @@ import numpy as np
 from simtest.calibration.lights.bundle import REACH_MM, Bundle, Highlights, solve
 from simtest.calibration.lights.mirrors import Mirrors
 from simtest.calibration.lights.search import Found
-from simtest.geometry import chi_squared
 from simtest.geometry.camera import Camera
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, Index
 from simtest.runtime.statistics import NORMAL_QUANTILE
 

@@ -22,8 +22,8 @@ from simtest.calibration.lights.bundle import (
     with_error,
 )
 from simtest.calibration.lights.mirrors import Mirrors
-from simtest.geometry import chi_squared
 from simtest.geometry.camera import Camera
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, Index, Mask
 
 MOST_LIGHTS = 4
