@@ -40,12 +40,11 @@ def render(scene: SceneName, /, *, out: Out, settings: Settings = None, variant:
     and lobe, as far as the scene says that they are known; `simtest reconstruct --camera` reads it.
     """
     from simtest import api
-    from simtest.simulation.frame_files import write_frame
 
     with exclusive_folder(out):
         with progress_bar("finding the truth", stopped="nothing is written") as move:
             frame = api.render(scene, values_of(settings), variant, move)
-        files = write_frame(frame, out)
+        files = frame.write(out)
     return Told(files, {"highlights": len(frame.highlights)})
 
 

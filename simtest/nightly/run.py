@@ -11,7 +11,6 @@ from pathlib import Path
 import polars as pl
 
 from simtest.errors import InputError
-from simtest.estimators import load_estimators
 from simtest.nightly.compare import compare
 from simtest.nightly.outputs import FILES, write_outputs
 from simtest.nightly.page import REPORTS, write_nightly_page
@@ -41,7 +40,7 @@ from simtest.runtime.processes import Engine, make_engine
 from simtest.spec import Experiment, Profile, experiments_of
 from simtest.validation.cases import Case, expand
 from simtest.validation.fingerprints import definition
-from simtest.validation.runner import Progress, run_experiments, variant_of
+from simtest.validation.runner import Progress, check_estimators, run_experiments, variant_of
 
 
 @dataclass(frozen=True)
@@ -109,8 +108,7 @@ Planned = tuple[list[Experiment], list[list[Case]]]
 def plan_run(profile: Profile) -> Planned:
     """Return what a profile runs; raise `InputError` for whatever is malformed, before anything is made."""
     experiments = experiments_of(profile)
-    for experiment in experiments:
-        load_estimators(experiment.estimators)
+    check_estimators(experiments)
     return experiments, [expand(experiment) for experiment in experiments]
 
 

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -168,6 +169,12 @@ class LabelledFrame(RenderedView):
     truth: TruthMaps
     world_from_camera: Array
     variant: str
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write the files of `simtest render` into a folder, made if need be; return them."""
+        from simtest.simulation.frame_files import write_frame
+
+        return write_frame(self, Path(folder))
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the lit surface with its highlights, and what was rendered."""

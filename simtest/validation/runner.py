@@ -196,7 +196,7 @@ def run_experiments(
     left = [job for job in jobs if job.folder not in finished]
     _warn_of_kept([job for job in jobs if job.folder in finished])
     # Check: everything that may be refused is refused before a folder is touched.
-    cores = _check_estimators(left)
+    cores = _checked_cores(left)
     for job in jobs:
         check_folder(job.folder)
     # Run what is not finished.
@@ -253,15 +253,17 @@ def _warn_of_another(job: Job) -> None:
         warnings.warn(f"{job.folder}: {what}; it is replaced", stacklevel=4)
 
 
-def _check_estimators(jobs: Sequence[Job]) -> dict[Path, Cores]:
-    """Raise `InputError` for unknown estimators; return what the records of the runs, by folder, say of cores.
-
-    The workers load them; a finished run names none that is unknown.
-    """
-    if jobs:
+def check_estimators(experiments: Sequence[Experiment]) -> None:
+    """Raise `InputError` for estimators that are unknown; the workers load them."""
+    if experiments:
         from simtest.estimators.names import load_estimators
-    for job in jobs:
-        load_estimators(job.experiment.estimators)
+    for experiment in experiments:
+        load_estimators(experiment.estimators)
+
+
+def _checked_cores(jobs: Sequence[Job]) -> dict[Path, Cores]:
+    """Return what the records of the runs, by folder, say of cores; a finished run names no unknown estimator."""
+    check_estimators([job.experiment for job in jobs])
     return {job.folder: core_records(job.experiment.estimators) for job in jobs}
 
 
