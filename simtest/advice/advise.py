@@ -1,5 +1,6 @@
-"""Asks a scope what it can reach: writes the experiments, runs them, renders a frame, and reads the answers."""
+"""Asks a scope what it can reach: writes and runs the experiment, renders a frame, reads the answers, writes them."""
 
+import math
 import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -9,17 +10,34 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from simtest.advice.break_points import BreakPoint, SpotSize, break_points, spot_size
-from simtest.advice.figures import Found, read_results
-from simtest.advice.plan import Question, main_experiment, surroundings, write_experiment
+from simtest.advice.answers import (
+    WIDE,
+    BreakPoint,
+    Choice,
+    Found,
+    MethodAnswers,
+    SpotSize,
+    break_points,
+    read_results,
+    spot_size,
+)
+from simtest.advice.plan import DISTANCES, MOST_ASKED, Question, main_experiment, surroundings, write_experiment
 from simtest.errors import InputError
+from simtest.pages import pixels
+from simtest.pages.charts import Axis, Chart, Mark, Panel, embedded, png
+from simtest.pages.html import environment
+from simtest.pages.palette import SERIES
 from simtest.pages.pixels import Pixels
-from simtest.runtime.files import make_folder, write_atomically
+from simtest.pages.style import number, symbols
+from simtest.runtime import provenance
+from simtest.runtime.files import make_folder, write_atomically, write_json
 from simtest.runtime.processes import make_engine
+from simtest.runtime.statistics import Interval
 from simtest.simulation.frame import make_frame
 from simtest.simulation.sensor import displayed
 from simtest.spec import Experiment, load_scene
 from simtest.spec.toml_files import toml_tables
+from simtest.validation import laws
 from simtest.validation.runner import run_experiments
 
 MAIN, SCENE, FRAME, RUN = "experiment.toml", "scene.toml", "frame.png", "run"
@@ -166,3 +184,146 @@ def _commands(out: Path) -> dict[str, str]:
         "errors": words("validate", out / MAIN, "--out", out / RUN),
         "picture": words("render", out / SCENE, "--out", out / "frame"),
     }
+
+
+PAGE, RESULT = "index.html", "advice.json"
+
+PICTURE_HEIGHT_PX = 480
+
+_SURFACES = {"fine": "the fine surface", "base": "the organ below its relief"}
+
+
+def write_advice(found: Advised, out: Path, command: str = "") -> Path:
+    """Write an advice into a folder; return the page.
+
+    Parameters
+    ----------
+    found : Advised
+        What to write.
+    out : Path
+        Gets advice.json, index.html and figures/distance.png.
+    command : str
+        How the advice was called.
+    """
+    make_folder(out / "figures")
+    chart = distance_chart(found)
+    content = png([chart])
+    write_atomically(out / "figures" / "distance.png", lambda part: part.write_bytes(content))
+    made_by = provenance.environment()
+    html = environment().get_template("advice.html.j2").render(
+        found=found, answers=[sentence(found, choice) for choice in found.found.choices] or [NOTHING],
+        chart=chart, picture=pixels.data_address(found.picture, PICTURE_HEIGHT_PX), command=command,
+        narrower=narrower(found, command), distances=DISTANCES,
+        interval=interval, surfaces=_SURFACES,
+        parts=list(dict.fromkeys(name for each in found.found.methods for name in each.budget_deg)),
+        provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"], "python": made_by["python"]},
+        **embedded([chart]),
+    )  # fmt: skip
+    write_json(out / RESULT, {**found.to_json(), "run": {"command": command, **made_by}})
+    write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
+    return out / PAGE
+
+
+NOTHING = "No highlight was found in the frames: there is nothing to compare the methods by."
+
+
+def sentence(found: Advised, choice: Choice) -> str:
+    """Return which method to use for a surface's normal, with the error to expect."""
+    surface = _SURFACES[choice.target]
+    if choice.best is None:
+        return f"For the normal of {surface} no method answered."
+    method = found.found.method(choice.best)
+    text = f"For the normal of {surface} use {choice.best}: mean error {number(method.own.mean_deg)} deg"
+    text += f" (95 % interval {interval(method.own.interval_deg)}), {method.answered} of {method.asked} answered."
+    if choice.ties:
+        text += f" It cannot be told from {', '.join(choice.ties)}."
+    text += _nearer(found, method)
+    if method.own.is_wide:
+        text += f" The interval is wide: {_remedy(found, choice)}"
+    return text
+
+
+def _nearer(found: Advised, best: MethodAnswers) -> str:
+    """Return a sentence if a method of the fine surface comes nearer to the base than the best of those that state it.
+
+    Only methods that state the base's normal are ranked for it, however few answers they have.
+    """
+    if best.target == "fine" or best.own.mean_deg is None:
+        return ""
+    others = [each for each in found.found.methods if each.target == "fine" and each.base.mean_deg is not None]
+    nearest = min(others, key=lambda each: each.base.mean_deg or 0.0, default=None)
+    if nearest is None or (nearest.base.mean_deg or 0.0) >= best.own.mean_deg:
+        return ""
+    return (
+        f" In these frames the fine normals of {nearest.estimator} lie nearer to it: mean "
+        f"{number(nearest.base.mean_deg)} deg, {nearest.answered} of {nearest.asked} answered."
+    )
+
+
+def _remedy(found: Advised, choice: Choice) -> str:
+    """Return what makes the interval of a choice's error narrower."""
+    frames = frames_for(found, choice)
+    if frames is None or choice.best is None:
+        return "more frames (--frames) make it narrower."
+    reach = 100 * (found.found.method(choice.best).own.reach or 0.0)
+    return f"it reaches {reach:.0f} % from the mean; {frames} frames would narrow it to about {100 * WIDE:.0f} %."
+
+
+def narrower(found: Advised, command: str) -> str | None:
+    """Return the command with the frames that narrow the first interval that is too wide; None where there is none."""
+    frames = next((frames for choice in found.found.choices if (frames := frames_for(found, choice))), None)
+    if frames is None or not command:
+        return None
+    words = shlex.split(command)
+    if "--frames" in words[:-1]:
+        at = words.index("--frames")
+        del words[at : at + 2]
+    return shlex.join([*(word for word in words if not word.startswith("--frames=")), "--frames", str(frames)])
+
+
+def frames_for(found: Advised, choice: Choice) -> int | None:
+    """Return about how many frames narrow the interval of a choice's error to `WIDE`.
+
+    The width of the mean's logarithm falls with the root of the number. None where the interval is narrow enough or
+    unknown, or where so many frames are not allowed.
+    """
+    reach = None if choice.best is None else found.found.method(choice.best).own.reach
+    if reach is None or reach <= WIDE:
+        return None
+    needed = math.ceil(found.found.frames * (math.log1p(reach) / math.log1p(WIDE)) ** 2 / DISTANCES) * DISTANCES
+    return needed if needed <= MOST_ASKED else None
+
+
+def interval(ends: Interval) -> str:
+    """Write an interval."""
+    return "–" if ends[0] is None else f"{number(ends[0])} to {number(ends[1])}"
+
+
+def distance_chart(found: Advised) -> Chart:
+    """Describe the best methods' mean error over the distance, with the laws of the light's offset."""
+    asked = found.question
+    near, far = asked.distances_mm
+    at = np.geomspace(near / 1.3, far * 1.3, 60)
+    offset = float(np.mean(asked.scope.offsets_mm))
+    marks = []
+    if offset:
+        ignored = np.degrees(laws.offset_error(offset / at))
+        points = np.stack([np.zeros_like(at), np.zeros_like(at), at], axis=-1)
+        known = np.degrees(laws.bisector_residual(points, np.array([offset, 0.0, 0.0]), asked.middle_mm / at - 1))
+        marks += [
+            Mark(at, ignored, SERIES[1], "law: offset ignored", line="dash", hover="{x} mm: {y} deg"),
+            Mark(at, known, SERIES[2], "law: bisector, range known", line="dot", hover="{x} mm: {y} deg"),
+        ]
+    bound = f"bound, {asked.bound_deg:g} deg"
+    marks.append(Mark([at[0], at[-1]], [asked.bound_deg] * 2, SERIES[5], bound, line="dashdot"))
+    for colour, choice in zip((SERIES[0], SERIES[3]), found.found.choices, strict=False):
+        rows = [(d, each) for d, each in sorted(choice.by_distance.items()) if each.mean_deg is not None and d > 0]
+        if not rows or choice.best is None:
+            continue
+        x, y = [d for d, _ in rows], [float(each.mean_deg or 0.0) for _, each in rows]
+        told = [f"{choice.best}, {choice.target}\n{d:g} mm: {number(v)} deg, {each.answered} answers"
+                for v, (d, each) in zip(y, rows, strict=True)]  # fmt: skip
+        symbol = symbols(["fine", "base"])[choice.target]
+        marks.append(Mark(x, y, colour, f"{choice.best} ({choice.target})", symbol=symbol, size=9, hover=told))
+    panel = Panel(Axis("distance (mm)", "log"), Axis("mean error (deg)", "log"), tuple(marks))
+    return Chart("distance", "Mean error over the distance", (panel,), 420)

@@ -10,13 +10,9 @@ import polars as pl
 import pytest
 
 import simtest
-from simtest.advice import draws
-from simtest.advice.advise import MAIN, RUN, advise, write_scene
-from simtest.advice.break_points import break_points, spot_size
-from simtest.advice.draws import drawn_values
-from simtest.advice.figures import mean_error, read_results
-from simtest.advice.organs import ORGANS, Surroundings, wall
-from simtest.advice.page import narrower, sentence, write_advice
+from simtest.advice import plan
+from simtest.advice.advise import MAIN, RUN, advise, narrower, sentence, write_advice, write_scene
+from simtest.advice.answers import break_points, mean_error, read_results, spot_size
 from simtest.advice.plan import (
     DISTANCES,
     LEAST_FRAMES,
@@ -24,11 +20,13 @@ from simtest.advice.plan import (
     Question,
     affordable,
     distances_of,
+    drawn_values,
     main_experiment,
     surroundings,
     write_experiment,
 )
 from simtest.advice.scope import SCOPES, ReliefPrior, read_scope
+from simtest.advice.tissue import ORGANS, Surroundings, wall
 from simtest.errors import InputError
 from simtest.rendering.placement_checks import check_camera, check_lights
 from simtest.runtime.arrays import kept
@@ -202,7 +200,7 @@ def test_every_wall_leaves_camera_and_lights_in_free_space():
 
 
 def test_a_distance_without_room_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(draws, "TRIES", 3)
+    monkeypatch.setattr(plan, "TRIES", 3)
     far = "[[0.0, 4000.0, 0.0], [0.0, -4000.0, 0.0], [4000.0, 0.0, 0.0], [-4000.0, 0.0, 0.0]]"
     scope = read_scope(written(tmp_path, CAMERA + f"[rig]\nlights_mm = {far}\n"))
     question = Question(scope, "plane", (20.0, 60.0), frames=16)

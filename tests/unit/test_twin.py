@@ -11,15 +11,24 @@ import cv2
 import numpy as np
 import pytest
 
+from simtest.advice.tissue import NAMES, WIDER, tissue_of
 from simtest.advice.twin import bank as banks
 from simtest.advice.twin.bank import BankFrame, all_spots, frames_for
-from simtest.advice.twin.matching import TWINS, Matcher
-from simtest.advice.twin.patches import ANCHOR_MM, MOST_TILT_DEG, REACH_MM, TissuePatch, look_at, make_pool
-from simtest.advice.twin.run import TwinResult, _drawn, match_spots, twin_picture, twins_of
-from simtest.advice.twin.scenes import Look, SceneDraws, _distance, drawn_camera, look_of
-from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot, usable_spots
-from simtest.advice.twin.tissue import NAMES, WIDER, tissue_of
-from simtest.advice.twin.writing import COLUMNS, write_twins
+from simtest.advice.twin.run import COLUMNS, TwinResult, _drawn, match_spots, twin_picture, twins_of, write_twins
+from simtest.advice.twin.scenes import (
+    ANCHOR_MM,
+    MOST_TILT_DEG,
+    REACH_MM,
+    Look,
+    SceneDraws,
+    TissuePatch,
+    _distance,
+    drawn_camera,
+    look_at,
+    look_of,
+    make_pool,
+)
+from simtest.advice.twin.scoring import FEATURES, TWINS, Matcher, ScoredSpot, Spot, usable_spots
 from simtest.calibration import Calibration, CameraPrior, Normal, Priors, Response, Uniform
 from simtest.calibration.photometry import AngularProfile
 from simtest.errors import InputError, SimtestError

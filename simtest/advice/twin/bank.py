@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.advice.twin.patches import make_pool
-from simtest.advice.twin.scenes import SceneDraws
+from simtest.advice.twin.scenes import SceneDraws, make_pool
 from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.dataset.maker import colour_variant
 from simtest.errors import SimtestError

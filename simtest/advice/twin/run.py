@@ -1,24 +1,29 @@
-"""Twins of one picture: reconstruct it, render a bank of frames like it, and measure the errors at highlights alike."""
+"""Twins of one picture: reconstruct it, render a bank like it, measure the errors at highlights alike, write them."""
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from simtest.advice.tissue import Tissue, tissue_of
 from simtest.advice.twin.bank import BankFrame, Progress, Subject, all_spots, frames_for, make_bank
-from simtest.advice.twin.matching import Matcher, Twins
 from simtest.advice.twin.scenes import Look, SceneDraws, look_of
-from simtest.advice.twin.scoring import ScoredSpot, Spot, SpotKind, usable_spots
-from simtest.advice.twin.tissue import Tissue, tissue_of
+from simtest.advice.twin.scoring import Matcher, ScoredSpot, Spot, SpotKind, Twins, usable_spots
 from simtest.calibration import Calibration
 from simtest.errors import InputError
+from simtest.pages.html import environment
+from simtest.pages.pixels import jpeg_address
 from simtest.reconstruction.assumptions import NEAR_MISSES, Assumption
 from simtest.reconstruction.images import is_sequence, read_picture
 from simtest.reconstruction.options import Options, calibration_for
+from simtest.reconstruction.outputs import write_csv
 from simtest.reconstruction.pipeline import run
-from simtest.runtime.arrays import Array, Image
+from simtest.runtime import provenance
+from simtest.runtime.arrays import Array, Image, Picture
+from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 
 LEAST_TWINS = 20
 """A bank with fewer highlights measures nothing."""
@@ -140,7 +145,7 @@ def twin_picture(
     progress : callable, optional
         Called with frames rendered, frames in all, and what is done.
     organ : str, optional
-        Whose relief and film the twins have (`simtest.advice.twin.tissue.NAMES`); default: any tissue's.
+        Whose relief and film the twins have (`simtest.advice.tissue.NAMES`); default: any tissue's.
     """
     started = time.process_time()
     if is_sequence(image):
@@ -197,3 +202,164 @@ def match_spots(
         )
     matcher = Matcher(twins)
     return [SpotTwins(spot, spot.estimate.deviation_deg, matcher.find(spot)) for spot in spots]
+
+
+FILES = ("twin.json", "twin.csv", "index.html")
+
+COLUMNS = (
+    "specularity", "x_px", "y_px", "radius_px", "estimator", "stated_deg", "twin_rms_deg", "twin_low_deg",
+    "twin_high_deg", "twin_p95_deg", "coverage", "near_misses", "false", "glint_rms_deg", "near_rms_deg",
+    "base_rms_deg", "base_low_deg", "base_high_deg", "near_mm", "median_mm", "far_mm", "twins", "unlikeness", "covered",
+)  # fmt: skip
+
+
+def write_twins(result: TwinResult, out: Path, command: str = "") -> list[Path]:
+    """Write the twins of a picture into a folder, which is made if need be; return the files.
+
+    Raises `InputError` where the folder cannot be written, `SimtestError` where its disk is full.
+    """
+    make_folder(out)
+    html = render_page(result, command)
+    write_json(out / FILES[0], to_json(result, command))
+    write_atomically(out / FILES[1], lambda part: write_csv(part, COLUMNS, [_row(each) for each in result.spots]))
+    write_atomically(out / FILES[2], lambda part: part.write_text(html, encoding="utf-8"))
+    return [out / name for name in FILES]
+
+
+def to_json(result: TwinResult, command: str = "") -> JsonObject:
+    """Return the content of twin.json."""
+    return {
+        "image": result.image,
+        "command": command,
+        "warnings": result.warnings,
+        "assumed": result.assumed,
+        "look": {"organ": result.look.organ, "mean_level": result.look.mean},
+        "bank": {
+            "frames": len(result.bank),
+            "highlights": len(result.bank_spots),
+            "near_misses": result.share_of("near_miss"),
+            "false": result.share_of("false"),
+            "processor_s": round(result.processor_s, 1),
+        },
+        "twin_rms_deg": result.rms_deg(),
+        "twin_base_rms_deg": result.rms_deg("base_rms_deg"),
+        "coverage": result.coverage,
+        "twin_distance_mm": [_finite(each) for each in result.distance_mm],
+        "specularities": [_spot_json(each) for each in result.spots],
+        "provenance": provenance.environment(),
+    }
+
+
+def _spot_json(each: SpotTwins) -> JsonObject:
+    spot, twins = each.spot, each.twins
+    return {
+        "id": spot.index,
+        "peak_px": spot.peak_px,
+        "radius_px": spot.radius_px,
+        "estimator": spot.estimator,
+        "normal": spot.estimate.normal,
+        "target": spot.estimate.target,
+        "stated_deg": each.stated_deg,
+        "twins": twins_json(twins),
+    }
+
+
+def twins_json(twins: Twins) -> JsonObject:
+    """Return what the twins of a highlight measure; a figure that they do not have is null."""
+    return {
+        "rms_deg": twins.rms_deg,
+        "interval_deg": twins.interval_deg,
+        "p95_deg": twins.p95_deg,
+        "coverage": twins.coverage,
+        "near_misses": twins.near_misses,
+        "false": twins.false,
+        "glint_rms_deg": _finite(twins.glint_rms_deg),
+        "near_rms_deg": _finite(twins.near_rms_deg),
+        "base_rms_deg": twins.base_rms_deg,
+        "base_interval_deg": twins.base_interval_deg,
+        "distance_mm": [_finite(each) for each in twins.distance_mm],
+        "effective": twins.effective,
+        "unlikeness": twins.unlikeness,
+        "covered": twins.is_covered,
+    }
+
+
+def _finite(value: float) -> float | None:
+    # NaN is the only number that differs from itself.
+    return value if value == value else None
+
+
+def _row(each: SpotTwins) -> tuple[object, ...]:
+    spot, twins = each.spot, each.twins
+    x, y = spot.peak_px.tolist()
+    return (
+        spot.index, round(x, 3), round(y, 3), spot.radius_px, spot.estimator, each.stated_deg, twins.rms_deg,
+        *twins.interval_deg, twins.p95_deg, twins.coverage, twins.near_misses, twins.false,
+        _finite(twins.glint_rms_deg), _finite(twins.near_rms_deg), twins.base_rms_deg, *twins.base_interval_deg,
+        *(_finite(each) for each in twins.distance_mm), twins.effective, twins.unlikeness, int(twins.is_covered),
+    )  # fmt: skip
+
+
+SHOWN_SPOTS, SHOWN_TWINS = 6, 6
+"""Highlights whose twins are shown, evenly over their sizes, and the likest twins of each."""
+
+PATCH_PX, LEAST_HALF_PX, RADII = 112, 9, 3.5
+"""Side of a shown patch; half the side that it shows of the frame, at least and in radii of the real highlight, px."""
+
+
+@dataclass(frozen=True)
+class ShownTwin:
+    """A twin's patch, as an address, its error in deg and whether it is a near miss."""
+
+    address: str
+    error_deg: float
+    is_near_miss: bool
+
+
+@dataclass(frozen=True)
+class ShownSpot:
+    """A real highlight's patch, as an address, and its likest twins."""
+
+    each: SpotTwins
+    address: str
+    twins: list[ShownTwin]
+
+
+def render_page(result: TwinResult, command: str = "") -> str:
+    """Return the page."""
+    made_by = provenance.environment()
+    told = [each for each in result.spots if each.stated_deg is not None]
+    stated = (
+        float(np.sqrt(np.mean([each.stated_deg**2 for each in told if each.stated_deg is not None]))) if told else None
+    )
+    return environment().get_template("twin.html.j2").render(
+        result=result, command=command, stated=stated, rms=result.rms_deg(), base=result.rms_deg("base_rms_deg"),
+        uncovered=sum(not each.twins.is_covered for each in result.spots), strips=_strips(result),
+        provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"], "python": made_by["python"]},
+    )  # fmt: skip
+
+
+def _strips(result: TwinResult) -> list[ShownSpot]:
+    """Return some highlights with their likest twins, the smallest first."""
+    ordered = sorted(result.spots, key=lambda each: each.spot.radius_px)
+    picked = np.unique(np.linspace(0, len(ordered) - 1, SHOWN_SPOTS).round().astype(int)).tolist()
+    picture = np.asarray(np.rint(255 * np.clip(result.picture, 0, 1)), dtype=np.uint8)
+    return [_strip(result, picture, ordered[i]) for i in picked]
+
+
+def _strip(result: TwinResult, picture: Picture, each: SpotTwins) -> ShownSpot:
+    half = max(LEAST_HALF_PX, round(RADII * each.spot.radius_px))
+    twins = []
+    for number in each.twins.best[:SHOWN_TWINS].tolist():
+        frame, scored = result.bank_spots[number]
+        patch = _patch(result.bank[frame].picture, scored.spot.peak_px, half)
+        twins.append(ShownTwin(jpeg_address(patch, 90), scored.error_deg, scored.is_near_miss))
+    return ShownSpot(each, jpeg_address(_patch(picture, each.spot.peak_px, half), 90), twins)
+
+
+def _patch(picture: Picture | Image, centre: Array, half: int) -> Picture:
+    """Return the surroundings of a point, px, enlarged; beyond the border the frame is repeated."""
+    padded = cv2.copyMakeBorder(picture, half, half, half, half, cv2.BORDER_REPLICATE)
+    x, y = (int(v) for v in centre)
+    cut = padded[y : y + 2 * half + 1, x : x + 2 * half + 1]
+    return np.asarray(cv2.resize(cut, (PATCH_PX, PATCH_PX), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
