@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import polars as pl
 
 from simtest.advice.answers import (
     WIDE,
@@ -47,55 +46,30 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Advised:
-    """What was found of a question.
-
-    Parameters
-    ----------
-    question : Question
-        What was asked.
-    found : Found
-        Errors and answers in frames of the organ.
-    breaks : list of BreakPoint
-        Where methods fail, by the laws.
-    spots : SpotSize
-        Size of highlights by the laws.
-    spot_radius_px : float or None
-        Median radius of the visible highlights that hold one glint alone, as rendered, px.
-    picture : ndarray of uint8, shape (H, W, 3)
-        A frame as the scope shows it.
-    commands : dict
-        What makes each figure again: ``errors``, ``picture``.
-    drawn : dict
-        What is drawn, by key path, with its ends.
-    """
+    """What was found of a question."""
 
     question: Question
-    found: Found
+    found: Found  # errors and answers in frames of the organ
     breaks: list[BreakPoint]
     spots: SpotSize
-    spot_radius_px: float | None
-    picture: Pixels
-    commands: dict[str, str]
-    drawn: dict[str, tuple[float, float]]
+    spot_radius_px: float | None  # median radius of the visible highlights that hold one glint alone, as rendered
+    picture: Pixels  # a frame as the scope shows it
+    commands: dict[str, str]  # what makes each figure again: errors, picture
+    drawn: dict[str, tuple[float, float]]  # by key path, with its ends
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures as JSON; the picture stands beside it."""
-        asked, scope = self.question, self.question.scope
+        asked, scope, farthest = self.question, self.question.scope, self.spots.shapeless_beyond_mm
         question = {
             "scope": scope.name, **scope.tables, "organ": asked.organ,
             "distances_mm": asked.distances_mm,
             "bound_deg": asked.bound_deg, "seed": asked.seed,
         }  # fmt: skip
-        spots = {"smooth_px": self.spots.smooth_px, "relief_px": self.spots.relief_px,
-                 "shapeless_beyond_mm": _finite(self.spots.shapeless_beyond_mm),
-                 "rendered_px": self.spot_radius_px}  # fmt: skip
+        spots = {**asdict(self.spots), "shapeless_beyond_mm": None if farthest == math.inf else farthest}
         return {"question": question, "drawn": self.drawn, **self.found.to_json(),
-                "break_points": [asdict(each) for each in self.breaks], "spot_radius": spots,
+                "break_points": [asdict(each) for each in self.breaks],
+                "spot_radius": {**spots, "rendered_px": self.spot_radius_px},
                 "commands": self.commands}  # fmt: skip
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and value < float("inf") else None
 
 
 def advise(question: Question, out: Path, progress: Progress | None = None, workers: int = 1) -> Advised:
@@ -126,65 +100,45 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
         raise
     picture = np.asarray(np.round(255 * displayed(frame.image, frame.scene.sensor)), dtype=np.uint8)
     (run,) = run_experiments([(main, out / RUN)], "", None, progress, engine)
-    results = run.results
-    count = sum(len(next(iter(table.values()))) for group in main.groups for table in group.pool) * main.realisations
-    _write_picture(out / FRAME, picture)
-    return Advised(
-        question, read_results(results, count), break_points(question), spot_size(question),
-        _median_radius(results), picture, _commands(out),
-        surroundings(question).random,
-    )  # fmt: skip
+    alone = run.results.drop_nulls("radius_px").unique(["setting", "realisation", "true_id"])["radius_px"]
+    radius = None if alone.is_empty() else float(alone.median())  # type: ignore[arg-type]
+    _write(out / FRAME, pixels.png(picture))
+    # A run that is kept is not rendered anew.
+    commands = {
+        "errors": shlex.join(["simtest", "validate", str(out / MAIN), "--out", str(out / RUN)]),
+        "picture": shlex.join(["simtest", "render", str(out / SCENE), "--out", str(out / "frame")]),
+    }
+    found = read_results(run.results, question.per_distance * DISTANCES)
+    return Advised(question, found, break_points(question), spot_size(question), radius, picture, commands,
+                   surroundings(question).random)  # fmt: skip
+
+
+def _write(path: Path, content: bytes) -> None:
+    write_atomically(path, lambda part: part.write_bytes(content))
 
 
 def write_scene(question: Question, main: Experiment, path: Path) -> Path:
     """Write the scene of the picture: the organ itself, with its vessels, through the scope; return its path."""
-    group = main.groups[0]
-    settings = {**group.set, "surface": _organ_surface(question, group.set["surface"])}
+    group, organ = main.groups[0], question.kind.scene
+    wall = group.set["surface"]
+    surface = wall
+    if not question.kind.smooth:
+        surface = load_scene(organ).model_dump(mode="json", exclude_unset=True)["surface"]
+        if question.scope.relief is not None:
+            # That of the walls that are measured.
+            surface.pop("relief", None)
+            surface |= {key: value for key, value in wall.items() if key == "relief"}
+    if question.kind.smooth or surface["type"] == "quadric":
+        surface = {**surface, "distance_mm": question.middle_mm}
     # The colours of the frames that are measured have no vessels.
-    settings.pop("reflectance.albedo", None)
-    described = load_scene(question.kind.scene, settings)
-    tables = described.model_dump(mode="json", exclude_unset=True, exclude_none=True)
+    settings = {key: value for key, value in group.set.items() if key != "reflectance.albedo"} | {"surface": surface}
+    tables = load_scene(organ, settings).model_dump(mode="json", exclude_unset=True, exclude_none=True)
     named = {key: value for key, value in tables.items() if isinstance(value, dict)}
     write_atomically(path, lambda part: part.write_text(toml_tables(named), encoding="utf-8"))
     return path
 
 
-def _organ_surface(question: Question, wall: dict[str, Any]) -> dict[str, Any]:
-    """Return the organ's surface, with the relief of the walls that are measured where one is stated."""
-    if question.kind.smooth:
-        return {**wall, "distance_mm": question.middle_mm}
-    surface = load_scene(question.kind.scene).model_dump(mode="json", exclude_unset=True)["surface"]
-    if question.scope.relief is not None:
-        surface.pop("relief", None)
-        surface |= {key: value for key, value in wall.items() if key == "relief"}
-    if surface["type"] == "quadric":
-        surface["distance_mm"] = question.middle_mm
-    return dict(surface)
-
-
-def _write_picture(path: Path, picture: Pixels) -> None:
-    from simtest.pages import pixels
-
-    content = pixels.png(picture)
-    write_atomically(path, lambda part: part.write_bytes(content))
-
-
-def _median_radius(results: pl.DataFrame) -> float | None:
-    alone = results.drop_nulls("radius_px").unique(["setting", "realisation", "true_id"])["radius_px"]
-    return None if alone.is_empty() else float(alone.median())  # type: ignore[arg-type]
-
-
-def _commands(out: Path) -> dict[str, str]:
-    """Return the commands that make the figures again; a run that is kept is not rendered anew."""
-
-    def words(*parts: object) -> str:
-        return shlex.join(["simtest", *map(str, parts)])
-
-    return {
-        "errors": words("validate", out / MAIN, "--out", out / RUN),
-        "picture": words("render", out / SCENE, "--out", out / "frame"),
-    }
-
+# Files and page -------------------------------------------------------------------------------------------------------
 
 PAGE, RESULT = "index.html", "advice.json"
 
@@ -207,8 +161,7 @@ def write_advice(found: Advised, out: Path, command: str = "") -> Path:
     """
     make_folder(out / "figures")
     chart = distance_chart(found)
-    content = png([chart])
-    write_atomically(out / "figures" / "distance.png", lambda part: part.write_bytes(content))
+    _write(out / "figures" / "distance.png", png([chart]))
     made_by = provenance.environment()
     html = environment().get_template("advice.html.j2").render(
         found=found, answers=[sentence(found, choice) for choice in found.found.choices] or [NOTHING],

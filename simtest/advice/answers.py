@@ -97,30 +97,15 @@ class Choice:
 
 @dataclass(frozen=True)
 class Found:
-    """What was found in an advice's frames.
-
-    Parameters
-    ----------
-    frames : int
-        Frames in all.
-    visible : int
-        Visible highlights that stand above the noise; on a smooth surface all true ones.
-    found : int
-        Those of them that the detector found.
-    detections, false : int
-        Detections, and those among them that show no highlight.
-    methods : list of MethodAnswers
-    choices : list of Choice
-        For the fine surface and, where a method states it, the base.
-    """
+    """What was found in an advice's frames."""
 
     frames: int
-    visible: int
-    found: int
+    visible: int  # visible highlights that stand above the noise; on a smooth surface all true ones
+    found: int  # those of them that the detector found
     detections: int
-    false: int
+    false: int  # detections that show no highlight
     methods: list[MethodAnswers]
-    choices: list[Choice]
+    choices: list[Choice]  # for the fine surface and, where a method states it, the base
 
     def method(self, name: str) -> MethodAnswers:
         """Return a method by name."""
@@ -237,10 +222,14 @@ def _difference(pair: Pair, other: str, tied: bool) -> Difference | None:
     mean, (low, high) = pair.difference_deg, pair.interval_deg
     if mean is None:
         return None
-    if other == pair.first or low is None or high is None:
-        return Difference(other, mean if other == pair.first else -mean, (low, high), pair.n, tied)
-    return Difference(other, -mean, (-high, -low), pair.n, tied)
+    if other != pair.first:
+        mean = -mean
+        if low is not None and high is not None:
+            low, high = -high, -low
+    return Difference(other, mean, (low, high), pair.n, tied)
 
+
+# Break-points: by closed-form laws, on smooth walls but for the slope of a relief -------------------------------------
 
 NEAREST_MM = 3.0
 """A break-point nearer than this is not named: no endoscope works there."""
@@ -256,54 +245,34 @@ _HALVINGS = 60
 
 @dataclass(frozen=True)
 class BreakPoint:
-    """A break-point.
+    """A value of one quantity at which a law gives the error that is asked about, or spots lose their shape."""
 
-    Parameters
-    ----------
-    title : str
-        What breaks, in words.
-    method : str
-        The method concerned.
-    quantity, unit : str
-        What is varied.
-    value : float
-        Where it breaks, by the law.
-    law : str
-        The law, in words and symbols.
-    expected : float or None
-        Error that the law gives there, deg; None where it says that the method refuses.
-    also : str
-        The same in other terms, such as the offset over the distance.
-    """
-
-    title: str
-    method: str
-    quantity: str
+    title: str  # what breaks, in words
+    method: str  # that is concerned
+    quantity: str  # that is varied
     unit: str
-    value: float
-    law: str
-    expected: float | None
-    also: str
+    value: float  # where it breaks, by the law
+    law: str  # in words and symbols
+    expected: float | None  # error that the law gives there, deg; None where it says that the method refuses
+    also: str  # the same in other terms, such as the offset over the distance
 
 
 def break_points(question: Question) -> list[BreakPoint]:
     """Return the break-points of a question by the laws."""
-    made = (_offset_ignored(question), *_distance_unknown(question), _streak(question), _relief(question))
-    return [point for point in made if point is not None]
+    return [*_offset_ignored(question), *_distance_unknown(question), *_streak_and_relief(question)]
 
 
-def _offset_ignored(question: Question) -> BreakPoint | None:
+def _offset_ignored(question: Question) -> Iterator[BreakPoint]:
     """Find the distance at which a method that ignores the light's offset errs by the bound."""
     offset = float(np.mean(question.scope.offsets_mm))
-    ratio = math.tan(2 * math.radians(question.bound_deg))
-    if offset / ratio < NEAREST_MM:
-        return None
-    distance = round(offset / ratio, 3)
-    return BreakPoint(
-        "a method that ignores the light's offset", "cone_axis", "distance", "mm", distance,
-        "atan(eps / d) / 2", float(np.degrees(laws.offset_error(offset / distance))),
-        f"eps/d = {offset / distance:.3g}, eps = {offset:.3g} mm",
-    )  # fmt: skip
+    distance = offset / math.tan(2 * math.radians(question.bound_deg))
+    if distance >= NEAREST_MM:
+        distance = round(distance, 3)
+        yield BreakPoint(
+            "a method that ignores the light's offset", "cone_axis", "distance", "mm", distance,
+            "atan(eps / d) / 2", float(np.degrees(laws.offset_error(offset / distance))),
+            f"eps/d = {offset / distance:.3g}, eps = {offset:.3g} mm",
+        )  # fmt: skip
 
 
 def _distance_unknown(question: Question) -> Iterator[BreakPoint]:
@@ -334,20 +303,15 @@ def _distance_unknown(question: Question) -> Iterator[BreakPoint]:
         )  # fmt: skip
 
 
-def _streak(question: Question) -> BreakPoint:
-    """Find the curvature at which a concave wall's isophotes become streaks."""
-    middle = question.middle_mm
-    return BreakPoint(
+def _streak_and_relief(question: Question) -> Iterator[BreakPoint]:
+    """Find the curvature of a streak, and the slope at which a glint's normal is off the base's by the bound."""
+    middle, slope = question.middle_mm, round(question.bound_deg / RAYLEIGH_MEAN, 3)
+    yield BreakPoint(
         "a wall seen from near its centre of curvature: a streak", "curved", "d k", "", STREAK_KD,
         "curved refuses where abs(1 + d k) < 0.1", None,
         f"a concave radius of {-middle / STREAK_KD:.3g} mm at {middle:g} mm",
     )  # fmt: skip
-
-
-def _relief(question: Question) -> BreakPoint:
-    """Find the slope at which a single glint's normal is off the base's by the bound."""
-    slope = round(question.bound_deg / RAYLEIGH_MEAN, 3)
-    return BreakPoint(
+    yield BreakPoint(
         "any single highlight, against the base", "brightest_point", "slope of the relief", "deg",
         slope, "1.25 slopes, whatever the method", RAYLEIGH_MEAN * slope,
         "the light at the camera",
@@ -365,20 +329,14 @@ class SpotSize:
 
 def spot_size(question: Question) -> SpotSize:
     """Return the size of highlights by the laws (theory.md 3.1 and 7.3)."""
-    held, drawn = rough(question.kind, question.scope.relief)
-    low, high = drawn.get("reflectance.film.alpha", (held["reflectance.film"]["alpha"],) * 2)
+    own = rough(question.kind, question.scope.relief)
+    low, high = own.film("alpha")
     curvature = 2 / (low * high)
-    focal = question.scope.focal_px
-    smooth = focal * math.sqrt(2 * math.log(2) / (curvature + 2))
-    if "surface.relief" not in held:
+    smooth = question.scope.focal_px * math.sqrt(2 * math.log(2) / (curvature + 2))
+    if not own.bands:
         return SpotSize(smooth, smooth, math.inf if smooth >= SMALL_SPOT_PX else None)
     # Curvature of a glint along an axis: the root of the band's mean square, slope times wave number.
-    bands = enumerate(held["surface.relief"]["bands"])
-    squares = [_middle(n, band, "slope_deg", drawn) / _middle(n, band, "wavelength_mm", drawn) for n, band in bands]
+    squares = [(sum(band.slope_deg) / 2) / (sum(band.wavelength_mm) / 2) for band in own.bands]
     bend = math.radians(1.0) * 2 * math.pi * math.hypot(*squares)
     farthest = (smooth / SMALL_SPOT_PX) / bend if smooth >= SMALL_SPOT_PX else None
     return SpotSize(smooth, smooth / max(1.0, question.middle_mm * bend), farthest)
-
-
-def _middle(number: int, band: dict[str, Any], name: str, drawn: dict[str, Any]) -> float:
-    return sum(drawn.get(f"surface.relief.bands.{number}.{name}", (band[name],) * 2)) / 2

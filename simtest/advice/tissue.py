@@ -30,31 +30,28 @@ RECIPE = "endoscopy"
 MESHES_IN_VIEW = 8.0
 """Of the net of vessels that have no colour, over the nearest view: so few are grown at once, and some must be."""
 
-_DRAWN = ("surface.relief.bands", "reflectance.film")
+BANDS, FILM = "surface.relief.bands", "reflectance.film"
 """Keys of the recipe that matter to a normal; colours stay as in the scene."""
+
+WIDER = 1.25
+"""An organ's ranges reach so many times farther to both sides for twins; the level of the film, `WIDER_LEVEL`."""
+
+WIDER_LEVEL = 0.3
+
+CURVED_PER_MM, MOST_CURVED = 0.03, (-0.1, 0.2)
+"""Scale of the curvatures of a tissue that nobody told, 1/mm: half are beyond 0.7 times it, as on folds and in lumens
+of 2 to 8 cm across; and their bounds."""
 
 
 @dataclass(frozen=True)
 class Organ:
-    """An organ.
+    """An organ: where its tissue stands, who looks at it, and how it is curved."""
 
-    Parameters
-    ----------
-    scene : str
-        Shipped scene whose tissue it is.
-    sensor : str
-        Preset of the sensor that usually looks at it.
-    k1_per_mm, k2_per_mm : (float, float)
-        Ranges of the principal curvatures, 1/mm, convex positive.
-    smooth : bool
-        Whether it has no relief unless one is stated.
-    """
-
-    scene: str
-    sensor: str
-    k1_per_mm: Interval
+    scene: str  # shipped scene whose tissue it is
+    sensor: str  # preset that usually looks at it
+    k1_per_mm: Interval  # range of a principal curvature, 1/mm, convex positive
     k2_per_mm: Interval
-    smooth: bool = False
+    smooth: bool = False  # whether it has no relief unless one is stated
 
 
 ORGANS: dict[str, Organ] = {
@@ -66,114 +63,17 @@ ORGANS: dict[str, Organ] = {
 }
 """Organs by name; `plane` is a flat wet phantom."""
 
-
-@cache
-def _family(scene: str) -> tuple[Mapping[str, Any], Mapping[str, Interval]]:
-    """Return what the recipe sets and draws of a scene's relief and film."""
-    family = next(each for each in load_dataset(RECIPE).families if each.scene == scene)
-    drawn = {**family.per_anatomy, **family.per_sample}
-    held = {key: value for key, value in family.set.items() if key.startswith(_DRAWN)}
-    return held, {key: (d.ends[0], d.ends[1]) for key, d in drawn.items() if key.startswith(_DRAWN)}
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """What an experiment sets and draws of the surface, by key path of a scene."""
-
-    set: dict[str, Any]
-    random: dict[str, Interval]
-
-
-def wall(organ: Organ, relief: ReliefPrior | None, view_mm: float) -> Surroundings:
-    """Return the wall of an organ, seen over `view_mm` at least; its distance is left to the experiment."""
-    held, drawn = rough(organ, relief)
-    held["reflectance.albedo"] = pale(organ, view_mm)
-    # A whole table in place of the scene's: an anatomy's keys are none of a quadric's.
-    bands = held.pop("surface.relief", None)
-    flat = organ.k1_per_mm == organ.k2_per_mm == (0.0, 0.0)
-    surface: dict[str, Any] = {"type": "plane"}
-    if not flat:
-        surface = {"type": "quadric", "k1_per_mm": organ.k1_per_mm[0], "k2_per_mm": organ.k2_per_mm[0]}
-    if bands is not None:
-        surface["relief"] = bands
-    form: dict[str, Interval] = {"surface.tilt_deg": (0.0, MOST_TILT_DEG), "surface.azimuth_deg": (0.0, 360.0)}
-    if not flat:
-        form |= {"surface.spin_deg": (0.0, 180.0), "surface.k1_per_mm": organ.k1_per_mm}
-        form |= {"surface.k2_per_mm": organ.k2_per_mm}
-    return Surroundings({"surface": surface, **held}, {**form, **drawn})
-
-
-def rough(organ: Organ, relief: ReliefPrior | None) -> tuple[dict[str, Any], dict[str, Interval]]:
-    """Return what is set and what is drawn of relief and film; the relief is the whole table ``surface.relief``."""
-    base = read_toml(find(organ.scene, "scenes"))
-    changes, drawn = _family(organ.scene)
-    film = dict(base["reflectance"]["film"])
-    random = dict(drawn)
-    if is_smooth(organ, relief):
-        # Without valleys a film has no level.
-        film.pop("level", None)
-        return {"reflectance.film": film}, {"reflectance.film.alpha": random["reflectance.film.alpha"]}
-    held: dict[str, Any] = {"reflectance.film": film}
-    if relief is None:
-        bands = [dict(band) for band in base["surface"]["relief"]["bands"]]
-        for key, value in changes.items():
-            if key.startswith("surface.relief.bands."):
-                *_, number, name = key.split(".")
-                bands[int(number)][name] = value
-    else:
-        random = {key: value for key, value in random.items() if not key.startswith("surface.relief")}
-        bands = [{}]
-        for name in ("slope_deg", "wavelength_mm"):
-            low, high = ends(getattr(relief, name))
-            bands[0][name] = low
-            if high > low:
-                random[f"surface.relief.bands.0.{name}"] = (low, high)
-    held["surface.relief"] = {"bands": bands}
-    return held, random
-
-
-def pale(organ: Organ, view_mm: float) -> dict[str, Any]:
-    """Return the organ's colour without vessels: they take as long to grow as a frame, and lie below the film."""
-    spacing = min(max(view_mm / MESHES_IN_VIEW, 0.2), 50.0)
-    largest = min(spacing / 2, 5.0)
-    vessels = {"largest_mm": largest, "smallest_mm": largest / 2, "spacing_mm": spacing, "strength": 0.0}
-    preset = read_toml(find(organ.scene, "scenes"))["reflectance"]["albedo"]["preset"]
-    return {"preset": preset, "vessels": vessels}
-
-
-def is_smooth(organ: Organ, relief: ReliefPrior | None) -> bool:
-    """Return whether the wall has no relief."""
-    return organ.smooth if relief is None else ends(relief.slope_deg) == (0.0, 0.0)
-
-
-WIDER = 1.25
-"""An organ's ranges reach so many times farther to both sides; the level of the film, `WIDER_LEVEL` farther."""
-
-WIDER_LEVEL = 0.3
-
-CURVED_PER_MM, MOST_CURVED = 0.03, (-0.1, 0.2)
-"""Scale of the curvatures of a tissue that nobody told, 1/mm: half are beyond 0.7 times it, as on folds and in lumens
-of 2 to 8 cm across; and their bounds."""
-
 NAMES = tuple(name for name, organ in ORGANS.items() if not organ.smooth)
-"""Organs that can be told."""
+"""Organs whose highlights can have twins."""
 
 
 @dataclass(frozen=True)
 class Band:
-    """A band of relief.
+    """A band of relief."""
 
-    Parameters
-    ----------
-    kinds : tuple of (dict, float)
-        Keys of a scene's band but for slope and wavelength, each with its share.
-    slope_deg, wavelength_mm : (float, float)
-        Ranges: drawn evenly, and evenly in the logarithm.
-    """
-
-    kinds: tuple[tuple[Mapping[str, Any], float], ...]
-    slope_deg: Interval
-    wavelength_mm: Interval
+    kinds: tuple[tuple[Mapping[str, Any], float], ...]  # keys of a scene's band but for the others, each with its share
+    slope_deg: Interval  # drawn evenly
+    wavelength_mm: Interval  # drawn evenly in the logarithm
 
     def draw(self, rng: np.random.Generator) -> dict[str, Any]:
         """Draw a band of a scene's relief."""
@@ -183,35 +83,110 @@ class Band:
 
 
 @dataclass(frozen=True)
-class Tissue:
-    """What is known of a tissue.
+class Surroundings:
+    """What is set and drawn of a surface, by key path of a scene; a relief that is set is the whole table of it."""
 
-    Parameters
-    ----------
-    bands : tuple of Band
-        Its relief.
-    alpha, level : (float, float)
-        Ranges of the film's roughness and of its level.
-    k1_per_mm, k2_per_mm : (float, float), optional
-        Ranges of the base's principal curvatures, 1/mm, convex positive; without them, draws have a Laplace
-        distribution: most patches are nearly flat over a highlight, some are folds.
-    scene : str, optional
-        Shipped scene whose colour and translucency it has; without it, that of the nearest colour.
-    """
+    set: dict[str, Any]
+    random: dict[str, Interval]
+
+    @property
+    def bands(self) -> list[Band]:
+        """The bands of the relief; none of a smooth wall."""
+        bands = []
+        for number, band in enumerate(self.set.get("surface.relief", {"bands": []})["bands"]):
+            fixed = {key: value for key, value in band.items() if key not in ("slope_deg", "wavelength_mm")}
+            slope, wavelength = (
+                self.random.get(f"{BANDS}.{number}.{key}", ends(band[key])) for key in ("slope_deg", "wavelength_mm")
+            )
+            bands.append(Band(((fixed, 1.0),), slope, wavelength))
+        return bands
+
+    def film(self, key: str) -> Interval:
+        """Return both ends of a number of the film."""
+        return self.random.get(f"{FILM}.{key}", ends(self.set[FILM][key]))
+
+
+@cache
+def _family(scene: str) -> tuple[Mapping[str, Any], Mapping[str, Interval]]:
+    """Return what the recipe sets of a scene's relief, and what it draws of relief and film."""
+    family = next(each for each in load_dataset(RECIPE).families if each.scene == scene)
+    drawn = {**family.per_anatomy, **family.per_sample}
+    held = {key: value for key, value in family.set.items() if key.startswith(BANDS)}
+    return held, {key: (d.ends[0], d.ends[1]) for key, d in drawn.items() if key.startswith((BANDS, FILM))}
+
+
+def rough(organ: Organ, relief: ReliefPrior | None) -> Surroundings:
+    """Return relief and film of an organ, with the relief that is stated in place of its own."""
+    base = read_toml(find(organ.scene, "scenes"))
+    changes, drawn = _family(organ.scene)
+    film = dict(base["reflectance"]["film"])
+    if is_smooth(organ, relief):
+        # Without valleys a film has no level.
+        film.pop("level", None)
+        return Surroundings({FILM: film}, {f"{FILM}.alpha": drawn[f"{FILM}.alpha"]})
+    if relief is None:
+        random, bands = dict(drawn), [dict(band) for band in base["surface"]["relief"]["bands"]]
+        for key, value in changes.items():
+            *_, number, name = key.split(".")
+            bands[int(number)][name] = value
+    else:
+        stated = {name: ends(getattr(relief, name)) for name in ("slope_deg", "wavelength_mm")}
+        random = {key: value for key, value in drawn.items() if not key.startswith(BANDS)}
+        random |= {f"{BANDS}.0.{name}": (low, high) for name, (low, high) in stated.items() if high > low}
+        bands = [{name: low for name, (low, _) in stated.items()}]
+    return Surroundings({FILM: film, "surface.relief": {"bands": bands}}, random)
+
+
+def is_smooth(organ: Organ, relief: ReliefPrior | None) -> bool:
+    """Return whether the wall has no relief."""
+    return organ.smooth if relief is None else ends(relief.slope_deg) == (0.0, 0.0)
+
+
+def wall(organ: Organ, relief: ReliefPrior | None, view_mm: float) -> Surroundings:
+    """Return the wall of an organ, seen over `view_mm` at least; its distance is left to the experiment."""
+    own = rough(organ, relief)
+    held = {**own.set, "reflectance.albedo": _pale(organ, view_mm)}
+    # A whole table in place of the scene's: an anatomy's keys are none of a quadric's.
+    bands = held.pop("surface.relief", None)
+    surface: dict[str, Any] = {"type": "plane"}
+    form: dict[str, Interval] = {"surface.tilt_deg": (0.0, MOST_TILT_DEG), "surface.azimuth_deg": (0.0, 360.0)}
+    if not organ.k1_per_mm == organ.k2_per_mm == (0.0, 0.0):
+        surface = {"type": "quadric", "k1_per_mm": organ.k1_per_mm[0], "k2_per_mm": organ.k2_per_mm[0]}
+        form |= {"surface.spin_deg": (0.0, 180.0), "surface.k1_per_mm": organ.k1_per_mm}
+        form |= {"surface.k2_per_mm": organ.k2_per_mm}
+    if bands is not None:
+        surface["relief"] = bands
+    return Surroundings({"surface": surface, **held}, {**form, **own.random})
+
+
+def _pale(organ: Organ, view_mm: float) -> dict[str, Any]:
+    """Return the organ's colour without vessels: they take as long to grow as a frame, and lie below the film."""
+    spacing = min(max(view_mm / MESHES_IN_VIEW, 0.2), 50.0)
+    largest = min(spacing / 2, 5.0)
+    vessels = {"largest_mm": largest, "smallest_mm": largest / 2, "spacing_mm": spacing, "strength": 0.0}
+    preset = read_toml(find(organ.scene, "scenes"))["reflectance"]["albedo"]["preset"]
+    return {"preset": preset, "vessels": vessels}
+
+
+# Twins ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """What is known of a tissue that twins are made of."""
 
     bands: tuple[Band, ...]
-    alpha: Interval
+    alpha: Interval  # ranges of the film's roughness and of its level
     level: Interval
-    k1_per_mm: Interval | None = None
-    k2_per_mm: Interval | None = None
-    scene: str | None = None
+    organ: Organ | None = None  # without it, curvatures have a Laplace distribution, and the colour is the nearest
 
     def draw_curvatures(self, rng: np.random.Generator) -> tuple[float, float]:
         """Draw the principal curvatures of the base, 1/mm."""
-        if self.k1_per_mm is None or self.k2_per_mm is None:
+        if self.organ is None:
+            # Most patches are nearly flat over a highlight, some are folds.
             k1, k2 = np.clip(rng.laplace(0.0, CURVED_PER_MM, 2), *MOST_CURVED).tolist()
             return k1, k2
-        return float(rng.uniform(*self.k1_per_mm)), float(rng.uniform(*self.k2_per_mm))
+        return float(rng.uniform(*self.organ.k1_per_mm)), float(rng.uniform(*self.organ.k2_per_mm))
 
     def __str__(self) -> str:
         waves = " and ".join("{:.2g} to {:.2g}".format(*band.wavelength_mm) for band in self.bands)
@@ -231,33 +206,22 @@ ANY = Tissue(
 """Of an organ that nobody told."""
 
 
-def tissue_of(organ: str | None) -> Tissue:
+def tissue_of(name: str | None) -> Tissue:
     """Return what is known of an organ's tissue; `ANY` of none."""
-    if organ is None:
+    if name is None:
         return ANY
-    if organ not in NAMES:
-        raise InputError(f"--organ {organ}: must be one of {', '.join(NAMES)}")
-    form = ORGANS[organ]
-    held, drawn = rough(form, None)
-    bands = []
-    for number, band in enumerate(held["surface.relief"]["bands"]):
-        fixed = {key: value for key, value in band.items() if key not in ("slope_deg", "wavelength_mm")}
-        slope, wavelength = (
-            _wider(drawn.get(f"surface.relief.bands.{number}.{key}", (band[key], band[key])))
-            for key in ("slope_deg", "wavelength_mm")
-        )
-        bands.append(Band(((fixed, 1.0),), slope, wavelength))
-    film = held["reflectance.film"]
-    level = drawn.get("reflectance.film.level", (film["level"], film["level"]))
-    alpha = drawn.get("reflectance.film.alpha", (film["alpha"], film["alpha"]))
-    film_level = level[0] - WIDER_LEVEL, level[1] + WIDER_LEVEL
-    return Tissue(tuple(bands), _wider(alpha), film_level, form.k1_per_mm, form.k2_per_mm, form.scene)
+    if name not in NAMES:
+        raise InputError(f"--organ {name}: must be one of {', '.join(NAMES)}")
+    own = rough(ORGANS[name], None)
+    bands = tuple(Band(each.kinds, _wider(each.slope_deg), _wider(each.wavelength_mm)) for each in own.bands)
+    low, high = own.film("level")
+    return Tissue(bands, _wider(own.film("alpha")), (low - WIDER_LEVEL, high + WIDER_LEVEL), ORGANS[name])
 
 
-def _wider(ends: Interval) -> Interval:
-    return ends[0] / WIDER, ends[1] * WIDER
+def _wider(interval: Interval) -> Interval:
+    return interval[0] / WIDER, interval[1] * WIDER
 
 
-def between(rng: np.random.Generator, ends: Interval) -> float:
-    """Draw a number that is log-uniform between two ends."""
-    return float(math.exp(rng.uniform(math.log(ends[0]), math.log(ends[1]))))
+def between(rng: np.random.Generator, interval: Interval) -> float:
+    """Draw a number that is log-uniform in an interval."""
+    return float(math.exp(rng.uniform(math.log(interval[0]), math.log(interval[1]))))

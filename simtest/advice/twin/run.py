@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from simtest.reconstruction.pipeline import run
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array, Image, Picture
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
+from simtest.runtime.statistics import root_mean_square
 
 LEAST_TWINS = 20
 """A bank with fewer highlights measures nothing."""
@@ -35,7 +37,7 @@ DRAWN = (
     Assumption("light exits", "discs of 0.5 to 1.3 mm radius; lights of one power", FIXED),
     Assumption("camera chain", "one of three presets, its sharpening, noise and coding drawn", FIXED),
 )
-"""What no frame shows and no file states of a twin; the ranges are those of `patches` and `scenes`."""
+"""What no frame shows and no file states of a twin; the ranges are those of `scenes`."""
 
 
 def _drawn(organ: str | None, tissue: Tissue) -> list[Assumption]:
@@ -48,57 +50,25 @@ def _drawn(organ: str | None, tissue: Tissue) -> list[Assumption]:
 
 @dataclass(frozen=True)
 class SpotTwins:
-    """A highlight of the real frame with what its twins measure.
-
-    Parameters
-    ----------
-    spot : Spot
-        The highlight.
-    stated_deg : float or None
-        RMS error that its best estimate states, deg.
-    twins : Twins
-        What the twins measure.
-    """
+    """A highlight of the real frame with what its twins measure."""
 
     spot: Spot
-    stated_deg: float | None
+    stated_deg: float | None  # RMS error that its best estimate states
     twins: Twins
 
 
 @dataclass(frozen=True)
 class TwinResult:
-    """The twins of a picture.
+    """The twins of a picture."""
 
-    Parameters
-    ----------
-    image : str
-        The picture's name.
-    picture : ndarray of float32, shape (H, W) or (H, W, 3)
-        As encoded.
-    spots : list of SpotTwins
-        Its usable highlights.
-    bank : list of BankFrame
-        The rendered frames.
-    bank_spots : list of (int, ScoredSpot)
-        The highlights in them, with the number of their frame.
-    look : Look
-        What the picture shows of tissue and exposure.
-    assumed : list of Assumption
-        What is not known exactly, and how it was drawn.
-    warnings : list of str
-        Of the calibration.
-    processor_s : float
-        Processor time of this process, s.
-    """
-
-    image: str
-    picture: Image
-    spots: list[SpotTwins]
+    image: str  # the picture's name
+    picture: Image  # as encoded, shape (H, W) or (H, W, 3)
+    spots: list[SpotTwins]  # its usable highlights
     bank: list[BankFrame]
-    bank_spots: list[tuple[int, ScoredSpot]]
+    bank_spots: list[tuple[int, ScoredSpot]]  # the highlights in it, with the number of their frame
     look: Look
-    assumed: list[Assumption]
-    warnings: list[str]
+    assumed: list[Assumption]  # what is not known exactly, and how it was drawn
+    warnings: list[str]  # of the calibration
     processor_s: float
 
     def share_of(self, kind: SpotKind) -> float:
@@ -186,7 +156,7 @@ def twins_of(
     bank = make_bank([subject], lambda values: run(values, calibration, whole), count, seed, progress)
     matched = match_spots(spots, all_spots(bank), name, count)
     # Twins have near misses, so nothing is assumed of them.
-    assumed = [each for each in made.choices.assumed if each is not NEAR_MISSES]
+    assumed = [each for each in made.choices.assumed if each != NEAR_MISSES]
     return matched, bank, look, [*assumed, *_drawn(organ, tissue)]
 
 
@@ -251,7 +221,9 @@ def to_json(result: TwinResult, command: str = "") -> JsonObject:
 
 
 def _spot_json(each: SpotTwins) -> JsonObject:
+    """Return a highlight; a figure that its twins do not have is null."""
     spot, twins = each.spot, each.twins
+    figures = {key: _finite(value) for key, value in vars(twins).items() if key != "best"}
     return {
         "id": spot.index,
         "peak_px": spot.peak_px,
@@ -260,31 +232,12 @@ def _spot_json(each: SpotTwins) -> JsonObject:
         "normal": spot.estimate.normal,
         "target": spot.estimate.target,
         "stated_deg": each.stated_deg,
-        "twins": twins_json(twins),
-    }
+        "twins": {**figures, "distance_mm": [_finite(value) for value in twins.distance_mm],
+                  "covered": twins.is_covered},
+    }  # fmt: skip
 
 
-def twins_json(twins: Twins) -> JsonObject:
-    """Return what the twins of a highlight measure; a figure that they do not have is null."""
-    return {
-        "rms_deg": twins.rms_deg,
-        "interval_deg": twins.interval_deg,
-        "p95_deg": twins.p95_deg,
-        "coverage": twins.coverage,
-        "near_misses": twins.near_misses,
-        "false": twins.false,
-        "glint_rms_deg": _finite(twins.glint_rms_deg),
-        "near_rms_deg": _finite(twins.near_rms_deg),
-        "base_rms_deg": twins.base_rms_deg,
-        "base_interval_deg": twins.base_interval_deg,
-        "distance_mm": [_finite(each) for each in twins.distance_mm],
-        "effective": twins.effective,
-        "unlikeness": twins.unlikeness,
-        "covered": twins.is_covered,
-    }
-
-
-def _finite(value: float) -> float | None:
+def _finite(value: Any) -> Any:
     # NaN is the only number that differs from itself.
     return value if value == value else None
 
@@ -307,59 +260,34 @@ PATCH_PX, LEAST_HALF_PX, RADII = 112, 9, 3.5
 """Side of a shown patch; half the side that it shows of the frame, at least and in radii of the real highlight, px."""
 
 
-@dataclass(frozen=True)
-class ShownTwin:
-    """A twin's patch, as an address, its error in deg and whether it is a near miss."""
-
-    address: str
-    error_deg: float
-    is_near_miss: bool
-
-
-@dataclass(frozen=True)
-class ShownSpot:
-    """A real highlight's patch, as an address, and its likest twins."""
-
-    each: SpotTwins
-    address: str
-    twins: list[ShownTwin]
-
-
 def render_page(result: TwinResult, command: str = "") -> str:
-    """Return the page."""
-    made_by = provenance.environment()
-    told = [each for each in result.spots if each.stated_deg is not None]
-    stated = (
-        float(np.sqrt(np.mean([each.stated_deg**2 for each in told if each.stated_deg is not None]))) if told else None
-    )
-    return environment().get_template("twin.html.j2").render(
-        result=result, command=command, stated=stated, rms=result.rms_deg(), base=result.rms_deg("base_rms_deg"),
-        uncovered=sum(not each.twins.is_covered for each in result.spots), strips=_strips(result),
-        provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"], "python": made_by["python"]},
-    )  # fmt: skip
-
-
-def _strips(result: TwinResult) -> list[ShownSpot]:
-    """Return some highlights with their likest twins, the smallest first."""
+    """Return the page: one HTML file that needs nothing else."""
+    about = provenance.environment()
+    stated = np.array([each.stated_deg for each in result.spots if each.stated_deg is not None])
+    # Some highlights, the smallest first.
     ordered = sorted(result.spots, key=lambda each: each.spot.radius_px)
     picked = np.unique(np.linspace(0, len(ordered) - 1, SHOWN_SPOTS).round().astype(int)).tolist()
     picture = np.asarray(np.rint(255 * np.clip(result.picture, 0, 1)), dtype=np.uint8)
-    return [_strip(result, picture, ordered[i]) for i in picked]
+    return environment().get_template("twin.html.j2").render(
+        result=result, command=command, stated=root_mean_square(stated), rms=result.rms_deg(),
+        base=result.rms_deg("base_rms_deg"), uncovered=sum(not each.twins.is_covered for each in result.spots),
+        strips=[_strip(result, picture, ordered[i]) for i in picked],
+        provenance={"commit": about["commit"] or "–", "simtest": about["version"], "python": about["python"]},
+    )  # fmt: skip
 
 
-def _strip(result: TwinResult, picture: Picture, each: SpotTwins) -> ShownSpot:
+def _strip(result: TwinResult, picture: Picture, each: SpotTwins) -> dict[str, Any]:
+    """Return a real highlight, its patch as an address, and its likest twins with theirs."""
     half = max(LEAST_HALF_PX, round(RADII * each.spot.radius_px))
-    twins = []
-    for number in each.twins.best[:SHOWN_TWINS].tolist():
-        frame, scored = result.bank_spots[number]
-        patch = _patch(result.bank[frame].picture, scored.spot.peak_px, half)
-        twins.append(ShownTwin(jpeg_address(patch, 90), scored.error_deg, scored.is_near_miss))
-    return ShownSpot(each, jpeg_address(_patch(picture, each.spot.peak_px, half), 90), twins)
 
+    def patch(frame: Picture, spot: Spot) -> str:
+        # Beyond the border the frame is repeated.
+        padded = cv2.copyMakeBorder(frame, half, half, half, half, cv2.BORDER_REPLICATE)
+        x, y = (int(v) for v in spot.peak_px)
+        cut = padded[y : y + 2 * half + 1, x : x + 2 * half + 1]
+        enlarged = cv2.resize(cut, (PATCH_PX, PATCH_PX), interpolation=cv2.INTER_NEAREST)
+        return jpeg_address(np.asarray(enlarged, dtype=np.uint8), 90)
 
-def _patch(picture: Picture | Image, centre: Array, half: int) -> Picture:
-    """Return the surroundings of a point, px, enlarged; beyond the border the frame is repeated."""
-    padded = cv2.copyMakeBorder(picture, half, half, half, half, cv2.BORDER_REPLICATE)
-    x, y = (int(v) for v in centre)
-    cut = padded[y : y + 2 * half + 1, x : x + 2 * half + 1]
-    return np.asarray(cv2.resize(cut, (PATCH_PX, PATCH_PX), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+    likest = [result.bank_spots[number] for number in each.twins.best[:SHOWN_TWINS].tolist()]
+    twins = [(patch(result.bank[frame].picture, scored.spot), scored) for frame, scored in likest]
+    return {"each": each, "address": patch(picture, each.spot), "twins": twins}

@@ -48,65 +48,31 @@ LEAST_DEG = 1e-3
 
 @dataclass(frozen=True)
 class Spot:
-    """A usable highlight: one whose best estimate is a normal of that highlight alone.
+    """A usable highlight: one whose best estimate is a normal of that highlight alone."""
 
-    Parameters
-    ----------
-    index : int
-        Of its specularity in the reconstruction.
-    peak_px : ndarray, shape (2,)
-        Where it is.
-    radius_px : float
-        Of the circle that has its area above half height.
-    estimator : str
-        Name of the best estimator.
-    estimate : Estimate
-        Its result.
-    features : ndarray, shape (F,)
-        What the picture shows of it (`FEATURES`).
-    """
-
-    index: int
-    peak_px: Array
-    radius_px: float
-    estimator: str
-    estimate: Estimate
-    features: Array
+    index: int  # of its specularity in the reconstruction
+    peak_px: Array  # shape (2,)
+    radius_px: float  # of the circle that has its area above half height
+    estimator: str  # the best one
+    estimate: Estimate  # its result
+    features: Array  # shape (F,), what the picture shows of it (`FEATURES`)
 
 
 @dataclass(frozen=True)
 class ScoredSpot:
     """A usable highlight of a rendered frame with its errors.
 
-    Parameters
-    ----------
-    spot : Spot
-        The highlight.
-    kind : {"glint", "near_miss", "false"}
-        glint: a lit highlight point lies inside its isophote at half height. near_miss: none does, so the normal there
-        nowhere bisects the directions to light and camera, but the noise-free frame shows a highlight there
-        (theory.md 7.1b). false: it shows none either, as at a pale edge.
-    error_deg : float
-        Angle to the fine normal: at the matched highlight point, or at the point looked at where there is none.
-    base_error_deg : float
-        Angle to the base's normal at the same point.
-    held : bool or None
-        Whether the stated 95 % region holds the normal that the estimate states; None where nothing is stated.
-    distance_mm : float
-        Of the surface along the sightline; NaN where that meets none.
+    A glint has a lit highlight point inside its isophote at half height. A near miss has none, so the normal there
+    nowhere bisects the directions to light and camera, but the noise-free frame shows a highlight there (theory.md
+    7.1b). A false one shows none either, as at a pale edge.
     """
 
     spot: Spot
     kind: SpotKind
-    error_deg: float
-    base_error_deg: float
-    held: bool | None
-    distance_mm: float = math.nan
-
-    @property
-    def is_near_miss(self) -> bool:
-        """Whether it is a visible highlight in which the normal only comes near the bisector."""
-        return self.kind == "near_miss"
+    error_deg: float  # to the fine normal: at the matched highlight point, or at the point looked at if there is none
+    base_error_deg: float  # to the base's normal at the same point
+    held: bool | None  # whether the stated 95 % region holds the normal; None where nothing is stated
+    distance_mm: float = math.nan  # of the surface along the sightline; NaN where that meets none
 
 
 FEATURES = (
@@ -247,48 +213,24 @@ UNLIKE = 2.0
 
 @dataclass(frozen=True)
 class Twins:
-    """What the twins of one highlight measure.
+    """What the twins of one highlight measure: those that are highlights, but for `false`."""
 
-    Parameters
-    ----------
-    rms_deg, interval_deg : float, tuple of float
-        Root mean square error against the fine normal, with its 95 % interval over the bank's frames.
-    base_rms_deg, base_interval_deg : float, tuple of float
-        The same against the base's normal.
-    coverage : float or None
-        Share of the twins whose stated 95 % region holds the truth; None where none states one.
-    near_misses, false : float
-        Share of near misses among the twins that are highlights, and of false detections among all (`ScoredSpot`). All
-        other figures are of the twins that are highlights.
-    glint_rms_deg, near_rms_deg : float
-        RMS error of the twins that are glints, and of near misses; NaN where there are none.
-    p95_deg : float
-        95 % of the twins' errors against the fine normal lie below.
-    distance_mm : tuple of float
-        Distances below which 10, 50 and 90 % of the twins stand, mm: what the picture's look says of it, and what was
-        told. The error from a light beside the lens goes with its inverse.
-    effective : float
-        Effective number of twins.
-    unlikeness : float
-        Root mean square over twins and features of how far they are from the highlight, in units of `SCALES`.
-    best : ndarray of int
-        The likest in the bank, the first first.
-    """
-
-    rms_deg: float
-    interval_deg: tuple[float, float]
-    base_rms_deg: float
+    rms_deg: float  # root mean square error against the fine normal
+    interval_deg: tuple[float, float]  # its 95 % interval over the bank's frames
+    p95_deg: float  # 95 % of the errors against the fine normal lie below
+    coverage: float | None  # share whose stated 95 % region holds the truth; None where none states one
+    near_misses: float  # share of near misses
+    false: float  # share of false detections among all
+    glint_rms_deg: float  # of the twins that are glints; NaN where there are none
+    near_rms_deg: float  # of near misses
+    base_rms_deg: float  # against the base's normal
     base_interval_deg: tuple[float, float]
-    coverage: float | None
-    near_misses: float
-    false: float
-    glint_rms_deg: float
-    near_rms_deg: float
-    p95_deg: float
+    # Distances below which 10, 50 and 90 % of the twins stand: what the picture's look says of it, and what was told.
+    # The error from a light beside the lens goes with its inverse.
     distance_mm: tuple[float, float, float]
-    effective: float
-    unlikeness: float
-    best: IntArray
+    effective: float  # number of twins
+    unlikeness: float  # root mean square over twins and features of the distance to the highlight, units of `SCALES`
+    best: IntArray  # the likest in the bank, the first first
 
     @property
     def is_covered(self) -> bool:
@@ -297,13 +239,7 @@ class Twins:
 
 
 class Matcher:
-    """Finds twins in a bank.
-
-    Parameters
-    ----------
-    spots : sequence of (int, ScoredSpot)
-        The bank's highlights, with the number of the frame that each is in; at least one.
-    """
+    """Finds twins among a bank's highlights, at least one, each with the number of its frame."""
 
     def __init__(self, spots: Sequence[tuple[int, ScoredSpot]]) -> None:
         self._frames = np.array([frame for frame, _ in spots])
@@ -327,7 +263,7 @@ class Matcher:
         # A false detection has no normal that is its own.
         weights = _weights(np.where(self._real, squared, np.inf), self._shares, TWINS)
         near, glint = weights * self._near, weights * ~self._near
-        nearest, middle, farthest = (weighted_quantile(self._distances, weights, share) for share in (0.1, 0.5, 0.9))
+        near_mm, middle_mm, far_mm = (weighted_quantile(self._distances, weights, share) for share in (0.1, 0.5, 0.9))
         stated = weights * self._stated
         return Twins(
             rms_deg=_rms(weights, self._errors),
@@ -340,7 +276,7 @@ class Matcher:
             glint_rms_deg=_rms(glint, self._errors),
             near_rms_deg=_rms(near, self._errors),
             p95_deg=weighted_quantile(self._errors, weights, 0.95),
-            distance_mm=(nearest, middle, farthest),
+            distance_mm=(near_mm, middle_mm, far_mm),
             effective=float(weights.sum() ** 2 / np.square(weights).sum()),
             unlikeness=float(np.sqrt(weights @ np.where(self._real, squared, 0.0) / weights.sum() / len(FEATURES))),
             best=np.argsort(np.where(self._real, squared, np.inf), kind="stable")[:12],
@@ -358,9 +294,9 @@ class Matcher:
     def _interval(self, weights: Array, errors: Array) -> tuple[float, float]:
         """Return the 95 % interval of an RMS error over the frames: their highlights share a light."""
         low, high = mean_interval(weights * np.square(errors), self._frames, counts=weights)
-        return (
-            (np.nan, np.nan) if low is None or high is None else (float(np.sqrt(max(low, 0.0))), float(np.sqrt(high)))
-        )
+        if low is None or high is None:
+            return np.nan, np.nan
+        return float(np.sqrt(max(low, 0.0))), float(np.sqrt(high))
 
 
 def _weights(squared: Array, shares: Array, wanted: float) -> Array:
