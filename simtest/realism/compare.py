@@ -335,4 +335,4 @@ def small(picture: Image, height: int) -> Picture:
 
 def plain(value: float) -> float | None:
     """Return what JSON holds of a number: None where it is not finite."""
-    return value if math.isfinite(value) else None
+    return float(value) if math.isfinite(value) else None

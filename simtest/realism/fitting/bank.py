@@ -19,7 +19,7 @@ from simtest.runtime.files import Json, make_folder, read_json, write_json
 from simtest.runtime.provenance import source_hash
 from simtest.runtime.seeds import Stage, generator, integer
 from simtest.spec import Scene, apply_settings
-from simtest.spec.recipes import Dataset, Distribution, Family, Splits
+from simtest.spec.recipes import Dataset, Distribution, Splits
 from simtest.spec.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -46,24 +46,12 @@ KNOWN: tuple[tuple[str, str, str], ...] = (
 
 @dataclass(frozen=True)
 class Parameter:
-    """A range of a recipe that is fitted.
+    """A range of a recipe that is fitted."""
 
-    Parameters
-    ----------
-    kind : str
-        What it is, one of `KNOWN`.
-    key : str
-        Key path of the scene.
-    prior : Distribution
-        The recipe's range.
-    table : str
-        Where the range stands: per_anatomy or per_sample of the family, or shared by all families.
-    """
-
-    kind: str
-    key: str
-    prior: Distribution
-    table: str
+    kind: str  # what it is, one of `KNOWN`
+    key: str  # key path of the scene
+    prior: Distribution  # the recipe's range
+    table: str  # where it stands: per_anatomy or per_sample of the family, or shared by all families
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -84,15 +72,7 @@ class Parameter:
 
 
 def one_family(dataset: Dataset, scene: str | None = None) -> Dataset:
-    """Return a recipe with the one family that is to be fitted.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        The recipe.
-    scene : str, optional
-        Base scene of the family; may be left out where there is only one.
-    """
+    """Return a recipe with the one family that is to be fitted, by its base scene where there are several."""
     names = [family.scene for family in dataset.families]
     found = [family for family in dataset.families if scene is None or family.scene == scene]
     if len(found) != 1:
@@ -107,13 +87,15 @@ def fitted_parameters(dataset: Dataset) -> list[Parameter]:
     tables = {"per_anatomy": family.per_anatomy, "per_sample": family.per_sample, "shared": dataset.per_sample}
     found = []
     for kind, pattern, _ in KNOWN:
-        ranges = [(key, prior, name) for name, table in tables.items() for key, prior in table.items()
-                  if re.fullmatch(pattern, key) and _has_width(prior)]  # fmt: skip
-        found += [Parameter(kind, *one) for one in sorted(ranges, key=lambda one: one[0])]
-    if not found:
+        ranges = [Parameter(kind, key, prior, name) for name, table in tables.items() for key, prior in table.items()
+                  if re.fullmatch(pattern, key)]  # fmt: skip
+        found += sorted(ranges, key=lambda one: one.key)
+    # A choice has no width, and neither has a range of one value.
+    wide = [p for p in found if not p.prior.choose and not p.prior.integer and p.prior.ends[0] < p.prior.ends[1]]
+    if not wide:
         kinds = ", ".join(kind for kind, _, _ in KNOWN)
         raise InputError(f"{dataset.name}: no range with low and high that can be fitted; must draw one of: {kinds}")
-    return found
+    return wide
 
 
 def missing_kinds(parameters: list[Parameter]) -> list[str]:
@@ -122,25 +104,19 @@ def missing_kinds(parameters: list[Parameter]) -> list[str]:
     return [kind for kind, _, _ in KNOWN if kind not in drawn]
 
 
-def _has_width(prior: Distribution) -> bool:
-    return not prior.choose and not prior.integer and prior.ends[0] < prior.ends[1]
-
-
 def narrowed(dataset: Dataset, parameters: list[Parameter], low: Array, high: Array) -> Dataset:
     """Return a recipe of one family whose ranges reach from `low` to `high`, shape (P,), shares of the prior's."""
-    tables = {"per_anatomy": dict(dataset.families[0].per_anatomy), "per_sample": dict(dataset.families[0].per_sample)}
-    shared = dict(dataset.per_sample)
+    family = dataset.families[0]
+    tables = {name: dict(getattr(family, name)) for name in ("per_anatomy", "per_sample")}
+    tables["shared"] = dict(dataset.per_sample)
     for parameter, first, last in zip(parameters, low, high, strict=True):
-        ends = parameter.from_unit(np.clip([first, last], 0.0, 1.0))
-        table = shared if parameter.table == "shared" else tables[parameter.table]
-        table[parameter.key] = Distribution(low=_plain(ends[0]), high=_plain(ends[1]), log=parameter.prior.log)
-    family: Family = dataset.families[0].model_copy(update=tables)
-    return dataset.model_copy(update={"families": (family,), "per_sample": shared})
-
-
-def _plain(value: float) -> float:
-    """Return a number of five digits: a recipe is read by people."""
-    return float(f"{value:.5g}")
+        # Five digits: a recipe is read by people.
+        ends = (float(f"{end:.5g}") for end in parameter.from_unit(np.clip([first, last], 0.0, 1.0)))
+        tables[parameter.table][parameter.key] = Distribution(
+            **dict(zip(("low", "high"), ends, strict=True)), log=parameter.prior.log
+        )
+    shared = tables.pop("shared")
+    return dataset.model_copy(update={"families": (family.model_copy(update=tables),), "per_sample": shared})
 
 
 TRIES = 8
@@ -149,37 +125,14 @@ TRIES = 8
 
 @dataclass(frozen=True)
 class DrawnFrame:
-    """A picture of a recipe and what was drawn for it.
+    """A picture of a recipe, encoded values in [0, 1], shape (H, W, 3), and what was drawn for it, by key path."""
 
-    Parameters
-    ----------
-    index, chain : int
-        Number of the radiance, and of the sensor's draw.
-    anatomy : Anatomy
-        What it shows.
-    values : dict
-        Drawn values by key path.
-    picture : ndarray of float32, shape (H, W, 3)
-        Encoded values in [0, 1].
-    """
-
-    index: int
-    chain: int
-    anatomy: Anatomy
     values: dict[str, JsonValue]
     picture: Image
 
 
 class FrameMaker:
-    """Renders frames of a recipe, without the labels of `simtest dataset`.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        The recipe; all its ranges are drawn.
-    variant : str, optional
-        Mitsuba variant.
-    """
+    """Renders frames of a recipe, all of whose ranges are drawn, without the labels of `simtest dataset`."""
 
     def __init__(self, dataset: Dataset, variant: str | None = None) -> None:
         # Imported here, as below: a bank that is complete needs no renderer.
@@ -210,7 +163,7 @@ class FrameMaker:
         for chain in range(chains):
             values, scene = (drawn.values, drawn.scene) if chain == 0 else self._redrawn(index, chain, drawn)
             picture = displayed(render_picture(session, scene, radiance), scene.sensor)
-            yield DrawnFrame(index, chain, drawn.anatomy, values, picture)
+            yield DrawnFrame(values, picture)
 
     def _redrawn(self, index: int, chain: int, drawn: Drawn) -> tuple[dict[str, JsonValue], Scene]:
         """Draw the sensor's values again, with other noise."""
@@ -255,21 +208,11 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Bank:
-    """Frames over the ranges of a recipe.
+    """Pictures over the ranges of a recipe."""
 
-    Parameters
-    ----------
-    shares : ndarray, shape (N, P)
-        Parameters of each picture as shares of their ranges.
-    summaries : ndarray, shape (N, S)
-        See `summarise`; NaN where a picture does not tell one.
-    radiance : ndarray of int, shape (N,)
-        Which pictures are of one radiance.
-    """
-
-    shares: Array
-    summaries: Array
-    radiance: IntArray
+    shares: Array  # shape (N, P), their parameters as shares of the ranges
+    summaries: Array  # shape (N, S), see `summarise`; NaN where a picture does not tell one
+    radiance: IntArray  # shape (N,), which of them are of one radiance
 
     def ends(self) -> tuple[Array, Array]:
         """Return the least and the largest value of each summary, shape (S,); infinite where no picture tells it."""
@@ -300,20 +243,9 @@ def make_bank(
     chains: int = CHAINS,
     progress: Progress | None = None,
 ) -> Bank:
-    """Render a bank, or what is missing of it.
+    """Render a bank of a recipe of one family, or what is missing of it.
 
-    Parameters
-    ----------
-    dataset : Dataset
-        Recipe of one family.
-    parameters : sequence of Parameter
-        What is fitted.
-    folder : Path
-        Holds a file for each radiance; one that holds another recipe's is refused.
-    size, chains : int
-        Radiances, and pictures of each.
-    progress : callable, optional
-        See `Progress`.
+    The folder holds a file for each of `size` radiances, with `chains` pictures; another recipe's is refused.
     """
     recipe = bank_recipe(dataset, size)
     _claim(recipe, folder, chains)

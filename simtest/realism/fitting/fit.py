@@ -1,7 +1,6 @@
 """Fits a recipe to frames: measures them, makes the bank, infers, narrows the recipe's ranges, and writes it."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from simtest.errors import InputError
+from simtest.realism.compare import plain
 from simtest.realism.fitting.bank import (
     KNOWN,
     Bank,
@@ -43,36 +43,16 @@ Seen = tuple[dict[str, Array], set[tuple[int, int]], dict[str, str]]
 
 @dataclass(frozen=True)
 class FittedRecipe:
-    """What a fit found.
+    """What a fit found."""
 
-    Parameters
-    ----------
-    recipe : Dataset
-        With its ranges narrowed to the fitted distribution.
-    parameters : list of Parameter
-        What was fitted, with the ranges before.
-    fitted : Fitted
-        As shares of these.
-    emulator : Emulator
-        Of the bank.
-    bank : Bank
-        Frames over the whole ranges.
-    scenes : dict
-        Summaries by scene, shape (S,), the mean over its frames.
-    sizes : set of (int, int)
-        Width and height of the frames, px.
-    left_out : dict
-        Reason by frame that could not be measured.
-    """
-
-    recipe: Dataset
-    parameters: list[Parameter]
-    fitted: Fitted
+    recipe: Dataset  # with its ranges narrowed to the fitted distribution
+    parameters: list[Parameter]  # what was fitted, with the ranges before
+    fitted: Fitted  # as shares of these
     emulator: Emulator
-    bank: Bank
-    scenes: dict[str, Array]
-    sizes: set[tuple[int, int]]
-    left_out: dict[str, str]
+    bank: Bank  # frames over the whole ranges
+    scenes: dict[str, Array]  # summaries by scene, shape (S,), the mean over its frames
+    sizes: set[tuple[int, int]]  # width and height of the frames, px
+    left_out: dict[str, str]  # reason by frame that could not be measured
 
     @property
     def out_of_reach(self) -> list[str]:
@@ -197,7 +177,13 @@ def ranges(fitted: Fitted) -> tuple[Array, Array]:
     return np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
 
 
-UNITS = {kind: unit for kind, _, unit in KNOWN}
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def check_out(path: Path) -> None:
+    """Raise `InputError` if a recipe cannot be written there: before the fit, which takes long."""
+    if path.suffix != ".toml" or path.is_dir():
+        raise InputError(f"--out {path}: must be a file whose name ends in .toml")
 
 
 def write_fit(found: FittedRecipe, path: Path) -> tuple[Path, Path]:
@@ -206,12 +192,6 @@ def write_fit(found: FittedRecipe, path: Path) -> tuple[Path, Path]:
     write_atomically(path, lambda part: part.write_text(recipe_toml(found.recipe), encoding="utf-8"))
     write_json(report, report_json(found))
     return path, report
-
-
-def check_out(path: Path) -> None:
-    """Raise `InputError` if a recipe cannot be written there: before the fit, which takes long."""
-    if path.suffix != ".toml" or path.is_dir():
-        raise InputError(f"--out {path}: must be a file whose name ends in .toml")
 
 
 def recipe_toml(dataset: Dataset) -> str:
@@ -235,7 +215,7 @@ def _lines(table: Mapping[str, Any]) -> str:
 def report_json(found: FittedRecipe) -> dict[str, Json]:
     """Return the fit's figures: parameters with intervals, summaries of both sides, and what limits it."""
     return {
-        "parameters": [parameter_json(found, number) for number in range(len(found.parameters))],
+        "parameters": [_parameter(found, number) for number in range(len(found.parameters))],
         "not_told": [p.key for p, told in zip(found.parameters, found.fitted.told, strict=True) if not told],
         "summaries": _summaries(found),
         "gap": found.fitted.gap,
@@ -246,22 +226,22 @@ def report_json(found: FittedRecipe) -> dict[str, Json]:
     }
 
 
-def parameter_json(found: FittedRecipe, number: int) -> dict[str, Json]:
+def _parameter(found: FittedRecipe, number: int) -> dict[str, Json]:
     """Return one parameter's centre, spread and 95 % interval, in its own unit."""
     parameter, fitted = found.parameters[number], found.fitted
-    centre, low, high = (float(v) for v in parameter.from_unit(
-        np.array([fitted.centre[number], *fitted.interval[number]])))  # fmt: skip
-    spread = fitted.spread[number] * (parameter.ends[1] - parameter.ends[0])
+    interval = fitted.interval[number]
+    centre, low, high = parameter.from_unit(np.array([fitted.centre[number], *interval])).tolist()
+    first, last = parameter.ends
     return {
         "key": parameter.key,
         "kind": parameter.kind,
-        "unit": UNITS[parameter.kind],
+        "unit": next(unit for kind, _, unit in KNOWN if kind == parameter.kind),
         "centre": centre,
         "ci95": [low, high],
-        "spread": float(spread),
+        "spread": float(fitted.spread[number] * (last - first)),
         "spread_of_logarithm": parameter.prior.log,
-        "spread_ci95_shares": [float(v) for v in np.quantile(fitted.spreads[:, number], [0.025, 0.975])],
-        "interval_share_of_range": float(np.diff(fitted.interval[number])[0]),
+        "spread_ci95_shares": np.quantile(fitted.spreads[:, number], [0.025, 0.975]).tolist(),
+        "interval_share_of_range": float(np.diff(interval)[0]),
         "told": bool(fitted.told[number]),
         "range_before": [float(end) for end in parameter.prior.ends],
     }
@@ -270,25 +250,17 @@ def parameter_json(found: FittedRecipe, number: int) -> dict[str, Json]:
 def _summaries(found: FittedRecipe) -> list[Json]:
     """Return of each summary the mean over scenes, what the fitted recipe shows, and the bank's ends."""
     emulator, fitted = found.emulator, found.fitted
-    values = np.array(list(found.scenes.values()))
-    shown_mean = emulator.mean(fitted.centre)[0] * emulator.scale + emulator.centre
-    low, high = found.bank.ends()
-    rows: list[Json] = []
-    for s, name in enumerate(NAMES):
-        told = values[np.isfinite(values[:, s]), s]
-        ends = [_plain(low[s]), _plain(high[s])]
-        rows.append(
-            {
-                "name": name,
-                "real": _plain(told.mean()) if len(told) else None,
-                "fitted": _plain(shown_mean[s]),
-                "bank": ends,
-                "used": bool(fitted.summaries[s]),
-                "in_reach": name not in found.out_of_reach,
-            }
-        )
-    return rows
-
-
-def _plain(value: Any) -> float | None:
-    return float(value) if math.isfinite(value) else None
+    real = [column[np.isfinite(column)] for column in np.array(list(found.scenes.values())).T]
+    columns = zip(NAMES, real, emulator.mean(fitted.centre)[0] * emulator.scale + emulator.centre, *found.bank.ends(),
+                  fitted.summaries, strict=True)  # fmt: skip
+    return [
+        {
+            "name": name,
+            "real": plain(values.mean()) if len(values) else None,
+            "fitted": plain(shown),
+            "bank": [plain(low), plain(high)],
+            "used": bool(used),
+            "in_reach": name not in found.out_of_reach,
+        }
+        for name, values, shown, low, high, used in columns
+    ]

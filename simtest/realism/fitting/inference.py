@@ -13,7 +13,6 @@ the range where nothing else says more.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -45,32 +44,18 @@ LEAST_RADIANCES = 20
 
 @dataclass(frozen=True)
 class Emulator:
-    """Mean and spread of a frame's summaries, in units of the bank's deviations.
+    """Mean and spread of a frame's S summaries by P parameters, in units of the bank's deviations."""
 
-    Parameters
-    ----------
-    centre, scale : ndarray, shape (S,)
-        The bank's mean and deviation of each summary.
-    weights : ndarray, shape (F, S)
-        Of the features of `features`, standardised summaries.
-    covariance : ndarray, shape (S, S)
-        Of the residuals of a picture.
-    error : ndarray, shape (S, S)
-        Covariance of the errors of `mean`, over the ranges.
-    draws : ndarray, shape (R, F, S)
-        Errors of `weights`, as the bank's radiances leave them.
-    """
-
-    centre: Array
-    scale: Array
-    weights: Array
-    covariance: Array
-    error: Array
-    draws: Array
+    centre: Array  # shape (S,), the bank's mean of each summary
+    scale: Array  # shape (S,), its deviation
+    weights: Array  # shape (F, S), of `features`
+    covariance: Array  # shape (S, S), of the residuals of a picture
+    error: Array  # shape (S, S), covariance of the errors of `mean`, over the ranges
+    draws: Array  # shape (R, F, S), errors of the weights, as the bank's radiances leave them
 
     @property
     def parameters(self) -> int:
-        """Number of parameters P; there are 1 + P + P + P (P - 1) / 2 features."""
+        """Number of parameters; there are 1 + P + P + P (P - 1) / 2 features."""
         return int((np.sqrt(9 + 8 * (len(self.weights) - 1)) - 3) / 2)
 
     def standardised(self, summaries: Array) -> Array:
@@ -85,15 +70,10 @@ class Emulator:
         """Return the derivative of the mean by each parameter, shape (P,) -> (P, S)."""
         return np.asarray(_feature_slopes(shares) @ self.weights)
 
-    @cached_property
-    def bends(self) -> Array:
-        """The second derivatives of the mean, the same at all parameters, shape (P, P, S)."""
-        count = self.parameters
-        first, second = np.triu_indices(count, k=1)
-        bends = np.zeros((count, count, self.weights.shape[1]))
-        bends[np.arange(count), np.arange(count)] = 8 * self.weights[1 + count : 1 + 2 * count]
-        bends[first, second] = bends[second, first] = 4 * self.weights[1 + 2 * count :]
-        return bends
+    @property
+    def curvature(self) -> Array:
+        """Half the second derivative of the mean by each parameter, the same at all of them, shape (P, S)."""
+        return np.asarray(4 * self.weights[1 + self.parameters : 1 + 2 * self.parameters])
 
     @property
     def deviation(self) -> Array:
@@ -115,27 +95,14 @@ def features(shares: Array) -> Array:
 
 def _feature_slopes(shares: Array) -> Array:
     """Return the derivatives of `features` by each share, shape (P,) -> (P, F)."""
-    x = 2 * np.asarray(shares) - 1
-    count = len(x)
-    first, second = np.triu_indices(count, k=1)
-    mixed = np.zeros((count, len(first)))
-    mixed[first, np.arange(len(first))] = x[second]
-    mixed[second, np.arange(len(first))] = x[first]
-    return 2 * np.hstack([np.zeros((count, 1)), np.eye(count), np.diag(2 * x), mixed])
+    x, own = 2 * np.asarray(shares) - 1, np.eye(len(shares))
+    first, second = np.triu_indices(len(x), k=1)
+    mixed = own[:, first] * x[second] + own[:, second] * x[first]
+    return 2 * np.hstack([np.zeros((len(x), 1)), own, np.diag(2 * x), mixed])
 
 
 def learn(bank: Bank, rng: np.random.Generator, draws: int) -> Emulator:
-    """Fit an emulator to a bank.
-
-    Parameters
-    ----------
-    bank : Bank
-        At least 20 radiances.
-    rng : numpy.random.Generator
-        Deals radiances to folds, and draws the errors of the weights.
-    draws : int
-        How many errors are drawn.
-    """
+    """Fit an emulator to a bank of at least 20 radiances, which are dealt to folds, with some draws of its errors."""
     radiances, numbers = np.unique(bank.radiance, return_inverse=True)
     if len(radiances) < LEAST_RADIANCES:
         raise InputError(f"bank of {len(radiances)} radiances: must have at least {LEAST_RADIANCES}; raise --size")
@@ -238,29 +205,15 @@ CENTRE_ENDS = (-0.2, 1.2)
 
 @dataclass(frozen=True)
 class Fitted:
-    """The distribution of parameters, as shares of their ranges.
+    """The distribution of parameters, as shares of their ranges."""
 
-    Parameters
-    ----------
-    centre, spread : ndarray, shape (P,)
-        Mean and deviation over scenes.
-    gap : float
-        How far the emulator's best mean stays from the scenes', deviations of a frame's summaries.
-    centres, spreads : ndarray, shape (R, P)
-        Of the repeated fits.
-    interval : ndarray, shape (P, 2)
-        95 % interval of the centre.
-    summaries : ndarray of bool, shape (S,)
-        Which summaries the frames tell.
-    """
-
-    centre: Array
-    spread: Array
-    gap: float
-    centres: Array
-    spreads: Array
-    interval: Array
-    summaries: Array
+    centre: Array  # shape (P,), mean over scenes
+    spread: Array  # shape (P,), deviation over scenes
+    gap: float  # how far the emulator's best mean stays from the scenes', deviations of a frame's summaries
+    centres: Array  # shape (R, P), of the repeated fits
+    spreads: Array  # shape (R, P)
+    interval: Array  # shape (P, 2), 95 % interval of the centre
+    summaries: Array  # shape (S,), bool: which ones the frames tell
 
     @property
     def told(self) -> Array:
@@ -284,7 +237,7 @@ def infer(
     repeats: int = REPEATS,
     step: Callable[[int, int], None] | None = None,
 ) -> Fitted:
-    """Find the distribution of parameters.
+    """Find the distribution of parameters that scenes have.
 
     Parameters
     ----------
@@ -387,8 +340,7 @@ def negative_log(
     own = weight * scenes.scatter / (scenes.count - 1) + (1 - weight) * emulator.covariance[inside]
     covariance = own / scenes.count + emulator.error[inside] + np.diag(gaps)
     # A quadratic form has the mean over scenes that its curvature adds.
-    curvature = emulator.bends[np.arange(len(centre)), np.arange(len(centre))][:, told] / 2
-    residual = scenes.mean - emulator.mean(centre)[0, told] - spread**2 @ curvature
+    residual = scenes.mean - emulator.mean(centre)[0, told] - spread**2 @ emulator.curvature[:, told]
     value, by_covariance = _gaussian(covariance, np.outer(residual, residual), 1)
     slopes = emulator.slopes(centre)[:, told]
     gradient = -slopes @ np.linalg.solve(covariance, residual) + (centre - prior) / CENTRE_PRIOR**2
