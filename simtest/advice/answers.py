@@ -290,12 +290,14 @@ def _distance_unknown(question: Question) -> Iterator[BreakPoint]:
     # The error grows from the middle to either end.
     for side, end in (("below", NEAREST_MM), ("beyond", question.distances_mm[1])):
         low, high = middle, end
-        if law_deg(end) < question.bound_deg:
+        if (end < middle) != (side == "below") or law_deg(end) < question.bound_deg:
             continue
         for _ in range(_HALVINGS):
             half = (low + high) / 2
             low, high = (low, half) if law_deg(half) > question.bound_deg else (half, high)
         distance = round(high, 3)
+        if distance < NEAREST_MM:
+            continue
         yield BreakPoint(
             f"bisector, given the range of the distance alone, {side} the middle", "bisector", "distance", "mm",
             distance, "eps / 2 * abs(1 / d - 1 / middle)", law_deg(distance),

@@ -258,6 +258,17 @@ def test_a_bisector_that_knows_the_range_errs_beyond_its_middle_too():
         assert abs(turn) == pytest.approx(0.8, abs=0.02)
 
 
+@pytest.mark.parametrize(("distances", "beyond"), [((0.5, 3.0), []), ((1.0, 4.0), []), ((1.0, 12.0), [7.039])])
+def test_break_points_of_the_bisector_lie_on_their_side_of_the_middle(distances, beyond):
+    """Of a middle that is nearer than any endoscope works none lies below it, and none beyond that is as near."""
+    question = Question(read_scope("colonoscope_2"), distances_mm=distances, bound_deg=1.0)
+    found = [point for point in break_points(question) if point.method == "bisector"]
+    middle = sum(distances) / 2
+    assert all(("below" in point.title) == (point.value < middle) for point in found)
+    assert all(point.value >= 3.0 for point in found)
+    assert [point.value for point in found if "beyond" in point.title] == pytest.approx(beyond, abs=1e-3)
+
+
 def test_a_light_at_the_camera_has_no_break_points_of_offset():
     quantities = [point.quantity for point in break_points(Question(read_scope("colocated")))]
     assert quantities == ["d k", "slope of the relief"]
