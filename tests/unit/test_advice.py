@@ -11,7 +11,7 @@ import pytest
 
 import simtest
 from simtest.advice import plan
-from simtest.advice.advise import MAIN, RUN, advise, narrower, sentence, write_advice, write_scene
+from simtest.advice.advise import MAIN, RUN, Advised, advise, narrower, sentence, write_advice, write_scene
 from simtest.advice.answers import break_points, mean_error, read_results, spot_size
 from simtest.advice.plan import (
     DISTANCES,
@@ -33,6 +33,7 @@ from simtest.runtime.arrays import kept
 from simtest.surfaces import make_surface
 from simtest.validation import laws, realisation
 from simtest.validation.cases import RELIEF_SEED
+from studies import advice_strata
 from studies.advice_strata import frames_of, gain
 from tests.unit.given_numbers import of_given_numbers
 
@@ -447,6 +448,25 @@ def test_strata_are_read_from_the_frames_of_a_run(tmp_path):
     turns = [1 + pool["surface.distance_mm"][6] * pool[f"surface.{key}_per_mm"][6] for key in ("k1", "k2")]
     assert least[6] == min(map(abs, turns))
     assert frames_of(tmp_path, "curved")[1].sum() == 0
+
+
+def test_strata_of_a_folder_without_an_advice_are_refused_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["advice_strata", str(tmp_path)])
+    with pytest.raises(SystemExit, match=r"advice\.json: no such file; must be what studies\.advice writes$"):
+        advice_strata.main()
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_the_page_says_whose_relief_is_drawn(tmp_path, stated):
+    scope = read_scope(written(tmp_path, CAMERA + "[relief]\nslope_deg = [1.0, 2.0]\n" * stated))
+    question = Question(scope, "colon", frames=8)
+    found = read_results(results([1.0, 3.0], [0, 1]), 8)
+    advised = Advised(question, found, break_points(question), spot_size(question), None,
+                      np.zeros((72, 96, 3), np.uint8), {"errors": "e", "picture": "p"},
+                      surroundings(question).random)  # fmt: skip
+    page = write_advice(advised, tmp_path / "out").read_text(encoding="utf-8")
+    assert ("the relief is that of the scope's file" in page) == stated
+    assert ("relief and film those of the dataset recipe endoscopy" in page) != stated
 
 
 @pytest.mark.parametrize(
