@@ -20,7 +20,7 @@ from typing import Any
 import polars as pl
 
 from simtest.advice.advise import MAIN
-from simtest.advice.figures import MeanError, read_results
+from simtest.advice.answers import MeanError, read_results
 from simtest.advice.plan import DISTANCES, Question, main_experiment, write_experiment
 from simtest.advice.scope import read_scope
 from simtest.runtime.files import write_json

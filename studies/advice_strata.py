@@ -11,7 +11,6 @@ of plain draws; the spreads in it are those of the same frames, so it flatters.
 """
 
 import argparse
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +18,9 @@ import numpy as np
 import polars as pl
 
 from simtest.advice.advise import MAIN
+from simtest.errors import InputError
 from simtest.runtime.arrays import Array
+from simtest.runtime.files import read_json
 from simtest.spec import load_experiment
 
 STRATA = 8
@@ -98,7 +99,10 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--rig", action="append", dest="names")
     told = parser.parse_args()
-    done = json.loads((told.out / "advice.json").read_text(encoding="utf-8"))
+    try:
+        done = read_json(told.out / "advice.json", "what studies.advice writes")
+    except InputError as error:
+        raise SystemExit(str(error)) from None
     for name in told.names or done:
         method = next(row["method"] for row in done[name]["figures"] if row["target"] == "fine")
         # Finished runs alone: a run that goes on has no table yet.

@@ -15,13 +15,19 @@ from pathlib import Path
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.realism.fitting.bank import Bank, count_made, make_bank, read_bank
-from simtest.realism.fitting.emulator import learn
-from simtest.realism.fitting.frames import FrameMaker
-from simtest.realism.fitting.inference import REPEATS, infer
-from simtest.realism.fitting.parameters import Parameter, fitted_parameters, narrowed, one_family
-from simtest.realism.fitting.summaries import summarise
-from simtest.realism.frame_statistics import measure
+from simtest.realism.fitting.bank import (
+    Bank,
+    FrameMaker,
+    Parameter,
+    count_made,
+    fitted_parameters,
+    make_bank,
+    narrowed,
+    one_family,
+    read_bank,
+)
+from simtest.realism.fitting.inference import REPEATS, infer, learn
+from simtest.realism.statistics import measure, summarise
 from simtest.runtime.arrays import Array
 from simtest.runtime.files import write_json
 from simtest.runtime.seeds import from_integer

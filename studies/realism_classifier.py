@@ -28,7 +28,7 @@ from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.detection.colour import ColourDetector
 from simtest.errors import InputError
 from simtest.geometry import Camera
-from simtest.realism.frame_sets import NamedFrame, open_frames, open_generated
+from simtest.realism.frames import NamedFrame, open_frames, open_generated
 from simtest.runtime.arrays import Array, Image, Picture
 from simtest.runtime.seeds import from_integer
 

@@ -17,14 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.realism.distance import NEAR, by_scene, quartiles
-from simtest.realism.fitting.bank import count_made, make_bank, read_bank
-from simtest.realism.fitting.fit import fit_to_bank, summarise_scenes
-from simtest.realism.fitting.frames import FrameMaker
-from simtest.realism.fitting.outcome import recipe_toml
-from simtest.realism.fitting.parameters import fitted_parameters, one_family
-from simtest.realism.frame_sets import open_frames
-from simtest.realism.frame_statistics import COLUMNS, STATISTICS, Measured, measure
+from simtest.realism.compare import NEAR, by_scene, quartiles
+from simtest.realism.fitting.bank import FrameMaker, count_made, fitted_parameters, make_bank, one_family, read_bank
+from simtest.realism.fitting.fit import fit_to_bank, recipe_toml, summarise_scenes
+from simtest.realism.frames import open_frames
+from simtest.realism.statistics import COLUMNS, STATISTICS, Measured, measure
 from simtest.runtime.files import write_json
 from simtest.spec.recipes import Dataset, Splits, load_dataset
 
@@ -51,7 +48,7 @@ def rows_of(real: dict[str, Measured], sets: dict[str, Measured]) -> Iterator[tu
 
     for statistic in STATISTICS:
         ratios = []
-        for column in statistic.columns:
+        for column in (each.name for each in statistic.columns):
             gaps, spreads = [], []
             for scene, values in real.items():
                 others = [other[column] for name, other in real.items() if name != scene and len(other[column])]

@@ -15,9 +15,9 @@ import numpy as np
 
 from simtest.errors import InputError
 from simtest.pages.pixels import png
-from simtest.realism.comparison import small
-from simtest.realism.frame_sets import NamedFrame, open_frames, open_generated
-from simtest.realism.strip import draw_strip
+from simtest.realism.compare import small
+from simtest.realism.frames import NamedFrame, open_frames, open_generated
+from simtest.realism.page import draw_strip
 from simtest.runtime.arrays import Image, Picture
 from simtest.runtime.files import write_atomically
 from studies.realism_classifier import CROP_PX, crops

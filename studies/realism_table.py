@@ -10,8 +10,8 @@ import argparse
 import json
 from pathlib import Path
 
-from simtest.realism.comparison import compare
-from simtest.realism.frame_sets import open_frames, open_generated
+from simtest.realism.compare import compare
+from simtest.realism.frames import open_frames, open_generated
 from simtest.runtime.files import write_json
 from simtest.spec import load_scene
 from simtest.validation.situations import MEASURED, MeasuredDistance, look_of

@@ -26,11 +26,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measuring import print_markdown
+from simtest.advice.tissue import tissue_of
 from simtest.advice.twin.bank import Subject, all_spots, make_bank
 from simtest.advice.twin.run import SpotTwins, match_spots
 from simtest.advice.twin.scenes import SceneDraws, look_of
 from simtest.advice.twin.scoring import ScoredSpot, score, usable_spots
-from simtest.advice.twin.tissue import tissue_of
 from simtest.calibration import Calibration, Priors, Uniform
 from simtest.dataset.plan import Plan
 from simtest.errors import InputError, SimtestError

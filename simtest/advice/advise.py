@@ -1,5 +1,6 @@
-"""Asks a scope what it can reach: writes the experiments, runs them, renders a frame, and reads the answers."""
+"""Asks a scope what it can reach: writes and runs the experiment, renders a frame, reads the answers, writes them."""
 
+import math
 import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -7,19 +8,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import polars as pl
 
-from simtest.advice.break_points import BreakPoint, SpotSize, break_points, spot_size
-from simtest.advice.figures import Found, read_results
-from simtest.advice.plan import Question, main_experiment, surroundings, write_experiment
+from simtest.advice.answers import (
+    WIDE,
+    BreakPoint,
+    Choice,
+    Found,
+    MethodAnswers,
+    SpotSize,
+    break_points,
+    read_results,
+    spot_size,
+)
+from simtest.advice.plan import DISTANCES, MOST_ASKED, Question, main_experiment, surroundings, write_experiment
 from simtest.errors import InputError
+from simtest.pages import pixels
+from simtest.pages.charts import Axis, Chart, Mark, Panel, embedded, png
+from simtest.pages.html import environment
 from simtest.pages.pixels import Pixels
-from simtest.runtime.files import make_folder, write_atomically
+from simtest.pages.style import SERIES, number, symbols
+from simtest.runtime import provenance
+from simtest.runtime.files import make_folder, write_atomically, write_json
 from simtest.runtime.processes import make_engine
+from simtest.runtime.statistics import Interval
 from simtest.simulation.frame import make_frame
 from simtest.simulation.sensor import displayed
 from simtest.spec import Experiment, load_scene
 from simtest.spec.toml_files import toml_tables
+from simtest.validation import laws
 from simtest.validation.runner import run_experiments
 
 MAIN, SCENE, FRAME, RUN = "experiment.toml", "scene.toml", "frame.png", "run"
@@ -29,55 +45,30 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Advised:
-    """What was found of a question.
-
-    Parameters
-    ----------
-    question : Question
-        What was asked.
-    found : Found
-        Errors and answers in frames of the organ.
-    breaks : list of BreakPoint
-        Where methods fail, by the laws.
-    spots : SpotSize
-        Size of highlights by the laws.
-    spot_radius_px : float or None
-        Median radius of the visible highlights that hold one glint alone, as rendered, px.
-    picture : ndarray of uint8, shape (H, W, 3)
-        A frame as the scope shows it.
-    commands : dict
-        What makes each figure again: ``errors``, ``picture``.
-    drawn : dict
-        What is drawn, by key path, with its ends.
-    """
+    """What was found of a question."""
 
     question: Question
-    found: Found
+    found: Found  # errors and answers in frames of the organ
     breaks: list[BreakPoint]
     spots: SpotSize
-    spot_radius_px: float | None
-    picture: Pixels
-    commands: dict[str, str]
-    drawn: dict[str, tuple[float, float]]
+    spot_radius_px: float | None  # median radius of the visible highlights that hold one glint alone, as rendered
+    picture: Pixels  # a frame as the scope shows it
+    commands: dict[str, str]  # what makes each figure again: errors, picture
+    drawn: dict[str, tuple[float, float]]  # by key path, with its ends
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures as JSON; the picture stands beside it."""
-        asked, scope = self.question, self.question.scope
+        asked, scope, farthest = self.question, self.question.scope, self.spots.shapeless_beyond_mm
         question = {
             "scope": scope.name, **scope.tables, "organ": asked.organ,
             "distances_mm": asked.distances_mm,
             "bound_deg": asked.bound_deg, "seed": asked.seed,
         }  # fmt: skip
-        spots = {"smooth_px": self.spots.smooth_px, "relief_px": self.spots.relief_px,
-                 "shapeless_beyond_mm": _finite(self.spots.shapeless_beyond_mm),
-                 "rendered_px": self.spot_radius_px}  # fmt: skip
+        spots = {**asdict(self.spots), "shapeless_beyond_mm": None if farthest == math.inf else farthest}
         return {"question": question, "drawn": self.drawn, **self.found.to_json(),
-                "break_points": [asdict(each) for each in self.breaks], "spot_radius": spots,
+                "break_points": [asdict(each) for each in self.breaks],
+                "spot_radius": {**spots, "rendered_px": self.spot_radius_px},
                 "commands": self.commands}  # fmt: skip
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and value < float("inf") else None
 
 
 def advise(question: Question, out: Path, progress: Progress | None = None, workers: int = 1) -> Advised:
@@ -108,61 +99,183 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
         raise
     picture = np.asarray(np.round(255 * displayed(frame.image, frame.scene.sensor)), dtype=np.uint8)
     (run,) = run_experiments([(main, out / RUN)], "", None, progress, engine)
-    results = run.results
-    count = sum(len(next(iter(table.values()))) for group in main.groups for table in group.pool) * main.realisations
-    _write_picture(out / FRAME, picture)
-    return Advised(
-        question, read_results(results, count), break_points(question), spot_size(question),
-        _median_radius(results), picture, _commands(out),
-        surroundings(question).random,
-    )  # fmt: skip
+    alone = run.results.drop_nulls("radius_px").unique(["setting", "realisation", "true_id"])["radius_px"]
+    radius = None if alone.is_empty() else float(alone.median())  # type: ignore[arg-type]
+    _write(out / FRAME, pixels.png(picture))
+    # A run that is kept is not rendered anew.
+    commands = {
+        "errors": shlex.join(["simtest", "validate", str(out / MAIN), "--out", str(out / RUN)]),
+        "picture": shlex.join(["simtest", "render", str(out / SCENE), "--out", str(out / "frame")]),
+    }
+    found = read_results(run.results, question.per_distance * DISTANCES)
+    return Advised(question, found, break_points(question), spot_size(question), radius, picture, commands,
+                   surroundings(question).random)  # fmt: skip
+
+
+def _write(path: Path, content: bytes) -> None:
+    write_atomically(path, lambda part: part.write_bytes(content))
 
 
 def write_scene(question: Question, main: Experiment, path: Path) -> Path:
     """Write the scene of the picture: the organ itself, with its vessels, through the scope; return its path."""
-    group = main.groups[0]
-    settings = {**group.set, "surface": _organ_surface(question, group.set["surface"])}
+    group, organ = main.groups[0], question.kind.scene
+    wall = group.set["surface"]
+    surface = wall
+    if not question.kind.smooth:
+        surface = load_scene(organ).model_dump(mode="json", exclude_unset=True)["surface"]
+        if question.scope.relief is not None:
+            # That of the walls that are measured.
+            surface.pop("relief", None)
+            surface |= {key: value for key, value in wall.items() if key == "relief"}
+    if question.kind.smooth or surface["type"] == "quadric":
+        surface = {**surface, "distance_mm": question.middle_mm}
     # The colours of the frames that are measured have no vessels.
-    settings.pop("reflectance.albedo", None)
-    described = load_scene(question.kind.scene, settings)
-    tables = described.model_dump(mode="json", exclude_unset=True, exclude_none=True)
+    settings = {key: value for key, value in group.set.items() if key != "reflectance.albedo"} | {"surface": surface}
+    tables = load_scene(organ, settings).model_dump(mode="json", exclude_unset=True, exclude_none=True)
     named = {key: value for key, value in tables.items() if isinstance(value, dict)}
     write_atomically(path, lambda part: part.write_text(toml_tables(named), encoding="utf-8"))
     return path
 
 
-def _organ_surface(question: Question, wall: dict[str, Any]) -> dict[str, Any]:
-    """Return the organ's surface, with the relief of the walls that are measured where one is stated."""
-    if question.kind.smooth:
-        return {**wall, "distance_mm": question.middle_mm}
-    surface = load_scene(question.kind.scene).model_dump(mode="json", exclude_unset=True)["surface"]
-    if question.scope.relief is not None:
-        surface.pop("relief", None)
-        surface |= {key: value for key, value in wall.items() if key == "relief"}
-    if surface["type"] == "quadric":
-        surface["distance_mm"] = question.middle_mm
-    return dict(surface)
+# Files and page -------------------------------------------------------------------------------------------------------
+
+PAGE, RESULT = "index.html", "advice.json"
+
+PICTURE_HEIGHT_PX = 480
+
+_SURFACES = {"fine": "the fine surface", "base": "the organ below its relief"}
 
 
-def _write_picture(path: Path, picture: Pixels) -> None:
-    from simtest.pages import pixels
+def write_advice(found: Advised, out: Path, command: str = "") -> Path:
+    """Write an advice into a folder; return the page.
 
-    content = pixels.png(picture)
-    write_atomically(path, lambda part: part.write_bytes(content))
+    Parameters
+    ----------
+    found : Advised
+        What to write.
+    out : Path
+        Gets advice.json, index.html and figures/distance.png.
+    command : str
+        How the advice was called.
+    """
+    make_folder(out / "figures")
+    chart = distance_chart(found)
+    _write(out / "figures" / "distance.png", png([chart]))
+    made_by = provenance.environment()
+    html = environment().get_template("advice.html.j2").render(
+        found=found, answers=[sentence(found, choice) for choice in found.found.choices] or [NOTHING],
+        chart=chart, picture=pixels.data_address(found.picture, PICTURE_HEIGHT_PX), command=command,
+        narrower=narrower(found, command), distances=DISTANCES,
+        interval=interval, surfaces=_SURFACES,
+        parts=list(dict.fromkeys(name for each in found.found.methods for name in each.budget_deg)),
+        provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"], "python": made_by["python"]},
+        **embedded([chart]),
+    )  # fmt: skip
+    write_json(out / RESULT, {**found.to_json(), "run": {"command": command, **made_by}})
+    write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
+    return out / PAGE
 
 
-def _median_radius(results: pl.DataFrame) -> float | None:
-    alone = results.drop_nulls("radius_px").unique(["setting", "realisation", "true_id"])["radius_px"]
-    return None if alone.is_empty() else float(alone.median())  # type: ignore[arg-type]
+NOTHING = "No highlight was found in the frames: there is nothing to compare the methods by."
 
 
-def _commands(out: Path) -> dict[str, str]:
-    """Return the commands that make the figures again; a run that is kept is not rendered anew."""
+def sentence(found: Advised, choice: Choice) -> str:
+    """Return which method to use for a surface's normal, with the error to expect."""
+    surface = _SURFACES[choice.target]
+    if choice.best is None:
+        return f"For the normal of {surface} no method answered."
+    method = found.found.method(choice.best)
+    text = f"For the normal of {surface} use {choice.best}: mean error {number(method.own.mean_deg)} deg"
+    text += f" (95 % interval {interval(method.own.interval_deg)}), {method.answered} of {method.asked} answered."
+    if choice.ties:
+        text += f" It cannot be told from {', '.join(choice.ties)}."
+    text += _nearer(found, method)
+    if method.own.is_wide:
+        text += f" The interval is wide: {_remedy(found, choice)}"
+    return text
 
-    def words(*parts: object) -> str:
-        return shlex.join(["simtest", *map(str, parts)])
 
-    return {
-        "errors": words("validate", out / MAIN, "--out", out / RUN),
-        "picture": words("render", out / SCENE, "--out", out / "frame"),
-    }
+def _nearer(found: Advised, best: MethodAnswers) -> str:
+    """Return a sentence if a method of the fine surface comes nearer to the base than the best of those that state it.
+
+    Only methods that state the base's normal are ranked for it, however few answers they have.
+    """
+    if best.target == "fine" or best.own.mean_deg is None:
+        return ""
+    others = [each for each in found.found.methods if each.target == "fine" and each.base.mean_deg is not None]
+    nearest = min(others, key=lambda each: each.base.mean_deg or 0.0, default=None)
+    if nearest is None or (nearest.base.mean_deg or 0.0) >= best.own.mean_deg:
+        return ""
+    return (
+        f" In these frames the fine normals of {nearest.estimator} lie nearer to it: mean "
+        f"{number(nearest.base.mean_deg)} deg, {nearest.answered} of {nearest.asked} answered."
+    )
+
+
+def _remedy(found: Advised, choice: Choice) -> str:
+    """Return what makes the interval of a choice's error narrower."""
+    frames = frames_for(found, choice)
+    if frames is None or choice.best is None:
+        return "more frames (--frames) make it narrower."
+    reach = 100 * (found.found.method(choice.best).own.reach or 0.0)
+    return f"it reaches {reach:.0f} % from the mean; {frames} frames would narrow it to about {100 * WIDE:.0f} %."
+
+
+def narrower(found: Advised, command: str) -> str | None:
+    """Return the command with the frames that narrow the first interval that is too wide; None where there is none."""
+    frames = next((frames for choice in found.found.choices if (frames := frames_for(found, choice))), None)
+    if frames is None or not command:
+        return None
+    words = shlex.split(command)
+    if "--frames" in words[:-1]:
+        at = words.index("--frames")
+        del words[at : at + 2]
+    return shlex.join([*(word for word in words if not word.startswith("--frames=")), "--frames", str(frames)])
+
+
+def frames_for(found: Advised, choice: Choice) -> int | None:
+    """Return about how many frames narrow the interval of a choice's error to `WIDE`.
+
+    The width of the mean's logarithm falls with the root of the number. None where the interval is narrow enough or
+    unknown, or where so many frames are not allowed.
+    """
+    reach = None if choice.best is None else found.found.method(choice.best).own.reach
+    if reach is None or reach <= WIDE:
+        return None
+    needed = math.ceil(found.found.frames * (math.log1p(reach) / math.log1p(WIDE)) ** 2 / DISTANCES) * DISTANCES
+    return needed if needed <= MOST_ASKED else None
+
+
+def interval(ends: Interval) -> str:
+    """Write an interval."""
+    return "–" if ends[0] is None else f"{number(ends[0])} to {number(ends[1])}"
+
+
+def distance_chart(found: Advised) -> Chart:
+    """Describe the best methods' mean error over the distance, with the laws of the light's offset."""
+    asked = found.question
+    near, far = asked.distances_mm
+    at = np.geomspace(near / 1.3, far * 1.3, 60)
+    offset = float(np.mean(asked.scope.offsets_mm))
+    marks = []
+    if offset:
+        ignored = np.degrees(laws.offset_error(offset / at))
+        points = np.stack([np.zeros_like(at), np.zeros_like(at), at], axis=-1)
+        known = np.degrees(laws.bisector_residual(points, np.array([offset, 0.0, 0.0]), asked.middle_mm / at - 1))
+        marks += [
+            Mark(at, ignored, SERIES[1], "law: offset ignored", line="dash", hover="{x} mm: {y} deg"),
+            Mark(at, known, SERIES[2], "law: bisector, range known", line="dot", hover="{x} mm: {y} deg"),
+        ]
+    bound = f"bound, {asked.bound_deg:g} deg"
+    marks.append(Mark([at[0], at[-1]], [asked.bound_deg] * 2, SERIES[5], bound, line="dashdot"))
+    for colour, choice in zip((SERIES[0], SERIES[3]), found.found.choices, strict=False):
+        rows = [(d, each) for d, each in sorted(choice.by_distance.items()) if each.mean_deg is not None and d > 0]
+        if not rows or choice.best is None:
+            continue
+        x, y = [d for d, _ in rows], [float(each.mean_deg or 0.0) for _, each in rows]
+        told = [f"{choice.best}, {choice.target}\n{d:g} mm: {number(v)} deg, {each.answered} answers"
+                for v, (d, each) in zip(y, rows, strict=True)]  # fmt: skip
+        symbol = symbols(["fine", "base"])[choice.target]
+        marks.append(Mark(x, y, colour, f"{choice.best} ({choice.target})", symbol=symbol, size=9, hover=told))
+    panel = Panel(Axis("distance (mm)", "log"), Axis("mean error (deg)", "log"), tuple(marks))
+    return Chart("distance", "Mean error over the distance", (panel,), 420)

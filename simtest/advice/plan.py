@@ -2,22 +2,23 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from simtest.advice.draws import drawn_values, in_free_space
-from simtest.advice.organs import ORGANS, Organ, Surroundings, is_smooth, wall
 from simtest.advice.scope import Interval, Scope
+from simtest.advice.tissue import ORGANS, Organ, Surroundings, is_smooth, wall
 from simtest.errors import InputError
 from simtest.geometry.checks import check_integer, check_number
 from simtest.runtime.boundary import suggestion
 from simtest.runtime.files import write_atomically
-from simtest.spec import Experiment, load_experiment, load_scene
+from simtest.runtime.seeds import Stage, generator
+from simtest.spec import Experiment, Scene, load_experiment, load_scene
 from simtest.spec.toml_files import toml_value
+from simtest.validation.cases import RELIEF_SEED
 
 ESTIMATORS = ("curved", "cone_axis", "brightest_point", "bisector", "cloud")
 
@@ -42,6 +43,15 @@ SAMPLES = 4
 FARTHEST_MM = 500.0
 MOST_BOUND_DEG = 30.0
 MOST_SEED = 2**63 - 1
+
+SURFACE = "surface."
+"""Begins the key paths of a wall's form and pose."""
+
+TRIES = 200
+"""Walls that are drawn for a frame until one leaves camera and lights in free space."""
+
+Values = dict[str, list[Any]]
+"""Values of all frames by key path."""
 
 
 @dataclass(frozen=True)
@@ -137,12 +147,6 @@ def distances_of(question: Question) -> list[float]:
     return [round(near + (far - near) * (i + 0.5) / DISTANCES, 6) for i in range(DISTANCES)]
 
 
-def estimators_of(scope: Scope) -> tuple[str, ...]:
-    """Return the methods that are compared; without an offset the bisector would be the cone's axis again."""
-    at_camera = bool(np.all(scope.offsets_mm == 0))
-    return tuple(name for name in ESTIMATORS if not (at_camera and name == "bisector"))
-
-
 def surroundings(question: Question) -> Surroundings:
     """Return what the frames set of the surface, and what is drawn for each of them."""
     return wall(question.kind, question.scope.relief, question.view_mm)
@@ -150,50 +154,40 @@ def surroundings(question: Question) -> Surroundings:
 
 def main_experiment(question: Question) -> Experiment:
     """Return the experiment whose results are the expected errors; its name is that of its file."""
-    around, told = surroundings(question), seen_through(question)
+    around, scope = surroundings(question), question.scope
+    near, far = question.distances_mm
+    # The middle of the range with the standard deviation of an even spread over it.
+    known = {"lobe": False, "distance_mm": question.middle_mm}
+    known["distance_sd"] = round((far - near) / math.sqrt(12) / question.middle_mm, 6)
+    held = {
+        **around.set, "sensor": {"preset": question.kind.sensor}, **scope.tables,
+        "render": {"samples_per_pixel": SAMPLES}, "known": known,
+    }  # fmt: skip
     values = drawn_values(around, question.seed, question.per_distance, DISTANCES)
     # Each distance once, then all again.
     distances = distances_of(question) * question.per_distance
-    scene = load_scene(question.kind.scene, {**around.set, **told})
-    values = in_free_space(values, scene, distances, around.random, question.seed)
+    values = in_free_space(values, load_scene(question.kind.scene, held), distances, around.random, question.seed)
+    # Without an offset the bisector would be the cone's axis again.
+    at_camera = bool(np.all(scope.offsets_mm == 0))
     group = {
         "scene": question.kind.scene, "label": question.organ,
         # Whatever is found gets an answer, not isolated highlights alone.
         "isolated": False,
-        "set": {**around.set, **told}, "pool": [{"surface.distance_mm": distances} | values],
+        "set": held, "pool": [{"surface.distance_mm": distances} | values],
     }  # fmt: skip
     return Experiment.model_validate({
         "name": "experiment", "title": f"Advice: {question.title}", "realisations": 1, "seed": question.seed,
-        "estimators": estimators_of(question.scope), "groups": [group],
+        "estimators": [name for name in ESTIMATORS if not (at_camera and name == "bisector")], "groups": [group],
     })  # fmt: skip
 
 
-def seen_through(question: Question) -> dict[str, Any]:
-    """Return what is set of camera, lights, sensor, effort, and of what the methods are told."""
-    near, far = question.distances_mm
-    tables = {"sensor": {"preset": question.kind.sensor}, **question.scope.tables}
-    # The middle of the range with the standard deviation of an even spread over it.
-    known = {"lobe": False, "distance_mm": question.middle_mm}
-    known["distance_sd"] = round((far - near) / math.sqrt(12) / question.middle_mm, 6)
-    return {**tables, "render": {"samples_per_pixel": SAMPLES}, "known": known}
-
-
 def write_experiment(experiment: Experiment, path: Path) -> Experiment:
-    """Write an experiment's file, and return what it reads back as: a run of the file is a run of the same."""
-    lines = [f"{name} = {toml_value(getattr(experiment, name))}\n" for name in ("title", "realisations", "seed")]
-    lines.append(f"estimators = {toml_value(experiment.estimators)}\n")
+    """Write the file of a `main_experiment`, and return what it reads back as: a run of it is a run of the same."""
+    names = ("title", "realisations", "seed", "estimators")
+    lines = [f"{name} = {toml_value(getattr(experiment, name))}\n" for name in names]
     for group in experiment.groups:
         lines.append(f"\n[[groups]]\nscene = {toml_value(group.scene)}\nlabel = {toml_value(group.label)}\n")
-        if group.realisations is not None:
-            lines.append(f"realisations = {group.realisations}\n")
-        if not group.isolated:
-            lines.append("isolated = false\n")
-        for name in ("sweep", "pool"):
-            if tables := getattr(group, name):
-                lines.append(f"{name} = [{', '.join(map(_inline, tables))}]\n")
-        lines.append(f"set = {_inline(group.set)}\n")
-        if group.random:
-            lines.append(f"random = {_inline({key: d.model_dump() for key, d in group.random.items()})}\n")
+        lines.append(f"isolated = false\npool = [{', '.join(map(_inline, group.pool))}]\nset = {_inline(group.set)}\n")
     write_atomically(path, lambda part: part.write_text("".join(lines), encoding="utf-8"))
     return load_experiment(path)
 
@@ -201,3 +195,74 @@ def write_experiment(experiment: Experiment, path: Path) -> Experiment:
 def _inline(table: Mapping[str, Any]) -> str:
     """Return a table on one line with its keys quoted: a key path is one key here."""
     return "{" + ", ".join(f"{json.dumps(key)} = {toml_value(value)}" for key, value in table.items()) + "}"
+
+
+# What differs from frame to frame ------------------------------------------------------------------------------------
+
+
+def drawn_values(around: Surroundings, seed: int, count: int, distances: int) -> Values:
+    """Return the drawn values of `count` frames at each of some distances, each distance once, then all again.
+
+    At each distance a value takes one number from each of as many equal parts of its range as there are frames: a Latin
+    hypercube [McKay, Beckman and Conover, Technometrics 21, 1979, 239], whose means vary less than those of independent
+    draws. Frames at one distance have reliefs of their own. Those of different distances that follow each other share
+    the noise that a relief is made of, but no wavelength, slope, form or pose: a noise takes as long as a small frame.
+    """
+    rng = generator(seed, "advice", "drawn", 0, Stage.SWEEP)
+    values: Values = {}
+    for key, ends in around.random.items():
+        # Shape (frames at a distance, distances).
+        parts = rng.permuted(np.repeat(np.arange(count)[:, None], distances, axis=1), axis=0)
+        shares = (parts + rng.uniform(size=parts.shape)) / count
+        values[key] = [_at(ends, share) for share in shares.ravel()]
+    if "relief" in around.set["surface"]:
+        values[RELIEF_SEED] = np.repeat(rng.integers(2**32, size=count), distances).tolist()
+    return values
+
+
+def _at(ends: Interval, share: float) -> float:
+    low, high = ends
+    return round(float(low + (high - low) * share), 9)
+
+
+def in_free_space(
+    values: Values, scene: Scene, distances_mm: Sequence[float], random: Mapping[str, Interval], seed: int
+) -> Values:
+    """Return values in which form and pose are drawn anew where the wall would hold the camera or touch a light.
+
+    A wall that bends towards the camera, and is tilted, may reach it. `random` are the ends of what is drawn.
+    """
+    forms = [key for key in values if key.startswith(SURFACE) and not key.startswith("surface.relief")]
+    free = {key: list(column) for key, column in values.items()}
+    for i, distance in enumerate(distances_mm):
+        rng = generator(seed, "advice", "placed", i, Stage.SWEEP)
+        for _ in range(TRIES):
+            form = {key.removeprefix(SURFACE): free[key][i] for key in forms}
+            if _stands_free(scene, {**form, "distance_mm": distance}):
+                break
+            for key in forms:
+                free[key][i] = _at(random[key], rng.uniform())
+        else:
+            raise InputError(
+                f"--distances: at {distance:g} mm no wall of {TRIES} leaves camera and lights in free space; "
+                "the nearest distance must be larger, or the lights nearer to the camera"
+            )
+    return free
+
+
+def _stands_free(scene: Scene, form: Mapping[str, float]) -> bool:
+    """Return whether camera and lights of a scene stand in free space before a wall of another form."""
+    # Imported here: a plan that is read again needs neither.
+    from simtest.rendering.placement_checks import check_camera, check_lights
+    from simtest.surfaces import make_surface
+
+    # Its relief moves no point.
+    surface = make_surface(scene.surface.model_copy(update={**form, "relief": None}))
+    try:
+        check_camera(scene, surface)
+        check_lights(scene, surface)
+    except InputError:
+        return False
+    # Beyond a wall that is no closed body a light is merely unseen: here it would lie in the tissue.
+    pose = surface.model_from_camera
+    return bool((surface.clearance(scene.rig.true_mm() @ pose[:3, :3].T + pose[:3, 3]) > 0).all())

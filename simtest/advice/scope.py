@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,28 +26,24 @@ Table = dict[str, Any]
 
 Interval = tuple[float, float]
 
-_COLONOSCOPE: Table = {
-    "camera": {"width": 640, "height": 480, "fx": 320.0, "fy": 320.0},
-    "sensor": {"preset": "colonoscope_hd", "vignetting": {"type": "cosine", "power": 2.0}},
-}
-_LAPAROSCOPE: Table = {
-    "camera": {"width": 640, "height": 480, "fx": 480.0, "fy": 480.0},
-    "sensor": {"preset": "laparoscope_hd", "vignetting": {"type": "cosine", "power": 2.0}},
-}
 
-
-def _rig(preset: str, radius_mm: float) -> Table:
-    source = {"type": "disc", "radius_mm": radius_mm}
-    return {"preset": preset, "each": {"source": source, "profile": {"type": "cosine", "power": 1.0}}}
+def _scope(kind: str, focal_px: float, rig: str, radius_mm: float | None = None) -> Table:
+    """Return a scope with the camera of the shipped tissue scenes (scenes/tissue_*.toml), and exits of some radius."""
+    emission = {"source": {"type": "disc", "radius_mm": radius_mm}, "profile": {"type": "cosine", "power": 1.0}}
+    return {
+        "camera": {"width": 640, "height": 480, "fx": focal_px, "fy": focal_px},
+        "sensor": {"preset": f"{kind}_hd", "vignetting": {"type": "cosine", "power": 2.0}},
+        "rig": {"preset": rig} | ({} if radius_mm is None else {"each": emission}),
+    }
 
 
 SCOPES: dict[str, Table] = {
-    "colocated": {**_COLONOSCOPE, "rig": {"preset": "colocated"}},
-    "colonoscope_2": {**_COLONOSCOPE, "rig": _rig("colonoscope_2", 0.9)},
-    "colonoscope_3": {**_COLONOSCOPE, "rig": _rig("colonoscope_3", 0.9)},
-    "laparoscope": {**_LAPAROSCOPE, "rig": _rig("laparoscope", 0.6)},
+    "colocated": _scope("colonoscope", 320.0, "colocated"),
+    "colonoscope_2": _scope("colonoscope", 320.0, "colonoscope_2", 0.9),
+    "colonoscope_3": _scope("colonoscope", 320.0, "colonoscope_3", 0.9),
+    "laparoscope": _scope("laparoscope", 480.0, "laparoscope", 0.6),
 }
-"""Scopes by the name of their rig's preset: the cameras of the shipped tissue scenes (scenes/tissue_*.toml)."""
+"""Scopes by the name of their rig's preset."""
 
 
 class ReliefPrior(Spec):
@@ -78,30 +75,20 @@ class ScopeFile(Spec):
 
 @dataclass(frozen=True)
 class Scope:
-    """A scope.
-
-    Parameters
-    ----------
-    name : str
-        Of the preset or the file.
-    tables : dict
-        The tables ``camera``, ``rig`` and ``sensor`` as a scene takes them; ``sensor`` may be absent.
-    relief : ReliefPrior, optional
-        What the file states of the relief.
-    """
+    """A scope, by the name of its preset or file."""
 
     name: str
-    tables: Table
-    relief: ReliefPrior | None = None
-    _spec: ScopeFile = field(init=False, repr=False, compare=False)
+    tables: Table  # camera, rig and sensor as a scene takes them; the last two may be absent
+    relief: ReliefPrior | None = None  # what the file states of it
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_spec", validate(ScopeFile, self.tables, self.name))
+    @cached_property
+    def _file(self) -> ScopeFile:
+        return validate(ScopeFile, self.tables, self.name)
 
     @property
     def camera(self) -> Camera:
         """The camera's geometry."""
-        return self._spec.camera.model()
+        return self._file.camera.model()
 
     @property
     def focal_px(self) -> float:
@@ -112,12 +99,12 @@ class Scope:
     @property
     def offsets_mm(self) -> Array:
         """Distance of each light from the camera's centre, mm, shape (L,)."""
-        return np.asarray(np.linalg.norm(self._spec.rig.nominal_mm(), axis=1))
+        return np.asarray(np.linalg.norm(self._file.rig.nominal_mm(), axis=1))
 
     @property
     def deepest_light_mm(self) -> float:
         """How far the foremost light lies in front of the camera, mm; below 0 it lies behind."""
-        return float(self._spec.rig.nominal_mm()[:, 2].max())
+        return float(self._file.rig.nominal_mm()[:, 2].max())
 
     @property
     def size(self) -> tuple[int, int]:
@@ -141,33 +128,30 @@ def read_scope(name: str, camera: Path | None = None) -> Scope:
     camera : Path, optional
         Camera file that replaces the scope's camera.
     """
-    scope = _named(name)
+    path = Path(name).expanduser()
+    if name in SCOPES:
+        scope = Scope(name, SCOPES[name])
+    elif path.is_file():
+        data = read_toml(path)
+        rig = data.get("rig")
+        if isinstance(rig, Mapping) and "lights_mm" in rig:
+            data["rig"] = _listed(rig, f"{path}: rig")
+        relief = validate(ScopeFile, data, str(path)).relief
+        scope = Scope(path.stem, {key: value for key, value in data.items() if key != "relief"}, relief)
+    else:
+        known = ", ".join(SCOPES)
+        raise InputError(f"{name}: no such file or preset; presets: {known}{suggestion(name, SCOPES)}")
     if camera is None:
         return scope
     return replace(scope, tables={**scope.tables, "camera": camera_table(load_camera(camera))})
 
 
-def _named(name: str) -> Scope:
-    if name in SCOPES:
-        return Scope(name, SCOPES[name])
-    path = Path(name).expanduser()
-    if not path.is_file():
-        known = ", ".join(SCOPES)
-        raise InputError(f"{name}: no such file or preset; presets: {known}{suggestion(name, SCOPES)}")
-    data = read_toml(path)
-    rig = data.get("rig")
-    if isinstance(rig, Mapping) and "lights_mm" in rig:
-        if len(rig) > 1:
-            other = next(key for key in rig if key != "lights_mm")
-            raise InputError(f"{path}: rig.{other}: must be left out where rig.lights_mm is given")
-        data["rig"] = _listed(rig["lights_mm"], f"{path}: rig.lights_mm")
-    read = validate(ScopeFile, data, str(path))
-    return Scope(path.stem, {key: value for key, value in data.items() if key != "relief"}, read.relief)
-
-
-def _listed(lights_mm: Any, where: str) -> Table:
+def _listed(rig: Mapping[str, Any], where: str) -> Table:
     """Return the rig of lights at some positions, of which each has its share of the power."""
+    if other := next((key for key in rig if key != "lights_mm"), None):
+        raise InputError(f"{where}.{other}: must be left out where rig.lights_mm is given")
+    lights_mm = rig["lights_mm"]
     sound = isinstance(lights_mm, Sequence) and 1 <= len(lights_mm) <= 32
     if not sound or not all(isinstance(light, Sequence) and len(light) == 3 for light in lights_mm):
-        raise InputError(f"{where} = {lights_mm!s:.80}: must be 1 to 32 positions x, y, z, mm")
+        raise InputError(f"{where}.lights_mm = {lights_mm!s:.80}: must be 1 to 32 positions x, y, z, mm")
     return {"lights": [{"position_mm": list(light), "power": 1 / len(lights_mm)} for light in lights_mm]}

@@ -35,7 +35,7 @@ from simtest.runtime.locks import exclusive_file, exclusive_folder
 
 if TYPE_CHECKING:
     from simtest.advice.advise import Advised
-    from simtest.realism.comparison import Comparison
+    from simtest.realism.compare import Comparison
     from simtest.realism.fitting.fit import FittedRecipe
 
 dataset = App(name="dataset", help="Make a labelled dataset for learning, check it, look at it.")
@@ -196,8 +196,8 @@ def realism(
         Real colour frames: pictures, films, or folders of pictures. A film is one scene, and so is a folder whose name
         ends in .film; any other picture is a scene of its own.
     """
-    from simtest.realism.comparison import compare
-    from simtest.realism.frame_sets import open_frames, open_generated
+    from simtest.realism.compare import compare
+    from simtest.realism.frames import open_frames, open_generated
     from simtest.realism.page import write_comparison
 
     real, generated = open_frames(frames), open_generated(against, count, surfaces or ())
@@ -209,7 +209,7 @@ def realism(
 
 
 def _distances(found: "Comparison") -> "Iterator[str | Table]":
-    from simtest.realism.distance import distance_text
+    from simtest.realism.compare import distance_text
 
     rows = []
     for d in found.distances:
@@ -245,10 +245,10 @@ def fit(
         Real colour frames of at least three scenes: pictures, films, or folders of pictures. A film is one scene, and
         so is a folder whose name ends in .film; any other picture is a scene of its own.
     """
+    from simtest.realism.fitting.bank import one_family
+    from simtest.realism.fitting.fit import check_out, report_json, write_fit
     from simtest.realism.fitting.fit import fit as fitted_to
-    from simtest.realism.fitting.outcome import check_out, report_json, write_fit
-    from simtest.realism.fitting.parameters import one_family
-    from simtest.realism.frame_sets import MOST_GENERATED, open_frames
+    from simtest.realism.frames import MOST_GENERATED, open_frames
     from simtest.spec.recipes import load_dataset
 
     check_out(out)
@@ -321,7 +321,7 @@ def advise(
         [sensor] and [relief].
     """
     from simtest.advice.advise import advise as run
-    from simtest.advice.page import write_advice
+    from simtest.advice.advise import write_advice
     from simtest.advice.plan import Question
     from simtest.advice.scope import read_scope
 
@@ -336,7 +336,7 @@ def advise(
 
 
 def _advice(found: "Advised") -> "Iterator[str | Table]":
-    from simtest.advice.page import NOTHING, interval, sentence
+    from simtest.advice.advise import NOTHING, interval, sentence
     from simtest.advice.plan import DISTANCES
     from simtest.pages.style import number
 

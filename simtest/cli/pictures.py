@@ -237,8 +237,7 @@ def twin(
     frame : Path
         PNG, JPEG, BMP or TIFF.
     """
-    from simtest.advice.twin.run import twin_picture
-    from simtest.advice.twin.writing import to_json, write_twins
+    from simtest.advice.twin.run import to_json, twin_picture, write_twins
 
     if frames is not None:
         check_count(frames, "--frames", MOST_FRAMES)

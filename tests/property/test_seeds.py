@@ -8,15 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from simtest.advice.draws import drawn_values
-from simtest.advice.plan import Question, surroundings
+from simtest.advice.plan import Question, drawn_values, surroundings
 from simtest.advice.scope import read_scope
-from simtest.advice.twin.patches import make_pool
+from simtest.advice.twin.scenes import make_pool
 from simtest.bench.suite import CaseSpec, pooled
 from simtest.dataset.plan import Plan
-from simtest.realism.distance import distances
-from simtest.realism.fitting.frames import FrameMaker
-from simtest.realism.frame_statistics import COLUMNS
+from simtest.realism.compare import distances
+from simtest.realism.fitting.bank import FrameMaker
+from simtest.realism.statistics import COLUMNS
 from simtest.runtime.resources import data_root
 from simtest.runtime.seeds import Stage, from_integer, generator, integer
 from simtest.simulation.sensor import capture

@@ -6,10 +6,10 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from simtest.realism.distance import distances
-from simtest.realism.frame_statistics import COLUMNS, STATISTICS
+from simtest.realism.compare import distances
+from simtest.realism.statistics import COLUMNS, STATISTICS
 
-SINGLE = {s.columns[0] for s in STATISTICS if len(s.columns) == 1}
+SINGLE = {s.columns[0].name for s in STATISTICS if len(s.columns) == 1}
 CALLS = 20
 """Of ten statistics with one column each: 200 draws."""
 
@@ -33,7 +33,7 @@ def drawn(kind, distance, count):
     rng, found = np.random.default_rng(count), []
     for _ in range(CALLS):
         sides = [{str(i): {name: kind(rng, d) for name in COLUMNS} for i in range(count)} for d in (0.0, distance)]
-        found += [d for d in distances(*sides) if d.statistic.columns[0] in SINGLE]
+        found += [d for d in distances(*sides) if d.statistic.columns[0].name in SINGLE]
     return found
 
 

@@ -10,13 +10,9 @@ import polars as pl
 import pytest
 
 import simtest
-from simtest.advice import draws
-from simtest.advice.advise import MAIN, RUN, advise, write_scene
-from simtest.advice.break_points import break_points, spot_size
-from simtest.advice.draws import drawn_values
-from simtest.advice.figures import mean_error, read_results
-from simtest.advice.organs import ORGANS, Surroundings, wall
-from simtest.advice.page import narrower, sentence, write_advice
+from simtest.advice import plan
+from simtest.advice.advise import MAIN, RUN, Advised, advise, narrower, sentence, write_advice, write_scene
+from simtest.advice.answers import break_points, mean_error, read_results, spot_size
 from simtest.advice.plan import (
     DISTANCES,
     LEAST_FRAMES,
@@ -24,17 +20,20 @@ from simtest.advice.plan import (
     Question,
     affordable,
     distances_of,
+    drawn_values,
     main_experiment,
     surroundings,
     write_experiment,
 )
 from simtest.advice.scope import SCOPES, ReliefPrior, read_scope
+from simtest.advice.tissue import ORGANS, Surroundings, wall
 from simtest.errors import InputError
 from simtest.rendering.placement_checks import check_camera, check_lights
 from simtest.runtime.arrays import kept
 from simtest.surfaces import make_surface
 from simtest.validation import laws, realisation
 from simtest.validation.cases import RELIEF_SEED
+from studies import advice_strata
 from studies.advice_strata import frames_of, gain
 from tests.unit.given_numbers import of_given_numbers
 
@@ -202,7 +201,7 @@ def test_every_wall_leaves_camera_and_lights_in_free_space():
 
 
 def test_a_distance_without_room_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(draws, "TRIES", 3)
+    monkeypatch.setattr(plan, "TRIES", 3)
     far = "[[0.0, 4000.0, 0.0], [0.0, -4000.0, 0.0], [4000.0, 0.0, 0.0], [-4000.0, 0.0, 0.0]]"
     scope = read_scope(written(tmp_path, CAMERA + f"[rig]\nlights_mm = {far}\n"))
     question = Question(scope, "plane", (20.0, 60.0), frames=16)
@@ -258,6 +257,17 @@ def test_a_bisector_that_knows_the_range_errs_beyond_its_middle_too():
         # By hand: the light at 4 mm seen from a wall at the true and at the given distance.
         turn = math.degrees(math.atan(4.0 / point.value) - math.atan(4.0 / question.middle_mm)) / 2
         assert abs(turn) == pytest.approx(0.8, abs=0.02)
+
+
+@pytest.mark.parametrize(("distances", "beyond"), [((0.5, 3.0), []), ((1.0, 4.0), []), ((1.0, 12.0), [7.039])])
+def test_break_points_of_the_bisector_lie_on_their_side_of_the_middle(distances, beyond):
+    """Of a middle that is nearer than any endoscope works none lies below it, and none beyond that is as near."""
+    question = Question(read_scope("colonoscope_2"), distances_mm=distances, bound_deg=1.0)
+    found = [point for point in break_points(question) if point.method == "bisector"]
+    middle = sum(distances) / 2
+    assert all(("below" in point.title) == (point.value < middle) for point in found)
+    assert all(point.value >= 3.0 for point in found)
+    assert [point.value for point in found if "beyond" in point.title] == pytest.approx(beyond, abs=1e-3)
 
 
 def test_a_light_at_the_camera_has_no_break_points_of_offset():
@@ -438,6 +448,25 @@ def test_strata_are_read_from_the_frames_of_a_run(tmp_path):
     turns = [1 + pool["surface.distance_mm"][6] * pool[f"surface.{key}_per_mm"][6] for key in ("k1", "k2")]
     assert least[6] == min(map(abs, turns))
     assert frames_of(tmp_path, "curved")[1].sum() == 0
+
+
+def test_strata_of_a_folder_without_an_advice_are_refused_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["advice_strata", str(tmp_path)])
+    with pytest.raises(SystemExit, match=r"advice\.json: no such file; must be what studies\.advice writes$"):
+        advice_strata.main()
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_the_page_says_whose_relief_is_drawn(tmp_path, stated):
+    scope = read_scope(written(tmp_path, CAMERA + "[relief]\nslope_deg = [1.0, 2.0]\n" * stated))
+    question = Question(scope, "colon", frames=8)
+    found = read_results(results([1.0, 3.0], [0, 1]), 8)
+    advised = Advised(question, found, break_points(question), spot_size(question), None,
+                      np.zeros((72, 96, 3), np.uint8), {"errors": "e", "picture": "p"},
+                      surroundings(question).random)  # fmt: skip
+    page = write_advice(advised, tmp_path / "out").read_text(encoding="utf-8")
+    assert ("the relief is that of the scope's file" in page) == stated
+    assert ("relief and film those of the dataset recipe endoscopy" in page) != stated
 
 
 @pytest.mark.parametrize(

@@ -13,14 +13,29 @@ from hypothesis import strategies as st
 from simtest.errors import InputError
 from simtest.realism.fitting import bank as banks
 from simtest.realism.fitting import inference
-from simtest.realism.fitting.bank import Bank, count_made, make_bank, read_bank
-from simtest.realism.fitting.emulator import FOLDS, PENALTIES, features, learn
-from simtest.realism.fitting.fit import fit_to_bank, ranges, summarise_scenes
-from simtest.realism.fitting.outcome import check_out, recipe_toml, report_json, write_fit
-from simtest.realism.fitting.parameters import Parameter, fitted_parameters, missing_kinds, narrowed, one_family
-from simtest.realism.fitting.summaries import NAMES, summarise
-from simtest.realism.frame_sets import open_frames
-from simtest.realism.frame_statistics import COLUMNS
+from simtest.realism.fitting.bank import (
+    Bank,
+    Parameter,
+    count_made,
+    fitted_parameters,
+    make_bank,
+    missing_kinds,
+    narrowed,
+    one_family,
+    read_bank,
+)
+from simtest.realism.fitting.fit import (
+    check_out,
+    fit_to_bank,
+    ranges,
+    recipe_toml,
+    report_json,
+    summarise_scenes,
+    write_fit,
+)
+from simtest.realism.fitting.inference import FOLDS, PENALTIES, features, learn
+from simtest.realism.frames import open_frames
+from simtest.realism.statistics import COLUMNS, NAMES, summarise
 from simtest.runtime.seeds import from_integer
 from simtest.spec.recipes import Dataset, Distribution, load_dataset
 from simtest.spec.spec_model import validate

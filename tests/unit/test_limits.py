@@ -15,7 +15,7 @@ from simtest.cli.data import fit
 from simtest.dataset.manifest import ManifestError, read_manifest
 from simtest.dataset.scoring.record import read_record
 from simtest.errors import InputError, SimtestError
-from simtest.realism.frame_sets import open_generated
+from simtest.realism.frames import open_generated
 from simtest.reconstruction.images import _tiff_size, read_picture
 from simtest.runtime.files import DEFAULTS, VARIABLE, check_limit, limit, require_plain
 from simtest.runtime.processes import call_apart, check_workers

@@ -194,7 +194,7 @@ def test_the_regions_hold_on_rendered_rough_tissue_and_not_without_the_part(monk
         scored = [
             spot for spot in score(session, view, run(picture, view.calibration, Options())) if spot.held is not None
         ]
-        near = [spot.is_near_miss for spot in scored]
+        near = [spot.kind == "near_miss" for spot in scored]
         return len(scored), np.mean(near), np.mean([spot.held for spot in scored])
 
     count, near, held = shares()

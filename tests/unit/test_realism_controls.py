@@ -6,9 +6,8 @@ import pytest
 from simtest.dataset.maker import colour_variant
 from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
-from simtest.realism.comparison import compare
-from simtest.realism.distance import distances
-from simtest.realism.frame_sets import open_frames, open_generated, rendered_frames, varied
+from simtest.realism.compare import compare, distances
+from simtest.realism.frames import open_frames, open_generated, rendered_frames, varied
 from simtest.runtime.processes import make_engine
 from simtest.runtime.resources import data_root
 from simtest.simulation.frame import make_frame

@@ -10,12 +10,10 @@ from scipy import stats
 import simtest.rendering
 from simtest.cli.data import realism
 from simtest.errors import InputError
-from simtest.realism.comparison import compare
-from simtest.realism.distance import distances
-from simtest.realism.fitting.frames import FrameMaker
-from simtest.realism.fitting.parameters import one_family
-from simtest.realism.frame_sets import NamedFrame, open_frames, open_generated, varied
-from simtest.realism.frame_statistics import COLUMNS
+from simtest.realism.compare import compare, distances
+from simtest.realism.fitting.bank import FrameMaker, one_family
+from simtest.realism.frames import NamedFrame, open_frames, open_generated, varied
+from simtest.realism.statistics import COLUMNS
 from simtest.runtime.arrays import kept
 from simtest.spec import load_scene
 from simtest.spec.recipes import load_dataset
@@ -159,7 +157,7 @@ def test_rendered_frames_keep_no_relief(tmp_path, monkeypatch):
 
 def test_a_bank_of_a_fit_keeps_neither_reliefs_nor_anatomies(tmp_path, monkeypatch):
     monkeypatch.setenv("SIMTEST_CACHE", str(tmp_path / "kept"))
-    monkeypatch.setattr(simtest.realism.fitting.frames, "Session", StoringSession)
+    monkeypatch.setattr(simtest.rendering, "Session", StoringSession)
     maker = FrameMaker(one_family(load_dataset("endoscopy"), "tissue_colon"))
     with pytest.raises(InputError, match="renders nothing"):
         next(maker.frames(0, 1))

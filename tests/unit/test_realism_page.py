@@ -13,12 +13,10 @@ from scipy import stats
 from simtest.cli.data import realism
 from simtest.errors import InputError
 from simtest.pages.charts import png
-from simtest.realism.charts import distance_chart, distribution_charts
-from simtest.realism.comparison import Comparison, SetOfFrames, compare
-from simtest.realism.distance import distances, mean_distribution
-from simtest.realism.frame_sets import NamedFrame, _Film, open_frames
-from simtest.realism.frame_statistics import COLUMNS
-from simtest.realism.page import write_comparison
+from simtest.realism.compare import Comparison, SetOfFrames, compare, distances, mean_distribution
+from simtest.realism.frames import NamedFrame, _Film, open_frames
+from simtest.realism.page import distance_chart, distribution_charts, write_comparison
+from simtest.realism.statistics import COLUMNS
 from simtest.reconstruction.images import Source, open_source
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtest.errors import InputError
-from simtest.realism.frame_statistics import COLUMNS, STATISTICS, measure
+from simtest.realism.statistics import COLUMNS, STATISTICS, measure
 
 TISSUE = np.float32([0.62, 0.34, 0.28])
 """Encoded red, green and blue."""

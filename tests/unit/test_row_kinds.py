@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 from nightly_samples import judged, make_run, no_baseline
 
-from simtest.advice.figures import _counted
+from simtest.advice.answers import _counted
 from simtest.nightly.page import results
 from simtest.nightly.quantities import harms
 from simtest.nightly.records import CELL

@@ -11,15 +11,24 @@ import cv2
 import numpy as np
 import pytest
 
+from simtest.advice.tissue import NAMES, WIDER, tissue_of
 from simtest.advice.twin import bank as banks
 from simtest.advice.twin.bank import BankFrame, all_spots, frames_for
-from simtest.advice.twin.matching import TWINS, Matcher
-from simtest.advice.twin.patches import ANCHOR_MM, MOST_TILT_DEG, REACH_MM, TissuePatch, look_at, make_pool
-from simtest.advice.twin.run import TwinResult, _drawn, match_spots, twin_picture, twins_of
-from simtest.advice.twin.scenes import Look, SceneDraws, _distance, drawn_camera, look_of
-from simtest.advice.twin.scoring import FEATURES, ScoredSpot, Spot, usable_spots
-from simtest.advice.twin.tissue import NAMES, WIDER, tissue_of
-from simtest.advice.twin.writing import COLUMNS, write_twins
+from simtest.advice.twin.run import COLUMNS, TwinResult, _drawn, match_spots, twin_picture, twins_of, write_twins
+from simtest.advice.twin.scenes import (
+    ANCHOR_MM,
+    MOST_TILT_DEG,
+    REACH_MM,
+    Look,
+    SceneDraws,
+    TissuePatch,
+    _distance,
+    drawn_camera,
+    look_at,
+    look_of,
+    make_pool,
+)
+from simtest.advice.twin.scoring import FEATURES, TWINS, Matcher, ScoredSpot, Spot, usable_spots
 from simtest.calibration import Calibration, CameraPrior, Normal, Priors, Response, Uniform
 from simtest.calibration.photometry import AngularProfile
 from simtest.errors import InputError, SimtestError
@@ -98,8 +107,8 @@ def test_a_told_organ_has_its_relief_and_film_and_form(organ):
             assert high / low >= WIDER**2 - 1e-9
     for patch in make_pool(6, tissue):
         k1, k2 = patch.k_per_mm
-        assert tissue.k1_per_mm[0] <= k1 <= tissue.k1_per_mm[1]
-        assert tissue.k2_per_mm[0] <= k2 <= tissue.k2_per_mm[1]
+        assert tissue.organ.k1_per_mm[0] <= k1 <= tissue.organ.k1_per_mm[1]
+        assert tissue.organ.k2_per_mm[0] <= k2 <= tissue.organ.k2_per_mm[1]
         for band, made in zip(tissue.bands, patch.surface["relief"]["bands"], strict=True):
             assert band.wavelength_mm[0] <= made["wavelength_mm"] <= band.wavelength_mm[1]
             assert band.slope_deg[0] <= made["slope_deg"] <= band.slope_deg[1]
@@ -231,7 +240,7 @@ def test_a_told_organ_decides_the_colour(organ, shape):
     """A picture's colour does not tell how dark its tissue is, and that decides which spots stand out of it."""
     look = look_of(np.full(shape, 0.5, dtype=np.float32), None, tissue_of(organ))
     assert look == Look(f"tissue_{organ}", 0.5)
-    assert tissue_of(None).scene is None
+    assert tissue_of(None).organ is None
 
 
 def test_a_range_of_distances_is_even_in_the_logarithm():

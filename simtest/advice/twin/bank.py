@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtest.advice.twin.patches import make_pool
-from simtest.advice.twin.scenes import SceneDraws
+from simtest.advice.twin.scenes import SceneDraws, make_pool
 from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.dataset.maker import colour_variant
 from simtest.errors import SimtestError
@@ -34,15 +33,7 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class BankFrame:
-    """A rendered frame of the bank.
-
-    Parameters
-    ----------
-    picture : ndarray of uint8, shape (H, W) or (H, W, 3)
-        As encoded.
-    spots : list of ScoredSpot
-        The usable highlights in it.
-    """
+    """A rendered frame of the bank, as encoded, and the usable highlights in it."""
 
     picture: Picture
     spots: list[ScoredSpot]
@@ -55,24 +46,12 @@ def frames_for(pixels: int) -> int:
 
 @dataclass(frozen=True)
 class Subject:
-    """A real picture that a bank is rendered for.
-
-    Parameters
-    ----------
-    draws : SceneDraws
-        Draws the scenes.
-    pixels : ndarray, shape (N, 2)
-        Peaks of its highlights, px: the patches stand where they are.
-    seen : ndarray of bool, shape (H, W), optional
-        Pixels of its view; twins are black outside of it too.
-    grey : bool
-        Whether it has no colours: twins are their luma then.
-    """
+    """A real picture that a bank is rendered for."""
 
     draws: SceneDraws
-    pixels: Array
-    seen: Mask | None = None
-    grey: bool = False
+    pixels: Array  # shape (N, 2), peaks of its highlights, px: the patches stand where they are
+    seen: Mask | None = None  # pixels of its view; twins are black outside of it too
+    grey: bool = False  # it has no colours: twins are their luma then
 
 
 def make_bank(
@@ -82,23 +61,11 @@ def make_bank(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[BankFrame]:
-    """Render a bank and score it.
+    """Render a bank of `count` frames, and score it by the reconstruction of the real picture.
 
-    Parameters
-    ----------
-    subjects : sequence of Subject
-        The real picture, or several of one camera and rig, which take turns.
-    reconstructs : Callable
-        The same reconstruction as theirs.
-    count : int
-        Frames.
-    seed : int
-        Of all draws.
-    progress : callable, optional
-        See `Progress`.
+    Several subjects, of one camera, rig and organ, take turns.
     """
-    made: list[BankFrame] = []
-    # All subjects show one organ.
+    frames: list[BankFrame] = []
     pool = make_pool(tissue=subjects[0].draws.tissue)
     # Frames of one patch come one after the other, since its kernels and its mesh then stay.
     used = min(len(pool), max(count // FRAMES_PER_PATCH, 1))
@@ -121,13 +88,13 @@ def make_bank(
                     session = session if session is not None and patch == at else Session(scene, colour_variant())
                     at = patch
                     view = render_view(session, scene)
-                    made.append(_scored_frame(session, view, reconstructs, subject))
+                    frames.append(_scored_frame(session, view, reconstructs, subject))
             except SimtestError:
                 # Such as a camera or a light that a drawn view puts inside the tissue: it gives no frame.
                 session = None
         if progress:
             progress(number + 1, count, "rendering twins")
-    return made
+    return frames
 
 
 def _scored_frame(session: Session, view: RenderedView, reconstructs: Reconstructs, subject: Subject) -> BankFrame:

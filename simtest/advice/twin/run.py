@@ -1,24 +1,31 @@
-"""Twins of one picture: reconstruct it, render a bank of frames like it, and measure the errors at highlights alike."""
+"""Twins of one picture: reconstruct it, render a bank like it, measure the errors at highlights alike, write them."""
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 
+from simtest.advice.tissue import Tissue, tissue_of
 from simtest.advice.twin.bank import BankFrame, Progress, Subject, all_spots, frames_for, make_bank
-from simtest.advice.twin.matching import Matcher, Twins
 from simtest.advice.twin.scenes import Look, SceneDraws, look_of
-from simtest.advice.twin.scoring import ScoredSpot, Spot, SpotKind, usable_spots
-from simtest.advice.twin.tissue import Tissue, tissue_of
+from simtest.advice.twin.scoring import Matcher, ScoredSpot, Spot, SpotKind, Twins, usable_spots
 from simtest.calibration import Calibration
 from simtest.errors import InputError
+from simtest.pages.html import environment
+from simtest.pages.pixels import jpeg_address
 from simtest.reconstruction.assumptions import NEAR_MISSES, Assumption
 from simtest.reconstruction.images import is_sequence, read_picture
 from simtest.reconstruction.options import Options, calibration_for
+from simtest.reconstruction.outputs import write_csv
 from simtest.reconstruction.pipeline import run
-from simtest.runtime.arrays import Array, Image
+from simtest.runtime import provenance
+from simtest.runtime.arrays import Array, Image, Picture
+from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
+from simtest.runtime.statistics import root_mean_square
 
 LEAST_TWINS = 20
 """A bank with fewer highlights measures nothing."""
@@ -30,7 +37,7 @@ DRAWN = (
     Assumption("light exits", "discs of 0.5 to 1.3 mm radius; lights of one power", FIXED),
     Assumption("camera chain", "one of three presets, its sharpening, noise and coding drawn", FIXED),
 )
-"""What no frame shows and no file states of a twin; the ranges are those of `patches` and `scenes`."""
+"""What no frame shows and no file states of a twin; the ranges are those of `scenes`."""
 
 
 def _drawn(organ: str | None, tissue: Tissue) -> list[Assumption]:
@@ -43,57 +50,25 @@ def _drawn(organ: str | None, tissue: Tissue) -> list[Assumption]:
 
 @dataclass(frozen=True)
 class SpotTwins:
-    """A highlight of the real frame with what its twins measure.
-
-    Parameters
-    ----------
-    spot : Spot
-        The highlight.
-    stated_deg : float or None
-        RMS error that its best estimate states, deg.
-    twins : Twins
-        What the twins measure.
-    """
+    """A highlight of the real frame with what its twins measure."""
 
     spot: Spot
-    stated_deg: float | None
+    stated_deg: float | None  # RMS error that its best estimate states
     twins: Twins
 
 
 @dataclass(frozen=True)
 class TwinResult:
-    """The twins of a picture.
+    """The twins of a picture."""
 
-    Parameters
-    ----------
-    image : str
-        The picture's name.
-    picture : ndarray of float32, shape (H, W) or (H, W, 3)
-        As encoded.
-    spots : list of SpotTwins
-        Its usable highlights.
-    bank : list of BankFrame
-        The rendered frames.
-    bank_spots : list of (int, ScoredSpot)
-        The highlights in them, with the number of their frame.
-    look : Look
-        What the picture shows of tissue and exposure.
-    assumed : list of Assumption
-        What is not known exactly, and how it was drawn.
-    warnings : list of str
-        Of the calibration.
-    processor_s : float
-        Processor time of this process, s.
-    """
-
-    image: str
-    picture: Image
-    spots: list[SpotTwins]
+    image: str  # the picture's name
+    picture: Image  # as encoded, shape (H, W) or (H, W, 3)
+    spots: list[SpotTwins]  # its usable highlights
     bank: list[BankFrame]
-    bank_spots: list[tuple[int, ScoredSpot]]
+    bank_spots: list[tuple[int, ScoredSpot]]  # the highlights in it, with the number of their frame
     look: Look
-    assumed: list[Assumption]
-    warnings: list[str]
+    assumed: list[Assumption]  # what is not known exactly, and how it was drawn
+    warnings: list[str]  # of the calibration
     processor_s: float
 
     def share_of(self, kind: SpotKind) -> float:
@@ -140,7 +115,7 @@ def twin_picture(
     progress : callable, optional
         Called with frames rendered, frames in all, and what is done.
     organ : str, optional
-        Whose relief and film the twins have (`simtest.advice.twin.tissue.NAMES`); default: any tissue's.
+        Whose relief and film the twins have (`simtest.advice.tissue.NAMES`); default: any tissue's.
     """
     started = time.process_time()
     if is_sequence(image):
@@ -181,7 +156,7 @@ def twins_of(
     bank = make_bank([subject], lambda values: run(values, calibration, whole), count, seed, progress)
     matched = match_spots(spots, all_spots(bank), name, count)
     # Twins have near misses, so nothing is assumed of them.
-    assumed = [each for each in made.choices.assumed if each is not NEAR_MISSES]
+    assumed = [each for each in made.choices.assumed if each != NEAR_MISSES]
     return matched, bank, look, [*assumed, *_drawn(organ, tissue)]
 
 
@@ -197,3 +172,122 @@ def match_spots(
         )
     matcher = Matcher(twins)
     return [SpotTwins(spot, spot.estimate.deviation_deg, matcher.find(spot)) for spot in spots]
+
+
+FILES = ("twin.json", "twin.csv", "index.html")
+
+COLUMNS = (
+    "specularity", "x_px", "y_px", "radius_px", "estimator", "stated_deg", "twin_rms_deg", "twin_low_deg",
+    "twin_high_deg", "twin_p95_deg", "coverage", "near_misses", "false", "glint_rms_deg", "near_rms_deg",
+    "base_rms_deg", "base_low_deg", "base_high_deg", "near_mm", "median_mm", "far_mm", "twins", "unlikeness", "covered",
+)  # fmt: skip
+
+
+def write_twins(result: TwinResult, out: Path, command: str = "") -> list[Path]:
+    """Write the twins of a picture into a folder, which is made if need be; return the files.
+
+    Raises `InputError` where the folder cannot be written, `SimtestError` where its disk is full.
+    """
+    make_folder(out)
+    html = render_page(result, command)
+    write_json(out / FILES[0], to_json(result, command))
+    write_atomically(out / FILES[1], lambda part: write_csv(part, COLUMNS, [_row(each) for each in result.spots]))
+    write_atomically(out / FILES[2], lambda part: part.write_text(html, encoding="utf-8"))
+    return [out / name for name in FILES]
+
+
+def to_json(result: TwinResult, command: str = "") -> JsonObject:
+    """Return the content of twin.json."""
+    return {
+        "image": result.image,
+        "command": command,
+        "warnings": result.warnings,
+        "assumed": result.assumed,
+        "look": {"organ": result.look.organ, "mean_level": result.look.mean},
+        "bank": {
+            "frames": len(result.bank),
+            "highlights": len(result.bank_spots),
+            "near_misses": result.share_of("near_miss"),
+            "false": result.share_of("false"),
+            "processor_s": round(result.processor_s, 1),
+        },
+        "twin_rms_deg": result.rms_deg(),
+        "twin_base_rms_deg": result.rms_deg("base_rms_deg"),
+        "coverage": result.coverage,
+        "twin_distance_mm": [_finite(each) for each in result.distance_mm],
+        "specularities": [_spot_json(each) for each in result.spots],
+        "provenance": provenance.environment(),
+    }
+
+
+def _spot_json(each: SpotTwins) -> JsonObject:
+    """Return a highlight; a figure that its twins do not have is null."""
+    spot, twins = each.spot, each.twins
+    figures = {key: _finite(value) for key, value in vars(twins).items() if key != "best"}
+    return {
+        "id": spot.index,
+        "peak_px": spot.peak_px,
+        "radius_px": spot.radius_px,
+        "estimator": spot.estimator,
+        "normal": spot.estimate.normal,
+        "target": spot.estimate.target,
+        "stated_deg": each.stated_deg,
+        "twins": {**figures, "distance_mm": [_finite(value) for value in twins.distance_mm],
+                  "covered": twins.is_covered},
+    }  # fmt: skip
+
+
+def _finite(value: Any) -> Any:
+    # NaN is the only number that differs from itself.
+    return value if value == value else None
+
+
+def _row(each: SpotTwins) -> tuple[object, ...]:
+    spot, twins = each.spot, each.twins
+    x, y = spot.peak_px.tolist()
+    return (
+        spot.index, round(x, 3), round(y, 3), spot.radius_px, spot.estimator, each.stated_deg, twins.rms_deg,
+        *twins.interval_deg, twins.p95_deg, twins.coverage, twins.near_misses, twins.false,
+        _finite(twins.glint_rms_deg), _finite(twins.near_rms_deg), twins.base_rms_deg, *twins.base_interval_deg,
+        *(_finite(each) for each in twins.distance_mm), twins.effective, twins.unlikeness, int(twins.is_covered),
+    )  # fmt: skip
+
+
+SHOWN_SPOTS, SHOWN_TWINS = 6, 6
+"""Highlights whose twins are shown, evenly over their sizes, and the likest twins of each."""
+
+PATCH_PX, LEAST_HALF_PX, RADII = 112, 9, 3.5
+"""Side of a shown patch; half the side that it shows of the frame, at least and in radii of the real highlight, px."""
+
+
+def render_page(result: TwinResult, command: str = "") -> str:
+    """Return the page: one HTML file that needs nothing else."""
+    about = provenance.environment()
+    stated = np.array([each.stated_deg for each in result.spots if each.stated_deg is not None])
+    # Some highlights, the smallest first.
+    ordered = sorted(result.spots, key=lambda each: each.spot.radius_px)
+    picked = np.unique(np.linspace(0, len(ordered) - 1, SHOWN_SPOTS).round().astype(int)).tolist()
+    picture = np.asarray(np.rint(255 * np.clip(result.picture, 0, 1)), dtype=np.uint8)
+    return environment().get_template("twin.html.j2").render(
+        result=result, command=command, stated=root_mean_square(stated), rms=result.rms_deg(),
+        base=result.rms_deg("base_rms_deg"), uncovered=sum(not each.twins.is_covered for each in result.spots),
+        strips=[_strip(result, picture, ordered[i]) for i in picked],
+        provenance={"commit": about["commit"] or "–", "simtest": about["version"], "python": about["python"]},
+    )  # fmt: skip
+
+
+def _strip(result: TwinResult, picture: Picture, each: SpotTwins) -> dict[str, Any]:
+    """Return a real highlight, its patch as an address, and its likest twins with theirs."""
+    half = max(LEAST_HALF_PX, round(RADII * each.spot.radius_px))
+
+    def patch(frame: Picture, spot: Spot) -> str:
+        # Beyond the border the frame is repeated.
+        padded = cv2.copyMakeBorder(frame, half, half, half, half, cv2.BORDER_REPLICATE)
+        x, y = (int(v) for v in spot.peak_px)
+        cut = padded[y : y + 2 * half + 1, x : x + 2 * half + 1]
+        enlarged = cv2.resize(cut, (PATCH_PX, PATCH_PX), interpolation=cv2.INTER_NEAREST)
+        return jpeg_address(np.asarray(enlarged, dtype=np.uint8), 90)
+
+    likest = [result.bank_spots[number] for number in each.twins.best[:SHOWN_TWINS].tolist()]
+    twins = [(patch(result.bank[frame].picture, scored.spot), scored) for frame, scored in likest]
+    return {"each": each, "address": patch(picture, each.spot), "twins": twins}

@@ -1,4 +1,10 @@
-"""Scores the highlights of a rendered frame as the harness does, and describes each by what a picture shows of it."""
+"""Scores the highlights of a rendered frame as the harness does, and weighs a bank's by likeness to a real one.
+
+A real highlight's twins are the bank's highlights weighted by a Gaussian kernel over their features (`FEATURES`), over
+the number of highlights in their frame: a frame is one draw of distance, lights and relief, and what its number of
+highlights tells is among the features. The kernel is as narrow as leaves `TWINS` effective ones: the weights' squared
+sum over the sum of their squares.
+"""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +20,8 @@ from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.records import Specularities, Specularity
 from simtest.rendering import Session
 from simtest.runtime import chi_squared
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, IntArray
+from simtest.runtime.statistics import mean_interval, weighted_quantile
 from simtest.simulation.frame import RenderedView
 from simtest.validation.scoring import mahalanobis2, match, on_instruments, peak_px
 
@@ -40,65 +47,31 @@ LEAST_DEG = 1e-3
 
 @dataclass(frozen=True)
 class Spot:
-    """A usable highlight: one whose best estimate is a normal of that highlight alone.
+    """A usable highlight: one whose best estimate is a normal of that highlight alone."""
 
-    Parameters
-    ----------
-    index : int
-        Of its specularity in the reconstruction.
-    peak_px : ndarray, shape (2,)
-        Where it is.
-    radius_px : float
-        Of the circle that has its area above half height.
-    estimator : str
-        Name of the best estimator.
-    estimate : Estimate
-        Its result.
-    features : ndarray, shape (F,)
-        What the picture shows of it (`FEATURES`).
-    """
-
-    index: int
-    peak_px: Array
-    radius_px: float
-    estimator: str
-    estimate: Estimate
-    features: Array
+    index: int  # of its specularity in the reconstruction
+    peak_px: Array  # shape (2,)
+    radius_px: float  # of the circle that has its area above half height
+    estimator: str  # the best one
+    estimate: Estimate  # its result
+    features: Array  # shape (F,), what the picture shows of it (`FEATURES`)
 
 
 @dataclass(frozen=True)
 class ScoredSpot:
     """A usable highlight of a rendered frame with its errors.
 
-    Parameters
-    ----------
-    spot : Spot
-        The highlight.
-    kind : {"glint", "near_miss", "false"}
-        glint: a lit highlight point lies inside its isophote at half height. near_miss: none does, so the normal there
-        nowhere bisects the directions to light and camera, but the noise-free frame shows a highlight there
-        (theory.md 7.1b). false: it shows none either, as at a pale edge.
-    error_deg : float
-        Angle to the fine normal: at the matched highlight point, or at the point looked at where there is none.
-    base_error_deg : float
-        Angle to the base's normal at the same point.
-    held : bool or None
-        Whether the stated 95 % region holds the normal that the estimate states; None where nothing is stated.
-    distance_mm : float
-        Of the surface along the sightline; NaN where that meets none.
+    A glint has a lit highlight point inside its isophote at half height. A near miss has none, so the normal there
+    nowhere bisects the directions to light and camera, but the noise-free frame shows a highlight there (theory.md
+    7.1b). A false one shows none either, as at a pale edge.
     """
 
     spot: Spot
     kind: SpotKind
-    error_deg: float
-    base_error_deg: float
-    held: bool | None
-    distance_mm: float = math.nan
-
-    @property
-    def is_near_miss(self) -> bool:
-        """Whether it is a visible highlight in which the normal only comes near the bisector."""
-        return self.kind == "near_miss"
+    error_deg: float  # to the fine normal: at the matched highlight point, or at the point looked at if there is none
+    base_error_deg: float  # to the base's normal at the same point
+    held: bool | None  # whether the stated 95 % region holds the normal; None where nothing is stated
+    distance_mm: float = math.nan  # of the surface along the sightline; NaN where that meets none
 
 
 FEATURES = (
@@ -216,3 +189,131 @@ def _crowding_px(peaks: Array, number: int) -> float:
     """Return the distance from a spot to its third neighbour, px."""
     away = np.sort(np.hypot(*(peaks - peaks[number]).T))
     return max(float(away[NEIGHBOUR]) if len(away) > NEIGHBOUR else ALONE_PX, 1.0)
+
+
+TWINS = 40.0
+"""Effective number of twins of a highlight."""
+
+SCALES = dict(zip(FEATURES, (0.15, 0.15, 0.4, 0.3, 0.3, 0.4, 0.03, 0.3, 0.15, 0.25), strict=True))
+"""How much of each feature is one unit of unlikeness."""
+
+OTHER_ESTIMATOR = 4.0
+"""Squared unlikeness of a spot whose best estimate is another estimator's."""
+
+UNKNOWN = 1.0
+"""Squared unlikeness by a feature that only one of two spots shows."""
+
+WIDEST = 64.0
+"""The kernel's width ends here; beyond it nothing in the bank is like the spot."""
+
+UNLIKE = 2.0
+"""Unlikeness of twins above which they are called so: outside of what the bank covers."""
+
+
+@dataclass(frozen=True)
+class Twins:
+    """What the twins of one highlight measure: those that are highlights, but for `false`."""
+
+    rms_deg: float  # root mean square error against the fine normal
+    interval_deg: tuple[float, float]  # its 95 % interval over the bank's frames
+    p95_deg: float  # 95 % of the errors against the fine normal lie below
+    coverage: float | None  # share whose stated 95 % region holds the truth; None where none states one
+    near_misses: float  # share of near misses
+    false: float  # share of false detections among all
+    glint_rms_deg: float  # of the twins that are glints; NaN where there are none
+    near_rms_deg: float  # of near misses
+    base_rms_deg: float  # against the base's normal
+    base_interval_deg: tuple[float, float]
+    # Distances below which 10, 50 and 90 % of the twins stand: what the picture's look says of it, and what was told.
+    # The error from a light beside the lens goes with its inverse.
+    distance_mm: tuple[float, float, float]
+    effective: float  # number of twins
+    unlikeness: float  # root mean square over twins and features of the distance to the highlight, units of `SCALES`
+    best: IntArray  # the likest in the bank, the first first
+
+    @property
+    def is_covered(self) -> bool:
+        """Whether the bank holds highlights like this one."""
+        return self.unlikeness <= UNLIKE
+
+
+class Matcher:
+    """Finds twins among a bank's highlights, at least one, each with the number of its frame."""
+
+    def __init__(self, spots: Sequence[tuple[int, ScoredSpot]]) -> None:
+        self._frames = np.array([frame for frame, _ in spots])
+        # Each frame is one draw of what was not told, however many highlights it shows.
+        self._shares = 1 / np.bincount(self._frames)[self._frames]
+        held = [spot.held for _, spot in spots]
+        self._features = np.array([spot.spot.features for _, spot in spots])
+        self._estimators = np.array([spot.spot.estimator for _, spot in spots])
+        self._errors = np.array([spot.error_deg for _, spot in spots])
+        self._base_errors = np.array([spot.base_error_deg for _, spot in spots])
+        self._distances = np.array([spot.distance_mm for _, spot in spots])
+        self._near = np.array([spot.kind == "near_miss" for _, spot in spots])
+        self._real = np.array([spot.kind != "false" for _, spot in spots])
+        self._stated = np.array([each is not None for each in held])
+        self._held = np.array([bool(each) for each in held])
+
+    def find(self, spot: Spot) -> Twins:
+        """Measure the twins of a highlight."""
+        squared = self._unlikeness(spot)
+        whole = _weights(squared, self._shares, TWINS)
+        # A false detection has no normal that is its own.
+        weights = _weights(np.where(self._real, squared, np.inf), self._shares, TWINS)
+        near, glint = weights * self._near, weights * ~self._near
+        near_mm, middle_mm, far_mm = (weighted_quantile(self._distances, weights, share) for share in (0.1, 0.5, 0.9))
+        stated = weights * self._stated
+        return Twins(
+            rms_deg=_rms(weights, self._errors),
+            interval_deg=self._interval(weights, self._errors),
+            base_rms_deg=_rms(weights, self._base_errors),
+            base_interval_deg=self._interval(weights, self._base_errors),
+            coverage=float(stated @ self._held / stated.sum()) if stated.sum() > 0 else None,
+            near_misses=float(near.sum() / weights.sum()),
+            false=float(whole @ ~self._real / whole.sum()),
+            glint_rms_deg=_rms(glint, self._errors),
+            near_rms_deg=_rms(near, self._errors),
+            p95_deg=weighted_quantile(self._errors, weights, 0.95),
+            distance_mm=(near_mm, middle_mm, far_mm),
+            effective=float(weights.sum() ** 2 / np.square(weights).sum()),
+            unlikeness=float(np.sqrt(weights @ np.where(self._real, squared, 0.0) / weights.sum() / len(FEATURES))),
+            best=np.argsort(np.where(self._real, squared, np.inf), kind="stable")[:12],
+        )
+
+    def _unlikeness(self, spot: Spot) -> Array:
+        """Return the squared unlikeness of the bank's highlights, shape (N,)."""
+        apart = (self._features - spot.features) / np.array([SCALES[name] for name in FEATURES])
+        squares = np.square(apart)
+        # Neither shows it: no difference.
+        one_sided = np.isnan(self._features) ^ np.isnan(spot.features)
+        squares = np.where(one_sided, UNKNOWN, np.nan_to_num(squares))
+        return np.asarray(squares.sum(axis=1) + OTHER_ESTIMATOR * (self._estimators != spot.estimator))
+
+    def _interval(self, weights: Array, errors: Array) -> tuple[float, float]:
+        """Return the 95 % interval of an RMS error over the frames: their highlights share a light."""
+        low, high = mean_interval(weights * np.square(errors), self._frames, counts=weights)
+        if low is None or high is None:
+            return np.nan, np.nan
+        return float(np.sqrt(max(low, 0.0))), float(np.sqrt(high))
+
+
+def _weights(squared: Array, shares: Array, wanted: float) -> Array:
+    """Return shares times Gaussian weights of squared distances, shape (N,), as narrow as leave an effective number."""
+    low, high = 1e-3, WIDEST
+    shifted = squared - squared.min()
+    # Bisection in the logarithm of the width: a wider kernel holds more.
+    for _ in range(50):
+        width = float(np.sqrt(low * high))
+        weights = shares * np.exp(-shifted / (2 * width**2))
+        if weights.sum() ** 2 / np.square(weights).sum() < wanted:
+            low = width
+        else:
+            high = width
+    return np.asarray(shares * np.exp(-shifted / (2 * high**2)))
+
+
+def _rms(weights: Array, errors: Array) -> float:
+    """Return a weighted root mean square; NaN without weight."""
+    total = float(weights.sum())
+    return float(np.sqrt(weights @ np.square(errors) / total)) if total > 0 else float("nan")

@@ -1,25 +1,197 @@
-"""A bank: frames of a recipe over its whole ranges, as parameters and summaries. It is kept, and resumes."""
+"""A bank: frames of a recipe over the ranges that can be fitted, as parameters and summaries. It resumes."""
 
 import json
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import JsonValue
 
+from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.errors import InputError
-from simtest.realism.fitting.parameters import Parameter
-from simtest.realism.fitting.summaries import NAMES, summarise
-from simtest.realism.frame_statistics import measure
-from simtest.runtime.arrays import Array, IntArray
+from simtest.realism.statistics import NAMES, measure, summarise
+from simtest.runtime.arrays import Array, Image, IntArray, only_reading
 from simtest.runtime.files import Json, make_folder, read_json, write_json
 from simtest.runtime.provenance import source_hash
-from simtest.spec.recipes import Dataset, Splits
+from simtest.runtime.seeds import Stage, generator, integer
+from simtest.spec import Scene, apply_settings
+from simtest.spec.recipes import Dataset, Distribution, Splits
+from simtest.spec.sensor import Sensor
 
 if TYPE_CHECKING:
-    from simtest.realism.fitting.frames import DrawnFrame
+    from simtest.rendering import Session
+
+KNOWN: tuple[tuple[str, str, str], ...] = (
+    ("relief slope", r"surface\.relief\.bands\.\d+\.slope_deg", "deg"),
+    ("relief wavelength", r"surface\.relief\.bands\.\d+\.wavelength_mm", "mm"),
+    ("film roughness", r"reflectance\.film\.alpha", ""),
+    ("film level", r"reflectance\.film\.level", "deviations of the relief"),
+    ("colour of the tissue", r"reflectance\.albedo\.(base\.\d|blood)", ""),
+    ("texture contrast", r"reflectance\.albedo\.(mottling\.amplitude|vessels\.strength|capillaries\.strength)", ""),
+    ("exposure", r"sensor\.exposure\.(average|percentile|gain|full_scale)", ""),
+    ("vignetting", r"sensor\.vignetting\.power", ""),
+    ("profile of the light", r"rig\.(each|lights\.\d+)\.profile\.power", ""),
+    ("source size", r"rig\.(each|lights\.\d+)\.source\.radius_mm", "mm"),
+    ("distance", r"surface\.(distance_mm|recipe\.radius_mm|radius_mm|off_axis_share)", ""),
+    ("sharpening", r"sensor\.sharpening\.(amount|radius_px)", ""),
+    ("noise", r"sensor\.(full_well|read_noise|noise_sigma)", ""),
+    ("point spread", r"sensor\.point_spread_px", "px"),
+)
+"""What can be fitted: its name, the key paths that hold it, and its unit where all of them share one."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A range of a recipe that is fitted."""
+
+    kind: str  # what it is, one of `KNOWN`
+    key: str  # key path of the scene
+    prior: Distribution  # the recipe's range
+    table: str  # where it stands: per_anatomy or per_sample of the family, or shared by all families
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Both ends of the range, in logarithms where it is even in them."""
+        low, high = (float(end) for end in self.prior.ends)
+        return (float(np.log(low)), float(np.log(high))) if self.prior.log else (low, high)
+
+    def to_unit(self, values: Array) -> Array:
+        """Return values as shares of the range, of its logarithm where it is even in that; same shape."""
+        low, high = self.ends
+        return np.asarray(((np.log(values) if self.prior.log else values) - low) / (high - low))
+
+    def from_unit(self, shares: Array) -> Array:
+        """Return the values at shares of the range."""
+        low, high = self.ends
+        value = low + np.asarray(shares) * (high - low)
+        return np.asarray(np.exp(value) if self.prior.log else value)
+
+
+def one_family(dataset: Dataset, scene: str | None = None) -> Dataset:
+    """Return a recipe with the one family that is to be fitted, by its base scene where there are several."""
+    names = [family.scene for family in dataset.families]
+    found = [family for family in dataset.families if scene is None or family.scene == scene]
+    if len(found) != 1:
+        what = f"--scene {scene}" if scene else "--scene is needed where a recipe has several families"
+        raise InputError(f"{dataset.name}: {what}; must name one of its base scenes: {', '.join(sorted(set(names)))}")
+    return dataset.model_copy(update={"families": tuple(found)})
+
+
+def fitted_parameters(dataset: Dataset) -> list[Parameter]:
+    """Return the parameters of a recipe of one family, in the order of `KNOWN`, then by key."""
+    family = dataset.families[0]
+    tables = {"per_anatomy": family.per_anatomy, "per_sample": family.per_sample, "shared": dataset.per_sample}
+    found = []
+    for kind, pattern, _ in KNOWN:
+        ranges = [Parameter(kind, key, prior, name) for name, table in tables.items() for key, prior in table.items()
+                  if re.fullmatch(pattern, key)]  # fmt: skip
+        found += sorted(ranges, key=lambda one: one.key)
+    # A choice has no width, and neither has a range of one value.
+    wide = [p for p in found if not p.prior.choose and not p.prior.integer and p.prior.ends[0] < p.prior.ends[1]]
+    if not wide:
+        kinds = ", ".join(kind for kind, _, _ in KNOWN)
+        raise InputError(f"{dataset.name}: no range with low and high that can be fitted; must draw one of: {kinds}")
+    return wide
+
+
+def missing_kinds(parameters: list[Parameter]) -> list[str]:
+    """Return the kinds of parameters that a recipe does not draw, and that no frames can tell of it."""
+    drawn = {parameter.kind for parameter in parameters}
+    return [kind for kind, _, _ in KNOWN if kind not in drawn]
+
+
+def narrowed(dataset: Dataset, parameters: list[Parameter], low: Array, high: Array) -> Dataset:
+    """Return a recipe of one family whose ranges reach from `low` to `high`, shape (P,), shares of the prior's."""
+    family = dataset.families[0]
+    tables = {name: dict(getattr(family, name)) for name in ("per_anatomy", "per_sample")}
+    tables["shared"] = dict(dataset.per_sample)
+    for parameter, first, last in zip(parameters, low, high, strict=True):
+        # Five digits: a recipe is read by people.
+        ends = (float(f"{end:.5g}") for end in parameter.from_unit(np.clip([first, last], 0.0, 1.0)))
+        tables[parameter.table][parameter.key] = Distribution(
+            **dict(zip(("low", "high"), ends, strict=True)), log=parameter.prior.log
+        )
+    shared = tables.pop("shared")
+    return dataset.model_copy(update={"families": (family.model_copy(update=tables),), "per_sample": shared})
+
+
+TRIES = 8
+"""Draws of a frame before one that cannot be placed is given up."""
+
+
+@dataclass(frozen=True)
+class DrawnFrame:
+    """A picture of a recipe, encoded values in [0, 1], shape (H, W, 3), and what was drawn for it, by key path."""
+
+    values: dict[str, JsonValue]
+    picture: Image
+
+
+class FrameMaker:
+    """Renders frames of a recipe, all of whose ranges are drawn, without the labels of `simtest dataset`."""
+
+    def __init__(self, dataset: Dataset, variant: str | None = None) -> None:
+        # Imported here, as below: a bank that is complete needs no renderer.
+        from simtest.dataset.maker import colour_variant
+
+        self.dataset = dataset
+        self.plan = Plan(dataset)
+        self._variant = colour_variant(variant)
+        self._session: Session | None = None
+        self._anatomy: Anatomy | None = None
+
+    def frames(self, index: int, chains: int) -> Iterator[DrawnFrame]:
+        """Render one radiance and yield its pictures, each by another draw of the sensor; the first is the sample's."""
+        from simtest.simulation.frame import render_picture
+        from simtest.simulation.sensor import displayed
+
+        drawn = self.plan.draw(index)
+        for attempt in range(1, TRIES + 1):
+            try:
+                session = self._at(drawn.anatomy, drawn.scene)
+                break
+            except InputError:
+                # A drawn camera or light may stand in the wall: the recipe itself draws again too.
+                if attempt == TRIES:
+                    raise
+                drawn = self.plan.draw(index, attempt)
+        radiance = session.radiance()
+        for chain in range(chains):
+            values, scene = (drawn.values, drawn.scene) if chain == 0 else self._redrawn(index, chain, drawn)
+            picture = displayed(render_picture(session, scene, radiance), scene.sensor)
+            yield DrawnFrame(values, picture)
+
+    def _redrawn(self, index: int, chain: int, drawn: Drawn) -> tuple[dict[str, JsonValue], Scene]:
+        """Draw the sensor's values again, with other noise."""
+        family, name, seed = self.dataset.families[drawn.anatomy.family], self.dataset.name, self.dataset.seed
+        rng = generator(seed, name, f"chain {chain}", index, Stage.SENSOR)
+        tables = {**family.per_anatomy, **family.per_sample, **self.dataset.per_sample}
+        values = {key: tables[key].draw(rng) for key in sorted(tables) if key.startswith("sensor.")}
+        noise = {"sensor.seed": integer(seed, name, f"noise {chain}", index, Stage.SENSOR)}
+        table = {"sensor": drawn.scene.sensor.model_dump(mode="json")}
+        sensor = apply_settings(table, {**values, **noise}, name)["sensor"]
+        scene = drawn.scene.model_copy(update={"sensor": Sensor.model_validate(sensor)})
+        return drawn.values | values, scene
+
+    def _at(self, anatomy: Anatomy, scene: Scene) -> "Session":
+        from simtest.rendering import Session, backend
+        from simtest.surfaces.factory import forget_meshes
+
+        if self._session is not None and anatomy != self._anatomy:
+            # As in `simtest dataset`: an anatomy never comes back, and neither its memory nor its files must add up.
+            self._session = None
+            forget_meshes()
+            backend.release_memory()
+        with only_reading():
+            if self._session is None:
+                self._session, self._anatomy = Session(scene, self._variant), anatomy
+            self._session.update(scene)
+        return self._session
+
 
 CHAINS = 3
 """Pictures of one radiance: the camera chain is cheap beside it."""
@@ -36,21 +208,11 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Bank:
-    """Frames over the ranges of a recipe.
+    """Pictures over the ranges of a recipe."""
 
-    Parameters
-    ----------
-    shares : ndarray, shape (N, P)
-        Parameters of each picture as shares of their ranges.
-    summaries : ndarray, shape (N, S)
-        See `summarise`; NaN where a picture does not tell one.
-    radiance : ndarray of int, shape (N,)
-        Which pictures are of one radiance.
-    """
-
-    shares: Array
-    summaries: Array
-    radiance: IntArray
+    shares: Array  # shape (N, P), their parameters as shares of the ranges
+    summaries: Array  # shape (N, S), see `summarise`; NaN where a picture does not tell one
+    radiance: IntArray  # shape (N,), which of them are of one radiance
 
     def ends(self) -> tuple[Array, Array]:
         """Return the least and the largest value of each summary, shape (S,); infinite where no picture tells it."""
@@ -81,20 +243,9 @@ def make_bank(
     chains: int = CHAINS,
     progress: Progress | None = None,
 ) -> Bank:
-    """Render a bank, or what is missing of it.
+    """Render a bank of a recipe of one family, or what is missing of it.
 
-    Parameters
-    ----------
-    dataset : Dataset
-        Recipe of one family.
-    parameters : sequence of Parameter
-        What is fitted.
-    folder : Path
-        Holds a file for each radiance; one that holds another recipe's is refused.
-    size, chains : int
-        Radiances, and pictures of each.
-    progress : callable, optional
-        See `Progress`.
+    The folder holds a file for each of `size` radiances, with `chains` pictures; another recipe's is refused.
     """
     recipe = bank_recipe(dataset, size)
     _claim(recipe, folder, chains)
@@ -102,11 +253,7 @@ def make_bank(
     for index in range(size):
         path = folder / f"{index:06d}.json"
         if not path.is_file():
-            if maker is None:
-                # Imported here: a complete bank needs no renderer.
-                from simtest.realism.fitting.frames import FrameMaker
-
-                maker = FrameMaker(recipe)
+            maker = maker or FrameMaker(recipe)
             write_json(path, [_row(frame, parameters) for frame in maker.frames(index, chains)])
         if progress:
             progress(index + 1, size, "rendering the bank")
@@ -144,7 +291,7 @@ def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
     return Bank(np.array(shares), np.array(summaries, dtype=float), np.array(radiance))
 
 
-def _row(frame: "DrawnFrame", parameters: Sequence[Parameter]) -> dict[str, Json]:
+def _row(frame: DrawnFrame, parameters: Sequence[Parameter]) -> dict[str, Json]:
     """Return what is kept of a picture."""
     try:
         told: Sequence[float] = summarise(measure(frame.picture)).tolist()

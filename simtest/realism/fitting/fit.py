@@ -1,23 +1,34 @@
-"""Fits a recipe to frames: measures them, makes the bank, infers, and narrows the recipe's ranges."""
+"""Fits a recipe to frames: measures them, makes the bank, infers, narrows the recipe's ranges, and writes it."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.realism.fitting.bank import Bank, Progress, make_bank
-from simtest.realism.fitting.emulator import Emulator, learn
-from simtest.realism.fitting.inference import REPEATS, Fitted, infer
-from simtest.realism.fitting.parameters import Parameter, fitted_parameters, missing_kinds, narrowed
-from simtest.realism.fitting.summaries import NAMES, summarise
-from simtest.realism.frame_sets import NamedFrame
-from simtest.realism.frame_statistics import measure
+from simtest.realism.compare import plain
+from simtest.realism.fitting.bank import (
+    KNOWN,
+    Bank,
+    Parameter,
+    Progress,
+    fitted_parameters,
+    make_bank,
+    missing_kinds,
+    narrowed,
+)
+from simtest.realism.fitting.inference import REPEATS, Emulator, Fitted, infer, learn
+from simtest.realism.frames import NamedFrame
+from simtest.realism.statistics import NAMES, measure, summarise
 from simtest.runtime.arrays import Array
+from simtest.runtime.files import Json, write_atomically, write_json
 from simtest.runtime.seeds import from_integer
 from simtest.spec import load_scene
 from simtest.spec.recipes import Dataset
+from simtest.spec.toml_files import toml_value
 
 LEAST_SCENES = 3
 """Of fewer scenes neither a spread nor an interval can be said."""
@@ -32,36 +43,16 @@ Seen = tuple[dict[str, Array], set[tuple[int, int]], dict[str, str]]
 
 @dataclass(frozen=True)
 class FittedRecipe:
-    """What a fit found.
+    """What a fit found."""
 
-    Parameters
-    ----------
-    recipe : Dataset
-        With its ranges narrowed to the fitted distribution.
-    parameters : list of Parameter
-        What was fitted, with the ranges before.
-    fitted : Fitted
-        As shares of these.
-    emulator : Emulator
-        Of the bank.
-    bank : Bank
-        Frames over the whole ranges.
-    scenes : dict
-        Summaries by scene, shape (S,), the mean over its frames.
-    sizes : set of (int, int)
-        Width and height of the frames, px.
-    left_out : dict
-        Reason by frame that could not be measured.
-    """
-
-    recipe: Dataset
-    parameters: list[Parameter]
-    fitted: Fitted
+    recipe: Dataset  # with its ranges narrowed to the fitted distribution
+    parameters: list[Parameter]  # what was fitted, with the ranges before
+    fitted: Fitted  # as shares of these
     emulator: Emulator
-    bank: Bank
-    scenes: dict[str, Array]
-    sizes: set[tuple[int, int]]
-    left_out: dict[str, str]
+    bank: Bank  # frames over the whole ranges
+    scenes: dict[str, Array]  # summaries by scene, shape (S,), the mean over its frames
+    sizes: set[tuple[int, int]]  # width and height of the frames, px
+    left_out: dict[str, str]  # reason by frame that could not be measured
 
     @property
     def out_of_reach(self) -> list[str]:
@@ -184,3 +175,92 @@ def ranges(fitted: Fitted) -> tuple[Array, Array]:
     low = np.where(fitted.told, fitted.centre - half, fitted.interval[:, 0])
     high = np.where(fitted.told, fitted.centre + half, fitted.interval[:, 1])
     return np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def check_out(path: Path) -> None:
+    """Raise `InputError` if a recipe cannot be written there: before the fit, which takes long."""
+    if path.suffix != ".toml" or path.is_dir():
+        raise InputError(f"--out {path}: must be a file whose name ends in .toml")
+
+
+def write_fit(found: FittedRecipe, path: Path) -> tuple[Path, Path]:
+    """Write the recipe, and the report beside it with the suffix .json; return both paths."""
+    report = path.with_suffix(".json")
+    write_atomically(path, lambda part: part.write_text(recipe_toml(found.recipe), encoding="utf-8"))
+    write_json(report, report_json(found))
+    return path, report
+
+
+def recipe_toml(dataset: Dataset) -> str:
+    """Return a recipe as a TOML file that `load_dataset` reads back to the same."""
+    dumped = dataset.model_dump(mode="json", exclude_none=True, exclude_defaults=True, exclude={"name"})
+    families, shared = dumped.pop("families"), dumped.pop("per_sample", {})
+    parts = ["".join(f"{key} = {toml_value(value)}\n" for key, value in dumped.items())]
+    for family in families:
+        tables = {name: family.pop(name) for name in ("set", "per_anatomy", "per_sample") if name in family}
+        parts.append("[[families]]\n" + _lines(family))
+        parts += [f"[families.{name}]\n{_lines(table)}" for name, table in tables.items() if table]
+    if shared:
+        parts.append(f"[per_sample]\n{_lines(shared)}")
+    return "\n".join(parts)
+
+
+def _lines(table: Mapping[str, Any]) -> str:
+    return "".join(f"{json.dumps(key)} = {toml_value(value)}\n" for key, value in table.items())
+
+
+def report_json(found: FittedRecipe) -> dict[str, Json]:
+    """Return the fit's figures: parameters with intervals, summaries of both sides, and what limits it."""
+    return {
+        "parameters": [_parameter(found, number) for number in range(len(found.parameters))],
+        "not_told": [p.key for p, told in zip(found.parameters, found.fitted.told, strict=True) if not told],
+        "summaries": _summaries(found),
+        "gap": found.fitted.gap,
+        "notes": found.notes(),
+        "scenes": len(found.scenes),
+        "bank": {"radiances": len(np.unique(found.bank.radiance)), "pictures": len(found.bank.radiance)},
+        "left_out": dict(found.left_out),
+    }
+
+
+def _parameter(found: FittedRecipe, number: int) -> dict[str, Json]:
+    """Return one parameter's centre, spread and 95 % interval, in its own unit."""
+    parameter, fitted = found.parameters[number], found.fitted
+    interval = fitted.interval[number]
+    centre, low, high = parameter.from_unit(np.array([fitted.centre[number], *interval])).tolist()
+    first, last = parameter.ends
+    return {
+        "key": parameter.key,
+        "kind": parameter.kind,
+        "unit": next(unit for kind, _, unit in KNOWN if kind == parameter.kind),
+        "centre": centre,
+        "ci95": [low, high],
+        "spread": float(fitted.spread[number] * (last - first)),
+        "spread_of_logarithm": parameter.prior.log,
+        "spread_ci95_shares": np.quantile(fitted.spreads[:, number], [0.025, 0.975]).tolist(),
+        "interval_share_of_range": float(np.diff(interval)[0]),
+        "told": bool(fitted.told[number]),
+        "range_before": [float(end) for end in parameter.prior.ends],
+    }
+
+
+def _summaries(found: FittedRecipe) -> list[Json]:
+    """Return of each summary the mean over scenes, what the fitted recipe shows, and the bank's ends."""
+    emulator, fitted = found.emulator, found.fitted
+    real = [column[np.isfinite(column)] for column in np.array(list(found.scenes.values())).T]
+    columns = zip(NAMES, real, emulator.mean(fitted.centre)[0] * emulator.scale + emulator.centre, *found.bank.ends(),
+                  fitted.summaries, strict=True)  # fmt: skip
+    return [
+        {
+            "name": name,
+            "real": plain(values.mean()) if len(values) else None,
+            "fitted": plain(shown),
+            "bank": [plain(low), plain(high)],
+            "used": bool(used),
+            "in_reach": name not in found.out_of_reach,
+        }
+        for name, values, shown, low, high, used in columns
+    ]

@@ -18,7 +18,7 @@ from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.api import reconstruct_picture
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
-from simtest.realism.comparison import compare
+from simtest.realism.compare import compare
 from simtest.realism.page import write_comparison
 from simtest.reconstruction.options import Options
 from simtest.report import write_report

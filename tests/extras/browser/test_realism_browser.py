@@ -3,7 +3,7 @@
 import pytest
 from test_realism_page import frames
 
-from simtest.realism.comparison import compare
+from simtest.realism.compare import compare
 from simtest.realism.page import write_comparison
 
 

@@ -1,20 +1,23 @@
-"""What the results of an advice's frames say: each method's error and answers, the best one, and its budget.
+"""What answers a question: each method's error and answers in the results, and where methods fail by the laws.
 
 Frames, not highlights, are the independent units, and the distances are strata.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from simtest.advice.plan import DISTANCES
+from simtest.advice.plan import DISTANCES, Question
+from simtest.advice.tissue import rough
 from simtest.runtime.statistics import Interval, mean_interval, root_mean_square
+from simtest.validation import laws
 from simtest.validation.guide import Advice, MethodFigures, advice_of
 from simtest.validation.paired import Pair, best_of, targets_of
-from simtest.validation.situations import Situation
+from simtest.validation.situations import SMALL_SPOT_PX, Situation
 from simtest.validation.statistics import FRAME, is_false, units
 
 WIDE = 0.15
@@ -92,30 +95,15 @@ class Choice:
 
 @dataclass(frozen=True)
 class Found:
-    """What was found in an advice's frames.
-
-    Parameters
-    ----------
-    frames : int
-        Frames in all.
-    visible : int
-        Visible highlights that stand above the noise; on a smooth surface all true ones.
-    found : int
-        Those of them that the detector found.
-    detections, false : int
-        Detections, and those among them that show no highlight.
-    methods : list of MethodAnswers
-    choices : list of Choice
-        For the fine surface and, where a method states it, the base.
-    """
+    """What was found in an advice's frames."""
 
     frames: int
-    visible: int
-    found: int
+    visible: int  # visible highlights that stand above the noise; on a smooth surface all true ones
+    found: int  # those of them that the detector found
     detections: int
-    false: int
+    false: int  # detections that show no highlight
     methods: list[MethodAnswers]
-    choices: list[Choice]
+    choices: list[Choice]  # for the fine surface and, where a method states it, the base
 
     def method(self, name: str) -> MethodAnswers:
         """Return a method by name."""
@@ -232,6 +220,123 @@ def _difference(pair: Pair, other: str, tied: bool) -> Difference | None:
     mean, (low, high) = pair.difference_deg, pair.interval_deg
     if mean is None:
         return None
-    if other == pair.first or low is None or high is None:
-        return Difference(other, mean if other == pair.first else -mean, (low, high), pair.n, tied)
-    return Difference(other, -mean, (-high, -low), pair.n, tied)
+    if other != pair.first:
+        mean = -mean
+        if low is not None and high is not None:
+            low, high = -high, -low
+    return Difference(other, mean, (low, high), pair.n, tied)
+
+
+# Break-points: by closed-form laws, on smooth walls but for the slope of a relief -------------------------------------
+
+NEAREST_MM = 3.0
+"""A break-point nearer than this is not named: no endoscope works there."""
+
+STREAK_KD = -0.9
+"""d k at which abs(1 + d k) = 0.1, below which `curved` refuses."""
+
+RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
+"""Mean angle between a glint's normal and the base's, in slopes an axis (theory.md 7.4)."""
+
+_HALVINGS = 60
+
+
+@dataclass(frozen=True)
+class BreakPoint:
+    """A value of one quantity at which a law gives the error that is asked about, or spots lose their shape."""
+
+    title: str  # what breaks, in words
+    method: str  # that is concerned
+    quantity: str  # that is varied
+    unit: str
+    value: float  # where it breaks, by the law
+    law: str  # in words and symbols
+    expected: float | None  # error that the law gives there, deg; None where it says that the method refuses
+    also: str  # the same in other terms, such as the offset over the distance
+
+
+def break_points(question: Question) -> list[BreakPoint]:
+    """Return the break-points of a question by the laws."""
+    return [*_offset_ignored(question), *_distance_unknown(question), *_streak_and_relief(question)]
+
+
+def _offset_ignored(question: Question) -> Iterator[BreakPoint]:
+    """Find the distance at which a method that ignores the light's offset errs by the bound."""
+    offset = float(np.mean(question.scope.offsets_mm))
+    distance = offset / math.tan(2 * math.radians(question.bound_deg))
+    if distance >= NEAREST_MM:
+        distance = round(distance, 3)
+        yield BreakPoint(
+            "a method that ignores the light's offset", "cone_axis", "distance", "mm", distance,
+            "atan(eps / d) / 2", float(np.degrees(laws.offset_error(offset / distance))),
+            f"eps/d = {offset / distance:.3g}, eps = {offset:.3g} mm",
+        )  # fmt: skip
+
+
+def _distance_unknown(question: Question) -> Iterator[BreakPoint]:
+    """Find the distances between which a bisector that knows the range alone errs by less than the bound."""
+    offset = float(np.mean(question.scope.offsets_mm))
+    if not offset:
+        return
+    # The distance given is the middle of the range.
+    middle = question.middle_mm
+
+    def law_deg(distance: float) -> float:
+        point = np.array([0.0, 0.0, distance])
+        return float(np.degrees(laws.bisector_residual(point, np.array([offset, 0.0, 0.0]), middle / distance - 1)))
+
+    # The error grows from the middle to either end.
+    for side, end in (("below", NEAREST_MM), ("beyond", question.distances_mm[1])):
+        low, high = middle, end
+        if (end < middle) != (side == "below") or law_deg(end) < question.bound_deg:
+            continue
+        for _ in range(_HALVINGS):
+            half = (low + high) / 2
+            low, high = (low, half) if law_deg(half) > question.bound_deg else (half, high)
+        distance = round(high, 3)
+        if distance < NEAREST_MM:
+            continue
+        yield BreakPoint(
+            f"bisector, given the range of the distance alone, {side} the middle", "bisector", "distance", "mm",
+            distance, "eps / 2 * abs(1 / d - 1 / middle)", law_deg(distance),
+            f"eps/d = {offset / distance:.3g}, middle = {middle:g} mm",
+        )  # fmt: skip
+
+
+def _streak_and_relief(question: Question) -> Iterator[BreakPoint]:
+    """Find the curvature of a streak, and the slope at which a glint's normal is off the base's by the bound."""
+    middle, slope = question.middle_mm, round(question.bound_deg / RAYLEIGH_MEAN, 3)
+    yield BreakPoint(
+        "a wall seen from near its centre of curvature: a streak", "curved", "d k", "", STREAK_KD,
+        "curved refuses where abs(1 + d k) < 0.1", None,
+        f"a concave radius of {-middle / STREAK_KD:.3g} mm at {middle:g} mm",
+    )  # fmt: skip
+    yield BreakPoint(
+        "any single highlight, against the base", "brightest_point", "slope of the relief", "deg",
+        slope, "1.25 slopes, whatever the method", RAYLEIGH_MEAN * slope,
+        "the light at the camera",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SpotSize:
+    """Radius of a highlight at half its height, px, by the law, and where it falls below what carries a shape."""
+
+    smooth_px: float  # of a smooth flat wall at the middle distance
+    relief_px: float  # of a typical glint there
+    shapeless_beyond_mm: float | None  # distance from which a typical glint is below `SMALL_SPOT_PX`; None: any
+
+
+def spot_size(question: Question) -> SpotSize:
+    """Return the size of highlights by the laws (theory.md 3.1 and 7.3)."""
+    own = rough(question.kind, question.scope.relief)
+    low, high = own.film("alpha")
+    curvature = 2 / (low * high)
+    smooth = question.scope.focal_px * math.sqrt(2 * math.log(2) / (curvature + 2))
+    if not own.bands:
+        return SpotSize(smooth, smooth, math.inf if smooth >= SMALL_SPOT_PX else None)
+    # Curvature of a glint along an axis: the root of the band's mean square, slope times wave number.
+    squares = [(sum(band.slope_deg) / 2) / (sum(band.wavelength_mm) / 2) for band in own.bands]
+    bend = math.radians(1.0) * 2 * math.pi * math.hypot(*squares)
+    farthest = (smooth / SMALL_SPOT_PX) / bend if smooth >= SMALL_SPOT_PX else None
+    return SpotSize(smooth, smooth / max(1.0, question.middle_mm * bend), farthest)

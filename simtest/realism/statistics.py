@@ -1,12 +1,13 @@
 """What is measured of a frame, real or generated, by one detector: its highlights, tissue, detail and noise.
 
 Lengths are shares of the frame's width or of a highlight's radius where frames of different sizes are compared; the
-spectrum and the noise are those of the recorded pixels.
+spectrum and the noise are those of the recorded pixels. A fit takes each frame's values as `summarise` makes them one
+vector of numbers that are near normal.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -46,48 +47,106 @@ VESSEL_SHARES = (1 / 400, 1 / 100)
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
 
+LEAST_VALUES = 3
+"""Of fewer highlights no spread is taken."""
+
+
+# Summaries ------------------------------------------------------------------------------------------------------------
+
+
+def _as_is(values: Array) -> float:
+    return float(values[0])
+
+
+def _log(values: Array) -> float:
+    return float(np.log(np.maximum(values[0], 1e-4)))
+
+
+def _level(values: Array) -> float:
+    return float(np.median(values))
+
+
+def _mean_log(values: Array) -> float:
+    return float(np.mean(np.log(np.maximum(values, 1e-6))))
+
+
+def _spread_log(values: Array) -> float:
+    # Of near equal values the logarithm of the spread has no lower end.
+    logs = np.log(np.maximum(values, 1e-6))
+    return float(np.std(logs)) if len(values) >= LEAST_VALUES else np.nan
+
+
+def _spread(values: Array) -> float:
+    return float(np.log(np.std(values) + 1e-3)) if len(values) >= LEAST_VALUES else np.nan
+
+
+# The table ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Column:
+    """Numbers of a frame: one, or one of each highlight."""
+
+    name: str  # key of what `measure` returns
+    axis: str  # quantity and unit
+    summaries: Mapping[str, Callable[[Array], float]] = field(default_factory=dict)  # see `summarise`
+
+
 @dataclass(frozen=True)
 class Statistic:
-    """A property of frames, measured by one or more columns of numbers.
-
-    Parameters
-    ----------
-    name, title : str
-        For files and for readers.
-    columns : tuple of str
-        Keys of what `measure` returns; the distance of the statistic is the mean of theirs.
-    axes : tuple of str
-        What each column's axis says: quantity and unit.
-    """
+    """A property of frames, measured by one or more columns; its distance is the mean of theirs."""
 
     name: str
     title: str
-    columns: tuple[str, ...]
-    axes: tuple[str, ...]
+    columns: tuple[Column, ...]
 
 
-_MOMENTS = ("l_mean", "l_sd", "a_mean", "a_sd", "b_mean", "b_sd")
-_MOMENT_AXES = tuple(f"{what} of {channel} (CIELAB)" for channel in ("L*", "a*", "b*") for what in ("mean", "spread"))
+def _single(name: str, title: str, axis: str, **summaries: Callable[[Array], float]) -> Statistic:
+    """Return a statistic of one column; a summary's name has spaces for underscores."""
+    named = {key.replace("_", " "): how for key, how in summaries.items()}
+    return Statistic(name, title, (Column(name, axis, named),))
+
+
+def _moments(letter: str, channel: str, name: str) -> tuple[Column, Column]:
+    """Return the columns of a channel's mean and spread."""
+    return (
+        Column(f"{letter}_mean", f"mean of {channel} (CIELAB)", {name: _as_is}),
+        Column(f"{letter}_sd", f"spread of {channel} (CIELAB)", {f"{name} spread": _log}),
+    )
+
+
+COUNT = (
+    Column("per_frame", "highlights in a frame", {"count": lambda values: float(np.log1p(values[0]))}),
+    Column("per_megapixel", "highlights in a megapixel of the view"),
+)
+MOMENTS = (*_moments("l", "L*", "lightness"), *_moments("a", "a*", "red-green"), *_moments("b", "b*", "yellow-blue"))
 
 STATISTICS = (
-    Statistic(
-        "count", "Number of highlights", ("per_frame", "per_megapixel"),
-        ("highlights in a frame", "highlights in a megapixel of the view"),
+    Statistic("count", "Number of highlights", COUNT),
+    _single(
+        "radius", "Radius of highlights", "radius (share of the frame's width)",
+        radius=_mean_log, radius_spread=_spread_log,
     ),
-    Statistic("radius", "Radius of highlights", ("radius",), ("radius (share of the frame's width)",)),
-    Statistic("axis_ratio", "Axis ratio of highlights", ("axis_ratio",), ("minor over major axis",)),
-    Statistic("clipped", "Clipped highlights", ("clipped",), ("share of a frame's highlights",)),
-    Statistic("area", "Area of highlights", ("area",), ("share of the view",)),
-    Statistic("clustering", "Nearest highlight", ("clustering",), ("distance (radii of the highlight)",)),
-    Statistic("halo", "Depth of halos", ("halo",), ("luma of the surroundings less the halo's",)),
-    Statistic("colour", "Colour of the tissue", _MOMENTS, _MOMENT_AXES),
-    Statistic("falloff", "Brightness over image radius", ("falloff",), ("log of linear light, corner less centre",)),
-    Statistic("spectrum", "Slope of the power spectrum", ("spectrum",), ("log power over log frequency, 4 to 64 px",)),
-    Statistic("vessels", "Contrast of vessels", ("vessels",), ("log of green over red",)),
-    Statistic("noise", "Noise at mid grey", ("noise",), ("standard deviation of the luma",)),
+    _single("axis_ratio", "Axis ratio of highlights", "minor over major axis", axis_ratio=_level),
+    _single("clipped", "Clipped highlights", "share of a frame's highlights", clipped=_as_is),
+    _single("area", "Area of highlights", "share of the view", area=lambda values: float(np.log(values[0] + 1e-4))),
+    _single("clustering", "Nearest highlight", "distance (radii of the highlight)", clustering=_mean_log),
+    _single("halo", "Depth of halos", "luma of the surroundings less the halo's", halo=_level, halo_spread=_spread),
+    Statistic("colour", "Colour of the tissue", MOMENTS),
+    _single("falloff", "Brightness over image radius", "log of linear light, corner less centre", falloff=_as_is),
+    _single("spectrum", "Slope of the power spectrum", "log power over log frequency, 4 to 64 px", spectrum=_as_is),
+    _single("vessels", "Contrast of vessels", "log of green over red", vessels=_log),
+    _single("noise", "Noise at mid grey", "standard deviation of the luma", noise=_log),
 )  # fmt: skip
 
-COLUMNS = tuple(column for statistic in STATISTICS for column in statistic.columns)
+COLUMNS = tuple(column.name for statistic in STATISTICS for column in statistic.columns)
+
+SUMMARIES = tuple((name, column.name, how) for statistic in STATISTICS for column in statistic.columns
+                  for name, how in column.summaries.items())  # fmt: skip
+"""Name of each summary, the column that it is of, and how it is taken."""
+
+NAMES = tuple(name for name, _, _ in SUMMARIES)
+"""Of the summaries."""
 
 Measured = Mapping[str, Array]
 """By column: one number of a frame, or one of each highlight; empty where the frame does not tell."""
@@ -118,6 +177,11 @@ def measure(picture: Image) -> Measured:
     values = _highlights(found.highlights, picture, luma, seen, bright) | _tissue(picture, frame.channels, luma, tissue)
     values |= {"spectrum": _spectrum(luma, seen), "noise": _noise(luma, tissue)}
     return {name: np.atleast_1d(np.asarray(values[name], dtype=float)) for name in COLUMNS}
+
+
+def summarise(measured: Measured) -> Array:
+    """Return a frame's summaries, shape (S,); NaN where the frame does not tell one, such as without highlights."""
+    return np.array([reduce(measured[column]) if len(measured[column]) else np.nan for _, column, reduce in SUMMARIES])
 
 
 # Highlights -----------------------------------------------------------------------------------------------------------
@@ -203,11 +267,12 @@ def _quantile(values: Image, share: float) -> float:
 
 def _tissue(picture: Image, linear: Image, luma: Image, tissue: Mask) -> dict[str, Array]:
     """Measure the tissue's colour, how its brightness falls towards the border, and its vessels."""
-    names = (*_MOMENTS, "falloff", "vessels")
+    moments = tuple(column.name for column in MOMENTS)
+    names = (*moments, "falloff", "vessels")
     if np.count_nonzero(tissue) < LEAST_SIDE**2:
         return {name: np.empty(0) for name in names}
-    moments = np.stack(cv2.meanStdDev(cv2.cvtColor(picture, cv2.COLOR_RGB2Lab), mask=tissue.astype(np.uint8)), axis=1)
-    values = dict(zip(_MOMENTS, moments.reshape(-1, 1), strict=True))
+    levels = np.stack(cv2.meanStdDev(cv2.cvtColor(picture, cv2.COLOR_RGB2Lab), mask=tissue.astype(np.uint8)), axis=1)
+    values = dict(zip(moments, levels.reshape(-1, 1), strict=True))
     return values | {"falloff": _falloff(linear, tissue), "vessels": _vessels(linear, tissue)}
 
 

@@ -5,14 +5,19 @@ its two distributions over the spread of the real scenes: the mean distance of e
 1 the generated frames differ from the real ones as much as a real scene does from other real scenes.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
+import cv2
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.realism.frame_statistics import COLUMNS, STATISTICS, Measured, Statistic
-from simtest.runtime.arrays import Array, IntArray
+from simtest.realism.frames import NamedFrame
+from simtest.realism.statistics import COLUMNS, STATISTICS, Measured, Statistic, measure
+from simtest.runtime.arrays import Array, Image, IntArray, Picture
+from simtest.runtime.files import Json
 from simtest.runtime.seeds import from_integer
 from simtest.runtime.statistics import CONFIDENCE, bootstrap_interval
 
@@ -35,25 +40,17 @@ Scenes = Mapping[str, Measured]
 
 @dataclass(frozen=True)
 class StatisticDistance:
-    """Distance of a statistic between two sets of frames.
+    """Distance of a statistic between two sets of frames, the mean over its columns.
 
-    Parameters
-    ----------
-    statistic : Statistic
-        Which.
-    distance : float
-        Mean over the statistic's columns; NaN where a side has too few scenes that tell it (two real ones, one
-        generated), infinite where all real scenes are alike and the generated ones differ.
-    interval : tuple of float
-        95 % interval by bootstrap over the scenes of both sides; NaN without a distance, or with one generated scene.
-    n_real, n_generated : int
-        Scenes that tell it, all of its columns.
+    The distance is NaN where a side has too few scenes that tell it (two real ones, one generated), infinite where all
+    real scenes are alike and the generated ones differ. The 95 % interval, by bootstrap over the scenes of both sides,
+    is NaN without a distance, or with one generated scene.
     """
 
     statistic: Statistic
     distance: float
     interval: tuple[float, float]
-    n_real: int
+    n_real: int  # scenes that tell it, all of its columns
     n_generated: int
 
     @property
@@ -86,7 +83,7 @@ def distances(real: Scenes, generated: Scenes, seed: int = 0) -> list[StatisticD
 
 def _distance(statistic: Statistic, real: Scenes, generated: Scenes, seed: int) -> StatisticDistance:
     rng = from_integer(seed)
-    sides = [[values for values in scenes.values() if all(len(values[c]) for c in statistic.columns)]
+    sides = [[values for values in scenes.values() if all(len(values[c.name]) for c in statistic.columns)]
              for scenes in (real, generated)]  # fmt: skip
     n, m = counts = (len(sides[0]), len(sides[1]))
     if n < 2 or m < 1:
@@ -95,9 +92,9 @@ def _distance(statistic: Statistic, real: Scenes, generated: Scenes, seed: int) 
     drawn = [rng.integers(count, size=(RESAMPLES, count)) for count in counts]
     dealt = rng.permuted(np.tile(np.arange(n + m), (RESAMPLES, 1)), axis=1)[:, :n]
     columns = []
-    for name in statistic.columns:
-        held, made = ([values[name] for values in side] for side in sides)
-        columns.append(_column_distance(held, made, drawn[0], drawn[1], dealt))
+    for column in statistic.columns:
+        held, shown = ([values[column.name] for values in side] for side in sides)
+        columns.append(_column_distance(held, shown, drawn[0], drawn[1], dealt))
     value, samples, exchanged = (np.mean(parts, axis=0) for parts in zip(*columns, strict=True))
     return StatisticDistance(statistic, float(value), _interval(value, samples, exchanged, min(n, m)), n, m)
 
@@ -201,3 +198,141 @@ def quartiles(scenes: Scenes, column: str) -> tuple[float, float, float] | None:
 def _steps(values: Array, grid: Array) -> Array:
     """Return the distribution function of values on the grid's intervals."""
     return np.asarray(np.searchsorted(np.sort(values), grid[:-1], side="right") / len(values))
+
+
+Progress = Callable[[int, int, str], None]
+"""Called with frames measured, frames in all, and what is done; may raise to stop."""
+
+Side = Literal["real", "generated"]
+
+SHOWN, SHOWN_HEIGHT_PX = 8, 240
+"""Frames of each side that a page shows, evenly spread, and their greatest height."""
+
+Quartiles = tuple[float, float, float]
+"""First quartile, median and third quartile."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A frame that could not be measured: its side, its name and why."""
+
+    side: Side
+    frame: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class SetOfFrames:
+    """What was measured of one side."""
+
+    scenes: dict[str, Measured]
+    frames: int
+    without_highlights: int
+    pictures: list[tuple[str, Picture]]  # name and small picture, RGB, of some frames
+
+    def quartiles(self, column: str) -> Quartiles | None:
+        """Return the quartiles of a column, each scene with the same weight; None where no frame tells it."""
+        return quartiles(self.scenes, column)
+
+    @property
+    def counts(self) -> dict[str, Json]:
+        """How many scenes and frames were measured."""
+        return {"scenes": len(self.scenes), "frames": self.frames, "without_highlights": self.without_highlights}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two sets of frames and their distances, in the order of `STATISTICS`."""
+
+    real: SetOfFrames
+    generated: SetOfFrames
+    distances: list[StatisticDistance]
+    left_out: list[LeftOut]
+
+    @property
+    def verdict(self) -> str:
+        """A sentence on all statistics together."""
+        near, far, few = (sum(d.verdict == word for d in self.distances) for word in ("near", "far", "too few scenes"))
+        judged = len(self.distances) - few
+        if not judged:
+            scenes = f"{len(self.real.scenes)} real and {len(self.generated.scenes)} generated"
+            return f"too few scenes: {scenes}; a verdict needs {LEAST_SCENES} of each"
+        text = f"{near} of {judged} statistics are near the real frames, {far} {'is' if far == 1 else 'are'} far"
+        return text + (f"; {few} {'has' if few == 1 else 'have'} too few scenes" if few else "")
+
+    def is_inside(self, column: str) -> bool | None:
+        """Return whether the generated median lies between the real quartiles; None where a side has no value."""
+        real, generated = self.real.quartiles(column), self.generated.quartiles(column)
+        return None if real is None or generated is None else real[0] <= generated[1] <= real[2]
+
+    def to_json(self) -> dict[str, Json]:
+        """Return distances with their intervals, and quartiles of both sides by column."""
+        return {
+            "verdict": self.verdict,
+            "sets": {"real": self.real.counts, "generated": self.generated.counts},
+            "statistics": [self._row(d) for d in self.distances],
+            "real": {name: self.real.quartiles(name) for name in COLUMNS},
+            "generated": {name: self.generated.quartiles(name) for name in COLUMNS},
+            "left_out": [vars(frame) for frame in self.left_out],
+        }
+
+    def _row(self, d: StatisticDistance) -> Json:
+        return {
+            "statistic": d.statistic.name,
+            "distance": plain(d.distance),
+            "ci95": [plain(v) for v in d.interval],
+            "verdict": d.verdict,
+            "real_scenes": d.n_real,
+            "generated_scenes": d.n_generated,
+            "median_inside_real_quartiles": {c.name: self.is_inside(c.name) for c in d.statistic.columns},
+        }
+
+
+def compare(
+    real: Sequence[NamedFrame], generated: Sequence[NamedFrame], progress: Progress | None = None, seed: int = 0
+) -> Comparison:
+    """Measure both sets and compare them; frames that cannot be measured are left out with their reason."""
+    total, done = len(real) + len(generated) + 1, 0
+    left_out: list[LeftOut] = []
+    sides = []
+    names: tuple[Side, Side] = ("real", "generated")
+    for side, frames in zip(names, (real, generated), strict=True):
+        measured: list[tuple[str, Measured]] = []
+        pictures = []
+        shown = {int(i) for i in np.linspace(0, len(frames) - 1, min(SHOWN, len(frames)))}
+        for number, frame in enumerate(frames):
+            if progress:
+                progress(done, total, f"measuring {frame.name}")
+            try:
+                picture = frame.read()
+                measured.append((frame.scene, measure(picture)))
+                if number in shown:
+                    pictures.append((frame.name, small(picture, SHOWN_HEIGHT_PX)))
+            except InputError as error:
+                left_out.append(LeftOut(side, frame.name, str(error)))
+            done += 1
+        if not measured:
+            reason = left_out[-1].reason if left_out else "the set is empty"
+            raise InputError(f"realism: no {side} frame can be measured ({reason})")
+        bare = sum(not values["per_frame"].any() for _, values in measured)
+        sides.append(SetOfFrames(by_scene(measured), len(measured), bare, pictures))
+    if progress:
+        progress(done, total, "comparing the distributions")
+    found = Comparison(sides[0], sides[1], distances(sides[0].scenes, sides[1].scenes, seed), left_out)
+    if progress:
+        progress(total, total, "compared")
+    return found
+
+
+def small(picture: Image, height: int) -> Picture:
+    """Return a picture of values in [0, 1], RGB, as bytes and at most so high."""
+    values = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
+    share = height / values.shape[0]
+    if share >= 1:
+        return values
+    return np.asarray(cv2.resize(values, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def plain(value: float) -> float | None:
+    """Return what JSON holds of a number: None where it is not finite."""
+    return float(value) if math.isfinite(value) else None
