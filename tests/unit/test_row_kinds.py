@@ -1,6 +1,5 @@
 """Rows of results are counted by one rule, wherever they are counted, and the counts add up."""
 
-from dataclasses import asdict
 
 import numpy as np
 import polars as pl
@@ -79,7 +78,7 @@ def test_every_row_is_of_one_kind_and_all_count_alike(seed):
             assert numbers == tuple(expected[kind] for kind in KINDS)
             assert sum(numbers) == own.filter(pl.col("setting") == setting).height
             assert told.n == told.n_ok + failed + told.n_missed
-            assert asdict(told)["n_false"] == expected["false"]
+            assert told.model_dump()["n_false"] == expected["false"]
     # The report's sections.
     run = Run(None, completed(rows).with_columns(pl.lit(0.0).alias("surface.viewpoint")))
     for row in surface_errors(run, has_figures=True).table.iter_rows(named=True):
