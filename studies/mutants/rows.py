@@ -502,7 +502,7 @@ ROWS = (
         "base[0], base[1], base[2]", "normal[0], normal[1], normal[2]", "dataset_relief"),
     row("noise shared by all samples", "seeds", "dataset.plan:Plan.draw", '"sample", index, Stage.SENSOR',
         '"sample", 0, Stage.SENSOR', "seeds dataset"),
-    row("axes of a normal map transposed", "transposes", "dataset.scoring.dense.conventions:to_camera",
+    row("axes of a normal map transposed", "transposes", "dataset.scoring.dense.maps:to_camera",
         "matrix(axes).T", "matrix(axes)", "dense_normals"),
     row("shift of relative depths has the wrong sign", "light sign", "dataset.scoring.dense.depth:align",
         "float(fitted[1]) if", "-float(fitted[1]) if", "dense_depths"),
