@@ -34,7 +34,7 @@ from simtest.dataset.export import check_exportable, export_run
 from simtest.dataset.scoring.dense.maps import MapOptions, find_maps
 from simtest.dataset.scoring.dense.score import DenseScore, score_maps
 from simtest.dataset.scoring.dense.truth import ANGLE, NORMAL, depth_source
-from simtest.dataset.scoring.record import read_record
+from simtest.dataset.scoring.frames import read_record
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.names import ESTIMATORS, core_hashes, core_records, has_files, short_name

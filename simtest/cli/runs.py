@@ -253,7 +253,7 @@ def score(
     if is_dense(answers):
         return score_dense(answers, on, out, how.named(name))
     how.refuse()
-    from simtest.dataset.scoring.run import score_table
+    from simtest.dataset.scoring.score import score_table
     from simtest.report import write_report
 
     folder = out or SCORES / (name or answers.stem)

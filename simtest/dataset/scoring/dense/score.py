@@ -32,8 +32,7 @@ from simtest.dataset.scoring.dense.truth import (
     labels,
     truth_of_view,
 )
-from simtest.dataset.scoring.frames import scored_frames
-from simtest.dataset.scoring.record import read_record
+from simtest.dataset.scoring.frames import read_record, scored_frames
 from simtest.errors import InputError
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
