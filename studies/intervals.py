@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 from scipy import stats
 
-from simtest.dataset.scoring.dense.tally import joined_figures
+from simtest.dataset.scoring.dense.score import joined_figures
 from simtest.nightly.contrasts import paired, unit_sums, unpaired
 from simtest.nightly.quantities import Quantity
 from simtest.runtime.arrays import Array, IntArray

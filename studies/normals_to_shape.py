@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.measuring import print_markdown
 from simtest.calibration import Calibration
-from simtest.dataset.scoring.dense.shading_maps import shading_maps
+from simtest.dataset.scoring.dense.shading import shading_maps
 from simtest.errors import Failure
 from simtest.estimators.protocol import Target
 from simtest.geometry import Camera

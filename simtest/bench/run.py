@@ -31,11 +31,10 @@ from simtest.bench.suite import (
     parts_of_overall,
 )
 from simtest.dataset.export import check_exportable, export_run
-from simtest.dataset.scoring.dense.conventions import MapOptions
-from simtest.dataset.scoring.dense.map_files import find_maps
+from simtest.dataset.scoring.dense.maps import MapOptions, find_maps
 from simtest.dataset.scoring.dense.score import DenseScore, score_maps
-from simtest.dataset.scoring.dense.scorer import ANGLE, NORMAL, depth_source
-from simtest.dataset.scoring.record import read_record
+from simtest.dataset.scoring.dense.truth import ANGLE, NORMAL, depth_source
+from simtest.dataset.scoring.frames import read_record
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.names import ESTIMATORS, core_hashes, core_records, has_files, short_name
@@ -155,14 +154,14 @@ def dense_figures(score: DenseScore, layout: Layout, numbers: Mapping[str, int])
     They are of normal maps where there are any, else of depth maps after an affine alignment. The score counts 90 deg
     for a pixel without a value.
     """
-    sources = sorted({key[0] for key, _ in score.scorer.cells()})
+    sources = sorted({key[0] for key, _ in score.cells})
     if not sources:
         raise InputError(f"maps {score.name}: hold neither normals nor depths")
     source = NORMAL if NORMAL in sources else depth_source("affine")
     zones = {
         label: _zone(score, source, label) for label in ("all", "highlight", "ring_1", "ring_2", "ring_4", "elsewhere")
     }
-    every, rows = zones["all"], [_plain(row) for row in score.scorer.rows if row["group"] == "zone"]
+    every, rows = zones["all"], [_plain(row) for row in score.rows if row["group"] == "zone"]
     refused = {"no_value": every.n_unanswered} if every.n_unanswered else {}
     return PartScore(
         n=every.n, answered=every.n - every.n_unanswered, missed=0, false=0, refused=refused,
@@ -182,7 +181,7 @@ def _scene_sums(
     `numbers` are the frames' realisations by name. A frame without a surface has no row, and equal ones have one name.
     """
     sums = {case: [(0, 0.0)] * scenes for case, (scenes, _) in layout.items()}
-    for row in score.scorer.rows:
+    for row in score.rows:
         if (row["source"], row["quantity"], row["surface"], row["group"], row["label"]) == (
             source, ANGLE, "fine", "zone", "all",
         ):  # fmt: skip

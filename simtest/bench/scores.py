@@ -121,7 +121,7 @@ class ZoneScore(Form):
 
 
 class StatedForm(Form):
-    """What was stated of maps (`simtest.dataset.scoring.dense.conventions.MapOptions`); null: the default."""
+    """What was stated of maps (`simtest.dataset.scoring.dense.maps.MapOptions`); null: the default."""
 
     encoding: Text | None
     frame: Text | None

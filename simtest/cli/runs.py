@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from simtest.dataset.scoring.dense import MapOptions
+    from simtest.dataset.scoring.dense.maps import MapOptions
     from simtest.nightly.run import Outcome
 
 RUNS = Path("reports/runs")
@@ -183,7 +183,7 @@ class HowMapsAreRead:
 
     def named(self, name: str | None) -> "MapOptions":
         """Return it with the name of the method."""
-        from simtest.dataset.scoring.dense.conventions import MapOptions
+        from simtest.dataset.scoring.dense.maps import MapOptions
 
         return MapOptions(name, **vars(self))
 
@@ -210,7 +210,7 @@ def is_dense(answers: Path) -> bool:
 
 def score_dense(maps: Path, on: Path, out: Path | None, options: "MapOptions") -> Told:
     """Score maps; tell how they were read, and the figures by zone."""
-    from simtest.dataset.scoring.dense import score_maps
+    from simtest.dataset.scoring.dense.score import score_maps
     from simtest.pages.style import number
 
     folder = out or SCORES / (options.name or maps.resolve().name)
@@ -219,7 +219,7 @@ def score_dense(maps: Path, on: Path, out: Path | None, options: "MapOptions") -
     with progress_bar("writing the page", stopped) as progress:
         score = score_maps(str(maps), on, folder, options, command_line(), progress)
     rows = []
-    for (source, quantity, surface), cell in score.scorer.cells():
+    for (source, quantity, surface), cell in score.cells:
         if quantity == "angle_deg" and cell["group"] == "zone" and cell["label"] in ZONES:
             figures = [number(cell[key]) for key in ("median", "mean", "p95")]
             shares = [f"{100 * float(str(cell[key])):.1f} %" for key in ("below_11.25", "share_unanswered")]
@@ -253,7 +253,7 @@ def score(
     if is_dense(answers):
         return score_dense(answers, on, out, how.named(name))
     how.refuse()
-    from simtest.dataset.scoring.run import score_table
+    from simtest.dataset.scoring.score import score_table
     from simtest.report import write_report
 
     folder = out or SCORES / (name or answers.stem)

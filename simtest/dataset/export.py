@@ -17,16 +17,18 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from pydantic import TypeAdapter, ValidationError
 from typing_extensions import TypedDict
 
-from simtest.dataset.scoring.record import (
+from simtest.dataset.scoring.frames import (
     ExportedFrame,
+    Frames,
     Record,
+    RenderedFrame,
     Source,
     Use,
+    frames_of_cases,
     image_hash,
     source_of_dataset,
     source_of_run,
 )
-from simtest.dataset.scoring.views import Shown, Views, views_of_cases
 from simtest.errors import InputError
 from simtest.reconstruction.images import scale_picture
 from simtest.runtime import provenance
@@ -85,14 +87,14 @@ _EXPORTED = TypeAdapter(list[Exported])
 class ExportPart:
     """Frames that one task writes into the folder `out`; `kept` is the file that it lists them in."""
 
-    views: Views
+    frames: Frames
     out: Path
     kept: Path
 
 
 def check_exportable(experiment: Experiment) -> None:
     """Raise `InputError` where an experiment renders no frames: before it is run."""
-    views_of_cases(experiment, expand(experiment), "")
+    frames_of_cases(experiment, expand(experiment), "")
 
 
 def check_export(experiment: Experiment, folder: Path, out: Path) -> None:
@@ -126,7 +128,7 @@ def export_run(
     Path
         README.md of the export.
     """
-    source = source_of_run(folder, experiment, expand(experiment))
+    source = source_of_run(folder, experiment)
     return _export(source, experiment.model_dump(mode="json"), out, engine, progress, "--export")
 
 
@@ -159,10 +161,10 @@ def _write_frames(source: Source, out: Path, engine: Engine, progress: Progress 
     for folder in (kept, *(out / name for name in (FRAMES, PREVIEWS, CAMERAS))):
         folder.mkdir(parents=True, exist_ok=True)
     origin = hashlib.sha256(f"{source.fingerprint} {source.definition} {provenance.source_hash()}".encode()).hexdigest()
-    parts = [ExportPart(views, out, kept / f"{origin[:12]}-{views.key:05d}.json") for views in source.views]
+    parts = [ExportPart(frames, out, kept / f"{origin[:12]}-{frames.key:05d}.json") for frames in source.parts]
     done = {number: made for number, part in enumerate(parts) if (made := _written(part)) is not None}
     missing = [number for number in range(len(parts)) if number not in done]
-    total = sum(len(views) for views in source.views)
+    total = sum(len(frames) for frames in source.parts)
     count = sum(map(len, done.values()))
 
     def step() -> None:
@@ -292,14 +294,14 @@ def _check_folder(out: Path, option: str) -> None:
 def write_part(part: ExportPart, on_step: OnStep) -> list[Exported]:
     """Write the frames of a part, each with its preview and camera; call `on_step` after each."""
     made = []
-    for each in part.views:
+    for each in part.frames:
         made.append(_write_frame(each, part.out))
         on_step()
     write_json(part.kept, made, compact=True)
     return made
 
 
-def _write_frame(each: Shown, out: Path) -> Exported:
+def _write_frame(each: RenderedFrame, out: Path) -> Exported:
     """Write a frame, its preview and its camera."""
     image, sensor, told = each.image, each.sensor, each.view.calibration
     calibration = calibration_toml(told)
@@ -320,7 +322,7 @@ def _write_frame(each: Shown, out: Path) -> Exported:
         "frame": name, "sha256": image_hash(image), "file": file, "width": width, "height": height,
         "channels": 1 if image.ndim == 2 else image.shape[2], "camera": camera,
         "table": json.loads(json.dumps(camera_table(told.camera))), "detections": detections,
-        "case": each.case, "setting": each.setting, "realisation": each.number,
+        "case": each.case, "setting": each.setting, "realisation": each.realisation,
     }  # fmt: skip
 
 

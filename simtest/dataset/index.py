@@ -1,167 +1,101 @@
 """Tables beside the shards: samples, highlights and estimates, all made from the metadata in the shards."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import NoneType
-from typing import Any, get_args, get_type_hints
 
 import polars as pl
 
 from simtest.conventions import ON_INSTRUMENT
-from simtest.dataset.metadata import EstimateMeta, SampleMeta
+from simtest.dataset.metadata import HighlightMeta, SampleMeta
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.shard import PART, samples
 from simtest.runtime.files import write_atomically
-from simtest.validation.columns import SCHEMA
+from simtest.validation.columns import COLUMNS, NUMBER, TEXT, WHOLE, YES_NO, Column, Row, Value
 
 SAMPLES, HIGHLIGHTS, ESTIMATES = "index.parquet", "highlights.parquet", "estimates.parquet"
 TABLES = (SAMPLES, HIGHLIGHTS, ESTIMATES)
 
-_KINDS = {int: pl.Int64(), float: pl.Float64(), str: pl.String(), bool: pl.Boolean()}
-_LEFT_OUT = ("experiment", "label", "setting", "realisation")
-"""Columns of an experiment's results that are constant here."""
-
-_ESTIMATE_SCHEMA = {
-    "index": pl.Int64(),
-    "split": pl.String(),
-    **{name: kind for name, kind in SCHEMA.items() if name not in _LEFT_OUT},
+SAMPLE_COLUMNS = {
+    "index": Column(WHOLE, "number of the sample, its key in the shard, and the split that it belongs to"),
+    "key": Column(TEXT),
+    "split": Column(TEXT),
+    "shard": Column(TEXT, "file of the shard, and where in it the sample's members start and how long they are, bytes"),
+    "offset": Column(WHOLE),
+    "bytes": Column(WHOLE),
+    "family": Column(WHOLE, "number of the recipe's family, kind of surface, number of the anatomy, and its seed"),
+    "surface": Column(TEXT),
+    "anatomy": Column(WHOLE),
+    "anatomy_seed": Column(WHOLE),
+    "attempt": Column(WHOLE, "which draw was taken, from 0"),
+    "width": Column(WHOLE, "of the frame, px"),
+    "height": Column(WHOLE),
+    "full_scale": Column(NUMBER, "radiance of the picture's largest value"),
+    "depth_scale_mm": Column(NUMBER, "unit of the stored depth, mm"),
+    "n_highlights": Column(WHOLE, "true highlights, isolated ones of these, and detections"),
+    "n_isolated": Column(WHOLE),
+    "n_detections": Column(WHOLE),
+    "drawn": Column(TEXT, "the drawn values by key path, as JSON"),
+    "instrument_share": Column(NUMBER, "share of the pixels that show an instrument; null where the scene lists none"),
 }
+"""Columns of index.parquet: a row a sample."""
+
+HIGHLIGHT_COLUMNS = {
+    "index": Column(WHOLE, "the sample, and its split"),
+    "split": Column(TEXT),
+    "highlight": Column(WHOLE, "number of the highlight in the sample, and of the light that makes it"),
+    "light": Column(WHOLE),
+    "isolated": Column(YES_NO, "whether it is isolated, and the first condition that fails where it is not"),
+    "why_not": Column(TEXT),
+    "bp_x_px": Column(NUMBER, "its brightest point, px"),
+    "bp_y_px": Column(NUMBER),
+    "x_mm": Column(NUMBER, "its point on the surface, camera frame, mm"),
+    "y_mm": Column(NUMBER),
+    "z_mm": Column(NUMBER),
+    "normal_x": Column(NUMBER, "unit normal of the fine surface there, camera frame"),
+    "normal_y": Column(NUMBER),
+    "normal_z": Column(NUMBER),
+    "distance_mm": Column(NUMBER, "distance of that point from the camera, mm"),
+    "kd_min": Column(NUMBER, "distance times principal curvature of the fine surface"),
+    "kd_max": Column(NUMBER),
+    "peak_snr": Column(NUMBER, "peak above its surroundings over the noise there; null without noise"),
+    "normal_base_x": Column(NUMBER, "unit normal of the base, without the relief, camera frame"),
+    "normal_base_y": Column(NUMBER),
+    "normal_base_z": Column(NUMBER),
+    "kd_min_base": Column(NUMBER, "distance times principal curvature of the base"),
+    "kd_max_base": Column(NUMBER),
+    "pool": Column(YES_NO, "whether the point lies in a pool of the film"),
+}
+"""Columns of highlights.parquet: a row a true highlight of a sample."""
+
+ESTIMATE_COLUMNS = {"index": Column(WHOLE), "split": Column(TEXT)} | {
+    name: column
+    for name, column in COLUMNS.items()
+    # constant here
+    if name not in ("experiment", "label", "setting", "realisation")
+}
+"""Columns of estimates.parquet: a row of results."""
 
 
-@dataclass(frozen=True)
-class SampleRow:
-    """Row of index.parquet: a sample, and its bytes in the shard.
-
-    Parameters
-    ----------
-    index, key, split : int, str, str
-        Number of the sample, its key in the shard, and the split that it belongs to.
-    shard, offset, bytes : str, int, int
-        File of the shard, and where in it the sample's members start and how long they are, bytes.
-    family, surface, anatomy, anatomy_seed : int, str, int, int or None
-        Number of the recipe's family, kind of surface, number of the anatomy, and its seed.
-    attempt : int
-        Which draw was taken, from 0.
-    width, height : int
-        Of the frame, px.
-    full_scale : float
-        Radiance of the picture's largest value.
-    depth_scale_mm : float
-        Unit of the stored depth, mm.
-    n_highlights, n_isolated, n_detections : int
-        True highlights, isolated ones of these, and detections.
-    drawn : str
-        The drawn values by key path, as JSON.
-    instrument_share : float or None
-        Share of the pixels that show an instrument; None where the scene lists none.
-    """
-
-    index: int
-    key: str
-    split: str
-    shard: str
-    offset: int
-    bytes: int
-    family: int
-    surface: str
-    anatomy: int
-    anatomy_seed: int | None
-    attempt: int
-    width: int
-    height: int
-    full_scale: float
-    depth_scale_mm: float
-    n_highlights: int
-    n_isolated: int
-    n_detections: int
-    drawn: str
-    instrument_share: float | None
-
-    @classmethod
-    def of(cls, meta: SampleMeta, shard: str, offset: int, size: int) -> "SampleRow":
-        """Return the row of a sample."""
-        anatomy, camera, highlights = meta["anatomy"], meta["camera"], meta["highlights"]
-        isolated = sum(highlight["isolated"] for highlight in highlights)
-        return cls(
-            meta["index"], meta["key"], meta["split"], shard, offset, size,
-            anatomy["family"], anatomy["surface"], anatomy["number"], anatomy["seed"], meta["attempt"],
-            camera["width"], camera["height"], meta["full_scale"], meta["depth_scale_mm"],
-            len(highlights), isolated, len(meta["detections"]), json.dumps(meta["drawn"], sort_keys=True),
-            meta.get("instrument_share"),
-        )  # fmt: skip
+def _sample_row(meta: SampleMeta, shard: str, offset: int, size: int) -> tuple[Value, ...]:
+    anatomy, camera, highlights = meta["anatomy"], meta["camera"], meta["highlights"]
+    isolated = sum(highlight["isolated"] for highlight in highlights)
+    return (
+        meta["index"], meta["key"], meta["split"], shard, offset, size,
+        anatomy["family"], anatomy["surface"], anatomy["number"], anatomy["seed"], meta["attempt"],
+        camera["width"], camera["height"], meta["full_scale"], meta["depth_scale_mm"],
+        len(highlights), isolated, len(meta["detections"]), json.dumps(meta["drawn"], sort_keys=True),
+        meta.get("instrument_share"),
+    )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class HighlightRow:
-    """Row of highlights.parquet: a true highlight of a sample; camera frame.
-
-    Parameters
-    ----------
-    index, split : int, str
-        The sample, and its split.
-    highlight, light : int
-        Number of the highlight in the sample, and of the light that makes it.
-    isolated, why_not : bool, str or None
-        Whether it is isolated, and the first condition that fails where it is not.
-    bp_x_px, bp_y_px : float
-        Its brightest point, px.
-    x_mm, y_mm, z_mm : float
-        Its point on the surface, mm.
-    normal_x, normal_y, normal_z : float
-        Unit normal of the fine surface there.
-    distance_mm : float
-        Distance of that point from the camera, mm.
-    kd_min, kd_max : float
-        Distance times principal curvature of the fine surface.
-    peak_snr : float or None
-        Peak above its surroundings over the noise there; None without noise.
-    normal_base_x, normal_base_y, normal_base_z : float
-        Unit normal of the base, without the relief.
-    kd_min_base, kd_max_base : float
-        Distance times principal curvature of the base.
-    pool : bool
-        Whether the point lies in a pool of the film.
-    """
-
-    index: int
-    split: str
-    highlight: int
-    light: int
-    isolated: bool
-    why_not: str | None
-    bp_x_px: float
-    bp_y_px: float
-    x_mm: float
-    y_mm: float
-    z_mm: float
-    normal_x: float
-    normal_y: float
-    normal_z: float
-    distance_mm: float
-    kd_min: float
-    kd_max: float
-    peak_snr: float | None
-    normal_base_x: float
-    normal_base_y: float
-    normal_base_z: float
-    kd_min_base: float
-    kd_max_base: float
-    pool: bool
-
-    @classmethod
-    def of(cls, meta: SampleMeta) -> "Iterator[HighlightRow]":
-        """Yield the rows of a sample."""
-        for number, found in enumerate(meta["highlights"]):
-            (bp_x, bp_y), (x, y, z), normal = found["bp_px"], found["position_mm"], found["normal"]
-            base = found["normal_base"]
-            yield cls(
-                meta["index"], meta["split"], number, found["light"], found["isolated"], found["why_not"],
-                bp_x, bp_y, x, y, z, normal[0], normal[1], normal[2],
-                found["distance_mm"], found["kd_min"], found["kd_max"], found["peak_snr"],
-                base[0], base[1], base[2], found["kd_min_base"], found["kd_max_base"], found["pool"],
-            )  # fmt: skip
+def _highlight_row(meta: SampleMeta, number: int, truth: HighlightMeta) -> tuple[Value, ...]:
+    return (
+        meta["index"], meta["split"], number, truth["light"], truth["isolated"], truth["why_not"],
+        *truth["bp_px"], *truth["position_mm"], *truth["normal"],
+        truth["distance_mm"], truth["kd_min"], truth["kd_max"], truth["peak_snr"],
+        *truth["normal_base"], truth["kd_min_base"], truth["kd_max_base"], truth["pool"],
+    )  # fmt: skip
 
 
 def make_tables(plan: Plan, folder: Path) -> dict[str, pl.DataFrame]:
@@ -171,50 +105,29 @@ def make_tables(plan: Plan, folder: Path) -> dict[str, pl.DataFrame]:
 
 def shard_tables(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFrame]:
     """Make the rows of one shard, from its metadata."""
-    rows: list[SampleRow] = []
-    highlights: list[HighlightRow] = []
-    estimates: list[EstimateMeta] = []
-    for meta, offset, size in _stored(folder / shard.name):
-        rows.append(SampleRow.of(meta, shard.name, offset, size))
-        highlights += HighlightRow.of(meta)
-        estimates += [{**row, "index": meta["index"], "split": meta["split"]} for row in meta["estimates"]]
-    content: dict[str, Iterable[Mapping[str, Any]]] = {
-        SAMPLES: map(vars, rows),
-        HIGHLIGHTS: map(vars, highlights),
-        ESTIMATES: estimates,
-    }
-    return {name: _table(content[name], schema) for name, schema in _schemas(plan).items()}
-
-
-def _schemas(plan: Plan) -> dict[str, dict[str, pl.DataType]]:
-    """Return the columns of each table of a dataset."""
-    of_samples, of_estimates = _schema(SampleRow), dict(_ESTIMATE_SCHEMA)
-    if plan.has_instruments:
-        of_estimates[ON_INSTRUMENT] = pl.Boolean()
-    else:
-        del of_samples["instrument_share"]
-    return {SAMPLES: of_samples, HIGHLIGHTS: _schema(HighlightRow), ESTIMATES: of_estimates}
-
-
-def _stored(path: Path) -> Iterator[tuple[SampleMeta, int, int]]:
-    """Yield the metadata of a shard's samples, each with offset and size."""
-    with path.open("rb") as file:
-        begin = 0
+    rows: dict[str, list[Row]] = {name: [] for name in TABLES}
+    begin = 0
+    with (folder / shard.name).open("rb") as file:
         for sample in samples(file, check=False):
-            yield sample.meta, begin, sample.end - begin
+            meta = sample.meta
+            values = _sample_row(meta, shard.name, begin, sample.end - begin)
+            rows[SAMPLES].append(dict(zip(SAMPLE_COLUMNS, values, strict=True)))
+            for number, truth in enumerate(meta["highlights"]):
+                values = _highlight_row(meta, number, truth)
+                rows[HIGHLIGHTS].append(dict(zip(HIGHLIGHT_COLUMNS, values, strict=True)))
+            rows[ESTIMATES] += [{**row, "index": meta["index"], "split": meta["split"]} for row in meta["estimates"]]
             begin = sample.end
+    columns = {SAMPLES: dict(SAMPLE_COLUMNS), HIGHLIGHTS: HIGHLIGHT_COLUMNS, ESTIMATES: dict(ESTIMATE_COLUMNS)}
+    if plan.has_instruments:
+        columns[ESTIMATES][ON_INSTRUMENT] = Column(YES_NO)
+    else:
+        del columns[SAMPLES]["instrument_share"]
+    return {name: _table(rows[name], of) for name, of in columns.items()}
 
 
-def _schema(record: type) -> dict[str, pl.DataType]:
-    """Return a table's columns from the fields of its rows; each is of one type, and may be missing."""
-    kinds = {name: get_args(kind) or (kind,) for name, kind in get_type_hints(record).items()}
-    return {name: _KINDS[next(kind for kind in found if kind is not NoneType)] for name, found in kinds.items()}
-
-
-def _table(rows: Iterable[Mapping[str, Any]], schema: Mapping[str, pl.DataType]) -> pl.DataFrame:
-    rows = list(rows)
-    columns = {name: [row.get(name) for row in rows] for name in schema}
-    return pl.DataFrame(columns, schema=schema, strict=False)
+def _table(rows: list[Row], columns: Mapping[str, Column]) -> pl.DataFrame:
+    schema = {name: column.dtype for name, column in columns.items()}
+    return pl.DataFrame({name: [row.get(name) for row in rows] for name in columns}, schema=schema, strict=False)
 
 
 def _joined(parts: Iterable[Mapping[str, pl.DataFrame]]) -> dict[str, pl.DataFrame]:

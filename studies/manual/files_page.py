@@ -7,10 +7,11 @@ from collections.abc import Iterable, Mapping
 from docstring_parser import parse
 
 from simtest.dataset.fields import FIELDS as SAMPLE_FIELDS
-from simtest.dataset.index import HighlightRow, SampleRow
+from simtest.dataset.index import HIGHLIGHT_COLUMNS, SAMPLE_COLUMNS
 from simtest.reconstruction.outputs import COLUMNS
 from simtest.simulation.frame_files import FIELDS, FILES, INSTRUMENT_FIELDS
 from simtest.validation.columns import COLUMNS as RESULTS
+from simtest.validation.columns import Column
 from simtest.validation.runner import RunRecord
 from simtest.validation.statistics import Figures
 from studies.manual.markdown import code, table
@@ -104,7 +105,7 @@ explains them.
 
 def files_page() -> str:
     """Return the page as Markdown."""
-    meaning = ("key", "meaning")
+    meaning, of_columns = ("key", "meaning"), ("column", "type", "meaning")
     images = (
         (code(own.name), code(own.suffix), f"{own.shape} {own.dtype}, {own.unit}", own.meaning, own.encoding)
         for own in SAMPLE_FIELDS
@@ -118,24 +119,27 @@ def files_page() -> str:
         "ESTIMATE": table(meaning, _coded(ESTIMATE)),
         "CSV": ", ".join(code(name) for name in COLUMNS),
         "CONSTRAINTS": table(("array", "shape", "meaning"), ((code(name), *row) for name, row in CONSTRAINTS.items())),
-        "RESULTS": table(("column", "type", "meaning"), _columns()),
+        "RESULTS": table(of_columns, _columns(RESULTS)),
         "RUN": _parameters(RunRecord),
         "FIGURES": _parameters(Figures),
         "IMAGES": table(("field", "member", "decoded", "meaning", "encoding"), images),
-        "SAMPLES": _parameters(SampleRow),
-        "HIGHLIGHTS": _parameters(HighlightRow),
+        "SAMPLES": table(of_columns, _columns(SAMPLE_COLUMNS)),
+        "HIGHLIGHTS": table(of_columns, _columns(HIGHLIGHT_COLUMNS)),
     }
     return re.sub(r"@([A-Z]+)\b", lambda match: made[match[1]], PAGE)
 
 
-def _columns() -> Iterable[tuple[str, str, str]]:
-    """Return the columns of results, those of one vector or matrix in a row."""
+def _columns(columns: Mapping[str, Column]) -> Iterable[tuple[str, str, str]]:
+    """Return the columns of a table, those of one meaning, such as a vector's, in a row."""
     rows: list[tuple[list[str], str, str]] = []
-    for name, column in RESULTS.items():
-        if not column.meaning:
-            rows[-1][0].append(name)
+    for name, column in columns.items():
+        kind = str(column.dtype).lower()
+        if column.meaning:
+            rows.append(([name], kind, column.meaning))
         else:
-            rows.append(([name], str(column.dtype).lower(), column.meaning))
+            rows[-1][0].append(name)
+            if kind not in rows[-1][1].split(", "):
+                rows[-1] = (rows[-1][0], f"{rows[-1][1]}, {kind}", rows[-1][2])
     return [(code(", ".join(names)), kind, line) for names, kind, line in rows]
 
 

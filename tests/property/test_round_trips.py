@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from simtest.dataset.scoring.dense.conventions import ALL, matrix, to_camera
+from simtest.dataset.scoring.dense.maps import ALL, matrix, to_camera
 from simtest.geometry import ellipse_of_conic
 from simtest.geometry.vectors import angle_deg, bisect, rotation, tangent_basis, tangent_coordinates
 from simtest.runtime.seeds import from_integer

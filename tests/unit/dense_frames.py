@@ -3,8 +3,7 @@
 import cv2
 import numpy as np
 
-from simtest.dataset.scoring.dense.frame_truth import EXCLUDED, FrameTruth
-from simtest.dataset.scoring.dense.zones import zones
+from simtest.dataset.scoring.dense.truth import EXCLUDED, FrameTruth, zones
 from simtest.geometry import Camera
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt
 

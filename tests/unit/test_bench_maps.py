@@ -12,8 +12,8 @@ def test_a_frame_without_a_row_moves_no_other_frame() -> None:
         return {"frame": frame, "setting": "plane", "source": "normal", "quantity": "angle_deg", "surface": "fine",
                 "group": "zone", "label": "all", "n": 10, "mean_penalised": error}  # fmt: skip
 
-    score = SimpleNamespace(scorer=SimpleNamespace(rows=[row("b", 1.0), row("c", 5.0), row("d", 5.0)]))
+    score = SimpleNamespace(rows=[row("b", 1.0), row("c", 5.0), row("d", 5.0)])
     numbers = {"a": 0, "b": 1, "c": 2, "d": 3}
     assert _scene_sums(score, "normal", {"plane": (2, 2)}, numbers) == {"plane": [(10, 10.0), (20, 100.0)]}
-    score.scorer.rows = [row("b", 1.0), row("c", 5.0)]
+    score.rows = [row("b", 1.0), row("c", 5.0)]
     assert _scene_sums(score, "normal", {"plane": (2, 2)}, numbers) == {"plane": [(10, 10.0), (10, 50.0)]}

@@ -16,7 +16,7 @@ from simtest.bench.scores import CERTIFICATE
 from simtest.bench.suite import Suite, digest_of, experiment_of, layout_of
 from simtest.bench.table import check_suite, read_certificate, read_entries
 from simtest.cli import runs
-from simtest.dataset.scoring.dense.conventions import MapOptions
+from simtest.dataset.scoring.dense.maps import MapOptions
 from simtest.errors import InputError
 from simtest.runtime.processes import make_engine
 from simtest.runtime.provenance import file_hash, version

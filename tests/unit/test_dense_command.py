@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dense_frames import turned, write_png
 
-from simtest.dataset.scoring.dense.from_folder import frames_of
+from simtest.dataset.scoring.dense.score import frames_of
 
 pytestmark = pytest.mark.render
 
@@ -138,12 +138,12 @@ def test_wrong_options_are_one_line(run, here, tmp_path, options, message):
 
 
 def test_names_of_maps_are_checked_before_anything_is_rendered(run, here, tmp_path, monkeypatch):
-    from simtest.dataset.scoring.dense import from_folder
+    from simtest.dataset.scoring.dense import score
 
     def render(*_):
         raise AssertionError("rendered")
 
-    monkeypatch.setattr(from_folder, "scored_frames", render)
+    monkeypatch.setattr(score, "scored_frames", render)
     (tmp_path / "maps").mkdir()
     np.save(tmp_path / "maps" / "stranger.npy", np.zeros((4, 4, 3)))
     code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", tmp_path / "scored")
@@ -152,12 +152,12 @@ def test_names_of_maps_are_checked_before_anything_is_rendered(run, here, tmp_pa
 
 
 def test_a_stopped_score_does_not_say_that_it_goes_on(run, here, tmp_path, monkeypatch):
-    from simtest.dataset.scoring.dense import from_folder
+    from simtest.dataset.scoring.dense import score
 
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(from_folder, "scored_frames", stop)
+    monkeypatch.setattr(score, "scored_frames", stop)
     (tmp_path / "maps").mkdir()
     np.save(tmp_path / "maps" / f"{run[1][0].name}.npy", np.zeros((4, 4, 3)))
     code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", tmp_path / "scored")
@@ -182,6 +182,6 @@ def test_a_run_is_not_written_over(run, here, tmp_path):
 
 def test_the_command_knows_the_methods():
     from simtest.cli.runs import WORDS
-    from simtest.dataset.scoring.dense import METHODS
+    from simtest.dataset.scoring.dense.maps import METHODS
 
     assert set(WORDS) == set(METHODS)

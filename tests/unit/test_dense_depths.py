@@ -7,8 +7,9 @@ import polars as pl
 import pytest
 from dense_frames import LENSES, sphere_truth
 
-from simtest.dataset.scoring.dense import MapFolder, MapOptions, open_method, score_frames, write_score
 from simtest.dataset.scoring.dense.depth import align, normals_of_distance
+from simtest.dataset.scoring.dense.maps import MapFolder, MapOptions, open_method
+from simtest.dataset.scoring.dense.score import score_frames, write_score
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
@@ -136,7 +137,7 @@ def test_depths_and_normals_are_scored_side_by_side(tmp_path):
     depth[:36] = np.nan
     np.save(tmp_path / "depth" / "a.npy", depth)
     score = scored(tmp_path, truth)
-    assert score.scorer.sources == ("normal", "depth_none", "depth_scale", "depth_affine")
+    assert score.sources == ("normal", "depth_none", "depth_scale", "depth_affine")
     assert score.cell("normal")["share_unanswered"] == 0
     # A normal next to a hole has no differences, so a row more is unanswered than depths are missing.
     assert score.cell("depth_none")["share_unanswered"] > 0.5

@@ -5,17 +5,15 @@ import numpy as np
 import pytest
 from dense_frames import LENSES, sphere_truth, turned, write_png
 
-from simtest.dataset.scoring.dense import MapFolder, MapOptions, score_frames
-from simtest.dataset.scoring.dense.conventions import parse_axes
-from simtest.dataset.scoring.dense.frame_truth import frame_truth
-from simtest.dataset.scoring.dense.tally import frame_figures, joined_figures
-from simtest.dataset.scoring.dense.zones import zones
+from simtest.dataset.scoring.dense.maps import MapFolder, MapOptions, parse_axes
+from simtest.dataset.scoring.dense.score import frame_figures, joined_figures, score_frames
+from simtest.dataset.scoring.dense.truth import frame_truth, zones
 from simtest.errors import InputError
 from simtest.geometry.axes import ALL, matrix
 
 
 def angles(score, figure, source="normal"):
-    return np.array([cell[figure] for key, cell in score.scorer.cells() if key[0] == source and key[1] == "angle_deg"])
+    return np.array([cell[figure] for key, cell in score.cells if key[0] == source and key[1] == "angle_deg"])
 
 
 def scored(folder, *truths, **options):

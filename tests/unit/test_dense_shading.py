@@ -7,8 +7,9 @@ import pytest
 from dense_frames import LENSES, hit, sphere_truth
 
 from simtest.calibration import Calibration
-from simtest.dataset.scoring.dense import MapOptions, Shading, score_frames
-from simtest.dataset.scoring.dense.shading_maps import shading_maps
+from simtest.dataset.scoring.dense.maps import MapOptions, Shading
+from simtest.dataset.scoring.dense.score import score_frames
+from simtest.dataset.scoring.dense.shading import shading_maps
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
 from tests.marked import marked

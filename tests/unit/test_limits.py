@@ -13,7 +13,7 @@ import pytest
 from simtest.api import sample_views
 from simtest.cli.data import fit
 from simtest.dataset.manifest import ManifestError, read_manifest
-from simtest.dataset.scoring.record import read_record
+from simtest.dataset.scoring.frames import read_record
 from simtest.errors import InputError, SimtestError
 from simtest.realism.frames import open_generated
 from simtest.reconstruction.images import _tiff_size, read_picture

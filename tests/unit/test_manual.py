@@ -13,7 +13,6 @@ from docstring_parser import parse
 
 import simtest
 from simtest.calibration import Calibration
-from simtest.dataset.index import HighlightRow, SampleRow
 from simtest.geometry import Camera
 from simtest.reconstruction.options import Options
 from simtest.reconstruction.outputs import constraints_arrays
@@ -161,7 +160,7 @@ def test_every_file_of_a_frame_is_in_the_reference():
     assert "preview.jpg" in FILES
 
 
-@pytest.mark.parametrize("record", [SampleRow, HighlightRow, RunRecord, Figures])
+@pytest.mark.parametrize("record", [RunRecord, Figures])
 def test_docstrings_of_records_name_their_fields(record):
     named = [name for own in parse(inspect.getdoc(record)).params for name in own.arg_name.split(", ")]
     assert sorted(named) == sorted(field.name for field in dataclasses.fields(record))

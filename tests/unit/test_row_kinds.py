@@ -1,6 +1,5 @@
 """Rows of results are counted by one rule, wherever they are counted, and the counts add up."""
 
-
 import numpy as np
 import polars as pl
 import pytest

@@ -6,9 +6,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from simtest.dataset.scoring.record import ExportedFrame, Record, read_record
-from simtest.dataset.scoring.run import score_table
-from simtest.dataset.scoring.table import read_answers
+from simtest.dataset.scoring.answers import read_answers
+from simtest.dataset.scoring.frames import ExportedFrame, Record, read_record
+from simtest.dataset.scoring.score import score_table
 from simtest.errors import InputError, Reason
 from simtest.geometry import Camera
 from simtest.spec import camera_table

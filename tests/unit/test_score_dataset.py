@@ -13,9 +13,9 @@ from simtest.dataset import calibration_of, read
 from simtest.dataset.card import CARD
 from simtest.dataset.export import export_dataset
 from simtest.dataset.manifest import read_manifest
-from simtest.dataset.scoring.dense.from_folder import frames_of
+from simtest.dataset.scoring.dense.score import frames_of
 from simtest.dataset.scoring.frames import scored_frames
-from simtest.dataset.scoring.run import score_table
+from simtest.dataset.scoring.score import score_table
 from simtest.dataset.shard_writer import write_dataset
 from simtest.dataset.verify import verify
 from simtest.runtime.processes import make_engine

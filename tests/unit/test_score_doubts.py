@@ -4,9 +4,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from simtest.dataset.scoring.answers import Answer
-from simtest.dataset.scoring.doubts import reversed_axes, stray_rows, wide_regions
-from simtest.dataset.scoring.record import ExportedFrame, Record
+from simtest.dataset.scoring.answers import Answer, reversed_axes, stray_rows, wide_regions
+from simtest.dataset.scoring.frames import ExportedFrame, Record
 from simtest.errors import Failure, Reason
 
 BOXES = ((100, 40, 20, 20), (10, 60, 30, 25))

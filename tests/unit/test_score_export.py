@@ -12,8 +12,7 @@ import pytest
 
 import simtest
 from simtest.dataset.export import export_run
-from simtest.dataset.scoring.frames import scored_frames
-from simtest.dataset.scoring.record import image_hash
+from simtest.dataset.scoring.frames import image_hash, scored_frames
 from simtest.errors import InputError
 from simtest.reconstruction.images import read_picture
 from simtest.runtime.processes import make_engine
@@ -288,6 +287,6 @@ def test_the_readme_names_every_column(made):
         with (frames / name).open() as file:
             for column in file.readline().strip().split(","):
                 assert column in text or column.startswith("box"), column
-    from simtest.dataset.scoring.table_file import COLUMNS
+    from simtest.dataset.scoring.answers import COLUMNS
 
     assert all(f"`{column}`" in text for column in COLUMNS if column != "cov_21")

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 import simtest
-from simtest.dataset.scoring.run import score_table
+from simtest.dataset.scoring.score import score_table
 from simtest.errors import InputError
 from simtest.reconstruction.images import read_picture
 

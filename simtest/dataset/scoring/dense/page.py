@@ -5,24 +5,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from simtest.dataset.scoring.dense.cells import BINS, SCOPES, ZONE_MEANINGS
-from simtest.dataset.scoring.dense.frame_truth import SURFACES
-from simtest.dataset.scoring.dense.pictures import ERROR_END_DEG
-from simtest.dataset.scoring.dense.scorer import ANGLE, BELOW, DEPTH, NORMAL, Key
+import cv2
+import numpy as np
+
+from simtest.dataset.scoring.dense.truth import (
+    ANGLE,
+    BELOW,
+    BINS,
+    DEPTH,
+    SCOPES,
+    SOURCE_MEANINGS,
+    SURFACES,
+    ZONE_MEANINGS,
+    FrameTruth,
+    Key,
+)
+from simtest.geometry.vectors import angle_deg
 from simtest.pages.html import environment
 from simtest.pages.pixels import data_address
 from simtest.pages.style import number
 from simtest.runtime import provenance
+from simtest.runtime.arrays import Array, Image, Picture
 
 if TYPE_CHECKING:
     from simtest.dataset.scoring.dense.score import DenseScore
 
-SOURCE_MEANINGS = {
-    NORMAL: "normal maps",
-    "depth_none": "normals of the depth maps, as stated",
-    "depth_scale": "normals of the depth maps, aligned by a factor a frame",
-    "depth_affine": "normals of the depth maps, aligned by a factor and a shift a frame",
-}
 GROUP_TITLES = {
     "d_k": "d k, the distance times the principal curvature of the larger size",
     "eps_over_d": "ε/d, the offset of the farthest light over the distance",
@@ -44,12 +51,12 @@ class Block:
 def write_dense_page(path: Path, score: "DenseScore", command: str) -> None:
     """Write the page of a score into one file that needs nothing else."""
     held: dict[Key, list[Figures]] = {}
-    for key, found in score.scorer.cells():
+    for key, found in score.cells:
         held.setdefault(key, []).append(found)
     made_by = provenance.environment()
     html = environment().get_template("dense.html.j2").render(
         score=score, command=command, headline=headlines(held), zones=ZONE_MEANINGS,
-        surfaces=SURFACES, sources=[(name, SOURCE_MEANINGS[name]) for name in score.scorer.sources],
+        surfaces=SURFACES, sources=[(name, SOURCE_MEANINGS[name]) for name in score.sources],
         zone_rows=_zone_rows(held, ANGLE), depth_rows=_zone_rows(held, DEPTH), bin_blocks=_bin_blocks(held),
         heads={ANGLE: _heads(ANGLE, "deg"), DEPTH: _heads(DEPTH, "%")}, below=BELOW,
         interval=interval_text, percent=percent_text,
@@ -128,3 +135,76 @@ def interval_text(found: Figures, name: str) -> str:
 def percent_text(share: object) -> str:
     """Return a share as per cent; a dash where there is none."""
     return f"{100 * share:.3g} %" if isinstance(share, int | float) else "–"
+
+
+# Pictures -----------------------------------------------------------------------------------------------------------
+
+WIDTH = 320
+"""Width of a picture, px."""
+
+ERROR_END_DEG = 30.0
+"""Error at which the colours end."""
+
+_UNANSWERED, _EXCLUDED = (190, 60, 160), (60, 64, 70)
+"""Colours of pixels without an answer, and of those that are not scored."""
+
+_TO_VIEWER = np.array([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The pictures of one frame, with their captions."""
+
+    frame: str
+    setting: str
+    source: str | None
+    pictures: list[tuple[str, Picture]]
+    median_deg: float | None
+
+
+def picture_row(truth: FrameTruth, estimate: Array | None, source: str | None) -> Shown:
+    """Return the pictures of a frame; `estimate` are the normals of a source, shape (H, W, 3), None for no answer."""
+    normal = truth.normal["fine"]
+    pictures = [] if truth.image is None else [("frame", _small(_grey(truth.image)))]
+    pictures.append(("true normal (fine surface)", _small(normal_colours(normal, truth))))
+    error = np.full(truth.size, np.nan)
+    if estimate is not None:
+        error = angle_deg(estimate, normal)
+        pictures.append(("estimated normal", _small(normal_colours(estimate, truth))))
+    error[~truth.scored] = np.nan
+    known = error[np.isfinite(error)]
+    pictures.append(("error", _small(error_colours(error, truth))))
+    return Shown(truth.name, truth.setting, source, pictures, float(np.median(known)) if known.size else None)
+
+
+def normal_colours(normal: Array, truth: FrameTruth) -> Picture:
+    """Return normals as colours: red right, green up, blue towards the camera."""
+    known = np.isfinite(normal).all(axis=-1)
+    colours = np.rint(127.5 * (1 + np.nan_to_num(normal) * _TO_VIEWER)).astype(np.uint8)
+    colours[~known] = _UNANSWERED
+    colours[~truth.scored] = _EXCLUDED
+    return colours
+
+
+def error_colours(error: Array, truth: FrameTruth) -> Picture:
+    """Return errors, deg, as colours from dark (0) to bright (`ERROR_END_DEG` and beyond)."""
+    share = np.clip(np.nan_to_num(error) / ERROR_END_DEG, 0, 1)
+    colours = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_CIVIDIS)[:, :, ::-1].copy()
+    colours[~np.isfinite(error)] = _UNANSWERED
+    colours[~truth.scored] = _EXCLUDED
+    return np.asarray(colours, np.uint8)
+
+
+def _grey(image: Image) -> Picture:
+    """Return a frame for the eye, as it is encoded."""
+    values = np.rint(255 * np.clip(np.nan_to_num(image), 0, 1)).astype(np.uint8)
+    return values if values.ndim == 3 else np.repeat(values[:, :, None], 3, axis=2)
+
+
+def _small(picture: Picture) -> Picture:
+    height, width = picture.shape[:2]
+    if width <= WIDTH:
+        return picture
+    size = (WIDTH, max(1, round(height * WIDTH / width)))
+    # Colours of single pixels, since a mean of two directions is none.
+    return np.asarray(cv2.resize(np.ascontiguousarray(picture), size, interpolation=cv2.INTER_NEAREST), np.uint8)

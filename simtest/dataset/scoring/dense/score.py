@@ -1,24 +1,45 @@
-"""`score_maps`: dense maps of a method against the truth of a run or a dataset, with tables, JSON and a page."""
+"""Dense maps of a method against the truth of a run or a dataset: figures, tables, JSON and a page.
 
-from collections.abc import Iterable
+Each frame leaves the figures of its angles and depth errors, a row a cell. The scenes, not the pixels, are the sample
+(of a dataset the anatomies): frames of one scene differ in noise alone.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from simtest.dataset.scoring.dense.cells import BINS, ZONE_MEANINGS
-from simtest.dataset.scoring.dense.conventions import Answer, Fit, MapOptions
-from simtest.dataset.scoring.dense.depth import ALIGNMENTS
-from simtest.dataset.scoring.dense.frame_truth import EXCLUDED, FrameTruth, Progress
-from simtest.dataset.scoring.dense.methods import Method, open_method
-from simtest.dataset.scoring.dense.pictures import Shown, picture_row
-from simtest.dataset.scoring.dense.scorer import ANGLE, NORMAL, Key, Scorer, depth_source
+from simtest.dataset.scoring.dense.depth import ALIGNMENTS, align, depth_factor, normals_of_distance
+from simtest.dataset.scoring.dense.maps import Answer, Fit, MapOptions, Method, decode_depth, open_method
+from simtest.dataset.scoring.dense.page import Shown, picture_row, write_dense_page
+from simtest.dataset.scoring.dense.truth import (
+    ANGLE,
+    BELOW,
+    BINS,
+    CELLS,
+    DEPTH,
+    EXCLUDED,
+    NORMAL,
+    SURFACES,
+    ZONE_MEANINGS,
+    Cell,
+    FrameTruth,
+    Key,
+    Progress,
+    depth_source,
+    labels,
+    truth_of_view,
+)
+from simtest.dataset.scoring.frames import read_record, scored_frames
 from simtest.errors import InputError
+from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
-from simtest.runtime.arrays import Array
+from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
+from simtest.runtime.statistics import Interval, mean_interval, median_interval, root_mean_square, share_interval
 
 TABLE, SUMMARY, PAGE = "dense.parquet", "dense.json", "index.html"
 SCHEMA = 3
@@ -37,12 +58,20 @@ class DenseScore:
         Of the method.
     on : str
         The run or dataset, as it was named.
+    options : MapOptions
+        How maps are read.
+    sources : tuple of str
+        Sources that some frame has; a frame without one counts as unanswered there.
     fit : Fit
-        How the maps were read, and how well they fit the truth so.
-    scorer : Scorer
-        The figures of each frame.
+        How well the maps fit the truth as they are read.
     counts : dict of int
         Frames, frames without any map, scored pixels, and pixels excluded by reason.
+    rows : list of dict
+        Figures of each frame and cell.
+    alignments : dict
+        Factor and shift in each frame, by alignment.
+    scenes : dict of str
+        Scene of each frame.
     shown : list of Shown
         Pictures of some frames.
     page : Path, optional
@@ -51,17 +80,142 @@ class DenseScore:
 
     name: str
     on: str
-    fit: Fit
-    scorer: Scorer
-    counts: dict[str, int]
+    options: MapOptions
+    sources: tuple[str, ...]
+    fit: Fit = field(init=False)
+    counts: dict[str, int] = field(
+        default_factory=lambda: dict.fromkeys(("frames", "frames_without_map", "scored", *EXCLUDED), 0)
+    )
+    rows: list[JsonObject] = field(default_factory=list)
+    alignments: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    scenes: dict[str, str] = field(default_factory=dict)
     shown: list[Shown] = field(default_factory=list)
     page: Path | None = None
+
+    def __post_init__(self) -> None:
+        self.fit = Fit(self.options)
+
+    # Frame by frame
+
+    def add(self, truth: FrameTruth, answer: Answer) -> None:
+        """Score a frame."""
+        self.fit.add(truth, answer)
+        self.counts["frames"] += 1
+        self.counts["frames_without_map"] += answer.normal is None and answer.depth is None
+        self.counts["scored"] += int(truth.scored.sum())
+        for reason in EXCLUDED:
+            self.counts[reason] += truth.excluded[reason]
+        self.scenes[truth.name] = truth.scene or truth.name
+        normals, distances = self._read(truth, answer)
+        unanswered = np.full(int(truth.scored.sum()), np.nan)
+        in_cells = {surface: labels(truth, surface) for surface in SURFACES}
+        for surface in SURFACES:
+            true = truth.normal[surface][truth.scored]
+            for source in self.sources:
+                values = angle_deg(normals[source][truth.scored], true) if source in normals else unanswered
+                self._count((source, ANGLE, surface), truth, values, in_cells[surface])
+        true = truth.distance[truth.scored]
+        for source in self.sources:
+            if source != NORMAL:
+                known = source in distances
+                values = 100 * np.abs(distances[source][truth.scored] / true - 1) if known else unanswered
+                self._count((source, DEPTH, "fine"), truth, values, in_cells["fine"])
+        self._show(truth, normals)
+
+    def _read(self, truth: FrameTruth, answer: Answer) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Return the normals, shape (H, W, 3), and, of depths, the distances along the rays, by source."""
+        normals: dict[str, Array] = {}
+        distances: dict[str, Array] = {}
+        if answer.normal is not None:
+            normals[NORMAL] = self.options.normals(answer.normal)
+        if answer.depth is not None:
+            depth = decode_depth(answer.depth, self.options.unit_mm)
+            factor = depth_factor(truth.camera, self.options.along)
+            rays = truth.camera.unproject(truth.camera.pixel_centres())
+            true, fitted_on = truth.distance * factor, truth.scored & np.isfinite(factor) & np.isfinite(depth)
+            for how in ALIGNMENTS:
+                a, b = align(depth[fitted_on], true[fitted_on], how)
+                self.alignments.setdefault(how, []).append((a, b))
+                # A factor below 0 turns the depths round: they are inverse ones, or no depths.
+                aligned = (a * depth + b) / factor if a > 0 else np.full(depth.shape, np.nan)
+                aligned[~(aligned > 0)] = np.nan
+                distances[depth_source(how)] = aligned
+                # A factor turns no normal.
+                as_stated = normals.get(depth_source("none")) if b == 0 and a > 0 else None
+                normals[depth_source(how)] = normals_of_distance(aligned, rays) if as_stated is None else as_stated
+        return normals, distances
+
+    def _count(self, key: Key, truth: FrameTruth, values: Array, in_cells: list[IntArray]) -> None:
+        source, quantity, surface = key
+        common = {"frame": truth.name, "setting": truth.setting, **truth.swept, "source": source,
+                  "quantity": quantity, "surface": surface}  # fmt: skip
+        penalty = PENALTY if quantity == ANGLE else None
+        for numbers in in_cells:
+            for number in np.unique(numbers[numbers >= 0]):
+                figures = frame_figures(values[numbers == number], BELOW[quantity], penalty)
+                self.rows.append({**common, **vars(CELLS[number]), **figures})
+
+    def _show(self, truth: FrameTruth, normals: dict[str, Array]) -> None:
+        """Keep the pictures of a frame for the page, if it is the first of its setting or one of the first."""
+        settings = {one.setting for one in self.shown}
+        if len(self.shown) >= MOST_SHOWN or (truth.setting in settings and len(self.shown) >= LEAST_SHOWN):
+            return
+        best = (NORMAL, depth_source("affine"), depth_source("scale"), depth_source("none"))
+        source = next((name for name in best if name in normals), None)
+        self.shown.append(picture_row(truth, None if source is None else normals[source], source))
+
+    # All frames
+
+    @cached_property
+    def cells(self) -> list[tuple[Key, JsonObject]]:
+        """The figures of every cell that holds a pixel; all frames must have been added."""
+        held: dict[tuple[Key, Cell], list[JsonObject]] = {}
+        for row in self.rows:
+            key = (row["source"], row["quantity"], row["surface"])
+            held.setdefault((key, Cell(row["group"], row["label"], row["scope"])), []).append(row)
+        keys = list(dict.fromkeys(key for key, _ in held))
+        return [
+            (key, {**vars(cell), **self._joined(held[key, cell])})
+            for key, cell in sorted(held, key=lambda each: (keys.index(each[0]), CELLS.index(each[1])))
+        ]
+
+    def _joined(self, rows: list[JsonObject]) -> JsonObject:
+        names = [[self.scenes[row["frame"]] for row in rows], [row["setting"] for row in rows]]
+        scenes, settings = (np.unique(each, return_inverse=True)[1] for each in names)
+        figures = [*rows[0]][[*rows[0]].index("scope") + 1 :]
+        return joined_figures([{name: row[name] for name in figures} for row in rows], scenes, settings)
+
+    def cell(self, source: str, surface: str = "fine", label: str = "all", quantity: str = ANGLE) -> JsonObject:
+        """Return the figures of a cell of the zones."""
+        for key, figures in self.cells:
+            if key == (source, quantity, surface) and (figures["group"], figures["label"]) == ("zone", label):
+                return dict(figures)
+        raise KeyError((source, quantity, surface, label))
+
+    def alignment_summary(self) -> JsonObject:
+        """Return median, least and largest factor and shift of each alignment over the frames.
+
+        Frames whose factor is not positive are counted apart; their depths count as unanswered.
+        """
+        summary: JsonObject = {}
+        for how, pairs in self.alignments.items():
+            fitted = np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)
+            if how == "none" or not len(fitted):
+                continue
+            sound = fitted[fitted[:, 0] > 0]
+            summary[how] = {"frames": len(sound), "frames_turned_round": len(fitted) - len(sound)}
+            names = ("factor", "shift_mm") if how == "affine" else ("factor",)
+            for name, part in zip(names, sound.T, strict=False) if len(sound) else ():
+                summary[how][name] = {
+                    "median": float(np.median(part)), "least": float(part.min()), "largest": float(part.max())
+                }  # fmt: skip
+        return summary
 
     @property
     def lines(self) -> list[str]:
         """What is told in words: conventions, alignments, and what was not answered."""
         told = self.fit.lines()
-        for how, found in self.scorer.alignment_summary().items():
+        for how, found in self.alignment_summary().items():
             if turned := found["frames_turned_round"]:
                 told.append(
                     f"warning: depths, {how}: the factor is negative in {turned} frames, whose pixels count as "
@@ -81,22 +235,15 @@ class DenseScore:
         told.append(f"pixels: {self.counts['scored']} scored; not scored: {excluded}")
         return told
 
-    def cell(self, source: str, surface: str = "fine", label: str = "all", quantity: str = ANGLE) -> JsonObject:
-        """Return the figures of a cell of the zones."""
-        for key, found in self.scorer.cells():
-            if key == (source, quantity, surface) and (found["group"], found["label"]) == ("zone", label):
-                return dict(found)
-        raise KeyError((source, quantity, surface, label))
-
     def to_json(self) -> JsonObject:
         """Return the content of dense.json."""
         cells: dict[str, dict[str, dict[str, list[object]]]] = {}
-        for (source, quantity, surface), found in self.scorer.cells():
+        for (source, quantity, surface), found in self.cells:
             cells.setdefault(source, {}).setdefault(quantity, {}).setdefault(surface, []).append(found)
         return {
             "schema": SCHEMA, "name": self.name, "on": self.on, "counts": self.counts,
             "conventions": self.fit.to_json(),
-            "alignments": self.scorer.alignment_summary(), "zones": ZONE_MEANINGS,
+            "alignments": self.alignment_summary(), "zones": ZONE_MEANINGS,
             "bins": {name: [edge if np.isfinite(edge) else None for edge in edges] for name, edges in BINS.items()},
             "sources": cells, "told": self.lines,
         }  # fmt: skip
@@ -111,16 +258,13 @@ def score_frames(
     """
     options.check()
     options = method.options(options)
-    counts = dict.fromkeys(("frames", "frames_without_map", "scored", *EXCLUDED), 0)
-    scorer = Scorer(options, sources=_sources(method))
-    score = DenseScore(options.name or method.name, on, Fit(options), scorer, counts)
+    sources: tuple[str, ...] = (NORMAL,) if "normal" in method.kinds else ()
+    sources += tuple(map(depth_source, ALIGNMENTS)) if "depth" in method.kinds else ()
+    score = DenseScore(options.name or method.name, on, options, sources)
     names = []
     for truth in frames:
         names.append(truth.name)
-        answer = method.answer(truth)
-        score.fit.add(truth, answer)
-        _count(counts, truth, answer)
-        _show(score, truth, scorer.add(truth, answer))
+        score.add(truth, method.answer(truth))
     if not is_checked:
         method.check(names)
     if not names:
@@ -128,39 +272,28 @@ def score_frames(
     return score
 
 
-def _sources(method: Method) -> tuple[str, ...]:
-    """Return the sources of normals that a method gives."""
-    own = (NORMAL,) if "normal" in method.kinds else ()
-    return own + (tuple(map(depth_source, ALIGNMENTS)) if "depth" in method.kinds else ())
+def frames_of(folder: Path, progress: Progress | None = None, total: int = 0) -> Iterator[FrameTruth]:
+    """Yield each exported frame of a run or dataset once, with its truth.
 
-
-def _count(counts: dict[str, int], truth: FrameTruth, answer: Answer) -> None:
-    counts["frames"] += 1
-    counts["frames_without_map"] += answer.normal is None and answer.depth is None
-    counts["scored"] += int(truth.scored.sum())
-    for reason in EXCLUDED:
-        counts[reason] += truth.excluded[reason]
-
-
-def _show(score: DenseScore, truth: FrameTruth, normals: dict[str, npt.NDArray[np.float64]]) -> None:
-    """Keep the pictures of a frame for the page, if it is the first of its setting or one of the first."""
-    settings = {one.setting for one in score.shown}
-    if len(score.shown) >= MOST_SHOWN or (truth.setting in settings and len(score.shown) >= LEAST_SHOWN):
-        return
-    best = (NORMAL, depth_source("affine"), depth_source("scale"), depth_source("none"))
-    source = next((name for name in best if name in normals), None)
-    estimate: Array | None = None if source is None else normals[source]
-    score.shown.append(picture_row(truth, estimate, source))
+    `progress` is called when a frame has been used, with their number, the `total` and its name. Raises `InputError` as
+    `scored_frames` does.
+    """
+    used: set[str] = set()
+    for each in scored_frames(folder):
+        # One frame may stand for several realisations; it has one map.
+        if each.name not in used:
+            used.add(each.name)
+            yield truth_of_view(each.name, each.view, each.session, each.setting, each.swept, each.image, each.anatomy)
+            if progress:
+                progress(len(used), total, each.name)
 
 
 def write_score(score: DenseScore, out: Path, command: str = "") -> Path:
     """Write dense.parquet, dense.json and the page into a folder, which is made if need be; return the page."""
     import polars as pl
 
-    from simtest.dataset.scoring.dense.page import write_dense_page
-
     make_folder(out)
-    table = pl.DataFrame(score.scorer.rows, infer_schema_length=None)
+    table = pl.DataFrame(score.rows, infer_schema_length=None)
     write_atomically(out / TABLE, table.write_parquet)
     write_json(out / SUMMARY, {**score.to_json(), "run": {"command": command, **provenance.environment()}})
     score.page = out / PAGE
@@ -189,13 +322,12 @@ def score_maps(
     progress : callable, optional
         Called with the frames done, frames in all, and the frame's name.
     """
-    from simtest.dataset.scoring.dense.from_folder import frame_names, frames_of
-
     options = options or MapOptions()
     options.check()
     method = open_method(maps)
-    names = frame_names(on)
-    _refuse_run(out)
+    names = list(read_record(on).frames)
+    if (out / PAGE).exists() and not (out / SUMMARY).exists():
+        raise InputError(f"--out {out}: holds another page; must be an empty folder or one of such figures")
     # Before anything is rendered, which takes long.
     method.check(names)
     with exclusive_folder(out):
@@ -204,10 +336,77 @@ def score_maps(
     return score
 
 
-def _refuse_run(out: Path) -> None:
-    """Raise `InputError` where a folder for figures holds something else that has a page."""
-    if out.is_dir() and (out / PAGE).exists() and not (out / SUMMARY).exists():
-        raise InputError(f"--out {out}: holds another page; must be an empty folder or one of such figures")
+# Figures ------------------------------------------------------------------------------------------------------------
+
+PENALTY = 90.0
+"""An unanswered pixel counts as this angle, deg, in the penalised mean."""
+
+QUANTILES = {"median": 0.5, "p95": 0.95}
 
 
-__all__ = ["DenseScore", "Key", "score_frames", "score_maps", "write_score"]
+def frame_figures(values: Array, below: Sequence[float], penalty: float | None = PENALTY) -> JsonObject:
+    """Return the figures of a frame's pixels of one cell: shares are of all, the unanswered among them.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        At least one; NaN where there is no answer.
+    below : sequence of float
+        Thresholds; the share of the pixels below each is told.
+    penalty : float or None
+        What an unanswered pixel counts in `mean_penalised`; None where the values have no such figure.
+    """
+    own = values[np.isfinite(values)]
+    n, missing = len(values), len(values) - len(own)
+    quantiles = np.quantile(own, [*QUANTILES.values()]).tolist() if own.size else [None] * len(QUANTILES)
+    return {
+        "n": n, "n_unanswered": missing,
+        "mean": float(own.mean()) if own.size else None, "rms": root_mean_square(own),
+        **({} if penalty is None else {"mean_penalised": float((own.sum() + penalty * missing) / n)}),
+        "share_unanswered": missing / n,
+        **{f"below_{most:g}": np.count_nonzero(own < most) / n for most in below},
+        **dict(zip(QUANTILES, quantiles, strict=True)),
+    }  # fmt: skip
+
+
+def joined_figures(rows: Sequence[JsonObject], scenes: IntArray, settings: IntArray) -> JsonObject:
+    """Return the figures of a cell over its frames, with 95 % intervals where these show two scenes or more.
+
+    Means and shares are of all pixels; median and p95 are the medians over the frames of each frame's.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        `frame_figures` of each frame.
+    scenes, settings : ndarray of int, shape (N,)
+        Number of the scene and of the setting of each frame.
+    """
+    columns = {name: np.array([np.nan if row[name] is None else row[name] for row in rows], float) for name in rows[0]}
+    pixels = columns.pop("n")
+    answers = pixels - columns.pop("n_unanswered")
+    found: JsonObject = {"frames": len(rows), "n": int(pixels.sum()), "n_unanswered": int((pixels - answers).sum())}
+    intervals: JsonObject = {}
+    for name, values in columns.items():
+        known = np.isfinite(values)
+        value, interval = _joined(
+            name, values[known], scenes[known], settings[known], (answers if name in ("mean", "rms") else pixels)[known]
+        )
+        found[name] = value
+        if interval[0] is not None and len(np.unique(scenes)) > 1:
+            intervals[name] = list(interval)
+    return found | {"ci95": intervals}
+
+
+def _joined(
+    name: str, values: Array, scenes: IntArray, settings: IntArray, counts: Array
+) -> tuple[float | None, Interval]:
+    if not len(values):
+        return None, (None, None)
+    if name in QUANTILES:
+        return float(np.median(values)), median_interval(values, scenes, settings)
+    root = np.sqrt if name == "rms" else float
+    totals = counts * (values**2 if name == "rms" else values)
+    interval_of = share_interval if name.startswith(("share", "below")) else mean_interval
+    low, high = interval_of(totals, scenes, settings, counts)
+    ends = (None, None) if low is None or high is None else (float(root(max(low, 0.0))), float(root(high)))
+    return float(root(totals.sum() / counts.sum())), ends
