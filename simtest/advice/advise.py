@@ -148,17 +148,7 @@ _SURFACES = {"fine": "the fine surface", "base": "the organ below its relief"}
 
 
 def write_advice(found: Advised, out: Path, command: str = "") -> Path:
-    """Write an advice into a folder; return the page.
-
-    Parameters
-    ----------
-    found : Advised
-        What to write.
-    out : Path
-        Gets advice.json, index.html and figures/distance.png.
-    command : str
-        How the advice was called.
-    """
+    """Write an advice, called by a command, into a folder: advice.json, figures and the page, which is returned."""
     make_folder(out / "figures")
     chart = distance_chart(found)
     _write(out / "figures" / "distance.png", png([chart]))
