@@ -139,13 +139,7 @@ NAMES = tuple(name for name, _, _ in SUMMARIES)
 
 
 def measure(picture: Image) -> Measured:
-    """Measure a frame.
-
-    Parameters
-    ----------
-    picture : ndarray of float32, shape (H, W, 3)
-        sRGB values in [0, 1].
-    """
+    """Measure a frame of sRGB values in [0, 1], shape (H, W, 3), float32."""
     if not is_coloured(picture):
         raise InputError(f"frame of shape {picture.shape} has no colours: realism takes colour frames, (H, W, 3)")
     height, width = picture.shape[:2]

@@ -104,22 +104,11 @@ def twin_picture(
     progress: Progress | None = None,
     organ: str | None = None,
 ) -> TwinResult:
-    """Measure the errors at a picture's highlights on rendered twins of them.
+    """Measure the errors at the highlights of a single picture on rendered twins of them, reconstructed alike.
 
-    Parameters
-    ----------
-    image : Path
-        A single picture.
-    options : Options
-        As of `simtest reconstruct`; the twins are reconstructed alike.
-    frames : int, optional
-        Frames of the bank; default by the picture's size (`frames_for`).
-    seed : int
-        Of what is drawn.
-    progress : callable, optional
-        Called with frames rendered, frames in all, and what is done.
-    organ : str, optional
-        Whose relief and film the twins have (`simtest.advice.tissue.NAMES`); default: any tissue's.
+    `frames` are those of the bank, by default as the picture's size has it (`frames_for`); `progress` is called with
+    those rendered, all, and what is done. `organ` is one of `simtest.advice.tissue.NAMES`, whose relief and film the
+    twins have; default: any tissue's.
     """
     if is_sequence(image):
         raise InputError(f"{image}: is a folder or a film; twin takes one picture")
@@ -144,20 +133,23 @@ def twins_of(
     """Measure twins of the usable highlights of a picture that was read (see `twin_picture`)."""
     started = time.process_time()
     whole = replace(options, roi=None)
-    made = run(picture, calibration, whole)
-    spots = usable_spots(made)
+    reconstructed = run(picture, calibration, whole)
+    spots = usable_spots(reconstructed)
     if not spots:
         raise InputError(f"{name}: no usable highlight: none was found that has a normal of its own; try --all")
-    visible = made.detection.view.seen
+    visible = reconstructed.detection.view.seen
     count = frames_for(picture.shape[0] * picture.shape[1]) if frames is None else frames
     tissue = tissue_of(organ)
     look = look_of(picture, visible, tissue)
-    draws, peaks = SceneDraws(made.choices.calibration, look, tissue), np.array([spot.peak_px for spot in spots])
+    draws, peaks = (
+        SceneDraws(reconstructed.choices.calibration, look, tissue),
+        np.array([spot.peak_px for spot in spots]),
+    )
     subject = Subject(draws, peaks, visible, picture.ndim == 2)
     bank = make_bank([subject], lambda values: run(values, calibration, whole), count, seed, progress)
     matched = match_spots(spots, all_spots(bank), name, count)
     # Twins have near misses, so nothing is assumed of them.
-    assumed = [each for each in made.choices.assumed if each != NEAR_MISSES] + _drawn(organ, tissue)
+    assumed = [each for each in reconstructed.choices.assumed if each != NEAR_MISSES] + _drawn(organ, tissue)
     return TwinResult(name, picture, matched, bank, look, assumed, [], time.process_time() - started)
 
 

@@ -86,10 +86,10 @@ of the distance to the third neighbour, px. off_axis is the estimated normal's a
 last two are the frame's medians of radius and crowding: together its highlights tell more of the distance than one."""
 
 
-def usable_spots(made: Specularities) -> list[Spot]:
+def usable_spots(specularities: Specularities) -> list[Spot]:
     """Return the highlights of a reconstruction that have a normal of their own, with their features."""
     chosen = []
-    for index, specularity in enumerate(made):
+    for index, specularity in enumerate(specularities):
         estimate, best = specularity.best_estimate, specularity.best
         if best is not None and estimate is not None and estimate.cloud is None:
             chosen.append((index, specularity, best, estimate))
@@ -106,16 +106,16 @@ def usable_spots(made: Specularities) -> list[Spot]:
     return spots
 
 
-def score(session: Session, view: RenderedView, made: Specularities) -> list[ScoredSpot]:
+def score(session: Session, view: RenderedView, specularities: Specularities) -> list[ScoredSpot]:
     """Score the usable highlights of a rendered frame; the session stands at its scene.
 
     Detections are matched to lit highlight points, of the fine surface, by the harness's own rule. Those on an
     instrument, and those whose sightline meets no surface, are left out.
     """
-    spots = usable_spots(made)
+    spots = usable_spots(specularities)
     if not spots:
         return []
-    found = [made[spot.index] for spot in spots]
+    found = [specularities[spot.index] for spot in spots]
     lit = [point for point in view.highlights if point.lit]
     matched = match(found, [point.bp_px for point in lit])
     metal = on_instruments(found, matched, view)
