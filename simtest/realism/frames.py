@@ -169,8 +169,8 @@ class _Rendered:
     def read(self, number: int) -> Image:
         """Return the scene as seen the `number`-th time."""
         # Imported here: sets of files need no renderer.
-        from simtest.dataset.maker import colour_variant
         from simtest.rendering import Session
+        from simtest.rendering.backend import colour_variant
         from simtest.simulation.frame import render_picture
         from simtest.simulation.sensor import displayed
 
