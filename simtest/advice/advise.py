@@ -72,19 +72,10 @@ class Advised:
 
 
 def advise(question: Question, out: Path, progress: Progress | None = None, workers: int = 1) -> Advised:
-    """Answer a question by renders.
+    """Answer a question by renders, with so many processes at once.
 
-    Parameters
-    ----------
-    question : Question
-        What is asked.
-    out : Path
-        Folder; gets the files of the experiment and the scene, the run, and frame.png. A run that is there and is
-        the same is kept.
-    progress : callable, optional
-        Called with steps done, steps in all, and what is done.
-    workers : int
-        Processes that render at once.
+    The folder gets the files of the experiment and the scene, the run, and frame.png. A run that is there and is the
+    same is kept. `progress` is called with steps done, steps in all, and what is done.
     """
     engine = make_engine(workers=workers)
     make_folder(out)
@@ -147,31 +138,21 @@ _SURFACES = {"fine": "the fine surface", "base": "the organ below its relief"}
 
 
 def write_advice(found: Advised, out: Path, command: str = "") -> Path:
-    """Write an advice into a folder; return the page.
-
-    Parameters
-    ----------
-    found : Advised
-        What to write.
-    out : Path
-        Gets advice.json, index.html and figures/distance.png.
-    command : str
-        How the advice was called.
-    """
+    """Write an advice, called by a command, into a folder: advice.json, figures and the page, which is returned."""
     make_folder(out / "figures")
     chart = distance_chart(found)
     _write(out / "figures" / "distance.png", png([chart]))
-    made_by = provenance.environment()
+    about = provenance.environment()
     html = environment().get_template("advice.html.j2").render(
         found=found, answers=[sentence(found, choice) for choice in found.found.choices] or [NOTHING],
         chart=chart, picture=pixels.data_address(found.picture, PICTURE_HEIGHT_PX), command=command,
         narrower=narrower(found, command), distances=DISTANCES,
         interval=interval, surfaces=_SURFACES,
         parts=list(dict.fromkeys(name for each in found.found.methods for name in each.budget_deg)),
-        provenance={"commit": made_by["commit"] or "–", "simtest": made_by["version"], "python": made_by["python"]},
+        provenance={"commit": about["commit"] or "–", "simtest": about["version"], "python": about["python"]},
         **embedded([chart]),
     )  # fmt: skip
-    write_json(out / RESULT, {**found.to_json(), "run": {"command": command, **made_by}})
+    write_json(out / RESULT, {**found.to_json(), "run": {"command": command, **about}})
     write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
     return out / PAGE
 

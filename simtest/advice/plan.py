@@ -56,30 +56,14 @@ Values = dict[str, list[Any]]
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked.
-
-    Parameters
-    ----------
-    scope : Scope
-        Camera, lights and sensor.
-    organ : str
-        One of `ORGANS`.
-    distances_mm : (float, float)
-        Range of the wall's distance along the optical axis, mm.
-    bound_deg : float
-        Error beyond which a method counts as broken.
-    frames : int, optional
-        Frames; default as many as `BUDGET_S` allows.
-    seed : int
-        Of everything that is drawn.
-    """
+    """What is asked."""
 
     scope: Scope
-    organ: str = "colon"
-    distances_mm: Interval = (20.0, 60.0)
-    bound_deg: float = 5.0
-    frames: int | None = None
-    seed: int = 0
+    organ: str = "colon"  # one of `ORGANS`
+    distances_mm: Interval = (20.0, 60.0)  # range of the wall's distance along the optical axis
+    bound_deg: float = 5.0  # error beyond which a method counts as broken
+    frames: int | None = None  # default as many as `BUDGET_S` allows
+    seed: int = 0  # of everything that is drawn
 
     def __post_init__(self) -> None:
         if self.organ not in ORGANS:

@@ -22,6 +22,7 @@ from simtest.estimators.names import forgive_cores
 from simtest.geometry import ellipse_of_conic, fit_ellipse
 from simtest.reconstruction.records import Specularity
 from simtest.rendering import Frame, Session, backend
+from simtest.rendering.backend import colour_variant
 from simtest.runtime.arrays import AnyArray, Image, only_reading
 from simtest.simulation.frame import RenderedView, brightest_mm, quick_look, render_view, shows_isolated
 from simtest.simulation.highlights import TrueHighlight, cloud_json, lobe_region
@@ -34,15 +35,6 @@ from simtest.validation.scoring import of_clouds
 
 UNPLACED = 100
 """Draws that cannot be rendered, beyond the tries, before a sample is given up."""
-
-
-def colour_variant(variant: str | None = None) -> str:
-    """Return the variant of a dataset: three channels, since learners want colour, unless `variant` names it whole.
-
-    Without one, the device is that of the environment's SIMTEST_VARIANT.
-    """
-    name = backend.requested_variant(variant, coloured=True)
-    return name if variant else name.replace("_mono", "_rgb")
 
 
 class Maker:

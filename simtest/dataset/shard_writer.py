@@ -15,7 +15,7 @@ import polars as pl
 
 from simtest.dataset.card import CARD, write_card
 from simtest.dataset.index import SAMPLES, TABLES, write_shard_tables, write_tables
-from simtest.dataset.maker import Maker, colour_variant
+from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import (
     NAME,
     FileEntry,
@@ -32,6 +32,7 @@ from simtest.dataset.shard import PART, finish, whole_samples, write_sample
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.names import absolute_names
+from simtest.rendering.backend import colour_variant
 from simtest.runtime.boundary import plain
 from simtest.runtime.files import sync_folder
 from simtest.runtime.locks import LOCK, exclusive_folder, waiting_for

@@ -37,6 +37,9 @@ BLOCK_VALUES = 2_000_000
 Scenes = Mapping[str, Measured]
 """Measured values by scene: those of all its frames, one after the other."""
 
+Quartiles = tuple[float, float, float]
+"""First quartile, median and third quartile."""
+
 
 @dataclass(frozen=True)
 class StatisticDistance:
@@ -75,9 +78,6 @@ def by_scene(frames: Sequence[tuple[str, Measured]]) -> dict[str, Measured]:
 
 def distances(real: Scenes, generated: Scenes, seed: int = 0) -> list[StatisticDistance]:
     """Compare two sets of frames by every statistic."""
-    for name, scenes in (("real", real), ("generated", generated)):
-        if not scenes:
-            raise InputError(f"realism: no {name} frames; at least one is needed")
     return [_distance(statistic, real, generated, seed) for statistic in STATISTICS]
 
 
@@ -110,7 +110,7 @@ def _column_distance(
     """
     grid = _grid([*real, *generated])
     # Distribution functions of all scenes on one grid: each resample is then a mean of rows.
-    both = np.stack([_steps(v, grid) for v in (*real, *generated)])
+    both = np.stack([_shares_below(v, grid[:-1]) for v in (*real, *generated)])
     own, other = both[: len(real)], both[len(real) :]
     widths = np.diff(grid)
 
@@ -181,10 +181,10 @@ def mean_distribution(scenes: Scenes, column: str, at: Array) -> Array:
     held = [values[column] for values in scenes.values() if len(values[column])]
     if not held:
         return np.full(len(at), np.nan)
-    return np.asarray(np.mean([np.searchsorted(np.sort(v), at, side="right") / len(v) for v in held], axis=0))
+    return np.asarray(np.mean([_shares_below(v, at) for v in held], axis=0))
 
 
-def quartiles(scenes: Scenes, column: str) -> tuple[float, float, float] | None:
+def quartiles(scenes: Scenes, column: str) -> Quartiles | None:
     """Return where `mean_distribution` reaches 1/4, 1/2 and 3/4; None without a scene."""
     held = [values[column] for values in scenes.values() if len(values[column])]
     if not held:
@@ -195,10 +195,12 @@ def quartiles(scenes: Scenes, column: str) -> tuple[float, float, float] | None:
     return low, middle, high
 
 
-def _steps(values: Array, grid: Array) -> Array:
-    """Return the distribution function of values on the grid's intervals."""
-    return np.asarray(np.searchsorted(np.sort(values), grid[:-1], side="right") / len(values))
+def _shares_below(values: Array, at: Array) -> Array:
+    """Return the distribution function of values."""
+    return np.asarray(np.searchsorted(np.sort(values), at, side="right") / len(values))
 
+
+# Frames ---------------------------------------------------------------------------------------------------------------
 
 Progress = Callable[[int, int, str], None]
 """Called with frames measured, frames in all, and what is done; may raise to stop."""
@@ -207,9 +209,6 @@ Side = Literal["real", "generated"]
 
 SHOWN, SHOWN_HEIGHT_PX = 8, 240
 """Frames of each side that a page shows, evenly spread, and their greatest height."""
-
-Quartiles = tuple[float, float, float]
-"""First quartile, median and third quartile."""
 
 
 @dataclass(frozen=True)
@@ -312,7 +311,7 @@ def compare(
                 left_out.append(LeftOut(side, frame.name, str(error)))
             done += 1
         if not measured:
-            reason = left_out[-1].reason if left_out else "the set is empty"
+            reason = next((each.reason for each in reversed(left_out) if each.side == side), "the set is empty")
             raise InputError(f"realism: no {side} frame can be measured ({reason})")
         bare = sum(not values["per_frame"].any() for _, values in measured)
         sides.append(SetOfFrames(by_scene(measured), len(measured), bare, pictures))

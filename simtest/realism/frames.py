@@ -11,7 +11,7 @@ import numpy as np
 from simtest.dataset.reader import read_samples, shard_names
 from simtest.errors import InputError
 from simtest.reconstruction.images import Source, is_sequence, open_source, read_picture
-from simtest.runtime.arrays import AnyArray, Image, only_reading
+from simtest.runtime.arrays import Image, only_reading
 from simtest.runtime.files import check_count, require_plain
 from simtest.spec.scene import Scene, load_scene
 
@@ -81,10 +81,6 @@ class _Film:
         raise InputError(f"{path}: ends after {self.held} of the {count} frames that it announces")
 
 
-def _as_values(picture: AnyArray) -> Image:
-    return np.asarray(picture.astype(np.float32) / np.float32(255))
-
-
 def _spread(items: Sequence[Item], most: int) -> Sequence[Item]:
     """Return at most so many items, evenly spread."""
     if len(items) <= most:
@@ -144,7 +140,7 @@ def _dataset(path: Path, count: int, surfaces: Sequence[str]) -> list[NamedFrame
 
 def _sample(path: Path, shard: str, index: int) -> Image:
     for sample in read_samples(path, fields=["image"], shards=[shard], indices={index}):
-        return _as_values(sample.images["image"])
+        return np.asarray(sample.images["image"].astype(np.float32) / np.float32(255))
     raise InputError(f"{path / shard}: has no sample {index}; simtest dataset verify --repair mends it")
 
 
@@ -173,8 +169,8 @@ class _Rendered:
     def read(self, number: int) -> Image:
         """Return the scene as seen the `number`-th time."""
         # Imported here: sets of files need no renderer.
-        from simtest.dataset.maker import colour_variant
         from simtest.rendering import Session
+        from simtest.rendering.backend import colour_variant
         from simtest.simulation.frame import render_picture
         from simtest.simulation.sensor import displayed
 

@@ -53,24 +53,10 @@ _STEPS = ("the strip of frames", "the distances", "the distributions", "the page
 def write_comparison(
     found: Comparison, out: Path, against: str, command: str = "", progress: Progress | None = None
 ) -> Path:
-    """Write a comparison into a folder, which is made if need be.
+    """Write a comparison into a folder, which is made if need be; return the page.
 
-    Parameters
-    ----------
-    found : Comparison
-        What to write.
-    out : Path
-        Gets realism.json, index.html, and figures/{strip,distances,distributions}.png. Pictures of real frames stand
-        in the page and in the strip, nowhere else.
-    against, command : str
-        The generated side as it was named, and how the comparison was called.
-    progress : callable, optional
-        Called with steps done, steps in all, and what is done; what it raises stops the writing between two files.
-
-    Returns
-    -------
-    Path
-        The page.
+    Pictures of real frames stand in the page and in the strip, nowhere else. `against` names the generated side,
+    `command` is how the comparison was called; what `progress` raises stops the writing between two files.
     """
 
     def tell(step: int) -> None:

@@ -8,6 +8,7 @@ vector of numbers that are near normal.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -46,41 +47,27 @@ VESSEL_SHARES = (1 / 400, 1 / 100)
 
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
-
 LEAST_VALUES = 3
 """Of fewer highlights no spread is taken."""
 
-
-# Summaries ------------------------------------------------------------------------------------------------------------
-
-
-def _as_is(values: Array) -> float:
-    return float(values[0])
-
-
-def _log(values: Array) -> float:
-    return float(np.log(np.maximum(values[0], 1e-4)))
-
-
-def _level(values: Array) -> float:
-    return float(np.median(values))
-
-
-def _mean_log(values: Array) -> float:
-    return float(np.mean(np.log(np.maximum(values, 1e-6))))
-
-
-def _spread_log(values: Array) -> float:
-    # Of near equal values the logarithm of the spread has no lower end.
-    logs = np.log(np.maximum(values, 1e-6))
-    return float(np.std(logs)) if len(values) >= LEAST_VALUES else np.nan
-
-
-def _spread(values: Array) -> float:
-    return float(np.log(np.std(values) + 1e-3)) if len(values) >= LEAST_VALUES else np.nan
+Measured = Mapping[str, Array]
+"""By column: one number of a frame, or one of each highlight; empty where the frame does not tell."""
 
 
 # The table ------------------------------------------------------------------------------------------------------------
+
+REDUCTIONS: dict[str, Callable[[Array], Any]] = {
+    "value": lambda v: v[0],
+    "log": lambda v: np.log(np.maximum(v[0], 1e-4)),
+    "log of count": lambda v: np.log1p(v[0]),
+    "log of area": lambda v: np.log(v[0] + 1e-4),
+    "median": np.median,
+    "mean of log": lambda v: np.mean(np.log(np.maximum(v, 1e-6))),
+    # Of near equal values the logarithm of the spread has no lower end.
+    "spread of log": lambda v: np.std(np.log(np.maximum(v, 1e-6))) if len(v) >= LEAST_VALUES else np.nan,
+    "log of spread": lambda v: np.log(np.std(v) + 1e-3) if len(v) >= LEAST_VALUES else np.nan,
+}
+"""How a column's values become one number that is near normal."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +76,7 @@ class Column:
 
     name: str  # key of what `measure` returns
     axis: str  # quantity and unit
-    summaries: Mapping[str, Callable[[Array], float]] = field(default_factory=dict)  # see `summarise`
+    summaries: Mapping[str, str] = field(default_factory=dict)  # by name, which of `REDUCTIONS` (see `summarise`)
 
 
 @dataclass(frozen=True)
@@ -101,65 +88,58 @@ class Statistic:
     columns: tuple[Column, ...]
 
 
-def _single(name: str, title: str, axis: str, **summaries: Callable[[Array], float]) -> Statistic:
-    """Return a statistic of one column; a summary's name has spaces for underscores."""
-    named = {key.replace("_", " "): how for key, how in summaries.items()}
-    return Statistic(name, title, (Column(name, axis, named),))
-
-
-def _moments(letter: str, channel: str, name: str) -> tuple[Column, Column]:
-    """Return the columns of a channel's mean and spread."""
-    return (
-        Column(f"{letter}_mean", f"mean of {channel} (CIELAB)", {name: _as_is}),
-        Column(f"{letter}_sd", f"spread of {channel} (CIELAB)", {f"{name} spread": _log}),
-    )
-
-
-COUNT = (
-    Column("per_frame", "highlights in a frame", {"count": lambda values: float(np.log1p(values[0]))}),
-    Column("per_megapixel", "highlights in a megapixel of the view"),
-)
-MOMENTS = (*_moments("l", "L*", "lightness"), *_moments("a", "a*", "red-green"), *_moments("b", "b*", "yellow-blue"))
-
 STATISTICS = (
-    Statistic("count", "Number of highlights", COUNT),
-    _single(
-        "radius", "Radius of highlights", "radius (share of the frame's width)",
-        radius=_mean_log, radius_spread=_spread_log,
-    ),
-    _single("axis_ratio", "Axis ratio of highlights", "minor over major axis", axis_ratio=_level),
-    _single("clipped", "Clipped highlights", "share of a frame's highlights", clipped=_as_is),
-    _single("area", "Area of highlights", "share of the view", area=lambda values: float(np.log(values[0] + 1e-4))),
-    _single("clustering", "Nearest highlight", "distance (radii of the highlight)", clustering=_mean_log),
-    _single("halo", "Depth of halos", "luma of the surroundings less the halo's", halo=_level, halo_spread=_spread),
-    Statistic("colour", "Colour of the tissue", MOMENTS),
-    _single("falloff", "Brightness over image radius", "log of linear light, corner less centre", falloff=_as_is),
-    _single("spectrum", "Slope of the power spectrum", "log power over log frequency, 4 to 64 px", spectrum=_as_is),
-    _single("vessels", "Contrast of vessels", "log of green over red", vessels=_log),
-    _single("noise", "Noise at mid grey", "standard deviation of the luma", noise=_log),
+    Statistic("count", "Number of highlights", (
+        Column("per_frame", "highlights in a frame", {"count": "log of count"}),
+        Column("per_megapixel", "highlights in a megapixel of the view"),
+    )),
+    Statistic("radius", "Radius of highlights", (
+        Column("radius", "radius (share of the frame's width)",
+               {"radius": "mean of log", "radius spread": "spread of log"}),
+    )),
+    Statistic("axis_ratio", "Axis ratio of highlights", (
+        Column("axis_ratio", "minor over major axis", {"axis ratio": "median"}),
+    )),
+    Statistic("clipped", "Clipped highlights", (
+        Column("clipped", "share of a frame's highlights", {"clipped": "value"}),
+    )),
+    Statistic("area", "Area of highlights", (Column("area", "share of the view", {"area": "log of area"}),)),
+    Statistic("clustering", "Nearest highlight", (
+        Column("clustering", "distance (radii of the highlight)", {"clustering": "mean of log"}),
+    )),
+    Statistic("halo", "Depth of halos", (
+        Column("halo", "luma of the surroundings less the halo's", {"halo": "median", "halo spread": "log of spread"}),
+    )),
+    Statistic("colour", "Colour of the tissue", (
+        Column("l_mean", "mean of L* (CIELAB)", {"lightness": "value"}),
+        Column("l_sd", "spread of L* (CIELAB)", {"lightness spread": "log"}),
+        Column("a_mean", "mean of a* (CIELAB)", {"red-green": "value"}),
+        Column("a_sd", "spread of a* (CIELAB)", {"red-green spread": "log"}),
+        Column("b_mean", "mean of b* (CIELAB)", {"yellow-blue": "value"}),
+        Column("b_sd", "spread of b* (CIELAB)", {"yellow-blue spread": "log"}),
+    )),
+    Statistic("falloff", "Brightness over image radius", (
+        Column("falloff", "log of linear light, corner less centre", {"falloff": "value"}),
+    )),
+    Statistic("spectrum", "Slope of the power spectrum", (
+        Column("spectrum", "log power over log frequency, 4 to 64 px", {"spectrum": "value"}),
+    )),
+    Statistic("vessels", "Contrast of vessels", (Column("vessels", "log of green over red", {"vessels": "log"}),)),
+    Statistic("noise", "Noise at mid grey", (Column("noise", "standard deviation of the luma", {"noise": "log"}),)),
 )  # fmt: skip
 
 COLUMNS = tuple(column.name for statistic in STATISTICS for column in statistic.columns)
 
-SUMMARIES = tuple((name, column.name, how) for statistic in STATISTICS for column in statistic.columns
+SUMMARIES = tuple((name, column.name, REDUCTIONS[how]) for statistic in STATISTICS for column in statistic.columns
                   for name, how in column.summaries.items())  # fmt: skip
 """Name of each summary, the column that it is of, and how it is taken."""
 
 NAMES = tuple(name for name, _, _ in SUMMARIES)
 """Of the summaries."""
 
-Measured = Mapping[str, Array]
-"""By column: one number of a frame, or one of each highlight; empty where the frame does not tell."""
-
 
 def measure(picture: Image) -> Measured:
-    """Measure a frame.
-
-    Parameters
-    ----------
-    picture : ndarray of float32, shape (H, W, 3)
-        sRGB values in [0, 1].
-    """
+    """Measure a frame of sRGB values in [0, 1], shape (H, W, 3), float32."""
     if not is_coloured(picture):
         raise InputError(f"frame of shape {picture.shape} has no colours: realism takes colour frames, (H, W, 3)")
     height, width = picture.shape[:2]
@@ -267,12 +247,11 @@ def _quantile(values: Image, share: float) -> float:
 
 def _tissue(picture: Image, linear: Image, luma: Image, tissue: Mask) -> dict[str, Array]:
     """Measure the tissue's colour, how its brightness falls towards the border, and its vessels."""
-    moments = tuple(column.name for column in MOMENTS)
-    names = (*moments, "falloff", "vessels")
+    names = ("l_mean", "l_sd", "a_mean", "a_sd", "b_mean", "b_sd", "falloff", "vessels")
     if np.count_nonzero(tissue) < LEAST_SIDE**2:
         return {name: np.empty(0) for name in names}
     levels = np.stack(cv2.meanStdDev(cv2.cvtColor(picture, cv2.COLOR_RGB2Lab), mask=tissue.astype(np.uint8)), axis=1)
-    values = dict(zip(moments, levels.reshape(-1, 1), strict=True))
+    values = dict(zip(names, levels.reshape(-1, 1), strict=False))
     return values | {"falloff": _falloff(linear, tissue), "vessels": _vessels(linear, tissue)}
 
 

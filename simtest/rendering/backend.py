@@ -99,6 +99,15 @@ def requested_variant(variant: str | None = None, coloured: bool = False) -> str
     return f"{name}_ad_{'rgb' if coloured else 'mono'}" if name in DEVICES else name
 
 
+def colour_variant(variant: str | None = None) -> str:
+    """Return the variant of frames in colour: three channels, unless `variant` names it whole.
+
+    Without one, the device is that of the environment's SIMTEST_VARIANT.
+    """
+    name = requested_variant(variant, coloured=True)
+    return name if variant else name.replace("_mono", "_rgb")
+
+
 def needs_gpu(variant: str | None = None) -> bool:
     """Return whether a variant (see `requested_variant`) runs on a GPU."""
     return requested_variant(variant).startswith(CUDA)

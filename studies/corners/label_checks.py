@@ -8,8 +8,8 @@ import numpy as np
 from scipy import ndimage
 
 from simtest.calibration import Response
-from simtest.dataset.maker import colour_variant
 from simtest.rendering import HighlightPoint, Session
+from simtest.rendering.backend import colour_variant
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.spec.scene import scene_from_dict
 from studies.corners import formulas

@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 from simtest.cli import main as command_line
-from simtest.dataset.maker import colour_variant
 from simtest.errors import BackendError, InputError
 from simtest.rendering import backend
-from simtest.rendering.backend import Candidate, candidates, choose_library, probe, requested_variant
+from simtest.rendering.backend import Candidate, candidates, choose_library, colour_variant, probe, requested_variant
 
 SYSTEM = Path("/usr/lib/x86_64-linux-gnu")
 MAIN = "from simtest.cli.main import main; main()"

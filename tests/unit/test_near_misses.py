@@ -8,7 +8,6 @@ import pytest
 
 from simtest.advice.twin.scoring import score
 from simtest.calibration import LIGHT_AT_CAMERA, NO_PRIORS, Calibration, exactly, srgb_encode
-from simtest.dataset.maker import colour_variant
 from simtest.errors import Failure, Reason
 from simtest.estimators import load_estimators
 from simtest.estimators.prior_parts import (
@@ -28,6 +27,7 @@ from simtest.reconstruction.options import Options
 from simtest.reconstruction.pipeline import reconstruct, run
 from simtest.reconstruction.records import Specularities, best_of
 from simtest.rendering import Session
+from simtest.rendering.backend import colour_variant
 from simtest.runtime import chi_squared
 from simtest.simulation.frame import render_view
 from simtest.spec import load_scene

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from simtest.dataset.maker import colour_variant
 from simtest.dataset.shard_writer import write_dataset
 from simtest.errors import InputError
 from simtest.realism.compare import compare, distances
 from simtest.realism.frames import open_frames, open_generated, rendered_frames, varied
+from simtest.rendering.backend import colour_variant
 from simtest.runtime.processes import make_engine
 from simtest.runtime.resources import data_root
 from simtest.simulation.frame import make_frame

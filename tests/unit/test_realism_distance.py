@@ -214,6 +214,15 @@ def test_a_set_without_frames_to_measure_is_refused(tmp_path):
         compare(frames, frames)
 
 
+def test_an_empty_set_is_not_refused_for_a_frame_of_the_other_one():
+    def read():
+        raise InputError("x.png: no picture")
+
+    sound = NamedFrame("b", "b.png", lambda: np.full((96, 128, 3), (0.6, 0.3, 0.2), np.float32))
+    with pytest.raises(InputError, match=r"no generated frame can be measured \(the set is empty\)"):
+        compare([sound, NamedFrame("a", "x.png", read)], [])
+
+
 def test_scenes_vary_from_frame_to_frame():
     scene = load_scene("tissue_colon")
     assert varied(scene, 0) == scene

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simtest.dataset.maker import Maker, colour_variant
+from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
 from simtest.rendering import Session, highlights, lighting
+from simtest.rendering.backend import colour_variant
 from simtest.simulation.frame import DEAR_SAMPLES, quick_look, render_view, shows_isolated
 from simtest.spec import scene_from_dict
 from simtest.spec.recipes import Dataset

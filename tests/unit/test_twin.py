@@ -13,7 +13,7 @@ import pytest
 
 from simtest.advice.tissue import NAMES, WIDER, tissue_of
 from simtest.advice.twin import bank as banks
-from simtest.advice.twin.bank import BankFrame, all_spots, frames_for
+from simtest.advice.twin.bank import BankFrame, frames_for
 from simtest.advice.twin.run import COLUMNS, TwinResult, _drawn, match_spots, twin_picture, twins_of, write_twins
 from simtest.advice.twin.scenes import (
     ANCHOR_MM,
@@ -420,7 +420,7 @@ def test_the_files_hold_what_was_measured(tmp_path, framed):
     twins = made_bank(200, frames=2)
     found = match_spots(spots, twins, "frame.png", 2)
     frames = [BankFrame(np.asarray(255 * picture, np.uint8), [s for f, s in twins if f == i]) for i in range(2)]
-    result = TwinResult("frame.png", picture, found, frames, all_spots(frames), Look("tissue_colon", 0.4),
+    result = TwinResult("frame.png", picture, found, frames, Look("tissue_colon", 0.4),
                         list(made.choices.assumed), [], 1.0)  # fmt: skip
     files = write_twins(result, tmp_path / "out", "simtest twin frame.png")
     told = json.loads(files[0].read_text())
@@ -469,12 +469,12 @@ def test_a_picture_has_twins_of_its_own_kind(monkeypatch, grey):
     told = Calibration(camera, priors=Priors(lights_mm=((3.0, 0.0, 0.0),), distance_mm=Uniform(15.0, 30.0)))
     options = Options(fov_deg=60.0)
     first, second = (twins_of(picture, told, options, frames=6, seed=5) for _ in range(2))
-    assert all(frame.picture.shape == picture.shape for frame in first[1])
-    assert len(first[1]) == 6
-    scored = [s for _, s in all_spots(first[1])]
+    assert all(frame.picture.shape == picture.shape for frame in first.bank)
+    assert len(first.bank) == 6
+    scored = [s for _, s in first.bank_spots]
     assert all(0 <= each.error_deg < 90 for each in scored)
     assert {each.kind for each in scored} <= {"glint", "near_miss", "false"}
-    assert [each.twins.rms_deg for each in first[0]] == [each.twins.rms_deg for each in second[0]]
+    assert [each.twins.rms_deg for each in first.spots] == [each.twins.rms_deg for each in second.spots]
     # Glints of a light that is told are reconstructed to a few degrees.
     glints = [each.error_deg for each in scored if each.kind == "glint"]
     assert np.median(glints) < 5

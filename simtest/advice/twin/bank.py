@@ -8,10 +8,10 @@ import numpy as np
 
 from simtest.advice.twin.scenes import SceneDraws, make_pool
 from simtest.advice.twin.scoring import ScoredSpot, score
-from simtest.dataset.maker import colour_variant
 from simtest.errors import SimtestError
 from simtest.reconstruction.records import Specularities
 from simtest.rendering import Session
+from simtest.rendering.backend import colour_variant
 from simtest.runtime.arrays import Array, Image, Mask, Picture, only_reading
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import RenderedView, render_view

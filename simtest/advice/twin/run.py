@@ -23,7 +23,7 @@ from simtest.reconstruction.options import Options, calibration_for
 from simtest.reconstruction.outputs import write_csv
 from simtest.reconstruction.pipeline import run
 from simtest.runtime import provenance
-from simtest.runtime.arrays import Array, Image, Picture
+from simtest.runtime.arrays import Image, Picture
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 from simtest.runtime.statistics import root_mean_square
 
@@ -65,11 +65,15 @@ class TwinResult:
     picture: Image  # as encoded, shape (H, W) or (H, W, 3)
     spots: list[SpotTwins]  # its usable highlights
     bank: list[BankFrame]
-    bank_spots: list[tuple[int, ScoredSpot]]  # the highlights in it, with the number of their frame
     look: Look
     assumed: list[Assumption]  # what is not known exactly, and how it was drawn
     warnings: list[str]  # of the calibration
     processor_s: float
+
+    @property
+    def bank_spots(self) -> list[tuple[int, ScoredSpot]]:
+        """The highlights of the bank, with the number of their frame."""
+        return all_spots(self.bank)
 
     def share_of(self, kind: SpotKind) -> float:
         """Return the share of one kind among all highlights of the bank."""
@@ -100,35 +104,20 @@ def twin_picture(
     progress: Progress | None = None,
     organ: str | None = None,
 ) -> TwinResult:
-    """Measure the errors at a picture's highlights on rendered twins of them.
+    """Measure the errors at the highlights of a single picture on rendered twins of them, reconstructed alike.
 
-    Parameters
-    ----------
-    image : Path
-        A single picture.
-    options : Options
-        As of `simtest reconstruct`; the twins are reconstructed alike.
-    frames : int, optional
-        Frames of the bank; default by the picture's size (`frames_for`).
-    seed : int
-        Of what is drawn.
-    progress : callable, optional
-        Called with frames rendered, frames in all, and what is done.
-    organ : str, optional
-        Whose relief and film the twins have (`simtest.advice.tissue.NAMES`); default: any tissue's.
+    `frames` are those of the bank, by default as the picture's size has it (`frames_for`); `progress` is called with
+    those rendered, all, and what is done. `organ` is one of `simtest.advice.tissue.NAMES`, whose relief and film the
+    twins have; default: any tissue's.
     """
-    started = time.process_time()
     if is_sequence(image):
         raise InputError(f"{image}: is a folder or a film; twin takes one picture")
     # A wrong name is told before minutes of rendering.
     tissue_of(organ)
     picture = read_picture(image)
     calibration, warnings = calibration_for(options, picture)
-    found, bank, look, assumed = twins_of(picture, calibration, options, str(image), frames, seed, progress, organ)
-    spots = all_spots(bank)
-    return TwinResult(
-        image.name, picture, found, bank, spots, look, assumed, warnings, time.process_time() - started
-    )  # fmt: skip
+    result = twins_of(picture, calibration, options, str(image), frames, seed, progress, organ)
+    return replace(result, image=image.name, warnings=warnings)
 
 
 def twins_of(
@@ -140,24 +129,28 @@ def twins_of(
     seed: int = 0,
     progress: Progress | None = None,
     organ: str | None = None,
-) -> tuple[list[SpotTwins], list[BankFrame], Look, list[Assumption]]:
-    """Measure twins of a picture's usable highlights (see `twin_picture`); return them, the bank, look and priors."""
+) -> TwinResult:
+    """Measure twins of the usable highlights of a picture that was read (see `twin_picture`)."""
+    started = time.process_time()
     whole = replace(options, roi=None)
-    made = run(picture, calibration, whole)
-    spots = usable_spots(made)
+    reconstructed = run(picture, calibration, whole)
+    spots = usable_spots(reconstructed)
     if not spots:
         raise InputError(f"{name}: no usable highlight: none was found that has a normal of its own; try --all")
-    view = made.detection.view
-    peaks: Array = np.array([spot.peak_px for spot in spots])
+    visible = reconstructed.detection.view.seen
     count = frames_for(picture.shape[0] * picture.shape[1]) if frames is None else frames
     tissue = tissue_of(organ)
-    look = look_of(picture, view.seen, tissue)
-    subject = Subject(SceneDraws(made.choices.calibration, look, tissue), peaks, view.seen, picture.ndim == 2)
+    look = look_of(picture, visible, tissue)
+    draws, peaks = (
+        SceneDraws(reconstructed.choices.calibration, look, tissue),
+        np.array([spot.peak_px for spot in spots]),
+    )
+    subject = Subject(draws, peaks, visible, picture.ndim == 2)
     bank = make_bank([subject], lambda values: run(values, calibration, whole), count, seed, progress)
     matched = match_spots(spots, all_spots(bank), name, count)
     # Twins have near misses, so nothing is assumed of them.
-    assumed = [each for each in made.choices.assumed if each != NEAR_MISSES]
-    return matched, bank, look, [*assumed, *_drawn(organ, tissue)]
+    assumed = [each for each in reconstructed.choices.assumed if each != NEAR_MISSES] + _drawn(organ, tissue)
+    return TwinResult(name, picture, matched, bank, look, assumed, [], time.process_time() - started)
 
 
 def match_spots(

@@ -253,7 +253,7 @@ class SceneDraws:
     def _sensor(self, rng: np.random.Generator) -> dict[str, Any]:
         """Draw a camera chain with the frame's mean level, its response where it was told."""
         calibration = self._calibration
-        told = calibration.response
+        response = calibration.response
         sensor: dict[str, Any] = {
             "preset": CHAINS[int(rng.integers(len(CHAINS)))],
             "point_spread_px": float(rng.uniform(0.55, 1.0)),
@@ -267,8 +267,8 @@ class SceneDraws:
             "coding": {"type": "jpeg", "quality": int(rng.integers(70, 96)), "chroma": "4:2:0"},
             "seed": int(rng.integers(2**31)),
         }  # fmt: skip
-        if told is not None and (keys := RESPONSE_KEYS.get(told.kind)) is not None:
-            sensor["response"] = {"type": told.kind, **{key: getattr(told, key) for key in keys}}
+        if response is not None and (keys := RESPONSE_KEYS.get(response.kind)) is not None:
+            sensor["response"] = {"type": response.kind, **{key: getattr(response, key) for key in keys}}
         if not calibration.vignetting.is_uniform:
             sensor["vignetting"] = _profile(calibration.vignetting)
         return sensor

@@ -9,6 +9,7 @@ sum over the sum of their squares.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -80,42 +81,44 @@ FEATURES = (
 )  # fmt: skip
 """Names of the features of a spot. radius, peak, own_deviation and crowding are natural logarithms: of the radius at
 half height, px; of the specular peak over full scale; of the deviation by the highlight's own parts of the budget, deg;
-of the distance to the third neighbour, px. off_axis is the sightline's angle from the optical axis, rad. The last two
-are the frame's medians of radius and crowding: together its highlights tell more of the distance than one does."""
+of the distance to the third neighbour, px. off_axis is the estimated normal's angle from the optical axis, rad. The
+last two are the frame's medians of radius and crowding: together its highlights tell more of the distance than one."""
 
 
-def usable_spots(made: Specularities) -> list[Spot]:
+def usable_spots(specularities: Specularities) -> list[Spot]:
     """Return the highlights of a reconstruction that have a normal of their own, with their features."""
     chosen = []
-    for index, specularity in enumerate(made):
+    for index, specularity in enumerate(specularities):
         estimate, best = specularity.best_estimate, specularity.best
         if best is not None and estimate is not None and estimate.cloud is None:
             chosen.append((index, specularity, best, estimate))
-    peaks = np.array([peak_px(specularity) for _, specularity, *_ in chosen]).reshape(-1, 2)
+    if not chosen:
+        return []
+    peaks = np.array([peak_px(specularity) for _, specularity, *_ in chosen])
     radii = [_radius_px(specularity) for _, specularity, *_ in chosen]
     crowding = [_crowding_px(peaks, number) for number in range(len(chosen))]
-    of_frame = np.median(np.log(np.maximum([radii, crowding], LEAST_RADIUS_PX)), axis=1) if chosen else np.empty(2)
+    of_frame = np.median(np.log(np.maximum([radii, crowding], LEAST_RADIUS_PX)), axis=1)
     spots = []
-    for number, (index, specularity, best, estimate) in enumerate(chosen):
-        own = _features(radii[number], crowding[number], specularity, estimate)
-        features = np.concatenate([own, of_frame])
-        spots.append(Spot(index, peaks[number], radii[number], best, estimate, features))
+    for (index, specularity, best, estimate), peak, radius, crowd in zip(chosen, peaks, radii, crowding, strict=True):
+        features = np.concatenate([_features(radius, crowd, specularity, estimate), of_frame])
+        spots.append(Spot(index, peak, radius, best, estimate, features))
     return spots
 
 
-def score(session: Session, view: RenderedView, made: Specularities) -> list[ScoredSpot]:
+def score(session: Session, view: RenderedView, specularities: Specularities) -> list[ScoredSpot]:
     """Score the usable highlights of a rendered frame; the session stands at its scene.
 
     Detections are matched to lit highlight points, of the fine surface, by the harness's own rule. Those on an
     instrument, and those whose sightline meets no surface, are left out.
     """
-    spots = usable_spots(made)
-    found = [made[spot.index] for spot in spots]
+    spots = usable_spots(specularities)
+    if not spots:
+        return []
+    found = [specularities[spot.index] for spot in spots]
     lit = [point for point in view.highlights if point.lit]
     matched = match(found, [point.bp_px for point in lit])
     metal = on_instruments(found, matched, view)
-    looks = np.array([spot.estimate.look_px for spot in spots]).reshape(-1, 2)
-    at_look = session.exact_points(looks) if len(looks) else None
+    at_look = session.exact_points(np.array([spot.estimate.look_px for spot in spots]))
     shown = _shown(found, [visible.peak_px for visible in view.visible_highlights])
     scored = []
     for i, spot in enumerate(spots):
@@ -123,13 +126,16 @@ def score(session: Session, view: RenderedView, made: Specularities) -> list[Sco
             continue
         if i in matched:
             fine, base = lit[matched[i]].normal, lit[matched[i]].normal_base
-        elif at_look is not None and at_look.valid[i]:
+        elif at_look.valid[i]:
             fine, base = at_look.normal[i], at_look.normal_base[i]
         else:
             continue
+        estimate = spot.estimate
+        squared = mahalanobis2(estimate, fine if estimate.target == "fine" else base)
+        held = None if squared is None else bool(squared <= chi_squared.quantile(0.95, 2))
         kind: SpotKind = "glint" if i in matched else "near_miss" if shown[i] else "false"
-        distance = math.nan if at_look is None else float(at_look.distance[i])
-        scored.append(_scored(spot, kind, fine, base, distance))
+        to_fine, to_base = (float(angle_deg(estimate.normal, normal)) for normal in (fine, base))
+        scored.append(ScoredSpot(spot, kind, to_fine, to_base, held, float(at_look.distance[i])))
     return scored
 
 
@@ -139,14 +145,6 @@ def _shown(found: Sequence[Specularity], peaks_px: Sequence[Array]) -> list[bool
     peaks = np.array([*peaks_px]).reshape(-1, 2)
     near = [bool((np.hypot(*(peaks - peak_px(each)).T) <= NEAR_PX).any()) for each in found]
     return [i in enclosed or near[i] for i in range(len(found))]
-
-
-def _scored(spot: Spot, kind: SpotKind, fine: Array, base: Array, distance_mm: float) -> ScoredSpot:
-    estimate = spot.estimate
-    squared = mahalanobis2(estimate, fine if estimate.target == "fine" else base)
-    held = None if squared is None else bool(squared <= chi_squared.quantile(0.95, 2))
-    to_fine, to_base = (float(angle_deg(estimate.normal, normal)) for normal in (fine, base))
-    return ScoredSpot(spot, kind, to_fine, to_base, held, distance_mm)
 
 
 def _radius_px(specularity: Specularity) -> float:
@@ -162,18 +160,15 @@ def _radius_px(specularity: Specularity) -> float:
 
 def _features(radius: float, crowding: float, specularity: Specularity, estimate: Estimate) -> Array:
     """Return the features of a spot but for those of its frame; NaN where it does not show one."""
-    highlight = specularity.highlight
-    ratio = estimate.axis_ratio if highlight is None else highlight.axis_ratio
-    peak = specularity.region.contrast
-    residual = None if highlight is None else highlight.residual
+    highlight, peak = specularity.highlight, specularity.region.contrast
     values: Sequence[float | None] = (
         math.log(max(radius, LEAST_RADIUS_PX)),
-        ratio,
+        estimate.axis_ratio if highlight is None else highlight.axis_ratio,
         None if not peak or peak <= 0 else math.log(peak),
         0.0 if highlight is None else highlight.clipped,
         math.log(own_deviation_deg(estimate)),
         math.log(crowding),
-        residual,
+        None if highlight is None else highlight.residual,
         math.acos(float(np.clip(-estimate.normal[2], -1, 1))),
     )
     return np.array([math.nan if value is None else value for value in values], dtype=float)
@@ -190,6 +185,8 @@ def _crowding_px(peaks: Array, number: int) -> float:
     away = np.sort(np.hypot(*(peaks - peaks[number]).T))
     return max(float(away[NEIGHBOUR]) if len(away) > NEIGHBOUR else ALONE_PX, 1.0)
 
+
+# Twins ----------------------------------------------------------------------------------------------------------------
 
 TWINS = 40.0
 """Effective number of twins of a highlight."""
@@ -262,8 +259,8 @@ class Matcher:
         # A false detection has no normal that is its own.
         weights = _weights(np.where(self._real, squared, np.inf), self._shares, TWINS)
         near, glint = weights * self._near, weights * ~self._near
-        near_mm, middle_mm, far_mm = (weighted_quantile(self._distances, weights, share) for share in (0.1, 0.5, 0.9))
         stated = weights * self._stated
+        at = partial(weighted_quantile, self._distances, weights)
         return Twins(
             rms_deg=_rms(weights, self._errors),
             interval_deg=self._interval(weights, self._errors),
@@ -275,7 +272,7 @@ class Matcher:
             glint_rms_deg=_rms(glint, self._errors),
             near_rms_deg=_rms(near, self._errors),
             p95_deg=weighted_quantile(self._errors, weights, 0.95),
-            distance_mm=(near_mm, middle_mm, far_mm),
+            distance_mm=(at(0.1), at(0.5), at(0.9)),
             effective=float(weights.sum() ** 2 / np.square(weights).sum()),
             unlikeness=float(np.sqrt(weights @ np.where(self._real, squared, 0.0) / weights.sum() / len(FEATURES))),
             best=np.argsort(np.where(self._real, squared, np.inf), kind="stable")[:12],

@@ -136,7 +136,7 @@ class FrameMaker:
 
     def __init__(self, dataset: Dataset, variant: str | None = None) -> None:
         # Imported here, as below: a bank that is complete needs no renderer.
-        from simtest.dataset.maker import colour_variant
+        from simtest.rendering.backend import colour_variant
 
         self.dataset = dataset
         self.plan = Plan(dataset)

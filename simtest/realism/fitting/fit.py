@@ -121,24 +121,11 @@ def fit(
     progress: Progress | None = None,
     repeats: int = REPEATS,
 ) -> FittedRecipe:
-    """Fit a recipe of one family to frames.
+    """Fit a recipe of one family to real frames of at least three scenes, inside the recipe's ranges.
 
-    Parameters
-    ----------
-    frames : sequence of NamedFrame
-        Real frames of at least three scenes.
-    dataset : Dataset
-        The recipe; its ranges are where parameters are looked for.
-    folder : Path
-        Of the bank, which is kept: a stopped fit goes on, and another fit of the same recipe uses it again.
-    size : int
-        Radiances of the bank.
-    seed : int
-        Of the inference; that of the bank is the recipe's.
-    progress : callable, optional
-        See `Progress`.
-    repeats : int
-        Repeated fits for the intervals.
+    `folder` is that of the bank of `size` radiances, which is kept: a stopped fit goes on, and another fit of the same
+    recipe uses it again. `seed` is that of the inference; the bank's is the recipe's. The intervals are those of
+    `repeats` repeated fits.
     """
     parameters = fitted_parameters(dataset)
     seen = summarise_scenes(frames, progress)

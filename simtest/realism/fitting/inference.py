@@ -237,20 +237,10 @@ def infer(
     repeats: int = REPEATS,
     step: Callable[[int, int], None] | None = None,
 ) -> Fitted:
-    """Find the distribution of parameters that scenes have.
+    """Find the distribution of parameters of scenes by an emulator with at least `repeats` draws.
 
-    Parameters
-    ----------
-    emulator : Emulator
-        With at least `repeats` draws.
-    scenes : ndarray, shape (N, S)
-        Summaries, a row a scene; NaN where it does not tell one.
-    rng : numpy.random.Generator
-        Draws starts, scenes and gaps.
-    repeats : int
-        Repeated fits.
-    step : callable, optional
-        Called with fits done and fits in all.
+    `scenes` are their summaries, shape (N, S), NaN where one does not tell it; `step` is called with the fits that are
+    done, and all.
     """
     values, told = _complete(emulator, scenes)
     parameters = emulator.parameters
