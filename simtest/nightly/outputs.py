@@ -66,6 +66,7 @@ def summary(judged: JudgedRun) -> str:
     if len(verdict.notes) > MAX_NOTES:
         notes.append(f"- ... and {len(verdict.notes) - MAX_NOTES} more notes")
     causes = [f"- {escaped(cause)}" for cause in verdict.causes]
+    took = "" if record.duration_s is None else f"{record.duration_s:.0f} s "
     counts = OUTCOMES if verdict.baseline is not None else ()
     columns = ("experiment", "rows", "answered", "missed", "false", *counts)
     parts = [
@@ -78,7 +79,7 @@ def summary(judged: JudgedRun) -> str:
         *_changes("Better", verdict, "better"),
         "### By experiment",
         _table(columns, judged.by_experiment().select(columns).rows()),
-        f"{escaped(record.started)}, commit {short_commit(record.commit)}, {record.duration_s or 0:.0f} s on "
+        f"{escaped(record.started)}, commit {short_commit(record.commit)}, {took}on "
         f"{escaped(record.processor)}; run `{escaped(record.id)}`",
     ]
     text = "\n\n".join(parts) + "\n"

@@ -140,6 +140,11 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{value:.{digits - 1}e}"
 
 
+def counted(count: int, word: str) -> str:
+    """Return a number of things, such as "1 row" or "2 rows"."""
+    return f"{count} {word}" if count == 1 else f"{count} {word}s"
+
+
 def degrees(value: Any) -> str:
     """Write an angle in degrees."""
     text = number(value)

@@ -11,7 +11,7 @@ import polars as pl
 from simtest.conventions import HIGHLIGHT_CONTRAST_SIGMA, ON_INSTRUMENT
 from simtest.estimators.motion_signs import WRONG_SHARE
 from simtest.pages.charts import NOTHING, Axis, Bars, Chart, Mark, Panel, log_range
-from simtest.pages.style import NEUTRAL, SERIES, degrees, estimator_order, number, symbols
+from simtest.pages.style import NEUTRAL, SERIES, counted, degrees, estimator_order, number, symbols
 from simtest.report.error_figures import axis_title, bar, scattered, varies
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
@@ -196,7 +196,11 @@ def _sentence(rows: pl.DataFrame, name: str) -> str:
     text = f"{name}: {degrees(fine)} against the fine surface, {degrees(base)} against the base"
     told = rows.filter(pl.col("error_base_law_deg").is_not_null())
     share = (told["error_base_deg"] / told["error_base_law_deg"]).mean()
-    return text + (f", {number(share)} of the law" if share is not None else "") + f" ({rows.height} highlights)."
+    return (
+        text
+        + (f", {number(share)} of the law" if share is not None else "")
+        + f" ({counted(rows.height, 'highlight')})."
+    )
 
 
 # Distribution --------------------------------------------------------------------------------------------------------
@@ -214,8 +218,8 @@ def _distribution(rows: pl.DataFrame, colours: Mapping[str, str]) -> Iterator[Re
         steps = np.arange(1, len(values) + 1) / len(values)
         marks.append(Mark(values, steps, colours[name], name, line="solid", width=1.6, hover=f"{name}\n{{x}}: {{y}}"))
         measured.append(
-            f"{name}: mean {number(values.mean())} slopes over {len(values)} highlights (law {_LAW_OVER_SLOPE:.3g}), "
-            f"largest distance from Rayleigh {number(_largest_gap(values))}."
+            f"{name}: mean {number(values.mean())} slopes over {counted(len(values), 'highlight')} "
+            f"(law {_LAW_OVER_SLOPE:.3g}), largest distance from Rayleigh {number(_largest_gap(values))}."
         )
     fine = np.linspace(0, 4, 161)
     law = Mark(fine, relief_laws.relief_error_share(fine, 1.0), NEUTRAL, "law: Rayleigh", line="dash", width=1.5,

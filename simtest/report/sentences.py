@@ -3,7 +3,7 @@
 import polars as pl
 
 from simtest.conventions import ON_INSTRUMENT
-from simtest.pages.style import degrees, number
+from simtest.pages.style import counted, degrees, number
 from simtest.report.error_figures import HeatMap, LineFigure, law_misses
 from simtest.report.run_folder import Run
 from simtest.validation.statistics import counts, row_kind
@@ -25,10 +25,6 @@ def headline(run: Run, figures: list[LineFigure]) -> list[str]:
     return [s for s in sentences if s]
 
 
-def _plural(word: str, count: int) -> str:
-    return word if count == 1 else word + "s"
-
-
 def _counts(rows: pl.DataFrame) -> str:
     count = rows.select(**counts(rows)).row(0, named=True)
     total = rows.height
@@ -40,7 +36,7 @@ def _counts(rows: pl.DataFrame) -> str:
     if count[ON_INSTRUMENT]:
         parts.append(f"{count[ON_INSTRUMENT]} lie on instruments")
     parts.append(f"{count['false']} belong to false detections")
-    return f"Of {total} {_plural('row', total)}, {', '.join(parts[:-1])} and {parts[-1]}."
+    return f"Of {counted(total, 'row')}, {', '.join(parts[:-1])} and {parts[-1]}."
 
 
 def measured(figure: LineFigure) -> list[str]:

@@ -72,6 +72,14 @@ def test_the_summary_says_first_what_matters(run):
                for line in lines)  # fmt: skip
 
 
+def test_a_duration_that_is_not_known_is_not_said(run):
+    known = judged(run, no_baseline())
+    record = run.record.model_copy(update={"duration_s": None})
+    unknown = judged(dataclasses.replace(run, record=record), no_baseline())
+    assert " s on " in summary(known)
+    assert " s on " not in summary(unknown)
+
+
 def test_tables_are_whole(run):
     head = None
     for line in summary(judged(run, regression(run))).splitlines():

@@ -127,6 +127,14 @@ def test_a_relief_without_a_law_is_drawn_without_dashes(tmp_path):
     assert "of the law" not in " ".join(figure.measured)
 
 
+def test_one_highlight_is_not_highlights(tmp_path):
+    first, *rest = (row for s in (2.0, 4.0) for row in made("cone_axis", "plane", f"{s}", s, **{SLOPE: s}))
+    run = run_of([first, *(row | {"status": "missed"} for row in rest)], tmp_path)
+    texts = [text for figure in relief_figures(run, COLOURS) for text in figure.measured]
+    assert any("1 highlight" in text for text in texts)
+    assert all("1 highlights" not in text for text in texts)
+
+
 def test_a_method_of_clouds_is_drawn_against_the_base_alone(tmp_path):
     """A method that reports the base's normal alone has no error against the fine surface."""
     rows = [row for s in (2.0, 4.0) for row in made("curved", "plane", f"{s}", s, **{SLOPE: s})]
