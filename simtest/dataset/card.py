@@ -6,7 +6,6 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE
-from simtest.dataset.fields import FIELDS
 from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
 from simtest.dataset.manifest import Manifest
 from simtest.dataset.plan import Plan
@@ -41,7 +40,7 @@ def make_card(plan: Plan, manifest: Manifest) -> str:
         dataset=dataset,
         counts=counts,
         made_small=plan.made_small,
-        fields=[field for field in FIELDS if field.name not in plan.fields_left_out],
+        fields=plan.fields,
         has_relief=plan.has_relief,
         has_instruments=plan.has_instruments,
         draws=list(_draws(plan)),

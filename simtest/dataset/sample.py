@@ -33,7 +33,7 @@ class Sample:
         fields = [field for field in FIELDS if field.name in self.images]
         # The codecs release Python's lock, so two threads nearly halve the time.
         with ThreadPoolExecutor(2) as threads:
-            encoded = threads.map(lambda field: field.encode(self.images[field.name]), fields)
+            encoded = threads.map(lambda field: field.codec.encode(self.images[field.name]), fields)
             members = {field.suffix: data for field, data in zip(fields, encoded, strict=True)}
         hashes = {suffix: hashlib.sha256(data).hexdigest() for suffix, data in members.items()}
         text = json.dumps({**self.meta, "sha256": hashes}, allow_nan=False, separators=(",", ":"))
@@ -42,7 +42,7 @@ class Sample:
 
 def decode(members: Mapping[str, bytes], meta: SampleMeta) -> Sample:
     """Decode a sample's images from the members of a shard, given by suffix."""
-    images = {BY_SUFFIX[s].name: BY_SUFFIX[s].decode(data, meta) for s, data in members.items() if s in BY_SUFFIX}
+    images = {BY_SUFFIX[s].name: BY_SUFFIX[s].codec.decode(data, meta) for s, data in members.items() if s in BY_SUFFIX}
     return Sample(meta, images)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from simtest.dataset.card import CARD, make_card
-from simtest.dataset.fields import BASE_FIELDS, BY_SUFFIX, FIELDS, INSTRUMENT, KEPT_ON_DEMAND, VISIBLE
+from simtest.dataset.fields import BY_SUFFIX, FIELDS, INSTRUMENT, VISIBLE
 from simtest.dataset.index import TABLES, make_tables
 from simtest.dataset.manifest import (
     NAME,
@@ -45,9 +45,6 @@ MAX_DEPTH_ERROR = 0.05
 
 MAX_SLOPES = 4.0
 """The median angle between fine normals and those of the base is 1.2 slopes of the relief, and far below this many."""
-
-REQUIRED = tuple(field.name for field in FIELDS if field.name not in (*KEPT_ON_DEMAND, INSTRUMENT, *BASE_FIELDS))
-"""Images of every sample; with a relief also those of the base."""
 
 
 @dataclass(frozen=True)
@@ -184,9 +181,7 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
     except (ValueError, KeyError, TypeError) as error:
         yield f"cannot be decoded ({error})"
         return
-    required = REQUIRED if relief is None else (*REQUIRED, *BASE_FIELDS)
-    required += (INSTRUMENT,) if listed else ()
-    if lacking := [name for name in required if name not in sample.images]:
+    if lacking := [own.name for own in FIELDS if own.is_required(meta) and own.name not in sample.images]:
         yield f"has no {', '.join(lacking)}"
         return
     # sizes

@@ -276,7 +276,7 @@ def test_fields_come_back(seed, scale):
     for array in (normal, depth, curvature):
         array[2, 3] = np.nan
     meta = {"depth_scale_mm": fields.depth_scale_mm(depth)}
-    back = {name: fields.BY_NAME[name].decode(fields.BY_NAME[name].encode(array), meta)
+    back = {name: fields.BY_NAME[name].codec.decode(fields.BY_NAME[name].codec.encode(array), meta)
             for name, array in (("normal", normal), ("depth", depth), ("curvature", curvature))}  # fmt: skip
     for array in back.values():
         assert np.isnan(array[2, 3]).all()
@@ -550,7 +550,7 @@ def test_the_card_says_where_surfaces_come_from():
 def test_stored_normals_have_the_levels_that_their_description_says():
     """Levels count from 1 to 16383 over the square, u above v; 0 stands for no surface."""
     normals = np.array([[[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [np.nan] * 3]], dtype=np.float32)
-    counts = png.decode(fields.BY_NAME["normal"].encode(normals))
+    counts = png.decode(fields.BY_NAME["normal"].codec.encode(normals))
     assert counts.tolist() == [[8192, 16383, 8192, 0], [8192, 8192, 1, 0]]
 
 
@@ -632,8 +632,8 @@ def with_image(name, change):
     def apply(stored):
         key, members, meta = stored[0]
         field = fields.BY_NAME[name]
-        array = field.decode(members[field.suffix], meta)
-        return [(key, {**members, field.suffix: field.encode(change(array.copy()))}, meta), *stored[1:]]
+        array = field.codec.decode(members[field.suffix], meta)
+        return [(key, {**members, field.suffix: field.codec.encode(change(array.copy()))}, meta), *stored[1:]]
 
     return lambda folder: rewrite(folder, TAR, apply)
 

@@ -140,7 +140,7 @@ def stored_rough(made):
 
 def recoded(members, name, change):
     field = fields.BY_NAME[name]
-    return members | {field.suffix: field.encode(change(field.decode(members[field.suffix], {})))}
+    return members | {field.suffix: field.codec.encode(change(field.codec.decode(members[field.suffix], {})))}
 
 
 DAMAGE = {
