@@ -11,8 +11,7 @@ import numpy as np
 
 from simtest.dataset.fields import BY_NAME, Field
 from simtest.dataset.manifest import Manifest, ManifestError, read_manifest
-from simtest.dataset.sample import Sample
-from simtest.dataset.shard import BrokenShardError, StoredSample, read_member, samples
+from simtest.dataset.shard import BrokenShardError, Sample, StoredSample, read_member, samples
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray
 from simtest.runtime.files import require_plain

@@ -24,6 +24,7 @@ TEMPLATES = [
             "reconstruction",
             "nightly/page",
             "bench",
+            "dataset",
             "dataset/scoring/dense",
         )
     ),

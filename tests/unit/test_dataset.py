@@ -18,17 +18,14 @@ from hypothesis import strategies as st
 import simtest
 from simtest.cli.main import main
 from simtest.dataset import calibration_of, fields, png, read
-from simtest.dataset.card import make_card
+from simtest.dataset.card import make_card, write_preview
 from simtest.dataset.index import TABLES, write_shard_tables, write_tables
 from simtest.dataset.maker import Maker, _share_of
 from simtest.dataset.manifest import NAME, FileEntry, _digest, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
-from simtest.dataset.preview import write_preview
-from simtest.dataset.reproduce import compare, reproduce_sample
-from simtest.dataset.sample import decode, sample_key
-from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
+from simtest.dataset.shard import BrokenShardError, decode, finish, sample_key, samples, write_sample
 from simtest.dataset.shard_writer import _write_shards, write_dataset
-from simtest.dataset.verify import repair_files, verify
+from simtest.dataset.verify import compare, repair_files, reproduce_sample, verify
 from simtest.errors import InputError, SimtestError
 from simtest.pages.markdown import escaped, yaml_string
 from simtest.runtime.processes import cores_per_task, make_engine
