@@ -15,8 +15,7 @@ from benchmarks.measuring import Figure
 from simtest.dataset import read
 from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
-from simtest.dataset.sample import Sample
-from simtest.dataset.shard import finish, write_sample
+from simtest.dataset.shard import Sample, finish, write_sample
 from simtest.dataset.shard_writer import append
 from simtest.spec import load_dataset
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from simtest.cli.progress import progress_bar
 from simtest.dataset.reader import read_samples, sample_positions
-from simtest.dataset.sample import Sample
 from simtest.dataset.scoring.dense.shading import shading_maps
+from simtest.dataset.shard import Sample
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.learned import normal_of

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from simtest.dataset.reader import read_samples
-from simtest.dataset.sample import Sample
+from simtest.dataset.shard import Sample
 from simtest.errors import Failure
 from simtest.estimators.learned_dense import LearnedDense
 from simtest.geometry.vectors import angle_deg

@@ -19,7 +19,7 @@ import numpy as np
 from simtest.cli.progress import progress_bar
 from simtest.dataset.fields import INSTRUMENT
 from simtest.dataset.reader import read_samples, sample_positions
-from simtest.dataset.sample import Sample
+from simtest.dataset.shard import Sample
 from simtest.errors import Failure
 from simtest.estimators import Estimate, load_estimators
 from simtest.estimators.learned_spot import LearnedSpot

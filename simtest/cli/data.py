@@ -130,7 +130,7 @@ def sample(
     index : int
         Of the sample, from 0.
     """
-    from simtest.dataset.reproduce import compare, reproduce_sample
+    from simtest.dataset.verify import compare, reproduce_sample
 
     target = out or Path(f"sample-{index}")
     files = reproduce_sample(folder, index, target, variant)
@@ -150,7 +150,7 @@ def preview(
     samples: Annotated[int, whole("How many samples to show.")] = 24,
 ) -> Told:
     """Write a page with a dataset's frames, labels, highlights and distributions."""
-    from simtest.dataset.preview import write_preview
+    from simtest.dataset.card import write_preview
 
     page = out or Path("preview.html")
     with exclusive_file(page):

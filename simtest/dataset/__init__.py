@@ -1,9 +1,9 @@
 """Datasets of labelled frames on disk: planned, written in shards, verified, read, and learned from.
 
 `plan` fixes what each sample is made of, `maker` makes it, `shard_writer` writes it (`fields`, `png`, `shard`), with
-`manifest`, `index` and `card` beside the shards. `reader` reads them back, `verify` checks and repairs,
-`reproduce` makes one sample anew, `preview` draws a contact sheet. `sample_calibration` tells what reconstruction may
-know of a sample. `learn` needs PyTorch.
+`manifest`, `index` and `card` beside the shards. `reader` reads them back, `verify` checks and repairs them and makes
+one sample anew, `card` also draws a contact sheet. `sample_calibration` tells what reconstruction may know of a sample;
+`export` and `scoring` are for methods that run elsewhere, `learn` needs PyTorch.
 """
 
 from typing import TYPE_CHECKING

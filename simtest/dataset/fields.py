@@ -5,8 +5,9 @@ smooth maps of 16 bits.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -27,6 +28,25 @@ OFFSET = 32768
 
 
 @dataclass(frozen=True)
+class Codec:
+    """How an image is held by a shard's member.
+
+    Parameters
+    ----------
+    text : str
+        How a reader without this package decodes it.
+    encode : callable
+        Array to bytes.
+    decode : callable
+        Bytes and the sample's metadata to the array.
+    """
+
+    text: str
+    encode: Callable[[AnyArray], bytes]
+    decode: Callable[[bytes, SampleMeta], AnyArray]
+
+
+@dataclass(frozen=True)
 class Field:
     """One image of a sample.
 
@@ -38,12 +58,13 @@ class Field:
         Of the member in the shard, after the sample's key.
     meaning : str
         What it holds, with frame and sign.
-    encoding : str
-        How a reader without this package decodes it.
-    encode : callable
-        Array to bytes.
-    decode : callable
-        Bytes and the sample's metadata to the array.
+    codec : Codec
+        How the member holds it.
+    stored : str
+        Which samples store it: all, those with a relief or with listed instruments, or those of datasets that ask for
+        it, by a key of its name.
+    otherwise : str or int, optional
+        What it is where that says no: the field of this name, or this number everywhere.
     """
 
     name: str
@@ -52,9 +73,18 @@ class Field:
     dtype: str
     unit: str
     meaning: str
-    encoding: str
-    encode: Callable[[AnyArray], bytes]
-    decode: Callable[[bytes, SampleMeta], AnyArray]
+    codec: Codec
+    stored: Literal["always", "relief", "instruments", "asked"] = "always"
+    otherwise: str | int | None = None
+
+    def is_required(self, meta: SampleMeta) -> bool:
+        """Return whether a sample must store it, by its scene."""
+        return {
+            "always": True,
+            "relief": has_relief(meta),
+            "instruments": bool(meta["scene"].get("instruments")),
+            "asked": False,
+        }[self.stored]
 
 
 # Depth ---------------------------------------------------------------------------------------------------------------
@@ -186,37 +216,17 @@ def _decode_curvature(data: bytes, _: SampleMeta) -> AnyArray:
     return np.asarray(cv2.merge(np.split(both, 2, axis=0)))
 
 
-# Pools ---------------------------------------------------------------------------------------------------------------
+# Pictures and numbers ----------------------------------------------------------------------------------------------
 
 
 def _encode_mask(mask: AnyArray) -> bytes:
     return encode(np.where(mask, np.uint8(255), np.uint8(0)), "none")
 
 
-def _decode_mask(data: bytes, _: SampleMeta) -> AnyArray:
-    return decode(data) > 0
-
-
-# Pictures ------------------------------------------------------------------------------------------------------------
-
-
-def _encode_picture(picture: AnyArray) -> bytes:
-    return encode(picture, "none")
-
-
-def _decode_picture(data: bytes, _: SampleMeta) -> AnyArray:
-    return decode(data)
-
-
 def _encode_numbers(numbers: AnyArray) -> bytes:
     if numbers.max(initial=0) > LEVELS:
         raise ValueError(f"{numbers.max()} highlights; 16 bits hold {LEVELS}")
     return encode(numbers.astype(np.uint16), "none")
-
-
-def _decode_numbers(data: bytes, _: SampleMeta) -> AnyArray:
-    # PyTorch computes with few unsigned types.
-    return decode(data).astype(np.int32)
 
 
 def _encode_half(radiance: AnyArray) -> bytes:
@@ -227,104 +237,80 @@ def _encode_half(radiance: AnyArray) -> bytes:
     return file.getvalue()
 
 
-def _decode_half(data: bytes, _: SampleMeta) -> AnyArray:
-    return np.asarray(np.load(BytesIO(data), allow_pickle=False))
-
-
-_PART = "8-bit PNG, sRGB-encoded share of full scale, clipped"
-_OCTAHEDRAL = (
+PICTURE = Codec("8-bit PNG", lambda picture: encode(picture, "none"), lambda data, _: decode(data))
+PART = replace(PICTURE, text="8-bit PNG, sRGB-encoded share of full scale, clipped")
+MASK = Codec("8-bit PNG; 255: pool, 0: none", _encode_mask, lambda data, _: decode(data) > 0)
+# PyTorch computes with few unsigned types.
+NUMBERS = Codec("16-bit PNG", _encode_numbers, lambda data, _: decode(data).astype(np.int32))
+HALF = Codec("NPY", _encode_half, lambda data, _: np.asarray(np.load(BytesIO(data), allow_pickle=False)))
+DEPTHS = Codec(
+    "8-bit PNG of 3 H rows: high above middle above low octets; (65536 high + 256 middle + low) times the sample's "
+    "depth_scale_mm; 0: no surface",
+    _encode_depth,
+    _decode_depth,
+)
+OCTAHEDRAL = Codec(
     f"16-bit PNG of 2 H rows: u above v, each 2 (count - 1) / {NORMAL_LEVELS - 1} - 1; 0: no surface. "
     "z = abs(u) + abs(v) - 1; where z > 0, (u, v) = (1 - abs(v), 1 - abs(u)) times the signs of u and v; the normal is "
-    "(u, v, z), made a unit vector"
+    "(u, v, z), made a unit vector",
+    _encode_normal,
+    _decode_normal,
 )
-_CURVATURE = (
+CURVATURES = Codec(
     f"16-bit PNG of 2 H rows: k_min above k_max; k = (count - {OFFSET}) * {CURVATURE_SCALE:g}; 0: unknown; "
-    f"1 and {LEVELS}: that or beyond"
+    f"1 and {LEVELS}: that or beyond",
+    _encode_curvature,
+    _decode_curvature,
 )
 
-VISIBLE = "visible"
-"""Field of the visible highlights' pixels."""
+INSTRUMENT, VISIBLE = "instrument", "visible"
+"""Fields of the pixels of instruments and of visible highlights."""
 
 FIELDS = (
     Field("image", "image.png", "(H, W, 3)", "uint8", "sensor counts",
           "the sensor's frame, R G B: as its response and bits encode it, or sRGB-encoded where it has neither",
-          "8-bit PNG", _encode_picture, _decode_picture),
+          PICTURE),
     Field("depth", "depth.png", "(H, W)", "float32", "mm",
           "distance from the camera centre along the pixel's ray (not z); NaN where there is no surface",
-          "8-bit PNG of 3 H rows: high above middle above low octets; (65536 high + 256 middle + low) times the "
-          "sample's depth_scale_mm; 0: no surface", _encode_depth, _decode_depth),
+          DEPTHS),
     Field("normal", "normal.png", "(H, W, 3)", "float32", "1",
           "unit normal of the fine surface, camera frame (x right, y down, z forward); without a relief it faces the "
-          "camera: N . ray < 0; NaN off the surface",
-          _OCTAHEDRAL, _encode_normal, _decode_normal),
+          "camera: N . ray < 0; NaN off the surface", OCTAHEDRAL),
     Field("curvature", "curvature.png", "(H, W, 2)", "float32", "1/mm",
           "principal curvatures k_min <= k_max of the fine surface, convex towards the camera positive; NaN where "
-          "unknown",
-          _CURVATURE, _encode_curvature, _decode_curvature),
+          "unknown", CURVATURES),
     Field("normal_base", "normal_base.png", "(H, W, 3)", "float32", "1",
           "unit normal of the base, without the relief, facing the camera; stored where there is a relief, elsewhere "
-          "it is normal",
-          _OCTAHEDRAL, _encode_normal, _decode_normal),
+          "it is normal", OCTAHEDRAL, "relief", "normal"),
     Field("curvature_base", "curvature_base.png", "(H, W, 2)", "float32", "1/mm",
-          "curvature of the base; stored where there is a relief, elsewhere it is curvature",
-          _CURVATURE, _encode_curvature, _decode_curvature),
+          "curvature of the base; stored where there is a relief, elsewhere it is curvature", CURVATURES, "relief",
+          "curvature"),
     Field("pool", "pool.png", "(H, W)", "bool", "1",
           "where the liquid film fills a valley; stored where there is a relief, elsewhere it is false everywhere",
-          "8-bit PNG; 255: pool, 0: none", _encode_mask, _decode_mask),
+          MASK, "relief", 0),
     Field("specular", "specular.png", "(H, W, 3)", "uint8", "full scale",
-          "direct light off the specular lobe, before lens and noise", _PART, _encode_picture, _decode_picture),
+          "direct light off the specular lobe, before lens and noise", PART),
     Field("diffuse", "diffuse.png", "(H, W, 3)", "uint8", "full scale",
-          "direct light off the diffuse base, before lens and noise", _PART, _encode_picture, _decode_picture),
+          "direct light off the diffuse base, before lens and noise", PART),
     Field("indirect", "indirect.png", "(H, W, 3)", "uint8", "full scale",
-          "light of more than one bounce, before lens and noise", _PART, _encode_picture, _decode_picture),
+          "light of more than one bounce, before lens and noise", PART),
     Field("instance", "instance.png", "(H, W)", "int32", "1",
           "0, or 1 + the index in the list highlights of the isolated highlight whose region this is: the connected "
           "pixels whose direct light off the lobe (specular, before it is clipped) is at least half of its peak. Where "
           "no pixel reaches that, as where it is smaller than one, there are none, and its entry in highlights says "
           "so (region)",
-          "16-bit PNG", _encode_numbers, _decode_numbers),
+          NUMBERS),
     Field(VISIBLE, "visible.png", "(H, W)", "int32", "1",
           "0, or 1 + the index in the list visible_highlights of the visible highlight whose pixel this is: above half "
-          "of its lobe's peak in the noise-free frame; only in datasets that keep it",
-          "16-bit PNG", _encode_numbers, _decode_numbers),
-    Field("instrument", "instrument.png", "(H, W)", "uint8", "1",
+          "of its lobe's peak in the noise-free frame; only in datasets that keep it", NUMBERS, "asked"),
+    Field(INSTRUMENT, "instrument.png", "(H, W)", "uint8", "1",
           "0, or 1 + the index in the scene's instruments of the metal instrument that is seen: depth and normals "
           "are its own there, curvature is NaN; stored where the scene lists instruments, elsewhere it is 0 everywhere",
-          "8-bit PNG", _encode_picture, _decode_picture),
+          PICTURE, "instruments", 0),
     Field("radiance", "radiance.npy", "(H, W, 3)", "float16", "full scale",
-          "linear radiance before lens and noise, share of full scale; only in datasets that keep it",
-          "NPY", _encode_half, _decode_half),
+          "linear radiance before lens and noise, share of full scale; only in datasets that keep it", HALF, "asked"),
 )  # fmt: skip
 """All fields, in the order of the members."""
 
 BY_NAME = {field.name: field for field in FIELDS}
 BY_SUFFIX = {field.suffix: field for field in FIELDS}
-
-FINE_OF = {"normal_base": "normal", "curvature_base": "curvature"}
-"""Field of the fine surface that each field of the base equals where there is no relief."""
-
-INSTRUMENT = "instrument"
-"""Field that is stored where the scene lists instruments alone, present or not."""
-
-KEPT_ON_DEMAND = ("radiance", VISIBLE)
-"""Fields that a recipe must ask for, by keys of these names."""
-
-BASE_FIELDS = (*FINE_OF, "pool")
-"""Fields that are stored where there is a relief alone."""
-
-
-def no_instrument(meta: SampleMeta) -> AnyArray | None:
-    """Return the field `INSTRUMENT` of a sample whose scene lists none, which does not store it; else None."""
-    if meta["scene"].get("instruments"):
-        return None
-    return np.zeros((meta["camera"]["height"], meta["camera"]["width"]), dtype=np.uint8)
-
-
-def smooth_base(name: str, fine: AnyArray | None, meta: SampleMeta) -> AnyArray | None:
-    """Return a field of `BASE_FIELDS` of a sample without a relief, which does not store it; None where it has one.
-
-    `fine` is the field that `FINE_OF` names, and is returned as it is: one array under two names.
-    """
-    if has_relief(meta):
-        return None
-    return np.zeros((meta["camera"]["height"], meta["camera"]["width"]), dtype=bool) if name == "pool" else fine

@@ -13,8 +13,8 @@ from simtest.conventions import HIGHLIGHT_ISOVALUE
 from simtest.dataset.fields import INSTRUMENT, VISIBLE, depth_scale_mm
 from simtest.dataset.metadata import DetectionMeta, EstimateMeta, HighlightMeta, InstanceMeta, SampleMeta
 from simtest.dataset.plan import Anatomy, Drawn, Plan
-from simtest.dataset.sample import Sample, sample_key
 from simtest.dataset.sample_calibration import calibration_of_picture, stored_picture
+from simtest.dataset.shard import Sample, sample_key
 from simtest.detection.peaks import Component
 from simtest.errors import Failure, InputError
 from simtest.estimators import AnyEstimator, load_estimators

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import JsonValue
 
-from simtest.dataset.fields import BASE_FIELDS, INSTRUMENT, KEPT_ON_DEMAND
+from simtest.dataset.fields import FIELDS, Field
 from simtest.errors import InputError
 from simtest.runtime.arrays import IntArray
 from simtest.runtime.resources import find
@@ -138,13 +138,11 @@ class Plan:
             dict.fromkeys(path for pair in zip(scenes, self._files, strict=True) for path in (pair[0], *pair[1]))
         )
 
-    @cached_property
-    def fields_left_out(self) -> tuple[str, ...]:
-        """Names of the fields that no sample stores."""
-        without_relief = () if self.has_relief else BASE_FIELDS
-        without_metal = () if self.has_instruments else (INSTRUMENT,)
-        not_asked_for = tuple(name for name in KEPT_ON_DEMAND if not getattr(self.dataset, name))
-        return (*not_asked_for, *without_relief, *without_metal)
+    @property
+    def fields(self) -> list[Field]:
+        """The fields that some sample stores."""
+        stored = {"always": True, "relief": self.has_relief, "instruments": self.has_instruments}
+        return [field for field in FIELDS if stored.get(field.stored, getattr(self.dataset, field.name, False))]
 
     def _base(self, number: int, family: Family) -> dict[str, Any]:
         path = find(family.scene, "scenes")

@@ -7,10 +7,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import IO, Any
 
-from simtest.dataset.fields import BASE_FIELDS, BY_NAME, FINE_OF, INSTRUMENT, Field, no_instrument, smooth_base
+import numpy as np
+
+from simtest.dataset.fields import BY_NAME, Field
 from simtest.dataset.manifest import Manifest, ManifestError, read_manifest
-from simtest.dataset.sample import Sample
-from simtest.dataset.shard import BrokenShardError, StoredSample, read_member, samples
+from simtest.dataset.shard import BrokenShardError, Sample, StoredSample, read_member, samples
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray
 from simtest.runtime.files import require_plain
@@ -181,14 +182,12 @@ def _decoded(file: IO[bytes], shard: str, stored: StoredSample, fields: list[str
 def _image(file: IO[bytes], stored: StoredSample, field: Field, read_before: dict[str, AnyArray]) -> AnyArray | None:
     """Decode a field; None where the sample has none. `read_before` holds the sample's other fields, by name."""
     if field.suffix in stored.members:
-        return field.decode(read_member(file, stored, field.suffix), stored.meta)
-    if field.name == INSTRUMENT:
-        return no_instrument(stored.meta)
-    if field.name not in BASE_FIELDS:
+        return field.codec.decode(read_member(file, stored, field.suffix), stored.meta)
+    if field.otherwise is None or field.is_required(stored.meta):
         return None
-    # On a smooth surface the base is the fine surface.
-    twin = FINE_OF.get(field.name)
-    fine = read_before.get(twin) if twin else None
-    if twin and fine is None:
-        fine = _image(file, stored, BY_NAME[twin], read_before)
-    return smooth_base(field.name, fine, stored.meta)
+    if isinstance(field.otherwise, str):
+        # One array under two names.
+        twin = BY_NAME[field.otherwise]
+        return read_before[twin.name] if twin.name in read_before else _image(file, stored, twin, read_before)
+    camera = stored.meta["camera"]
+    return np.full((camera["height"], camera["width"]), field.otherwise, field.dtype)

@@ -27,8 +27,7 @@ from simtest.dataset.manifest import (
     read_manifest,
 )
 from simtest.dataset.plan import Plan, Shard
-from simtest.dataset.sample import Sample
-from simtest.dataset.shard import PART, finish, whole_samples, write_sample
+from simtest.dataset.shard import PART, Sample, finish, whole_samples, write_sample
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
 from simtest.estimators.names import absolute_names

@@ -1,4 +1,7 @@
-"""Verifies a dataset's folder: every byte against its hash, every value against its range and the other values."""
+"""Verifies a dataset's folder: every byte against its hash, every value against its range and the other values.
+
+It also makes one sample again alone, and compares it with the stored one.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,8 +11,9 @@ import numpy as np
 import polars as pl
 
 from simtest.dataset.card import CARD, make_card
-from simtest.dataset.fields import BASE_FIELDS, BY_SUFFIX, FIELDS, INSTRUMENT, KEPT_ON_DEMAND, VISIBLE
+from simtest.dataset.fields import BY_SUFFIX, FIELDS, INSTRUMENT, VISIBLE
 from simtest.dataset.index import TABLES, make_tables
+from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import (
     NAME,
     FileEntry,
@@ -22,15 +26,15 @@ from simtest.dataset.manifest import (
 )
 from simtest.dataset.metadata import SampleMeta, has_relief
 from simtest.dataset.plan import Plan, Shard
-from simtest.dataset.sample import Sample, decode, sample_key
-from simtest.dataset.shard import PART, BrokenShardError, read_member, samples
+from simtest.dataset.reader import open_manifest
+from simtest.dataset.shard import PART, BrokenShardError, Sample, decode, read_member, sample_key, samples
 from simtest.dataset.shard_writer import remake
 from simtest.errors import InputError
 from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
 from simtest.runtime.arrays import AnyArray
-from simtest.runtime.locks import LOCK
+from simtest.runtime.locks import LOCK, exclusive_folder
 from simtest.runtime.processes import Engine
 from simtest.spec.camera import SceneCamera
 from simtest.spec.surfaces import Relief
@@ -45,9 +49,6 @@ MAX_DEPTH_ERROR = 0.05
 
 MAX_SLOPES = 4.0
 """The median angle between fine normals and those of the base is 1.2 slopes of the relief, and far below this many."""
-
-REQUIRED = tuple(field.name for field in FIELDS if field.name not in (*KEPT_ON_DEMAND, INSTRUMENT, *BASE_FIELDS))
-"""Images of every sample; with a relief also those of the base."""
 
 
 @dataclass(frozen=True)
@@ -184,9 +185,7 @@ def check_sample(members: dict[str, bytes], meta: SampleMeta) -> Iterator[str]:
     except (ValueError, KeyError, TypeError) as error:
         yield f"cannot be decoded ({error})"
         return
-    required = REQUIRED if relief is None else (*REQUIRED, *BASE_FIELDS)
-    required += (INSTRUMENT,) if listed else ()
-    if lacking := [name for name in required if name not in sample.images]:
+    if lacking := [own.name for own in FIELDS if own.is_required(meta) and own.name not in sample.images]:
         yield f"has no {', '.join(lacking)}"
         return
     # sizes
@@ -311,3 +310,41 @@ def _tables(folder: Path, manifest: Manifest, plan: Plan, damaged: set[str]) -> 
         columns = table.columns if same_code else [name for name in there.columns if name in table.columns]
         if (same_code and there.columns != columns) or not there.select(columns).equals(table.select(columns)):
             yield Fault(name, "differs from what the shards say")
+
+
+def reproduce_sample(folder: Path, index: int, out: Path, variant: str | None = None) -> list[Path]:
+    """Make a sample anew and write its members as files into a folder, created if needed; return their paths.
+
+    By default the dataset's Mitsuba variant renders it. Raises `InputError` if there is no such sample, or the folder
+    cannot be written; `SimtestError` if its disk is full.
+    """
+    manifest = open_manifest(folder)
+    plan = manifest.plan()
+    if not 0 <= index < plan.dataset.samples:
+        raise InputError(f"INDEX = {index}: must be 0 to {plan.dataset.samples - 1}")
+    files = []
+    with exclusive_folder(out):
+        made = Maker(plan, variant or manifest.origin["variant"]).make(index)
+        for suffix, data in made.encode().items():
+            files.append(out / f"{made.key}.{suffix}")
+            files[-1].write_bytes(data)
+    return files
+
+
+def compare(folder: Path, index: int, out: Path) -> str:
+    """Compare the files that `reproduce_sample` wrote with the stored sample; return one line."""
+    shard, key = open_manifest(folder).plan().shard_of(index), sample_key(index)
+    try:
+        with (folder / shard.name).open("rb") as file:
+            # Only the metadata are read until the sample is found.
+            stored = next((sample for sample in samples(file, check=False) if sample.key == key), None)
+            if stored is None:
+                return f"{shard.name} holds no sample {key}"
+            different = [s for s in stored.members if read_member(file, stored, s) != _bytes(out / f"{key}.{s}")]
+    except (OSError, BrokenShardError) as error:
+        return f"{shard.name}: cannot be compared ({error})"
+    return f"{shard.name}: differs in {', '.join(different)}" if different else f"{shard.name}: same bytes"
+
+
+def _bytes(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None

@@ -24,6 +24,7 @@ TEMPLATES = [
             "reconstruction",
             "nightly",
             "bench",
+            "dataset",
             "dataset/scoring/dense",
         )
     ),

@@ -107,7 +107,7 @@ def files_page() -> str:
     """Return the page as Markdown."""
     meaning, of_columns = ("key", "meaning"), ("column", "type", "meaning")
     images = (
-        (code(own.name), code(own.suffix), f"{own.shape} {own.dtype}, {own.unit}", own.meaning, own.encoding)
+        (code(own.name), code(own.suffix), f"{own.shape} {own.dtype}, {own.unit}", own.meaning, own.codec.text)
         for own in SAMPLE_FIELDS
     )
     *most, last = FILES

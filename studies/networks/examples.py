@@ -9,8 +9,8 @@ import numpy as np
 from simtest.calibration import Frame
 from simtest.dataset.fields import INSTRUMENT
 from simtest.dataset.reader import read_samples, sample_positions
-from simtest.dataset.sample import Sample
 from simtest.dataset.sample_calibration import calibration_of
+from simtest.dataset.shard import Sample
 from simtest.detection.detector import load_detector, run_detector
 from simtest.errors import Failure, InputError
 from simtest.estimators.learned import rotation_of

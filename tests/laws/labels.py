@@ -119,7 +119,7 @@ def encodings() -> list[Law]:
     )
     sound = np.isfinite(depth)
     meta: Any = {"depth_scale_mm": scale}
-    own = {name: BY_NAME[name].decode(BY_NAME[name].encode(image), meta)
+    own = {name: BY_NAME[name].codec.decode(BY_NAME[name].codec.encode(image), meta)
            for name, image in (("depth", depth), ("normal", normal), ("curvature", curvature))}  # fmt: skip
     made = []
     for name, by_formula, wanted, quantum in (
@@ -229,7 +229,7 @@ def _directions(session: Session) -> Law:
 
 def _png(name: str, image: AnyArray) -> AnyArray:
     """Encode an image as a field, and read the PNG by OpenCV."""
-    return np.asarray(cv2.imdecode(np.frombuffer(BY_NAME[name].encode(image), np.uint8), cv2.IMREAD_UNCHANGED))
+    return np.asarray(cv2.imdecode(np.frombuffer(BY_NAME[name].codec.encode(image), np.uint8), cv2.IMREAD_UNCHANGED))
 
 
 def _srgb(linear: Array) -> Array:

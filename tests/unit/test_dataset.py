@@ -18,17 +18,14 @@ from hypothesis import strategies as st
 import simtest
 from simtest.cli.main import main
 from simtest.dataset import calibration_of, fields, png, read
-from simtest.dataset.card import make_card
+from simtest.dataset.card import make_card, write_preview
 from simtest.dataset.index import TABLES, write_shard_tables, write_tables
 from simtest.dataset.maker import Maker, _share_of
 from simtest.dataset.manifest import NAME, FileEntry, _digest, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
-from simtest.dataset.preview import write_preview
-from simtest.dataset.reproduce import compare, reproduce_sample
-from simtest.dataset.sample import decode, sample_key
-from simtest.dataset.shard import BrokenShardError, finish, samples, write_sample
+from simtest.dataset.shard import BrokenShardError, decode, finish, sample_key, samples, write_sample
 from simtest.dataset.shard_writer import _write_shards, write_dataset
-from simtest.dataset.verify import repair_files, verify
+from simtest.dataset.verify import compare, repair_files, reproduce_sample, verify
 from simtest.errors import InputError, SimtestError
 from simtest.pages.markdown import escaped, yaml_string
 from simtest.runtime.processes import cores_per_task, make_engine
@@ -276,7 +273,7 @@ def test_fields_come_back(seed, scale):
     for array in (normal, depth, curvature):
         array[2, 3] = np.nan
     meta = {"depth_scale_mm": fields.depth_scale_mm(depth)}
-    back = {name: fields.BY_NAME[name].decode(fields.BY_NAME[name].encode(array), meta)
+    back = {name: fields.BY_NAME[name].codec.decode(fields.BY_NAME[name].codec.encode(array), meta)
             for name, array in (("normal", normal), ("depth", depth), ("curvature", curvature))}  # fmt: skip
     for array in back.values():
         assert np.isnan(array[2, 3]).all()
@@ -550,7 +547,7 @@ def test_the_card_says_where_surfaces_come_from():
 def test_stored_normals_have_the_levels_that_their_description_says():
     """Levels count from 1 to 16383 over the square, u above v; 0 stands for no surface."""
     normals = np.array([[[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [np.nan] * 3]], dtype=np.float32)
-    counts = png.decode(fields.BY_NAME["normal"].encode(normals))
+    counts = png.decode(fields.BY_NAME["normal"].codec.encode(normals))
     assert counts.tolist() == [[8192, 16383, 8192, 0], [8192, 8192, 1, 0]]
 
 
@@ -632,8 +629,8 @@ def with_image(name, change):
     def apply(stored):
         key, members, meta = stored[0]
         field = fields.BY_NAME[name]
-        array = field.decode(members[field.suffix], meta)
-        return [(key, {**members, field.suffix: field.encode(change(array.copy()))}, meta), *stored[1:]]
+        array = field.codec.decode(members[field.suffix], meta)
+        return [(key, {**members, field.suffix: field.codec.encode(change(array.copy()))}, meta), *stored[1:]]
 
     return lambda folder: rewrite(folder, TAR, apply)
 

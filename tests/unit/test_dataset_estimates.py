@@ -8,7 +8,7 @@ import simtest
 from simtest.dataset import calibration_of
 from simtest.dataset.maker import Maker
 from simtest.dataset.plan import Plan
-from simtest.dataset.sample import decode
+from simtest.dataset.shard import decode
 from simtest.errors import Failure
 from simtest.estimators import load_estimators
 from simtest.rendering import Session

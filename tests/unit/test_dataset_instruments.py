@@ -5,11 +5,10 @@ import polars as pl
 import pytest
 
 from simtest.dataset import read
-from simtest.dataset.card import make_card
+from simtest.dataset.card import make_card, write_preview
 from simtest.dataset.index import ESTIMATES, SAMPLES
 from simtest.dataset.manifest import read_manifest
 from simtest.dataset.plan import Plan
-from simtest.dataset.preview import write_preview
 from simtest.dataset.shard_writer import write_dataset
 from simtest.dataset.verify import check_sample, verify
 from simtest.errors import InputError

@@ -8,12 +8,11 @@ import pytest
 from scipy.ndimage import label
 
 from simtest.dataset import fields, read
-from simtest.dataset.card import make_card
+from simtest.dataset.card import make_card, write_preview
 from simtest.dataset.index import HIGHLIGHTS
 from simtest.dataset.maker import Maker
 from simtest.dataset.manifest import read_manifest
 from simtest.dataset.plan import Plan
-from simtest.dataset.preview import write_preview
 from simtest.dataset.shard import read_member, samples
 from simtest.dataset.shard_writer import write_dataset
 from simtest.dataset.verify import check_sample, verify
@@ -140,7 +139,7 @@ def stored_rough(made):
 
 def recoded(members, name, change):
     field = fields.BY_NAME[name]
-    return members | {field.suffix: field.encode(change(field.decode(members[field.suffix], {})))}
+    return members | {field.suffix: field.codec.encode(change(field.codec.decode(members[field.suffix], {})))}
 
 
 DAMAGE = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from simtest.calibration import Calibration, Frame, Priors, Response
-from simtest.dataset.sample import Sample
+from simtest.dataset.shard import Sample
 from simtest.estimators.learned_dense import (
     CAMERA,
     CELLS,

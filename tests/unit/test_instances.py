@@ -67,7 +67,7 @@ def test_the_lobe_at_a_point_is_what_a_ray_through_it_sees():
 
 def test_numbers_beyond_255_are_kept():
     field, numbers = BY_NAME["instance"], np.arange(600, dtype=np.int32).reshape(20, 30)
-    assert np.array_equal(field.decode(field.encode(numbers), {}), numbers)
+    assert np.array_equal(field.codec.decode(field.codec.encode(numbers), {}), numbers)
 
 
 def test_labels_do_not_hold_the_renderers_noise():

@@ -112,7 +112,7 @@ def test_webdataset_reads_the_shards(made):
     assert {row["__key__"] for row in rows} == set(ours)
     for row in rows:
         assert (np.asarray(Image.open(io.BytesIO(row["image.png"]))) == ours[row["__key__"]]["image"]).all()
-        normal = fields.BY_NAME["normal"].decode(row["normal.png"], {})
+        normal = fields.BY_NAME["normal"].codec.decode(row["normal.png"], {})
         assert np.array_equal(normal, ours[row["__key__"]]["normal"], equal_nan=True)
         visible = np.asarray(Image.open(io.BytesIO(row["visible.png"])))
         assert np.array_equal(visible, ours[row["__key__"]]["visible"])

@@ -6,7 +6,7 @@ import test_dense_inputs
 import torch
 from test_dense_inputs import LIGHTS, frame
 
-from simtest.dataset.sample import Sample
+from simtest.dataset.shard import Sample
 from simtest.estimators.learned_dense import (
     dense_inputs,
     output_centres,
