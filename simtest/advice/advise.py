@@ -2,7 +2,6 @@
 
 import math
 import shlex
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -36,11 +35,9 @@ from simtest.simulation.sensor import displayed
 from simtest.spec import Experiment, load_scene
 from simtest.spec.toml_files import toml_tables
 from simtest.validation import laws
-from simtest.validation.runner import run_experiments
+from simtest.validation.runner import Progress, run_experiments
 
 MAIN, SCENE, FRAME, RUN = "experiment.toml", "scene.toml", "frame.png", "run"
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)

@@ -203,7 +203,7 @@ def _shares_below(values: Array, at: Array) -> Array:
 # Frames ---------------------------------------------------------------------------------------------------------------
 
 Progress = Callable[[int, int, str], None]
-"""Called with frames measured, frames in all, and what is done; may raise to stop."""
+"""Called with how much is done, how much there is, and what is done now; may raise to stop."""
 
 Side = Literal["real", "generated"]
 

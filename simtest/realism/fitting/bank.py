@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ from pydantic import JsonValue
 
 from simtest.dataset.plan import Anatomy, Drawn, Plan
 from simtest.errors import InputError
+from simtest.realism.compare import Progress
 from simtest.realism.statistics import NAMES, measure, summarise
 from simtest.runtime.arrays import Array, Image, IntArray, only_reading
 from simtest.runtime.files import Json, make_folder, read_json, write_json
@@ -201,9 +202,6 @@ FRAMES_PER_ANATOMY = 5
 
 MADE_ANEW = ("surface.recipe", "surface.path", "reflectance.albedo")
 """Keys of which each value is another anatomy, or a pattern of its own, which takes as long."""
-
-Progress = Callable[[int, int, str], None]
-"""Called with what is done, how much there is, and what is done now; may raise to stop."""
 
 
 @dataclass(frozen=True)

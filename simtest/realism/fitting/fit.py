@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.realism.compare import plain
+from simtest.realism.compare import Progress, plain
 from simtest.realism.fitting.bank import (
     KNOWN,
     Bank,
     Parameter,
-    Progress,
     fitted_parameters,
     make_bank,
     missing_kinds,
