@@ -22,7 +22,7 @@ from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import key
 from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec.scene import Scene, load_scene, scene_from_dict
-from simtest.validation import relief_laws as laws
+from simtest.validation import laws
 from simtest.validation.scoring import match
 
 CURVED = {"plane": 0.0, "kd = 1": 1.0, "kd = -0.5": -0.5, "kd = 2": 2.0}

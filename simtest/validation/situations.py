@@ -26,45 +26,6 @@ from simtest.validation.cases import Case
 LOW_NOISE = 0.02
 """White noise up to this share of full scale is called low."""
 
-LOBES = {
-    "phong": "Phong lobe",
-    "rough_plastic": "rough plastic",
-    "principled": "principled lobe",
-    "rough_conductor": "rough conductor",
-    "tissue": "film over tissue",
-}
-"""Types of reflectance in words."""
-
-_PRESET = "stands for lights, which count themselves"
-_NUMBER = "in the number of lights and their offset, which the results tell"
-_TOLD_EMISSION = "told to the estimators, unless emission_known is false"
-
-DEGREES: dict[str, dict[str, str]] = {
-    "rig": {
-        **dict.fromkeys(("preset", "count", "radius_mm", "azimuth_deg", "axial_mm", "power", "each"), _PRESET),
-        "seed": "of position_error_mm",
-        **{f"lights.{key}": _NUMBER for key in ("position_mm", "offset_mm", "azimuth_deg")},
-        **{f"lights.{key}": _TOLD_EMISSION for key in ("colour", "profile", "direction", "spot_deg", "soft_edge_deg",
-                                                       "power")},
-    },
-    "reflectance": {
-        "colour": "of the diffuse base, which is a kind",
-        "albedo": "colour of the diffuse base, which is a kind",
-        "translucency": "of the diffuse base, which is a kind",
-        "specular": "scales the picture",
-        "normalised": "scales the picture",
-        "film": "its roughness is the half-width of the lobe, its level stands with the relief",
-    },
-    "sensor": {
-        "preset": "stands for other keys, which count themselves",
-        "vignetting": "taken out of the picture, unless vignetting_known is false",
-        "exposure": "scales the picture; what it clips is told by saturation",
-        "read_noise": "part of shot noise",
-        "seed": "of the noise",
-    },
-}  # fmt: skip
-"""Keys of a scene that set no situations apart, each with why; all others are kinds."""
-
 
 @dataclass(frozen=True)
 class Conditions:
@@ -122,7 +83,7 @@ def conditions(scene: Scene, drawn: Collection[str] = ()) -> Conditions:
     half_width = getattr(scene.reflectance, "half_width", None)
     return Conditions(
         _told(scene, drawn), _relief(scene), _sensor(scene), _render(scene), _camera(scene),
-        LOBES.get(scene.reflectance.type, scene.reflectance.type), _emission(scene),
+        scene.reflectance.in_words, _emission(scene),
         None if half_width is None else float(half_width), float(scene.camera.fx),
     )  # fmt: skip
 
