@@ -18,7 +18,7 @@ from simtest.errors import InputError
 from simtest.realism.fitting.bank import (
     Bank,
     FrameMaker,
-    Parameter,
+    RecipeParameter,
     count_made,
     fitted_parameters,
     make_bank,
@@ -38,7 +38,7 @@ FRAMES, MARGIN, WIDTH = 30, 0.15, 0.15
 SEED = 7000
 
 
-def planted(dataset: Dataset, parameters: list[Parameter], number: int) -> tuple[Dataset, Array]:
+def planted(dataset: Dataset, parameters: list[RecipeParameter], number: int) -> tuple[Dataset, Array]:
     """Return a planting's recipe and the middle of its ranges, shape (P,), shares of the recipe's."""
     middle = from_integer(SEED + number).uniform(MARGIN, 1 - MARGIN, len(parameters))
     recipe = narrowed(dataset, parameters, middle - WIDTH / 2, middle + WIDTH / 2)
@@ -48,7 +48,7 @@ def planted(dataset: Dataset, parameters: list[Parameter], number: int) -> tuple
     return recipe.model_copy(update={**update, "splits": Splits(train=1.0, validation=0.0, test=0.0)}), middle
 
 
-def frames(dataset: Dataset, parameters: list[Parameter], number: int, folder: Path) -> tuple[Array, Array]:
+def frames(dataset: Dataset, parameters: list[RecipeParameter], number: int, folder: Path) -> tuple[Array, Array]:
     """Return the summaries of a planting's frames, shape (30, S), and its truth; rendered where they are missing."""
     path = folder / f"planting_{number:02d}.json"
     recipe, middle = planted(dataset, parameters, number)
@@ -62,7 +62,7 @@ def frames(dataset: Dataset, parameters: list[Parameter], number: int, folder: P
     return np.array([[np.nan if v is None else v for v in row] for row in held], dtype=float), middle
 
 
-def coverage(dataset: Dataset, parameters: list[Parameter], bank: Bank, folder: Path, numbers: list[int]) -> None:
+def coverage(dataset: Dataset, parameters: list[RecipeParameter], bank: Bank, folder: Path, numbers: list[int]) -> None:
     """Fit each planting and print how many intervals hold the truth, how wide they are, and the errors of centres."""
     emulator = learn(bank, from_integer(SEED), REPEATS)
     held, widths, errors = [], [], []

@@ -10,9 +10,9 @@ import numpy as np
 
 from simtest.advice.answers import (
     WIDE,
+    Answers,
     BreakPoint,
     Choice,
-    Found,
     MethodAnswers,
     SpotSize,
     break_points,
@@ -45,7 +45,7 @@ class Advised:
     """What was found of a question."""
 
     question: Question
-    found: Found  # errors and answers in frames of the organ
+    answers: Answers  # errors and answers in frames of the organ
     breaks: list[BreakPoint]
     spots: SpotSize
     spot_radius_px: float | None  # median radius of the visible highlights that hold one glint alone, as rendered
@@ -62,7 +62,7 @@ class Advised:
             "bound_deg": asked.bound_deg, "seed": asked.seed,
         }  # fmt: skip
         spots = {**asdict(self.spots), "shapeless_beyond_mm": None if farthest == math.inf else farthest}
-        return {"question": question, "drawn": self.drawn, **self.found.to_json(),
+        return {"question": question, "drawn": self.drawn, **self.answers.to_json(),
                 "break_points": [asdict(each) for each in self.breaks],
                 "spot_radius": {**spots, "rendered_px": self.spot_radius_px},
                 "commands": self.commands}  # fmt: skip
@@ -95,8 +95,8 @@ def advise(question: Question, out: Path, progress: Progress | None = None, work
         "errors": shlex.join(["simtest", "validate", str(out / MAIN), "--out", str(out / RUN)]),
         "picture": shlex.join(["simtest", "render", str(out / SCENE), "--out", str(out / "frame")]),
     }
-    found = read_results(run.results, question.per_distance * DISTANCES)
-    return Advised(question, found, break_points(question), spot_size(question), radius, picture, commands,
+    answers = read_results(run.results, question.per_distance * DISTANCES)
+    return Advised(question, answers, break_points(question), spot_size(question), radius, picture, commands,
                    surroundings(question).random)  # fmt: skip
 
 
@@ -134,22 +134,22 @@ PICTURE_HEIGHT_PX = 480
 _SURFACES = {"fine": "the fine surface", "base": "the organ below its relief"}
 
 
-def write_advice(found: Advised, out: Path, command: str = "") -> Path:
+def write_advice(advised: Advised, out: Path, command: str = "") -> Path:
     """Write an advice, called by a command, into a folder: advice.json, figures and the page, which is returned."""
     make_folder(out / "figures")
-    chart = distance_chart(found)
+    chart = distance_chart(advised)
     _write(out / "figures" / "distance.png", png([chart]))
     about = provenance.environment()
     html = environment().get_template("advice.html.j2").render(
-        found=found, answers=[sentence(found, choice) for choice in found.found.choices] or [NOTHING],
-        chart=chart, picture=pixels.data_address(found.picture, PICTURE_HEIGHT_PX), command=command,
-        narrower=narrower(found, command), distances=DISTANCES,
+        advised=advised, sentences=[sentence(advised, choice) for choice in advised.answers.choices] or [NOTHING],
+        chart=chart, picture=pixels.data_address(advised.picture, PICTURE_HEIGHT_PX), command=command,
+        narrower=narrower(advised, command), distances=DISTANCES,
         interval=interval, surfaces=_SURFACES,
-        parts=list(dict.fromkeys(name for each in found.found.methods for name in each.budget_deg)),
+        parts=list(dict.fromkeys(name for each in advised.answers.methods for name in each.budget_deg)),
         provenance={"commit": about["commit"] or "–", "simtest": about["version"], "python": about["python"]},
         **embedded([chart]),
     )  # fmt: skip
-    write_json(out / RESULT, {**found.to_json(), "run": {"command": command, **about}})
+    write_json(out / RESULT, {**advised.to_json(), "run": {"command": command, **about}})
     write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
     return out / PAGE
 
@@ -157,30 +157,30 @@ def write_advice(found: Advised, out: Path, command: str = "") -> Path:
 NOTHING = "No highlight was found in the frames: there is nothing to compare the methods by."
 
 
-def sentence(found: Advised, choice: Choice) -> str:
+def sentence(advised: Advised, choice: Choice) -> str:
     """Return which method to use for a surface's normal, with the error to expect."""
     surface = _SURFACES[choice.target]
     if choice.best is None:
         return f"For the normal of {surface} no method answered."
-    method = found.found.method(choice.best)
+    method = advised.answers.method(choice.best)
     text = f"For the normal of {surface} use {choice.best}: mean error {number(method.own.mean_deg)} deg"
     text += f" (95 % interval {interval(method.own.interval_deg)}), {method.answered} of {method.asked} answered."
     if choice.ties:
         text += f" It cannot be told from {', '.join(choice.ties)}."
-    text += _nearer(found, method)
+    text += _nearer(advised, method)
     if method.own.is_wide:
-        text += f" The interval is wide: {_remedy(found, choice)}"
+        text += f" The interval is wide: {_remedy(advised, choice)}"
     return text
 
 
-def _nearer(found: Advised, best: MethodAnswers) -> str:
+def _nearer(advised: Advised, best: MethodAnswers) -> str:
     """Return a sentence if a method of the fine surface comes nearer to the base than the best of those that state it.
 
     Only methods that state the base's normal are ranked for it, however few answers they have.
     """
     if best.target == "fine" or best.own.mean_deg is None:
         return ""
-    others = [each for each in found.found.methods if each.target == "fine" and each.base.mean_deg is not None]
+    others = [each for each in advised.answers.methods if each.target == "fine" and each.base.mean_deg is not None]
     nearest = min(others, key=lambda each: each.base.mean_deg or 0.0, default=None)
     if nearest is None or (nearest.base.mean_deg or 0.0) >= best.own.mean_deg:
         return ""
@@ -190,18 +190,18 @@ def _nearer(found: Advised, best: MethodAnswers) -> str:
     )
 
 
-def _remedy(found: Advised, choice: Choice) -> str:
+def _remedy(advised: Advised, choice: Choice) -> str:
     """Return what makes the interval of a choice's error narrower."""
-    frames = frames_for(found, choice)
+    frames = frames_for(advised, choice)
     if frames is None or choice.best is None:
         return "more frames (--frames) make it narrower."
-    reach = 100 * (found.found.method(choice.best).own.reach or 0.0)
+    reach = 100 * (advised.answers.method(choice.best).own.reach or 0.0)
     return f"it reaches {reach:.0f} % from the mean; {frames} frames would narrow it to about {100 * WIDE:.0f} %."
 
 
-def narrower(found: Advised, command: str) -> str | None:
+def narrower(advised: Advised, command: str) -> str | None:
     """Return the command with the frames that narrow the first interval that is too wide; None where there is none."""
-    frames = next((frames for choice in found.found.choices if (frames := frames_for(found, choice))), None)
+    frames = next((frames for choice in advised.answers.choices if (frames := frames_for(advised, choice))), None)
     if frames is None or not command:
         return None
     words = shlex.split(command)
@@ -211,16 +211,16 @@ def narrower(found: Advised, command: str) -> str | None:
     return shlex.join([*(word for word in words if not word.startswith("--frames=")), "--frames", str(frames)])
 
 
-def frames_for(found: Advised, choice: Choice) -> int | None:
+def frames_for(advised: Advised, choice: Choice) -> int | None:
     """Return about how many frames narrow the interval of a choice's error to `WIDE`.
 
     The width of the mean's logarithm falls with the root of the number. None where the interval is narrow enough or
     unknown, or where so many frames are not allowed.
     """
-    reach = None if choice.best is None else found.found.method(choice.best).own.reach
+    reach = None if choice.best is None else advised.answers.method(choice.best).own.reach
     if reach is None or reach <= WIDE:
         return None
-    needed = math.ceil(found.found.frames * (math.log1p(reach) / math.log1p(WIDE)) ** 2 / DISTANCES) * DISTANCES
+    needed = math.ceil(advised.answers.frames * (math.log1p(reach) / math.log1p(WIDE)) ** 2 / DISTANCES) * DISTANCES
     return needed if needed <= MOST_ASKED else None
 
 
@@ -229,9 +229,9 @@ def interval(ends: Interval) -> str:
     return "–" if ends[0] is None else f"{number(ends[0])} to {number(ends[1])}"
 
 
-def distance_chart(found: Advised) -> Chart:
+def distance_chart(advised: Advised) -> Chart:
     """Describe the best methods' mean error over the distance, with the laws of the light's offset."""
-    asked = found.question
+    asked = advised.question
     near, far = asked.distances_mm
     at = np.geomspace(near / 1.3, far * 1.3, 60)
     offset = float(np.mean(asked.scope.offsets_mm))
@@ -246,7 +246,7 @@ def distance_chart(found: Advised) -> Chart:
         ]
     bound = f"bound, {asked.bound_deg:g} deg"
     marks.append(Mark([at[0], at[-1]], [asked.bound_deg] * 2, SERIES[5], bound, line="dashdot"))
-    for colour, choice in zip((SERIES[0], SERIES[3]), found.found.choices, strict=False):
+    for colour, choice in zip((SERIES[0], SERIES[3]), advised.answers.choices, strict=False):
         rows = [(d, each) for d, each in sorted(choice.by_distance.items()) if each.mean_deg is not None and d > 0]
         if not rows or choice.best is None:
             continue

@@ -94,8 +94,8 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Found:
-    """What was found in an advice's frames."""
+class Answers:
+    """What an advice's frames say."""
 
     frames: int
     visible: int  # visible highlights that stand above the noise; on a smooth surface all true ones
@@ -117,7 +117,7 @@ class Found:
         return record
 
 
-def read_results(results: pl.DataFrame, frames: int, distances: int = DISTANCES) -> Found:
+def read_results(results: pl.DataFrame, frames: int, distances: int = DISTANCES) -> Answers:
     """Read the results of an advice's experiment, of so many frames, as many at each of some distances."""
     rows = results if STRATUM in results.columns else results.with_columns(pl.lit(0.0).alias(STRATUM))
     rows = rows.with_columns(pl.format("{} mm", STRATUM).alias("setting"))
@@ -126,7 +126,7 @@ def read_results(results: pl.DataFrame, frames: int, distances: int = DISTANCES)
     visible, found, detections, false = _counted(rows.filter(pl.col("estimator") == single))
     # Not of the distances that have rows: one without a highlight has none.
     methods = [_answers(name, target, rows, frames // distances) for name, target in targets.items()]
-    return Found(frames, visible, found, detections, false, methods, _choices(rows))
+    return Answers(frames, visible, found, detections, false, methods, _choices(rows))
 
 
 def _counted(rows: pl.DataFrame) -> tuple[int, int, int, int]:

@@ -335,7 +335,7 @@ def advise(
     return Told([page], found.to_json, _advice(found))
 
 
-def _advice(found: "Advised") -> "Iterator[str | Table]":
+def _advice(advised: "Advised") -> "Iterator[str | Table]":
     from simtest.advice.advise import NOTHING, interval, sentence
     from simtest.advice.plan import DISTANCES
     from simtest.pages.style import number
@@ -343,15 +343,15 @@ def _advice(found: "Advised") -> "Iterator[str | Table]":
     rows = [
         (m.estimator, m.target, f"{m.answered} of {m.asked}", number(m.fine.mean_deg), interval(m.fine.interval_deg),
          number(m.base.mean_deg), interval(m.base.interval_deg))
-        for m in found.found.methods
+        for m in advised.answers.methods
     ]  # fmt: skip
     columns = ("method", "states", "answered", "error, fine", "95 % interval", "error, base", "95 % interval")
     yield Table(columns, rows)
-    yield f"{found.found.frames} frames, {found.question.per_distance} at each of {DISTANCES} distances"
+    yield f"{advised.answers.frames} frames, {advised.question.per_distance} at each of {DISTANCES} distances"
     breaks = [
         (b.title, b.method, f"{b.quantity} {number(b.value)} {b.unit}".strip(),
          "refuses" if b.expected is None else number(b.expected))
-        for b in found.breaks
+        for b in advised.breaks
     ]  # fmt: skip
     yield Table(("what breaks", "method", "at", "law, deg"), breaks)
-    yield from few([sentence(found, choice) for choice in found.found.choices] or [NOTHING])
+    yield from few([sentence(advised, choice) for choice in advised.answers.choices] or [NOTHING])

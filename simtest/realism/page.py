@@ -24,7 +24,7 @@ from simtest.realism.compare import (
     mean_distribution,
     plain,
 )
-from simtest.realism.statistics import STATISTICS, Column, Statistic
+from simtest.realism.statistics import STATISTICS, FrameColumn, Statistic
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array, Picture
 from simtest.runtime.files import make_folder, write_atomically, write_json
@@ -150,7 +150,7 @@ def distribution_charts(found: Comparison) -> list[Chart]:
     return [_distribution(found, statistic, column) for statistic in STATISTICS for column in statistic.columns]
 
 
-def _distribution(found: Comparison, statistic: Statistic, column: Column) -> Chart:
+def _distribution(found: Comparison, statistic: Statistic, column: FrameColumn) -> Chart:
     """Describe a column: distribution functions above, and boxes with points below."""
     sides: tuple[tuple[str, SetOfFrames, str, Line, float], ...] = (
         ("real", found.real, REAL, "solid", 1.0),

@@ -71,7 +71,7 @@ REDUCTIONS: dict[str, Callable[[Array], Any]] = {
 
 
 @dataclass(frozen=True)
-class Column:
+class FrameColumn:
     """Numbers of a frame: one, or one of each highlight."""
 
     name: str  # key of what `measure` returns
@@ -85,47 +85,52 @@ class Statistic:
 
     name: str
     title: str
-    columns: tuple[Column, ...]
+    columns: tuple[FrameColumn, ...]
 
 
 STATISTICS = (
     Statistic("count", "Number of highlights", (
-        Column("per_frame", "highlights in a frame", {"count": "log of count"}),
-        Column("per_megapixel", "highlights in a megapixel of the view"),
+        FrameColumn("per_frame", "highlights in a frame", {"count": "log of count"}),
+        FrameColumn("per_megapixel", "highlights in a megapixel of the view"),
     )),
     Statistic("radius", "Radius of highlights", (
-        Column("radius", "radius (share of the frame's width)",
-               {"radius": "mean of log", "radius spread": "spread of log"}),
+        FrameColumn("radius", "radius (share of the frame's width)",
+                    {"radius": "mean of log", "radius spread": "spread of log"}),
     )),
     Statistic("axis_ratio", "Axis ratio of highlights", (
-        Column("axis_ratio", "minor over major axis", {"axis ratio": "median"}),
+        FrameColumn("axis_ratio", "minor over major axis", {"axis ratio": "median"}),
     )),
     Statistic("clipped", "Clipped highlights", (
-        Column("clipped", "share of a frame's highlights", {"clipped": "value"}),
+        FrameColumn("clipped", "share of a frame's highlights", {"clipped": "value"}),
     )),
-    Statistic("area", "Area of highlights", (Column("area", "share of the view", {"area": "log of area"}),)),
+    Statistic("area", "Area of highlights", (FrameColumn("area", "share of the view", {"area": "log of area"}),)),
     Statistic("clustering", "Nearest highlight", (
-        Column("clustering", "distance (radii of the highlight)", {"clustering": "mean of log"}),
+        FrameColumn("clustering", "distance (radii of the highlight)", {"clustering": "mean of log"}),
     )),
     Statistic("halo", "Depth of halos", (
-        Column("halo", "luma of the surroundings less the halo's", {"halo": "median", "halo spread": "log of spread"}),
+        FrameColumn("halo", "luma of the surroundings less the halo's",
+                    {"halo": "median", "halo spread": "log of spread"}),
     )),
     Statistic("colour", "Colour of the tissue", (
-        Column("l_mean", "mean of L* (CIELAB)", {"lightness": "value"}),
-        Column("l_sd", "spread of L* (CIELAB)", {"lightness spread": "log"}),
-        Column("a_mean", "mean of a* (CIELAB)", {"red-green": "value"}),
-        Column("a_sd", "spread of a* (CIELAB)", {"red-green spread": "log"}),
-        Column("b_mean", "mean of b* (CIELAB)", {"yellow-blue": "value"}),
-        Column("b_sd", "spread of b* (CIELAB)", {"yellow-blue spread": "log"}),
+        FrameColumn("l_mean", "mean of L* (CIELAB)", {"lightness": "value"}),
+        FrameColumn("l_sd", "spread of L* (CIELAB)", {"lightness spread": "log"}),
+        FrameColumn("a_mean", "mean of a* (CIELAB)", {"red-green": "value"}),
+        FrameColumn("a_sd", "spread of a* (CIELAB)", {"red-green spread": "log"}),
+        FrameColumn("b_mean", "mean of b* (CIELAB)", {"yellow-blue": "value"}),
+        FrameColumn("b_sd", "spread of b* (CIELAB)", {"yellow-blue spread": "log"}),
     )),
     Statistic("falloff", "Brightness over image radius", (
-        Column("falloff", "log of linear light, corner less centre", {"falloff": "value"}),
+        FrameColumn("falloff", "log of linear light, corner less centre", {"falloff": "value"}),
     )),
     Statistic("spectrum", "Slope of the power spectrum", (
-        Column("spectrum", "log power over log frequency, 4 to 64 px", {"spectrum": "value"}),
+        FrameColumn("spectrum", "log power over log frequency, 4 to 64 px", {"spectrum": "value"}),
     )),
-    Statistic("vessels", "Contrast of vessels", (Column("vessels", "log of green over red", {"vessels": "log"}),)),
-    Statistic("noise", "Noise at mid grey", (Column("noise", "standard deviation of the luma", {"noise": "log"}),)),
+    Statistic("vessels", "Contrast of vessels", (
+        FrameColumn("vessels", "log of green over red", {"vessels": "log"}),
+    )),
+    Statistic("noise", "Noise at mid grey", (
+        FrameColumn("noise", "standard deviation of the luma", {"noise": "log"}),
+    )),
 )  # fmt: skip
 
 COLUMNS = tuple(column.name for statistic in STATISTICS for column in statistic.columns)

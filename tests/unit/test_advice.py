@@ -476,7 +476,7 @@ def test_a_wide_interval_names_the_frames_that_narrow_it(high, said):
     found = read_results(results([1.0, 1.2, 0.8, 1.0], [0, 1, 2, 3]), 8, 2)
     own = replace(found.method("cone_axis").fine, mean_deg=1.0, interval_deg=(0.5, high))
     found = replace(found, methods=[replace(found.method("cone_axis"), fine=own)])
-    advised = SimpleNamespace(found=found)
+    advised = SimpleNamespace(answers=found)
     text = sentence(advised, found.choices[0])
     assert ("wide" in text) == (said is not None)
     assert said is None or said in text
@@ -496,7 +496,7 @@ def test_the_best_for_the_base_is_compared_with_fine_normals(base_deg, said):
     near = replace(single, base=replace(single.fine, mean_deg=base_deg))
     cloud = replace(single, estimator="cloud", target="base", base=replace(single.fine, mean_deg=6.0))
     choice = replace(found.choices[0], target="base", best="cloud", ties=())
-    advised = SimpleNamespace(found=replace(found, methods=[near, cloud]))
+    advised = SimpleNamespace(answers=replace(found, methods=[near, cloud]))
     assert ("fine normals of cone_axis lie nearer to it: mean 2.5 deg, 4 of 4" in sentence(advised, choice)) == said
     assert "lie nearer" not in sentence(advised, found.choices[0])
 
@@ -514,12 +514,12 @@ def test_every_figure_runs_again_and_the_page_prints_how(tmp_path):
     # The command of the errors, with another folder: the same rows, so the same figures.
     run = simtest.validate(out / MAIN, tmp_path / "again")
     again = read_results(run.results, 8)
-    assert again == found.found
+    assert again == found.answers
     by_setting = run.summary["experiments"]["experiment"]["settings"]["plane"]
-    assert by_setting["curved"]["mean_deg"] == pytest.approx(found.found.method("curved").fine.mean_deg)
+    assert by_setting["curved"]["mean_deg"] == pytest.approx(found.answers.method("curved").fine.mean_deg)
     # A smooth plane under a light 2 mm beside the camera obeys the law of the offset.
     law = np.mean([math.degrees(math.atan(2.0 / d) / 2) for d in distances_of(found.question)])
-    assert found.found.method("cone_axis").fine.mean_deg == pytest.approx(law, rel=0.1)
+    assert found.answers.method("cone_axis").fine.mean_deg == pytest.approx(law, rel=0.1)
     assert len(record["break_points"]) == len(found.breaks) == page.count('<td class="text wrap-short">') / 2
     # Kept runs are not rendered anew.
     kept = (out / RUN / "results.parquet").stat().st_mtime_ns

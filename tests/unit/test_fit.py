@@ -15,7 +15,7 @@ from simtest.realism.fitting import bank as banks
 from simtest.realism.fitting import inference
 from simtest.realism.fitting.bank import (
     Bank,
-    Parameter,
+    RecipeParameter,
     count_made,
     fitted_parameters,
     make_bank,
@@ -58,7 +58,9 @@ def small():
 
 @given(st.floats(0.001, 100), st.floats(1.1, 50), st.booleans(), st.floats(0, 1))
 def test_shares_of_a_range_and_values_belong_together(low, factor, log, share):
-    parameter = Parameter("noise", "sensor.full_well", Distribution(low=low, high=low * factor, log=log), "per_sample")
+    parameter = RecipeParameter(
+        "noise", "sensor.full_well", Distribution(low=low, high=low * factor, log=log), "per_sample"
+    )
     value = float(parameter.from_unit(np.array(share)))
     assert low * (1 - 1e-9) <= value <= low * factor * (1 + 1e-9)
     assert float(parameter.to_unit(np.array(value))) == pytest.approx(share, abs=1e-6)

@@ -46,7 +46,7 @@ KNOWN: tuple[tuple[str, str, str], ...] = (
 
 
 @dataclass(frozen=True)
-class Parameter:
+class RecipeParameter:
     """A range of a recipe that is fitted."""
 
     kind: str  # what it is, one of `KNOWN`
@@ -82,13 +82,14 @@ def one_family(dataset: Dataset, scene: str | None = None) -> Dataset:
     return dataset.model_copy(update={"families": tuple(found)})
 
 
-def fitted_parameters(dataset: Dataset) -> list[Parameter]:
+def fitted_parameters(dataset: Dataset) -> list[RecipeParameter]:
     """Return the parameters of a recipe of one family, in the order of `KNOWN`, then by key."""
     family = dataset.families[0]
     tables = {"per_anatomy": family.per_anatomy, "per_sample": family.per_sample, "shared": dataset.per_sample}
     found = []
     for kind, pattern, _ in KNOWN:
-        ranges = [Parameter(kind, key, prior, name) for name, table in tables.items() for key, prior in table.items()
+        ranges = [RecipeParameter(kind, key, prior, name)
+                  for name, table in tables.items() for key, prior in table.items()
                   if re.fullmatch(pattern, key)]  # fmt: skip
         found += sorted(ranges, key=lambda one: one.key)
     # A choice has no width, and neither has a range of one value.
@@ -99,13 +100,13 @@ def fitted_parameters(dataset: Dataset) -> list[Parameter]:
     return wide
 
 
-def missing_kinds(parameters: list[Parameter]) -> list[str]:
+def missing_kinds(parameters: list[RecipeParameter]) -> list[str]:
     """Return the kinds of parameters that a recipe does not draw, and that no frames can tell of it."""
     drawn = {parameter.kind for parameter in parameters}
     return [kind for kind, _, _ in KNOWN if kind not in drawn]
 
 
-def narrowed(dataset: Dataset, parameters: list[Parameter], low: Array, high: Array) -> Dataset:
+def narrowed(dataset: Dataset, parameters: list[RecipeParameter], low: Array, high: Array) -> Dataset:
     """Return a recipe of one family whose ranges reach from `low` to `high`, shape (P,), shares of the prior's."""
     family = dataset.families[0]
     tables = {name: dict(getattr(family, name)) for name in ("per_anatomy", "per_sample")}
@@ -235,7 +236,7 @@ def bank_recipe(dataset: Dataset, size: int) -> Dataset:
 
 def make_bank(
     dataset: Dataset,
-    parameters: Sequence[Parameter],
+    parameters: Sequence[RecipeParameter],
     folder: Path,
     size: int,
     chains: int = CHAINS,
@@ -266,7 +267,7 @@ def count_made(folder: Path) -> int:
     return count
 
 
-def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
+def read_bank(folder: Path, size: int, parameters: Sequence[RecipeParameter]) -> Bank:
     """Read the first `size` radiances of a bank; those that could not be measured are left out."""
     shares, summaries, radiance, reason = [], [], [], ""
     for index in range(size):
@@ -289,7 +290,7 @@ def read_bank(folder: Path, size: int, parameters: Sequence[Parameter]) -> Bank:
     return Bank(np.array(shares), np.array(summaries, dtype=float), np.array(radiance))
 
 
-def _row(frame: DrawnFrame, parameters: Sequence[Parameter]) -> dict[str, Json]:
+def _row(frame: DrawnFrame, parameters: Sequence[RecipeParameter]) -> dict[str, Json]:
     """Return what is kept of a picture."""
     try:
         told: Sequence[float] = summarise(measure(frame.picture)).tolist()

@@ -13,7 +13,7 @@ from simtest.realism.compare import Progress, plain
 from simtest.realism.fitting.bank import (
     KNOWN,
     Bank,
-    Parameter,
+    RecipeParameter,
     fitted_parameters,
     make_bank,
     missing_kinds,
@@ -45,7 +45,7 @@ class FittedRecipe:
     """What a fit found."""
 
     recipe: Dataset  # with its ranges narrowed to the fitted distribution
-    parameters: list[Parameter]  # what was fitted, with the ranges before
+    parameters: list[RecipeParameter]  # what was fitted, with the ranges before
     fitted: Fitted  # as shares of these
     emulator: Emulator
     bank: Bank  # frames over the whole ranges
@@ -135,7 +135,7 @@ def fit(
 def fit_to_bank(
     seen: Seen,
     dataset: Dataset,
-    parameters: list[Parameter],
+    parameters: list[RecipeParameter],
     bank: Bank,
     seed: int = 0,
     progress: Progress | None = None,
