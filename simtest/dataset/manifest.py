@@ -48,27 +48,13 @@ Files = dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,200}$"
 
 
 class Manifest(BaseModel):
-    """Record of a dataset's folder, updated as files are finished.
+    """Record of a dataset's folder, updated as files are finished."""
 
-    Parameters
-    ----------
-    dataset : dict
-        The whole specification, as JSON.
-    origin : Origin
-        Versions, source, variant and hashes of the inputs.
-    environment : dict
-        Commit, Python and processor.
-    shards : dict
-        Finished shards by name.
-    tables : dict
-        Finished tables and card by name; there once all shards are.
-    """
-
-    dataset: dict[str, JsonValue]
-    origin: Origin
-    environment: dict[str, str | None]
-    shards: Files
-    tables: Files
+    dataset: dict[str, JsonValue]  # the whole specification, as JSON
+    origin: Origin  # versions, source, variant and hashes of the inputs
+    environment: dict[str, str | None]  # commit, Python and processor
+    shards: Files  # finished shards by name
+    tables: Files  # finished tables and card by name; there once all shards are
 
     def save(self, folder: Path) -> None:
         """Write the manifest, with a digest of its own content."""
