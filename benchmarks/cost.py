@@ -188,7 +188,9 @@ def _booking(plan: Plan, folder: Path) -> tuple[float, float]:
     manifest = new_manifest(plan, "any")
     counts, times = (1, 20_000), []
     for count in counts:
-        manifest.shards = {f"train-{number:06d}.tar": FileEntry(2**28, "0" * 64) for number in range(count)}
+        manifest.shards = {
+            f"train-{number:06d}.tar": FileEntry(bytes=2**28, sha256="0" * 64) for number in range(count)
+        }
         times.append(_booked(manifest, folder))
     each = (times[1] - times[0]) / (counts[1] - counts[0])
     return times[0], each

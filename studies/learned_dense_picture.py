@@ -17,6 +17,7 @@ from simtest.dataset.shard import Sample
 from simtest.errors import Failure
 from simtest.estimators.learned_dense import LearnedDense
 from simtest.geometry.vectors import angle_deg
+from simtest.pages.pixels import normal_colours
 from simtest.runtime.arrays import Array, Picture
 from studies.networks.examples import DENSE_FIELDS, sample_frame
 
@@ -25,7 +26,6 @@ HEAD_PX, GAP_PX, QUALITY = 24, 4, 85
 ERROR_END_DEG, DEVIATION_END_DEG = 30.0, 30.0
 HEADS = ("frame", "true normal, base", "estimated", f"error, 0 to {ERROR_END_DEG:g} deg",
          f"stated deviation, 0 to {DEVIATION_END_DEG:g} deg")  # fmt: skip
-TO_VIEWER = np.array([1.0, -1.0, -1.0])
 EMPTY = (60, 64, 70)
 
 
@@ -56,17 +56,10 @@ def _panels(sample: Sample, estimator: LearnedDense) -> Iterator[Picture]:
         f"sample {sample.index}: median error {np.nanmedian(error):.1f} deg, stated {np.nanmedian(deviation):.1f} deg"
     )
     yield _small(sample.images["image"])
-    yield _small(_directions(true))
-    yield _small(_directions(maps.normal.astype(float)))
+    yield _small(normal_colours(true, EMPTY))
+    yield _small(normal_colours(maps.normal.astype(float), EMPTY))
     yield _small(_shares(error / ERROR_END_DEG))
     yield _small(_shares(deviation / DEVIATION_END_DEG))
-
-
-def _directions(normal: Array) -> Picture:
-    """Return normals as colours: red right, green up, blue towards the camera."""
-    colours = np.rint(127.5 * (1 + np.nan_to_num(normal) * TO_VIEWER)).astype(np.uint8)
-    colours[~np.isfinite(normal).all(axis=-1)] = EMPTY
-    return colours
 
 
 def _shares(values: Array) -> Picture:

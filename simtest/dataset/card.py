@@ -21,7 +21,7 @@ from simtest.pages import style
 from simtest.pages.charts import Axis, Chart, Mark, Panel, embedded
 from simtest.pages.html import environment
 from simtest.pages.markdown import escaped, paragraphs, yaml_string
-from simtest.pages.pixels import jpeg_address
+from simtest.pages.pixels import jpeg_address, normal_colours
 from simtest.runtime.arrays import AnyArray
 from simtest.runtime.files import write_atomically
 from simtest.spec.recipes import Distribution
@@ -148,7 +148,7 @@ def _card(sample: Sample) -> tuple[str, str, list[tuple[str, str]]]:
     isolated = [highlight for highlight in meta["highlights"] if highlight["isolated"]]
     base = []
     if has_relief(meta):
-        base = [("normal of the base, without the relief", _data_url(_normal_colours(images["normal_base"])))]
+        base = [("normal of the base, without the relief", _data_url(normal_colours(images["normal_base"])))]
     if meta.get("instrument_share"):
         base.append(("instruments, by number", _data_url(_instrument_colours(images["instrument"]))))
     drawn = ", ".join(f"{key} = {_short(value)}" for key, value in sorted(meta["drawn"].items()))
@@ -157,7 +157,7 @@ def _card(sample: Sample) -> tuple[str, str, list[tuple[str, str]]]:
         f"{len(isolated)} isolated of {len(meta['highlights'])} highlights; {drawn}",
         [
             ("frame, isolated highlights outlined", _data_url(_outlined(images["image"], images["instance"]))),
-            ("normal, as colour (x, y, z)", _data_url(_normal_colours(images["normal"]))),
+            ("normal, as colour (x, y, z)", _data_url(normal_colours(images["normal"]))),
             *base,
             ("depth, near is bright", _data_url(_depth_colours(images["depth"]))),
             (
@@ -178,11 +178,6 @@ def _outlined(image: AnyArray, instance: AnyArray) -> AnyArray:
     contours, _ = cv2.findContours(regions, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(image, contours, -1, _HIGHLIGHT_COLOUR, max(1, image.shape[1] // WIDTH))
     return image
-
-
-def _normal_colours(normal: AnyArray) -> AnyArray:
-    colours = np.rint(127.5 * (1 + normal * np.array([1, -1, -1])))
-    return np.nan_to_num(colours, nan=0.0).astype(np.uint8)
 
 
 def _instrument_colours(instrument: AnyArray) -> AnyArray:

@@ -14,8 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from pydantic import TypeAdapter, ValidationError
-from typing_extensions import TypedDict
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from simtest.dataset.scoring.frames import (
     ExportedFrame,
@@ -56,31 +55,34 @@ README = "README.md"
 NAME_DIGITS = 16
 
 
-class Detected(TypedDict):
-    """A detection: its peak, px, and its box: column, row, width, height."""
+class WrittenFrame(BaseModel):
+    """A frame that has been written: its picture, the table of its camera, and what the run's record keeps of it."""
 
-    peak_px: tuple[float, float]
-    box: tuple[int, int, int, int]
-
-
-class Exported(TypedDict):
-    """A frame that has been written, and what it shows."""
-
-    frame: str
-    sha256: str
     file: str
     width: int
     height: int
     channels: int
-    camera: str
     table: dict[str, Any]
-    detections: list[Detected]
-    case: int
-    setting: str
-    realisation: int
+    kept: ExportedFrame
+    use: Use
+
+    @property
+    def name(self) -> str:
+        """Name of the frame."""
+        return self.use.frame
+
+    @property
+    def preview(self) -> str:
+        """File of its preview."""
+        return f"{PREVIEWS}/{self.name}.png"
+
+    @property
+    def files(self) -> tuple[str, str, str]:
+        """Its files in the export."""
+        return self.file, self.preview, self.kept.camera
 
 
-_EXPORTED = TypeAdapter(list[Exported])
+_WRITTEN = TypeAdapter(list[WrittenFrame])
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ def _export(
     return out / README
 
 
-def _write_frames(source: Source, out: Path, engine: Engine, progress: Progress | None) -> list[Exported]:
+def _write_frames(source: Source, out: Path, engine: Engine, progress: Progress | None) -> list[WrittenFrame]:
     """Write what is missing of frames, previews and cameras; return all frames in the order of cases and realisations.
 
     Each task lists what it has written, so that a stopped export goes on.
@@ -182,33 +184,32 @@ def _write_frames(source: Source, out: Path, engine: Engine, progress: Progress 
     return [each for _, made in sorted(done.items()) for each in made]
 
 
-def _written(part: ExportPart) -> list[Exported] | None:
+def _written(part: ExportPart) -> list[WrittenFrame] | None:
     """Return the frames that a stopped export has written of a part; None where some are missing."""
     try:
-        made = _EXPORTED.validate_json(part.kept.read_bytes())
+        made = _WRITTEN.validate_json(part.kept.read_bytes())
     except (OSError, ValidationError):
         return None
-    files = {part.out / path for each in made for path in (each["file"], _preview_of(each), each["camera"])}
+    files = {part.out / path for each in made for path in each.files}
     return made if all(file.is_file() for file in files) else None
 
 
-def _preview_of(frame: Exported) -> str:
-    return f"{PREVIEWS}/{frame['frame']}.png"
-
-
-def _write_tables(out: Path, made: Sequence[Exported]) -> None:
+def _write_tables(out: Path, made: Sequence[WrittenFrame]) -> None:
     """Write frames.csv, highlights.csv and the README; remove frames of an earlier export.
 
     Frames stand in the order of their names, which are hashes, so that the order tells nothing.
     """
-    by_name = {each["frame"]: each for each in made}
-    frames = {name: by_name[name] for name in sorted(by_name)}
-    listed: list[Sequence[object]] = []
-    found: list[Sequence[object]] = []
-    for name, f in frames.items():
-        listed.append((name, f["file"], _preview_of(f), f["width"], f["height"], f["channels"], f["camera"]))
-        found += [(name, number, *each["peak_px"], *each["box"]) for number, each in enumerate(f["detections"])]
-    own = {path for f in frames.values() for path in (f["file"], _preview_of(f), f["camera"])}
+    frames = sorted({each.name: each for each in made}.items())
+    listed: list[Sequence[object]] = [
+        (name, each.file, each.preview, each.width, each.height, each.channels, each.kept.camera)
+        for name, each in frames
+    ]
+    found: list[Sequence[object]] = [
+        (name, number, *peak, *box)
+        for name, each in frames
+        for number, (peak, box) in enumerate(zip(each.kept.peaks, each.kept.boxes, strict=True))
+    ]
+    own = {path for _, each in frames for path in each.files}
     for name in (FRAMES, PREVIEWS, CAMERAS):
         for path in (out / name).iterdir():
             if f"{name}/{path.name}" not in own:
@@ -243,20 +244,7 @@ def _csv(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     return text.getvalue()
 
 
-def _write_record(source: Source, experiment: dict[str, Any], made: Sequence[Exported]) -> None:
-    frames = {
-        each["frame"]: ExportedFrame(
-            sha256=each["sha256"],
-            camera=each["camera"],
-            peaks=tuple(detected["peak_px"] for detected in each["detections"]),
-            boxes=tuple(detected["box"] for detected in each["detections"]),
-        )
-        for each in made
-    }
-    uses = tuple(
-        Use(frame=each["frame"], case=each["case"], setting=each["setting"], realisation=each["realisation"])
-        for each in made
-    )
+def _write_record(source: Source, experiment: dict[str, Any], made: Sequence[WrittenFrame]) -> None:
     Record(
         kind=source.kind,
         version=source.version,
@@ -264,9 +252,9 @@ def _write_record(source: Source, experiment: dict[str, Any], made: Sequence[Exp
         definition=source.definition,
         variant=source.variant,
         experiment=experiment,
-        cameras={each["camera"]: each["table"] for each in made},
-        frames=frames,
-        uses=uses,
+        cameras={each.kept.camera: each.table for each in made},
+        frames={each.name: each.kept for each in made},
+        uses=tuple(each.use for each in made),
     ).write(source.folder)
 
 
@@ -291,17 +279,17 @@ def _check_folder(out: Path, option: str) -> None:
 # In a worker --------------------------------------------------------------------------------------------------------
 
 
-def write_part(part: ExportPart, on_step: OnStep) -> list[Exported]:
+def write_part(part: ExportPart, on_step: OnStep) -> list[WrittenFrame]:
     """Write the frames of a part, each with its preview and camera; call `on_step` after each."""
     made = []
     for each in part.frames:
         made.append(_write_frame(each, part.out))
         on_step()
-    write_json(part.kept, made, compact=True)
+    write_json(part.kept, [each.model_dump(mode="json") for each in made], compact=True)
     return made
 
 
-def _write_frame(each: RenderedFrame, out: Path) -> Exported:
+def _write_frame(each: RenderedFrame, out: Path) -> WrittenFrame:
     """Write a frame, its preview and its camera."""
     image, sensor, told = each.image, each.sensor, each.view.calibration
     calibration = calibration_toml(told)
@@ -312,18 +300,22 @@ def _write_frame(each: RenderedFrame, out: Path) -> Exported:
     write_atomically(out / file, lambda part: part.write_bytes(data))
     write_atomically(out / PREVIEWS / f"{name}.png", lambda part: part.write_bytes(bytes(small)))
     _write_text(out / camera, calibration)
-    detections: list[Detected] = []
-    for found in each.detections():
-        x, y = peak_px(found).tolist()
-        left, top, width, height = found.region.box
-        detections.append({"peak_px": (x, y), "box": (int(left), int(top), int(width), int(height))})
+    detections = each.detections()
     height, width = image.shape[:2]
-    return {
-        "frame": name, "sha256": image_hash(image), "file": file, "width": width, "height": height,
-        "channels": 1 if image.ndim == 2 else image.shape[2], "camera": camera,
-        "table": json.loads(json.dumps(camera_table(told.camera))), "detections": detections,
-        "case": each.case, "setting": each.setting, "realisation": each.realisation,
-    }  # fmt: skip
+    return WrittenFrame(
+        file=file,
+        width=width,
+        height=height,
+        channels=1 if image.ndim == 2 else image.shape[2],
+        table=json.loads(json.dumps(camera_table(told.camera))),
+        kept=ExportedFrame(
+            sha256=image_hash(image),
+            camera=camera,
+            peaks=tuple(peak_px(found).tolist() for found in detections),
+            boxes=tuple(tuple(map(int, found.region.box)) for found in detections),
+        ),
+        use=Use(frame=name, case=each.case, setting=each.setting, realisation=each.realisation),
+    )
 
 
 def frame_name(image: Image, calibration: str, isolated: bool) -> str:

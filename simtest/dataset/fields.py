@@ -29,52 +29,29 @@ OFFSET = 32768
 
 @dataclass(frozen=True)
 class Codec:
-    """How an image is held by a shard's member.
+    """How an image is held by a shard's member."""
 
-    Parameters
-    ----------
-    text : str
-        How a reader without this package decodes it.
-    encode : callable
-        Array to bytes.
-    decode : callable
-        Bytes and the sample's metadata to the array.
-    """
-
-    text: str
-    encode: Callable[[AnyArray], bytes]
-    decode: Callable[[bytes, SampleMeta], AnyArray]
+    text: str  # how a reader without this package decodes it
+    encode: Callable[[AnyArray], bytes]  # array to bytes
+    decode: Callable[[bytes, SampleMeta], AnyArray]  # bytes and the sample's metadata to the array
 
 
 @dataclass(frozen=True)
 class Field:
-    """One image of a sample.
+    """One image of a sample."""
 
-    Parameters
-    ----------
-    name, shape, dtype, unit : str
-        Of the decoded array.
-    suffix : str
-        Of the member in the shard, after the sample's key.
-    meaning : str
-        What it holds, with frame and sign.
-    codec : Codec
-        How the member holds it.
-    stored : str
-        Which samples store it: all, those with a relief or with listed instruments, or those of datasets that ask for
-        it, by a key of its name.
-    otherwise : str or int, optional
-        What it is where that says no: the field of this name, or this number everywhere.
-    """
-
+    # of the decoded array
     name: str
-    suffix: str
+    suffix: str  # of the member in the shard, after the sample's key
     shape: str
     dtype: str
     unit: str
-    meaning: str
-    codec: Codec
+    meaning: str  # what it holds, with frame and sign
+    codec: Codec  # how the member holds it
+    # which samples store it: all, those with a relief or with listed instruments, or those of datasets that ask for it,
+    # by a key of its name
     stored: Literal["always", "relief", "instruments", "asked"] = "always"
+    # what it is where that says no: the field of this name, or this number everywhere
     otherwise: str | int | None = None
 
     def is_required(self, meta: SampleMeta) -> bool:

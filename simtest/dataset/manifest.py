@@ -2,12 +2,11 @@
 
 import hashlib
 import json
-import re
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Annotated, Any
 
-from pydantic import JsonValue
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, StrictInt
+from typing_extensions import TypedDict
 
 from simtest.dataset.plan import Plan
 from simtest.errors import InputError
@@ -19,7 +18,6 @@ from simtest.spec.spec_model import validate
 
 NAME = "manifest.json"
 FORMAT = "simtest dataset, version 2"
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,200}")
 
 
 class ManifestError(Exception):
@@ -35,49 +33,33 @@ class Origin(TypedDict):
     inputs: dict[str, str]
 
 
-@dataclass(frozen=True)
-class FileEntry:
+class FileEntry(BaseModel):
     """A finished file: its size in bytes, and the SHA-256 of its content."""
 
-    bytes: int
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    bytes: StrictInt
     sha256: str
 
 
-@dataclass
-class Manifest:
-    """Record of a dataset's folder, updated as files are finished.
+# Whoever writes a manifest can write its digest too, so what it lists is not trusted: a name that leaves the folder is
+# never opened.
+Files = dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,200}$")], FileEntry]
 
-    Parameters
-    ----------
-    dataset : dict
-        The whole specification, as JSON.
-    origin : Origin
-        Versions, source, variant and hashes of the inputs.
-    environment : dict
-        Commit, Python and processor.
-    shards : dict
-        Finished shards by name.
-    tables : dict
-        Finished tables and card by name; there once all shards are.
-    """
 
-    dataset: dict[str, JsonValue]
-    origin: Origin
-    environment: dict[str, str | None]
-    shards: dict[str, FileEntry] = field(default_factory=dict)
-    tables: dict[str, FileEntry] = field(default_factory=dict)
+class Manifest(BaseModel):
+    """Record of a dataset's folder, updated as files are finished."""
+
+    dataset: dict[str, JsonValue]  # the whole specification, as JSON
+    origin: Origin  # versions, source, variant and hashes of the inputs
+    environment: dict[str, str | None]  # commit, Python and processor
+    shards: Files  # finished shards by name
+    tables: Files  # finished tables and card by name; there once all shards are
 
     def save(self, folder: Path) -> None:
         """Write the manifest, with a digest of its own content."""
-        content = {
-            "format": FORMAT,
-            "complete": bool(self.tables),
-            "dataset": self.dataset,
-            "origin": self.origin,
-            "environment": self.environment,
-            "shards": {name: vars(self.shards[name]) for name in sorted(self.shards)},
-            "tables": {name: vars(self.tables[name]) for name in sorted(self.tables)},
-        }
+        content = {"format": FORMAT, "complete": bool(self.tables), **self.model_dump()}
+        content |= {key: dict(sorted(content[key].items())) for key in ("shards", "tables")}
         write_json(folder / NAME, {**content, "digest": _digest(content)})
 
     def plan(self) -> Plan:
@@ -95,7 +77,9 @@ def new_manifest(plan: Plan, variant: str) -> Manifest:
     }
     found = provenance.environment()
     environment = {name: found[name] for name in ("commit", "python", "processor", "system")}
-    return Manifest(plan.dataset.model_dump(mode="json"), origin, environment)
+    return Manifest(
+        dataset=plan.dataset.model_dump(mode="json"), origin=origin, environment=environment, shards={}, tables={}
+    )
 
 
 def _input_hashes(plan: Plan) -> dict[str, str]:
@@ -134,34 +118,10 @@ def read_manifest(folder: Path) -> Manifest:
         raise ManifestError(f"{NAME}: is no manifest of the form {FORMAT!r}")
     if content.pop("digest", None) != _digest(content):
         raise ManifestError(f"{NAME}: was changed; its digest does not fit")
-    for key in ("dataset", "origin", "environment"):
-        if not isinstance(content.get(key), dict):
-            raise ManifestError(f"{NAME}: {key} must be a table")
-    return Manifest(
-        content["dataset"],
-        content["origin"],
-        content["environment"],
-        _entries(content, "shards"),
-        _entries(content, "tables"),
-    )
-
-
-def _entries(content: dict[str, Any], key: str) -> dict[str, FileEntry]:
-    """Return the listed files; raise `ManifestError` where one is malformed or lies outside the folder.
-
-    Whoever writes a manifest can write its digest too, so what it lists is not trusted: a name that leaves the folder
-    is never opened.
-    """
-    listed = content.get(key)
-    if not isinstance(listed, dict):
-        raise ManifestError(f"{NAME}: {key} must be a table of files")
-    for name, entry in listed.items():
-        if not _PLAIN_NAME.fullmatch(name):
-            raise ManifestError(f"{NAME}: {key} lists {name}; must be a file's name inside the folder")
-        sound = isinstance(entry, dict) and entry.keys() == {"bytes", "sha256"}
-        if not (sound and type(entry["bytes"]) is int and isinstance(entry["sha256"], str)):
-            raise ManifestError(f"{NAME}: {key}.{name} must hold bytes, an integer, and sha256, a text")
-    return {name: FileEntry(**entry) for name, entry in listed.items()}
+    try:
+        return validate(Manifest, {key: value for key, value in content.items() if key in Manifest.model_fields}, NAME)
+    except InputError as error:
+        raise ManifestError(str(error)) from None
 
 
 def _digest(content: Any) -> str:
@@ -199,4 +159,4 @@ def _first_difference(old: Any, new: Any, path: str = "") -> tuple[str, Any, Any
 
 def file_entry(path: Path) -> FileEntry:
     """Describe a finished file."""
-    return FileEntry(path.stat().st_size, provenance.file_hash(path))
+    return FileEntry(bytes=path.stat().st_size, sha256=provenance.file_hash(path))

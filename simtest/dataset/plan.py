@@ -35,40 +35,20 @@ RADIANCE_BYTES_PER_PIXEL = 6.0
 
 @dataclass(frozen=True)
 class Anatomy:
-    """One anatomy.
+    """One anatomy."""
 
-    Parameters
-    ----------
-    family : int
-        Index of its family.
-    number : int
-        Index among the family's anatomies.
-    seed : int or None
-        surface.seed; None if the family has only that of the scene.
-    """
-
-    family: int
-    number: int
-    seed: int | None
+    family: int  # index of its family
+    number: int  # index among the family's anatomies
+    seed: int | None  # surface.seed; None if the family has only that of the scene
 
 
 @dataclass(frozen=True)
 class Shard:
-    """Samples of one file.
+    """Samples of one file."""
 
-    Parameters
-    ----------
-    split : str
-        train, validation or test.
-    number : int
-        Index among the split's shards.
-    indices : tuple of int
-        Samples, in rising order.
-    """
-
-    split: str
-    number: int
-    indices: tuple[int, ...]
+    split: str  # train, validation or test
+    number: int  # index among the split's shards
+    indices: tuple[int, ...]  # samples, in rising order
 
     @property
     def name(self) -> str:
@@ -78,21 +58,11 @@ class Shard:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Scene drawn for a sample.
+    """Scene drawn for a sample."""
 
-    Parameters
-    ----------
-    scene : Scene
-        With seeds of noise and bounces.
-    anatomy : Anatomy
-        Its anatomy.
-    values : dict
-        Drawn values by key path.
-    """
-
-    scene: Scene
+    scene: Scene  # with seeds of noise and bounces
     anatomy: Anatomy
-    values: dict[str, JsonValue]
+    values: dict[str, JsonValue]  # drawn values by key path
 
 
 class Plan:

@@ -32,6 +32,13 @@ def displayed(frame: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return np.asarray(np.nan_to_num(np.clip(frame, 0, 1)) ** np.float32(1 / GAMMA))
 
 
+def normal_colours(normal: Array, unknown: tuple[int, int, int] = (0, 0, 0)) -> Pixels:
+    """Return normals, camera frame, shape (H, W, 3), as colours: red right, green up, blue towards the camera."""
+    colours = np.rint(127.5 * (1 + np.nan_to_num(normal) * [1.0, -1.0, -1.0])).astype(np.uint8)
+    colours[~np.isfinite(normal).all(axis=-1)] = unknown
+    return colours
+
+
 class Canvas:
     """A part of a frame, enlarged, RGB. All points are pixel coordinates of the frame, shape (n, 2) or (2,).
 

@@ -34,21 +34,11 @@ _TAKEN = Failure(Reason.NO_ESTIMATE, "a row names this detection")
 
 @dataclass(frozen=True)
 class Answer:
-    """One row of a table of answers.
+    """One row of a table of answers."""
 
-    Parameters
-    ----------
-    result : Estimate or Failure
-        The normal, or why there is none.
-    point_px : ndarray, shape (2,)
-        Pixel that is answered for.
-    specularity : int, optional
-        Number of the detection in highlights.csv; without it the pixel decides.
-    """
-
-    result: Estimate | Failure
-    point_px: Array
-    specularity: int | None = None
+    result: Estimate | Failure  # the normal, or why there is none
+    point_px: Array  # pixel that is answered for, shape (2,)
+    specularity: int | None = None  # number of the detection in highlights.csv; without it the pixel decides
 
 
 @dataclass(frozen=True)

@@ -73,42 +73,19 @@ class Use(_Model):
 
 
 class Record(_Model):
-    """Content of export.json.
-
-    Parameters
-    ----------
-    format : str
-        Of this file.
-    kind : {"run", "dataset"}
-        What the frames are of.
-    version : str
-        Of simtest.
-    fingerprint : str
-        Of the run whose folder this is; of a dataset its manifest's source.
-    definition : str
-        Hash of the experiment and its scenes; of a dataset that of its specification.
-    variant : str
-        Of Mitsuba.
-    experiment : dict
-        The experiment, with all values that the command replaced; empty for a dataset, whose manifest has it.
-    cameras : dict
-        Table of each camera, by name.
-    frames : dict
-        By name.
-    uses : tuple of Use
-        In the order of cases and realisations.
-    """
+    """Content of export.json."""
 
     format: Format = FORMAT
-    kind: Literal["run", "dataset"]
-    version: str
-    fingerprint: str
-    definition: str
-    variant: str
+    kind: Literal["run", "dataset"]  # what the frames are of
+    version: str  # of simtest
+    fingerprint: str  # of the run whose folder this is; of a dataset its manifest's source
+    definition: str  # hash of the experiment and its scenes; of a dataset that of its specification
+    variant: str  # of Mitsuba
+    # the experiment, with all values that the command replaced; empty for a dataset, whose manifest has it
     experiment: dict[str, JsonValue]
-    cameras: dict[str, dict[str, JsonValue]]
-    frames: dict[str, ExportedFrame]
-    uses: tuple[Use, ...]
+    cameras: dict[str, dict[str, JsonValue]]  # table of each camera, by name
+    frames: dict[str, ExportedFrame]  # by name
+    uses: tuple[Use, ...]  # in the order of cases and realisations
 
     @model_validator(mode="after")
     def _is_whole(self) -> "Record":
@@ -172,46 +149,21 @@ def image_hash(image: Image) -> str:
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """One frame, with the view that it is of.
+    """One frame, with the view that it is of."""
 
-    Parameters
-    ----------
-    case, realisation : int
-        Index of the experiment's case and number of the realisation; of a dataset 0 and the sample's index.
-    seed : int
-        Of the frame's noise.
-    view : RenderedView
-        The rendered scene: truth, true highlights, calibration.
-    session : Session
-        At the scene, until the next frame is taken.
-    setting : str
-        Of the experiment; of a dataset the split.
-    swept : mapping
-        Swept, pooled and drawn values by key path.
-    image : ndarray of float32, shape (H, W) or (H, W, 3)
-        The frame as the estimators see it.
-    sensor : Sensor
-        The sensor as whose values it is encoded.
-    isolated : bool
-        Whether isolated highlights alone are detected and counted.
-    anatomy : str
-        Name of the dataset's anatomy that it shows; empty in a run.
-    name : str
-        As in frames.csv, where it was exported.
-    """
-
+    # index of the experiment's case and number of the realisation; of a dataset 0 and the sample's index
     case: int
     realisation: int
-    seed: int
-    view: RenderedView
-    session: Session
-    setting: str
-    swept: Mapping[str, Value]
-    image: Image
-    sensor: Sensor
-    isolated: bool = True
-    anatomy: str = ""
-    name: str = ""
+    seed: int  # of the frame's noise
+    view: RenderedView  # the rendered scene: truth, true highlights, calibration
+    session: Session  # at the scene, until the next frame is taken
+    setting: str  # of the experiment; of a dataset the split
+    swept: Mapping[str, Value]  # swept, pooled and drawn values by key path
+    image: Image  # the frame as the estimators see it, float32, shape (H, W) or (H, W, 3)
+    sensor: Sensor  # the sensor as whose values it is encoded
+    isolated: bool = True  # whether isolated highlights alone are detected and counted
+    anatomy: str = ""  # name of the dataset's anatomy that it shows; empty in a run
+    name: str = ""  # as in frames.csv, where it was exported
 
     def detections(self) -> Sequence[Specularity]:
         """Detect the frame's highlights as a run does, without any estimator; none where no light reaches it."""
@@ -332,30 +284,17 @@ def frames_of_cases(experiment: Experiment, cases: Sequence[Case], variant: str)
 
 @dataclass(frozen=True)
 class Source:
-    """A run or dataset whose frames can be rendered again.
+    """A run or dataset whose frames can be rendered again."""
 
-    Parameters
-    ----------
-    folder : Path
-        Of the run or dataset.
-    parts : sequence of Frames
-        All frames.
-    kind : {"run", "dataset"}
-        What it is.
-    version, fingerprint, definition, variant : str
-        As in `Record`.
-    recipe : Experiment or Dataset
-        What was run or made; of an experiment with its `cases`.
-    """
-
-    folder: Path
+    folder: Path  # of the run or dataset
     parts: Sequence[Frames]
     kind: Literal["run", "dataset"]
+    # as in `Record`
     version: str
     fingerprint: str
     definition: str
     variant: str
-    recipe: Experiment | Dataset
+    recipe: Experiment | Dataset  # what was run or made; of an experiment with its `cases`
     cases: Sequence[Case] = ()
 
     @property

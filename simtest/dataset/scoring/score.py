@@ -39,33 +39,15 @@ from simtest.validation.runner import Progress, Run, RunRecord
 
 @dataclass(frozen=True)
 class ScorePart:
-    """Some frames that one task scores.
-
-    Parameters
-    ----------
-    frames : Frames
-        The frames.
-    folder : Path
-        The run or dataset, for messages.
-    names : mapping
-        Name of each frame, by number of the realisation or sample.
-    hashes : mapping
-        SHA-256 of each frame, by name.
-    answers : mapping
-        By estimator and name of the frame; only those of these frames.
-    swept : mapping
-        An example of each swept value, for the columns' types.
-    item : Path, optional
-        Where to keep the first frame for the gallery.
-    """
+    """Some frames that one task scores."""
 
     frames: Frames
-    folder: Path
-    names: Mapping[int, str]
-    hashes: Mapping[str, str]
-    answers: Answers
-    swept: Mapping[str, Value]
-    item: Path | None = None
+    folder: Path  # the run or dataset, for messages
+    names: Mapping[int, str]  # name of each frame, by number of the realisation or sample
+    hashes: Mapping[str, str]  # SHA-256 of each frame, by name
+    answers: Answers  # by estimator and name of the frame; only those of these frames
+    swept: Mapping[str, Value]  # an example of each swept value, for the columns' types
+    item: Path | None = None  # where to keep the first frame for the gallery
 
 
 def score_table(

@@ -72,24 +72,13 @@ def _named(path: Path, kind: Kind | None) -> MapFile:
 
 @dataclass(frozen=True)
 class RawMap:
-    """What a file holds: channels as red, green, blue; floats as they are, integers undecoded.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    kind : str
-        "normal" or "depth".
-    values : ndarray, shape (H, W, 3) or (H, W)
-        NaN cannot stand in integers; there 0 in all channels is no answer.
-    clear : ndarray of bool, shape (H, W), optional
-        Where an alpha channel is 0: no answer.
-    """
+    """What a file holds: channels as red, green, blue; floats as they are, integers undecoded."""
 
     path: Path
-    kind: Kind
+    kind: Kind  # "normal" or "depth"
+    # shape (H, W, 3) or (H, W); NaN cannot stand in integers; there 0 in all channels is no answer
     values: npt.NDArray[np.generic]
-    clear: npt.NDArray[np.bool_] | None = None
+    clear: npt.NDArray[np.bool_] | None = None  # where an alpha channel is 0: no answer; shape (H, W)
 
     @property
     def is_encoded(self) -> bool:
@@ -418,15 +407,9 @@ class Method(Protocol):
 
 @dataclass
 class MapFolder:
-    """A folder of maps.
+    """A folder of maps."""
 
-    Parameters
-    ----------
-    folder : Path
-        Holds the files (`find_maps`).
-    """
-
-    folder: Path
+    folder: Path  # holds the files (`find_maps`)
     maps: dict[tuple[str, Kind | None], MapFile] = field(init=False)
 
     def __post_init__(self) -> None:

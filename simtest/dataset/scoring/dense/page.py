@@ -22,7 +22,7 @@ from simtest.dataset.scoring.dense.truth import (
 )
 from simtest.geometry.vectors import angle_deg
 from simtest.pages.html import environment
-from simtest.pages.pixels import data_address
+from simtest.pages.pixels import data_address, normal_colours
 from simtest.pages.style import number
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array, Image, Picture
@@ -148,8 +148,6 @@ ERROR_END_DEG = 30.0
 _UNANSWERED, _EXCLUDED = (190, 60, 160), (60, 64, 70)
 """Colours of pixels without an answer, and of those that are not scored."""
 
-_TO_VIEWER = np.array([1.0, -1.0, -1.0])
-
 
 @dataclass(frozen=True)
 class Shown:
@@ -166,33 +164,28 @@ def picture_row(truth: FrameTruth, estimate: Array | None, source: str | None) -
     """Return the pictures of a frame; `estimate` are the normals of a source, shape (H, W, 3), None for no answer."""
     normal = truth.normal["fine"]
     pictures = [] if truth.image is None else [("frame", _small(_grey(truth.image)))]
-    pictures.append(("true normal (fine surface)", _small(normal_colours(normal, truth))))
+    pictures.append(("true normal (fine surface)", _scored(normal_colours(normal, _UNANSWERED), truth)))
     error = np.full(truth.size, np.nan)
     if estimate is not None:
         error = angle_deg(estimate, normal)
-        pictures.append(("estimated normal", _small(normal_colours(estimate, truth))))
+        pictures.append(("estimated normal", _scored(normal_colours(estimate, _UNANSWERED), truth)))
     error[~truth.scored] = np.nan
     known = error[np.isfinite(error)]
-    pictures.append(("error", _small(error_colours(error, truth))))
+    pictures.append(("error", _scored(error_colours(error), truth)))
     return Shown(truth.name, truth.setting, source, pictures, float(np.median(known)) if known.size else None)
 
 
-def normal_colours(normal: Array, truth: FrameTruth) -> Picture:
-    """Return normals as colours: red right, green up, blue towards the camera."""
-    known = np.isfinite(normal).all(axis=-1)
-    colours = np.rint(127.5 * (1 + np.nan_to_num(normal) * _TO_VIEWER)).astype(np.uint8)
-    colours[~known] = _UNANSWERED
-    colours[~truth.scored] = _EXCLUDED
-    return colours
-
-
-def error_colours(error: Array, truth: FrameTruth) -> Picture:
+def error_colours(error: Array) -> Picture:
     """Return errors, deg, as colours from dark (0) to bright (`ERROR_END_DEG` and beyond)."""
     share = np.clip(np.nan_to_num(error) / ERROR_END_DEG, 0, 1)
     colours = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_CIVIDIS)[:, :, ::-1].copy()
     colours[~np.isfinite(error)] = _UNANSWERED
-    colours[~truth.scored] = _EXCLUDED
     return np.asarray(colours, np.uint8)
+
+
+def _scored(colours: Picture, truth: FrameTruth) -> Picture:
+    colours[~truth.scored] = _EXCLUDED
+    return _small(colours)
 
 
 def _grey(image: Image) -> Picture:

@@ -50,47 +50,23 @@ MOST_SHOWN, LEAST_SHOWN = 6, 3
 
 @dataclass
 class DenseScore:
-    """The figures of a method.
+    """The figures of a method."""
 
-    Parameters
-    ----------
-    name : str
-        Of the method.
-    on : str
-        The run or dataset, as it was named.
-    options : MapOptions
-        How maps are read.
-    sources : tuple of str
-        Sources that some frame has; a frame without one counts as unanswered there.
-    fit : Fit
-        How well the maps fit the truth as they are read.
-    counts : dict of int
-        Frames, frames without any map, scored pixels, and pixels excluded by reason.
-    rows : list of dict
-        Figures of each frame and cell.
-    alignments : dict
-        Factor and shift in each frame, by alignment.
-    scenes : dict of str
-        Scene of each frame.
-    shown : list of Shown
-        Pictures of some frames.
-    page : Path, optional
-        Where the page was written.
-    """
-
-    name: str
-    on: str
-    options: MapOptions
-    sources: tuple[str, ...]
-    fit: Fit = field(init=False)
+    name: str  # of the method
+    on: str  # the run or dataset, as it was named
+    options: MapOptions  # how maps are read
+    sources: tuple[str, ...]  # sources that some frame has; a frame without one counts as unanswered there
+    fit: Fit = field(init=False)  # how well the maps fit the truth as they are read
+    # frames, frames without any map, scored pixels, and pixels excluded by reason
     counts: dict[str, int] = field(
         default_factory=lambda: dict.fromkeys(("frames", "frames_without_map", "scored", *EXCLUDED), 0)
     )
-    rows: list[JsonObject] = field(default_factory=list)
+    rows: list[JsonObject] = field(default_factory=list)  # figures of each frame and cell
+    # factor and shift in each frame, by alignment
     alignments: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    scenes: dict[str, str] = field(default_factory=dict)
-    shown: list[Shown] = field(default_factory=list)
-    page: Path | None = None
+    scenes: dict[str, str] = field(default_factory=dict)  # scene of each frame
+    shown: list[Shown] = field(default_factory=list)  # pictures of some frames
+    page: Path | None = None  # where the page was written
 
     def __post_init__(self) -> None:
         self.fit = Fit(self.options)

@@ -29,53 +29,23 @@ EXCLUDED = ("outside_view", "no_surface", "instrument")
 
 @dataclass(frozen=True)
 class FrameTruth:
-    """The truth at each pixel's centre, camera frame.
+    """The truth at each pixel's centre, camera frame."""
 
-    Parameters
-    ----------
-    name : str
-        Of the frame; its map has the same.
-    camera : Camera
-        Calibration.
-    normal : dict of ndarray, shape (H, W, 3)
-        Unit normal of the fine surface and of the base, by name of the surface.
-    curvature : dict of ndarray, shape (H, W)
-        Principal curvature of the larger size, 1/mm, convex towards the camera positive, of both.
-    distance : ndarray, shape (H, W)
-        Along the pixel's ray, mm.
-    eps : float
-        Offset of the light that is farthest from the camera, mm.
-    scored : ndarray of bool, shape (H, W)
-        Pixels of the surface inside the view, which are scored.
-    excluded : dict of int
-        How many pixels are not, by reason.
-    zone : ndarray of uint8, shape (H, W)
-        See `zones`.
-    image : ndarray of float32, shape (H, W) or (H, W, 3), optional
-        The frame as the sensor encoded it.
-    calibration : Calibration, optional
-        What methods are told of the camera.
-    setting : str
-        Of the experiment.
-    swept : dict
-        Values of the swept parameters.
-    scene : str
-        Names the scene, of a dataset the anatomy, which other frames may show too. Empty where each has its own.
-    """
-
-    name: str
+    name: str  # of the frame; its map has the same
     camera: Camera
-    normal: Mapping[str, Array]
+    normal: Mapping[str, Array]  # unit, shape (H, W, 3), of the fine surface and of the base, by name
+    # principal curvature of the larger size, 1/mm, convex towards the camera positive, of both, shape (H, W)
     curvature: Mapping[str, Array]
-    distance: Array
-    eps: float
-    scored: Mask
-    excluded: Mapping[str, int]
-    zone: npt.NDArray[np.uint8]
-    image: Image | None = None
-    calibration: Calibration | None = None
-    setting: str = ""
-    swept: Mapping[str, object] = field(default_factory=dict)
+    distance: Array  # along the pixel's ray, mm, shape (H, W)
+    eps: float  # offset of the light that is farthest from the camera, mm
+    scored: Mask  # pixels of the surface inside the view, which are scored, shape (H, W)
+    excluded: Mapping[str, int]  # how many pixels are not, by reason
+    zone: npt.NDArray[np.uint8]  # see `zones`, shape (H, W)
+    image: Image | None = None  # the frame as the sensor encoded it, shape (H, W) or (H, W, 3)
+    calibration: Calibration | None = None  # what methods are told of the camera
+    setting: str = ""  # of the experiment
+    swept: Mapping[str, object] = field(default_factory=dict)  # values of the swept parameters
+    # names the scene, of a dataset the anatomy, which other frames may show too. Empty where each has its own
     scene: str = ""
 
     __repr__ = short_repr
