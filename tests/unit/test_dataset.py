@@ -943,3 +943,6 @@ def test_a_dataset_of_another_version_is_sound_as_well(copy):
 def test_a_preview_shows_samples_of_the_whole_dataset(made, tmp_path):
     page = write_preview(made, tmp_path / "page.html", 4).read_text()
     assert re.findall(r"<h3>(\d)", page) == list("0235")
+    # Histograms are charts of the page.
+    assert "<h3>distance of isolated highlights</h3>" in page
+    assert page.count('data-chart="histogram-') >= 1

@@ -27,7 +27,6 @@ from simtest.dataset.scoring.dense.truth import (
     Cell,
     FrameTruth,
     Key,
-    Progress,
     depth_source,
     labels,
     truth_of_view,
@@ -40,6 +39,7 @@ from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.statistics import Interval, mean_interval, median_interval, root_mean_square, share_interval
+from simtest.validation.runner import Progress
 
 TABLE, SUMMARY, PAGE = "dense.parquet", "dense.json", "index.html"
 SCHEMA = 3

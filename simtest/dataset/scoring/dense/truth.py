@@ -1,7 +1,7 @@
 """The truth of one frame, as far as dense maps are scored against it: its maps, and zones and cells of its pixels."""
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -16,9 +16,6 @@ from simtest.runtime.arrays import Array, Image, IntArray, Mask, short_repr
 if TYPE_CHECKING:
     from simtest.rendering import Session, TruthMaps
     from simtest.simulation.frame import RenderedView
-
-Progress = Callable[[int, int, str], None]
-"""Called with frames done, frames in all, and the frame's name."""
 
 SURFACES = ("fine", "base")
 """The two truths: with relief and without. They are equal where a scene has none."""
