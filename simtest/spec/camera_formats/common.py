@@ -103,13 +103,13 @@ def json_object(text: str) -> dict[str, Any]:
 def parse_json(text: str) -> Any:
     """Parse JSON in which no key is given twice; raise `ValueError` or `RecursionError` where it is malformed."""
     try:
-        return json.loads(text, object_pairs_hook=_once)
+        return json.loads(text, object_pairs_hook=once)
     except json.JSONDecodeError:
         # OpenCV has long written 1. for 1.0, which is no JSON. Names of files may hold the same, so this comes second.
-        return json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text), object_pairs_hook=_once)
+        return json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text), object_pairs_hook=once)
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return an object's keys and values."""
     made = dict(pairs)
     if len(made) < len(pairs):

@@ -32,6 +32,7 @@ from simtest.spec.camera_formats.common import (
     number,
     numbers,
     of_text,
+    once,
     parse_json,
     parse_xml,
     plain_table,
@@ -116,7 +117,7 @@ def _plain_xml(element: ElementTree.Element) -> Any:
     if children:
         if all(child.tag == "_" for child in children):
             return [_plain_xml(child) for child in children]
-        return {child.tag: _plain_xml(child) for child in children}
+        return once([(child.tag, _plain_xml(child)) for child in children])
     words = (element.text or "").split()
     try:
         values = [float(word) for word in words]
@@ -207,7 +208,7 @@ def _check_whole(data: Mapping[str, Any]) -> None:
 def _lens(data: Mapping[str, Any]) -> dict[str, str | float] | None:
     """Return the lens as the table of a `DistortionSpec`; None for a pinhole."""
     name, value = _one_of(data, LENS_NAMES)
-    fisheye, model = _is_fisheye(data), data.get("distortion_model") or ""
+    fisheye, model = _is_fisheye(data), (data.get("distortion_model") or "").lower()
     if "xi" in data:
         # Without it the other numbers mean another lens.
         raise InputError("xi: simtest lacks the lens of OpenCV's omnidir module; calibrate as a fisheye")
@@ -244,6 +245,8 @@ def _check_no_other_lens(data: Mapping[str, Any]) -> None:
 
 def _is_fisheye(data: Mapping[str, Any]) -> bool:
     model, flag = data.get("distortion_model"), data.get("fisheye_model")
+    if flag not in (None, 0, 1):
+        raise InputError(f"fisheye_model = {flag!r:.40}: must be 0 or 1")
     if model in (None, ""):
         return bool(flag)
     if not isinstance(model, str) or model.lower() not in MODELS:
