@@ -43,7 +43,7 @@ def load_calibration(
     --------
     >>> import simtest, tempfile
     >>> from pathlib import Path
-        >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
+    >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
     >>> simtest.save_calibration(simtest.Calibration(simtest.Camera.from_fov(70.0, 640, 480)), path)
     >>> simtest.load_calibration(path).camera.width
     640
@@ -100,7 +100,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     --------
     >>> import simtest, tempfile
     >>> from pathlib import Path
-        >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
+    >>> path = Path(tempfile.mkdtemp()) / "calibration.toml"
     >>> simtest.save_calibration(simtest.Calibration(simtest.Camera.from_fov(70.0, 640, 480)), path)
     >>> simtest.load_calibration(path).camera.width
     640

@@ -232,6 +232,11 @@ def swapped(old, new):
     return JSON.replace(old, new)
 
 
+EIGHT = (
+    "image_width: 640\nimage_height: 480\ndistortion_model: PLUMB_BOB\nK: [400, 0, 319.5, 0, 400, 239.5, 0, 0, 1]\n"
+    "D: [-0.1, 0, 0, 0, 0, 0, 0, 0]\n"
+)
+
 BAD = {
     "no JSON": ("c.json", "{", "not valid JSON: "),
     "a list": ("c.json", "[1, 2]", "holds no keys"),
@@ -275,6 +280,9 @@ BAD = {
     "model and count": ("c.yaml", ROS_FILE.replace("plumb_bob", "equidistant"), "5 values; must be 4"),
     "model and flag": ("c.yaml", ROS_FILE + "fisheye_model: 1\n", "does not fit distortion_model = 'plumb_bob'"),
     "fisheye alone": ("c.yaml", "fisheye_model: 1\n" + ROS_FILE.split("distortion_model")[0], "a fisheye has 4"),
+    "flag in words": ("c.yaml", "fisheye_model: no\n" + ROS_FILE.split("distortion_model")[0], "= 'no': must be 0 "),
+    "model in capitals": ("c.yaml", EIGHT, "8 values; must be 4 or 5"),
+    "XML twice": ("c.xml", "<a><K>1</K><K>2</K></a>", "not valid XML: K is given twice"),
     "binned": ("c.yaml", ROS_MESSAGE.replace("binning_x: 0", "binning_x: 2"), "binning_x = 2: must be 0 or 1"),
     "cropped": ("c.yaml", ROS_MESSAGE.replace("x_offset: 0", "x_offset: 8"), "roi.x_offset = 8: must be 0"),
     "mask": ("c.json", swapped('"D"', '"view_mask": [1, 2], "D"'), "view_mask: 2 values; must be 3"),

@@ -21,10 +21,14 @@ from simtest.geometry.vectors import quaternion_of, rotation_of
 from simtest.runtime.arrays import Array
 from simtest.runtime.boundary import suggestion
 from simtest.spec.camera_formats.common import (
+    BROWN,
+    FISHEYE,
     Files,
     Poses,
     Table,
     check_alike,
+    check_no_skew,
+    coefficients,
     inverse,
     json_object,
     lens_table,
@@ -33,6 +37,7 @@ from simtest.spec.camera_formats.common import (
     mask_text,
     number,
     of_text,
+    plain_table,
     rigid,
     within,
 )
@@ -72,25 +77,10 @@ NERF_MODELS = {
 }  # fmt: skip
 """Camera models, and whether each is a fisheye."""
 
-INTRINSICS = (
-    "w",
-    "h",
-    "fl_x",
-    "fl_y",
-    "camera_angle_x",
-    "camera_angle_y",
-    "cx",
-    "cy",
-    "k1",
-    "k2",
-    "k3",
-    "k4",
-    "p1",
-    "p2",
-)
-
 FOCAL_KEYS = (("fl_x", "camera_angle_x"), ("fl_y", "camera_angle_y"))
 """Two keys for one focal length, along x and y."""
+
+INTRINSICS = ("w", "h", *FOCAL_KEYS[0], *FOCAL_KEYS[1], "cx", "cy", *FISHEYE, "p1", "p2")
 
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera axes from OpenCV's; its own inverse."""
@@ -137,9 +127,8 @@ def _colmap_camera(words: Sequence[str]) -> Table:
     told = {name: number(word, name) for name, word in zip(names, words[4:], strict=True)}
     if "f" in told:
         told["fx"] = told["fy"] = told.pop("f")
-    table: Table = {"width": width, "height": height}
-    table |= {name: told.pop(name) for name in ("fx", "fy", "cx", "cy")}
-    return table | {"distortion": lens_table("FISHEYE" in model, told)}
+    fx, fy, cx, cy = (told.pop(name) for name in ("fx", "fy", "cx", "cy"))
+    return plain_table((width, height), (fx, fy), (cx, cy), distortion=lens_table("FISHEYE" in model, told))
 
 
 @of_text("pose", "record_bytes")
@@ -196,8 +185,7 @@ def _check_no_points(path: Path) -> None:
 def _cameras_text(camera: Camera) -> str:
     """Return a camera as the text of cameras.txt, under the id 1."""
     lens, mask = camera.distortion, camera.view_mask
-    if camera.skew != 0:
-        raise InputError(f"camera.skew = {camera.skew:g}: must be 0, since COLMAP has none; save as TOML instead")
+    check_no_skew(camera, "COLMAP has none")
     model = "PINHOLE"
     if isinstance(lens, KannalaBrandt):
         model = "OPENCV_FISHEYE"
@@ -206,7 +194,7 @@ def _cameras_text(camera: Camera) -> str:
     elif lens is not None:
         raise InputError(f"camera.distortion: COLMAP has no {type(lens).__name__} lens; save as TOML instead")
     told = [camera.fx, camera.fy, camera.cx, camera.cy]
-    told += [getattr(lens, name) for name in COLMAP_MODELS[model][2:]]
+    told += coefficients(lens, COLMAP_MODELS[model][2:]) if lens is not None else []
     words = ["1", model, str(camera.width), str(camera.height), *(repr(float(value)) for value in told)]
     lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     if mask is not None:
@@ -293,10 +281,8 @@ def _nerf_camera(data: Mapping[str, Any]) -> Table:
     both = lens is None or lens["type"] != "kannala_brandt"
     fx = _nerf_focal(told, FOCAL_KEYS[0], width, both)
     fy = fx if not set(FOCAL_KEYS[1]) & set(told) else _nerf_focal(told, FOCAL_KEYS[1], height, both)
-    return {
-        "width": width, "height": height, "fx": fx, "fy": fy, "cx": told.get("cx", width / 2),
-        "cy": told.get("cy", height / 2), "distortion": lens, "view_mask": data.get("view_mask"),
-    }  # fmt: skip
+    centre = told.get("cx", width / 2), told.get("cy", height / 2)
+    return plain_table((width, height), (fx, fy), centre, distortion=lens, view_mask=data.get("view_mask"))
 
 
 def _nerf_focal(told: Mapping[str, float], keys: tuple[str, str], extent: int, both: bool) -> float:
@@ -330,22 +316,21 @@ def _nerf_lens(data: Mapping[str, Any], told: Mapping[str, float]) -> Table | No
         raise InputError(f"is_fisheye = {told_fisheye}: does not fit camera_model = {model!r}")
     if not fisheye and told.get("k4"):
         raise InputError(f"k4 = {told['k4']:g}: must be 0; simtest's perspective lens has no term r^8")
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    names = FISHEYE if fisheye else BROWN[:5]
     return lens_table(fisheye, {key: told.get(key, 0.0) for key in names})
 
 
 def transforms_file(camera: Camera, path: Path, poses: Poses | None) -> Files:
     """Return a camera, and poses of its frames, whose lengths must be mm, as transforms.json."""
     lens, name = camera.distortion, "transforms.json"
-    if camera.skew != 0:
-        raise InputError(f"camera.skew = {camera.skew:g}: must be 0, since {name} has none; save as TOML instead")
+    check_no_skew(camera, f"{name} has none")
     data: dict[str, Any] = {"camera_model": "PINHOLE"}
     if isinstance(lens, KannalaBrandt):
-        data = {"camera_model": "OPENCV_FISHEYE", **{key: getattr(lens, key) for key in ("k1", "k2", "k3", "k4")}}
+        data = {"camera_model": "OPENCV_FISHEYE", **{key: getattr(lens, key) for key in FISHEYE}}
     elif isinstance(lens, BrownConrady):
         if lens.k4 or lens.k5 or lens.k6:
             raise InputError(f"camera.distortion: k4, k5, k6 must be 0, since {name} lacks them; save as TOML instead")
-        data = {"camera_model": "OPENCV", **{key: getattr(lens, key) for key in ("k1", "k2", "p1", "p2", "k3")}}
+        data = {"camera_model": "OPENCV", **{key: getattr(lens, key) for key in BROWN[:5]}}
     elif lens is not None:
         raise InputError(f"camera.distortion: {name} has no {type(lens).__name__} lens; save as TOML instead")
     data |= {

@@ -13,7 +13,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from simtest.errors import InputError
-from simtest.geometry.camera import ViewMask
+from simtest.geometry.camera import Camera, ViewMask
+from simtest.geometry.lenses import Distortion
 from simtest.runtime.arrays import Array
 from simtest.runtime.boundary import suggestion
 from simtest.spec.toml_files import read_text
@@ -25,6 +26,12 @@ Table = dict[str, Any]
 
 Poses = Sequence[tuple[str, Array]]
 """Names of frames, and their world_from_camera, shape (4, 4): OpenCV axes, in the file's unit of length."""
+
+FISHEYE = ("k1", "k2", "k3", "k4")
+"""Coefficients of a fisheye, as all formats order them."""
+
+BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Coefficients of a perspective lens, as OpenCV orders them."""
 
 Files = dict[Path, bytes]
 """What is written into each file."""
@@ -73,14 +80,21 @@ def read_json(path: Path, kind: str = "camera") -> dict[str, Any]:
     return of_text(kind, "record_bytes")(json_object)(path)
 
 
+@contextmanager
+def syntax(kind: str) -> Iterator[None]:
+    """Raise `InputError` where a text that is parsed inside is not of a kind: JSON, XML or YAML."""
+    try:
+        yield
+    except RecursionError:
+        raise InputError(f"not valid {kind}: nested too deeply") from None
+    except (ValueError, ElementTree.ParseError) as error:
+        raise InputError(f"not valid {kind}: {error!s:.80}") from error
+
+
 def json_object(text: str) -> dict[str, Any]:
     """Return the JSON object of a text."""
-    try:
+    with syntax("JSON"):
         data = parse_json(text)
-    except RecursionError:
-        raise InputError("not valid JSON: nested too deeply") from None
-    except ValueError as error:
-        raise InputError(f"not valid JSON: {error!s:.80}") from error
     if not isinstance(data, dict):
         raise InputError(f"holds a {type(data).__name__}; must be an object of keys and values")
     return data
@@ -89,13 +103,13 @@ def json_object(text: str) -> dict[str, Any]:
 def parse_json(text: str) -> Any:
     """Parse JSON in which no key is given twice; raise `ValueError` or `RecursionError` where it is malformed."""
     try:
-        return json.loads(text, object_pairs_hook=_once)
+        return json.loads(text, object_pairs_hook=once)
     except json.JSONDecodeError:
         # OpenCV has long written 1. for 1.0, which is no JSON. Names of files may hold the same, so this comes second.
-        return json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text), object_pairs_hook=_once)
+        return json.loads(re.sub(r"(\d)\.(?=[\s,\]}])", r"\1.0", text), object_pairs_hook=once)
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return an object's keys and values."""
     made = dict(pairs)
     if len(made) < len(pairs):
@@ -112,14 +126,6 @@ def parse_xml(text: str) -> ElementTree.Element:
     return ElementTree.fromstring(text)  # nosec B314: without entities nothing grows or is fetched
 
 
-def xml_root(text: str) -> ElementTree.Element:
-    """Return the root of an XML text; raise `InputError` where it is malformed."""
-    try:
-        return parse_xml(text)
-    except (ElementTree.ParseError, ValueError, RecursionError) as error:
-        raise InputError(f"not valid XML: {error!s:.80}") from error
-
-
 def number(value: Any, name: str, whole: bool = False) -> float:
     """Return a finite number, given as one or as text; raise `InputError` for anything else."""
     try:
@@ -134,14 +140,12 @@ def number(value: Any, name: str, whole: bool = False) -> float:
     return found
 
 
-def numbers(values: Any, name: str, counts: int | Sequence[int]) -> list[float]:
-    """Return a list of finite numbers of an allowed length."""
-    allowed = (counts,) if isinstance(counts, int) else tuple(counts)
+def numbers(values: Any, name: str, count: int) -> list[float]:
+    """Return a list of so many finite numbers."""
     if not isinstance(values, list | tuple):
         raise InputError(f"{name} = {values!r:.60}: must be a list of numbers")
-    if len(values) not in allowed:
-        said = " or ".join(str(count) for count in allowed)
-        raise InputError(f"{name}: {len(values)} values; must be {said}")
+    if len(values) != count:
+        raise InputError(f"{name}: {len(values)} values; must be {count}")
     return [number(value, name) for value in values]
 
 
@@ -193,6 +197,25 @@ def chosen(cameras: Mapping[str, Table], wanted: str | None) -> Table:
     if any(table != tables[0] for table in tables):
         raise InputError(f"holds {len(cameras)} cameras ({listed}); name one as FILE#ID")
     return tables[0]
+
+
+def plain_table(
+    size: Sequence[Any], focal: Sequence[float], centre: Sequence[float], shift: float = 0.0, **others: Any
+) -> Table:
+    """Return the table of a camera whose principal point is moved by `shift`, px, along both axes."""
+    fx, fy, cx, cy = map(float, (*focal, *centre))
+    return {"width": size[0], "height": size[1], "fx": fx, "fy": fy, "cx": cx + shift, "cy": cy + shift, **others}
+
+
+def coefficients(lens: Distortion, names: Sequence[str]) -> list[float]:
+    """Return coefficients of a lens by their names."""
+    return [float(getattr(lens, name)) for name in names]
+
+
+def check_no_skew(camera: Camera, why: str) -> None:
+    """Raise `InputError` for a camera with a skew, which a format cannot hold."""
+    if camera.skew != 0:
+        raise InputError(f"camera.skew = {camera.skew:g}: must be 0, since {why}; save as TOML instead")
 
 
 def lens_table(is_fisheye: bool, told: Mapping[str, float]) -> Table | None:

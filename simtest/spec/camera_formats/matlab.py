@@ -27,6 +27,7 @@ from simtest.spec.camera_formats.common import (
     mask_of_text,
     mask_text,
     number,
+    plain_table,
     within,
 )
 from simtest.spec.camera_formats.omnidirectional import scaramuzza_table
@@ -76,12 +77,9 @@ def _table(fields: Mapping[str, Any]) -> Table:
     radial = _array(fields, "RadialDistortion", (2, 3)).tolist()
     tangential = _array(fields, "TangentialDistortion", 2).tolist()
     lens = dict(zip(("k1", "k2", "k3", "p1", "p2"), [*radial, 0.0][:3] + tangential, strict=True))
-    return {
-        "width": width, "height": height, "fx": float(matrix[0, 0]), "fy": float(matrix[1, 1]),
-        "cx": float(matrix[0, 2]) - PIXEL_CENTRE, "cy": float(matrix[1, 2]) - PIXEL_CENTRE,
-        "skew": float(matrix[0, 1]),
-        "distortion": lens_table(False, lens), "view_mask": mask,
-    }  # fmt: skip
+    (fx, skew, cx), (_, fy, cy), _ = matrix.tolist()
+    told = {"skew": skew, "distortion": lens_table(False, lens), "view_mask": mask}
+    return plain_table((width, height), (fx, fy), (cx, cy), -PIXEL_CENTRE, **told)
 
 
 def _check_repeated(fields: Mapping[str, Any], matrix: Any) -> None:
@@ -154,8 +152,10 @@ def struct_of(path: str) -> dict[str, Any]:
         # SciPy raises whatever its parser runs into.
         told = f"{error!s:.80}" if str(error).strip() else type(error).__name__
         raise InputError(f"{_kind(path)}: {told}; {HOW}") from error
-    # The variables themselves may be the fields of the struct.
-    nested = {name: value["Intrinsics"] for name, value in data.items() if _holds_intrinsics(value)}
+    # The variables themselves may be the fields of the struct; fisheyeParameters hold their intrinsics as a struct.
+    structs = {name: value for name, value in data.items() if isinstance(value, Mapping)}
+    inner = {name: struct.get("Intrinsics") for name, struct in structs.items()}
+    nested = {name: value for name, value in inner.items() if isinstance(value, Mapping)}
     found = {name: value for name, value in {"": data, **data, **nested}.items() if _is_calibration(value)}
     if len(found) == 1:
         return {name: _plain(value) for name, value in next(iter(found.values())).items() if name in FIELDS}
@@ -185,11 +185,6 @@ def _plain(value: Any) -> Any:
 
 def _is_calibration(value: Any) -> bool:
     return isinstance(value, Mapping) and bool({"IntrinsicMatrix", "K", "MappingCoefficients"} & set(value))
-
-
-def _holds_intrinsics(value: Any) -> bool:
-    """Return whether a variable is a struct of fisheyeParameters, which holds its intrinsics as a struct."""
-    return isinstance(value, Mapping) and isinstance(value.get("Intrinsics"), Mapping)
 
 
 # Writing ---------------------------------------------------------------------------------------------------------

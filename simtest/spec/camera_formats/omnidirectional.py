@@ -24,7 +24,17 @@ from numpy.polynomial import Polynomial
 from simtest.conventions import PIXEL_CENTRE
 from simtest.errors import InputError
 from simtest.runtime.boundary import suggestion
-from simtest.spec.camera_formats.common import Table, json_object, number, numbers, of_text, within, xml_root
+from simtest.spec.camera_formats.common import (
+    Table,
+    json_object,
+    number,
+    numbers,
+    of_text,
+    parse_xml,
+    plain_table,
+    syntax,
+    within,
+)
 
 C3VD_KEYS = ("width", "height", "cx", "cy", "a0", "a2", "a3", "a4", "c", "d", "e")
 
@@ -33,8 +43,6 @@ LONGEST = 1e6
 
 MOST_APART = 5.0
 """px by which OCamCalib's two polynomials may differ; the inverse one is a fit to the other."""
-
-FOCAL = ("fx", "fy", "cx", "cy")
 
 VICALIB_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "calibu_fu_fv_u0_v0": ("", ()),
@@ -61,10 +69,7 @@ MOST_SPREAD = 1000.0
 
 
 def scaramuzza_table(
-    size: Sequence[float],
-    centre: Sequence[float],
-    mapping: Sequence[float],
-    stretch: Sequence[float],
+    size: Sequence[float], centre: Sequence[float], mapping: Sequence[float], stretch: Sequence[float]
 ) -> Table:
     """Return the table of a `CameraSpec` of Scaramuzza's model with x before y and z along the viewing direction.
 
@@ -77,10 +82,7 @@ def scaramuzza_table(
     if not a0 <= LONGEST:
         raise InputError(f"a0 = {a0:g}: must be at most {LONGEST:g} px")
     lens = {"k2": a2 * a0, "k3": a3 * a0**2, "k4": a4 * a0**3, **dict(zip("cde", stretch, strict=True))}
-    return {
-        "width": int(size[0]), "height": int(size[1]), "fx": a0, "fy": a0, "cx": centre[0], "cy": centre[1],
-        "distortion": {"type": "scaramuzza", **lens},
-    }  # fmt: skip
+    return plain_table([int(side) for side in size], (a0, a0), centre, distortion={"type": "scaramuzza", **lens})
 
 
 @of_text()
@@ -97,14 +99,8 @@ def read_c3vd(text: str) -> dict[str, Table]:
     told = {key: number(data[key], key, whole=key in ("width", "height")) for key in C3VD_KEYS}
     if number(data.get("a1", 0.0), "a1") != 0:
         raise InputError(f"a1 = {data['a1']}: must be 0, as in Scaramuzza's model")
-    return {
-        "": scaramuzza_table(
-            (told["width"], told["height"]),
-            (told["cx"] + PIXEL_CENTRE, told["cy"] + PIXEL_CENTRE),
-            [told[key] for key in ("a0", "a2", "a3", "a4")],
-            [told[key] for key in "cde"],
-        )
-    }
+    width, height, cx, cy, *lens = told.values()
+    return {"": scaramuzza_table((width, height), (cx + PIXEL_CENTRE, cy + PIXEL_CENTRE), lens[:4], lens[4:])}
 
 
 def _lines(text: str) -> Mapping[str, Any]:
@@ -139,7 +135,7 @@ def read_ocamcalib(text: str) -> dict[str, Table]:
     if len(rows[4]) != 2:
         raise InputError(f"size: {len(rows[4])} values; must be 2, height and width")
     height, width = (number(word, "size (height, width)", whole=True) for word in rows[4])
-    if any(direct[5:]) or len(direct) < 1 or (len(direct) > 1 and direct[1] != 0):
+    if any(direct[5:]) or (len(direct) > 1 and direct[1] != 0):
         raise InputError("direct polynomial: must have the terms a0, a2, a3, a4 alone")
     a0, _, a2, a3, a4 = (*direct, 0.0, 0.0, 0.0, 0.0)[:5]
     if not a0 < 0:
@@ -148,12 +144,8 @@ def read_ocamcalib(text: str) -> dict[str, Table]:
         raise InputError(f"affine parameters: c = {c:g}: must be > 0")
     _check_inverse(direct, back, min(width, height) / 4)
     # From (row, column) to (x, y) the matrix ((c, d), (e, 1)) becomes ((1, e), (d, c)), c times ((1/c, e/c), (d/c, 1)).
-    table = scaramuzza_table(
-        (width, height),
-        (column + PIXEL_CENTRE, row + PIXEL_CENTRE),
-        (-a0, -a2, -a3, -a4),
-        (1 / c, e / c, d / c),
-    )
+    centre, mapping = (column + PIXEL_CENTRE, row + PIXEL_CENTRE), (-a0, -a2, -a3, -a4)
+    table = scaramuzza_table((width, height), centre, mapping, (1 / c, e / c, d / c))
     return {"": table | {"fx": -a0 * c, "fy": -a0 * c}}
 
 
@@ -180,7 +172,9 @@ def _check_inverse(direct: list[float], back: list[float], most: float) -> None:
 def read_vicalib(text: str) -> dict[str, Table]:
     """Read the cameras of a rig, by their index; raise `InputError` where the file is malformed."""
     cameras: dict[str, Table] = {}
-    for i, element in enumerate(xml_root(text).iter("camera_model")):
+    with syntax("XML"):
+        root = parse_xml(text)
+    for i, element in enumerate(root.iter("camera_model")):
         name = element.get("index") or str(i)
         if name in cameras:
             raise InputError(f"camera index {name} is given twice")
@@ -208,12 +202,9 @@ def _vicalib_camera(element: ElementTree.Element) -> Table:
     if lens == "scaramuzza":
         cx, cy, *mapping, e, f, g = values(params, "params", 9)
         return scaramuzza_table((width, height), (cx + PIXEL_CENTRE, cy + PIXEL_CENTRE), mapping, (e, f, g))
-    told = dict(zip((*FOCAL, *names), values(params, "params", 4 + len(names)), strict=True))
-    table: Table = {"width": width, "height": height, "fx": told["fx"], "fy": told["fy"]}
-    table |= {key: told[key] + PIXEL_CENTRE for key in ("cx", "cy")}
-    if lens:
-        table["distortion"] = {"type": lens, **{key: told[key] for key in names}}
-    return table
+    fx, fy, cx, cy, *told = values(params, "params", 4 + len(names))
+    distortion = {"type": lens, **dict(zip(names, told, strict=True))} if lens else None
+    return plain_table((width, height), (fx, fy), (cx, cy), PIXEL_CENTRE, distortion=distortion)
 
 
 def text_of(element: ElementTree.Element, key: str) -> str:
@@ -236,7 +227,8 @@ def read_photometric(text: str) -> Tables:
 
     Several lights must spread their light alike.
     """
-    root = xml_root(text)
+    with syntax("XML"):
+        root = parse_xml(text)
     tables: Tables = {}
     cameras = root.findall("camera")
     if len(cameras) > 1:
@@ -257,26 +249,16 @@ def read_photometric(text: str) -> Tables:
 
 
 def _lens_and_response(model: ElementTree.Element) -> Tables:
-    if model.get("type") != "gamma":
-        raise InputError(f"type = {model.get('type')!r:.40}: simtest lacks it; must be 'gamma'")
-    gamma = _number(model, "gamma")
-    if not 0.1 <= gamma <= 10:
-        raise InputError(f"gamma = {gamma:g}: must be 0.1 to 10")
-    tables: Tables = {"response": {"type": "gamma", "gamma": gamma}}
-    power = _number(model, "vignetting") if model.find("vignetting") is not None else 0.0
-    if not 0 <= power <= 1000:
-        raise InputError(f"vignetting = {power:g}: must be 0 to 1000")
-    tables["vignetting"] = {"type": "cosine", "power": power}
-    return tables
+    _check_type(model, "gamma")
+    gamma = _number(model, "gamma", 0.1, 10)
+    power = _number(model, "vignetting", 0, 1000) if model.find("vignetting") is not None else 0.0
+    return {"response": {"type": "gamma", "gamma": gamma}, "vignetting": {"type": "cosine", "power": power}}
 
 
 def _light(model: ElementTree.Element) -> dict[str, Any]:
     """Return the spread, position, mm, and direction of a light."""
-    if model.get("type") != "sls":
-        raise InputError(f"type = {model.get('type')!r:.40}: simtest lacks it; must be 'sls'")
-    mu = _number(model, "mu")
-    if not 0 <= mu <= MOST_SPREAD:
-        raise InputError(f"mu = {mu:g}: must be 0 to {MOST_SPREAD:g}")
+    _check_type(model, "sls")
+    mu = _number(model, "mu", 0, MOST_SPREAD)
     _number(model, "sigma")
     told = {}
     for key in ("P", "D"):
@@ -307,6 +289,14 @@ def _rig(lights: list[dict[str, Any]]) -> Tables:
     return {"emission": emission, "rig": {"lights_mm": [light["position"] for light in lights]}}
 
 
-def _number(model: ElementTree.Element, key: str) -> float:
+def _check_type(model: ElementTree.Element, known: str) -> None:
+    if (kind := model.get("type")) != known:
+        raise InputError(f"type = {kind!r:.40}: simtest lacks it; must be '{known}'")
+
+
+def _number(model: ElementTree.Element, key: str, least: float = -math.inf, most: float = math.inf) -> float:
     """Return a number, in brackets or not."""
-    return number(text_of(model, key).strip("[] "), key)
+    value = number(text_of(model, key).strip("[] "), key)
+    if not least <= value <= most:
+        raise InputError(f"{key} = {value:g}: must be {least:g} to {most:g}")
+    return value

@@ -20,17 +20,24 @@ from simtest.geometry.camera import Camera
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.runtime.arrays import Array
 from simtest.spec.camera_formats.common import (
+    BROWN,
+    FISHEYE,
     Files,
     Poses,
     Table,
+    check_no_skew,
+    coefficients,
     inverse,
     lens_table,
     number,
     numbers,
     of_text,
+    once,
     parse_json,
     parse_xml,
+    plain_table,
     rigid,
+    syntax,
     within,
 )
 from simtest.spec.camera_formats.plain_yaml import parse_yaml
@@ -55,8 +62,6 @@ MODELS = {
 NUMBER_TYPES = ("d", "f", "i")
 """Of a FileStorage matrix: double, float, integers of 32 bits."""
 
-BROWN_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-
 UNKNOWN_TERMS = ("s1", "s2", "s3", "s4", "tauX", "tauY")
 """Coefficients 9 to 14 of OpenCV: thin prism and tilted sensor, which simtest lacks."""
 
@@ -76,7 +81,7 @@ def read_opencv(path: Path) -> dict[str, Table]:
 
 def _table(data: Mapping[str, Any]) -> Table:
     """Return the camera of a file's keys."""
-    width, height = _size(data)
+    size = _size(data)
     # K, upper triangular
     name, given = _one_of(data, MATRIX_NAMES)
     if name is None:
@@ -86,11 +91,10 @@ def _table(data: Mapping[str, Any]) -> Table:
         raise InputError(f"{name} = {matrix.tolist()}: must be upper triangular with 1 in its last corner")
     _check_whole(data)
     # lens and view mask
-    table = {
-        "width": width, "height": height, "fx": float(matrix[0, 0]), "fy": float(matrix[1, 1]),
-        "cx": float(matrix[0, 2]) + PIXEL_CENTRE, "cy": float(matrix[1, 2]) + PIXEL_CENTRE,
-        "skew": float(matrix[0, 1]), "distortion": _lens(data),
-    }  # fmt: skip
+    skew, lens = float(matrix[0, 1]), _lens(data)
+    table = plain_table(
+        size, (matrix[0, 0], matrix[1, 1]), matrix[:2, 2].tolist(), PIXEL_CENTRE, skew=skew, distortion=lens
+    )
     if "view_mask" in data:
         cx, cy, radius = _numbers(data["view_mask"], "view_mask", (3,))
         table["view_mask"] = {"cx": cx + PIXEL_CENTRE, "cy": cy + PIXEL_CENTRE, "radius": radius}
@@ -101,12 +105,8 @@ def _parse(text: str, suffix: str) -> Mapping[str, Any]:
     """Read a text into plain dicts, lists, numbers and text."""
     kind = {".json": "JSON", ".xml": "XML"}.get(suffix) or ("XML" if text.startswith("<") else "YAML")
     parsers = {"JSON": parse_json, "XML": lambda text: _plain_xml(parse_xml(text)), "YAML": parse_yaml}
-    try:
+    with syntax(kind):
         data = parsers[kind](text)
-    except RecursionError:
-        raise InputError(f"not valid {kind}: nested too deeply") from None
-    except (ValueError, ElementTree.ParseError) as error:
-        raise InputError(f"not valid {kind}: {error!s:.80}") from error
     if not isinstance(data, Mapping) or not data:
         raise InputError("holds no keys; must be a calibration of OpenCV or ROS")
     return data
@@ -117,7 +117,7 @@ def _plain_xml(element: ElementTree.Element) -> Any:
     if children:
         if all(child.tag == "_" for child in children):
             return [_plain_xml(child) for child in children]
-        return {child.tag: _plain_xml(child) for child in children}
+        return once([(child.tag, _plain_xml(child)) for child in children])
     words = (element.text or "").split()
     try:
         values = [float(word) for word in words]
@@ -208,7 +208,7 @@ def _check_whole(data: Mapping[str, Any]) -> None:
 def _lens(data: Mapping[str, Any]) -> dict[str, str | float] | None:
     """Return the lens as the table of a `DistortionSpec`; None for a pinhole."""
     name, value = _one_of(data, LENS_NAMES)
-    fisheye, model = _is_fisheye(data), data.get("distortion_model") or ""
+    fisheye, model = _is_fisheye(data), (data.get("distortion_model") or "").lower()
     if "xi" in data:
         # Without it the other numbers mean another lens.
         raise InputError("xi: simtest lacks the lens of OpenCV's omnidir module; calibrate as a fisheye")
@@ -221,8 +221,7 @@ def _lens(data: Mapping[str, Any]) -> dict[str, str | float] | None:
         return None
     # Kannala-Brandt
     if fisheye:
-        values = _numbers(value, name, (4,))
-        return lens_table(fisheye, dict(zip(("k1", "k2", "k3", "k4"), values, strict=True)))
+        return lens_table(fisheye, dict(zip(FISHEYE, _numbers(value, name, (4,)), strict=True)))
     # Brown-Conrady: which counts are possible depends on the model, if one is named.
     counts = {"plumb_bob": (4, 5), "radtan": (4, 5), "rational_polynomial": (8, 12, 14)}.get(model, (4, 5, 8, 12, 14))
     values = _numbers(value, name, counts)
@@ -231,7 +230,7 @@ def _lens(data: Mapping[str, Any]) -> dict[str, str | float] | None:
         if amount != 0:
             kind = "tilted sensor" if term.startswith("tau") else "thin prism"
             raise InputError(f"{name}: {term} = {amount:g} ({kind}): must be 0; simtest does not know that term")
-    return lens_table(fisheye, dict(zip(BROWN_ORDER, values, strict=False)))
+    return lens_table(fisheye, dict(zip(BROWN, values, strict=False)))
 
 
 def _check_no_other_lens(data: Mapping[str, Any]) -> None:
@@ -246,6 +245,8 @@ def _check_no_other_lens(data: Mapping[str, Any]) -> None:
 
 def _is_fisheye(data: Mapping[str, Any]) -> bool:
     model, flag = data.get("distortion_model"), data.get("fisheye_model")
+    if flag not in (None, 0, 1):
+        raise InputError(f"fisheye_model = {flag!r:.40}: must be 0 or 1")
     if model in (None, ""):
         return bool(flag)
     if not isinstance(model, str) or model.lower() not in MODELS:
@@ -299,15 +300,14 @@ def ros_file(camera: Camera, path: Path, _: Poses | None) -> Files:
 
 def _shifted(camera: Camera, whose: str) -> tuple[Any, list[float]]:
     """Return K and the coefficients in the other convention; raise `InputError` for a skew."""
-    if camera.skew != 0:
-        raise InputError(f"camera.skew = {camera.skew:g}: must be 0, since {whose} ignores it; save as TOML instead")
+    check_no_skew(camera, f"{whose} ignores it")
     matrix = camera.K - np.array([[0, 0, PIXEL_CENTRE], [0, 0, PIXEL_CENTRE], [0, 0, 0]])
     lens = camera.distortion
     if isinstance(lens, Scaramuzza):
         raise InputError(f"camera.distortion: {whose} has no Scaramuzza lens; save as TOML or for MATLAB instead")
     if isinstance(lens, KannalaBrandt):
-        return matrix, [float(getattr(lens, name)) for name in ("k1", "k2", "k3", "k4")]
-    values = [float(getattr(lens or BrownConrady(), name)) for name in BROWN_ORDER]
+        return matrix, coefficients(lens, FISHEYE)
+    values = coefficients(lens or BrownConrady(), BROWN)
     return matrix, values if any(values[5:]) else values[:5]
 
 
@@ -350,10 +350,8 @@ def kalibr_poses(text: str) -> Poses:
 
 
 def _chain(text: str) -> dict[str, Mapping[str, Any]]:
-    try:
+    with syntax("YAML"):
         data = parse_yaml(text)
-    except ValueError as error:
-        raise InputError(f"not valid YAML: {error!s:.80}") from error
     items = data.items() if isinstance(data, Mapping) else ()
     found = {name: value for name, value in items if KALIBR_CAMERA.fullmatch(name)}
     if not found:
@@ -370,11 +368,8 @@ def _kalibr_camera(data: Mapping[str, Any]) -> Table:
         raise InputError(f"camera_model = {model!r:.40}: simtest lacks it; must be pinhole")
     fx, fy, cx, cy = numbers(data.get("intrinsics"), "intrinsics", 4)
     width, height = numbers(data.get("resolution"), "resolution", 2)
-    return {
-        "width": int(number(width, "resolution", whole=True)), "fx": fx, "cx": cx + PIXEL_CENTRE,
-        "height": int(number(height, "resolution", whole=True)), "fy": fy, "cy": cy + PIXEL_CENTRE,
-        "distortion": _kalibr_lens(data),
-    }  # fmt: skip
+    size = [int(number(side, "resolution", whole=True)) for side in (width, height)]
+    return plain_table(size, (fx, fy), (cx, cy), PIXEL_CENTRE, distortion=_kalibr_lens(data))
 
 
 def _kalibr_lens(data: Mapping[str, Any]) -> Table | None:
@@ -385,4 +380,4 @@ def _kalibr_lens(data: Mapping[str, Any]) -> Table | None:
     if name == "none":
         return None
     fisheye, told = name != "radtan", numbers(data.get("distortion_coeffs"), "distortion_coeffs", 4)
-    return lens_table(fisheye, dict(zip(("k1", "k2", "k3", "k4") if fisheye else BROWN_ORDER[:4], told, strict=True)))
+    return lens_table(fisheye, dict(zip(FISHEYE if fisheye else BROWN, told, strict=False)))
