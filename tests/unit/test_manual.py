@@ -1,6 +1,5 @@
 """The manual: every page is reached, the reference is complete, links work, and the checks find faults."""
 
-import dataclasses
 import inspect
 import itertools
 import json
@@ -163,7 +162,8 @@ def test_every_file_of_a_frame_is_in_the_reference():
 @pytest.mark.parametrize("record", [RunRecord, Figures])
 def test_docstrings_of_records_name_their_fields(record):
     named = [name for own in parse(inspect.getdoc(record)).params for name in own.arg_name.split(", ")]
-    assert sorted(named) == sorted(field.name for field in dataclasses.fields(record))
+    fields = getattr(record, "model_fields", None) or record.__dataclass_fields__
+    assert sorted(named) == sorted(fields)
 
 
 def spot_picture():

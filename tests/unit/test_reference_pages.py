@@ -90,7 +90,7 @@ def test_every_field_of_an_estimate_is_explained():
     assert not missing(Estimate.__dataclass_fields__, section)
 
 
-@pytest.mark.parametrize("names", [SCHEMA, Figures.__dataclass_fields__], ids=["columns", "figures"])
+@pytest.mark.parametrize("names", [SCHEMA, Figures.model_fields], ids=["columns", "figures"])
 def test_every_column_and_figure_is_explained(names):
     assert not missing(names, page("experiments.md"))
 
