@@ -14,7 +14,7 @@ from simtest.realism.comparison import compare
 from simtest.realism.frame_sets import open_frames, open_generated
 from simtest.runtime.files import write_json
 from simtest.spec import load_scene
-from simtest.validation.realism import MEASURED, MeasuredDistance, look_of
+from simtest.validation.situations import MEASURED, MeasuredDistance, look_of
 
 
 def main() -> None:

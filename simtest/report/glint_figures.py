@@ -24,7 +24,7 @@ from simtest.report.relief_figures import (
 )
 from simtest.report.run_folder import Run
 from simtest.runtime.statistics import deviation_of_mean, mean_interval, summed
-from simtest.validation import relief_laws
+from simtest.validation import laws
 from simtest.validation.statistics import units
 
 LEAST_RADIUS_PX = 2.0
@@ -118,7 +118,7 @@ def _centroids(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
     if rows["setting"].n_unique() < 2:
         return
     labels = symbols(rows["label"].to_list())
-    marks, measured, independent = [], [], float(relief_laws.independent_centroid_error(1.0, 1.0))
+    marks, measured, independent = [], [], float(laws.independent_centroid_error(1.0, 1.0))
     for (name, symbol), colour in zip(labels.items(), cycle(SERIES), strict=False):
         own = rows.filter(pl.col("label") == name).with_columns(
             expected=pl.col("cloud_error_law_deg").mean().over("setting") / independent
@@ -131,12 +131,10 @@ def _centroids(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
         measured.append(f"{name}: {number(shares.mean())} s/√N in the mean of {own.height} clouds{interval}.")
     ends = finite([mark.x for mark in marks])
     x = np.geomspace(ends.min() / 1.3, ends.max() * 1.3, 60)
-    lines = [Mark(x, relief_laws.independent_centroid_error(x, 1.0), NEUTRAL, "1.25 s/√N: independent glints",
+    lines = [Mark(x, laws.independent_centroid_error(x, 1.0), NEUTRAL, "1.25 s/√N: independent glints",
                   line="dot", width=1.5)]  # fmt: skip
-    known = " and ".join(f"{factor:g}" for factor in relief_laws.CENTROID_FACTORS)
-    lines += [
-        Mark(x, factor * x, NEUTRAL, f"{known} s/√N", line="dash", width=1.5) for factor in relief_laws.CENTROID_FACTORS
-    ]
+    known = " and ".join(f"{factor:g}" for factor in laws.CENTROID_FACTORS)
+    lines += [Mark(x, factor * x, NEUTRAL, f"{known} s/√N", line="dash", width=1.5) for factor in laws.CENTROID_FACTORS]
     panel = Panel(Axis("slope over gain and root of the number of glints, s/√N (deg)", "log"),
                   _log("error of the cloud's mean normal (deg)", [*lines, *marks]), (*lines, *marks))  # fmt: skip
     about = (
@@ -175,7 +173,7 @@ def _ratios(clouds: pl.DataFrame) -> Iterator[ReliefFigure]:
                           hover=f"{name}\nk d = {{x}}: {{y}}"))  # fmt: skip
     ends = finite([mark.x for mark in marks])
     fine = np.linspace(ends.min(), ends.max(), 161)
-    dashes = Mark(fine, [relief_laws.cloud_axis_ratio((1 + kd, 1.0)) for kd in fine], NEUTRAL,
+    dashes = Mark(fine, [laws.cloud_axis_ratio((1 + kd, 1.0)) for kd in fine], NEUTRAL,
                   "law: |1 + d k|, minor over major", line="dash", width=1.5, hover="law\n{x}: {y}")  # fmt: skip
     panel = Panel(sweep_axis(KD), Axis("axis ratio of the cloud", limits=(0.0, 1.4)), (dashes, *marks))
     about = (
@@ -216,7 +214,7 @@ def pooled_ratio(rows: pl.DataFrame) -> tuple[float, float, tuple[float, float]]
 
 def _ratio_law(rows: pl.DataFrame) -> float:
     gains = [1 + float(rows[name].mean()) for name in ("cloud_kd_min", "cloud_kd_max")]  # type: ignore[arg-type]
-    return relief_laws.cloud_axis_ratio((gains[0], gains[1]))
+    return laws.cloud_axis_ratio((gains[0], gains[1]))
 
 
 # Size (7.3) ----------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from simtest.report.run_folder import Run
 from simtest.report.series import axis_title
 from simtest.runtime.arrays import Array
 from simtest.spec.keys import name_key
-from simtest.validation import relief_laws
+from simtest.validation import laws
 
 KD = "kd_base"
 """Distance times the base's principal curvature of larger size: what a swept radius is drawn over."""
@@ -30,7 +30,7 @@ _TITLES = {
 }
 _NAMES = {KD: "the base's curvature", LEVEL: "the film's level"}
 _SEED = "surface.relief.seed"
-_LAW_OVER_SLOPE = float(relief_laws.relief_error(1.0))
+_LAW_OVER_SLOPE = float(laws.relief_error(1.0))
 _AGAINST = {"error_base_deg": "base", "error_fine_deg": "fine surface"}
 _SYMBOLS = {"error_base_deg": "●", "error_fine_deg": "▲"}
 
@@ -215,7 +215,7 @@ def _distribution(rows: pl.DataFrame, colours: Mapping[str, str]) -> Iterator[Re
             f"largest distance from Rayleigh {number(_largest_gap(values))}."
         )
     fine = np.linspace(0, 4, 161)
-    law = Mark(fine, relief_laws.relief_error_share(fine, 1.0), NEUTRAL, "law: Rayleigh", line="dash", width=1.5,
+    law = Mark(fine, laws.relief_error_share(fine, 1.0), NEUTRAL, "law: Rayleigh", line="dash", width=1.5,
                hover="Rayleigh\n{x}: {y}")  # fmt: skip
     panel = Panel(Axis("error against the base over the relief's slope", limits=(0.0, 4.0)),
                   Axis("share of highlights below", limits=(0.0, 1.02)), (law, *marks))  # fmt: skip
@@ -230,6 +230,6 @@ def _distribution(rows: pl.DataFrame, colours: Mapping[str, str]) -> Iterator[Re
 
 def _largest_gap(values: Array) -> float:
     """Compute the Kolmogorov-Smirnov distance of sorted errors over the slope from Rayleigh's distribution."""
-    expected, count = relief_laws.relief_error_share(values, 1.0), len(values)
+    expected, count = laws.relief_error_share(values, 1.0), len(values)
     above, below = np.arange(1, count + 1) / count - expected, expected - np.arange(count) / count
     return float(max(above.max(), below.max()))

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -148,7 +148,8 @@ KernelTable = dict[str, Any]
 class _Reflectance(Spec):
     """What the renderer takes of a reflectance beside its parameters is `kernel`, `updates`, `compiled`, `base_kernel`.
 
-    Each class gives `kernel`, its description, `updates`, the values that change without a rebuild, and `half_width`.
+    Each class gives `kernel`, its description, `updates`, the values that change without a rebuild, `half_width`, and
+    its name `in_words`.
     """
 
     diffuse: Share = Field(0.0, description="share of the diffuse base, its albedo")
@@ -203,6 +204,8 @@ class _Painted(_Reflectance):
 class PhongReflectance(_Painted):
     """Phong: specular c cos^n(beta) as published, or the energy-conserving form."""
 
+    in_words: ClassVar[str] = "Phong lobe"
+
     type: Literal["phong"] = "phong"
     exponent: float = Field(50.0, gt=0, le=1e5, description="roughness exponent n")
     specular: float = Field(1.0, ge=0, le=1e6, description="scale c of the specular lobe")
@@ -252,6 +255,8 @@ class PhongReflectance(_Painted):
 class RoughPlasticReflectance(_Reflectance):
     """Mitsuba's rough plastic, GGX."""
 
+    in_words: ClassVar[str] = "rough plastic"
+
     type: Literal["rough_plastic"] = "rough_plastic"
     alpha: float = Field(0.15, gt=0, le=1, description="GGX roughness")
     diffuse: Share = Field(0.5, description="share of the diffuse base, its albedo")
@@ -275,6 +280,8 @@ class RoughPlasticReflectance(_Reflectance):
 
 class PrincipledReflectance(_Reflectance):
     """Mitsuba's principled material, not metallic."""
+
+    in_words: ClassVar[str] = "principled lobe"
 
     type: Literal["principled"] = "principled"
     roughness: float = Field(0.3, gt=0, le=1, description="roughness (alpha is its square)")
@@ -304,6 +311,8 @@ class PrincipledReflectance(_Reflectance):
 
 class RoughConductorReflectance(_Reflectance):
     """Mitsuba's rough conductor, GGX, blended with a diffuse base by its share."""
+
+    in_words: ClassVar[str] = "rough conductor"
 
     type: Literal["rough_conductor"] = "rough_conductor"
     alpha: float = Field(0.2, gt=0, le=1, description="GGX roughness")
@@ -344,6 +353,8 @@ class Film(Spec):
 
 class TissueReflectance(_Painted):
     """Wet tissue: the film's reflection, and a diffuse base whose light passes the film twice."""
+
+    in_words: ClassVar[str] = "film over tissue"
 
     type: Literal["tissue"] = "tissue"
     film: Film

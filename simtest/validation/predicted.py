@@ -13,7 +13,7 @@ from simtest.spec.lights import CosineProfile, is_at_camera
 from simtest.spec.reflectance import PhongReflectance
 from simtest.spec.scene import Scene
 from simtest.spec.surfaces import Relief
-from simtest.validation import laws, relief_laws
+from simtest.validation import laws
 
 EQUAL_KD = 1e-3
 """Principal curvatures times distance that differ by less are those of a plane or a sphere."""
@@ -149,7 +149,7 @@ def base_law_deg(scene: Scene) -> float | None:
     For isotropic gaussian relief without pools; None for other surfaces.
     """
     relief = _lawful_relief(scene)
-    return None if relief is None else float(np.degrees(relief_laws.relief_error(np.radians(relief.slope_deg))))
+    return None if relief is None else float(np.degrees(laws.relief_error(np.radians(relief.slope_deg))))
 
 
 def glint_count_law(scene: Scene, centre: HighlightPoint) -> float | None:
@@ -165,7 +165,7 @@ def glint_count_law(scene: Scene, centre: HighlightPoint) -> float | None:
     waves = np.array([band.wavelength_mm for band in relief.bands])
     wave = np.sqrt(squared.sum() / np.sum(squared / waves**2))
     gains = 1 + centre.kd_min, 1 + centre.kd_max
-    return relief_laws.glint_count(float(np.sqrt(squared.sum())), float(wave), centre.distance, gains)
+    return laws.glint_count(float(np.sqrt(squared.sum())), float(wave), centre.distance, gains)
 
 
 def centroid_law_deg(scene: Scene, centre: HighlightPoint, glints: int) -> float | None:
@@ -177,7 +177,7 @@ def centroid_law_deg(scene: Scene, centre: HighlightPoint, glints: int) -> float
     if relief is None or not is_at_camera(scene.rig.true_mm()[centre.light]):
         return None
     gains = 1 + centre.kd_min, 1 + centre.kd_max
-    return float(np.degrees(relief_laws.independent_centroid_error(np.radians(relief.slope_deg), glints, gains)))
+    return float(np.degrees(laws.independent_centroid_error(np.radians(relief.slope_deg), glints, gains)))
 
 
 def _lawful_relief(scene: Scene) -> Relief | None:

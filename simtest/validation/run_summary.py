@@ -11,12 +11,11 @@ from simtest.runtime import provenance
 from simtest.runtime.files import Json, write_atomically, write_json
 from simtest.spec import Experiment
 from simtest.validation.cases import Case
-from simtest.validation.conditions import conditions_of
 from simtest.validation.faults import faults_of
 from simtest.validation.mesh_verdicts import mesh_verdicts
-from simtest.validation.realism import realism_of
 from simtest.validation.run_folder import RESULTS
 from simtest.validation.runner import RunRecord
+from simtest.validation.situations import conditions_of, realism_of
 from simtest.validation.statistics import summarise
 
 

@@ -1,10 +1,154 @@
-"""Sorts the settings of a run into situations: settings of one kind of light, surface, relief, noise and spot."""
+"""A scene in words: its conditions, the situation that a run's guide sorts it into, and which realism it stands for.
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+Conditions are read from the scenes: what a reader asks before choosing an estimator and no column of results tells.
+Situations are settings of one kind of light, surface, relief, noise and spot. Realism: a scene is a smooth control, or
+tissue with its measured distance to real frames. The distances stand in measured_realism.json, which
+`studies/realism_table.py` writes. An entry is quoted only for what looks as the measured scene did: its key is a hash
+of all that a frame shows, but for seeds, viewpoint and rendering.
+"""
+
+import hashlib
+import json
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, TypedDict
 
 import numpy as np
 import polars as pl
+
+from simtest.runtime.files import Json
+from simtest.spec import Scene, scene_from_dict
+from simtest.validation.cases import Case
+
+LOW_NOISE = 0.02
+"""White noise up to this share of full scale is called low."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions of a setting, in words; lengths of the camera and the lobe as numbers.
+
+    Parameters
+    ----------
+    told : str
+        What the estimators are told of the lights: "position and distance known", "position known" or
+        "position not known", and whether the known one has an error.
+    relief : str
+        Relief and film of the surface.
+    sensor : str
+        Noise, and what else the sensor does that estimators suffer from.
+    render : str
+        Light beside the direct highlight: a diffuse base, bounces.
+    camera : str
+        Projection and distortion.
+    reflectance : str
+        Type of the lobe.
+    emission : str
+        What of the lights' emission estimators suffer from; empty where nothing.
+    half_width_rad : float or None
+        Angle between normal and sightline at which the lobe falls to half.
+    focal_px : float or None
+        Focal length, px.
+    """
+
+    told: str = ""
+    relief: str = ""
+    sensor: str = ""
+    render: str = ""
+    camera: str = ""
+    reflectance: str = ""
+    emission: str = ""
+    half_width_rad: float | None = None
+    focal_px: float | None = None
+
+    def to_json(self) -> Json:
+        """Return the entry of summary.json."""
+        return asdict(self)
+
+
+def conditions_of(cases: Iterable[Case]) -> dict[str, Conditions]:
+    """Return the conditions of each setting; its first part counts, and computed cases have none."""
+    found: dict[str, Conditions] = {}
+    for case in cases:
+        if not case.is_paper and case.setting not in found:
+            found[case.setting] = conditions(scene_from_dict(case.data, case.where), case.random)
+    return found
+
+
+def conditions(scene: Scene, drawn: Collection[str] = ()) -> Conditions:
+    """Return the conditions of a scene, of which the values of some keys are drawn for each realisation."""
+    return Conditions(
+        _told(scene, drawn), _relief(scene), _sensor(scene), _render(scene), _camera(scene),
+        scene.reflectance.in_words, _emission(scene),
+        float(scene.reflectance.half_width), float(scene.camera.fx),
+    )  # fmt: skip
+
+
+def _told(scene: Scene, drawn: Collection[str]) -> str:
+    if not scene.known.lights:
+        return "position not known"
+    keys = ("distance_mm", "distance_error")
+    has_distance = any(getattr(scene.known, key) is not None or f"known.{key}" in drawn for key in keys)
+    told = "position and distance known" if has_distance else "position known"
+    wrong = any(light.position_error_mm for light in scene.rig.lights)
+    return f"{told}, the position with an error" if wrong else told
+
+
+def _emission(scene: Scene) -> str:
+    parts = [] if scene.rig.emission_known else ["emission not told"]
+    parts += ["light of finite size"] if any(light.source is not None for light in scene.rig.lights) else []
+    return ", ".join(parts)
+
+
+def _relief(scene: Scene) -> str:
+    relief = scene.surface.relief
+    parts = [] if relief is None else ["relief"]
+    if scene.film_level is not None:
+        parts.append("liquid in its valleys")
+    return " with ".join(parts) or "smooth surface"
+
+
+def _sensor(scene: Scene) -> str:
+    sensor = scene.sensor
+    sigma = sensor.noise_sigma
+    parts = []
+    if sigma > 0:
+        parts.append("noise up to 2 %" if sigma <= LOW_NOISE else "noise above 2 %")
+    parts += [
+        words
+        for words, applies in (
+            ("shot noise", sensor.full_well is not None),
+            ("blur", sensor.point_spread_px > 0),
+            ("clipping", sensor.saturation),
+            (f"{sensor.bits} bits", sensor.bits is not None),
+            ("encoded values" + ("" if sensor.response_known else ", not told"), sensor.response.type != "linear"),
+            ("vignetting not told", not sensor.vignetting_known),
+            ("lossy coding", sensor.coding is not None),
+            ("colour mosaic", sensor.mosaic is not None),
+            ("colour processing", sensor.colour is not None),
+            ("sharpening", sensor.sharpening is not None),
+            ("rescaled", sensor.scaling is not None),
+            ("overlay", sensor.overlay is not None),
+        )
+        if applies
+    ]
+    return ", ".join(parts) or "no noise"
+
+
+def _render(scene: Scene) -> str:
+    parts = ["diffuse base"] if getattr(scene.reflectance, "diffuse", 0.0) else []
+    parts += ["bounced light"] if scene.render.path_depth > 2 else []
+    parts += ["instruments"] if scene.shown_instruments else []
+    return ", ".join(parts) or "direct highlight alone"
+
+
+def _camera(scene: Scene) -> str:
+    kind = getattr(scene.camera.distortion, "type", None) if scene.camera.distortion is not None else None
+    return {None: "pinhole camera", "none": "pinhole camera", "brown_conrady": "distorted lens",
+            "kannala_brandt": "fisheye", "scaramuzza": "omnidirectional lens"}.get(kind, str(kind))  # fmt: skip
+
 
 FLAT = 0.05
 """A curvature times distance below this size counts as none: the surface bends by less than 1/20 of its distance."""
@@ -25,7 +169,7 @@ _USUAL = {"direct highlight alone", "pinhole camera", "resolved spot", "smooth s
 
 _ANALYTIC = {"plane", "cylinder", "sphere", "quadric"}
 
-_TOLD = ("reflectance", "emission", "relief", "sensor", "render", "camera")
+_ASPECTS = ("reflectance", "emission", "relief", "sensor", "render", "camera")
 
 
 @dataclass(frozen=True)
@@ -65,7 +209,7 @@ def situations_of(
     true : polars.DataFrame
         Rows of results.parquet with a true highlight.
     conditions : mapping
-        Conditions of each setting (`simtest.validation.conditions`); may be empty.
+        Conditions of each setting (`conditions_of`); may be empty.
 
     Returns
     -------
@@ -97,15 +241,15 @@ def _kind(rows: pl.DataFrame, told: Mapping[str, object]) -> tuple[str, ...]:
     """Return what kind of setting some highlights belong to: a phrase for each aspect, empty for one not known."""
     if rows["kd_min"].null_count() == rows.height:
         # The published protocol computes its frames; the label names what it varies.
-        return (str(rows["label"][0]), "", "", *("" for _ in _TOLD))
+        return (str(rows["label"][0]), "", "", *("" for _ in _ASPECTS))
     names = [str(name) for name in rows["surface"].drop_nulls().unique(maintain_order=True)]
-    surface = _surface(rows)
+    surface = _shape(rows)
     if set(names) - _ANALYTIC:
         surface = f"{', '.join(names)}: {surface}"
-    return (surface, _light(rows, told), _spot(rows, told), *(str(told.get(name) or "") for name in _TOLD))
+    return (surface, _light(rows, told), _spot(rows, told), *(str(told.get(name) or "") for name in _ASPECTS))
 
 
-def _surface(rows: pl.DataFrame) -> str:
+def _shape(rows: pl.DataFrame) -> str:
     """Name the kind of surface at some highlights by the signs of their principal curvatures.
 
     Under a relief these are the base's: the fine surface bends both ways within every cloud.
@@ -151,3 +295,106 @@ def _spot(rows: pl.DataFrame, told: Mapping[str, object]) -> str:
     stretch = np.abs((1 + rows["kd_min"].to_numpy()) * (1 + rows["kd_max"].to_numpy()))
     radius = focal * half_width / np.sqrt(np.nanmedian(np.maximum(stretch, 1e-6)))
     return "small spot (below 3 px)" if radius < SMALL_SPOT_PX else "resolved spot"
+
+
+MEASURED = Path(__file__).parent / "measured_realism.json"
+
+CHAIN = ("mosaic", "colour", "sharpening", "scaling", "overlay", "coding")
+"""Stages of the camera chain, keys of `sensor`: with one of them, or with motion, there is a chain."""
+
+UNKNOWN = "Its distance to real frames is not known; `simtest realism` measures it."
+
+
+class MeasuredDistance(TypedDict):
+    """An entry of measured_realism.json: a scene's distance to a set of real frames."""
+
+    scene: str
+    look: str  # `look_of` the scene
+    real: list[str]  # names of the real frames
+    frames: int  # generated ones
+    verdict: str
+    near: int
+    judged: int
+    statistics: Json
+
+
+def realism_of(cases: Iterable[Case]) -> list[Json]:
+    """Describe the scenes of an experiment: an entry for all labels whose scenes are alike; none for computed cases."""
+    found: dict[str, tuple[dict[str, Json], list[str]]] = {}
+    for case in cases:
+        if case.is_paper:
+            continue
+        entry = _entry(scene_from_dict(case.data, case.where), case.random)
+        _, labels = found.setdefault(json.dumps(entry, sort_keys=True), (entry, []))
+        if case.label not in labels:
+            labels.append(case.label)
+    return [{"scenes": labels, **entry} for entry, labels in found.values()]
+
+
+def _entry(scene: Scene, random: Mapping[str, Any]) -> dict[str, Json]:
+    kind, what = _carried(scene)
+    stages = ["motion"] if scene.camera.motion is not None else []
+    stages += [name for name in CHAIN if getattr(scene.sensor, name) is not None]
+    chain = f"through a camera chain ({', '.join(stages)})" if stages else "without a camera chain"
+    # What is drawn anew for each realisation has not one look.
+    measured = None if random else _measured().get(look_of(scene))
+    distance = UNKNOWN if measured is None else _quoted(measured)
+    # A smooth scene is a control, whatever its distance.
+    told = f"{what}, {chain}." + ("" if kind == "smooth" and measured is None else f" {distance}")
+    quoted: Json = None
+    if measured is not None:
+        quoted = {
+            "scene": measured["scene"], "real": measured["real"], "frames": measured["frames"],
+            "verdict": measured["verdict"], "statistics": measured["statistics"],
+        }  # fmt: skip
+    return {"kind": kind, "camera_chain": stages, "sentence": told, "distance": quoted}
+
+
+def _carried(scene: Scene) -> tuple[str, str]:
+    """Return whether a scene is smooth or tissue, or only rough or painted, and what its surface carries."""
+    relief = scene.surface.relief
+    parts = []
+    if relief is not None:
+        bands = " and ".join(f"{band.slope_deg:g}° at {band.wavelength_mm:g} mm" for band in relief.bands)
+        parts.append(f"relief with slopes of {bands}")
+    if scene.film_level is not None or getattr(scene.reflectance, "film", None) is not None:
+        parts.append("a liquid film")
+    if scene.albedo is not None:
+        parts.append("vessels and mottling")
+    if scene.translucency is not None:
+        parts.append("translucency")
+    if not parts:
+        return "smooth", "Smooth control: no relief and no texture"
+    kind = "tissue" if relief is not None and scene.albedo is not None else "partial"
+    words = parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
+    return kind, f"{'Tissue' if kind == 'tissue' else 'Parts of tissue'}: {words}"
+
+
+def _quoted(measured: MeasuredDistance) -> str:
+    real, frames = len(measured["real"]), f"{measured['frames']} frames of {measured['scene']}"
+    against = f"measured on {frames} against {real} real {'frame' if real == 1 else 'frames'}"
+    if not measured["judged"]:
+        return f"Its distance to real frames carries no verdict: too few scenes ({against})."
+    return f"{measured['near']} of {measured['judged']} statistics are near real frames ({against})."
+
+
+def look_of(scene: Scene) -> str:
+    """Return a hash of all of a scene that its frames show, but for seeds, viewpoint and rendering."""
+    # Defaults are left out, so that a key that scenes get later changes no look.
+    keys = scene.model_dump(mode="json", exclude={"name", "render"}, exclude_defaults=True)
+    surface, reflectance = keys.setdefault("surface", {}), keys.setdefault("reflectance", {})
+    surface.pop("viewpoint", None)
+    for table in (surface.get("relief"), reflectance.get("albedo"), keys.get("sensor"), keys.get("rig")):
+        if table is not None:
+            table.pop("seed", None)
+    keys["types"] = [part.type for part in (scene.surface, scene.reflectance, scene.sensor.response)]
+    return hashlib.sha256(json.dumps(keys, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@cache
+def _measured() -> dict[str, MeasuredDistance]:
+    """Return the measured distances by look."""
+    if not MEASURED.is_file():
+        return {}
+    entries: Sequence[MeasuredDistance] = json.loads(MEASURED.read_text(encoding="utf-8"))["scenes"]
+    return {entry["look"]: entry for entry in entries}

@@ -13,7 +13,7 @@ from simtest.spec import scene_from_dict
 from simtest.spec.reflectance import Translucency
 from simtest.spec.surfaces import Relief
 from simtest.surfaces.relief_field import make_relief
-from simtest.validation.relief_laws import cloud_covariance, glint_count, relief_error
+from simtest.validation.laws import cloud_covariance, glint_count, relief_error
 from tests.laws import by_hand
 from tests.laws.law import Law, law
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simtest.validation import relief_laws as laws
+from simtest.validation import laws
 from studies.relief_laws import Case, cloud, collect, count, normals
 
 pytestmark = pytest.mark.slow

@@ -17,10 +17,10 @@ from simtest.report.run_folder import read_run
 from simtest.runtime.statistics import median_interval
 from simtest.spec import load_experiment, load_scene
 from simtest.validation.cases import expand
-from simtest.validation.conditions import conditions, conditions_of
 from simtest.validation.guide import guide_of
 from simtest.validation.paired import LEAST_FRAMES
 from simtest.validation.run_summary import run_summary
+from simtest.validation.situations import conditions, conditions_of
 
 FLAT = {"kd_min": 0.0, "kd_max": 0.0, "eps_over_d": 0.0, "surface": "plane"}
 TUBE = FLAT | {"kd_max": 1.0, "surface": "cylinder"}

@@ -9,7 +9,37 @@ from simtest.spec import load_scene
 from simtest.spec.lights import LightSpec, Rig
 from simtest.spec.reflectance import Reflectance
 from simtest.spec.sensor import Sensor
-from simtest.validation.conditions import DEGREES, conditions
+from simtest.validation.situations import conditions
+
+_PRESET = "stands for lights, which count themselves"
+_NUMBER = "in the number of lights and their offset, which the results tell"
+_TOLD_EMISSION = "told to the estimators, unless emission_known is false"
+
+DEGREES: dict[str, dict[str, str]] = {
+    "rig": {
+        **dict.fromkeys(("preset", "count", "radius_mm", "azimuth_deg", "axial_mm", "power", "each"), _PRESET),
+        "seed": "of position_error_mm",
+        **{f"lights.{key}": _NUMBER for key in ("position_mm", "offset_mm", "azimuth_deg")},
+        **{f"lights.{key}": _TOLD_EMISSION for key in ("colour", "profile", "direction", "spot_deg", "soft_edge_deg",
+                                                       "power")},
+    },
+    "reflectance": {
+        "colour": "of the diffuse base, which is a kind",
+        "albedo": "colour of the diffuse base, which is a kind",
+        "translucency": "of the diffuse base, which is a kind",
+        "specular": "scales the picture",
+        "normalised": "scales the picture",
+        "film": "its roughness is the half-width of the lobe, its level stands with the relief",
+    },
+    "sensor": {
+        "preset": "stands for other keys, which count themselves",
+        "vignetting": "taken out of the picture, unless vignetting_known is false",
+        "exposure": "scales the picture; what it clips is told by saturation",
+        "read_noise": "part of shot noise",
+        "seed": "of the noise",
+    },
+}  # fmt: skip
+"""Keys of a scene that set no situations apart, each with why; all others are kinds."""
 
 # A change of each key that sets situations apart, with what it needs beside.
 KINDS = {

@@ -8,9 +8,9 @@ from test_report import make_run
 from simtest.report.run_folder import Summary
 from simtest.report.write import write_report
 from simtest.spec import load_experiment, load_scene
-from simtest.validation import realism
+from simtest.validation import situations
 from simtest.validation.cases import expand
-from simtest.validation.realism import UNKNOWN, look_of, realism_of
+from simtest.validation.situations import UNKNOWN, look_of, realism_of
 
 
 def described(tmp_path, text):
@@ -34,7 +34,7 @@ def measured(monkeypatch):
         "scene": "tissue_colon", "look": look_of(load_scene("tissue_colon")), "real": ["a.png", "b.png"], "frames": 12,
         "verdict": "10 of 12", "near": 10, "judged": 12, "statistics": {},
     }  # fmt: skip
-    monkeypatch.setattr(realism, "_measured", lambda: {entry["look"]: entry})
+    monkeypatch.setattr(situations, "_measured", lambda: {entry["look"]: entry})
     return entry
 
 
@@ -80,7 +80,7 @@ def test_look_keeps_what_a_frame_shows_alone():
 
 
 def test_shipped_entries_are_whole():
-    held = json.loads(realism.MEASURED.read_text(encoding="utf-8"))["scenes"]
+    held = json.loads(situations.MEASURED.read_text(encoding="utf-8"))["scenes"]
     assert held
     for entry in held:
         assert entry["judged"] == len(entry["statistics"])
@@ -91,7 +91,7 @@ def test_shipped_entries_are_whole():
 @pytest.mark.slow
 def test_shipped_entries_are_of_the_scenes_as_they_are():
     """Where this fails, a scene was changed since: `python -m studies.realism_table` measures it again."""
-    for entry in json.loads(realism.MEASURED.read_text(encoding="utf-8"))["scenes"]:
+    for entry in json.loads(situations.MEASURED.read_text(encoding="utf-8"))["scenes"]:
         assert entry["look"] == look_of(load_scene(entry["scene"])), entry["scene"]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from simtest.validation import relief_laws as laws
+from simtest.validation import laws
 
 
 def test_without_relief_there_is_one_glint():

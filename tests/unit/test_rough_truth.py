@@ -10,7 +10,7 @@ from simtest.simulation.frame import render_view
 from simtest.simulation.highlights import CloudRegions
 from simtest.spec import Experiment, scene_from_dict
 from simtest.spec.spec_model import validate
-from simtest.validation import relief_laws
+from simtest.validation import laws
 from simtest.validation.cases import expand
 from simtest.validation.columns import table
 from simtest.validation.predicted import centroid_law_deg, glint_count_law
@@ -81,7 +81,7 @@ def test_columns_of_a_cloud_are_its_glints(name):
     visible = [spot for spot in made.view.visible_highlights if spot.cloud == 0]
     assert row["cloud_visible"] == sum(spot.peak_snr >= 10 for spot in visible)
     assert 0 < row["cloud_visible"] <= len(visible)
-    law = relief_laws.glint_count(np.radians(4.0), 2.0, 20.0, (1 + kd, 1.0))
+    law = laws.glint_count(np.radians(4.0), 2.0, 20.0, (1 + kd, 1.0))
     assert row["cloud_glints_law"] == pytest.approx(law, rel=1e-5)
 
 
@@ -147,7 +147,7 @@ def test_the_laws_hold_for_isotropic_gaussian_relief_under_a_light_at_the_camera
     session = Session(scene_of())
     (centre,) = session.base_highlights(session.radiance())
     expected = glint_count_law(session.scene, centre)
-    assert expected == pytest.approx(relief_laws.glint_count(np.radians(4.0), 2.0, 20.0), rel=1e-6)
+    assert expected == pytest.approx(laws.glint_count(np.radians(4.0), 2.0, 20.0), rel=1e-6)
     assert centroid_law_deg(session.scene, centre, 9) == pytest.approx(1.2533 * 4.0 / 3, rel=1e-4)
 
     def law(*bands, **more):
@@ -161,7 +161,7 @@ def test_the_laws_hold_for_isotropic_gaussian_relief_under_a_light_at_the_camera
     mixed = [{"slope_deg": 2.0, "wavelength_mm": 2.0}, {"slope_deg": 2.0, "wavelength_mm": 1.0}]
     curved = 2 * np.radians(2.0) ** 2 * (2 * np.pi) ** 2 * (1 / 2**2 + 1)
     wave = 2 * np.pi * np.sqrt(2 * np.radians(np.sqrt(8)) ** 2 / curved)
-    assert law(*mixed)[0] == pytest.approx(relief_laws.glint_count(np.radians(np.sqrt(8)), wave, 20.0), rel=1e-6)
+    assert law(*mixed)[0] == pytest.approx(laws.glint_count(np.radians(np.sqrt(8)), wave, 20.0), rel=1e-6)
     # Elsewhere there is none.
     assert law(one | {"kind": "ridged"}) == (None, None)
     assert law(one | {"anisotropy": 2.0}) == (None, None)
