@@ -42,7 +42,7 @@ from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import RenderedView
 from simtest.simulation.highlights import CloudRegions
 from simtest.spec.recipes import load_dataset
-from simtest.validation.cloud_rows import match_cloud
+from simtest.validation.matching import match_cloud
 from simtest.validation.metrics import mahalanobis2
 from studies.twins import SCOPES, _rendered, told
 

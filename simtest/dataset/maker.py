@@ -28,8 +28,8 @@ from simtest.simulation.highlights import TrueHighlight, cloud_json, lobe_region
 from simtest.simulation.sensor import to_uint8
 from simtest.spec import describe_camera
 from simtest.surfaces import forget_meshes
-from simtest.validation.cloud_rows import of_clouds
 from simtest.validation.columns import Row
+from simtest.validation.metrics import of_clouds
 from simtest.validation.realisation import answer, score
 
 UNPLACED = 100

@@ -1,15 +1,18 @@
-"""Matches detections, which come from the frame alone, to true highlights."""
+"""Matches detections, which come from the frame alone, to true highlights, and estimates of clouds to clouds."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE, PIXEL_CENTRE
 from simtest.errors import Failure
+from simtest.estimators import Estimate
 from simtest.geometry.patch import encloses
 from simtest.reconstruction.records import Specularity
 from simtest.runtime.arrays import Array
 from simtest.simulation.frame import RenderedView
+from simtest.simulation.highlights import CloudRegions
 
 
 def match(specularities: Sequence[Specularity], points_px: Sequence[Array]) -> dict[int, int]:
@@ -52,6 +55,27 @@ def on_instruments(
     pixels = [peak_px(specularity).astype(int) for specularity in specularities]
     peaks = [(min(max(row, 0), height - 1), min(max(column, 0), width - 1)) for column, row in pixels]
     return [i not in matched and bool(view.instruments[peak]) for i, peak in enumerate(peaks)]
+
+
+def match_cloud(regions: CloudRegions, view: RenderedView, estimate: Estimate) -> list[int]:
+    """Return the indices in `view.clouds`, whose `regions` are given, of those that an estimate is of, one a light.
+
+    Of each light it is the one that most of the estimate's spots belong to; of several, the nearest to where the
+    estimate looks. That of most spots comes first. Empty where they belong to none that is in view. A point that an
+    instrument covers or shades counts too, since the spots around it still belong to it.
+    """
+    if estimate.cloud is None or not view.clouds:
+        return []
+    points, centres = estimate.cloud.points_px, list(view.clouds)
+    votes: dict[int, int] = {}
+    for light in sorted({centre.light for centre in centres}):
+        owners = regions.assign(np.full(len(points), light), points)
+        counts = Counter(n for n in owners if n is not None)
+        if counts:
+            best = [n for n, count in counts.items() if count == max(counts.values())]
+            nearest = min(best, key=lambda n: float(np.hypot(*(centres[n].bp_px - estimate.look_px))))
+            votes[nearest] = counts[nearest]
+    return sorted(votes, key=lambda n: -votes[n])
 
 
 def _is_undetected(specularity: Specularity) -> bool:

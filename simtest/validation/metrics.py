@@ -1,28 +1,33 @@
 """Measures estimates against the truth: a row of results for each estimator at each detected or missed highlight."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from simtest.conventions import HIGHLIGHT_ISOVALUE, ON_INSTRUMENT
 from simtest.errors import Failure
-from simtest.estimators import Estimate
+from simtest.estimators import AnyEstimator, Estimate
 from simtest.estimators.budget import deviations
-from simtest.estimators.protocol import Law
+from simtest.estimators.protocol import CloudEstimator, Law
 from simtest.geometry import Patch
 from simtest.geometry.vectors import angle_deg, tangent_coordinates
 from simtest.reconstruction.records import Specularity
 from simtest.rendering import HighlightPoint, Session
 from simtest.runtime.arrays import Array
-from simtest.simulation.highlights import TrueHighlight
+from simtest.simulation.frame import RenderedView
+from simtest.simulation.highlights import CloudRegions, TrueHighlight
 from simtest.spec.scene import Scene
 from simtest.validation import laws
 from simtest.validation.columns import Row
+from simtest.validation.matching import match_cloud
 from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, base_law_deg, law_deg, look_law_deg
-from simtest.validation.rough_truth import RoughTruth
+from simtest.validation.rough_truth import Cloud, RoughTruth, cloud_columns
 
 MISSED = "missed"
+
+LEAST_VISIBLE = 15
+"""A cloud that is wholly in view and has so many visible highlights is missed where no estimate is of it."""
 
 
 def rows(
@@ -185,61 +190,53 @@ def _error_columns(
     """
     # The headline errors are those against the surface whose normal is stated.
     stated = truth.normal if estimate.target == "fine" else truth.normal_base
-    to_truth = angle_deg(estimate.candidates, stated)
-    error_look_deg = None if look_normal is None else float(angle_deg(estimate.normal, look_normal))
-    curvature = curvature_errors(estimate, truth)
     smoothing_px = 0.0 if isinstance(patch, Failure) else patch.smoothing_px
     return {
+        **scored(estimate, stated, look_normal),
+        **curvature_errors(estimate, truth),
         "axis_ratio_seen_law": axis_ratio_seen(scene, declared, estimate, truth, smoothing_px),
-        "error_deg": float(to_truth[0]),
         "error_fine_deg": float(angle_deg(estimate.normal, truth.normal)),
         "error_base_deg": float(angle_deg(estimate.normal, truth.normal_base)),
-        "error_oracle_deg": float(to_truth.min()),
-        "error_look_deg": error_look_deg,
         "error_law_deg": law_deg(scene, declared, estimate, truth),
         "error_look_law_deg": look_law_deg(scene, declared, estimate, truth),
         "error_base_law_deg": base_law_deg(scene),
-        "rank_correct": int(to_truth.argmin()),
-        "mahalanobis2": mahalanobis2(estimate, stated),
-        "gain_error": curvature.gain_error,
-        "gain_oracle_error": curvature.gain_oracle_error,
-        "direction_error_deg": curvature.direction_error_deg,
     }
 
 
-class CurvatureErrors(NamedTuple):
-    """Errors of an estimate's curvature; None where it has none.
+def scored(estimate: Estimate, truth: Array, look_normal: Array | None) -> Row:
+    """Compute an estimate's errors against the true normal of what it states, unit, shape (3,).
 
-    Parameters
-    ----------
-    gain_error, gain_oracle_error : float or None
-        The larger error of 1 + d k over its true value, of the proposed hypothesis and of the best one.
-    direction_error_deg : float or None
-        Angle between the estimated and the true direction of the smaller abs(1 + d k), in [0, 90]; None where the true
-        curvatures are equal.
+    `look_normal` is that where the estimate looks; None where there is no surface.
     """
+    errors = angle_deg(estimate.candidates, truth)
+    return {
+        "error_deg": float(errors[0]),
+        "error_oracle_deg": float(errors.min()),
+        "error_look_deg": None if look_normal is None else float(angle_deg(estimate.normal, look_normal)),
+        "rank_correct": int(errors.argmin()),
+        "mahalanobis2": mahalanobis2(estimate, truth),
+    }
 
-    gain_error: float | None = None
-    gain_oracle_error: float | None = None
-    direction_error_deg: float | None = None
 
+def curvature_errors(estimate: Estimate, true: HighlightPoint) -> Row:
+    """Compute the errors of an estimate's curvature at a true highlight; what it does not state is left out.
 
-def curvature_errors(estimate: Estimate, true: HighlightPoint) -> CurvatureErrors:
-    """Compute the errors of an estimate's curvature at a true highlight."""
-    found = estimate.curvature
-    if found is None:
-        return CurvatureErrors()
+    Of the gains it is the larger relative error of 1 + d k, of the proposed hypothesis and of the best one. The
+    direction is that of the smaller abs(1 + d k), in [0, 90] deg; left out where the true curvatures are equal.
+    """
+    stated, errors = estimate.curvature, Row()
+    if stated is None:
+        return errors
     # True gains and their first direction, the smaller gain first as in the estimate.
     gains, first = np.array([1 + true.kd_min, 1 + true.kd_max]), true.direction_min
     if abs(gains[0]) > abs(gains[1]):
         gains, first = gains[::-1], np.cross(true.normal, true.direction_min)
-    errors = CurvatureErrors()
-    if found.hypotheses is not None and np.all(gains != 0):
-        off = np.abs(found.hypotheses / gains - 1).max(axis=1)
-        errors = errors._replace(gain_error=float(off[0]), gain_oracle_error=float(off.min()))
+    if stated.hypotheses is not None and np.all(gains != 0):
+        off = np.abs(stated.hypotheses / gains - 1).max(axis=1)
+        errors |= {"gain_error": float(off[0]), "gain_oracle_error": float(off.min())}
     if abs(true.kd_max - true.kd_min) > EQUAL_KD:
-        angle = float(angle_deg(found.directions[0], first))
-        errors = errors._replace(direction_error_deg=min(angle, 180 - angle))
+        angle = float(angle_deg(stated.directions[0], first))
+        errors["direction_error_deg"] = min(angle, 180 - angle)
     return errors
 
 
@@ -259,3 +256,91 @@ def mahalanobis2(estimate: Estimate, truth: Array) -> float | None:
         return None
     miss = tangent_coordinates(estimate.normal, truth)
     return float(miss @ np.linalg.solve(covariance, miss))
+
+
+def of_clouds(estimators: Mapping[str, AnyEstimator]) -> list[str]:
+    """Return the names of the estimators that state the normals of clouds."""
+    return [name for name, estimator in estimators.items() if isinstance(estimator, CloudEstimator)]
+
+
+def apart(
+    specularities: Sequence[Specularity], names: Sequence[str]
+) -> tuple[list[Specularity], dict[str, list[tuple[int, Estimate]]], dict[str, Failure]]:
+    """Part the results of cloud estimators from those of single highlights.
+
+    Returns
+    -------
+    singles : list of Specularity
+        Those of single highlights, without the cloud estimators' results; they come first in `specularities`.
+    clouds : dict
+        Number of the specularity and estimate, by estimator.
+    failures : dict
+        Why an estimator found no cloud, if it failed.
+    """
+    clouds: dict[str, list[tuple[int, Estimate]]] = {name: [] for name in names}
+    failures: dict[str, Failure] = {}
+    singles = []
+    for i, specularity in enumerate(specularities):
+        own = {name: result for name, result in specularity.estimates.items() if name in clouds}
+        for name, result in own.items():
+            if isinstance(result, Failure):
+                failures[name] = result
+            else:
+                clouds[name].append((i, result))
+        if not any(isinstance(result, Estimate) for result in own.values()):
+            others = {name: result for name, result in specularity.estimates.items() if name not in clouds}
+            singles.append(replace(specularity, estimates=others))
+    return singles, clouds, failures
+
+
+def cloud_rows(
+    session: Session, view: RenderedView, common: Row, found: Mapping[str, Sequence[tuple[int, Estimate]]],
+    failures: Mapping[str, Failure], whole: Mapping[int, Cloud],
+) -> list[Row]:  # fmt: skip
+    """Make the rows of cloud estimators: of each estimate, and of each whole cloud that none is of.
+
+    `found` and `failures` are those of `apart`, `whole` the clouds that are wholly in view. The column ``true_id`` is
+    the index of the base's highlight point, as ``cloud``; the errors are against the base's normal there.
+    """
+    made, regions = [], CloudRegions.of(session, view.clouds) if any(found.values()) else None
+    for name, estimates in found.items():
+        taken: set[int] = set()
+        for i, estimate in estimates:
+            assert regions is not None
+            numbers = match_cloud(regions, view, estimate)
+            taken.update(numbers)
+            row = _cloud_row(session, common, view, whole, numbers[0] if numbers else None)
+            row |= estimate_columns(estimate) | {"estimator": name, "specularity": i}
+            made.append(row | _cloud_errors(session, estimate, [view.clouds[n] for n in numbers]) if numbers else row)
+        status = MISSED if name not in failures else str(failures[name].reason)
+        detail = None if name not in failures else failures[name].detail
+        for number, cloud in whole.items():
+            if number not in taken and cloud.visible >= LEAST_VISIBLE and view.clouds[number].lit:
+                row = _cloud_row(session, common, view, whole, number)
+                made.append(row | {"estimator": name, "status": status, "flags": detail})
+    return made
+
+
+def _cloud_row(
+    session: Session, common: Row, view: RenderedView, whole: Mapping[int, Cloud], number: int | None
+) -> Row:
+    """Return the row of a cloud before its estimate: scene, and the base's highlight point by number, if any."""
+    centre = None if number is None else view.clouds[number]
+    row = common | scene_columns(session.scene, centre) | {"true_id": number, "cloud": number, "target": "base"}
+    own = None if number is None else whole.get(number)
+    return row if own is None else row | cloud_columns(own)
+
+
+def _cloud_errors(session: Session, estimate: Estimate, centres: Sequence[HighlightPoint]) -> Row:
+    """Compute the errors against the base's normal at its highlight point, and where the estimate looks.
+
+    Lights that are not told apart make one cloud: the truth is the mean of the normals at their points.
+    """
+    mean = np.mean([centre.normal_base for centre in centres], axis=0)
+    truth = mean / np.linalg.norm(mean)
+    look = session.exact_points(estimate.look_px[None], fine=False)
+    errors = scored(estimate, truth, look.normal_base[0] if look.valid[0] else None)
+    truth_x, truth_y, truth_z = truth.tolist()
+    return errors | {
+        "error_base_deg": errors["error_deg"], "truth_x": truth_x, "truth_y": truth_y, "truth_z": truth_z,
+    }  # fmt: skip

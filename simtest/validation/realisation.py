@@ -15,10 +15,9 @@ from simtest.simulation.frame import RenderedView, render_view
 from simtest.simulation.highlights import TrueHighlight
 from simtest.spec import Experiment
 from simtest.validation.cases import Case
-from simtest.validation.cloud_rows import apart, cloud_rows, of_clouds
 from simtest.validation.columns import Row, Value, swept_columns
 from simtest.validation.matching import match, on_instruments
-from simtest.validation.metrics import MISSED, rows
+from simtest.validation.metrics import MISSED, apart, cloud_rows, of_clouds, rows
 from simtest.validation.motion import MOTION, FurtherView, MotionResult, further_views, with_motion
 from simtest.validation.rough_truth import rough_truth
 

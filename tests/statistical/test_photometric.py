@@ -22,8 +22,8 @@ from simtest.simulation.frame import render_view
 from simtest.spec import scene_from_dict
 from simtest.spec.recipes import PaperSetting
 from simtest.validation.metrics import mahalanobis2
-from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.plane_from_aside import PlaneFromAside, photometric_plane
+from simtest.validation.paper.predictions import cramer_rao_bound
 from simtest.validation.paper.published_pipeline import Pipeline
 from tests.marked import marked
 

@@ -14,8 +14,8 @@ from simtest.simulation.highlights import CloudRegions
 from simtest.spec import Experiment
 from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
-from simtest.validation.cloud_rows import match_cloud
 from simtest.validation.gallery_items import save
+from simtest.validation.matching import match_cloud
 from simtest.validation.realisation import Realiser
 
 PLANE = {

@@ -6,8 +6,8 @@ from pydantic import ValidationError
 
 from simtest.errors import InputError
 from simtest.spec.recipes import PaperSetting, paper_from_dict
-from simtest.validation.paper.bound import cramer_rao_bound
 from simtest.validation.paper.isocurves import brightest_point, isocurve_radii, isophote_radius
+from simtest.validation.paper.predictions import cramer_rao_bound
 from simtest.validation.paper.slanted_view import (
     draw_light,
     picture,

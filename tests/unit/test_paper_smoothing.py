@@ -6,9 +6,9 @@ import pytest
 from simtest.errors import Failure
 from simtest.geometry.vectors import angle_deg
 from simtest.spec.recipes import PaperSetting
-from simtest.validation.paper import smoothing
+from simtest.validation.paper import predictions
+from simtest.validation.paper.predictions import smoothing_bias
 from simtest.validation.paper.published_pipeline import Pipeline
-from simtest.validation.paper.smoothing import smoothing_bias
 
 TOLERANCE = 0.2
 """Share of the measured error."""
@@ -47,7 +47,7 @@ def test_the_law_meets_the_pipeline_without_noise(values):
 def test_the_interpolation_between_pixels_matters_where_the_smoothing_is_narrow(monkeypatch):
     setting = PaperSetting(sigma=0.0, smoothing_px=0.5)
     assert predicted(setting) == pytest.approx(measured(setting), rel=0.05)
-    monkeypatch.setattr(smoothing, "LINEAR_INTERPOLATION_PX2", 0.0)
+    monkeypatch.setattr(predictions, "LINEAR_INTERPOLATION_PX2", 0.0)
     assert predicted(setting) < 0.7 * measured(setting)
 
 
