@@ -12,9 +12,8 @@ import polars as pl
 
 from simtest.advice.plan import DISTANCES
 from simtest.runtime.statistics import Interval, mean_interval, root_mean_square
+from simtest.validation.comparison import Pair, best_of, targets_of
 from simtest.validation.guide import Advice, MethodFigures, advice_of
-from simtest.validation.paired import targets_of
-from simtest.validation.ranking import Pair, best_of
 from simtest.validation.row_kinds import is_false
 from simtest.validation.situations import Situation
 from simtest.validation.statistics import FRAME, units

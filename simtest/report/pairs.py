@@ -4,8 +4,7 @@ import polars as pl
 
 from simtest.pages.style import estimator_order
 from simtest.report.run_folder import Run
-from simtest.validation.paired import distinct_frames, side_by_side, targets_of
-from simtest.validation.ranking import Pair, compare
+from simtest.validation.comparison import Pair, compare, distinct_frames, side_by_side, targets_of
 
 
 def pairs(run: Run) -> list[tuple[str, Pair]]:

@@ -22,7 +22,7 @@ from simtest.validation import laws
 from simtest.validation.columns import Row
 from simtest.validation.matching import match_cloud
 from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, base_law_deg, law_deg, look_law_deg
-from simtest.validation.rough_truth import Cloud, RoughTruth, cloud_columns
+from simtest.validation.rough_truth import RoughTruth
 
 MISSED = "missed"
 
@@ -295,12 +295,12 @@ def apart(
 
 def cloud_rows(
     session: Session, view: RenderedView, common: Row, found: Mapping[str, Sequence[tuple[int, Estimate]]],
-    failures: Mapping[str, Failure], whole: Mapping[int, Cloud],
+    failures: Mapping[str, Failure], whole: Mapping[int, Row],
 ) -> list[Row]:  # fmt: skip
     """Make the rows of cloud estimators: of each estimate, and of each whole cloud that none is of.
 
-    `found` and `failures` are those of `apart`, `whole` the clouds that are wholly in view. The column ``true_id`` is
-    the index of the base's highlight point, as ``cloud``; the errors are against the base's normal there.
+    `found` and `failures` are those of `apart`, `whole` the columns of the clouds that are wholly in view. The column
+    ``true_id`` is the index of the base's highlight point, as ``cloud``; errors are against the base's normal there.
     """
     made, regions = [], CloudRegions.of(session, view.clouds) if any(found.values()) else None
     for name, estimates in found.items():
@@ -314,21 +314,20 @@ def cloud_rows(
             made.append(row | _cloud_errors(session, estimate, [view.clouds[n] for n in numbers]) if numbers else row)
         status = MISSED if name not in failures else str(failures[name].reason)
         detail = None if name not in failures else failures[name].detail
-        for number, cloud in whole.items():
-            if number not in taken and cloud.visible >= LEAST_VISIBLE and view.clouds[number].lit:
+        for number, columns in whole.items():
+            visible = columns["cloud_visible"]
+            is_clear = isinstance(visible, int) and visible >= LEAST_VISIBLE
+            if number not in taken and is_clear and view.clouds[number].lit:
                 row = _cloud_row(session, common, view, whole, number)
                 made.append(row | {"estimator": name, "status": status, "flags": detail})
     return made
 
 
-def _cloud_row(
-    session: Session, common: Row, view: RenderedView, whole: Mapping[int, Cloud], number: int | None
-) -> Row:
+def _cloud_row(session: Session, common: Row, view: RenderedView, whole: Mapping[int, Row], number: int | None) -> Row:
     """Return the row of a cloud before its estimate: scene, and the base's highlight point by number, if any."""
     centre = None if number is None else view.clouds[number]
     row = common | scene_columns(session.scene, centre) | {"true_id": number, "cloud": number, "target": "base"}
-    own = None if number is None else whole.get(number)
-    return row if own is None else row | cloud_columns(own)
+    return row if number is None else row | whole.get(number, {})
 
 
 def _cloud_errors(session: Session, estimate: Estimate, centres: Sequence[HighlightPoint]) -> Row:

@@ -17,8 +17,8 @@ from simtest.report.run_folder import read_run
 from simtest.runtime.statistics import median_interval
 from simtest.spec import load_experiment, load_scene
 from simtest.validation.cases import expand
+from simtest.validation.comparison import LEAST_FRAMES
 from simtest.validation.guide import guide_of
-from simtest.validation.paired import LEAST_FRAMES
 from simtest.validation.run_summary import run_summary
 from simtest.validation.situations import conditions, conditions_of
 
