@@ -9,7 +9,7 @@ of all that a frame shows, but for seeds, viewpoint and rendering.
 
 import hashlib
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 import polars as pl
 
 from simtest.runtime.files import Json
-from simtest.spec import Scene, scene_from_dict
+from simtest.spec import Scene, apply_settings, scene_from_dict
 from simtest.validation.cases import Case
 
 LOW_NOISE = 0.02
@@ -69,28 +69,30 @@ class Conditions:
 
 
 def conditions_of(cases: Iterable[Case]) -> dict[str, Conditions]:
-    """Return the conditions of each setting; its first part counts, and computed cases have none."""
+    """Return the conditions of each setting, at the upper ends of what is drawn for each realisation.
+
+    A setting's first part counts, and computed cases have none.
+    """
     found: dict[str, Conditions] = {}
     for case in cases:
         if not case.is_paper and case.setting not in found:
-            found[case.setting] = conditions(scene_from_dict(case.data, case.where), case.random)
+            data = apply_settings(case.data, case.ends[1], case.where)
+            found[case.setting] = conditions(scene_from_dict(data, case.where))
     return found
 
 
-def conditions(scene: Scene, drawn: Collection[str] = ()) -> Conditions:
-    """Return the conditions of a scene, of which the values of some keys are drawn for each realisation."""
+def conditions(scene: Scene) -> Conditions:
+    """Return the conditions of a scene."""
     return Conditions(
-        _told(scene, drawn), _relief(scene), _sensor(scene), _render(scene), _camera(scene),
-        scene.reflectance.in_words, _emission(scene),
-        float(scene.reflectance.half_width), float(scene.camera.fx),
+        _told(scene), _relief(scene), _sensor(scene), _render(scene), _camera(scene), scene.reflectance.in_words,
+        _emission(scene), float(scene.reflectance.half_width), float(scene.camera.fx),
     )  # fmt: skip
 
 
-def _told(scene: Scene, drawn: Collection[str]) -> str:
+def _told(scene: Scene) -> str:
     if not scene.known.lights:
         return "position not known"
-    keys = ("distance_mm", "distance_error")
-    has_distance = any(getattr(scene.known, key) is not None or f"known.{key}" in drawn for key in keys)
+    has_distance = scene.known.distance_mm is not None or scene.known.distance_error is not None
     told = "position and distance known" if has_distance else "position known"
     wrong = any(light.position_error_mm for light in scene.rig.lights)
     return f"{told}, the position with an error" if wrong else told
