@@ -1,4 +1,4 @@
-"""Measures estimates against the truth: a row of results for each estimator at each detected or missed highlight."""
+"""Measures estimates against the truth: a row of results for each estimator at each highlight, and at each cloud."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
