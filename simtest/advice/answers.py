@@ -15,8 +15,8 @@ from simtest.advice.plan import DISTANCES, Question
 from simtest.advice.tissue import rough
 from simtest.runtime.statistics import Interval, mean_interval, root_mean_square
 from simtest.validation import laws
+from simtest.validation.comparison import Pair, best_of, targets_of
 from simtest.validation.guide import Advice, MethodFigures, advice_of
-from simtest.validation.paired import Pair, best_of, targets_of
 from simtest.validation.situations import SMALL_SPOT_PX, Situation
 from simtest.validation.statistics import FRAME, is_false, units
 

@@ -6,8 +6,8 @@ from typing import Any
 
 from simtest.estimators.names import is_own
 from simtest.pages.style import estimator_order, number
+from simtest.validation.comparison import LEAST_FRAMES, MATTERS_DEG, MATTERS_SHARE
 from simtest.validation.guide import BREAK_DEG, LEAST_ANSWERED, Advice, Guide, MethodFigures
-from simtest.validation.paired import LEAST_FRAMES, MATTERS_DEG, MATTERS_SHARE
 
 HEADS = ("situation", "best method", "median error", "answered", "where it breaks")
 

@@ -12,7 +12,7 @@ from simtest.pages.style import degrees, estimator_order, number
 from simtest.report.error_figures import LEAST_LAW, TOLERANCE_DEG, TOLERANCE_SHARE
 from simtest.report.run_folder import Run
 from simtest.runtime.arrays import Array
-from simtest.validation.paired import Pair, compare, distinct_frames, side_by_side, targets_of
+from simtest.validation.comparison import Pair, compare, distinct_frames, side_by_side, targets_of
 from simtest.validation.situations import CO_LOCATED
 from simtest.validation.statistics import Figures, counts, row_kind
 

@@ -19,7 +19,7 @@ from simtest.runtime.processes import Engine, OnStep
 from simtest.spec import Experiment
 from simtest.spec.recipes import PaperSetting
 from simtest.validation.cases import Case, swept_example
-from simtest.validation.columns import Row, Value, completed, swept_columns, table
+from simtest.validation.columns import Row, Value, swept_columns, table
 from simtest.validation.paper.gallery_item import save_realisation
 from simtest.validation.paper.predictions import cramer_rao_bound
 from simtest.validation.paper.rows import paper_rows, pipeline_with
@@ -105,11 +105,12 @@ def make_rows(part: Part, tell: OnStep) -> pl.DataFrame:
     # The rows must not depend on the parts that this process has made before.
     forgive_cores()
     if part.case.is_paper:
-        made = completed(_published(part), part.swept)
+        rows = _published(part)
         for _ in part.numbers:
             tell()
-        return made
-    return table(_rendered(part, tell), part.swept)
+    else:
+        rows = _rendered(part, tell)
+    return table(rows, part.swept)
 
 
 def _rendered(part: Part, tell: OnStep) -> list[Row]:
@@ -125,7 +126,7 @@ def _rendered(part: Part, tell: OnStep) -> list[Row]:
     return rows
 
 
-def _published(part: Part) -> pl.DataFrame:
+def _published(part: Part) -> list[Row]:
     experiment, case, setting = part.experiment, part.case, part.case.paper_setting()
     seeds = [case.noise_seed(experiment, number) for number in part.numbers]
     if part.item:

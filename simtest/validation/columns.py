@@ -160,15 +160,6 @@ def table(rows: Sequence[Row], swept: Mapping[str, Value]) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=schema)
 
 
-def completed(made: pl.DataFrame, swept: Mapping[str, Value]) -> pl.DataFrame:
-    """Return a table of results with all columns of `table`, in its order; those that are missing are null."""
-    columns = [
-        (pl.col(name) if name in made.columns else pl.lit(None)).cast(dtype).alias(name)
-        for name, dtype in _schema(swept).items()
-    ]
-    return made.select(columns)
-
-
 def _schema(swept: Mapping[str, Value]) -> dict[str, pl.DataType]:
     return SCHEMA | {name: _dtype(value) for name, value in swept.items() if name not in SCHEMA}
 

@@ -24,40 +24,6 @@ of its glints are outside."""
 
 
 @dataclass(frozen=True)
-class Cloud:
-    """The glints of one light around one highlight point of the base, wholly in view (theory.md 7.1 to 7.5).
-
-    Parameters
-    ----------
-    glints : int
-        Zeros of the misfit, however faint.
-    glints_law : float or None
-        Their expected number (7.2); None where the law does not hold.
-    visible : int
-        Visible highlights that belong to it, above the noise as isolated ones are (theory.md section 6).
-    error_deg : float or None
-        Angle between the mean of the glints' fine normals and the base's normal at its highlight point. With the light
-        at the camera these normals are the reversed sightlines (7.5). None without glints, as `covariance`.
-    error_law_deg : float or None
-        Mean of `error_deg` if the glints were independent (7.5); None where the law does not hold.
-    kd_min, kd_max : float
-        Distance times principal curvatures of the base at its highlight point.
-    covariance : ndarray, shape (2, 2), or None
-        Mean square of the glints' positions about the highlight point, in its tangent plane along the directions of
-        k_min and k_max, mm^2 (7.1).
-    """
-
-    glints: int
-    glints_law: float | None
-    visible: int
-    error_deg: float | None
-    error_law_deg: float | None
-    kd_min: float
-    kd_max: float
-    covariance: Array | None
-
-
-@dataclass(frozen=True)
 class RoughTruth:
     """What stands beside the true highlights of a frame on a relief; all empty on a smooth surface.
 
@@ -70,7 +36,7 @@ class RoughTruth:
     alone_px : mapping
         Radius of the visible highlight that is whole and holds one glint alone, px, by index of the truth.
     clouds : mapping
-        By number, those wholly in view.
+        Columns of those wholly in view, by number (`whole_clouds`).
     is_rough : bool
         Whether the surface has a relief.
     """
@@ -78,7 +44,7 @@ class RoughTruth:
     visible: Sequence[VisibleHighlight] = ()
     seen: Mapping[int, int] = field(default_factory=dict)
     alone_px: Mapping[int, float] = field(default_factory=dict)
-    clouds: Mapping[int, Cloud] = field(default_factory=dict)
+    clouds: Mapping[int, Row] = field(default_factory=dict)
     is_rough: bool = False
 
     @cached_property
@@ -109,30 +75,12 @@ class RoughTruth:
             law = truth.radius_px if np.isfinite(truth.radius_px) else None
             alone = None if true_id is None else self.alone_px.get(true_id)
             row |= {"pool": truth.pool, "radius_px": alone, "radius_law_px": law}
-        whole = None if cloud is None else self.clouds.get(cloud)
-        return row if whole is None else row | cloud_columns(whole)
+        return row if cloud is None else row | self.clouds.get(cloud, {})
 
 
 def shown(visible: Sequence[VisibleHighlight]) -> list[VisibleHighlight]:
     """Return the visible highlights that stand above the noise as isolated ones do (theory.md section 6)."""
     return [spot for spot in visible if spot.peak_snr >= HIGHLIGHT_CONTRAST_SIGMA]
-
-
-def cloud_columns(cloud: Cloud) -> Row:
-    """Return the columns of a cloud that is wholly in view."""
-    covariance = cloud.covariance
-    return {
-        "cloud_glints": cloud.glints,
-        "cloud_glints_law": cloud.glints_law,
-        "cloud_visible": cloud.visible,
-        "cloud_error_deg": cloud.error_deg,
-        "cloud_error_law_deg": cloud.error_law_deg,
-        "cloud_kd_min": cloud.kd_min,
-        "cloud_kd_max": cloud.kd_max,
-        "cloud_cov_11": None if covariance is None else float(covariance[0, 0]),
-        "cloud_cov_12": None if covariance is None else float(covariance[0, 1]),
-        "cloud_cov_22": None if covariance is None else float(covariance[1, 1]),
-    }
 
 
 def rough_truth(session: Session, view: RenderedView, counted: Sequence[int], seen: Mapping[int, int]) -> RoughTruth:
@@ -146,31 +94,38 @@ def rough_truth(session: Session, view: RenderedView, counted: Sequence[int], se
     return RoughTruth(visible, seen, alone_px, whole_clouds(session, view), is_rough=True)
 
 
-def whole_clouds(session: Session, view: RenderedView) -> dict[int, Cloud]:
-    """Describe the clouds of a view that are wholly in view, by number (`WHOLE_SLOPES`)."""
+def whole_clouds(session: Session, view: RenderedView) -> dict[int, Row]:
+    """Return the columns of the clouds of a view that are wholly in view, by number (`WHOLE_SLOPES`).
+
+    A cloud is the glints of one light around one highlight point of the base (theory.md 7.1 to 7.5). With the light at
+    the camera the glints' fine normals are the reversed sightlines (7.5).
+    """
     relief = view.scene.surface.relief
     assert relief is not None
     least = WHOLE_SLOPES * np.radians(relief.slope_deg)
     edges = CloudRegions.of(session, view.clouds).edges()
-    return {n: _cloud(view, n, centre) for n, centre in enumerate(view.clouds) if edges[n] >= least}
+    return {n: _cloud_columns(view, n, centre) for n, centre in enumerate(view.clouds) if edges[n] >= least}
 
 
-def _cloud(view: RenderedView, number: int, centre: HighlightPoint) -> Cloud:
-    own = [glint for glint in view.highlights if glint.cloud == number]
-    error_deg = covariance = None
-    if own:
-        mean = np.mean([glint.normal for glint in own], axis=0)
-        error_deg = float(angle_deg(mean / np.linalg.norm(mean), centre.normal))
-        axes = np.stack([centre.direction_min, np.cross(centre.normal, centre.direction_min)])
-        at = (np.array([glint.position for glint in own]) - centre.position) @ axes.T
-        covariance = at.T @ at / len(own)
-    return Cloud(
-        glints=len(own),
-        glints_law=glint_count_law(view.scene, centre),
-        visible=sum(spot.cloud == number for spot in shown(view.visible_highlights)),
-        error_deg=error_deg,
-        error_law_deg=centroid_law_deg(view.scene, centre, len(own)) if own else None,
-        kd_min=centre.kd_min,
-        kd_max=centre.kd_max,
-        covariance=covariance,
-    )
+def _cloud_columns(view: RenderedView, number: int, centre: HighlightPoint) -> Row:
+    glints = [glint for glint in view.highlights if glint.cloud == number]
+    row: Row = {
+        "cloud_glints": len(glints),
+        "cloud_glints_law": glint_count_law(view.scene, centre),
+        "cloud_visible": sum(spot.cloud == number for spot in shown(view.visible_highlights)),
+        "cloud_kd_min": centre.kd_min,
+        "cloud_kd_max": centre.kd_max,
+    }
+    if not glints:
+        return row
+    mean = np.mean([glint.normal for glint in glints], axis=0)
+    axes = np.stack([centre.direction_min, np.cross(centre.normal, centre.direction_min)])
+    at = (np.array([glint.position for glint in glints]) - centre.position) @ axes.T
+    covariance = at.T @ at / len(glints)
+    return row | {
+        "cloud_error_deg": float(angle_deg(mean / np.linalg.norm(mean), centre.normal)),
+        "cloud_error_law_deg": centroid_law_deg(view.scene, centre, len(glints)),
+        "cloud_cov_11": float(covariance[0, 0]),
+        "cloud_cov_12": float(covariance[0, 1]),
+        "cloud_cov_22": float(covariance[1, 1]),
+    }

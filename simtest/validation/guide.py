@@ -5,7 +5,7 @@ share one. Settings that differ in degree do, and where a method breaks among th
 state the normal of the base are ranked apart from those that state the fine surface's: their errors are of other
 normals, and of other highlights.
 
-Methods are ranked in pairs, on the highlights that both answered (`simtest.validation.paired`): no other one is better
+Methods are ranked in pairs, on the highlights that both answered (`comparison`): no other one is better
 than the best, or the fewest are. A method ties with it where neither is better. What a method refuses or misses is
 counted apart: one that answers fewer than `LEAST_ANSWERED` of the highlights is not the best where another answers
 more. A method that breaks never ties with one that does not. Fewer than `LEAST_FRAMES` distinct frames make no tie:
@@ -22,7 +22,7 @@ from simtest.conventions import MOTION
 from simtest.errors import FAULTS
 from simtest.estimators.names import is_own
 from simtest.runtime.statistics import Interval, median_interval
-from simtest.validation.paired import (
+from simtest.validation.comparison import (
     LEAST_FRAMES,
     Distinct,
     Pair,

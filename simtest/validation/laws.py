@@ -1,7 +1,8 @@
-"""The closed-form laws that the renders confirm or refute (theory.md sections 3 and 4).
+"""The closed-form laws that the renders confirm or refute (theory.md sections 3, 4 and 7).
 
-All functions are vectorised over their arguments. Angles are in radians; half-axes are tangents of the half-angles of
-the back-projected cone. Arguments that recur:
+Those of sections 3 and 4 are vectorised over their arguments; those of section 7 are of the glints on a gaussian relief
+with light and camera together, lengths in mm, slopes in rad per axis. Angles are in radians; half-axes are tangents of
+the half-angles of the back-projected cone. Arguments that recur:
 
 - `kd`, `kd_min`, `kd_max`: d k, distance times signed (principal) curvature;
 - `isovalue`: t in (0, 1); `exponent`: n of a Phong lobe;

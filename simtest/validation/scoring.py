@@ -6,7 +6,6 @@ Detections come from the frame alone; each estimator has a row at each detected 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from simtest.simulation.highlights import CloudRegions, TrueHighlight
 from simtest.spec.scene import Scene
 from simtest.validation import laws
 from simtest.validation.columns import Row
-from simtest.validation.glints import Cloud, RoughTruth, cloud_columns
+from simtest.validation.glints import RoughTruth
 from simtest.validation.predicted import EQUAL_KD, axis_ratio_seen, base_law_deg, law_deg, look_law_deg
 
 
@@ -72,6 +71,27 @@ def on_instruments(
     return [i not in matched and bool(view.instruments[peak]) for i, peak in enumerate(peaks)]
 
 
+def match_cloud(regions: CloudRegions, view: RenderedView, estimate: Estimate) -> list[int]:
+    """Return the indices in `view.clouds`, whose `regions` are given, of those that an estimate is of, one a light.
+
+    Of each light it is the one that most of the estimate's spots belong to; of several, the nearest to where the
+    estimate looks. That of most spots comes first. Empty where they belong to none that is in view. A point that an
+    instrument covers or shades counts too, since the spots around it still belong to it.
+    """
+    if estimate.cloud is None or not view.clouds:
+        return []
+    points, centres = estimate.cloud.points_px, list(view.clouds)
+    votes: dict[int, int] = {}
+    for light in sorted({centre.light for centre in centres}):
+        owners = regions.assign(np.full(len(points), light), points)
+        counts = Counter(n for n in owners if n is not None)
+        if counts:
+            best = [n for n, count in counts.items() if count == max(counts.values())]
+            nearest = min(best, key=lambda n: float(np.hypot(*(centres[n].bp_px - estimate.look_px))))
+            votes[nearest] = counts[nearest]
+    return sorted(votes, key=lambda n: -votes[n])
+
+
 def _is_undetected(specularity: Specularity) -> bool:
     """Return whether no detector found it: it has neither a patch nor a contrast."""
     return isinstance(specularity.patch, Failure) and specularity.region.contrast is None
@@ -100,6 +120,9 @@ def _enclosed(specularity: Specularity, points: Array) -> list[int]:
 
 
 MISSED = "missed"
+
+LEAST_VISIBLE = 15
+"""A cloud that is wholly in view and has so many visible highlights is missed where no estimate is of it."""
 
 
 def rows(
@@ -132,7 +155,7 @@ def rows(
     rough : RoughTruth, optional
         What stands beside the true highlights on a surface with relief.
     on_instrument : sequence of bool, optional
-        Of a scene with instruments, for each detection: see `on_instruments`.
+        Of a scene with instruments, for each detection: see `matching.on_instruments`.
     """
     rough = rough or RoughTruth()
     made = []
@@ -262,61 +285,53 @@ def _error_columns(
     """
     # The headline errors are those against the surface whose normal is stated.
     stated = truth.normal if estimate.target == "fine" else truth.normal_base
-    to_truth = angle_deg(estimate.candidates, stated)
-    error_look_deg = None if look_normal is None else float(angle_deg(estimate.normal, look_normal))
-    curvature = curvature_errors(estimate, truth)
     smoothing_px = 0.0 if isinstance(patch, Failure) else patch.smoothing_px
     return {
+        **scored(estimate, stated, look_normal),
+        **curvature_errors(estimate, truth),
         "axis_ratio_seen_law": axis_ratio_seen(scene, declared, estimate, truth, smoothing_px),
-        "error_deg": float(to_truth[0]),
         "error_fine_deg": float(angle_deg(estimate.normal, truth.normal)),
         "error_base_deg": float(angle_deg(estimate.normal, truth.normal_base)),
-        "error_oracle_deg": float(to_truth.min()),
-        "error_look_deg": error_look_deg,
         "error_law_deg": law_deg(scene, declared, estimate, truth),
         "error_look_law_deg": look_law_deg(scene, declared, estimate, truth),
         "error_base_law_deg": base_law_deg(scene),
-        "rank_correct": int(to_truth.argmin()),
-        "mahalanobis2": mahalanobis2(estimate, stated),
-        "gain_error": curvature.gain_error,
-        "gain_oracle_error": curvature.gain_oracle_error,
-        "direction_error_deg": curvature.direction_error_deg,
     }
 
 
-class CurvatureErrors(NamedTuple):
-    """Errors of an estimate's curvature; None where it has none.
+def scored(estimate: Estimate, truth: Array, look_normal: Array | None) -> Row:
+    """Compute an estimate's errors against the true normal of what it states, unit, shape (3,).
 
-    Parameters
-    ----------
-    gain_error, gain_oracle_error : float or None
-        The larger error of 1 + d k over its true value, of the proposed hypothesis and of the best one.
-    direction_error_deg : float or None
-        Angle between the estimated and the true direction of the smaller abs(1 + d k), in [0, 90]; None where the true
-        curvatures are equal.
+    `look_normal` is that where the estimate looks; None where there is no surface.
     """
+    errors = angle_deg(estimate.candidates, truth)
+    return {
+        "error_deg": float(errors[0]),
+        "error_oracle_deg": float(errors.min()),
+        "error_look_deg": None if look_normal is None else float(angle_deg(estimate.normal, look_normal)),
+        "rank_correct": int(errors.argmin()),
+        "mahalanobis2": mahalanobis2(estimate, truth),
+    }
 
-    gain_error: float | None = None
-    gain_oracle_error: float | None = None
-    direction_error_deg: float | None = None
 
+def curvature_errors(estimate: Estimate, true: HighlightPoint) -> Row:
+    """Compute the errors of an estimate's curvature at a true highlight; what it does not state is left out.
 
-def curvature_errors(estimate: Estimate, true: HighlightPoint) -> CurvatureErrors:
-    """Compute the errors of an estimate's curvature at a true highlight."""
-    found = estimate.curvature
-    if found is None:
-        return CurvatureErrors()
+    Of the gains it is the larger relative error of 1 + d k, of the proposed hypothesis and of the best one. The
+    direction is that of the smaller abs(1 + d k), in [0, 90] deg; left out where the true curvatures are equal.
+    """
+    stated, errors = estimate.curvature, Row()
+    if stated is None:
+        return errors
     # True gains and their first direction, the smaller gain first as in the estimate.
     gains, first = np.array([1 + true.kd_min, 1 + true.kd_max]), true.direction_min
     if abs(gains[0]) > abs(gains[1]):
         gains, first = gains[::-1], np.cross(true.normal, true.direction_min)
-    errors = CurvatureErrors()
-    if found.hypotheses is not None and np.all(gains != 0):
-        off = np.abs(found.hypotheses / gains - 1).max(axis=1)
-        errors = errors._replace(gain_error=float(off[0]), gain_oracle_error=float(off.min()))
+    if stated.hypotheses is not None and np.all(gains != 0):
+        off = np.abs(stated.hypotheses / gains - 1).max(axis=1)
+        errors |= {"gain_error": float(off[0]), "gain_oracle_error": float(off.min())}
     if abs(true.kd_max - true.kd_min) > EQUAL_KD:
-        angle = float(angle_deg(found.directions[0], first))
-        errors = errors._replace(direction_error_deg=min(angle, 180 - angle))
+        angle = float(angle_deg(stated.directions[0], first))
+        errors["direction_error_deg"] = min(angle, 180 - angle)
     return errors
 
 
@@ -336,10 +351,6 @@ def mahalanobis2(estimate: Estimate, truth: Array) -> float | None:
         return None
     miss = tangent_coordinates(estimate.normal, truth)
     return float(miss @ np.linalg.solve(covariance, miss))
-
-
-LEAST_VISIBLE = 15
-"""A cloud that is wholly in view and has so many visible highlights is missed where no estimate is of it."""
 
 
 def of_clouds(estimators: Mapping[str, AnyEstimator]) -> list[str]:
@@ -377,35 +388,14 @@ def apart(
     return singles, clouds, failures
 
 
-def match_cloud(regions: CloudRegions, view: RenderedView, estimate: Estimate) -> list[int]:
-    """Return the indices in `view.clouds`, whose `regions` are given, of those that an estimate is of, one a light.
-
-    Of each light it is the one that most of the estimate's spots belong to; of several, the nearest to where the
-    estimate looks. That of most spots comes first. Empty where they belong to none that is in view. A point that an
-    instrument covers or shades counts too, since the spots around it still belong to it.
-    """
-    if estimate.cloud is None or not view.clouds:
-        return []
-    points, centres = estimate.cloud.points_px, list(view.clouds)
-    votes: dict[int, int] = {}
-    for light in sorted({centre.light for centre in centres}):
-        owners = regions.assign(np.full(len(points), light), points)
-        counts = Counter(n for n in owners if n is not None)
-        if counts:
-            best = [n for n, count in counts.items() if count == max(counts.values())]
-            nearest = min(best, key=lambda n: float(np.hypot(*(centres[n].bp_px - estimate.look_px))))
-            votes[nearest] = counts[nearest]
-    return sorted(votes, key=lambda n: -votes[n])
-
-
 def cloud_rows(
     session: Session, view: RenderedView, common: Row, found: Mapping[str, Sequence[tuple[int, Estimate]]],
-    failures: Mapping[str, Failure], whole: Mapping[int, Cloud],
+    failures: Mapping[str, Failure], whole: Mapping[int, Row],
 ) -> list[Row]:  # fmt: skip
     """Make the rows of cloud estimators: of each estimate, and of each whole cloud that none is of.
 
-    `found` and `failures` are those of `apart`, `whole` the clouds that are wholly in view. The column ``true_id`` is
-    the index of the base's highlight point, as ``cloud``; the errors are against the base's normal there.
+    `found` and `failures` are those of `apart`, `whole` the columns of the clouds that are wholly in view. The column
+    ``true_id`` is the index of the base's highlight point, as ``cloud``; errors are against the base's normal there.
     """
     made, regions = [], CloudRegions.of(session, view.clouds) if any(found.values()) else None
     for name, estimates in found.items():
@@ -414,44 +404,37 @@ def cloud_rows(
             assert regions is not None
             numbers = match_cloud(regions, view, estimate)
             taken.update(numbers)
-            row = _row(session, common, view, whole, numbers[0] if numbers else None)
+            row = _cloud_row(session, common, view, whole, numbers[0] if numbers else None)
             row |= estimate_columns(estimate) | {"estimator": name, "specularity": i}
-            made.append(row | _errors(session, estimate, [view.clouds[n] for n in numbers]) if numbers else row)
+            made.append(row | _cloud_errors(session, estimate, [view.clouds[n] for n in numbers]) if numbers else row)
         status = MISSED if name not in failures else str(failures[name].reason)
         detail = None if name not in failures else failures[name].detail
-        for number, cloud in whole.items():
-            if number not in taken and cloud.visible >= LEAST_VISIBLE and view.clouds[number].lit:
-                row = _row(session, common, view, whole, number)
+        for number, columns in whole.items():
+            visible = columns["cloud_visible"]
+            is_clear = isinstance(visible, int) and visible >= LEAST_VISIBLE
+            if number not in taken and is_clear and view.clouds[number].lit:
+                row = _cloud_row(session, common, view, whole, number)
                 made.append(row | {"estimator": name, "status": status, "flags": detail})
     return made
 
 
-def _row(session: Session, common: Row, view: RenderedView, whole: Mapping[int, Cloud], number: int | None) -> Row:
+def _cloud_row(session: Session, common: Row, view: RenderedView, whole: Mapping[int, Row], number: int | None) -> Row:
     """Return the row of a cloud before its estimate: scene, and the base's highlight point by number, if any."""
     centre = None if number is None else view.clouds[number]
     row = common | scene_columns(session.scene, centre) | {"true_id": number, "cloud": number, "target": "base"}
-    own = None if number is None else whole.get(number)
-    return row if own is None else row | cloud_columns(own)
+    return row if number is None else row | whole.get(number, {})
 
 
-def _errors(session: Session, estimate: Estimate, centres: Sequence[HighlightPoint]) -> Row:
+def _cloud_errors(session: Session, estimate: Estimate, centres: Sequence[HighlightPoint]) -> Row:
     """Compute the errors against the base's normal at its highlight point, and where the estimate looks.
 
     Lights that are not told apart make one cloud: the truth is the mean of the normals at their points.
     """
     mean = np.mean([centre.normal_base for centre in centres], axis=0)
     truth = mean / np.linalg.norm(mean)
-    errors = angle_deg(estimate.candidates, truth)
     look = session.exact_points(estimate.look_px[None], fine=False)
-    at_look = float(angle_deg(estimate.normal, look.normal_base[0])) if look.valid[0] else None
-    return {
-        "truth_x": float(truth[0]),
-        "truth_y": float(truth[1]),
-        "truth_z": float(truth[2]),
-        "error_deg": float(errors[0]),
-        "error_base_deg": float(errors[0]),
-        "error_oracle_deg": float(errors.min()),
-        "error_look_deg": at_look,
-        "rank_correct": int(errors.argmin()),
-        "mahalanobis2": mahalanobis2(estimate, truth),
-    }
+    errors = scored(estimate, truth, look.normal_base[0] if look.valid[0] else None)
+    truth_x, truth_y, truth_z = truth.tolist()
+    return errors | {
+        "error_base_deg": errors["error_deg"], "truth_x": truth_x, "truth_y": truth_y, "truth_z": truth_z,
+    }  # fmt: skip

@@ -1,15 +1,15 @@
-"""Under which conditions frames are made: each setting's, situations of settings of one kind, realism of their scenes.
+"""A scene in words: its conditions, the situation that a run's guide sorts it into, and which realism it stands for.
 
-Conditions are read from the scenes, so they hold what no column of results tells, and stand in summary.json by setting.
-A situation is one kind of light, surface, relief, noise and spot. Scenes are smooth controls, or tissue with its
-measured distance to real frames: measured_realism.json, which `studies/realism_table.py` writes. An entry is quoted
-only for what looks as the measured scene did: its key is a hash of all that a frame shows, but for seeds, viewpoint and
-rendering.
+Conditions are read from the scenes: what a reader asks before choosing an estimator and no column of results tells.
+Situations are settings of one kind of light, surface, relief, noise and spot. Realism: a scene is a smooth control, or
+tissue with its measured distance to real frames. The distances stand in measured_realism.json, which
+`studies/realism_table.py` writes. An entry is quoted only for what looks as the measured scene did: its key is a hash
+of all that a frame shows, but for seeds, viewpoint and rendering.
 """
 
 import hashlib
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,7 @@ import polars as pl
 from pydantic import BaseModel
 
 from simtest.runtime.files import Json
-from simtest.spec import Scene, scene_from_dict
+from simtest.spec import Scene, apply_settings, scene_from_dict
 from simtest.validation.cases import Case
 
 LOW_NOISE = 0.02
@@ -70,29 +70,30 @@ class Conditions:
 
 
 def conditions_of(cases: Iterable[Case]) -> dict[str, Conditions]:
-    """Return the conditions of each setting; its first part counts, and computed cases have none."""
+    """Return the conditions of each setting, at the upper ends of what is drawn for each realisation.
+
+    A setting's first part counts, and computed cases have none.
+    """
     found: dict[str, Conditions] = {}
     for case in cases:
         if not case.is_paper and case.setting not in found:
-            found[case.setting] = conditions(scene_from_dict(case.data, case.where), case.random)
+            data = apply_settings(case.data, case.ends[1], case.where)
+            found[case.setting] = conditions(scene_from_dict(data, case.where))
     return found
 
 
-def conditions(scene: Scene, drawn: Collection[str] = ()) -> Conditions:
-    """Return the conditions of a scene, of which the values of some keys are drawn for each realisation."""
-    half_width = getattr(scene.reflectance, "half_width", None)
+def conditions(scene: Scene) -> Conditions:
+    """Return the conditions of a scene."""
     return Conditions(
-        _told(scene, drawn), _relief(scene), _sensor(scene), _render(scene), _camera(scene),
-        scene.reflectance.in_words, _emission(scene),
-        None if half_width is None else float(half_width), float(scene.camera.fx),
+        _told(scene), _relief(scene), _sensor(scene), _render(scene), _camera(scene), scene.reflectance.in_words,
+        _emission(scene), float(scene.reflectance.half_width), float(scene.camera.fx),
     )  # fmt: skip
 
 
-def _told(scene: Scene, drawn: Collection[str]) -> str:
+def _told(scene: Scene) -> str:
     if not scene.known.lights:
         return "position not known"
-    keys = ("distance_mm", "distance_error")
-    has_distance = any(getattr(scene.known, key) is not None or f"known.{key}" in drawn for key in keys)
+    has_distance = scene.known.distance_mm is not None or scene.known.distance_error is not None
     told = "position and distance known" if has_distance else "position known"
     wrong = any(light.position_error_mm for light in scene.rig.lights)
     return f"{told}, the position with an error" if wrong else told
@@ -171,7 +172,7 @@ _USUAL = {"direct highlight alone", "pinhole camera", "resolved spot", "smooth s
 
 _ANALYTIC = {"plane", "cylinder", "sphere", "quadric"}
 
-_TOLD = ("reflectance", "emission", "relief", "sensor", "render", "camera")
+_ASPECTS = ("reflectance", "emission", "relief", "sensor", "render", "camera")
 
 
 @dataclass(frozen=True)
@@ -211,7 +212,7 @@ def situations_of(
     true : polars.DataFrame
         Rows of results.parquet with a true highlight.
     conditions : mapping
-        Conditions of each setting (`simtest.validation.situations`); may be empty.
+        Conditions of each setting (`conditions_of`); may be empty.
 
     Returns
     -------
@@ -243,15 +244,15 @@ def _kind(rows: pl.DataFrame, told: Mapping[str, object]) -> tuple[str, ...]:
     """Return what kind of setting some highlights belong to: a phrase for each aspect, empty for one not known."""
     if rows["kd_min"].null_count() == rows.height:
         # The published protocol computes its frames; the label names what it varies.
-        return (str(rows["label"][0]), "", "", *("" for _ in _TOLD))
+        return (str(rows["label"][0]), "", "", *("" for _ in _ASPECTS))
     names = [str(name) for name in rows["surface"].drop_nulls().unique(maintain_order=True)]
-    surface = _surface(rows)
+    surface = _shape(rows)
     if set(names) - _ANALYTIC:
         surface = f"{', '.join(names)}: {surface}"
-    return (surface, _light(rows, told), _spot(rows, told), *(str(told.get(name) or "") for name in _TOLD))
+    return (surface, _light(rows, told), _spot(rows, told), *(str(told.get(name) or "") for name in _ASPECTS))
 
 
-def _surface(rows: pl.DataFrame) -> str:
+def _shape(rows: pl.DataFrame) -> str:
     """Name the kind of surface at some highlights by the signs of their principal curvatures.
 
     Under a relief these are the base's: the fine surface bends both ways within every cloud.
@@ -344,7 +345,7 @@ def realism_of(cases: Iterable[Case]) -> list[SceneRealism]:
 
 
 def _entry(scene: Scene, random: Mapping[str, Any]) -> dict[str, Any]:
-    kind, what = _surface_realism(scene)
+    kind, what = _carried(scene)
     stages = ["motion"] if scene.camera.motion is not None else []
     stages += [name for name in CHAIN if getattr(scene.sensor, name) is not None]
     chain = f"through a camera chain ({', '.join(stages)})" if stages else "without a camera chain"
@@ -353,11 +354,16 @@ def _entry(scene: Scene, random: Mapping[str, Any]) -> dict[str, Any]:
     distance = UNKNOWN if measured is None else _quoted(measured)
     # A smooth scene is a control, whatever its distance.
     told = f"{what}, {chain}." + ("" if kind == "smooth" and measured is None else f" {distance}")
-    quoted = None if measured is None else _as_json(measured)
+    quoted: Json = None
+    if measured is not None:
+        quoted = {
+            "scene": measured["scene"], "real": measured["real"], "frames": measured["frames"],
+            "verdict": measured["verdict"], "statistics": measured["statistics"],
+        }  # fmt: skip
     return {"kind": kind, "camera_chain": stages, "sentence": told, "distance": quoted}
 
 
-def _surface_realism(scene: Scene) -> tuple[str, str]:
+def _carried(scene: Scene) -> tuple[str, str]:
     """Return whether a scene is smooth or tissue, or only rough or painted, and what its surface carries."""
     relief = scene.surface.relief
     parts = []
@@ -375,13 +381,6 @@ def _surface_realism(scene: Scene) -> tuple[str, str]:
     kind = "tissue" if relief is not None and scene.albedo is not None else "partial"
     words = parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
     return kind, f"{'Tissue' if kind == 'tissue' else 'Parts of tissue'}: {words}"
-
-
-def _as_json(measured: MeasuredDistance) -> Json:
-    return {
-        "scene": measured["scene"], "real": measured["real"], "frames": measured["frames"],
-        "verdict": measured["verdict"], "statistics": measured["statistics"],
-    }  # fmt: skip
 
 
 def _quoted(measured: MeasuredDistance) -> str:

@@ -63,8 +63,8 @@ def protocol_noise() -> list[Law]:
 def published() -> list[Law]:
     """Reconstruct the published protocol's plane without noise, at its default slant."""
     setting = PaperSetting(sigma=0.0, smoothing_px=0.0)
-    rows = paper_rows(setting, {}, range(1), [0], ("circle_pose",))
-    off = rows["error_deg"].fill_null(np.nan).item()
+    (row,) = paper_rows(setting, {}, range(1), [0], ("circle_pose",))
+    off = float(row.get("error_deg", np.nan))
     about = "circle_pose at a slant of 58 deg, without noise; unsmoothed; interpolation leaves 0.01 deg"
     return [law("published", "circle_pose_off", "deg", off, SLANT_OFF_DEG, about=about)]
 

@@ -216,7 +216,8 @@ class _Still:
 
 def _of_protocol() -> list[Law]:
     """Compare the published protocol's errors with the angles between its columns."""
-    made = paper_rows(PaperSetting(size=200, sigma=0.02, isovalue=0.5), {}, range(2), [3, 4], ("circle_pose",))
+    setting = PaperSetting(size=200, sigma=0.02, isovalue=0.5)
+    made = table(paper_rows(setting, {}, range(2), [3, 4], ("circle_pose",)), {})
     stated = made.select("normal_x", "normal_y", "normal_z").to_numpy()
     slanted = np.array([0.0, math.sin(58 / 180 * math.pi), -math.cos(58 / 180 * math.pi)])
     gap = np.abs(by_hand.angle_deg(stated, slanted) - made["error_deg"].to_numpy()).max()
@@ -241,8 +242,8 @@ def _curvature_errors(made: Realisation) -> list[Law]:
         truth.normal, truth.normal[None], np.zeros(2), curvature=EstimatedCurvature(turned, 0.55, listed)
     )
     errors = curvature_errors(estimate, truth)
-    gap = abs(_value(errors.gain_error) - 0.1) + abs(_value(errors.gain_oracle_error))
-    gap += abs(_value(errors.direction_error_deg) - 30.0)
+    gap = abs(_value(errors["gain_error"]) - 0.1) + abs(_value(errors["gain_oracle_error"]))
+    gap += abs(_value(errors["direction_error_deg"]) - 30.0)
     return [law("columns", "curvature_errors_off", "", gap, 1e-9, about="10 %, 0 and 30 deg, by construction")]
 
 

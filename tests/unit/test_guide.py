@@ -15,10 +15,11 @@ from simtest.report.guide_text import guide_rows, method_rows, seen_sentence
 from simtest.report.run_folder import read_run
 from simtest.report.tables import pairs
 from simtest.runtime.statistics import median_interval
-from simtest.spec import load_experiment, load_scene
+from simtest.spec import Experiment, load_experiment, load_scene
+from simtest.spec.spec_model import validate
 from simtest.validation.cases import expand
+from simtest.validation.comparison import LEAST_FRAMES
 from simtest.validation.guide import guide_of
-from simtest.validation.paired import LEAST_FRAMES
 from simtest.validation.run_summary import summarise_run
 from simtest.validation.situations import conditions, conditions_of
 
@@ -438,6 +439,15 @@ def test_conditions_come_from_the_scene():
     # A distance whose error is drawn for each realisation is known as well.
     known = conditions_of(expand(load_experiment("known_light")))
     assert {found.told for found in known.values()} == {"position and distance known"}
+
+
+def test_conditions_are_of_the_values_that_are_drawn():
+    drawn = {"sensor.noise_sigma": {"low": 0.03, "high": 0.05}, "reflectance.exponent": {"low": 10.0, "high": 20.0}}
+    group = {"scene": "plane", "set": {"sensor.noise_sigma": 0.0}, "random": drawn}
+    data = {"name": "drawn", "seed": 1, "realisations": 1, "estimators": ["cone_axis"], "groups": [group]}
+    (found,) = conditions_of(expand(validate(Experiment, data, "experiment"))).values()
+    assert found.sensor == "noise above 2 %"
+    assert found.half_width_rad == conditions(load_scene("plane", {"reflectance.exponent": 20.0})).half_width_rad
 
 
 def test_summary_json_holds_conditions_and_descriptions():

@@ -23,8 +23,8 @@ from simtest.runtime.statistics import (
     weighted_quantile,
 )
 from simtest.validation.columns import table
+from simtest.validation.comparison import difference_interval
 from simtest.validation.guide import guide_of
-from simtest.validation.paired import difference_interval
 from simtest.validation.statistics import summarise, units
 from tests.unit.given_numbers import of_given_numbers
 

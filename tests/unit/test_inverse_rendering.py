@@ -126,9 +126,9 @@ def test_normal_and_curvatures_are_recovered(render, name):
     assert angle_deg(found.normal, highlight.normal) < 0.012
     assert mahalanobis2(found, highlight.normal) < 14
     errors = curvature_errors(found, highlight)
-    assert errors.gain_error < 0.01
+    assert errors["gain_error"] < 0.01
     if name not in ("plane", "ball"):
-        assert errors.direction_error_deg < 0.2
+        assert errors["direction_error_deg"] < 0.2
     law = abs(1 + highlight.kd_min) / abs(1 + highlight.kd_max)
     assert found.axis_ratio == pytest.approx(law, rel=0.015)
 
@@ -144,8 +144,8 @@ def test_it_is_the_maximum_likelihood_estimate_that_photometric_is(render):
             cone_axis=cone_axis,
         )  # fmt: skip
         assert angle_deg(found["inverse"].normal, found["photometric"].normal) < 0.006
-        ours.append(curvature_errors(found["inverse"], highlight).gain_error)
-        others.append(curvature_errors(found["curved"], highlight).gain_error)
+        ours.append(curvature_errors(found["inverse"], highlight)["gain_error"])
+        others.append(curvature_errors(found["curved"], highlight)["gain_error"])
         axes.append(angle_deg(found["cone_axis"].normal, highlight.normal))
         # That of `photometric` holds the drift of the axis beside the noise.
         spreads = [np.sqrt(np.diag(found[name].covariance)) for name in ("inverse", "photometric")]
@@ -161,7 +161,7 @@ def test_a_known_light_beside_the_camera(render):
     priors = Priors(lights, exactly(highlight.distance), exactly(4 * N), falloff_power=None)
     found = answers(session, frame_of(radiance, 0.02), priors, inverse=inverse_rendering)["inverse"]
     assert angle_deg(found.normal, highlight.normal) < 0.02
-    assert curvature_errors(found, highlight).gain_error < 0.01
+    assert curvature_errors(found, highlight)["gain_error"] < 0.01
     unaware = answers(session, frame_of(radiance, 0.02), replace(priors, lights_mm=()), inverse=inverse_rendering)
     assert 2 < angle_deg(unaware["inverse"].normal, highlight.normal) < 4
     about = replace(priors, distance_mm=Normal(highlight.distance, 1.0))

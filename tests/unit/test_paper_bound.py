@@ -8,7 +8,13 @@ from simtest.errors import InputError
 from simtest.spec.recipes import PaperSetting, paper_from_dict
 from simtest.validation.paper.isocurves import brightest_point, isocurve_radii, isophote_radius
 from simtest.validation.paper.predictions import cramer_rao_bound
-from simtest.validation.paper.protocol import draw_light, picture, plane_from_image, texture, window_centre
+from simtest.validation.paper.protocol import (
+    draw_light,
+    picture,
+    plane_from_image,
+    texture,
+    window_centre,
+)
 from tests.isocurve_formulas import cosine_beta, cosine_of_isovalue, kappa
 
 

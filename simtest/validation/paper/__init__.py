@@ -2,5 +2,5 @@
 
 It tests the conic pipeline, not the imaging of a camera with its own light; the rendered experiments do that.
 `slanted_view` makes the noise-free picture, `published_pipeline` adds noise, smooths and reconstructs, `rows` measures.
-`smoothing` predicts the error without noise, and `bound` the least error with it.
+`predictions` are of the error without noise, and of the least error with it.
 """

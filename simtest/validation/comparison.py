@@ -1,9 +1,11 @@
-"""Compares estimators on the same highlights and ranks them; frames, not highlights, are the independent units.
+"""Compares estimators on the same highlights, and ranks them; frames, not highlights, are the independent units.
 
 Highlights of one frame share its noise, its light and its surface. Settings are chosen, not drawn, so the spread
 between them is no noise: all spread is taken within settings. A frame that repeats another of its setting to the last
-bit, as every realisation without noise does, says nothing new and counts once. Of two methods, highlights that both
-answered are compared; what one refuses or misses stands in columns of its own.
+bit, as every realisation without noise does, says nothing new and counts once.
+
+Methods are ranked in pairs, on the highlights that both answered; what one refuses or misses stands in columns of its
+own.
 """
 
 from collections import Counter
@@ -111,7 +113,7 @@ def difference_interval(differences: Array, frames: IntArray, settings: IntArray
     differences : ndarray
         Of each highlight, deg.
     frames, settings : ndarray
-        Number of the frame and of the setting of each (`simtest.validation.statistics.units`).
+        Number of the frame and of the setting of each (`units`).
     certain : ndarray
         Whether its setting has no spread; such highlights count in the mean, and widen its interval only where their
         mean differs from that of the others.
