@@ -99,6 +99,11 @@ CAMERAS = {
         transforms(camera_model="EQUIRECTANGULAR"),
         "camera_model = 'EQUIRECTANGULAR': simtest",
     ),
+    "transforms: model under another key": (
+        "t.json",
+        transforms(model="OPENCV_FISHEYE"),
+        "model = 'OPENCV_FISHEYE': transforms.json names its lens camera_model",
+    ),
     "transforms: k4": ("t.json", transforms(k4=0.1), "k4 = 0.1: must be 0; simtest's perspective lens has no term r^8"),
     "transforms: text": ("t.json", transforms(cx="left"), "cx = 'left': must be a finite number"),
     "transforms: frames": ("t.json", transforms(frames=5), "frames = 5: must be a list of objects"),

@@ -303,6 +303,8 @@ def _nerf_focal(told: Mapping[str, float], keys: tuple[str, str], extent: int, b
 def _nerf_lens(data: Mapping[str, Any], told: Mapping[str, float]) -> Table | None:
     """Return the lens as a table; None for a pinhole."""
     model = data.get("camera_model")
+    if model is None and str(data.get("model")) in NERF_MODELS:
+        raise InputError(f"model = {data['model']!r}: transforms.json names its lens camera_model")
     if model is not None and (not isinstance(model, str) or model not in NERF_MODELS):
         hint = suggestion(model, NERF_MODELS) if isinstance(model, str) else ""
         raise InputError(
