@@ -1,6 +1,7 @@
 """Which packages below simtest/ import which, wherever in the code, and that modules do not import in a circle."""
 
 import ast
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -58,6 +59,35 @@ def test_no_more_pairs_of_packages_than_there_were():
     assert len(pairs) <= PAIRS
     assert ("cli", TOP) in pairs
     assert not {other for one, other in pairs if one == "runtime"} - {TOP}
+
+
+def named(target: ast.expr) -> Iterator[str]:
+    """Yield the names that an assignment's target gives."""
+    if isinstance(target, ast.Name):
+        yield target.id
+    elif isinstance(target, ast.Tuple):
+        yield from (name for each in target.elts for name in named(each))
+
+
+def given(node: ast.stmt) -> list[str]:
+    """Return the names that a statement of a module gives, other than by an import."""
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        return [node.name]
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    return [name for target in targets for name in named(target)]
+
+
+def test_no_module_gives_a_name_twice():
+    """Ruff sees functions and classes that are defined twice, but no constants: the second one wins everywhere."""
+    twice = {}
+    for file in FILES:
+        body = ast.parse(file.read_text(encoding="utf-8")).body
+        # A type variable or an overload may stand in branches, which are not looked into.
+        names = Counter(name for node in body for name in given(node))
+        twice |= {f"{name_of(file)}.{name}": count for name, count in names.items() if count > 1}
+    assert not twice
+    both = ast.parse("A = 1\nB, A = 2, 3").body
+    assert Counter(name for node in both for name in given(node))["A"] == 2
 
 
 def test_no_modules_import_each_other_in_a_circle():

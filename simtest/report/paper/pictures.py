@@ -119,8 +119,8 @@ def _radii(data: IsocurveFigure) -> Chart:
     return Chart("isocurve_radii", "Radii against κ", (Panel(x, y, (one, inner, outer, both)),), 440)
 
 
-_ISOPHOTE = "#00C2D1"
-_DOT, _CROSS = "●", "✖"
+_STAGE_ISOPHOTE = "#00C2D1"
+_DOT, _STAGE_CROSS = "●", "✖"
 PICTURES = ("texture", "clean", "smoothed")
 
 
@@ -232,7 +232,7 @@ def _fitted(data: Stages, colour: str) -> list[Mark]:
     marks = []
     if data.isophote is not None:
         x, y = np.vstack([data.isophote, data.isophote[:1]]).T
-        marks.append(Mark(x, y, _ISOPHOTE, f"isophote t = {data.setting.isovalue:g}", line="solid", width=2.8))
+        marks.append(Mark(x, y, _STAGE_ISOPHOTE, f"isophote t = {data.setting.isovalue:g}", line="solid", width=2.8))
     if data.ellipse is not None:
         x, y = data.ellipse.T
         marks.append(Mark(x, y, colour, "fitted ellipse", line="dash", width=2.0))
@@ -286,7 +286,7 @@ def _close_up(data: Stages, colour: str) -> Chart:
         marks = [
             Mark(error * np.cos(angle), error * np.sin(angle), NEUTRAL, line="solid", width=1.2), *marks,
             Mark([0, miss[0]], [0, miss[1]], colour, line="solid", width=2),
-            Mark([miss[0]], [miss[1]], colour, name, symbol=_CROSS, size=14),
+            Mark([miss[0]], [miss[1]], colour, name, symbol=_STAGE_CROSS, size=14),
         ]  # fmt: skip
         reach = 1.35 * error
     x, y = (Axis(f"error of the {of} (deg)", limits=(-reach, reach)) for of in ("tilt's direction", "slant"))
