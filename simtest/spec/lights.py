@@ -14,6 +14,7 @@ import numpy.typing as npt
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from simtest.calibration.photometry import AngularProfile
+from simtest.calibration.priors import AT_CAMERA_MM
 from simtest.geometry.vectors import basis_across
 from simtest.runtime.arrays import Array
 from simtest.spec.spec_model import Coordinate, Spec
@@ -225,13 +226,10 @@ Gain = Annotated[float, Field(ge=0, le=1e6)]
 Power = Annotated[float, Field(gt=0, le=1e12)]
 Vector = tuple[float, float, float]
 
-COLOCATED_MM = 1e-9
-"""A light no farther than this from the camera centre is at the camera: it sees what the camera sees."""
-
 
 def is_at_camera(position_mm: npt.ArrayLike) -> bool:
-    """Return whether a position, shape (3,), camera frame, mm, is the camera centre."""
-    return float(np.linalg.norm(position_mm)) <= COLOCATED_MM
+    """Return whether a position, shape (3,), camera frame, mm, is the camera centre: it sees what the camera sees."""
+    return float(np.linalg.norm(position_mm)) <= AT_CAMERA_MM
 
 
 class Emission(Spec):

@@ -13,7 +13,7 @@ from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, integer
 from simtest.spec import LightSpec, scene_from_dict
-from simtest.spec.lights import COLOCATED_MM, PRESETS, Rig
+from simtest.spec.lights import AT_CAMERA_MM, PRESETS, Rig
 from simtest.spec.recipes import Experiment
 from simtest.spec.toml_files import apply_settings
 from simtest.validation.cases import expand
@@ -289,7 +289,7 @@ def test_presets_stand_on_a_ring_and_share_the_power(preset, count):
         np.testing.assert_allclose(places.mean(axis=0), 0, atol=1e-12)
         assert 3 <= PRESETS[preset].radius_mm <= 5
     else:
-        assert np.linalg.norm(places) <= COLOCATED_MM
+        assert np.linalg.norm(places) <= AT_CAMERA_MM
 
 
 @given(

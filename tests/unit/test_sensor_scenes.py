@@ -83,7 +83,7 @@ def test_the_emission_of_other_rigs_is_not_divided_away():
         [{**light, "spot_deg": 90.0}], [{**light, "offset_mm": 1e-8}],
     ):  # fmt: skip
         assert scene(rig={"lights": lights}).calibration().emission.is_uniform
-    # As the renderer has it, a light within COLOCATED_MM is at the camera.
+    # As the renderer has it, a light within AT_CAMERA_MM is at the camera.
     for own in ({}, {"offset_mm": 1e-10}):
         assert scene(rig={"lights": [{**light, **own}]}).calibration().emission.power == 4.0
 
