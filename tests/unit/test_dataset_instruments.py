@@ -150,10 +150,10 @@ def test_detection_on_an_instrument_is_counted_as_such():
     assert found.n_instrument == sum(on)
     false = (not metal and true is None for metal, true in zip(on, rows["true_id"], strict=True))
     assert found.n_false == sum(false)
-    assert found.to_json()["n_instrument"] == found.n_instrument
+    assert found.model_dump(exclude_unset=True)["n_instrument"] == found.n_instrument
 
 
 def test_without_instruments_results_have_no_further_column():
     _, rows = realised()
     assert "on_instrument" not in rows.columns
-    assert "n_instrument" not in figures(rows).to_json()
+    assert "n_instrument" not in figures(rows).model_dump(exclude_unset=True)
