@@ -108,7 +108,8 @@ Planned = tuple[list[Experiment], list[list[Case]]]
 def plan_run(profile: Profile) -> Planned:
     """Return what a profile runs; raise `InputError` for whatever is malformed, before anything is made."""
     experiments = experiments_of(profile)
-    check_estimators(experiments)
+    for experiment in experiments:
+        check_estimators(experiment.estimators)
     return experiments, [expand(experiment) for experiment in experiments]
 
 

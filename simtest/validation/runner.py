@@ -253,17 +253,17 @@ def _warn_of_another(job: Job) -> None:
         warnings.warn(f"{job.folder}: {what}; it is replaced", stacklevel=4)
 
 
-def check_estimators(experiments: Sequence[Experiment]) -> None:
+def check_estimators(names: Sequence[str]) -> None:
     """Raise `InputError` for estimators that are unknown; the workers load them."""
-    if experiments:
-        from simtest.estimators.names import load_estimators
-    for experiment in experiments:
-        load_estimators(experiment.estimators)
+    from simtest.estimators.names import load_estimators
+
+    load_estimators(names)
 
 
 def _checked_cores(jobs: Sequence[Job]) -> dict[Path, Cores]:
     """Return what the records of the runs, by folder, say of cores; a finished run names no unknown estimator."""
-    check_estimators([job.experiment for job in jobs])
+    for job in jobs:
+        check_estimators(job.experiment.estimators)
     return {job.folder: core_records(job.experiment.estimators) for job in jobs}
 
 
