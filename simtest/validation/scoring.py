@@ -286,15 +286,17 @@ def _error_columns(
     # The headline errors are those against the surface whose normal is stated.
     stated = truth.normal if estimate.target == "fine" else truth.normal_base
     smoothing_px = 0.0 if isinstance(patch, Failure) else patch.smoothing_px
+    # Samples of datasets hold the columns in this order.
     return {
-        **scored(estimate, stated, look_normal),
-        **curvature_errors(estimate, truth),
         "axis_ratio_seen_law": axis_ratio_seen(scene, declared, estimate, truth, smoothing_px),
-        "error_fine_deg": float(angle_deg(estimate.normal, truth.normal)),
-        "error_base_deg": float(angle_deg(estimate.normal, truth.normal_base)),
+        **dict.fromkeys(("error_deg", "error_fine_deg", "error_base_deg", "error_oracle_deg", "error_look_deg")),
         "error_law_deg": law_deg(scene, declared, estimate, truth),
         "error_look_law_deg": look_law_deg(scene, declared, estimate, truth),
         "error_base_law_deg": base_law_deg(scene),
+        **scored(estimate, stated, look_normal),
+        "error_fine_deg": float(angle_deg(estimate.normal, truth.normal)),
+        "error_base_deg": float(angle_deg(estimate.normal, truth.normal_base)),
+        **curvature_errors(estimate, truth),
     }
 
 
