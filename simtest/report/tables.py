@@ -26,7 +26,7 @@ _MEASURES = (("error", "error_oracle_deg", "error_law_deg", "°", TOLERANCE_DEG)
 class Coverage(NamedTuple):
     """Two tables of a run over views of anatomies, a row for each setting and for each measure of it with a law."""
 
-    found: pl.DataFrame  # setting, found (true highlights), detections, `row_kinds.counts`, coverage, false_share
+    found: pl.DataFrame  # setting, found (true highlights), detections, `counts`, coverage, false_share
     laws: pl.DataFrame  # setting, estimator, measure, unit, n, met (within tolerance), median, median_law, median_gap
 
 
@@ -106,7 +106,7 @@ class SurfaceErrors(NamedTuple):
 
     surfaces: list[str]
     boxes: list[Box]
-    table: pl.DataFrame  # surface, estimator, `row_kinds.counts`, mean, median, p95, max (deg)
+    table: pl.DataFrame  # surface, estimator, `counts`, mean, median, p95, max (deg)
 
 
 def surface_errors(run: Run, has_figures: bool) -> SurfaceErrors | None:

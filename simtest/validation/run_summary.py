@@ -40,7 +40,7 @@ class Fault(BaseModel):
     count: int
 
     def __str__(self) -> str:
-        """Say it in words: ``moment: ValueError: my bug (my_core.py:11), 29 times``.
+        """Return it in words: ``moment: ValueError: my bug (my_core.py:11), 29 times``.
 
         An exception of the estimator names itself; the other reasons stand before their text.
         """

@@ -155,7 +155,7 @@ def rows(
     rough : RoughTruth, optional
         What stands beside the true highlights on a surface with relief.
     on_instrument : sequence of bool, optional
-        Of a scene with instruments, for each detection: see `matching.on_instruments`.
+        Of a scene with instruments, for each detection: see `on_instruments`.
     """
     rough = rough or RoughTruth()
     made = []
