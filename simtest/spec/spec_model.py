@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from types import NoneType, UnionType
+from types import UnionType
 from typing import Annotated, Any, ClassVar, Self, TypeGuard, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -48,9 +48,10 @@ class Spec(BaseModel):
             # Unknown keys are refused later, with a suggestion.
             field: Any = cls.model_fields.get(name)
             kinds = _leaf_types(field.annotation) if field else frozenset()
-            wrong, numeric = "", bool(kinds) and kinds <= {int, float, NoneType}
-            if numeric and any(isinstance(leaf, str | bytes | bool) for leaf in _leaves(value)):
-                wrong = "numbers" if isinstance(value, list | tuple) else "a number"
+            words = [kind for kind in kinds if isinstance(kind, str)]
+            wrong, numeric = "", not kinds.isdisjoint({int, float}) and kinds.isdisjoint({str, bool, object, Any})
+            if numeric and any(isinstance(leaf, str | bytes | bool) and leaf not in words for leaf in _leaves(value)):
+                wrong = "numbers" if isinstance(value, list | tuple) else " or ".join(["a number", *map(repr, words)])
             elif kinds == {bool} and not isinstance(value, bool):
                 wrong = "true or false"
             if wrong:
