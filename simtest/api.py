@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
 from simtest.runtime.boundary import plain, plain_errors
-from simtest.runtime.files import check_count
+from simtest.runtime.files import as_path, check_count
 from simtest.runtime.lazy_names import lazy_names
 
 if TYPE_CHECKING:
@@ -133,8 +133,9 @@ def export(
     from simtest.rendering.mitsuba_export import export_scene
     from simtest.runtime.locks import exclusive_folder
 
-    with exclusive_folder(Path(out)):
-        return export_scene(_scene(scene, settings, overrides), Path(out), variant)
+    folder = as_path(out, "out")
+    with exclusive_folder(folder):
+        return export_scene(_scene(scene, settings, overrides), folder, variant)
 
 
 @plain_errors
@@ -163,8 +164,9 @@ def sample_views(
     viewpoints = candidates(described, TRIES * count) if along is None else along_path(described, count, *along)
     if along is None and (fps is not None or labels):
         raise InputError(f"{'labels' if labels else 'fps'}: needs along, a sequence of views")
-    with exclusive_folder(Path(out)):
-        return sample_into(Path(out), described, count, viewpoints, variant, progress, along is not None, fps, labels)
+    folder = as_path(out, "out")
+    with exclusive_folder(folder):
+        return sample_into(folder, described, count, viewpoints, variant, progress, along is not None, fps, labels)
 
 
 @plain_errors
@@ -239,15 +241,15 @@ def validate(
 
     described = _experiment(experiment, settings, overrides)
     chosen = engine or make_engine(workers=workers)
-    frames = None if export is None else Path(export)
-    with exclusive_folder(Path(out)):
+    folder, frames = as_path(out, "out"), None if export is None else as_path(export, "export")
+    with exclusive_folder(folder):
         try:
-            made = _run_and_report(described, Path(out), command, variant, progress, chosen, frames, charts)
+            made = _run_and_report(described, folder, command, variant, progress, chosen, frames, charts)
             made.warn_of_faults()
             return made
         except OSError as error:
             kept = "what is finished is kept, and the same command goes on from there"
-            raise plain(error, kept, Path(out)) from error
+            raise plain(error, kept, folder) from error
         finally:
             # The page's worst cases are estimated again.
             close_cores()
@@ -279,6 +281,7 @@ def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, over
     from simtest.spec import Scene, load_scene
     from simtest.spec.keys import full_keys, replace_values
     from simtest.spec.scene import scene_from_dict, without_presets
+    from simtest.spec.toml_files import as_settings
 
     def replaced(values: dict[str, Any]) -> Scene:
         if not isinstance(scene, Scene):
@@ -288,7 +291,7 @@ def _scene(scene: "Scene | str | Path", settings: Mapping[str, Any] | None, over
         data = without_presets(scene.model_dump(mode="json", exclude_unset=True), values)
         return scene_from_dict(replace_values(Scene, data, values, "scene"))
 
-    described = replaced(values := dict(settings or {}))
+    described = replaced(values := as_settings(settings))
     if not overrides:
         return described
     # The keys are those of the scene with its settings, so that a new type's keys have short names too.
@@ -301,12 +304,13 @@ def _experiment(
     """Return the described experiment with values replaced; those of an `Experiment` are its own already."""
     from simtest.spec import Experiment, load_experiment
     from simtest.spec.recipes import OWN_KEYS
+    from simtest.spec.toml_files import as_settings
 
     if isinstance(experiment, Experiment):
         if settings or overrides:
             raise InputError("settings: the experiment is given as an object; change it, or name its file")
         return experiment
-    values = dict(settings or {})
+    values = as_settings(settings)
     described = load_experiment(experiment, values)
     if not overrides:
         return described

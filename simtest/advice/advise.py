@@ -27,7 +27,7 @@ from simtest.pages.html import environment
 from simtest.pages.pixels import Pixels
 from simtest.pages.style import SERIES, number, symbols
 from simtest.runtime import provenance
-from simtest.runtime.files import make_folder, write_atomically, write_json
+from simtest.runtime.files import make_folder, write_atomically, write_json, written_together
 from simtest.runtime.processes import make_engine
 from simtest.runtime.statistics import Interval
 from simtest.simulation.frame import make_frame
@@ -149,8 +149,9 @@ def write_advice(advised: Advised, out: Path, command: str = "") -> Path:
         provenance={"commit": about["commit"] or "–", "simtest": about["version"], "python": about["python"]},
         **embedded([chart]),
     )  # fmt: skip
-    write_json(out / RESULT, {**advised.to_json(), "run": {"command": command, **about}})
-    write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
+    with written_together(out, (RESULT, PAGE)) as new:
+        write_json(new / RESULT, {**advised.to_json(), "run": {"command": command, **about}})
+        write_atomically(new / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
     return out / PAGE
 
 

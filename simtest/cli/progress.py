@@ -66,18 +66,26 @@ LINE_EVERY_S = 10.0
 """Of a log; work that takes less leaves no line."""
 
 
+PATIENCE_S = 5.0
+"""So long a stop waits for the end of a step: who stops a container kills it 10 s later."""
+
+
 @contextmanager
 def stop_between_steps() -> Iterator[Callable[[], None]]:
-    """Yield a callable that raises KeyboardInterrupt if Ctrl-C was pressed meanwhile; a second press stops at once.
+    """Yield a callable that raises KeyboardInterrupt if Ctrl-C was pressed meanwhile.
 
-    Raised anywhere else, KeyboardInterrupt can be lost in a callback, or break the renderer while it is imported. A
-    wait for another process (`breakable`) is stopped by the first press.
+    A second press stops at once, and so does the end of `PATIENCE_S`: what is lost is the step. Raised anywhere else,
+    KeyboardInterrupt can be lost in a callback, or break the renderer while it is imported. A wait for another process
+    (`breakable`) is stopped by the first press.
     """
 
     def press(*_: object) -> None:
         if STOP.is_wanted or STOP.is_breakable:
             raise KeyboardInterrupt
         STOP.is_wanted = True
+        # Where a command runs, its answer to this signal is a press (`simtest.cli.main.Termination`).
+        if callable(signal.getsignal(signal.SIGALRM)):
+            signal.setitimer(signal.ITIMER_REAL, PATIENCE_S, PATIENCE_S)
 
     def check() -> None:
         if STOP.is_wanted:
@@ -87,6 +95,8 @@ def stop_between_steps() -> Iterator[Callable[[], None]]:
     try:
         yield check
     finally:
+        if STOP.is_wanted:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGINT, before)
         STOP.is_wanted = False
 

@@ -14,7 +14,7 @@ from simtest.dataset.index import ESTIMATES, HIGHLIGHTS, SAMPLES
 from simtest.dataset.manifest import Manifest
 from simtest.dataset.metadata import has_relief
 from simtest.dataset.plan import Plan
-from simtest.dataset.reader import open_manifest, read_samples, shard_names
+from simtest.dataset.reader import open_manifest, read_samples, read_table, shard_names
 from simtest.dataset.shard import Sample
 from simtest.errors import InputError
 from simtest.pages import style
@@ -104,7 +104,7 @@ def write_preview(folder: Path, page: Path, count: int = 24) -> Path:
         raise InputError(f"--samples {count}: must be 1 to {MAX_SAMPLES}")
     shard_names(folder)
     manifest = open_manifest(folder)
-    index, highlights = (pl.read_parquet(folder / name) for name in (SAMPLES, HIGHLIGHTS))
+    index, highlights = (read_table(folder / name) for name in (SAMPLES, HIGHLIGHTS))
     # samples, evenly over the dataset, and the shards that hold them
     places = np.linspace(0, index.height - 1, min(count, index.height)).round().astype(int)
     wanted = set(index["index"].sort()[places.tolist()].to_list())

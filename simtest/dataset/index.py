@@ -10,7 +10,7 @@ from simtest.conventions import ON_INSTRUMENT
 from simtest.dataset.metadata import HighlightMeta, SampleMeta
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.shard import PART, samples
-from simtest.runtime.files import write_atomically
+from simtest.runtime.files import write_parquet
 from simtest.validation.columns import COLUMNS, NUMBER, TEXT, WHOLE, YES_NO, Column, Row, Value
 
 SAMPLES, HIGHLIGHTS, ESTIMATES = "index.parquet", "highlights.parquet", "estimates.parquet"
@@ -143,13 +143,13 @@ def _joined(parts: Iterable[Mapping[str, pl.DataFrame]]) -> dict[str, pl.DataFra
 def write_shard_tables(plan: Plan, folder: Path, shard: Shard) -> None:
     """Write the rows of a finished shard beside it, for `write_tables`; done by the worker that made the shard."""
     for name, table in shard_tables(plan, folder, shard).items():
-        write_atomically(_part(folder, shard, name), table.write_parquet)
+        write_parquet(_part(folder, shard, name), table)
 
 
 def write_tables(plan: Plan, folder: Path) -> None:
     """Write the tables, from the rows that workers have written or else from the shards."""
     for name, table in _joined(_written(plan, folder, shard) for shard in plan.shards).items():
-        write_atomically(folder / name, table.write_parquet)
+        write_parquet(folder / name, table)
 
 
 def _written(plan: Plan, folder: Path, shard: Shard) -> dict[str, pl.DataFrame]:

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from simtest.dataset.shard import BrokenShardError, Sample, StoredSample, read_m
 from simtest.errors import InputError
 from simtest.runtime.arrays import AnyArray
 from simtest.runtime.files import require_plain
+
+if TYPE_CHECKING:
+    import polars as pl
 
 Record = dict[str, Any]
 """A sample as `read` yields it: array by field name, and ``meta``, a `SampleMeta`."""
@@ -88,6 +91,18 @@ def shard_names(folder: Path, split: str | None = None) -> list[str]:
     return [name for name in sorted(manifest.shards) if split in (None, name.rpartition("-")[0])]
 
 
+def read_table(path: Path, columns: list[str] | None = None) -> "pl.DataFrame":
+    """Read a table of a dataset, or some of its columns; raise `InputError` where it is missing or damaged."""
+    # Here alone: polars takes 0.1 s to import, and who reads shard after shard needs none.
+    import polars as pl
+
+    try:
+        return pl.read_parquet(require_plain(path), columns=columns)
+    except (OSError, ValueError, pl.exceptions.PolarsError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: cannot be read ({reason}); simtest dataset verify --repair mends it") from None
+
+
 @dataclass(frozen=True)
 class SamplePosition:
     """Where a sample stands: file name of its shard, and offset of its first byte there."""
@@ -99,20 +114,10 @@ class SamplePosition:
 def sample_positions(folder: str | Path, split: str | None = None) -> list[SamplePosition]:
     """Return where the samples of a split stand, shard after shard; raise errors as `read` does."""
     folder = Path(folder)
-    names = shard_names(folder, split)
-    # Here alone: polars takes 0.1 s to import, and who reads shard after shard needs none.
-    import polars as pl
-
+    wanted = set(shard_names(folder, split))
     from simtest.dataset.index import SAMPLES
 
-    path = folder / SAMPLES
-    try:
-        table = pl.read_parquet(require_plain(path), columns=["shard", "offset"])
-        rows = sorted((str(shard), int(offset)) for shard, offset in table.iter_rows())
-    except (OSError, TypeError, ValueError, pl.exceptions.PolarsError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: cannot be read ({reason}); simtest dataset verify --repair mends it") from None
-    wanted = set(names)
+    rows = sorted(read_table(folder / SAMPLES, ["shard", "offset"]).iter_rows())
     return [SamplePosition(shard, offset) for shard, offset in rows if shard in wanted]
 
 

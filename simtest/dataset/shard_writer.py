@@ -11,8 +11,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import IO
 
-import polars as pl
-
 from simtest.dataset.card import CARD, write_card
 from simtest.dataset.index import SAMPLES, TABLES, write_shard_tables, write_tables
 from simtest.dataset.maker import Maker
@@ -27,6 +25,7 @@ from simtest.dataset.manifest import (
     read_manifest,
 )
 from simtest.dataset.plan import Plan, Shard
+from simtest.dataset.reader import read_table
 from simtest.dataset.shard import PART, Sample, finish, whole_samples, write_sample
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
@@ -89,7 +88,7 @@ def write_dataset(
     with _telling_what_stays(folder), exclusive_folder(folder):
         manifest = _open(folder, plan, colour_variant(variant))
         _complete(plan, manifest, folder, engine, progress)
-        isolated = pl.read_parquet(folder / SAMPLES, columns=["n_isolated"])["n_isolated"]
+        isolated = read_table(folder / SAMPLES, ["n_isolated"])["n_isolated"]
     if few := int((isolated < dataset.highlights).sum()):
         warnings.warn(
             f"{few} of {len(isolated)} samples show fewer isolated highlights than highlights = {dataset.highlights} "
@@ -191,6 +190,14 @@ def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
     # Shards that were removed are made anew.
     for name in [name for name in there.shards if not (folder / name).exists()]:
         del there.shards[name]
+    # A file that was cut or changed since is not taken for a finished one.
+    listed = {**there.shards, **{name: entry for name, entry in there.tables.items() if name in TABLES}}
+    for name, entry in listed.items():
+        if (path := folder / name).exists() and (size := path.stat().st_size) != entry.bytes:
+            raise InputError(
+                f"--out {folder}: {name} has {size} bytes; must have {entry.bytes}; simtest dataset verify --repair "
+                "mends it"
+            )
     return there
 
 

@@ -24,7 +24,7 @@ from simtest.errors import InputError, SimtestError
 from simtest.nightly.quantities import OLDEST_COLUMNS, OPTIONAL_COLUMNS, RESULT_COLUMNS
 from simtest.nightly.records import CELL, FIGURES, NightlyRun, RunRecord, Verdict
 from simtest.runtime.boundary import explain
-from simtest.runtime.files import read_json, require_plain, sync_folder, write_atomically, write_json
+from simtest.runtime.files import read_json, require_plain, sync_folder, write_json, write_parquet
 from simtest.runtime.locks import exclusive_file, waiting_for
 from simtest.runtime.provenance import file_hash
 from simtest.validation.columns import SCHEMA
@@ -154,7 +154,7 @@ def save_run(folder: Path, run: NightlyRun, rows_file: str, smallest: bool = Fal
     tables = {rows_file: run.rows, FIGURES_FILE: run.figures}
     how = _SMALL if smallest else _FAST
     for name, table in tables.items():
-        write_atomically(folder / name, lambda part, table=table: table.write_parquet(part, **how))  # type: ignore[misc]
+        write_parquet(folder / name, table, **how)
     hashes = {name: file_hash(folder / name) for name in tables}
     write_json(folder / RUN_FILE, {**run.record.to_json(), "files": hashes})
     sync_folder(folder)
@@ -410,7 +410,7 @@ def append(folder: Path, rows: pl.DataFrame, scratch: Path) -> Path:
     """
     name = f"{rows['run_id'][0]}.parquet"
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(scratch / name, lambda part: rows.write_parquet(part, compression="zstd"))
+    write_parquet(scratch / name, rows, compression="zstd")
     os.replace(scratch / name, folder / name)
     # The new names outlast a loss of power.
     for made in (folder, folder.parent):

@@ -27,7 +27,7 @@ from simtest.realism.compare import (
 from simtest.realism.statistics import STATISTICS, FrameColumn, Statistic
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array, Picture
-from simtest.runtime.files import make_folder, write_atomically, write_json
+from simtest.runtime.files import make_folder, write_atomically, write_json, written_together
 
 PAGE, RESULT = "index.html", "realism.json"
 
@@ -79,8 +79,9 @@ def write_comparison(
     html = _render(found, against, command, distance, columns)
     # These come last, so that a stopped command leaves the earlier ones.
     record = {"against": against, "command": command, **provenance.environment()}
-    write_json(out / RESULT, {**found.to_json(), "run": record})
-    write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
+    with written_together(out, (RESULT, PAGE)) as new:
+        write_json(new / RESULT, {**found.to_json(), "run": record})
+        write_atomically(new / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
     if progress:
         progress(len(_STEPS), len(_STEPS), WRITTEN)
     return out / PAGE

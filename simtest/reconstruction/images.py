@@ -48,13 +48,13 @@ def read_picture(path: Path) -> Image:
     `InputError` as `read_raw` does, and for other depths.
     """
     picture = read_raw(path, "a picture (PNG, JPEG, BMP, TIFF)")
-    alpha = picture[..., 3] if picture.ndim == 3 and picture.shape[2] == 4 else None
-    if alpha is not None and (clear := float((alpha < alpha.max()).mean())):
-        told = f"{path}: its alpha channel is ignored, by which {clear:.2g} of the pixels are transparent"
-        warnings.warn(told, stacklevel=3)
     scaled = scale_picture(picture, str(path))
     if scaled is None:
         raise InputError(f"{path}: pixels are {picture.dtype}; must be 8 or 16 bits")
+    alpha = picture[..., 3] if picture.ndim == 3 and picture.shape[2] == 4 else None
+    if alpha is not None and (clear := float(np.less(alpha, OPAQUE * LARGEST[alpha.dtype.name]).mean())):
+        told = f"{path}: its alpha channel is ignored, by which {clear:.2g} of the pixels are transparent"
+        warnings.warn(told, stacklevel=3)
     # OpenCV's order of channels is BGR.
     return scaled if scaled.ndim == 2 else np.ascontiguousarray(scaled[:, :, ::-1])
 
@@ -274,6 +274,9 @@ def quiet_libraries() -> Iterator[None]:
 LARGEST = {"uint8": 2**8 - 1, "uint16": 2**16 - 1}
 """The value that light of full scale has, by the type of the values."""
 
+OPAQUE = 0.99
+"""Share of full scale from which a pixel counts as opaque: full alpha of 8 bits, shifted to 16, is 0.996."""
+
 SAFE_SUM = 1e38
 """A sum of values up to this is finite in float32, whatever the rounding."""
 
@@ -335,9 +338,13 @@ def check_frame(frame: npt.ArrayLike, camera: Camera, encoding: str | None = Non
             image = given.astype(np.float32)
     check_size(image, camera)
     check_finite(image)
-    if is_picture and ((low := float(image.min())) < 0 or image.max() > 1):
-        high = float(image.max())
+    low, high = float(image.min()), float(image.max())
+    if is_picture and (low < 0 or high > 1):
         raise InputError(f"frame holds values from {low:g} to {high:g}: encoded real values must lie in [0, 1]")
+    if is_picture and image.ndim == 3 and image.shape[2] not in (1, 3):
+        raise InputError(f"frame has {image.shape[2]} channels: a picture must have 1 or 3, or alpha beside them")
+    if low < 0 and high <= 0:
+        raise InputError(f"frame holds values from {low:g} to {high:g}: some must be above 0")
     return image, is_picture
 
 

@@ -29,6 +29,7 @@ from simtest.reconstruction.assumptions import (
 )
 from simtest.reconstruction.images import check_roi, is_coloured
 from simtest.runtime.arrays import Image, short_repr
+from simtest.runtime.boundary import shown
 
 AUTO = "auto"
 ENCODINGS = ("srgb", "linear")
@@ -93,15 +94,15 @@ class Options:
                 load_detector(self.detector)
             except InputError as error:
                 raise InputError(f"{error}; {AUTO} chooses among those of simtest") from error
-        if self.target not in TARGETS:
-            raise InputError(f"target = {self.target!s:.80}: must be one of {', '.join(TARGETS)}")
+        if not isinstance(self.target, str) or self.target not in TARGETS:
+            raise InputError(f"target = {shown(self.target)}: must be one of {', '.join(TARGETS)}")
         width = self.smoothing_px
         number = isinstance(width, int | float | np.number) and not isinstance(width, bool)
         if width is not None and not (number and 0 <= width <= MAX_SMOOTHING_PX):
             raise InputError(f"smoothing_px = {width!r}: must be a number in [0, {MAX_SMOOTHING_PX}]")
         names = () if self.estimators is None or isinstance(self.estimators, Mapping) else self.estimators
         if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-            raise InputError(f"estimators = {names!r:.80}: must be a list of names")
+            raise InputError(f"estimators = {shown(names)}: must be a list of names")
         if self.roi is not None:
             object.__setattr__(self, "roi", check_roi(self.roi))
 
@@ -253,8 +254,8 @@ def check_encoding(encoding: str | None, calibration: Calibration) -> None:
     """Raise `InputError` for an unknown encoding, and for one beside a calibration that states the response."""
     if encoding is None:
         return
-    if encoding not in ENCODINGS:
-        raise InputError(f"encoding = {encoding!r:.80}: must be one of {', '.join(ENCODINGS)}, or None")
+    if not isinstance(encoding, str) or encoding not in ENCODINGS:
+        raise InputError(f"encoding = {shown(encoding)}: must be one of {', '.join(ENCODINGS)}, or None")
     if calibration.response is not None:
         raise InputError(f"encoding = {encoding!r}: the calibration states the response; give one of them")
 

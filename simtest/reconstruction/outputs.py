@@ -17,7 +17,7 @@ from simtest.reconstruction.overlay import draw_overlay
 from simtest.reconstruction.page import write_picture_page
 from simtest.reconstruction.records import Specularities, Specularity
 from simtest.runtime.arrays import Array, Image
-from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
+from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json, written_together
 
 MANY = 10
 """Above this many specularities normals.json is written on one line, since most of it is outlines."""
@@ -44,12 +44,17 @@ def write_outputs(
     points = normals_ply(found, found.camera, depths)
     entries = found.to_json()
     make_folder(out)
-    write_json(out / "normals.json", entries, compact=len(found) > MANY)
-    write_atomically(out / "normals.csv", lambda part: write_csv(part, COLUMNS, normals_rows(entries["specularities"])))
-    write_atomically(out / "normals.ply", lambda part: part.write_text(points, encoding="ascii"))
-    write_atomically(out / "overlay.png", lambda part: cv2.imwrite(str(part), draw_overlay(picture, found)))
-    write_atomically(out / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
-    write_atomically(out / "index.html", lambda part: write_picture_page(part, found, picture))
+    with written_together(out, FILES) as new:
+        write_json(new / "normals.json", entries, compact=len(found) > MANY)
+        write_atomically(
+            new / "normals.csv", lambda part: write_csv(part, COLUMNS, normals_rows(entries["specularities"]))
+        )
+        write_atomically(new / "normals.ply", lambda part: part.write_text(points, encoding="ascii"))
+        # In memory: OpenCV does not tell which of the system's errors it met.
+        overlay = cv2.imencode(".png", draw_overlay(picture, found))[1].tobytes()
+        write_atomically(new / "overlay.png", lambda part: part.write_bytes(overlay))
+        write_atomically(new / "constraints.npz", lambda part: np.savez(part, allow_pickle=False, **arrays))
+        write_atomically(new / "index.html", lambda part: write_picture_page(part, found, picture))
     return [out / name for name in FILES]
 
 

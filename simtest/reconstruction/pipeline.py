@@ -123,6 +123,8 @@ def reconstruct(
     elif not isinstance(camera, Calibration):
         raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera or simtest.Calibration")
     check_encoding(encoding, camera)
+    if not isinstance(isolated, bool | np.bool_):
+        raise InputError(f"isolated is a {type(isolated).__name__}: must be True or False")
     image, is_picture = check_frame(frame, camera.camera, encoding)
     options = Options(
         estimators=estimators, roi=roi, encoding=encoding, every=not isolated, detector=detector,

@@ -215,13 +215,13 @@ class _Run:
         self.assumed = found.choices.assumed
         numbers = self._track_numbers([spot.position_px for spot in found], size, frame.index)
         found[:] = [replace(spot, track=number) for spot, number in zip(found, numbers, strict=True)]
-        overlay = draw_overlay(picture, found)
+        overlay = cv2.imencode(".jpg", draw_overlay(picture, found))[1].tobytes()
         # Not before a frame is there: a run that reads nothing leaves nothing.
         if not self.folder.is_dir() or not (self.out / SETTINGS).is_file():
             make_folder(self.folder)
             write_json(self.out / SETTINGS, self.settings)
         file = self.file(frame.index)
-        write_atomically(file.with_suffix(".jpg"), lambda part: cv2.imwrite(str(part), overlay))
+        write_atomically(file.with_suffix(".jpg"), lambda part: part.write_bytes(overlay))
         entry = {**found.to_json(False, self._origin), "frame_index": frame.index, "time_s": frame.time_s, "size": size}
         # Last: a frame whose JSON is there is done.
         write_json(file, entry, compact=True)

@@ -12,8 +12,10 @@ import json
 import os
 import re
 import signal
+import stat
 import subprocess
 import sys
+import tempfile
 import warnings
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -47,7 +49,7 @@ VARIANTS = tuple(f"{device}_ad_{channels}" for device in DEVICES for channels in
 
 DEFAULT_VARIANT = f"{LLVM}_ad_mono"
 COLOUR_VARIANT = f"{LLVM}_ad_rgb"
-LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
+LIBRARY_VARIABLE, CACHE_VARIABLE = "DRJIT_LIBLLVM_PATH", "DRJIT_CACHE_DIR"
 VARIANT_VARIABLE = "SIMTEST_VARIANT"
 PIP_PACKAGE = "karellen-llvm-core"
 PROBE_TIMEOUT_S = 120
@@ -251,6 +253,7 @@ def load(variant: str | None = None) -> Any:
             _check_library_in_memory()
     else:
         _set_library(needed=needs_llvm(name))
+        _set_kernel_cache()
     import mitsuba
 
     # Variant.
@@ -307,6 +310,24 @@ def _set_library(needed: bool) -> None:
 
 _chosen: set[str] = set()
 """The library that this process chose for Dr.Jit, once it did."""
+
+
+def _set_kernel_cache() -> None:
+    """Let Dr.Jit keep its kernels in a folder of this user's among the temporary ones, where it can keep none at home.
+
+    Each process would otherwise complain in a line of its own, whatever its user wants to hear.
+    """
+    home = Path(os.environ.get("HOME") or "/nonexistent")
+    kept = home / ".drjit" if (home / ".drjit").is_dir() else home
+    if CACHE_VARIABLE in os.environ or os.access(kept, os.W_OK | os.X_OK):
+        return
+    folder = Path(tempfile.gettempdir(), f"simtest-kernels-{os.getuid()}")
+    with contextlib.suppress(OSError):
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+        # Compiled code is run: nobody else may have made it.
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
+            os.environ[CACHE_VARIABLE] = str(folder)
 
 
 def _check_library_in_memory() -> None:

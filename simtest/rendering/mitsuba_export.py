@@ -18,7 +18,7 @@ from simtest.rendering.built_scene import make_shape
 from simtest.rendering.kernel_values import MitsubaDict
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array
-from simtest.runtime.files import make_folder, write_atomically
+from simtest.runtime.files import make_folder, write_atomically, written_together
 from simtest.spec import Scene
 from simtest.spec.lights import CosineProfile, DiscSource, LightSpec
 from simtest.spec.spec_model import Spec
@@ -64,16 +64,16 @@ def export_scene(scene: Scene, out: Path, variant: str | None = None) -> list[Pa
     shape = _cut_to_view(surface.shape(), surface, scene.camera.model())
     text = _xml(scene, surface, shape)
     make_folder(out)
-    files = [out / SCENE_FILE]
-    if shape.mesh:
-        files.append(out / MESH_FILE)
-        mesh = make_shape(shape, {"type": "diffuse"})
-        # By way of memory, since Mitsuba does not tell which of the system's errors it met.
-        stream = mi.MemoryStream()
-        mesh.write_ply(stream)
-        write_atomically(files[1], lambda part: part.write_bytes(stream.raw_buffer()))
-    write_atomically(files[0], lambda part: part.write_text(text, encoding="utf-8"))
-    return files
+    names = (MESH_FILE, SCENE_FILE) if shape.mesh else (SCENE_FILE,)
+    with written_together(out, names) as new:
+        if shape.mesh:
+            mesh = make_shape(shape, {"type": "diffuse"})
+            # By way of memory, since Mitsuba does not tell which of the system's errors it met.
+            stream = mi.MemoryStream()
+            mesh.write_ply(stream)
+            write_atomically(new / MESH_FILE, lambda part: part.write_bytes(stream.raw_buffer()))
+        write_atomically(new / SCENE_FILE, lambda part: part.write_text(text, encoding="utf-8"))
+    return [out / name for name in reversed(names)]
 
 
 def _inexpressible(scene: Scene) -> Iterator[tuple[str, Any, str]]:

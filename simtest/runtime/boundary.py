@@ -36,6 +36,16 @@ _OS_ERROR = re.compile(r"\(os error (\d+)\)")
 """How libraries written in Rust (polars) hand an error of the system on."""
 
 
+def shown(value: object) -> str:
+    """Return a value as a message shows it: on one line, 80 characters at most."""
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:
+        # Python refuses to write integers of more than 4300 digits.
+        text = "a number of too many digits"
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
 def close_names(name: object, known: Iterable[str], count: int = 1, alike: float = _ALIKE) -> list[str]:
     """Return at most `count` known names that a wrong one may mean, the closest first; `alike` is from 0 to 1."""
     import difflib  # slow to import

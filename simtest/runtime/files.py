@@ -6,21 +6,37 @@ The ranges of single values (a width, an exponent) stand in the schemas and are 
 
 import contextlib
 import errno
+import io
 import json
 import os
+import shutil
 import stat
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from simtest.errors import InputError
-from simtest.runtime.boundary import suggestion
+from simtest.runtime.boundary import shown, suggestion
+
+if TYPE_CHECKING:
+    import polars as pl
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 """What a JSON file can hold."""
 JsonObject = dict[str, Any]
 """An object as it stands in a JSON file: what records become when they are written, and are made of when read."""
+
+
+def as_path(value: object, name: str = "path") -> Path:
+    """Return a path that a caller from Python gave under a name; raise `InputError` for what is none."""
+    try:
+        path = Path(value)  # type: ignore[arg-type]
+    except TypeError:
+        path = Path("\0")
+    if "\0" in str(path):
+        raise InputError(f"{name} = {shown(value)}: must be a path") from None
+    return path
 
 
 def refuse_file(folder: Path, option: str = "--out") -> None:
@@ -74,12 +90,13 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     """Write a file under a temporary name, flush it to disk, then rename it.
 
     `write` is called with the temporary path, which has the final file's suffix. An `OSError` names the final file,
-    also where the system's own names none (a full disk), or where `write` returns False, as OpenCV does.
+    also where the system's own names none (a full disk).
     """
+    if not path.name:
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
-        if write(part) is False:
-            raise OSError(errno.EIO, "cannot be written; is the disk full?", str(path))
+        write(part)
         # The content must be on disk before the rename is, or a loss of power leaves an empty file.
         with part.open("rb+") as file:
             os.fsync(file.fileno())
@@ -91,6 +108,32 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def written_together(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Yield an empty folder for files that belong together; at the end they take the place of these names in `folder`.
+
+    What an earlier result left under the names goes before the first new file comes: at no moment do old and new files
+    stand side by side. A full disk leaves the earlier files; a kill leaves these, or new ones alone, of which those
+    that come last in `names` may lack. An `OSError` names the final file.
+    """
+    new = folder / f".{Path(names[-1]).name}.new"
+    shutil.rmtree(new, ignore_errors=True)
+    try:
+        new.mkdir()
+        yield new
+        for name in names:
+            (folder / name).unlink(missing_ok=True)
+        for name in filter(lambda name: (new / name).exists(), names):
+            os.replace(new / name, folder / name)
+        sync_folder(folder)
+    except OSError as error:
+        if error.filename is not None and (path := Path(os.fsdecode(error.filename))).is_relative_to(new):
+            error.filename = str(folder / path.relative_to(new))
+        raise
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
 
 
 def sync_folder(folder: Path) -> None:
@@ -110,6 +153,13 @@ def write_json(path: Path, value: Any, compact: bool = False) -> None:
     how: dict[str, Any] = {"separators": (",", ":")} if compact else {"indent": 2}
     text = json.dumps(value, allow_nan=False, default=as_json, **how) + "\n"
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def write_parquet(path: Path, table: "pl.DataFrame", **how: Any) -> None:
+    """Write a table atomically: made in memory, since polars hands on an error of the disk without number or file."""
+    made = io.BytesIO()
+    table.write_parquet(made, **how)
+    write_atomically(path, lambda part: part.write_bytes(made.getbuffer()))
 
 
 def read_json(path: Path, wanted: str = "a JSON file") -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 
 from simtest.errors import InputError
 from simtest.runtime.boundary import suggestion
-from simtest.runtime.files import require_plain
+from simtest.runtime.files import as_path, require_plain
 from simtest.runtime.provenance import file_hash
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -29,7 +29,7 @@ def find(name: str | Path, kind: str, folder: str = "", suffixes: tuple[str, ...
     Raises `InputError` if there is no such file; the message lists the names that exist.
     """
     try:
-        path = Path(name).expanduser()
+        path = as_path(name, "file").expanduser()
         if path.is_file():
             return path
     except RuntimeError as error:

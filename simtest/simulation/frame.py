@@ -23,6 +23,7 @@ from simtest.geometry import Camera, smooth
 from simtest.rendering import HighlightPoint, Progress, Radiance, Session, TruthMaps
 from simtest.rendering.highlights import radii_px
 from simtest.runtime.arrays import Array, Image, Mask, short_repr
+from simtest.runtime.files import as_path
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.highlights import (
     CloudRegions,
@@ -174,7 +175,7 @@ class LabelledFrame(RenderedView):
         """Write the files of `simtest render` into a folder, made if need be; return them."""
         from simtest.simulation.frame_files import write_frame
 
-        return write_frame(self, Path(folder))
+        return write_frame(self, as_path(folder, "folder"))
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the lit surface with its highlights, and what was rendered."""

@@ -13,7 +13,7 @@ from simtest.calibration import Calibration, Response
 from simtest.rendering.bitmap import write_exr
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image, Picture, write_arrays
-from simtest.runtime.files import Json, make_folder, write_atomically, write_json
+from simtest.runtime.files import Json, make_folder, write_atomically, write_json, written_together
 from simtest.simulation.frame import LabelledFrame, preview
 from simtest.simulation.highlights import cloud_json
 from simtest.simulation.sensor import to_uint8
@@ -78,18 +78,19 @@ def write_frame(frame: LabelledFrame, out: Path) -> list[Path]:
     The folder is made if need be; `InputError` is raised if it cannot be written,
     `SimtestError` if its disk is full. Returns the files.
     """
-    files = [out / name for name in FILES]
     calibration = calibration_toml(picture_calibration(frame.calibration, frame.scene.sensor), _note(frame.scene))
     make_folder(out)
-    write_atomically(files[0], lambda part: part.write_bytes(encoded_png(frame.image, frame.scene.sensor)))
-    write_atomically(files[1], lambda part: write_exr(part, frame.radiance.total, frame.variant))
-    write_atomically(files[2], lambda part: write_arrays(part, _truth(frame)))
-    write_json(files[3], _description(frame))
-    write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
-    write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
-    shown = _coded(preview(frame), ".jpg", (cv2.IMWRITE_JPEG_QUALITY, 90))
-    write_atomically(files[6], lambda part: part.write_bytes(shown))
-    return files
+    with written_together(out, FILES) as new:
+        files = [new / name for name in FILES]
+        write_atomically(files[0], lambda part: part.write_bytes(encoded_png(frame.image, frame.scene.sensor)))
+        write_atomically(files[1], lambda part: write_exr(part, frame.radiance.total, frame.variant))
+        write_atomically(files[2], lambda part: write_arrays(part, _truth(frame)))
+        write_json(files[3], _description(frame))
+        write_atomically(files[4], lambda part: part.write_text(camera_toml(frame.camera), encoding="utf-8"))
+        write_atomically(files[5], lambda part: part.write_text(calibration, encoding="utf-8"))
+        shown = _coded(preview(frame), ".jpg", (cv2.IMWRITE_JPEG_QUALITY, 90))
+        write_atomically(files[6], lambda part: part.write_bytes(shown))
+    return [out / name for name in FILES]
 
 
 def _coded(picture: npt.NDArray[np.unsignedinteger], suffix: str = ".png", quality: Sequence[int] = ()) -> bytes:

@@ -7,6 +7,7 @@ from typing import Any
 from simtest.calibration import Calibration
 from simtest.errors import InputError
 from simtest.runtime.boundary import plain_errors
+from simtest.runtime.files import as_path
 from simtest.spec.camera import NOT_OF_THE_CAMERA, load_camera
 from simtest.spec.camera_formats.files import FOREIGN_SUFFIXES, recognise
 from simtest.spec.spec_model import validate
@@ -48,7 +49,7 @@ def load_calibration(
     >>> simtest.load_calibration(path).camera.width
     640
     """
-    path = Path(path)
+    path = as_path(path)
     # camera
     camera = load_camera(path, view_radius_px)
     # everything else, which only TOML holds
@@ -57,7 +58,7 @@ def load_calibration(
         # The camera's keys stand at top level, before the other tables.
         data = {key: value for key, value in data.items() if key in NOT_OF_THE_CAMERA}
     if photometric is not None:
-        data = _with_photometry(data, Path(photometric), path)
+        data = _with_photometry(data, as_path(photometric, "photometric"), path)
     if not data.keys() - {"camera"}:
         return Calibration(camera)
     # Imported here: the models of sensor and lobe are slow to load, and a camera alone needs none.
@@ -105,7 +106,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     >>> simtest.load_calibration(path).camera.width
     640
     """
-    path = Path(path)
+    path = as_path(path)
     if not isinstance(calibration, Calibration):
         raise InputError(f"calibration is a {type(calibration).__name__}: must be a simtest.Calibration")
     if path.suffix.lower() in FOREIGN_SUFFIXES:

@@ -14,6 +14,7 @@ from simtest.geometry.lenses import BrownConrady, Distortion, KannalaBrandt, Sca
 from simtest.geometry.vectors import rotation
 from simtest.runtime.arrays import Array
 from simtest.runtime.boundary import plain_errors
+from simtest.runtime.files import as_path
 from simtest.spec.spec_model import Spec, validate
 from simtest.spec.toml_files import read_toml
 
@@ -359,7 +360,7 @@ def load_camera(path: str | Path, view_radius_px: float | None = None) -> Camera
     # Imported on demand: scenes need no format but TOML.
     from simtest.spec.camera_formats.files import read_table, recognise
 
-    path = Path(path)
+    path = as_path(path)
     if recognise(path) != "toml":
         return _validated(_with_view(read_table(path), view_radius_px, path), path, HOW_TO_MASK)
     # The camera's keys under [camera], or at top level beside the other tables of a calibration file

@@ -22,7 +22,7 @@ from simtest.runtime.resources import find
 from simtest.spec.keys import replace_values, rivals
 from simtest.spec.scene import Scene
 from simtest.spec.spec_model import Name, Share, Spec, load, validate
-from simtest.spec.toml_files import read_toml
+from simtest.spec.toml_files import as_settings, read_toml
 
 
 class PaperSetting(Spec):
@@ -201,7 +201,7 @@ def load_experiment(name: str | Path, settings: Mapping[str, Any] | None = None)
     """
     path = find(name, "scenes", "experiments")
     # The experiment's own keys; all others are keys of the scenes.
-    settings = dict(settings or {})
+    settings = as_settings(settings)
     own = {key: settings.pop(key) for key in list(settings) if key in OWN_KEYS}
     viewpoints = own.pop("viewpoints", None)
     changes = [f"{key}={value}" for key, value in settings.items()]
@@ -474,7 +474,7 @@ def load_dataset(name: str | Path, settings: Mapping[str, Any] | None = None) ->
     """
     path = find(name, "scenes", "datasets")
     # The dataset's own keys; all others are keys of the scenes.
-    settings = dict(settings or {})
+    settings = as_settings(settings)
     own = {key: settings.pop(key) for key in list(settings) if key.split(".")[0] in _DATASET_KEYS}
     check_first_parts(settings, Scene.model_fields, _DATASET_KEYS)
     dataset = load(Dataset, path, own)

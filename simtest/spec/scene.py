@@ -22,7 +22,7 @@ from simtest.spec.reflectance import PhongReflectance, Reflectance, TissueColour
 from simtest.spec.sensor import Sensor
 from simtest.spec.spec_model import Millimetres, Spec, validate
 from simtest.spec.surfaces import MOST_DEFORMATIONS, Deformation, Instrument, Surface
-from simtest.spec.toml_files import read_toml, source_name
+from simtest.spec.toml_files import as_settings, read_toml, source_name
 
 MOST_INSTRUMENTS = 8
 """More than a patient has ports for."""
@@ -265,11 +265,11 @@ def load_scene(name: str | Path, settings: Mapping[str, Any] | None = None) -> S
     >>> simtest.load_scene("cylinder", {"surface.radius_mm": 5.0}).surface.radius_mm
     5.0
     """
-    path = find(name, "scenes")
+    path, values = find(name, "scenes"), as_settings(settings)
     tables = _tables(path)
     if path.suffix.lower() == ".json":
-        tables = without_presets(tables, settings or {})
-    data = replace_values(Scene, tables, settings or {}, str(path))
+        tables = without_presets(tables, values)
+    data = replace_values(Scene, tables, values, str(path))
     data.setdefault("name", path.stem[:80])
     return scene_from_dict(data, source_name(path, settings))
 

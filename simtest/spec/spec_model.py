@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from simtest.errors import InputError
-from simtest.runtime.boundary import close_names, suggestion
+from simtest.runtime.boundary import close_names, shown, suggestion
 from simtest.spec.toml_files import apply_settings, read_toml, source_name
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -147,11 +147,11 @@ def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> st
     location = [str(part) or "''" for part in _without_tags(error["loc"], data, kind == "missing")]
     # our own error, which names the field itself
     if kind == "coerced":
-        return f"{'.'.join([*location, error['ctx']['field']])} = {_short(error['ctx']['got'])}: {error['msg']}"
+        return f"{'.'.join([*location, error['ctx']['field']])} = {shown(error['ctx']['got'])}: {error['msg']}"
     # keys
     path = ".".join(location) or "(top level)"
     if kind == "extra_forbidden":
-        return f"{path} = {_short(value)}: unknown key{_allowed_keys(error['loc'], model)}"
+        return f"{path} = {shown(value)}: unknown key{_allowed_keys(error['loc'], model)}"
     if kind == "missing":
         return f"{path}: missing; it must be given"
     # types of tagged unions
@@ -159,12 +159,12 @@ def _describe(error: Any, model: type[BaseModel], data: Mapping[str, Any]) -> st
         return f"{path}.type: missing; allowed: {_allowed_types(error['loc'], model)}"
     if kind == "union_tag_invalid":
         allowed = _allowed_types(error["loc"], model, value["type"])
-        return f"{path}.type = {_short(value['type'])}: unknown; allowed: {allowed}"
+        return f"{path}.type = {shown(value['type'])}: unknown; allowed: {allowed}"
     # validators of our models, then the ranges of fields
     if kind == "value_error":
-        shown_value = "" if isinstance(value, Mapping) else f" = {_short(value)}"
-        return f"{path}{shown_value}: {error['ctx']['error']}" if location else str(error["ctx"]["error"])
-    return f"{path} = {_short(value)}: must {_demand(error)}"
+        text = "" if isinstance(value, Mapping) else f" = {shown(value)}"
+        return f"{path}{text}: {error['ctx']['error']}" if location else str(error["ctx"]["error"])
+    return f"{path} = {shown(value)}: must {_demand(error)}"
 
 
 def _demand(error: Any) -> str:
@@ -217,15 +217,6 @@ def _allowed_types(location: tuple[Any, ...], model: type[BaseModel], given: obj
     """List the types that a tagged union allows, and the one that may be meant."""
     known = next((found for place, _ in places(model, location) if (found := types_of(place))), [])
     return ", ".join(known) + ("" if given is None else suggestion(given, known))
-
-
-def _short(value: Any) -> str:
-    try:
-        text = repr(value)
-    except ValueError:
-        # Python refuses to write integers of more than 4300 digits.
-        text = "a number of too many digits"
-    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def places(kind: Any, path: Sequence[Any], field: FieldInfo | None = None) -> Iterator[tuple[Any, Any]]:

@@ -3,16 +3,23 @@
 import copy
 import itertools
 import json
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from simtest.errors import InputError
+from simtest.runtime.boundary import shown
 from simtest.runtime.files import require_plain
 
 MAX_DEPTH = 32
 """Tables and lists within each other, and parts of a key path; the deepest key of a scene has 6."""
+
+
+_PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+_DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*{_PART}(?:[ \t]*\.[ \t]*{_PART}){{{MAX_DEPTH}}}", re.MULTILINE)
+"""A dotted key of more parts than `MAX_DEPTH`: the parser's memory grows with the square of their number."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -39,6 +46,8 @@ def read_text(path: Path, kind: str, limit: str = "text_bytes") -> str:
 
 def _loads(text: str) -> dict[str, Any]:
     """Parse TOML; limits (nesting, digits) raise `TOMLDecodeError` too."""
+    if _DEEP_KEY.search(text):
+        raise tomllib.TOMLDecodeError(f"nested too deeply; at most {MAX_DEPTH} levels are allowed")
     try:
         parsed = tomllib.loads(text)
     except tomllib.TOMLDecodeError:
@@ -78,6 +87,15 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
         # More than one key means that the value held a line break, so it is text.
         parsed[path.strip()] = table["value"] if list(table) == ["value"] else value
     return parsed
+
+
+def as_settings(settings: object) -> dict[str, Any]:
+    """Return values by key path that a caller from Python gave; raise `InputError` where they are no such table."""
+    if settings is None:
+        return {}
+    if not isinstance(settings, Mapping) or not all(isinstance(key, str) for key in settings):
+        raise InputError(f"settings = {shown(settings)}: must be values by key path")
+    return dict(settings)
 
 
 def apply_settings(data: Mapping[str, Any], settings: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import polars as pl
 
 from simtest.estimators import AnyEstimator, load_estimators
 from simtest.estimators.names import absolute_names, forgive_cores
-from simtest.runtime.files import write_atomically
+from simtest.runtime.files import write_parquet
 from simtest.runtime.processes import Engine, OnStep
 from simtest.spec import Experiment
 from simtest.spec.recipes import PaperSetting
@@ -163,7 +163,7 @@ def make_cases(jobs: Sequence[Job], engine: Engine, progress: "Progress | None")
         made[case][number] = rows
         if len(made[case]) == waiting[case]:
             whole = pl.concat([rows for _, rows in sorted(made.pop(case).items())])
-            write_atomically(part_file(case.folder / PARTS, case.number), whole.write_parquet)
+            write_parquet(part_file(case.folder / PARTS, case.number), whole)
         bar.begin(number + 1)
     forget()
     bar.end()

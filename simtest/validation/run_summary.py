@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 from simtest.errors import FAULTS, InputError
 from simtest.estimators.names import describe_estimators
 from simtest.runtime import provenance
-from simtest.runtime.files import write_atomically, write_json
+from simtest.runtime.files import write_json, write_parquet
 from simtest.spec import Experiment
 from simtest.validation.cases import Case
 from simtest.validation.mesh_verdicts import MeshVerdict, mesh_verdicts
@@ -125,7 +125,7 @@ def write_results(
     folder: Path, record: RunRecord, results: pl.DataFrame, name: str, summary: ExperimentSummary
 ) -> None:
     """Write results.parquet, and summary.json with how the run was made; `name` is the experiment's."""
-    write_atomically(folder / RESULTS, results.write_parquet)
+    write_parquet(folder / RESULTS, results)
     record = replace(record, results=provenance.file_hash(folder / RESULTS))
     content = RunSummary(run=record.to_json(), experiments={name: summary})
     # What a scored dataset does not state is left out.

@@ -107,7 +107,7 @@ def test_depths_and_channels(kind, shape, tmp_path):
     grey = colours[:, :, 0]
     values = {
         "colour": colours, "grey": grey, "one channel": grey[:, :, None], "three alike": np.dstack([grey] * 3),
-        "alpha": np.dstack([colours, np.full_like(grey, 7)]),
+        "alpha": np.dstack([colours, np.full_like(grey, np.iinfo(kind).max)]),
     }[shape]  # fmt: skip
     written = (
         values[:, :, [2, 1, 0, *range(3, values.shape[2])]] if values.ndim == 3 and shape != "one channel" else values

@@ -382,3 +382,22 @@ def test_one_thread_writes_a_picture(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split(")")[1].strip() == "1"
+
+
+@pytest.mark.parametrize("home", ["read-only", None])
+@pytest.mark.parametrize("others", [False, True])
+def test_a_home_that_cannot_be_written_is_no_news(tmp_path, home, others):
+    """Dr.Jit said so in a line of its own, in each process, also with --quiet."""
+    kept = tmp_path / f"simtest-kernels-{os.getuid()}"
+    (tmp_path / "home").write_text("")
+    environment = {**os.environ, "TMPDIR": str(tmp_path)} | ({"HOME": str(tmp_path / "home")} if home else {})
+    if home is None:
+        environment.pop("HOME", None)
+    if others:
+        # Compiled code in a folder that others can write to is not run.
+        kept.mkdir(mode=0o777)
+        kept.chmod(0o777)
+    code = "from simtest.rendering import backend; backend.load('llvm')"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stderr.count("jit_init") == others
+    assert others or oct(kept.stat().st_mode & 0o777) == "0o700"

@@ -306,7 +306,7 @@ def test_a_picture_of_which_nothing_is_told(tmp_path, target):
     stated = np.degrees(np.sqrt(np.trace(found["estimates"]["cone_axis"]["covariance"])))
     assert 4 < stated < (7 if target == "fine" else 15)
     assert [each["what"] for each in document["assumed"]][:2] == ["light", "distance of the tissue"]
-    with pytest.raises(InputError, match="target = top: must be one of fine, base"):
+    with pytest.raises(InputError, match="target = 'top': must be one of fine, base"):
         Options(fov_deg=53.0, target="top")
 
 

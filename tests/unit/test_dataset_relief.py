@@ -1,6 +1,7 @@
 """Datasets of surfaces with a relief: both truths stored, drawn, read, and checked."""
 
 import hashlib
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -249,3 +250,20 @@ def test_wrong_pixels_of_visible_highlights_are_found(with_visible, change, said
     members, meta = stored_rough(with_visible)
     assert list(check_sample(members, meta)) == []
     assert any(said in fault for fault in check_sample(recoded(members, "visible", change), meta))
+
+
+def test_a_normal_that_leans_away_is_its_triangles_if_the_base_leans_away():
+    """Interpolated normals lean away at the silhouette of a mesh; a fine normal may do so on a sound base."""
+    position = np.tile([0.0, 0.0, 10.0], (1, 3, 1))
+    towards, away, flat = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.1, 1.0]), np.array([0.0, 0.6, -0.8])
+    seen = SimpleNamespace(
+        position=position, depth=np.full((1, 3), 10.0), pool=np.zeros((1, 3), bool),
+        normal=np.array([[towards, away, away]]), normal_base=np.array([[towards, towards, away]]),
+        geometric_normal=np.array([[flat, flat, flat]]),
+        **{name: np.zeros((1, 3)) for name in ("k_min", "k_max", "k_min_base", "k_max_base")},
+    )  # fmt: skip
+    maker = SimpleNamespace(plan=SimpleNamespace(dataset=SimpleNamespace(exact=False)))
+    drawn = SimpleNamespace(scene=SimpleNamespace(instruments=(), surface=SimpleNamespace(relief=object())))
+    truth = Maker._truth(maker, drawn, SimpleNamespace(labels=seen))
+    np.testing.assert_array_equal(truth["normal"], [[towards, away, flat]])
+    np.testing.assert_array_equal(truth["normal_base"], [[towards, towards, flat]])

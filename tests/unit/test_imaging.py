@@ -163,7 +163,7 @@ def test_other_depths_and_channels_are_read(tmp_path):
     values = frame()
     wide = np.rint(65535 * values[:, :, ::-1]).astype(np.uint16)
     cv2.imwrite(str(tmp_path / "wide.png"), wide)
-    cv2.imwrite(str(tmp_path / "alpha.png"), np.dstack([wide >> 8, np.full(wide.shape[:2], 7)]).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "alpha.png"), np.dstack([wide >> 8, np.full(wide.shape[:2], 255)]).astype(np.uint8))
     cv2.imwrite(str(tmp_path / "grey.png"), (wide[:, :, 0] >> 8).astype(np.uint8))
     np.testing.assert_allclose(read_picture(tmp_path / "wide.png"), values, atol=1e-5)
     assert read_picture(tmp_path / "alpha.png").shape == (HEIGHT, WIDTH, 3)

@@ -30,7 +30,7 @@ def models(base=Spec):
     found = {}
     for model in base.__subclasses__():
         found |= models(model)
-        if not model.__name__.startswith("_"):
+        if not model.__name__.startswith("_") and model.__module__.startswith("simtest."):
             found[model.__name__] = model
     return dict(sorted(found.items()))
 

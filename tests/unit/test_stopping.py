@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from simtest.cli.main import INTERRUPTED, TERMINATED, main
+from simtest.cli.main import INTERRUPTED, TERMINATED, Termination, main
 from simtest.cli.progress import stop_between_steps
 from simtest.errors import InputError, SimtestError
 from simtest.runtime.boundary import plain
@@ -223,3 +223,13 @@ def test_a_stop_says_whether_the_same_command_goes_on(here, monkeypatch, tmp_pat
     told = "goes on from there" if goes_on else "begins anew"
     assert errors[-1] == f"simtest: stopped; what is finished is kept, and the same command {told}"
     assert not list(tmp_path.iterdir())
+
+
+def test_a_stop_does_not_wait_for_the_end_of_a_long_step(monkeypatch):
+    """Making an anatomy took 25 s, and who stops a container kills it after 10."""
+    monkeypatch.setattr("simtest.cli.progress.PATIENCE_S", 0.01)
+    with Termination(), stop_between_steps():
+        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            signal.pause()
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

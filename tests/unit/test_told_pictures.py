@@ -31,6 +31,13 @@ def test_pixels_that_are_transparent_are_told(tmp_path, depth):
     alpha[:5] = 0
     cv2.imwrite(str(path), np.dstack([picture().astype(depth), alpha]))
     assert told(path) == [f"{path}: its alpha channel is ignored, by which 0.25 of the pixels are transparent"]
+    # Full alpha of 8 bits, shifted to 16, as some programs write it.
+    if depth is np.uint16:
+        cv2.imwrite(str(path), np.dstack([picture().astype(depth), np.full_like(alpha, 255 << 8)]))
+        assert told(path) == []
+    # All alike, and below full.
+    cv2.imwrite(str(path), np.dstack([picture().astype(depth), np.full_like(alpha, most // 2)]))
+    assert told(path) == [f"{path}: its alpha channel is ignored, by which 1 of the pixels are transparent"]
     cv2.imwrite(str(path), picture())
     assert told(path) == []
 

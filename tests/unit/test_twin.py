@@ -36,6 +36,7 @@ from simtest.estimators import Estimate
 from simtest.geometry import Camera
 from simtest.geometry.lenses import BrownConrady, KannalaBrandt, Scaramuzza
 from simtest.geometry.vectors import angle_deg
+from simtest.reconstruction.assumptions import NEAR_MISSES
 from simtest.reconstruction.options import Options
 from simtest.reconstruction.pipeline import run
 from simtest.runtime.arrays import kept
@@ -478,3 +479,12 @@ def test_a_picture_has_twins_of_its_own_kind(monkeypatch, grey):
     # Glints of a light that is told are reconstructed to a few degrees.
     glints = [each.error_deg for each in scored if each.kind == "glint"]
     assert np.median(glints) < 5
+
+
+def test_nothing_is_assumed_of_near_misses_where_twins_have_them(monkeypatch, framed):
+    twins = made_bank(200, frames=2)
+    bank = [BankFrame(np.zeros((2, 2), np.uint8), [spot for frame, spot in twins if frame == i]) for i in range(2)]
+    monkeypatch.setattr("simtest.advice.twin.run.make_bank", lambda *told: bank)
+    picture = np.ascontiguousarray(cv2.imread(str(framed))[..., ::-1].astype(np.float32) / 255)
+    assert NEAR_MISSES in run(picture, Calibration(CAMERA), Options()).choices.assumed
+    assert NEAR_MISSES not in twins_of(picture, Calibration(CAMERA), Options(), frames=2).assumed

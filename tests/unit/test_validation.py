@@ -487,3 +487,11 @@ def test_highlights_of_a_frame_that_the_detector_refuses_are_missed(monkeypatch)
     session = Session(scene)
     made = realise(session, described, case, 0, render_view(session, scene), drawn, load_estimators(["cone_axis"]))
     assert [(row["status"], row["true_id"]) for row in made.rows] == [("missed", 0)]
+
+
+def test_a_column_that_the_table_lacks_is_refused():
+    """polars drops a key that its schema lacks without a word."""
+    row = {"experiment": "x", "status": "ok"}
+    assert table([row], {})["status"].to_list() == ["ok"]
+    with pytest.raises(KeyError, match="no such column of results: stauts"):
+        table([row, {"stauts": "ok"}], {})

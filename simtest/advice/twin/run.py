@@ -24,7 +24,7 @@ from simtest.reconstruction.outputs import write_csv
 from simtest.reconstruction.pipeline import run
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Image, Picture
-from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
+from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json, written_together
 from simtest.runtime.statistics import root_mean_square
 
 LEAST_TWINS = 20
@@ -183,9 +183,10 @@ def write_twins(result: TwinResult, out: Path, command: str = "") -> list[Path]:
     """
     make_folder(out)
     html = render_page(result, command)
-    write_json(out / FILES[0], to_json(result, command))
-    write_atomically(out / FILES[1], lambda part: write_csv(part, COLUMNS, [_row(each) for each in result.spots]))
-    write_atomically(out / FILES[2], lambda part: part.write_text(html, encoding="utf-8"))
+    with written_together(out, FILES) as new:
+        write_json(new / FILES[0], to_json(result, command))
+        write_atomically(new / FILES[1], lambda part: write_csv(part, COLUMNS, [_row(each) for each in result.spots]))
+        write_atomically(new / FILES[2], lambda part: part.write_text(html, encoding="utf-8"))
     return [out / name for name in FILES]
 
 

@@ -23,7 +23,7 @@ from simtest.realism.fitting.inference import REPEATS, Emulator, Fitted, infer, 
 from simtest.realism.frames import NamedFrame
 from simtest.realism.statistics import NAMES, measure, summarise
 from simtest.runtime.arrays import Array
-from simtest.runtime.files import Json, write_atomically, write_json
+from simtest.runtime.files import Json, write_atomically, write_json, written_together
 from simtest.runtime.seeds import from_integer
 from simtest.spec import load_scene
 from simtest.spec.recipes import Dataset
@@ -175,8 +175,9 @@ def check_out(path: Path) -> None:
 def write_fit(found: FittedRecipe, path: Path) -> tuple[Path, Path]:
     """Write the recipe, and the report beside it with the suffix .json; return both paths."""
     report = path.with_suffix(".json")
-    write_atomically(path, lambda part: part.write_text(recipe_toml(found.recipe), encoding="utf-8"))
-    write_json(report, report_json(found))
+    with written_together(path.parent, (report.name, path.name)) as new:
+        write_atomically(new / path.name, lambda part: part.write_text(recipe_toml(found.recipe), encoding="utf-8"))
+        write_json(new / report.name, report_json(found))
     return path, report
 
 

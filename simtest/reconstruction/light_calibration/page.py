@@ -11,7 +11,7 @@ from simtest.pages.html import environment
 from simtest.reconstruction.light_calibration.run import Calibrated, View
 from simtest.reconstruction.overlay import write_text
 from simtest.runtime import provenance
-from simtest.runtime.files import make_folder, write_atomically, write_json
+from simtest.runtime.files import make_folder, write_atomically, write_json, written_together
 
 PAGE, RESULT, CALIBRATION = "index.html", "lights.json", "calibration.toml"
 SHOWN_PX = 360
@@ -35,16 +35,13 @@ def write_calibration(made: Calibrated, out: Path, command: str = "") -> list[Pa
     from simtest.spec.calibration_file import save_calibration
 
     make_folder(out)
-    files = []
-    if made.result.problems or not made.result.own:
-        (out / CALIBRATION).unlink(missing_ok=True)
-    else:
-        save_calibration(made.calibration, out / CALIBRATION)
-        files.append(out / CALIBRATION)
-    write_json(out / RESULT, {**result_json(made), "run": {"command": command, **provenance.environment()}})
-    html = _page(made, command)
-    write_atomically(out / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
-    return [*files, out / RESULT, out / PAGE]
+    with written_together(out, (CALIBRATION, RESULT, PAGE)) as new:
+        if not made.result.problems and made.result.own:
+            save_calibration(made.calibration, new / CALIBRATION)
+        write_json(new / RESULT, {**result_json(made), "run": {"command": command, **provenance.environment()}})
+        html = _page(made, command)
+        write_atomically(new / PAGE, lambda part: part.write_text(html, encoding="utf-8"))
+    return [out / name for name in (CALIBRATION, RESULT, PAGE) if (out / name).exists()]
 
 
 def result_json(made: Calibrated) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import numpy as np
 from simtest.errors import InputError
 from simtest.geometry.camera import Camera
 from simtest.runtime.boundary import suggestion
-from simtest.runtime.files import write_atomically
+from simtest.runtime.files import as_path, write_atomically, written_together
 from simtest.spec.camera_formats.common import LARGEST, Files, Poses, Table, chosen, within
 from simtest.spec.camera_tables import camera_toml
 from simtest.spec.toml_files import read_text
@@ -99,7 +99,7 @@ HEAD = 20_000
 
 def split_id(path: str | Path) -> tuple[Path, str | None]:
     """Return the file and the camera's id of "FILE#ID"; no id where there is none, or a file has that very name."""
-    path = Path(path)
+    path = as_path(path)
     head, mark, wanted = path.name.rpartition("#")
     if not mark or not head or _holds(path, Path.exists):
         return path, None
@@ -198,7 +198,7 @@ def write_camera(camera: Camera, path: str | Path, format: str | None = None, po
     COLMAP's images.txt and an empty points3D.txt are written beside cameras.txt. Poses are world_from_camera, shape (4,
     4), OpenCV axes, mm: lengths are written as they are, and both formats state mm.
     """
-    path = Path(path)
+    path = as_path(path)
     suffix = path.suffix.lower()
     if not isinstance(camera, Camera):
         raise InputError(f"camera is a {type(camera).__name__}: must be a simtest.Camera")
@@ -217,9 +217,10 @@ def write_camera(camera: Camera, path: str | Path, format: str | None = None, po
 
 
 def write_files(files: Files) -> None:
-    """Write files whole or not at all; raise `InputError` for one that cannot be written."""
-    for file, data in files.items():
-        write_atomically(file, partial(Path.write_bytes, data=data))
+    """Write files of one folder, all or none of them; raise `InputError` for one that cannot be written."""
+    with written_together(next(iter(files)).parent, [file.name for file in files]) as new:
+        for file, data in files.items():
+            write_atomically(new / file.name, partial(Path.write_bytes, data=data))
 
 
 def file_contents(camera: Camera, path: Path, format: str, poses: Poses | None) -> Files:

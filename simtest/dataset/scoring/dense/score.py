@@ -36,7 +36,7 @@ from simtest.errors import InputError
 from simtest.geometry.vectors import angle_deg
 from simtest.runtime import provenance
 from simtest.runtime.arrays import Array, IntArray
-from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json
+from simtest.runtime.files import JsonObject, make_folder, write_atomically, write_json, write_parquet
 from simtest.runtime.locks import exclusive_folder
 from simtest.runtime.statistics import Interval, mean_interval, median_interval, root_mean_square, share_interval
 from simtest.validation.runner import Progress
@@ -270,7 +270,7 @@ def write_score(score: DenseScore, out: Path, command: str = "") -> Path:
 
     make_folder(out)
     table = pl.DataFrame(score.rows, infer_schema_length=None)
-    write_atomically(out / TABLE, table.write_parquet)
+    write_parquet(out / TABLE, table)
     write_json(out / SUMMARY, {**score.to_json(), "run": {"command": command, **provenance.environment()}})
     score.page = out / PAGE
     write_atomically(score.page, lambda part: write_dense_page(part, score, command))
