@@ -56,6 +56,11 @@ def keys(model):
     return made, schema.get("required", []), definitions
 
 
+def items_of(form, count):
+    """Return the schemas of a list's first items, so many."""
+    return form["prefixItems"][:count] if "prefixItems" in form else [form.get("items", {})] * count
+
+
 def meets(value, form, definitions):
     """Return whether a value may meet a form: the type, the bounds, and the items of a list; of a table nothing."""
     if "const" in form or "enum" in form:
@@ -72,9 +77,10 @@ def meets(value, form, definitions):
     if kind is not None and not isinstance(value, OTHERS[kind]):
         return False
     if kind == "array":
-        items = forms(form.get("items", {}), definitions)
-        least, most = form.get("minItems", 0), form.get("maxItems", math.inf)
-        return least <= len(value) <= most and all(any(meets(v, f, definitions) for f in items) for v in value)
+        if not form.get("minItems", 0) <= len(value) <= form.get("maxItems", math.inf):
+            return False
+        pairs = zip(value, items_of(form, len(value)), strict=True)
+        return all(any(meets(v, each, definitions) for each in forms(item, definitions)) for v, item in pairs)
     return True
 
 
@@ -96,9 +102,11 @@ def bad_values(allowed, definitions):
     tried = [*WRONG_TYPES]
     for form in allowed:
         tried += edges(form)
-        items = forms(form["items"], definitions) if isinstance(form.get("items"), dict) else []
-        count = max(1, form.get("minItems", 1))
-        tried += [[edge] * count for item in items for edge in edges(item)]
+        items = items_of(form, form.get("minItems", 1)) if form.get("type") == "array" else []
+        whole = [good(forms(item, definitions)[0], definitions) for item in items]
+        for i, item in enumerate(items):
+            beyond = [edge for each in forms(item, definitions) for edge in edges(each)]
+            tried += [[*whole[:i], edge, *whole[i + 1 :]] for edge in beyond]
     return [value for value in tried if not any(meets(value, form, definitions) for form in allowed)]
 
 
@@ -111,7 +119,7 @@ def good(form, definitions):
         low = form.get("minimum", form.get("exclusiveMinimum", 0.0) + 1)
         return min(max(low, 1), form.get("maximum", math.inf))
     if kind == "array":
-        items = form.get("prefixItems") or [form.get("items", {"type": "number"})] * form.get("minItems", 0)
+        items = items_of(form, form.get("minItems", 0))
         return [good(forms(item, definitions)[0], definitions) for item in items]
     if kind == "object":
         told = form.get("properties", {})
