@@ -29,7 +29,7 @@ CALLS = {
     "save_camera": (lambda value: simtest.save_camera(CAMERA, value), [*NO_PATH, ""]),
     "save_calibration": (lambda value: simtest.save_calibration(Calibration(CAMERA), value), [*NO_PATH, ""]),
     "render": (simtest.render, [*NO_PATH, "", "zz"]),
-    "render's samples": (lambda value: simtest.render("plane", samples=value), [*NO_NAME, 0]),
+    "a key of render": (lambda value: simtest.render("plane", samples_per_pixel=value), [*NO_NAME, 0]),
     "export": (lambda value: simtest.export("plane", value), NO_PATH),
     "validate": (lambda value: simtest.validate(value, "out"), [*NO_PATH, "", "zz"]),
     "settings": (lambda value: simtest.load_scene("plane", value), NO_TABLE),
