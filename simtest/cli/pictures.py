@@ -111,6 +111,8 @@ def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]
     yield from record_tables(spots)
     if spots.stated is not None:
         yield f"reported: {spots.stated}"
+        if spots.stated_of_organ not in (None, spots.stated):
+            yield f"of the organ below its relief: {spots.stated_of_organ}"
         yield MEANING
     yield from silent_lines(spots)
     yield from assumed_lines(spots.choices.assumed)
@@ -129,10 +131,18 @@ def record_tables(spots: "Specularities") -> "Iterator[str | Table]":
         yield from (f"reference: {problem}" for problem in compared.problems)
         rows = [
             (name, str(errors.n), _pair(errors.mean_deg, errors.std_deg),
-             _pair(errors.mean_oracle_deg, errors.std_oracle_deg))
+             _pair(errors.mean_oracle_deg, errors.std_oracle_deg), _share(errors.inside), _share(errors.inside_organ))
             for name, errors in compared.estimators.items()
         ]  # fmt: skip
-        yield Table(("estimator", "n", "mean ± std (deg)", "better candidate (deg)"), rows)
+        columns = (
+            "estimator",
+            "n",
+            "mean ± std (deg)",
+            "better candidate (deg)",
+            "inside its 95 %",
+            "the organ's 95 %",
+        )
+        yield Table(columns, rows)
         yield f"{compared.missed} sightlines miss {compared.source}"
 
 
@@ -195,6 +205,10 @@ def count_lines(spots: "Specularities", image: Path) -> "Iterator[str]":
         kinds = kinds_counted(each.kind for each in others)
         left = f"{counted(len(others), 'more highlight')} found and left out"
         yield f"{left}, because no single normal can be read from them: {kinds} (index.html shows them)"
+
+
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.0f} %"
 
 
 def _pair(mean: float, spread: float | None) -> str:

@@ -341,8 +341,8 @@ def _distances(distance: Distribution) -> Array:
     return np.asarray(distance.quantile(SAMPLES[:, 4:]))
 
 
-def to_base(estimate: Estimate, priors: Priors) -> Estimate:
-    """State the base's normal from a single highlight: the same normal, and the slope of the relief in its budget.
+def to_base(estimate: Estimate, relief: Array) -> Estimate:
+    """State the base's normal from a single highlight: the same normal, and the relief's part in its budget.
 
     The fine normal at a glint differs from the base's by the relief's slope there, which is a normal pair of standard
     deviation s an axis (theory.md 7.4); highlights lie a little wider (`SPOT_SPREAD`). An estimate that states the
@@ -351,7 +351,7 @@ def to_base(estimate: Estimate, priors: Priors) -> Estimate:
     if estimate.target == "base":
         return estimate
     based = replace(estimate, target="base", region=None)
-    return based if based.budget is None else based.with_parts(relief=relief_part(priors))
+    return based if based.budget is None else based.with_parts(relief=relief)
 
 
 def relief_part(priors: Priors) -> Array:

@@ -12,7 +12,7 @@ from simtest.calibration import Calibration, CameraPrior, Priors
 from simtest.calibration.priors import UNTOLD_FALLOFF_POWER, UNTOLD_OFFSET_MM, UNTOLD_SLOPE_RAD
 from simtest.detection.view import DARK, View
 from simtest.errors import InputError
-from simtest.estimators.protocol import Target
+from simtest.estimators.prior_parts import relief_part
 from simtest.geometry import Camera, KannalaBrandt, ViewMask
 
 FOCAL_SD = 0.1
@@ -111,7 +111,7 @@ def _guessed(
     return Calibration(camera, priors=Priors(camera=prior))
 
 
-def assumptions(calibration: Calibration, encoding: str | None, target: Target) -> list[Assumption]:
+def assumptions(calibration: Calibration, encoding: str | None) -> list[Assumption]:
     """List what is not known exactly of a picture: what its calibration gives with a spread, and what nobody told.
 
     `encoding` is the one that was told beside the calibration, if any. A default of `Priors` counts as told by nobody.
@@ -151,11 +151,11 @@ def assumptions(calibration: Calibration, encoding: str | None, target: Target) 
         falloff = f"cos^k over the angle from the optical axis, k {priors.falloff_power}"
         how = f"[vignetting] and [emission] {key}, or [uncertainty] falloff_power"
         add("falloff towards the border", falloff, how, priors.falloff_power != UNTOLD_FALLOFF_POWER)
-    if target == "base":
+    if relief_part(priors).any():
         slope = priors.relief_slope
         in_degrees = type(slope)(*map(math.degrees, vars(slope).values()))
         how = f"[surface] relief_slope_deg {key}"
-        add("slope of the relief", f"{in_degrees} deg an axis", how, slope != UNTOLD_SLOPE_RAD)
+        add("slope of the relief", f"{in_degrees} deg an axis, for the organ's normal", how, slope != UNTOLD_SLOPE_RAD)
     if not priors.plane:
         made.append(NEAR_MISSES)
     return made

@@ -241,7 +241,7 @@ def choose(
         "estimators": options.estimators,
     }  # fmt: skip
     inferred = tuple(key for key, value in stated.items() if value is None)
-    assumed = tuple(assumptions(calibration, encoding, options.target))
+    assumed = tuple(assumptions(calibration, encoding))
     return Choices(known, name, smoothing, short_names(estimators), inferred, assumed), finder, estimators
 
 

@@ -25,7 +25,7 @@ MANY = 10
 COLUMNS = (
     "specularity", "estimator", "status", "candidate", "normal_x", "normal_y", "normal_z", "look_x_px", "look_y_px",
     "axis_ratio", "flags", "best", "choice_margin", "cov_11", "cov_12", "cov_22", "peak_x_px", "peak_y_px", "kind",
-    "score", "target", "deviation_deg",
+    "score", "target", "deviation_deg", "organ_deviation_deg",
 )  # fmt: skip
 
 FILES = ("normals.json", "normals.csv", "normals.ply", "overlay.png", "constraints.npz", "index.html")
@@ -65,17 +65,19 @@ def normals_rows(entries: Iterable[JsonObject]) -> Iterator[tuple[object, ...]]:
         judged = (*peak, entry.get("kind"), entry.get("score"))
         for name, each in entry["estimates"].items():
             start, best = (entry["id"], name, each["status"]), int(name == entry["best"])
-            covariance, deviation = (None,) * 3, None
+            covariance, deviation, organ = (None,) * 3, None, None
             if each["status"] != "ok":
                 # candidate, normal, look and axis ratio; then margin
-                yield (*start, *(None,) * 7, "", best, None, *covariance, *judged, None, deviation)
+                yield (*start, *(None,) * 7, "", best, None, *covariance, *judged, None, deviation, organ)
                 continue
             if each["covariance"] is not None:
                 matrix = np.array(each["covariance"])
                 covariance, deviation = matrix[np.triu_indices(2)].tolist(), deviation_deg(matrix)
+            if each["organ_covariance"] is not None:
+                organ = deviation_deg(np.array(each["organ_covariance"]))
             shape = (*each["look_px"], each["axis_ratio"], ";".join(each["flags"]), best, each["choice_margin"])
             for k, normal in enumerate(np.array(each["candidates"]).tolist()):
-                yield (*start, k, *normal, *shape, *covariance, *judged, each["target"], deviation)
+                yield (*start, k, *normal, *shape, *covariance, *judged, each["target"], deviation, organ)
 
 
 def write_csv(path: Path, columns: Sequence[str], table: Iterable[Sequence[object]]) -> None:

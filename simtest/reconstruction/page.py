@@ -65,7 +65,8 @@ def write_picture_page(path: Path, spots: Specularities, picture: Image) -> None
     parts = {} if stated is None else stated.shown_parts_deg
     clouds = any(each.cloud is not None for spot in spots for each in spot.normals.values())
     write_page(
-        path, "picture.html.j2", data, record=spots, stated=stated, told=list(parts.items()), picture=_address(picture),
+        path, "picture.html.j2", data, record=spots, stated=stated, organ=spots.stated_of_organ,
+        told=list(parts.items()), picture=_address(picture),
         title=Path(spots.image).name, width=width, height=height, palette=palette, best=best,
         answered=sum(best.values()), clouds=clouds, terms=explanations.TERMS,
         others=len(data["others"]), left_out=len(spots.detection.others),

@@ -17,7 +17,7 @@ from simtest.detection.view import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import prepare, run_in_frame
-from simtest.estimators.prior_parts import to_base
+from simtest.estimators.prior_parts import relief_part
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spots import UNRESOLVED
 from simtest.geometry import Camera, Patch
@@ -88,7 +88,7 @@ def reconstruct(
         colour in frames that have colours and are not linear, else peaks. Default "auto" in pictures, else "peaks".
     target : {"fine", "base"}
         Which surface's normals are wanted. Estimates at a single highlight are those of the fine surface; as the base's
-        they have the relief's slope in their budget (`simtest.estimators.prior_parts.to_base`).
+        they have the relief's slope in their budget. Either way `Specularity.organ` holds the latter.
     encoding : {"srgb", "linear"}, optional
         How the values are encoded, where the calibration does not state the response. Real numbers in [0, 1] are a
         picture too where they are said to be "srgb".
@@ -251,6 +251,7 @@ def _estimate(
     ]
     prepare(list(estimators.values()), patches, frame.calibration.camera)
     priors = frame.calibration.priors
+    relief = relief_part(priors)
     answers = {name: run_in_frame(each, frame, patches, priors) for name, each in estimators.items()}
     spots = []
     for i, (region, patch, highlight) in enumerate(zip(regions, patches, highlights, strict=True)):
@@ -260,10 +261,10 @@ def _estimate(
             small = highlight is not None and math.sqrt(highlight.area_px / math.pi) < SMALL_RADIUS * frame.smoothing_px
             dim = highlight is not None and highlight.dim
             results = {name: _flagged(each, patch, frame, small, dim) for name, each in results.items()}
-        spots.append(Specularity(region, patch, results, highlight, frame.calibration.camera, options.target))
+        spots.append(Specularity(region, patch, results, highlight, frame.calibration.camera, options.target, relief))
     box = options.roi
     undetected = [
-        _undetected(name, estimate, frame, options.target)
+        _undetected(name, estimate, frame, options.target, relief)
         for name, each in answers.items()
         for estimate in each.elsewhere
         if box is None or _is_inside(estimate.look_px, box)
@@ -271,10 +272,7 @@ def _estimate(
     # Clouds stand last.
     spots.extend(sorted(undetected, key=lambda spot: any(each.cloud is not None for each in spot.normals.values())))
     if options.target == "base":
-        spots = [
-            replace(spot, estimates={**spot.estimates, **{n: to_base(e, priors) for n, e in spot.normals.items()}})
-            for spot in spots
-        ]
+        spots = [replace(spot, estimates={**spot.estimates, **spot.organ}) for spot in spots]
     return spots
 
 
@@ -282,7 +280,7 @@ def _is_inside(point_px: Array, box: Box) -> bool:
     return bool((np.array(box[:2]) <= point_px).all() and (point_px < np.add(box[:2], box[2:])).all())
 
 
-def _undetected(name: str, estimate: Estimate, frame: Frame, target: Target) -> Specularity:
+def _undetected(name: str, estimate: Estimate, frame: Frame, target: Target, relief: Array) -> Specularity:
     """Return the specularity of a frame estimator's result that no patch takes: at a pixel, or around a cloud."""
     height, width = frame.encoded.shape[:2]
     x, y = (min(max(int(v), 0), size - 1) for v, size in zip(estimate.look_px, (width, height), strict=True))
@@ -292,7 +290,7 @@ def _undetected(name: str, estimate: Estimate, frame: Frame, target: Target) -> 
         box = (low[0], low[1], min(high[0] + 1, width) - low[0], min(high[1] + 1, height) - low[1])
         why = f"a cloud of {len(estimate.cloud.points_px)} highlights, no single one"
     region, no_patch = Region(box, (x, y), None), Failure(Reason.NO_PEAK, why)
-    return Specularity(region, no_patch, {name: estimate}, camera=frame.calibration.camera, target=target)
+    return Specularity(region, no_patch, {name: estimate}, None, frame.calibration.camera, target, relief)
 
 
 def _flagged(result: Estimate | Failure, patch: Patch, frame: Frame, small: bool, dim: bool) -> Estimate | Failure:

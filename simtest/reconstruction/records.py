@@ -20,6 +20,7 @@ from simtest.detection.view import View
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.estimators.budget import deviations, dominant
+from simtest.estimators.prior_parts import to_base
 from simtest.estimators.protocol import Target
 from simtest.geometry import Camera, Patch
 from simtest.reconstruction.options import Choices
@@ -69,6 +70,9 @@ class Specularity:
         Of the frame.
     target : {"fine", "base"}
         The surface whose normal is wanted: the best estimate states it, where there is any.
+    relief : array, shape (2, 2), optional
+        Covariance of a highlight's normal about that of the organ below its relief, rad^2
+        (`simtest.estimators.prior_parts.relief_part`).
     id : int
         Its place among those of the frame.
     track : int, optional
@@ -92,6 +96,7 @@ class Specularity:
     highlight: Highlight | None = None
     camera: Camera | None = None
     target: Target = "fine"
+    relief: Array | None = None
     id: int = 0
     track: int | None = None
     reference: Any = None
@@ -129,6 +134,13 @@ class Specularity:
     def normals(self) -> dict[str, Estimate]:
         """The results of the estimators that did not fail."""
         return {name: result for name, result in self.estimates.items() if isinstance(result, Estimate)}
+
+    @cached_property
+    def organ(self) -> dict[str, Estimate]:
+        """The same results as normals of the organ below its relief, with the relief's slope in their budgets."""
+        if self.relief is None:
+            return {}
+        return {name: to_base(result, self.relief) for name, result in self.normals.items()}
 
     @cached_property
     def _judged(self) -> tuple[str | None, str]:
@@ -176,7 +188,7 @@ class Specularity:
         # A lens sees no direction beyond its fold.
         if sightline is not None and not np.isfinite(sightline).all():
             sightline = None
-        drawings = self.drawings if drawn else {}
+        drawings, organ = self.drawings if drawn else {}, self.organ
         return {
             "id": self.id,
             "box_px": self.region.box,
@@ -185,7 +197,9 @@ class Specularity:
             **({} if self.highlight is None else _highlight_json(self.highlight)),
             "best": self.best,
             "best_because": self.best_because,
-            "estimates": {name: _estimate_json(each, drawings.get(name)) for name, each in self.estimates.items()},
+            "estimates": {
+                name: _estimate_json(each, drawings.get(name), organ.get(name)) for name, each in self.estimates.items()
+            },
             **{name: value for name in ("track", "reference") if (value := getattr(self, name)) is not None},
         }
 
@@ -261,6 +275,11 @@ class Specularities(list[Specularity]):
         """What the best estimates state, with the medians of their budgets; None where none states anything."""
         return stated_errors([best for each in self if (best := each.best_estimate) is not None])
 
+    @property
+    def stated_of_organ(self) -> "StatedErrors | None":
+        """The same of the normals of the organ below its relief."""
+        return stated_errors([each.organ[each.best] for each in self if each.best in each.organ])
+
     def to_json(self, drawn: bool = True, origin: provenance.Environment | None = None) -> JsonObject:
         """Return the content of normals.json; without isophotes and curves where it is not `drawn`.
 
@@ -281,6 +300,7 @@ class Specularities(list[Specularity]):
             "warnings": self.warnings,
             "assumed": self.choices.assumed,
             "stated": self.stated,
+            "stated_of_organ": self.stated_of_organ,
             "frame": FRAME,
             "specularities": [spot.to_json(drawn) for spot in self],
             "clouds": [entry for spot in self for entry in spot.clouds_json(drawn)],
@@ -421,7 +441,7 @@ def _highlight_json(highlight: Highlight) -> JsonObject:
     }
 
 
-def _estimate_json(result: Estimate | Failure, drawing: Drawing | None) -> JsonObject:
+def _estimate_json(result: Estimate | Failure, drawing: Drawing | None, organ: Estimate | None) -> JsonObject:
     if isinstance(result, Failure):
         return {"status": result.reason, "detail": result.detail}
     entry: JsonObject = {
@@ -434,6 +454,7 @@ def _estimate_json(result: Estimate | Failure, drawing: Drawing | None) -> JsonO
         "isovalues": [isophote.isovalue for isophote in result.isophotes],
         "target": result.target,
         "covariance": result.covariance,
+        "organ_covariance": None if organ is None else organ.covariance,
         "budget": result.budget,
         "curvature": None,
         "flags": result.flags,

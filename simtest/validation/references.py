@@ -14,13 +14,16 @@ import numpy as np
 import numpy.typing as npt
 
 from simtest.errors import InputError
+from simtest.estimators import Estimate
 from simtest.geometry import Camera
 from simtest.geometry.axes import ALL, described, matrix
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.records import Specularities, Specularity
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.boundary import suggestion
 from simtest.runtime.files import JsonObject
+from simtest.runtime.statistics import CONFIDENCE
 from simtest.spec.toml_files import read_toml
 from simtest.validation.depth_maps import (
     DEPTH_SUFFIXES,
@@ -38,10 +41,16 @@ ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class ErrorRecord:
-    """Angle to a reference, deg: of the proposed normal, and of the better candidate."""
+    """Angle to a reference, deg: of the proposed normal, and of the better candidate; and whether regions hold it.
+
+    `inside` is of the 95 % region that is stated of the facet's normal, `inside_organ` of that of the organ's; None
+    where there is none.
+    """
 
     error_deg: float
     error_oracle_deg: float
+    inside: bool | None
+    inside_organ: bool | None
 
 
 @dataclass(frozen=True)
@@ -58,13 +67,18 @@ class ReferenceRecord:
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """An estimator's errors against a reference, deg; a single one has no spread."""
+    """An estimator's errors against a reference, deg, and the shares of its 95 % regions that hold the reference.
+
+    A single error has no spread, and without a region there is no share.
+    """
 
     n: int
     mean_deg: float
     std_deg: float | None
     mean_oracle_deg: float
     std_oracle_deg: float | None
+    inside: float | None
+    inside_organ: float | None
 
 
 @dataclass(frozen=True)
@@ -273,14 +287,33 @@ def _errors(spot: Specularity, normal: Array) -> ReferenceRecord:
     if not np.isfinite(normal).all():
         return ReferenceRecord(None, {})
     angles = {name: angle_deg(estimate.candidates, normal) for name, estimate in spot.normals.items()}
-    errors = {name: ErrorRecord(float(own[0]), float(own.min())) for name, own in angles.items()}
+    errors = {
+        name: ErrorRecord(
+            float(own[0]),
+            float(own.min()),
+            _is_inside(spot.normals[name], normal),
+            _is_inside(spot.organ.get(name), normal),
+        )
+        for name, own in angles.items()
+    }
     return ReferenceRecord(normal, errors)
+
+
+def _is_inside(estimate: Estimate | None, normal: Array) -> bool | None:
+    """Return whether the 95 % region of an estimate holds a normal; None where none is stated."""
+    # Here: a picture without a reference needs no table of results.
+    from simtest.validation.scoring import mahalanobis2
+
+    squared = None if estimate is None else mahalanobis2(estimate, normal)
+    return None if squared is None else squared <= chi_squared.quantile(CONFIDENCE, 2)
 
 
 def _summary(errors: Sequence[ErrorRecord]) -> ErrorSummary:
     pairs = np.array([(error.error_deg, error.error_oracle_deg) for error in errors])
     spread = pairs.std(axis=0, ddof=1).tolist() if len(pairs) > 1 else (None, None)
-    return ErrorSummary(len(pairs), float(pairs[:, 0].mean()), spread[0], float(pairs[:, 1].mean()), spread[1])
+    inside, organ = ([v for e in errors if (v := getattr(e, name)) is not None] for name in ("inside", "inside_organ"))
+    shares = [sum(held) / len(held) if held else None for held in (inside, organ)]
+    return ErrorSummary(len(pairs), float(pairs[:, 0].mean()), spread[0], float(pairs[:, 1].mean()), spread[1], *shares)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ NORMALS = {
     "warnings": "one line each",
     "assumed": "what is not known exactly: `what`, `distribution`, `how_to_narrow`, `given` (by the calibration)",
     "stated": "what the best estimates state: medians of the parts of their budgets; null where none states anything",
+    "stated_of_organ": "the same of the same normals as those of the organ below its relief",
     "frame": "the frame of all vectors, in words",
     "specularities": "a list, the brightest first: the next table",
     "clouds": "clouds of highlights that estimates rest on: specularity, estimator, highlights, points_px, covariance, "
@@ -19,7 +20,7 @@ NORMALS = {
     "the keys from kind to outline of the next table",
     "provenance": "versions and machine",
     "reference": "with `--reference` only: source, problems, compared, missed, and by estimator n, mean_deg, std_deg, "
-    "mean_oracle_deg, std_oracle_deg",
+    "mean_oracle_deg, std_oracle_deg, inside, inside_organ (shares of 95 % regions that hold it)",
 }
 """Keys of normals.json."""
 
@@ -54,6 +55,7 @@ ESTIMATE = {
     "isovalues": "shares of the peak at which isophotes were fitted",
     "target": "`fine` or `base`: surface whose normal is stated",
     "covariance": "2 x 2, of the normal in its tangent plane, rad^2; null where none is stated",
+    "organ_covariance": "the same of the same normal as that of the organ below its relief",
     "budget": "the parts of the covariance by name, rad^2",
     "curvature": "directions, axis_ratio, and gains (1 + d k) by hypothesis; null where not estimated",
     "flags": "warnings",

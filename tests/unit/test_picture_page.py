@@ -167,7 +167,7 @@ def test_a_picture_without_highlights_has_a_page(tmp_path):
 
 
 def test_what_the_calibration_gives_stands_apart_from_what_is_assumed(tmp_path):
-    first, *others = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None, "fine")
+    first, *others = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None)
     record = record_of(many(1), assumed=[first, *(replace(each, given=True) for each in others)])
     write_picture_page(tmp_path / "index.html", record, np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
@@ -182,7 +182,7 @@ def test_what_the_calibration_gives_stands_apart_from_what_is_assumed(tmp_path):
 def test_counts_and_the_light_are_told_alike_on_page_and_terminal(tmp_path):
     others = [highlight(Kind.SMALL, (40, 40)), highlight(Kind.BORDER, (80, 40)), highlight(Kind.BORDER, (90, 60))]
     spots = [*many(2), spot(2, (50, 90), {"cone_axis": Failure(Reason.CLUSTER, "two")}, None)]
-    assumed = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None, "fine")
+    assumed = assumptions(calibration_of_view(70.0, WIDTH, HEIGHT), None)
     record = record_of(spots, others, assumed)
     write_picture_page(tmp_path / "index.html", record, np.full((HEIGHT, WIDTH, 3), 0.3, np.float32))
     page = (tmp_path / "index.html").read_text(encoding="utf-8")

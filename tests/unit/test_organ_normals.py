@@ -1,0 +1,84 @@
+"""The normal of the organ below its relief, stated beside that of the facet that shines."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from simtest import reconstruct
+from simtest.calibration import Calibration, Priors
+from simtest.calibration.priors import exactly
+from simtest.estimators.prior_parts import relief_part
+from simtest.geometry import Camera
+from simtest.geometry.vectors import tangent_basis
+from simtest.reconstruction.outputs import write_outputs
+from simtest.validation.references import compare
+
+CAMERA = Camera.from_fov(60.0, 160, 120)
+
+
+def picture():
+    y, x = np.mgrid[:120, :160] + 0.5
+    return np.exp(-((x - 70) ** 2 + (y - 55) ** 2) / 200).astype(np.float32)
+
+
+def found(slope_deg=None, **options):
+    priors = Priors() if slope_deg is None else Priors(relief_slope=exactly(np.radians(slope_deg)))
+    return reconstruct(picture(), Calibration(CAMERA, priors=priors), **options)
+
+
+@pytest.mark.parametrize("slope_deg", [None, 0.0, 6.0])
+def test_it_is_the_same_normal_with_the_relief_in_its_budget(slope_deg):
+    (spot,) = found(slope_deg)
+    relief = relief_part(Priors() if slope_deg is None else Priors(relief_slope=exactly(np.radians(slope_deg))))
+    assert spot.organ.keys() == spot.normals.keys()
+    for name, fine in spot.normals.items():
+        organ = spot.organ[name]
+        assert (fine.target, organ.target) == ("fine", "base")
+        np.testing.assert_array_equal(organ.normal, fine.normal)
+        if fine.covariance is None:
+            assert organ.covariance is None
+        else:
+            np.testing.assert_allclose(organ.covariance, fine.covariance + relief, rtol=1e-9)
+    # Asked for the base's normals, the estimates are these.
+    (base,) = found(slope_deg, target="base")
+    for name, organ in spot.organ.items():
+        np.testing.assert_array_equal(base.normals[name].normal, organ.normal)
+        assert (base.normals[name].covariance is None) == (organ.covariance is None)
+    assert base.organ[base.best] is base.normals[base.best]
+
+
+def test_files_state_both(tmp_path):
+    spots = found(6.0)
+    write_outputs(tmp_path, spots, picture())
+    told = json.loads((tmp_path / "normals.json").read_text())
+    assert told["stated_of_organ"]["parts_deg"]["relief"] > 6.0
+    assert told["stated"]["median_deg"] < told["stated_of_organ"]["median_deg"]
+    assert "slope of the relief" in {each["what"] for each in told["assumed"]}
+    for row in csv.DictReader((tmp_path / "normals.csv").read_text().splitlines()):
+        fine, organ = (row[name] for name in ("deviation_deg", "organ_deviation_deg"))
+        assert (fine == "") == (organ == "")
+        if fine:
+            entry = told["specularities"][int(row["specularity"])]["estimates"][row["estimator"]]
+            trace = np.trace(entry["organ_covariance"])
+            assert float(organ) == pytest.approx(np.degrees(np.sqrt(trace)), rel=1e-9)
+            assert float(fine) < float(organ)
+
+
+@pytest.mark.parametrize(("off_deg", "inside", "inside_organ"), [(0.0, 1.0, 1.0), (14.0, 0.0, 1.0), (60.0, 0.0, 0.0)])
+def test_a_reference_is_held_against_both_regions(off_deg, inside, inside_organ):
+    class Tilted:
+        source, notes = "tilted", ()
+
+        def normals_at(self, pixels, camera):
+            normal = spots[0].best_estimate.normal
+            turned = normal + np.tan(np.radians(off_deg)) * tangent_basis(normal[None])[0][0]
+            return np.tile(turned / np.linalg.norm(turned), (len(pixels), 1))
+
+    spots = found(6.0)
+    spots[:] = [replace(spot, estimates={spot.best: spot.best_estimate}) for spot in spots]
+    compare(spots, Tilted())
+    (summary,) = spots.reference.estimators.values()
+    assert (summary.inside, summary.inside_organ) == (inside, inside_organ)
