@@ -172,7 +172,7 @@ def test_no_text_of_the_night_becomes_markup(tmp_path, night):
     [
         ("no baseline", "No baseline:"),
         ("regression", "figures are worse than"),
-        # Meanwhile: test_gate_notes for the sentences.
+        # Meanwhile: test_gate for the sentences.
         pytest.param("fine", "Fine: nothing is worse", marks=pytest.mark.ci),
         pytest.param("changed", "Changed: nothing is worse, but ", marks=pytest.mark.ci),
     ],
