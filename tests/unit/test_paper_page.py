@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from simtest.pages import style
-from simtest.pages.charts import png, spec
+from simtest.pages.charts import png
 from simtest.report import write_report
 from simtest.report.error_figures import line_figures
 from simtest.report.paper.pictures import KAPPA, OFFSET_LIGHT, isocurve_figure, stages
@@ -31,6 +31,7 @@ from simtest.validation.runner import run_experiment
 from tests.isocurve_formulas import cosine_beta
 
 COLOURS = {"circle_pose": "#B15912", "cone_axis": "#166B90"}
+
 
 MEANS = {
     "sigma": {0.0: 0.2, 0.05: 0.4, 0.1: 0.8},
@@ -115,7 +116,7 @@ def test_error_plots_hold_the_rows(tmp_path):
     assert "no_closed_isophote 3" in figures[1].sweeps[0].reasons
 
 
-def test_both_media_hold_bars_bound_law_and_failures(tmp_path):
+def test_a_chart_holds_bars_bound_law_and_failures(tmp_path):
     rows = rows_of("slant", "theta_deg", MEANS["theta_deg"], failures=5, law=lambda x: 0.01 * x)
     (figure,) = sweep_figures(run_of(tmp_path, rows))
     (sweep,) = figure.sweeps
@@ -133,16 +134,6 @@ def test_both_media_hold_bars_bound_law_and_failures(tmp_path):
     assert list(failures.words) == ["5"] * 3
     assert failures.bold
     assert "5 of 40 failed: no_closed_isophote 5" in failures.hover[0]
-    assert (upper.y.title, lower.x.title) == ("error of the better candidate (deg)", "slant θ (deg)")
-    above, below = spec(chart)["vconcat"]
-    rows = {layer["mark"]["type"]: layer["data"]["values"] for layer in above["layer"]}
-    thin = [row for row in rows["rule"] if row["width"] == 1.0]
-    thick = [row for row in rows["rule"] if row["width"] > 3]
-    np.testing.assert_allclose([row["low"] for row in thin], sweep.least, rtol=1e-4)
-    np.testing.assert_allclose([row["high"] for row in thin], sweep.largest, rtol=1e-4)
-    np.testing.assert_allclose([row["high"] for row in thick], sweep.mean + sweep.std, rtol=1e-4)
-    (counts,) = (layer["data"]["values"] for layer in below["layer"] if layer["mark"]["type"] == "text")
-    assert [(row["text"], row["bold"]) for row in counts] == [("5", True)] * 3
     with Image.open(io.BytesIO(png([chart]))) as file:
         picture = np.asarray(file.convert("RGB"))
     # Ink of the curve, of the bound and of the failures.
@@ -268,15 +259,13 @@ def small(tmp_path_factory):
 
 def test_the_pages_sections_and_files(small):
     html = write_report(small.folder, charts=True).read_text(encoding="utf-8")
-    wanted = {"statements", "isocurves", "pipeline", "error_vs_paper_sigma", "gallery"}
-    assert wanted <= set(re.findall(r'<(?:section|details)[^>]* id="(\w+)"', html))
-    assert "error_vs_curvature" not in html
-    assert "surfaces" not in re.findall(r'<(?:section|details)[^>]* id="(\w+)"', html)
-    assert "at the article&#39;s defaults" in html or "at the article's defaults" in html
+    sections = set(re.findall(r'<(?:section|details)[^>]* id="(\w+)"', html))
+    assert {"statements", "isocurves", "pipeline", "error_vs_paper_sigma", "gallery"} <= sections
+    assert not {"error_vs_curvature", "surfaces"} & sections
     files = {file.name for file in (small.folder / "figures").iterdir()}
     assert {"isocurves.png", "pipeline.png", "error_vs_paper_sigma.png", "gallery_000.png"} <= files
-    assert "texture of the specular term" in html
     assert line_figures(read_run(small.folder)) == []
+    assert set(PARAMETERS) == set(DEFAULTS)
 
 
 def test_the_kept_realisation_is_that_of_its_row(small):
@@ -328,8 +317,3 @@ def test_a_run_without_an_answer_has_a_page(tmp_path):
     html = write_report(tmp_path).read_text(encoding="utf-8")
     assert "not in this run" in html
     assert "40 of 40" in html
-
-
-def test_every_parameter_is_described():
-    assert set(PARAMETERS) == set(DEFAULTS)
-    assert style.colours(["circle_pose"])["circle_pose"] == COLOURS["circle_pose"]
