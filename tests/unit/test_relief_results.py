@@ -2,6 +2,7 @@
 
 import itertools
 import shlex
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -9,7 +10,13 @@ import pytest
 
 from simtest.errors import InputError
 from simtest.estimators import load_estimators
+from simtest.estimators.cloud import CloudCentre, cloud
+from simtest.estimators.cone_axis import cone_axis
+from simtest.geometry.vectors import angle_deg
+from simtest.pages.style import degrees
 from simtest.rendering import Session
+from simtest.report.gallery import result_of
+from simtest.report.run_folder import read_item
 from simtest.runtime.seeds import Stage, integer
 from simtest.simulation.frame import render_view
 from simtest.simulation.highlights import CloudRegions, TrueHighlight
@@ -20,8 +27,8 @@ from simtest.validation.cases import expand
 from simtest.validation.columns import SCHEMA, table
 from simtest.validation.glints import whole_clouds
 from simtest.validation.predicted import base_law_deg, centroid_law_deg, glint_count_law
-from simtest.validation.realisation import Realiser
-from simtest.validation.scoring import rows
+from simtest.validation.realisation import Realiser, keep_frame
+from simtest.validation.scoring import match_cloud, rows
 from simtest.validation.statistics import summarise
 
 SMALL = {"camera.width": 96, "camera.height": 96, "camera.fx": 120.0, "camera.fy": 120.0, "sensor.noise_sigma": 0.0}
@@ -288,3 +295,78 @@ def test_the_laws_hold_for_isotropic_gaussian_relief_under_a_light_at_the_camera
     assert law(one, rig={"lights": [{"offset_mm": 3.0}]}) == (None, None)
     film = {"type": "tissue", "film": {"index": 1.34, "alpha": 0.05, "level": 0.0}}
     assert law(one, reflectance=film) == (None, None)
+
+
+PLANE = {
+    "surface.tilt_deg": 25.0, "surface.distance_mm": 25.0, "reflectance.exponent": 400.0, "camera.width": 512,
+    "camera.height": 512, "camera.fx": 300.0, "camera.fy": 300.0, "sensor.noise_sigma": 0.01,
+    "sensor.point_spread_px": 0.7, "surface.relief": {"bands": [{"slope_deg": 4.0, "wavelength_mm": 1.5}]},
+}  # fmt: skip
+
+
+def of_clouds():
+    return experiment({"scene": "plane", "set": PLANE}, name="clouds", seed=3, realisations=1)
+
+
+def made_of(estimators):
+    described, realiser = of_clouds(), Realiser(None)
+    return realiser.make(described, expand(described)[0], 0, estimators), realiser.session
+
+
+@pytest.mark.render
+def test_a_cloud_is_measured_against_the_base():
+    made, session = made_of({"cloud": cloud})
+    (row,) = [row for row in made.rows if row["estimator"] == "cloud"]
+    (centre,) = [point for point in made.view.clouds if point.lit]
+    assert (row["status"], row["target"]) == ("ok", "base")
+    assert row["cloud"] == row["true_id"] == made.view.clouds.index(centre)
+    # The normal of a plane 25 deg off the optical axis.
+    normal = np.array([row["normal_x"], row["normal_y"], row["normal_z"]])
+    assert row["error_deg"] == row["error_base_deg"] == pytest.approx(float(angle_deg(normal, centre.normal_base)))
+    assert row["error_deg"] < 3.0
+    assert row["error_look_deg"] == pytest.approx(row["error_deg"], abs=1e-6)
+    assert row.get("error_fine_deg") is None
+    assert row["cloud_visible"] is not None
+    assert row["budget_relief_deg"] > 0
+    # Where no estimate is of it, the vote is empty.
+    estimate = made.specularities[-1].estimates["cloud"]
+    assert match_cloud(CloudRegions.of(session, made.view.clouds), made.view, estimate) == [row["cloud"]]
+
+
+@pytest.mark.render
+def test_the_card_of_a_frame_says_what_the_results_say(tmp_path):
+    """A cloud is no false detection there, nor is a spot of several glints."""
+    made, session = made_of({"cone_axis": cone_axis, "cloud": cloud})
+    described = of_clouds()
+    keep_frame(tmp_path / "item.npz", session, described, expand(described)[0], made)
+    shown = {(each.specularity, each.estimator): each for each in read_item(tmp_path / "item.npz").meta.estimates}
+    told = {(row.get("specularity"), row["estimator"]): row for row in made.rows if row.get("specularity") is not None}
+    assert {key: (each.error_deg, each.status) for key, each in shown.items()} == {
+        key: (row.get("error_deg"), row["status"]) for key, row in told.items()
+    }
+    (of_cloud,) = [each for (_, name), each in shown.items() if name == "cloud"]
+    assert result_of(of_cloud) == degrees(of_cloud.error_deg) != "–"
+    in_spots = {key for key, each in shown.items() if "in a spot of several glints or of none" in result_of(each)}
+    false = [key for key, row in told.items() if row["true_id"] is None and row["visible_id"] is not None]
+    assert in_spots
+    assert {key for key in in_spots if key[1] == "cone_axis"} == {key for key in false if key[1] == "cone_axis"}
+
+
+@pytest.mark.render
+def test_a_cloud_that_is_not_answered_is_a_row_with_its_reason():
+    made, _ = made_of({"cloud": CloudCentre(least_spots=500)})
+    (row,) = [row for row in made.rows if row["estimator"] == "cloud"]
+    assert row["status"] == "no_estimate"
+    assert row.get("error_deg") is None
+    assert "a cloud takes 500" in row["flags"]
+
+
+def test_a_cloud_belongs_to_the_point_of_most_of_its_spots_also_where_an_instrument_covers_that():
+    """One stray spot at a lit point far away does not make that point the truth."""
+    centres = [SimpleNamespace(light=0, lit=lit, bp_px=np.array(at)) for lit, at in ((False, (50, 50)), (True, (9, 9)))]
+    points = np.zeros((26, 2))
+    estimate = SimpleNamespace(cloud=SimpleNamespace(points_px=points), look_px=np.array([50.0, 50.0]))
+    view = SimpleNamespace(clouds=centres)
+    for owners, expected in (([0] * 25 + [1], [0]), ([0] * 12 + [1] * 14, [1]), ([None] * 26, [])):
+        regions = SimpleNamespace(assign=lambda *_, owners=owners: owners)
+        assert match_cloud(regions, view, estimate) == expected
