@@ -399,7 +399,7 @@ ROWS = (
     # validation
     row("the published protocol's noise 20 % too small", "noise width",
         "validation.paper.protocol:Pipeline.stages", "clean + setting.sigma *",
-        "clean + 0.8 * setting.sigma *", "paper_pipeline paper_smoothing"),
+        "clean + 0.8 * setting.sigma *", "paper_pipeline paper_experiment"),
     row("law of the glints' number: m4 half as large", "tissue", "validation.laws:glint_count",
         "m4 = 2 * slope**2", "m4 = slope**2", "relief_laws"),
     row("noise shared by all realisations", "seeds", "validation.cases:Case.noise_seed", "realisation, Stage.SENSOR",

@@ -1,4 +1,4 @@
-"""The published protocol: its picture, its Cramer-Rao bound, and its runs through the harness."""
+"""The published protocol: its picture, its bound, the law of the smoothing's bias, and its runs through the harness."""
 
 import json
 
@@ -8,15 +8,18 @@ import pytest
 from pydantic import ValidationError
 
 from simtest import validate
-from simtest.errors import InputError
+from simtest.errors import Failure, InputError
+from simtest.geometry.vectors import angle_deg
 from simtest.runtime.processes import make_engine
 from simtest.spec import Experiment, load_experiment, load_scene
 from simtest.spec.recipes import PaperSetting, paper_from_dict
 from simtest.validation.cases import expand
 from simtest.validation.columns import SCHEMA
+from simtest.validation.paper import predictions
 from simtest.validation.paper.isocurves import brightest_point, isocurve_radii, isophote_radius
-from simtest.validation.paper.predictions import cramer_rao_bound
+from simtest.validation.paper.predictions import cramer_rao_bound, smoothing_bias
 from simtest.validation.paper.protocol import (
+    Pipeline,
     draw_light,
     picture,
     texture,
@@ -224,3 +227,57 @@ def test_the_isophotes_radius_keeps_its_digits():
     assert isophote_radius(0.5, 1e12, 1.0) == pytest.approx(np.sqrt(np.log(2) / 2e12), rel=1e-9)
     tau = cosine_of_isovalue(0.3, 40.0)
     assert isophote_radius(0.3, 40.0, 5.0) == pytest.approx(float(isocurve_radii(kappa(tau), 5.0)[0]), rel=1e-12)
+
+
+def measured(setting):
+    result = Pipeline(setting).realise([np.random.default_rng(0)])["circle_pose"][0]
+    assert not isinstance(result, Failure), result
+    return float(angle_deg(result.candidates, setting.normal).min())
+
+
+def predicted(setting):
+    bias = smoothing_bias(setting)
+    assert bias is not None, setting
+    return float(np.degrees(bias))
+
+
+SMOOTHED = [
+    *[{"isovalue": t, "smoothing_px": s} for t in (0.1, 0.5, 0.8) for s in (1.0, 4.0)],
+    *[{"theta_deg": 30.0, "isovalue": t, "smoothing_px": s} for t in (0.1, 0.5) for s in (1.0, 4.0)],
+    *[{"theta_deg": 75.0, "isovalue": 0.5, "smoothing_px": s} for s in (1.0, 4.0)],
+    {"theta_deg": 75.0, "smoothing_px": 1.0},
+    {"exponent": 120.0, "theta_deg": 75.0, "smoothing_px": 4.0},
+    {"exponent": 30.0, "isovalue": 0.5},
+    {"exponent": 120.0, "isovalue": 0.02},
+    {"size": 256, "height": 631.0, "isovalue": 0.3},
+]
+
+
+@pytest.mark.parametrize("values", SMOOTHED, ids=lambda v: "-".join(f"{k}={x:g}" for k, x in v.items()))
+def test_the_law_meets_the_pipeline_without_noise(values):
+    setting = PaperSetting(sigma=0.0, **values)
+    # A share of the measured error.
+    assert predicted(setting) == pytest.approx(measured(setting), rel=0.2)
+
+
+def test_the_interpolation_between_pixels_matters_where_the_smoothing_is_narrow(monkeypatch):
+    setting = PaperSetting(sigma=0.0, smoothing_px=0.5)
+    assert predicted(setting) == pytest.approx(measured(setting), rel=0.05)
+    monkeypatch.setattr(predictions, "LINEAR_INTERPOLATION_PX2", 0.0)
+    assert predicted(setting) < 0.7 * measured(setting)
+
+
+def test_a_circle_stays_a_circle():
+    assert predicted(PaperSetting(theta_deg=0.0)) < 1e-6
+
+
+def test_the_law_does_not_know_the_noise():
+    assert smoothing_bias(PaperSetting(sigma=0.1)) == smoothing_bias(PaperSetting(sigma=0.0))
+
+
+NO_LAW = [{"eps": 10.0}, {"isovalue": 0.01}, {"exponent": 30.0}, {"theta_deg": 87.0}, {"size": 406, "height": 100.0}]
+
+
+@pytest.mark.parametrize("values", NO_LAW)
+def test_the_law_says_nothing_with_the_light_off_v_or_the_window_cut(values):
+    assert smoothing_bias(PaperSetting(**values)) is None
