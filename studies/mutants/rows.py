@@ -399,7 +399,7 @@ ROWS = (
     # validation
     row("the published protocol's noise 20 % too small", "noise width",
         "validation.paper.protocol:Pipeline.stages", "clean + setting.sigma *",
-        "clean + 0.8 * setting.sigma *", "paper_pipeline paper_smoothing"),
+        "clean + 0.8 * setting.sigma *", "paper_pipeline paper_experiment"),
     row("law of the glints' number: m4 half as large", "tissue", "validation.laws:glint_count",
         "m4 = 2 * slope**2", "m4 = slope**2", "relief_laws"),
     row("noise shared by all realisations", "seeds", "validation.cases:Case.noise_seed", "realisation, Stage.SENSOR",
@@ -542,7 +542,7 @@ ROWS = (
         "stated @ self._held / stated.sum()", "stated @ self._held / weights.sum()", "twin"),
     # report
     row("laws that are met lie beyond their tolerance", "counts", "report.error_laws:LawResult.met",
-        "<= self.tolerance", "> self.tolerance", "laws_section"),
+        "<= self.tolerance", "> self.tolerance", "report_tables"),
     row("points of a curve count failed answers", "counts", "report.error_figures:_aggregate", "n=values.len(), rows",
         "n=pl.len(), rows", "report"),
     row("curvature of smaller size on the axis", "columns", "report.error_figures:prepared",
@@ -552,7 +552,7 @@ ROWS = (
         'cells[row["row"], row["column"]] =', 'cells[row["column"] % levels.size, row["row"] % columns.size] =',
         "report"),
     row("law's gap has the wrong sign", "columns", "report.error_laws:LawResult.gap", "self.measured - self.predicted",
-        "self.predicted - self.measured", "laws_section"),
+        "self.predicted - self.measured", "report_tables"),
     # nightly
     row("Holm without the running maximum", "statistics", "nightly.contrasts:holm",
         "np.maximum.accumulate(own[order] * left / share[order])", "own[order] * left / share[order]",

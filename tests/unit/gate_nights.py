@@ -3,6 +3,7 @@
 import numpy as np
 import polars as pl
 
+from simtest.conventions import MOTION, MOTION_COLUMNS
 from simtest.nightly.quantities import setting_figures
 from simtest.nightly.records import NightlyRun, RunRecord
 from simtest.validation.columns import SCHEMA
@@ -78,3 +79,19 @@ def whole(count=10, settings=tuple("abcdefgh"), estimators=("cone_axis", "curved
     of_truth = {name: None for name in ("true_id", "error_deg", *error_columns, "mahalanobis2", "error_law_deg")}
     false = changed(table.filter(pl.col("realisation") % 2 == 0), True, specularity=1, **of_truth)
     return pl.concat([table, false])
+
+
+def with_signs(wrong=0.0, told=1.0, seed=0, count=20):
+    """Return rows of `motion` with true gains of both signs; a share of the told signs is wrong."""
+    table = rows(count=count, settings=tuple("abcdefghijkl"), estimators=("cone_axis", MOTION))
+    rng = np.random.default_rng(seed)
+    gains = np.random.default_rng(3).choice([-0.5, 1.5], (table.height, 2))
+    signs = np.sign(gains) * np.where(rng.random(gains.shape) < wrong, -1, 1)
+    signs = np.where(np.random.default_rng(4).random(gains.shape) < told, signs, 0.0)
+    values = dict.fromkeys(MOTION_COLUMNS, np.full(table.height, 1.0))
+    for i in (0, 1):
+        values |= {f"motion_sign_{i + 1}": signs[:, i], f"motion_gain_{i + 1}": gains[:, i]}
+    mine = pl.col("estimator") == MOTION
+    return table.with_columns(pl.Series(name, value) for name, value in values.items()).with_columns(
+        pl.when(mine).then(pl.col(name)) for name in MOTION_COLUMNS
+    )

@@ -77,18 +77,14 @@ def test_a_line_has_gaps_where_points_are_missing_or_no_axis_shows_them():
     assert len({row["piece"] for row in rows_of(two, "line")}) == 2
 
 
-def test_a_hover_may_hold_the_points_coordinates():
-    made = chart(Mark([-1.0, 1.0], [1.0, 2.0], RED, line="dash", hover="law {x}: {y}"), x=Axis("x", "stretched"))
+def test_a_hover_may_hold_the_points_coordinates_or_nothing():
+    law = Mark([-1.0, 1.0], [1.0, 2.0], RED, line="dash", hover="law {x}: {y}")
+    made = chart(law, Mark([1, 2], [1.0, 2.0], RED, symbol="●"), x=Axis("x", "stretched"))
     told = rows_of(made, "point")
-    assert [row["told"] for row in told] == ["law -1: 1", "law 1: 2"]
+    assert [row["told"] for row in told] == ["law -1: 1", "law 1: 2", "", ""]
     # Points that are only told of are not seen.
-    assert [row["opacity"] for row in told] == [0.0, 0.0]
+    assert [row["opacity"] > 0 for row in told] == [False, False, True, True]
     assert spec(made)["layer"][0]["encoding"]["x"]["scale"]["type"] == "symlog"
-
-
-def test_a_mark_without_a_text_tells_nothing():
-    made = chart(Mark([1, 2], [1.0, 2.0], RED, symbol="●"), Mark([1, 2], [1.0, 2.0], BLUE, hover=["one", "two"]))
-    assert [row["told"] for row in rows_of(made, "point")] == ["", "", "one", "two"]
 
 
 def test_panels_share_x_and_the_height():
@@ -134,18 +130,17 @@ def test_axes_end_beyond_their_values_and_name_powers():
     assert [key.name for key in label_keys(["one", "two", "one"])] == ["one", "two"]
 
 
-def test_vega_takes_every_kind_of_mark_as_it_is():
+@pytest.mark.parametrize("x", [Axis("x"), Axis("x", "log"), Axis("x", "stretched"), Axis("x", named=((1.0, "one"),))])
+def test_vega_takes_every_kind_of_mark_as_it_is(x):
     """A wrong name or value would be dropped with a warning, or refused."""
     bars = Bars(np.array([0.5, 0.5]), np.array([2.0, 2.0]), 4.0)
     marks = [Mark([1, 2], [1, 2], RED, f"n{i}", symbol=s, words=["a", "b"]) for i, s in enumerate(SHAPES)]
     marks += [Mark([1, 2], [1, 2], RED, line=line, bars=bars) for line in ("solid", "dash", "dashdot", "dot")]
-    for x in (Axis("x"), Axis("x", "log"), Axis("x", "stretched"), Axis("x", named=((1.0, "one"),))):
-        made = spec(chart(*marks, Mark([1, 2, 2], [1, 1, 2], BLUE, fill=True), x=x))
-        compiled = json.dumps(vl_convert.vegalite_to_vega(made))
-        assert compiled.count('"type": "symbol"') == 1
-        assert all(
-            kind in compiled for kind in ('"type": "rect"', '"type": "rule"', '"type": "text"', '"type": "line"')
-        )
+    made = spec(chart(*marks, Mark([1, 2, 2], [1, 1, 2], BLUE, fill=True), x=x))
+    compiled = json.dumps(vl_convert.vegalite_to_vega(made))
+    assert compiled.count('"type": "symbol"') == 1
+    for kind in ("rect", "rule", "text", "line"):
+        assert f'"type": "{kind}"' in compiled
 
 
 def test_names_are_plain_text_for_vega():

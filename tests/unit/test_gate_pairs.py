@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from gate_nights import changed, night, raised, rows, whole
-from test_gate_signs import with_signs
+from gate_nights import changed, night, raised, rows, whole, with_signs
 
 from simtest.conventions import MOTION_COLUMNS
 from simtest.nightly.compare import compare

@@ -30,10 +30,13 @@ from tests.unit.given_numbers import of_given_numbers
 
 NONE = np.empty(0)
 
+
 TRIALS, MOST = 300, 31
 """An interval that misses in 5.7 % of the cases misses in more of so many trials with a probability of 0.001."""
 
+
 MANY, LOW, HIGH, RATE = 0.1, 8, 30, 0.35
+
 
 TRUE = MANY * (LOW + HIGH - 1) / 2 / (MANY * (LOW + HIGH - 1) / 2 + (1 - MANY) / RATE)
 """Mean of `drawn_values`: that of frames with many highlights is 1, that of the others 0."""
@@ -196,26 +199,19 @@ def rows_of(each):
     return table(rows, {})
 
 
-def of_summary(rows, path):
-    return [found.ci95_deg for found in summarise(rows)["s"].values()]
-
-
-def of_curves(rows, path):
-    return [bar(own, "error_deg") for _, own in rows.filter(pl.col("status") == "ok").group_by("estimator")]
-
-
-def of_pairs(rows, path):
-    return [pair.interval_deg for _, pair in pairs(Run(path, rows))]
-
-
-def of_guide(rows, path):
-    return [method.interval_deg for advice in guide_of(rows).advice for method in advice.methods.values()]
-
-
 def of_nightly_run(rows, path):
     found = setting_figures(rows).drop_nulls("low")
     assert {"mean_deg", "failed", "unanswered", "coverage95", "axis_ratio"} <= set(found["quantity"])
     return found.select("low", "high").rows()
+
+
+PRINTED = {
+    "summary": lambda rows, _: [found.ci95_deg for found in summarise(rows)["s"].values()],
+    "curves": lambda rows, _: [bar(own, "error_deg") for _, own in rows.filter(status="ok").group_by("estimator")],
+    "pairs": lambda rows, path: [pair.interval_deg for _, pair in pairs(Run(path, rows))],
+    "guide": lambda rows, _: [own.interval_deg for each in guide_of(rows).advice for own in each.methods.values()],
+    "nightly run": of_nightly_run,
+}
 
 
 def test_a_median_between_two_strata_has_a_width():
@@ -239,11 +235,11 @@ def test_samples_of_one_anatomy_are_one_unit():
     np.testing.assert_array_equal(strata, settings)
 
 
-@pytest.mark.parametrize("intervals", [of_summary, of_curves, of_pairs, of_guide, of_nightly_run])
-def test_each_printed_interval_counts_equal_highlights_of_a_frame_once(intervals, tmp_path):
+@pytest.mark.parametrize("where", PRINTED)
+def test_each_printed_interval_counts_equal_highlights_of_a_frame_once(where, tmp_path):
     # A median lies between two values, of few frames farther apart.
-    allowed = 0.25 if intervals is of_guide else 1e-6
-    once, often = (intervals(rows_of(each), tmp_path) for each in (1, 20))
+    allowed = 0.25 if where == "guide" else 1e-6
+    once, often = (PRINTED[where](rows_of(each), tmp_path) for each in (1, 20))
     assert len(once) > 0
     np.testing.assert_allclose(sorted(often), sorted(once), rtol=allowed)
 

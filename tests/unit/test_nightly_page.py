@@ -1,6 +1,7 @@
-"""The nightly page: what it says, what it embeds, and that it keeps its limits."""
+"""What a night writes: its page, which says what happened and keeps its limits, JSON and Markdown."""
 
 import base64
+import json
 import re
 import zlib
 from dataclasses import replace
@@ -15,12 +16,14 @@ from test_report import EVIL, make_rows
 
 from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.nightly.compare import compare
+from simtest.nightly.outputs import MAX_CHARACTERS, summary, write_outputs
 from simtest.nightly.page import comparisons, trends, write_nightly_page
-from simtest.nightly.records import COMPARISONS, FIGURES, JudgedRun, NightlyRun, RunRecord, Verdict
+from simtest.nightly.records import COMPARISONS, FIGURES, OUTCOMES, JudgedRun, NightlyRun, RunRecord, Verdict
 from simtest.nightly.words import headline_sentence, measure, short_commit, signed
 from simtest.pages.charts import packed_vega
 from simtest.validation.columns import SCHEMA
-from tests.unit.nightly_samples import make_run
+from tests.marked import marked
+from tests.unit.nightly_samples import RUN, compared, judged, make_run, no_baseline, regression
 
 STARTED = datetime(2026, 3, 1, 2, 30, tzinfo=UTC)
 
@@ -71,7 +74,7 @@ class Page(HTMLParser):
             self.text += data
 
 
-def written(tmp_path, night, verdict, history=None, files=()):
+def page_of(tmp_path, night, verdict, history=None, files=()):
     judged = JudgedRun(night, verdict, pl.DataFrame() if history is None else history)
     page = write_nightly_page(tmp_path, judged, files)
     text = page.read_text(encoding="utf-8")
@@ -81,7 +84,7 @@ def written(tmp_path, night, verdict, history=None, files=()):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, night, history):
     folder = tmp_path_factory.mktemp("night")
-    return written(folder / "page", night, verdict_of(night), history, ("verdict.json",))
+    return page_of(folder / "page", night, verdict_of(night), history, ("verdict.json",))
 
 
 def test_the_verdict_comes_first_and_every_part_is_there(whole):
@@ -161,47 +164,31 @@ def test_no_text_of_the_night_becomes_markup(tmp_path, night):
     evil = run_of(rows, STARTED)
     evil = replace(evil, record=evil.record.model_copy(update={"command": EVIL, "commit": EVIL}))
     verdict = replace(verdict_of(evil), notes=(EVIL,))
-    text, page = written(tmp_path, evil, verdict, history_of(evil, 3), files=(EVIL,))
+    text, page = page_of(tmp_path, evil, verdict, history_of(evil, 3), files=(EVIL,))
     assert "<script>alert" not in text
     assert "<img src=https" not in text
     assert not page.stack
 
 
-@pytest.mark.parametrize(
-    ("state", "told"),
-    [
-        ("no baseline", "No baseline:"),
-        ("regression", "figures are worse than"),
-        # Meanwhile: test_gate_notes for the sentences.
-        pytest.param("fine", "Fine: nothing is worse", marks=pytest.mark.ci),
-        pytest.param("changed", "Changed: nothing is worse, but ", marks=pytest.mark.ci),
-    ],
-)
-def test_each_state_is_told(tmp_path, night, state, told):
-    verdict = verdict_of(night, state=state)
-    _, page = written(tmp_path, night, verdict)
-    assert told in page.text
-    bit_equal = {
-        "fine": "yes: all rows",
-        "no baseline": "not known",
-        "regression": "no: some rows",
-        "changed": "no: some rows",
-    }[state]
-    assert bit_equal in page.text
+STATES = {
+    "no baseline": ("No baseline:", "not known"),
+    "regression": ("figures are worse than", "no: some rows"),
+    "fine": ("Fine: nothing is worse", "yes: all rows"),
+    "changed": ("Changed: nothing is worse, but ", "no: some rows"),
+}
 
 
-def test_the_causes_come_before_all_else(tmp_path, night):
+# Meanwhile: test_gate for the sentences.
+@pytest.mark.parametrize("state", marked([*STATES], ci=["fine", "changed"]))
+def test_each_state_is_told_with_its_causes_first(tmp_path, night, state):
     cause = "cone_axis in overview, plane: the mean error is 3 deg, was 1 deg (worse)."
-    _, page = written(tmp_path, night, replace(verdict_of(night), causes=(cause, "<b>second</b>")))
-    assert page.text.index("Regression:") < page.text.index(cause) < page.text.index("Bit-equal")
+    verdict = replace(verdict_of(night, state=state), causes=(cause, "<b>second</b>"))
+    _, page = page_of(tmp_path, night, verdict)
+    headline, bit_equal = STATES[state]
+    assert (
+        page.text.index(headline) < page.text.index(cause) < page.text.index("Bit-equal") < page.text.index(bit_equal)
+    )
     assert "<b>second</b>" in page.text
-
-
-def test_a_first_night_has_one_line_and_no_table_of_what_is_new(tmp_path):
-    first = make_run()
-    text, page = written(tmp_path, first, compare(first, None))
-    assert "no baseline has been accepted" in page.text
-    assert 'class="outcome new"' not in text
 
 
 def test_a_name_that_does_not_apply_is_a_dash_not_a_blank_choice(tmp_path, night):
@@ -212,15 +199,15 @@ def test_a_name_that_does_not_apply_is_a_dash_not_a_blank_choice(tmp_path, night
     assert headline_sentence(replace(verdict, comparisons=blank)).endswith("than the baseline.")
 
 
-def test_an_empty_night_has_a_page(tmp_path):
-    empty = NightlyRun(
-        RunRecord(id="a", profile="quick", started=STARTED.isoformat()),
-        pl.DataFrame(schema=SCHEMA),
-        pl.DataFrame(schema=FIGURES),
-    )
-    _, page = written(tmp_path, empty, Verdict("no baseline", None, pl.DataFrame(schema=COMPARISONS), (), None))
+def test_an_empty_night_has_a_page_and_a_first_one_no_table_of_what_is_new(tmp_path, small):
+    record = RunRecord(id="a", profile="quick", started=STARTED.isoformat())
+    empty = NightlyRun(record, pl.DataFrame(schema=SCHEMA), pl.DataFrame(schema=FIGURES))
+    _, page = page_of(tmp_path, empty, Verdict("no baseline", None, pl.DataFrame(schema=COMPARISONS), (), None))
     assert not page.stack
     assert "There is nothing to compare" in page.text
+    text, page = page_of(tmp_path, small, compare(small, None))
+    assert "no baseline has been accepted" in page.text
+    assert 'class="outcome new"' not in text
 
 
 def test_reports_of_experiments_with_findings_are_linked(tmp_path, night):
@@ -230,13 +217,12 @@ def test_reports_of_experiments_with_findings_are_linked(tmp_path, night):
     assert "Reports of the experiments with findings: noise, overview" in page.text
 
 
-def test_the_same_night_gives_the_same_page(tmp_path, night, history):
-    first, _ = written(tmp_path / "a", night, verdict_of(night), history)
-    second, _ = written(tmp_path / "b", night, verdict_of(night), history)
+def test_the_same_night_gives_the_same_bytes(tmp_path, night, history, small):
+    first, second = (page_of(tmp_path / name, night, verdict_of(night), history)[0] for name in "ab")
     assert first == second
-
-
-# The table of comparisons ---------------------------------------------------------------------------------------------
+    outputs = outputs_of(tmp_path / "c", small, regression(small))
+    assert outputs_of(tmp_path / "d", small, regression(small)) == outputs
+    assert set(outputs) == {"verdict.json", "summary.md"}
 
 
 def test_the_worst_come_first_and_nothing_vanishes_unsaid(night):
@@ -256,17 +242,9 @@ def test_the_worst_come_first_and_nothing_vanishes_unsaid(night):
 
 
 def test_numbers_have_signs_units_and_dashes():
-    assert measure(0.25, "deg") == "0.25°"
-    assert measure(0.25, "px") == "0.25\u00a0px"
-    assert measure(None, "deg") == "–"
-    assert signed(0.002, "deg") == "+0.002°"
-    assert signed(-0.002, "deg") == "−0.002°"
-    assert signed(0.0) == "0"
-    assert short_commit("0123456789abcdef+") == "0123456789ab+"
-    assert short_commit(None) == "unknown"
-
-
-# Trends ---------------------------------------------------------------------------------------------------------------
+    assert [measure(0.25, "deg"), measure(0.25, "px"), measure(None, "deg")] == ["0.25°", "0.25\u00a0px", "–"]
+    assert [signed(0.002, "deg"), signed(-0.002, "deg"), signed(0.0)] == ["+0.002°", "−0.002°", "0"]
+    assert [short_commit("0123456789abcdef+"), short_commit(None)] == ["0123456789ab+", "unknown"]
 
 
 def curves(charts):
@@ -286,6 +264,7 @@ def test_a_curve_is_the_median_over_the_settings_at_each_run(night, history):
     expected = own.group_by("started").agg(pl.col("value").median()).sort("started")["value"].to_numpy()
     np.testing.assert_array_equal(values, expected)
     assert own["setting"].n_unique() == 3
+    assert trends(pl.DataFrame(), None, {}) == trends(history_of(night, 0), None, {}) == []
 
 
 def test_missing_runs_stay_missing_and_runs_are_in_order_of_time(night, history):
@@ -311,6 +290,92 @@ def test_regressions_are_crossed_and_the_baseline_is_marked(night, history):
     assert baseline.x[0] == pytest.approx(20, abs=0.1)
 
 
-def test_without_a_history_there_is_no_chart(night):
-    assert trends(pl.DataFrame(), None, {}) == []
-    assert trends(history_of(night, 0), None, {}) == []
+BASELINE = RunRecord(**RUN)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return make_run()
+
+
+def outputs_of(folder, small, verdict):
+    folder.mkdir(exist_ok=True)
+    write_outputs(folder, judged(small, verdict))
+    return {path.name: path.read_text(encoding="utf-8") for path in folder.iterdir()}
+
+
+def test_json_holds_the_verdict(tmp_path, small):
+    verdict = regression(small, notes=["Versions differ."])
+    data = json.loads(outputs_of(tmp_path, small, verdict)["verdict.json"])
+    expected = {
+        "schema": 3, "state": "regression", "exit_code": 1, "bit_equal": False, "notes": ["Versions differ."],
+        "counts": {**dict.fromkeys(OUTCOMES, 0), "worse": 2, "same": 2, "better": 2, "equivalent": 2}, "run": RUN,
+        "reports": [],
+    }  # fmt: skip
+    assert {key: data[key] for key in expected} == expected
+    assert data["baseline"]["reason"] == "first"
+    # What is the same is counted, not listed.
+    assert {row["outcome"] for row in data["comparisons"]} == {"worse", "better", "equivalent"}
+    assert data["comparisons"][0]["p_holm"] == 1e-4
+    none = json.loads(outputs_of(tmp_path, small, no_baseline())["verdict.json"])
+    assert (none["state"], none["exit_code"], none["bit_equal"], none["baseline"]) == ("no baseline", 0, None, None)
+
+
+def test_json_bears_figures_that_are_not_finite(tmp_path, small):
+    text = outputs_of(tmp_path, small, regression(small, difference=float("inf"), low=float("nan")))["verdict.json"]
+    row = json.loads(text, parse_constant=pytest.fail)["comparisons"][0]
+    assert (row["difference"], row["low"]) == ("inf", "nan")
+
+
+def test_the_summary_says_first_what_matters(small):
+    lines = summary(judged(small, regression(small, notes=["Versions differ."]))).splitlines()
+    assert lines[0] == "## Nightly quick: regression: 2 figures worse"
+    assert lines[2].startswith('Not bit-equal to the baseline of 2026-03-01T02:30:00+00:00, commit 0123456789ab+: "fir')
+    titles = [line for line in lines if line.startswith("#")]
+    assert titles[1:] == ["### Worse: 2", "### Better: 2", "### By experiment"]
+    assert "- Versions differ." in lines
+    assert any(line.startswith("| first | plane, tilt_deg=0, cone_axis | mean_deg | 1 deg | 1.1 deg | 0.1 [")
+               for line in lines)  # fmt: skip
+
+
+def test_a_duration_that_is_not_known_is_not_said(small):
+    record = small.record.model_copy(update={"duration_s": None})
+    assert " s on " in summary(judged(small, no_baseline()))
+    assert " s on " not in summary(judged(replace(small, record=record), no_baseline()))
+
+
+def test_tables_are_whole_and_count_by_experiment(small):
+    head = None
+    for line in summary(judged(small, regression(small))).splitlines():
+        cells = line.count("|") - line.count("\\|")
+        head = (head or cells) if line.startswith("|") else None
+        assert head in (None, cells)
+    text = summary(judged(small, no_baseline()))
+    assert "| first | 16 | 15 | 1 | 0 |" in text
+    assert "| second | 16 | 16 | 0 | 1 |" in text
+
+
+@pytest.mark.parametrize("causes", [(), ("cause " * 500,) * 500])
+def test_a_huge_verdict_fits_a_comment(small, causes):
+    cells = pl.concat([compared(small, ("worse", "better"))] * 500)
+    long = cells.with_columns(pl.lit("x" * 5000).alias("setting"))
+    verdict = Verdict("regression", False, long, ("note " * 500,) * 1000, BASELINE, causes)
+    text = summary(judged(small, verdict))
+    assert 10_000 < len(text) <= MAX_CHARACTERS
+
+
+def test_texts_of_a_user_stay_texts(small):
+    odd = "a|b <script>x</script> `c` @everyone\n# d"
+    lines = summary(judged(small, regression(small, setting=odd, notes=[odd]))).splitlines()
+    assert not [line for line in lines if "<script>" in line or "`c`" in line or "@everyone" in line]
+    assert not [line for line in lines if line.startswith("# d")]
+    assert any("a\\|b &lt;script>" in line for line in lines)
+
+
+def test_causes_stand_first(small):
+    cause = "cone_axis in first, plane: the law is 6 deg, was 1 deg."
+    verdict = replace(regression(small, outcomes=("changed", "same")), state="changed", causes=(cause,))
+    text = summary(judged(small, verdict))
+    assert text.splitlines()[0] == f"## Nightly quick: changed: {verdict.unexplained.height} figures to explain"
+    assert text.splitlines()[2] == f"- {cause}"
+    assert "### Changed, to be explained" in text

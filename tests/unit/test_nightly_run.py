@@ -167,21 +167,18 @@ def test_the_profile_of_the_page_on_the_nightly_is_sound(tmp_path):
     assert (curvature.realisations, dark.name, len(expand(dark))) == (8, "colon_dark", 4)
 
 
+COLON = '[[experiments]]\nexperiment = "colon"\n'
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "experiments: missing"),
-        ("experiments = []", "experiments = \\[\\]: must have at least 1 item"),
-        ('[[experiments]]\nexperiment = "colon"\nrealisation = 1', "experiments.0.realisation = 1: unknown key; "
-         "allowed: realisations"),
-        ('[[experiments]]\nexperiment = "colon"\npool = 0', "pool = 0: must be greater than or equal to 1"),
-        ('[[experiments]]\nexperiment = "colon"\n[[experiments]]\nexperiment = "colon"', "experiment colon: listed "
-         "twice; give one of them another name"),
-        ('name = "../x"\n[[experiments]]\nexperiment = "colon"', "name = '../x': must match the pattern"),
+        (2 * COLON, "experiment colon: listed twice; give one of them another name"),
+        (f'name = "../x"\n{COLON}', "name = '../x': must match the pattern"),
     ],
-)  # fmt: skip
-def test_a_malformed_profile_is_refused(tmp_path, text, said):
-    with pytest.raises(InputError, match=f"mine.toml: {said}|mine.toml: .*{said}"):
+)
+def test_a_profile_that_gives_two_reports_one_place_or_one_elsewhere_is_refused(tmp_path, text, said):
+    with pytest.raises(InputError, match=f"mine.toml: .*{said}"):
         profile_of(tmp_path, text)
 
 
@@ -262,9 +259,8 @@ def test_a_regression_exits_1(measured, reports, monkeypatch):
     assert outcome.judged.verdict.exit_code == 1
     assert json.loads((outcome.folder / "verdict.json").read_text())["exit_code"] == 1
     history, _ = read_history(reports.history("quick"))
-    assert history.filter(pl.col("run_id") == outcome.judged.run.record.id)["state"].unique().to_list() == [
-        "regression"
-    ]
+    own = history.filter(pl.col("run_id") == outcome.judged.run.record.id)
+    assert own["state"].unique().to_list() == ["regression"]
 
 
 def own_rows(**values):
@@ -591,11 +587,7 @@ def test_the_command_prints_what_is_worse(measured, here, monkeypatch):
 )
 def test_a_night_that_could_not_be_run_exits_2(here, monkeypatch, error, said):
     """1 would be a regression."""
-
-    def fails(*_, **__):
-        raise error
-
-    monkeypatch.setattr(run_module, "measure_run", fails)
+    monkeypatch.setattr(run_module, "measure_run", fails_with(error))
     assert here() == (2, "", [f"simtest: {said}"])
 
 
@@ -604,7 +596,6 @@ def test_a_night_that_could_not_be_run_exits_2(here, monkeypatch, error, said):
     [
         ("--profile daily", "daily: no such file; shipped by name: full, quick"),
         ("--workers 0", "workers = 0: must be 1 to 256"),
-        ("--workers many", "many is not a whole number"),
         ("accept", "--reason: missing"),
         ("accept --reason because --profile full", "nightly/full: no night of the profile full; run simtest nightly"),
     ],
@@ -628,9 +619,3 @@ def test_ctrl_c_says_what_is_kept(here, monkeypatch, tmp_path):
         "simtest: stopped; nothing of this night is kept; history, baseline and the last page are as they were"
     )
     assert contents(tmp_path / "reports") == {}
-
-
-def test_help_names_the_profiles(here):
-    code, output, _ = here("--help")
-    assert code == 0
-    assert "shipped one: quick, full." in " ".join(output.replace("│", " ").split())

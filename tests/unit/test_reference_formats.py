@@ -9,6 +9,8 @@ from simtest.geometry import Camera, KannalaBrandt
 from simtest.validation.references import FORMATS, load_map_reference, load_reference
 
 SIZES = {"c3vd": (270, 216), "simcol3d": (190, 190), "ucl": (256, 256), "endoslam": (320, 320)}
+
+
 RADIUS_MM, CENTRE_MM = 25.0, np.array([4.0, -3.0, 45.0])
 
 
@@ -122,59 +124,45 @@ def test_a_facing_wall_of_rendered_depths_is_degenerate(tmp_path):
     assert any(note.startswith("degenerate") for note in reference.notes)
 
 
-def broken(folder, what):
-    """Write a file that is malformed, and return it with its format and scale."""
-    path, name, given = folder / "0007_depth.tiff", "c3vd", None
-    if what == "8 bits":
-        cv2.imwrite(str(path), np.full(SIZES[name][::-1], 9, np.uint8))
-    elif what == "only clipped":
-        cv2.imwrite(str(path), np.full(SIZES[name][::-1], 65535, np.uint16))
-    elif what == "colours":
-        cv2.imwrite(str(path), np.dstack([np.full(SIZES[name][::-1], 9 + i, np.uint16) for i in range(3)]))
-    elif what == "no picture":
-        path.write_bytes(b"II*\0 nothing")
-    elif what == "grey normals":
-        path = folder / "0007_normals.tiff"
-        cv2.imwrite(str(path), np.full(SIZES[name][::-1], 9, np.uint16))
-    elif what == "normals of no length":
-        path = folder / "0007_normals.tiff"
-        cv2.imwrite(str(path), np.full((*SIZES[name][::-1], 3), 32767, np.uint16))
-    elif what == "another size":
-        write_depth(folder, name, np.full((50, 60), 40.0))
-    elif what == "a scale too many":
-        write_depth(folder, name)
-        given = 0.1
-    elif what == "no scale":
-        path, name = write_depth(folder, "ucl"), "ucl"
-    elif what == "scale of nothing":
-        path, name, given = write_depth(folder, "ucl"), "ucl", -1.0
-    elif what == "another format":
-        path, name = write_depth(folder, "ucl"), "c3vd2"
-    return path, name, given
-
-
+C3VD = SIZES["c3vd"][::-1]
+DEPTHS, NORMALS = "0007_depth.tiff", "0007_normals.tiff"
 MALFORMED = {
-    "8 bits": "holds uint8; a depth map of this format holds uint16",
-    "only clipped": "holds no depth; counts 0, 65535 stand for none",
-    "colours": "channels differ",
-    "no picture": "no picture|cannot be decoded",
-    "missing": "does not exist|cannot be read|no such",
-    "grey normals": "a normal map has three channels",
-    "normals of no length": "holds no unit vector",
-    "another size": "is 60 x 50 px: must be 270 x 216",
-    "a scale too many": "--depth-scale 0.1: c3vd has its own, 0.0015259 mm a count; leave it out",
-    "no scale": "ucl does not tell its unit; --depth-scale must say",
-    "scale of nothing": "--depth-scale -1: must be 1e-9 to 1e.06 mm",
-    "another format": r"--reference-format c3vd2: unknown; allowed: c3vd, simcol3d, ucl, endoslam \(did you mean c3vd",
+    "8 bits": (DEPTHS, np.full(C3VD, 9, np.uint8), "holds uint8; a depth map of this format holds uint16"),
+    "only clipped": (DEPTHS, np.full(C3VD, 65535, np.uint16), "holds no depth; counts 0, 65535 stand for none"),
+    "colours": (DEPTHS, np.dstack([np.full(C3VD, 9 + i, np.uint16) for i in range(3)]), "channels differ"),
+    "no picture": (DEPTHS, b"II*\0 nothing", "no picture|cannot be decoded"),
+    "missing": (DEPTHS, None, "does not exist|cannot be read|no such"),
+    "another size": (DEPTHS, np.full((50, 60), 40, np.uint16), "is 60 x 50 px: must be 270 x 216"),
+    "grey normals": (NORMALS, np.full(C3VD, 9, np.uint16), "a normal map has three channels"),
+    "normals of no length": (NORMALS, np.full((*C3VD, 3), 32767, np.uint16), "holds no unit vector"),
 }
 
 
 @pytest.mark.parametrize("what", MALFORMED)
 def test_malformed_maps_are_refused_in_one_line(tmp_path, what):
-    path, name, given = broken(tmp_path, what)
-    with pytest.raises(InputError, match=MALFORMED[what]) as error:
-        load_map_reference(path, name, camera(name if name in SIZES else "ucl"), given)
+    name, content, told = MALFORMED[what]
+    path = tmp_path / name
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        cv2.imwrite(str(path), content)
+    with pytest.raises(InputError, match=told) as error:
+        load_map_reference(path, "c3vd", camera("c3vd"))
     assert "\n" not in str(error.value)
+
+
+TOLD = [
+    ("c3vd", "c3vd", 0.1, "--depth-scale 0.1: c3vd has its own, 0.0015259 mm a count"),
+    ("ucl", "ucl", None, "ucl does not tell its unit; --depth-scale must say"),
+    ("ucl", "ucl", -1.0, "--depth-scale -1: must be 1e-9 to 1e.06 mm"),
+    ("ucl", "c3vd2", None, r"--reference-format c3vd2: unknown; allowed: .* \(did you mean c3vd"),
+]
+
+
+@pytest.mark.parametrize(("written", "named", "given", "told"), TOLD)
+def test_scales_and_names_that_do_not_fit_are_refused(tmp_path, written, named, given, told):
+    with pytest.raises(InputError, match=told):
+        load_map_reference(write_depth(tmp_path, written), named, camera(written), given)
 
 
 def test_a_camera_of_another_shape_is_refused(tmp_path):

@@ -13,7 +13,7 @@ from simtest.detection import Detection, Region
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate, load_estimators
 from simtest.geometry import Camera, Patch
-from simtest.geometry.vectors import angle_deg, tangent_basis
+from simtest.geometry.vectors import tangent_basis
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.reconstruction.records import Specularity
 from simtest.rendering import Session
@@ -24,11 +24,14 @@ from simtest.spec import Experiment, load_experiment, scene_from_dict
 from simtest.validation.cases import expand, swept_example
 from simtest.validation.columns import SCHEMA, swept_columns, table
 from simtest.validation.realisation import realise
+from simtest.validation.run_summary import MOST_TEXTS, faults_of
 from simtest.validation.runner import run_experiment
 from simtest.validation.scoring import mahalanobis2, match, rows
 from simtest.validation.statistics import figures, summarise
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
+
+
 NORTH = np.array([0.0, 0.0, -1.0])
 
 
@@ -61,10 +64,8 @@ def test_the_mahalanobis_distance_counts_deviations():
     truth = NORTH + np.tan(1e-3) * (2 * first + 3 * second)
     estimate = Estimate(NORTH, NORTH[None], np.zeros(2), covariance=np.diag([1e-6, 9e-6]))
     assert mahalanobis2(estimate, truth / np.linalg.norm(truth)) == pytest.approx(5.0, rel=1e-4)
-    assert mahalanobis2(Estimate(NORTH, NORTH[None], np.zeros(2)), NORTH) is None
-
-
-# Matching ------------------------------------------------------------------------------------------------------------
+    for none in (None, np.zeros((2, 2))):
+        assert mahalanobis2(Estimate(NORTH, NORTH[None], np.zeros(2), covariance=none), NORTH) is None
 
 
 def test_each_detection_takes_the_truth_inside_its_isophote():
@@ -93,9 +94,6 @@ def test_a_truth_is_given_to_one_detection_only():
     assert matched_to([], [truth_at(1, 1)]) == {}
 
 
-# Rows ----------------------------------------------------------------------------------------------------------------
-
-
 def estimate(normal, candidates=None, look=(80.0, 60.0)):
     normal = np.asarray(normal, float) / np.linalg.norm(normal)
     candidates = normal[None] if candidates is None else np.asarray(candidates, float)
@@ -121,26 +119,16 @@ def test_rows_count_matched_false_and_missed():
         detection(100, 80, 20, 20, (110, 90), {"a": estimate(NORTH), "b": estimate(NORTH)}),
     ]
     truths = [truth_at(21, 21), truth_at(75, 100)]
-    made = rows(*context(), found, truths, matched_to(found, truths), {"a": (), "b": ()})
-    frame = table(made, {})
+    frame = table(rows(*context(), found, truths, matched_to(found, truths), {"a": (), "b": ()}), {})
     assert frame.columns == list(SCHEMA)
-    assert len(frame) == 6
-    matched = frame.filter(pl.col("specularity") == 0)
-    assert matched["true_id"].to_list() == [0, 0]
-    assert matched["status"].to_list() == ["ok", "not_an_ellipse"]
-    assert matched["error_deg"][0] == pytest.approx(3)
-    assert matched["error_deg"][1] is None
-    assert matched["flags"][1] == "why"
-    false = frame.filter(pl.col("specularity") == 1)
-    assert false["true_id"].to_list() == [None, None]
-    assert false["status"].to_list() == ["ok", "ok"]
-    assert false["error_deg"].to_list() == [None, None]
-    missed = frame.filter(pl.col("specularity").is_null())
-    assert missed["status"].to_list() == ["missed", "missed"]
-    assert missed["true_id"].to_list() == [1, 1]
-    assert missed["estimator"].to_list() == ["a", "b"]
+    told = frame.select("specularity", "true_id", "estimator", "status", "error_deg", "kd_max")
+    assert told.rows() == [
+        (0, 0, "a", "ok", pytest.approx(3), 0.5), (0, 0, "b", "not_an_ellipse", None, 0.5),
+        (1, None, "a", "ok", None, None), (1, None, "b", "ok", None, None),
+        (None, 1, "a", "missed", None, 0.5), (None, 1, "b", "missed", None, 0.5),
+    ]  # fmt: skip
+    assert frame["flags"][1] == "why"
     assert frame["realisation"].to_list() == [3] * 6
-    assert frame.filter(pl.col("true_id").is_not_null())["kd_max"].unique().to_list() == [0.5]
 
 
 def test_a_row_has_the_columns_of_the_table_and_swept_parameters_by_their_own_names():
@@ -184,64 +172,43 @@ def test_columns_of_a_row_are_what_their_names_say():
     assert row["budget_noise_deg"] == pytest.approx(np.degrees(0.02))
 
 
-def test_angles_are_exact_near_zero_and_near_180_deg():
-    for degrees in (0.0, 1e-9, 1e-4, 30.0, 179.9999999):
-        assert float(angle_deg(NORTH, leaned(degrees))) == pytest.approx(degrees, rel=1e-6, abs=1e-15)
-    np.testing.assert_allclose(angle_deg(np.stack([leaned(2), leaned(4)]), NORTH), [2, 4])
-
-
-# Figures -------------------------------------------------------------------------------------------------------------
-
-
 def hand_made():
     """Two ok, one failed, one missed, two false (one failed) of estimator a; three ok of b."""
     lines = [
         ("s1", "a", 0, "ok", 1.0, 0.5, 2.0, 3.0),
         ("s1", "a", 1, "ok", 3.0, 3.0, 8.0, 5.0),
-        ("s1", "a", 2, "not_an_ellipse", None, None, None),
-        ("s1", "a", 3, "missed", None, None, None),
-        ("s1", "a", None, "ok", None, None, None),
-        ("s1", "a", None, "no_closed_isophote", None, None, None),
-        ("s1", "b", 0, "ok", 2.0, 2.0, None),
-        ("s1", "b", 1, "ok", 2.0, 2.0, None),
-        ("s1", "b", 2, "ok", 5.0, 5.0, None),
-        ("s0", "a", 0, "missed", None, None, None),
+        ("s1", "a", 2, "not_an_ellipse"),
+        ("s1", "a", 3, "missed"),
+        ("s1", "a", None, "ok"),
+        ("s1", "a", None, "no_closed_isophote"),
+        ("s1", "b", 0, "ok", 2.0, 2.0),
+        ("s1", "b", 1, "ok", 2.0, 2.0),
+        ("s1", "b", 2, "ok", 5.0, 5.0),
+        ("s0", "a", 0, "missed"),
     ]
-    names = (
-        "setting",
-        "estimator",
-        "true_id",
-        "status",
-        "error_deg",
-        "error_oracle_deg",
-        "mahalanobis2",
-        "error_base_deg",
-    )
-    rows = [dict(zip(names, line, strict=False)) for line in lines]
-    return table([dict(realisation=i, **row) for i, row in enumerate(rows)], {})
+    names = ("setting", "estimator", "true_id", "status", "error_deg", "error_oracle_deg", "mahalanobis2",
+             "error_base_deg")  # fmt: skip
+    made = [dict(zip(names, line, strict=False), realisation=i) for i, line in enumerate(lines)]
+    return table(made, {})
 
 
 def test_summary_of_a_hand_made_table():
     summary = summarise(hand_made())
     assert list(summary) == ["s1", "s0"]
-    a = summary["s1"]["a"]
+    a, b = summary["s1"].values()
     assert (a.n, a.n_ok, a.n_missed, a.n_false) == (4, 2, 1, 2)
     assert a.n_failed_by_reason == {"not_an_ellipse": 1}
-    assert a.mean_deg == pytest.approx(2.0)
-    assert a.mean_oracle_deg == pytest.approx(1.75)
-    assert a.mean_base_deg == pytest.approx(4.0)
-    assert a.rms_deg == pytest.approx(np.sqrt(5))
-    assert a.std_deg == pytest.approx(np.sqrt(2))
-    assert a.median_deg == pytest.approx(2.0)
-    assert a.p95_deg == pytest.approx(2.9)
-    assert a.max_deg == pytest.approx(3.0)
-    # (1 + 3 + 90 + 90) / 4: the failed and the missed count 90 deg each, the false none.
-    assert a.mean_penalised_deg == pytest.approx(46.0)
+    expected = {
+        "mean_deg": 2.0, "mean_oracle_deg": 1.75, "mean_base_deg": 4.0, "rms_deg": np.sqrt(5), "std_deg": np.sqrt(2),
+        "median_deg": 2.0, "p95_deg": 2.9, "max_deg": 3.0,
+        # (1 + 3 + 90 + 90) / 4: the failed and the missed count 90 deg each, the false none.
+        "mean_penalised_deg": 46.0,
+        "coverage95": 0.5,  # chi-square of 2 at 95 %: 5.99
+    }  # fmt: skip
+    assert {name: getattr(a, name) for name in expected} == pytest.approx(expected)
     # Two frames: Student's t with 1 degree of freedom, 12.706 standard errors of 1.
     # Its lower end would be negative, which no angle is.
     assert a.ci95_deg == pytest.approx((0.0, 2 + 12.7062), abs=1e-4)
-    assert a.coverage95 == pytest.approx(0.5)  # chi-square of 2 at 95 %: 5.99
-    b = summary["s1"]["b"]
     assert (b.n, b.n_ok, b.n_missed, b.n_false) == (3, 3, 0, 0)
     assert b.mean_penalised_deg == b.mean_deg == pytest.approx(3.0)
     # Three: 4.302653 of them below, which no angle is; above more, as they are skewed.
@@ -271,9 +238,6 @@ def test_summary_where_nothing_answered():
     assert figures(hand_made().clear()).mean_penalised_deg is None
 
 
-# Seeds ---------------------------------------------------------------------------------------------------------------
-
-
 def test_seeds_do_not_change_from_version_to_version():
     assert key("plane") == 7486435753795864637
     assert key("") == 13020603013274838756
@@ -298,9 +262,6 @@ def test_every_branch_of_the_seed_tree_is_another():
     states = {sequence(*branch).generate_state(4).tobytes() for branch in branches}
     assert len(states) == len(branches)
     assert [int(stage) for stage in Stage] == [0, 1, 2, 3, 4, 5, 6]
-
-
-# Cases ---------------------------------------------------------------------------------------------------------------
 
 
 def experiment(*groups, **settings):
@@ -351,10 +312,7 @@ def test_random_values_are_drawn_anew_for_each_realisation_and_the_same_again():
     assert swept_example([case]) == {drawn_path: 0.0}
 
 
-def test_settings_take_the_place_of_sweeps_pools_and_draws(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(
-        """
+MINE = """
 realisations = 2
 [[groups]]
 scene = "cylinder"
@@ -364,7 +322,11 @@ pool = [{ "surface.spin_deg" = [0.0, 10.0] }]
 [groups.random]
 "surface.azimuth_deg" = { low = 0.0, high = 90.0 }
 """
-    )
+
+
+def test_settings_take_the_place_of_sweeps_pools_and_draws(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(MINE)
     plain = expand(load_experiment(path))
     assert len(plain) == 8
     assert plain[0].scene(load_experiment(path), 0)[0].surface.tilt_deg == 3
@@ -393,10 +355,12 @@ def test_malformed_groups_are_refused_before_anything_is_rendered(tmp_path):
         expand(experiment({"scene": "nowhere"}))
 
 
-# Whole runs ----------------------------------------------------------------------------------------------------------
-
 SMALL = {"camera.width": 120, "camera.height": 100, "camera.fx": 130.0, "camera.fy": 130.0}
+
+
 FIXED = {"scene": "plane", "set": SMALL, "isolated": False}
+
+
 DRAWN = {
     "scene": "cylinder",
     "set": SMALL,
@@ -431,21 +395,25 @@ def test_a_run_has_a_row_for_each_estimator_and_realisation(whole):
     assert pl.read_parquet(whole.folder / "results.parquet").equals(results)
 
 
+def alone(described, index=0, realisation=0):
+    """Make one realisation of one case."""
+    case = expand(described)[index]
+    scene, drawn = case.scene(described, realisation)
+    session = Session(scene)
+    estimators = load_estimators(described.estimators)
+    return case, realise(session, described, case, realisation, render_view(session, scene), drawn, estimators)
+
+
 @pytest.mark.render
 @pytest.mark.parametrize("index", [0, 2])
 def test_a_realisation_alone_gives_the_rows_of_the_whole_run(whole, index):
     described = experiment(FIXED, DRAWN, realisations=4)
-    case = expand(described)[index]
-    scene, drawn = case.scene(described, 3)
-    session = Session(scene)
-    estimators = load_estimators(described.estimators)
-    made = realise(session, described, case, 3, render_view(session, scene), drawn, estimators)
-    alone = table(made.rows, swept_example(expand(described)))
+    case, made = alone(described, index, 3)
+    own = table(made.rows, swept_example(expand(described)))
     in_run = whole.results.filter((pl.col("setting") == case.setting) & (pl.col("realisation") == 3))
-    assert len(alone) == 3
-    assert sorted_rows(alone).equals(sorted_rows(in_run))
-    other = realise(session, described, case, 2, render_view(session, scene), drawn, estimators)
-    assert other.frame.tobytes() != made.frame.tobytes()
+    assert len(own) == 3
+    assert sorted_rows(own).equals(sorted_rows(in_run))
+    assert alone(described, index, 2)[1].frame.tobytes() != made.frame.tobytes()
 
 
 @pytest.mark.render
@@ -457,15 +425,9 @@ def test_the_order_of_the_groups_changes_no_row(whole, tmp_path):
 
 @pytest.mark.render
 def test_what_drowns_in_noise_is_missed():
-    """A frame of noise alone: nothing is detected, and what is there is missed, not dropped."""
     dark = {**FIXED, "set": {**SMALL, "sensor.noise_sigma": 1.0}}
-    described = experiment(dark, realisations=1)
-    (case,) = expand(described)
-    scene, drawn = case.scene(described, 0)
-    session = Session(scene)
-    made = realise(session, described, case, 0, render_view(session, scene), drawn, load_estimators(["cone_axis"]))
-    statuses = [row["status"] for row in made.rows if row["true_id"] is not None]
-    assert statuses == ["missed"]
+    _, made = alone(experiment(dark, realisations=1, estimators=["cone_axis"]))
+    assert [row["status"] for row in made.rows if row["true_id"] is not None] == ["missed"]
     assert all(isinstance(s.patch, Patch | Failure) for s in made.specularities)
 
 
@@ -476,22 +438,37 @@ def test_highlights_of_a_frame_that_the_detector_refuses_are_missed(monkeypatch)
             return Detection((), frame, refusal=Failure(Reason.NO_ESTIMATE, "unlike the training"))
 
     def refused(frame, calibration, estimators, isolated, detector):
-        made = reconstruct(frame, calibration, estimators, smoothing_px=2.0, detector=Refusing())
-        assert made.detection.refusal is not None
-        return made
+        return reconstruct(frame, calibration, estimators, smoothing_px=2.0, detector=Refusing())
 
     monkeypatch.setattr("simtest.validation.realisation.reconstruct", refused)
-    described = experiment(FIXED, realisations=1)
-    (case,) = expand(described)
-    scene, drawn = case.scene(described, 0)
-    session = Session(scene)
-    made = realise(session, described, case, 0, render_view(session, scene), drawn, load_estimators(["cone_axis"]))
+    _, made = alone(experiment(FIXED, realisations=1, estimators=["cone_axis"]))
     assert [(row["status"], row["true_id"]) for row in made.rows] == [("missed", 0)]
 
 
-def test_a_column_that_the_table_lacks_is_refused():
-    """polars drops a key that its schema lacks without a word."""
-    row = {"experiment": "x", "status": "ok"}
-    assert table([row], {})["status"].to_list() == ["ok"]
-    with pytest.raises(KeyError, match="no such column of results: stauts"):
-        table([row, {"stauts": "ok"}], {})
+def faulty(estimator, status, text, count=1):
+    return [{"estimator": estimator, "status": status, "flags": text}] * count
+
+
+def test_each_distinct_text_is_told_once_with_its_count():
+    table = pl.DataFrame([
+        *faulty("moment", "ok", ""), *faulty("moment", "estimator_error", "TypeError: other"),
+        *faulty("moment", "estimator_error", "ValueError: my\n  bug (my_core.py:11)", 29),
+        *faulty("core", "core_timeout", "no answer within 2 s"), *faulty("cone_axis", "no_peak", "peak 0", 3),
+    ])  # fmt: skip
+    assert list(map(str, faults_of(table))) == [
+        "moment: ValueError: my bug (my_core.py:11), 29 times",
+        "moment: TypeError: other, once",
+        "core: core_timeout: no answer within 2 s, once",
+    ]
+
+
+def test_texts_that_differ_at_every_highlight_are_cut():
+    table = pl.DataFrame([row for i in range(MOST_TEXTS + 3) for row in faulty("a", "estimator_error", f"E: {i}", 2)])
+    found = list(map(str, faults_of(table)))
+    assert len(found) == MOST_TEXTS + 1
+    assert found[-1] == "a: 3 other texts; column flags of results.parquet holds them, 6 times"
+
+
+def test_results_without_a_fault_have_none():
+    assert faults_of(pl.DataFrame({"status": ["ok", "missed"], "estimator": ["a", "a"], "flags": ["", None]})) == []
+    assert faults_of(pl.DataFrame({"status": ["ok"]})) == []

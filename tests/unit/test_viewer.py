@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from simtest.cli.main import main
 from simtest.errors import InputError
+from simtest.report import viewer
 from simtest.report.scene3d import curvature_limit, framed
 from simtest.report.viewer import Content, make_content, save_screenshot, show, window, write_scene_page
 from simtest.report.viewer.scene_page import errors_deg
@@ -120,25 +122,23 @@ def test_where_nothing_draws_it_says_what_to_install(content, tmp_path, monkeypa
         save_screenshot(content, tmp_path / "view.jpg")
 
 
-@pytest.mark.render
-def test_a_window_without_a_display_is_refused(content, monkeypatch):
+@pytest.fixture
+def no_display(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(window.sys, "platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
+@pytest.mark.render
+def test_a_window_without_a_display_is_refused(content, no_display):
     with pytest.raises(InputError, match="--screenshot"):
         show(content)
 
 
 @pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 @pytest.mark.parametrize("target", [["--screenshot", "nowhere/view.png"], ["--screenshot", "view.jpg"], []])
-def test_the_command_refuses_before_it_renders(monkeypatch, tmp_path, capsys, target):
-    from simtest.cli.main import main
-    from simtest.report import viewer
-
+def test_the_command_refuses_before_it_renders(monkeypatch, tmp_path, capsys, no_display, target):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(window.sys, "platform", "linux")
     monkeypatch.setattr(viewer, "make_content", lambda *_: pytest.fail("rendered"))
     monkeypatch.setattr("sys.argv", ["simtest", "view", "plane", *target])
     with pytest.raises(SystemExit) as ended:
