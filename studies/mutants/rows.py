@@ -155,10 +155,10 @@ ROWS = (
         "2 * len(kept) - 3 * len(lights)", "2 * len(kept)", "light_solver light_calibration"),
     # spec
     row("MATLAB's principal point kept as it is", "pixel centre", "spec.camera_formats.matlab:_table",
-        "(cx, cy), -PIXEL_CENTRE, **told", "(cx, cy), 0.0, **told", "camera_files camera_formats"),
+        "(cx, cy), -PIXEL_CENTRE, **told", "(cx, cy), 0.0, **told", "camera_formats"),
     row("OpenCV's principal point kept as it is", "pixel centre", "spec.camera_formats.opencv:_table",
         "matrix[:2, 2].tolist(), PIXEL_CENTRE, skew", "matrix[:2, 2].tolist(), 0.0, skew",
-        "camera_files camera_formats"),
+        "camera_formats"),
     row("GGX's half-width without the root", "lobe width", "spec.reflectance:ggx_half_width",
         "math.sqrt(math.sqrt(2) - 1)", "(math.sqrt(2) - 1)", "lobe_widths"),
     row("Phong's curvature 2 n", "lobe width", "spec.reflectance:PhongReflectance.lobe_curvature", "4 * self.exponent",
