@@ -2,6 +2,13 @@
 
 import numpy as np
 
+
+def written(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
 ROS_FILE = """image_width: 640
 image_height: 480
 camera_name: narrow_stereo

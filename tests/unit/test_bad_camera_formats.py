@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from camera_texts import FISHEYE_STRUCT, JSON, KALIBR, PHOTOMETRIC, ROS_FILE, ROS_MESSAGE, STRUCT, vicalib
+from camera_texts import FISHEYE_STRUCT, JSON, KALIBR, PHOTOMETRIC, ROS_FILE, ROS_MESSAGE, STRUCT, vicalib, written
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
@@ -49,17 +49,10 @@ def transforms(**told):
     return json.dumps({**TRANSFORMS, **told})
 
 
-def written(tmp_path, name, text):
-    path = tmp_path / name
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
 CAMERAS = {
     "cameras.txt: unknown model": (swap(COLMAP_LINE, "OPENCV", "OPENVC"), "unknown camera model; must be one"),
     "cameras.txt: lens that simtest lacks": (swap(COLMAP_LINE, "OPENCV", "THIN_PRISM_FISHEYE"), "lacks this"),
     "cameras.txt: too few parameters": (swap(COLMAP_LINE, " -0.001", ""), "7 parameters; must be 8: fx, fy, cx"),
-    "cameras.txt: no number": (swap(COLMAP_LINE, "490", "x"), "fy = 'x': must be a finite number"),
     "cameras.txt: part of a pixel": ("1 PINHOLE 640 480 5 5 3 2\n2 PINHOLE 64.5 48 5 5 3 2\n", "WIDTH = '64.5'"),
     "cameras.txt: twice": (f"{COLMAP_LINE}\n{COLMAP_LINE}\n", "line 2: camera 1 is given twice"),
     "cameras.txt: broken mask": (f"# simtest view_mask (1\n{COLMAP_LINE}\n", "view mask '(1': must be a JSON"),
@@ -93,15 +86,12 @@ CAMERAS = {
         "image_height = 40: does not fit image_size, which says 48",
     ),
     "chain.yaml: distortion": (swap(KALIBR, "radtan", "fov"), "distortion_model = 'fov': simtest lacks it"),
-    "chain.yaml: coefficients": (swap(KALIBR, ", 0.00011]", "]"), "distortion_coeffs: 3 values; must be 4"),
     "chain.yaml: no resolution": (swap(KALIBR, "resolution", "size"), "resolution = None: must be a list"),
     "g.xml: type": (swap(VICALIB, "v0_kb4", "v0_w"), "type = 'calibu_fu_fv_u0_v0_w': simtest lacks it"),
     "g.xml: parameters": (swap(VICALIB, "0.003; 0 ]", "0.003 ]"), "camera 0: params: 7 values; must be 8"),
     "g.xml: axes": (swap(VICALIB, "[ 0; 0; 1 ]", "[ 0; 0; -1 ]"), "forward = [ 0; 0; -1 ]: must be [0.0"),
-    "g.xml: no size": (swap(VICALIB, "<height> 480 </height>", ""), "height: missing"),
     "c.ini: missing": (swap(INI, "a4 =", "a5 ="), "a4: missing"),
     "c.ini: no number of others": (swap(INI, "769.2", "7_69"), "a0 = '7_69': must be a finite number"),
-    "c.ini: huge": (swap(INI, "769.2", "1e300"), "a0 = 1e+300: must be at most 1e+06 px"),
     "c.ini: a1": (swap(INI, "a1 = 0.0", "a1 = 0.5"), "a1 = 0.5: must be 0"),
     "c.ini: backwards": (swap(INI, "769.2", "-769.2"), "a0 = -769.2: must be > 0, since z points along"),
     "c.ini: twice": (INI + "a0 = 1\n", "line 13: a0 is given twice"),
@@ -111,10 +101,7 @@ CAMERAS = {
     "c.txt: forwards": (swap(OCAM, "-400", "400"), "a0 = 400: must be < 0, since OCamCalib's z points"),
     "c.txt: higher terms": (swap(OCAM, "5 -400 0 7e-4 0 0", "6 -400 0 7e-4 0 0 1e-12"), "a3, a4 alone"),
     "c.txt: contradiction": (OCAM, "the two polynomials differ by"),
-    "c.txt: centre": (swap(OCAM, "540 960", "540"), "centre (row, column): 1 values; must be 2"),
     "c.json: no JSON": ("{", "not valid JSON: "),
-    "c.yaml: empty": ("", "holds no keys"),
-    "c.xml: broken XML": ("<?xml version='1.0'?><opencv_storage><a>", "not valid XML: "),
     "c.xml: entities": (
         "<!DOCTYPE a [<!ENTITY b 'bb'>]><opencv_storage><a>&b;</a></opencv_storage>",
         "not valid XML: document types and entities are not allowed",
@@ -124,14 +111,12 @@ CAMERAS = {
     "c.json: no size": (swap(JSON, '"image_width": 640, ', ""), "image_width: missing; a camera needs the size"),
     "c.json: no K": (swap(JSON, '"K"', '"L"'), "camera_matrix: missing; allowed names: camera_matrix, cameraMatrix"),
     "c.json: two K": (swap(JSON, '"D"', '"cameraMatrix": 1, "D"'), "K: given beside cameraMatrix; only one"),
-    "c.json: short K": (swap(JSON, ", [0, 0, 1]", ""), "K: rows of [3, 3] values; must be 3 rows of 3"),
     "c.json: transposed K": (
         swap(JSON, "[400, 0, 319.5], [0, 400, 239.5], [0, 0, 1]", "[400, 0, 0], [0, 400, 0], [319, 239, 1]"),
         "must be upper triangular with 1 in its last corner",
     ),
     "c.json: three": (swap(JSON, ", 0.0, 0.0]", ", 0.0]"), "D: 3 values; must be 4 or 5 or 8 or 12 or 14"),
     "c.json: thin prism": (swap(JSON, "0.0, 0.0]", "0, 0, 0, 0, 0, 0, 0.1, 0, 0, 0]"), "s1 = 0.1 (thin prism)"),
-    "c.json: tilted": (swap(JSON, "0.0, 0.0]", "0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0]"), "tauX = 0.1 (tilted sensor)"),
     "c.json: folds": (swap(JSON, "-0.2", "-2"), "distortion: the lens folds over at 2"),
     "c.yaml: model": (ROS_FILE.replace("plumb_bob", "omni"), "distortion_model = 'omni': must be one of plumb_bob, "),
     "c.yaml: model and count": (ROS_FILE.replace("plumb_bob", "equidistant"), "5 values; must be 4"),
@@ -176,7 +161,6 @@ def test_missing_files(tmp_path, name):
 # Poses -----------------------------------------------------------------------------------------------------------
 
 POSES = {
-    "images.txt: few words": ("1 1 0 0 0 0 0 0 1\n\n", "holds no pose"),
     "images.txt: name": ("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 0 1\n\n", "line 3: 9 words; must be IMAGE_ID"),
     "images.txt: quaternion": ("1 2 0 0 0 0 0 0 1 a.png\n\n", "line 1: quaternion of length 2; must be 1"),
     "images.txt: no points": ("1 1 0 0 0 0 0 0 1 a\n2 1 0 0 0 0 0 0 1 b\n", "line 2: must hold an image's points"),

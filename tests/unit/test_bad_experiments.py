@@ -169,10 +169,7 @@ ANATOMIES = {
     ),
     "none.toml": (None, "no such file; shipped by name: colon, liver"),
     "none.ply": (None, "no such file"),
-    "mesh.xyz": ("0 0 0\n", "unknown suffix .xyz; allowed: .toml, .ply, .obj, .stl, .vtk"),
-    "empty.ply": ("", "0 bytes"),
     "text.obj": ("this is no mesh\n", "no faces"),
-    "cloud.obj": ("v 0 0 0\nv 9 0 0\nv 0 9 0\n", "3 points and no faces"),
 }
 
 

@@ -6,7 +6,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from camera_texts import C3VD, FISHEYE_STRUCT, JSON, KALIBR, ROS_FILE, ROS_MESSAGE, STRUCT, vicalib
+from camera_texts import C3VD, FISHEYE_STRUCT, JSON, KALIBR, ROS_FILE, ROS_MESSAGE, STRUCT, vicalib, written
 from scipy.io import loadmat, savemat
 from scipy.spatial.transform import Rotation
 
@@ -32,12 +32,6 @@ def agrees(camera, project, rays):
     np.testing.assert_allclose(camera.unproject(pixels), unit, rtol=0, atol=PX / max(camera.fx, camera.fy))
     # Negative control: half a pixel counts.
     assert np.abs(camera.project(rays) - pixels - 0.5).min() > 0.4
-
-
-def written(tmp_path, name, text):
-    path = tmp_path / name
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 # COLMAP -----------------------------------------------------------------------------------------------------------
@@ -166,44 +160,15 @@ def test_ros_files(tmp_path):
 
 
 def test_yaml_as_others_write_it():
-    """The plain part of YAML: comments, quotes, tags, flow maps, lists of lists."""
-    text = """%YAML:1.0
-# a comment
----
-name: "a: # b"   # and another
-other: 'x'
-flag: true
-nothing: ~
-number: 1.
-tagged: !!opencv-matrix
-   rows: 1
-   data: [ 1, 2.5e-1,
-       -3 ]
-flow: { x: 1, y: [2, .Nan], z: a b }
-rows:
-- [1, 2]
-- - 3
-  - 4
-nested:
-  - a: 1
-    b: 2
-  -
-    c: 3
-...
-ignored: 1
-"""
-    data = parse_yaml(text)
-    assert np.isnan(data["flow"]["y"].pop())
-    assert data == {
-        "name": "a: # b", "other": "x", "flag": True, "nothing": None, "number": 1.0,
-        "tagged": {"rows": 1, "data": [1, 0.25, -3]}, "flow": {"x": 1, "y": [2], "z": "a b"},
-        "rows": [[1, 2], [3, 4]], "nested": [{"a": 1, "b": 2}, {"c": 3}],
-    }  # fmt: skip
-    assert parse_yaml("") is None
-    assert parse_yaml("[1, 2]") == [1, 2]
+    """A header that is no YAML directive, tags, a second document; line ends of Windows."""
+    text = "%YAML:1.0\n# a comment\n---\ntagged: !!opencv-matrix\n   rows: 1\n   data: [ 1, 2.5e-1,\n       -3 ]\n"
+    tagged = {"tagged": {"rows": 1, "data": [1, 0.25, -3]}}
+    assert parse_yaml(text) == parse_yaml(text + "...\nignored: 1\n") == tagged
+    quoted = 'name: "a: # b"   # and another\nflag: true\nnothing: ~\nflow: { x: 1, z: a b }\n'
+    assert parse_yaml(quoted) == {"name": "a: # b", "flag": True, "nothing": None, "flow": {"x": 1, "z": "a b"}}
+    assert parse_yaml("a: 1\r\nb:\r\n- [1, 2]\r\n") == {"a": 1, "b": [[1, 2]]}
     assert len(parse_yaml("data: [" + "1.25, " * 20_000 + "2]")["data"]) == 20_001
-    assert parse_yaml("a: 1\r\nb: 2\r\n") == {"a": 1, "b": 2}
-    assert parse_yaml("---\n") is None
+    assert parse_yaml("") is parse_yaml("---\n") is None
 
 
 def test_yaml_scalars():
