@@ -90,11 +90,11 @@ cam1:
 """
 
 
-def vicalib(kind, params, width=640, height=480, extra=""):
+def vicalib(kind, params, width=640, height=480):
     return (
         f'<rig>\n<camera>\n<camera_model name="" index="0" serialno="0" type="{kind}" version="0">\n'
         f"<width> {width} </width><height> {height} </height>\n<!-- Use RDF matrix -->\n<right> [ 1; 0; 0 ] </right>\n"
-        f"<down> [ 0; 1; 0 ] </down>\n<forward> [ 0; 0; 1 ] </forward>\n{extra}<params> [ {params} ] </params>\n"
+        f"<down> [ 0; 1; 0 ] </down>\n<forward> [ 0; 0; 1 ] </forward>\n<params> [ {params} ] </params>\n"
         "</camera_model>\n<pose><T_wc> [ 1, 0, 0, 0; 0, 1, 0, 0; 0, 0, 1, 0 ] </T_wc></pose>\n</camera>\n</rig>\n"
     )
 
