@@ -6,7 +6,7 @@ import pytest
 
 from simtest.estimators import load_estimators
 from simtest.runtime.boundary import plain_errors
-from simtest.spec import load_experiment, load_scene
+from simtest.spec import load_experiment, load_scene, scene_from_dict
 from simtest.spec.surfaces import AnatomySurface
 from simtest.surfaces import make_surface
 from simtest.validation import realisation, runner
@@ -15,18 +15,16 @@ from tests.refusals import refused
 
 # Experiments -----------------------------------------------------------------------------------------------------
 
-PLANE = '[surface]\ntype = "plane"\n'
 GROUP = '[[groups]]\nscene = "plane"\n'
 EXPERIMENTS = {
     "group without scene": ("[[groups]]", "groups.0.scene: missing"),
-    "unknown key of a group": (GROUP + "swep = []", "groups.0.swep = []: unknown key; allowed: sweep, scene"),
+    "unknown key": ("repeats = 3\n" + GROUP, "repeats = 3: unknown key; allowed: realisations, name"),
     "unequal lengths": (
         GROUP + 'sweep = [{ "surface.tilt_deg" = [1, 2], "surface.azimuth_deg" = [1] }]',
         "lists of one sweep must be equally long and not empty, got lengths {'surface.tilt_deg': 2, 'surface.azimu",
     ),
     "empty sweep": (GROUP + 'sweep = [{ "surface.tilt_deg" = [] }]', "not empty, got lengths {'surface.tilt_deg': 0}"),
     "sweep of nothing": (GROUP + "sweep = [{}]", "not empty, got lengths {}"),
-    "sweep of a plain value": (GROUP + 'sweep = [{ "surface.tilt_deg" = 3 }]', "tilt_deg = 3: must be a list"),
     "empty pool": (GROUP + 'pool = [{ "surface.tilt_deg" = [] }]', "not empty"),
     "unknown estimator": ('estimators = ["magic"]\n' + GROUP, "estimator 'magic': not installed; allowed: "),
     "estimator twice": ('estimators = ["cone_axis", "cone_axis"]\n' + GROUP, "estimator 'cone_axis': given twice"),
@@ -36,7 +34,6 @@ EXPERIMENTS = {
         GROUP + 'sweep = [{ "surface.tilt_deg" = [0, 45, 95] }]',
         "plane.toml: surface.tilt_deg = 95: must be less than 90",
     ),
-    "swept text": (GROUP + 'sweep = [{ "camera.fx" = [90, "x"] }]', "camera.fx = 'x': must be a number"),
     "unknown swept key": (GROUP + 'sweep = [{ "surface.tilt" = [0] }]', "surface.tilt = 0: unknown key; allowed: "),
     "swept index": (GROUP + 'sweep = [{ "rig.lights.2.power" = [1] }]', "index 2 is not allowed; the first item is 0"),
     "swept type": (GROUP + 'sweep = [{ "surface.type" = ["plane", "cone"] }]', "surface.type = 'cone': unknown"),
@@ -91,9 +88,7 @@ def test_a_swept_recipe_is_read_before_anything_is_rendered(tmp_path):
     recipe = tmp_path / "bad.toml"
     recipe.write_text('type = "colon"\nradius_mm = 1\n')
     described = load_experiment("anatomy", {"surface.path": str(recipe)})
-    refused(
-        lambda: runner.run_experiment(described, tmp_path / "out"), f"{recipe}: radius_mm = 1: must be greater than"
-    )
+    refused(lambda: runner.run_experiment(described, tmp_path / "out"), f"{recipe}: radius_mm = 1: must be greater")
 
 
 def test_a_range_may_end_at_an_excluded_bound(tmp_path):
@@ -105,13 +100,9 @@ def test_a_range_may_end_at_an_excluded_bound(tmp_path):
     assert described.name == "my-experiment-new-"
 
 
-@pytest.mark.usefixtures("no_rendering")
 def test_settings_of_an_experiment():
     refused(lambda: load_experiment("overview", {"realisations": 0}), "realisations = 0: must be greater than")
-    refused(lambda: load_experiment("overview", {"seed": "x"}), "seed = 'x': must be a number")
-    refused(
-        lambda: load_experiment("overview", {"estimators": "cone_axis"}), "estimators = 'cone_axis': must be a list"
-    )
+    refused(lambda: load_experiment("overview", {"estimators": "cone_axis"}), "estimators = 'cone_axis': must be a")
     refused(lambda: expand(load_experiment("overview", {"surface.foo": 1})), "surface.foo = 1: unknown key")
     refused(lambda: load_estimators(["cone_axis", "magic"]), "estimator 'magic'")
 
@@ -119,11 +110,10 @@ def test_settings_of_an_experiment():
 def test_few_viewpoints_of_an_experiment():
     few, all_of_them = load_experiment("mesh", {"viewpoints": 3}), load_experiment("mesh")
     assert {case.data["surface"]["viewpoint"] for case in expand(few)} == {0, 1, 2}
-    kinds = {case.setting for case in expand(all_of_them)}
-    assert {case.setting for case in expand(few)} == kinds
+    assert {case.setting for case in expand(few)} == {case.setting for case in expand(all_of_them)}
     # 48, 5 x 12 and 3 x 8 frames, or 3 of each.
     assert (len(expand(all_of_them)), len(expand(few))) == (132, 27)
-    assert few.description.endswith("Cut down by viewpoints=3: at most the first 3 viewpoints of each setting.")
+    assert "viewpoints=3" in few.description
     assert len(expand(load_experiment("mesh", {"viewpoints": 1000}))) == 132
     refused(
         lambda: load_experiment("curvature", {"viewpoints": 3}),
@@ -132,7 +122,7 @@ def test_few_viewpoints_of_an_experiment():
     )
 
 
-@pytest.mark.parametrize("bad", [0, -1, 2.5, True, "x"])
+@pytest.mark.parametrize("bad", [0, 2.5, True, "x"])
 def test_a_number_of_viewpoints_is_a_whole_one(bad):
     refused(
         lambda: load_experiment("mesh", {"viewpoints": bad}), f"--set viewpoints={bad}: must be a whole number from 1"
@@ -168,40 +158,24 @@ def test_folders_that_cannot_be_written(tmp_path):
 
 # Recipes and meshes through a scene ------------------------------------------------------------------------------
 
-RECIPES = {
-    "unknown type": ('type = "kidney"', "type = 'kidney'; allowed: colon, liver"),
-    "no type": ("length_mm = 100", "type: missing; allowed: colon, liver"),
-    "unknown key": ('type = "colon"\nlength = 100', "length = 100: unknown key; allowed: length_mm"),
-    "folds close the lumen": ('type = "colon"\nfold_depth_mm = 30', "at most 0.8 radius_mm = 17.6 mm is allowed"),
-    "lobe of two axes": (
+ANATOMIES = {
+    "kidney.toml": ('type = "kidney"', "type = 'kidney'; allowed: colon, liver"),
+    "untyped.toml": ("length_mm = 100", "type: missing; allowed: colon, liver"),
+    "unknown.toml": ('type = "colon"\nlength = 100', "length = 100: unknown key; allowed: length_mm"),
+    "closed.toml": ('type = "colon"\nfold_depth_mm = 30', "at most 0.8 radius_mm = 17.6 mm is allowed"),
+    "flat.toml": (
         'type = "liver"\nlobes = [{ centre_mm = [0, 0, 0], semi_axes_mm = [50, 50] }]',
         "lobes.0.semi_axes_mm.2: missing",
     ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", RECIPES)
-def test_recipes(tmp_path, name):
-    text, fragment = RECIPES[name]
-    path = tmp_path / "my.toml"
-    path.write_text(text)
-    refused(lambda: make_surface(AnatomySurface(path=str(path))), f"{path}: ", fragment)
-
-
-MESHES = {
     "none.toml": (None, "no such file; shipped by name: colon, liver"),
     "none.ply": (None, "no such file"),
-    "mesh.xyz": ("0 0 0\n", "unknown suffix .xyz; allowed: .toml, .ply, .obj, .stl, .vtk"),
-    "empty.ply": ("", "0 bytes"),
     "text.obj": ("this is no mesh\n", "no faces"),
-    "cloud.obj": ("v 0 0 0\nv 9 0 0\nv 0 9 0\n", "3 points and no faces"),
-    "scene.toml": (PLANE, "type: missing; allowed: colon, liver"),
 }
 
 
-@pytest.mark.parametrize("name", MESHES)
-def test_meshes_through_a_scene(tmp_path, name):
-    text, fragment = MESHES[name]
+@pytest.mark.parametrize("name", ANATOMIES)
+def test_recipes_and_meshes(tmp_path, name):
+    text, fragment = ANATOMIES[name]
     path = tmp_path / name
     if text is not None:
         path.write_text(text)
@@ -212,3 +186,23 @@ def test_meshes_through_a_scene(tmp_path, name):
 def test_a_folder_is_no_anatomy(tmp_path):
     refused(lambda: make_surface(AnatomySurface(path=str(tmp_path))), "is a folder")
     refused(lambda: make_surface(AnatomySurface(path="kidney")), "kidney: no such file; shipped by name: colon, liver")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*inside out")
+def test_waves_that_a_mesh_holds_itself():
+    mesh = Path(__file__).resolve().parents[2] / "meshes" / "colon_40mm.ply"
+
+    def make(wavelength, **values):
+        relief = {"bands": [{"slope_deg": 1, "wavelength_mm": 1.0}, {"slope_deg": 1, "wavelength_mm": wavelength}]}
+        surface = {"type": "anatomy", "path": str(mesh), "relief": relief, **values}
+        return make_surface(scene_from_dict({"surface": surface}).surface)
+
+    refused(
+        lambda: make(wavelength=5.0),
+        "surface.relief.bands.1.wavelength_mm = 5: ",
+        "colon_40mm.ply holds waves from 2.4 mm on itself (two of its median edges, or smoothing_mm)",
+    )
+    # Waves below the mesh's own lie in the normal alone and need no triangles; smoothing makes room for longer ones.
+    assert make(wavelength=0.1).relief is not None
+    assert make(wavelength=5.0, smoothing_mm=6.0).relief is not None

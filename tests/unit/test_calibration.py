@@ -60,9 +60,12 @@ def write(tmp_path, text, name="calibration.toml"):
 # Files ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("text", [CAMERA_TABLE, CAMERA_TABLE.removeprefix("[camera]\n")])
-def test_a_whole_file_is_read(tmp_path, text):
-    read = load_calibration(write(tmp_path, text + WHOLE))
+FLAT = CAMERA_TABLE.removeprefix("[camera]\n")
+
+
+@pytest.mark.parametrize(("name", "camera"), [("c.toml", CAMERA_TABLE), ("calib.cfg", CAMERA_TABLE), ("c.toml", FLAT)])
+def test_a_whole_file_is_read(tmp_path, name, camera):
+    read = load_calibration(write(tmp_path, camera + WHOLE, name))
     response = Response("gamma", 2.0)
     assert read == Calibration(
         CAMERA,
@@ -75,19 +78,11 @@ def test_a_whole_file_is_read(tmp_path, text):
     )
 
 
-@pytest.mark.parametrize("text", [CAMERA_TABLE, CAMERA_TABLE.removeprefix("[camera]\n")])
+@pytest.mark.parametrize("text", [CAMERA_TABLE, FLAT])
 def test_a_camera_file_is_a_calibration_of_nothing_else(tmp_path, text):
     read = load_calibration(write(tmp_path, text))
     assert read == Calibration(CAMERA)
-    assert read.response is None
-    assert read.falloff is None
-    assert read.saturation_level is None
-
-
-@pytest.mark.parametrize("name", ["a.txt", "calib.cfg", "calibration", "c.TOML"])
-def test_the_other_tables_are_read_whatever_the_file_is_called(tmp_path, name):
-    text = CAMERA_TABLE + WHOLE
-    assert load_calibration(write(tmp_path, text, name)) == load_calibration(write(tmp_path, text))
+    assert (read.response, read.falloff, read.saturation_level) == (None, None, None)
 
 
 def test_lens_and_view_mask_are_read_beside_the_other_tables(tmp_path):
@@ -111,16 +106,11 @@ def test_lens_and_view_mask_are_read_beside_the_other_tables(tmp_path):
     ("text", "message"),
     [
         (WHOLE, "width: missing"),
-        (CAMERA_TABLE.removeprefix("[camera]\n") + "[lens]\nk1 = 0.1", "lens = .*unknown key"),
-        (CAMERA_TABLE.removeprefix("[camera]\n") + "[sensor]\nbits = 20", "sensor.bits = 20"),
+        (FLAT + "[lens]\nk1 = 0.1", "lens = .*unknown key"),
         (CAMERA_TABLE + "[lens]\nk1 = 0.1", "lens = .*unknown key"),
-        (CAMERA_TABLE + '[response]\ntype = "film"', "response.type = 'film'"),
         (CAMERA_TABLE + '[response]\ntype = "table"\nlight = [0.0, 1.0]\nvalue = [1.0, 0.0]', "response.*rise from 0"),
-        (CAMERA_TABLE + '[vignetting]\ntype = "cosine"\npower = -1', "vignetting.power = -1"),
-        (CAMERA_TABLE + "[sensor]\nsaturation_level = 0", "sensor.saturation_level = 0"),
         (CAMERA_TABLE + "[sensor]\nread_noise = 5", "sensor: read_noise = 5 electrons: needs full_well"),
         (CAMERA_TABLE + "[sensor]\nbits = 20", "sensor.bits = 20"),
-        (CAMERA_TABLE.replace("90.0", "0.0"), "fx = 0.0"),
     ],
 )
 def test_malformed_files_name_the_key(tmp_path, text, message):
@@ -128,43 +118,28 @@ def test_malformed_files_name_the_key(tmp_path, text, message):
         load_calibration(write(tmp_path, text))
 
 
-def test_malformed_calibrations_are_refused():
-    with pytest.raises(InputError, match=r"must be a simtest\.Camera"):
-        Calibration("camera")
-    with pytest.raises(InputError, match="saturation_level"):
-        Calibration(CAMERA, saturation_level=0.0)
-    with pytest.raises(InputError, match=r"must be a simtest\.Camera or simtest\.Calibration"):
-        reconstruct(spot(), "camera.toml")
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: Calibration("camera"), r"must be a simtest\.Camera"),
+        (lambda: reconstruct(spot(), "camera.toml"), r"must be a simtest\.Camera or simtest\.Calibration"),
         (lambda: Calibration(CAMERA, response="srgb"), "calibration response is a str: must be a simtest Response"),
         (lambda: Calibration(CAMERA, vignetting=4.0), "calibration vignetting is a float: must be a simtest Angular"),
         (lambda: Calibration(CAMERA, emission=None), "calibration emission is a NoneType"),
         (lambda: Calibration(CAMERA, noise=0.05), "calibration noise is a float"),
         (lambda: Calibration(CAMERA, saturation_level="x"), "saturation_level = 'x': must be a finite number > 0"),
-        (lambda: Calibration(CAMERA, saturation_level=np.nan), "saturation_level = nan"),
         (lambda: Response("film"), "response kind = 'film'"),
         (lambda: Response("gamma", "x"), "response gamma = 'x': must be a finite number > 0"),
-        (lambda: Response("gamma", True), "response gamma = True"),
         (lambda: Response("gamma", 10**400), "response gamma = 1000"),
         (lambda: Response("table", light=5, value=6), "light = 5: must be a sequence of finite numbers"),
-        (lambda: Response("table", light=(0, 1), value="01"), "value = '01'"),
-        (lambda: Response("table", light=(0, "a", 1), value=(0, 0.5, 1)), "light = "),
         (lambda: AngularProfile(power="a"), "profile power = 'a': must be a finite number >= 0"),
-        (lambda: AngularProfile(power=None), "profile power = None"),
-        (lambda: AngularProfile(angles=(0, "a"), values=(1, 1)), "profile angles = "),
         (lambda: AngularProfile(angles=0.5, values=(1, 1)), "profile angles = 0.5: must be a sequence"),
         (lambda: AngularProfile(angles=(0, 1), values=(1, np.nan)), "profile values = "),
         (lambda: NoiseModel(full_well=0), "noise full_well = 0: must be a finite number > 0"),
-        (lambda: NoiseModel(np.nan), "noise sigma = nan: must be a finite number >= 0"),
         (lambda: NoiseModel(-1), "noise sigma = -1"),
         (lambda: NoiseModel(0.0, 100.0, -1.0), "noise read_noise = -1.0"),
         (lambda: NoiseModel(read_noise=5.0), "noise read_noise = 5 electrons: needs full_well"),
         (lambda: NoiseModel(bits=8.5), "noise bits = 8.5: must be an integer from 1 to 32"),
-        (lambda: NoiseModel(bits=0), "noise bits = 0"),
         (lambda: NoiseModel(response="srgb"), "noise response is a str"),
     ],
 )  # fmt: skip
@@ -182,26 +157,20 @@ def test_numpys_numbers_are_numbers():
 # What is undone ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shape", ["grey", "colour"])
-def test_correction_is_the_inverse_of_the_sensor(shape):
+def test_correction_is_the_inverse_of_the_sensor():
+    """Channels are made linear before they are averaged."""
     vignetting = {"type": "cosine", "power": 4.0}
     response = {"type": "gamma", "gamma": 2.2}
     sensor = Sensor.model_validate({"vignetting": vignetting, "response": response, "bits": 16})
     scene = spot(20, 30, height=0.9)
-    radiance = scene if shape == "grey" else scene[..., None] * np.array([0.9, 0.6, 0.3], np.float32)
+    radiance = scene[..., None] * np.array([0.9, 0.6, 0.3], np.float32)
     frame = capture(collect(radiance, sensor, CAMERA), 1.0, sensor, None)
     known = Calibration(CAMERA, Response("gamma", 2.2), AngularProfile(4.0))
-    expected = scene if shape == "grey" else scene * 0.6
+    expected = 0.6 * scene
     np.testing.assert_allclose(known.correct(frame).intensity, expected, atol=1e-4)
     # Each part that is missing shows.
     for unknown in (Calibration(CAMERA, Response("gamma", 2.2)), Calibration(CAMERA, vignetting=AngularProfile(4.0))):
         assert np.abs(unknown.correct(frame).intensity - expected).max() > 0.1
-
-
-def test_channels_are_made_linear_before_they_are_averaged():
-    frame = np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), (120, 160, 3))
-    known = Calibration(CAMERA, Response("gamma", 2.0))
-    np.testing.assert_allclose(known.correct(frame * 0.5).intensity, 0.25 / 3, rtol=1e-6)
 
 
 def test_emission_counts_like_vignetting():
@@ -212,7 +181,6 @@ def test_emission_counts_like_vignetting():
 
 
 def test_a_prior_on_the_falloff_is_left_alone_and_must_hold_what_is_not_undone():
-    """It was dropped as soon as one part was given, and an emission was undone wherever the lights were."""
     power, profile = Uniform(0.0, 3.0), AngularProfile(2.0)
     for parts in ({"vignetting": profile}, {"emission": profile}, {"vignetting": profile, "emission": profile}):
         assert Calibration(CAMERA, **parts, priors=Priors(falloff_power=power)).priors.falloff_power == power
@@ -227,7 +195,6 @@ def test_a_prior_on_the_falloff_is_left_alone_and_must_hold_what_is_not_undone()
 
 @pytest.mark.parametrize("lights_mm", [(), ((5.0, 0.0, 0.0),)])
 def test_a_known_falloff_beside_one_that_nobody_gave_is_written(lights_mm, tmp_path):
-    """No file could state it, as `simtest calibrate light` makes it of a calibration that has both."""
     profile = AngularProfile(2.0)
     known = Calibration(CAMERA, vignetting=profile, emission=profile, priors=Priors(lights_mm))
     save_calibration(known, tmp_path / "written.toml")
@@ -296,8 +263,8 @@ def patch_of(frame, level=1.0):
     return Patch.cut(smoothed, (0, 0, 160, 120), saturated=frame >= level)
 
 
-@pytest.mark.parametrize("place", [(80.3, 60.6), (71.9, 44.2)])
-def test_a_clipped_peak_lies_at_the_plateaus_centroid(place):
+def test_a_clipped_peak_lies_at_the_plateaus_centroid():
+    place = (71.9, 44.2)
     frame = np.minimum(spot(*place, height=2.5), 1.0)
     clipped, blind = patch_of(frame), Patch.cut(smooth(frame, 2.0), (0, 0, 160, 120))
     # The plateau is made of whole pixels.

@@ -5,17 +5,14 @@ import sys
 
 import numpy as np
 import pytest
+from camera_texts import PHOTOMETRIC
 
-from simtest import Camera, KannalaBrandt, Scaramuzza, load_calibration, load_camera, save_camera
+from simtest import Camera, KannalaBrandt, Scaramuzza, ViewMask, load_calibration, load_camera, save_camera
 from simtest.cli.main import main
 from simtest.spec.camera_formats.files import read_poses
 from simtest.spec.camera_tables import camera_summary
 
 FISHEYE = Camera(640, 480, 200.0, 200.0, 320.0, 240.0, 0.0, KannalaBrandt(0.01))
-PHOTOMETRY = """<rig><camera><camera_model type="gamma"><gamma> [ 2.2 ] </gamma></camera_model></camera><light>
-<light_model type="sls"><sigma> 1 </sigma><mu> 2.5 </mu><P> [ 0.0; -0.001; 0.0 ] </P><D> [ 0; 0; 1 ] </D></light_model>
-</light></rig>
-"""
 
 
 @pytest.fixture
@@ -56,15 +53,9 @@ def test_show_what_a_lens_does_not_see():
     corner = told["border"][-1]
     assert corner["angle_deg"] > 90
     assert corner["moved_px"] is None
-    masked = load_summary_with_mask()
+    masked = camera_summary(Camera(640, 480, 200.0, 200.0, 320.0, 240.0, 0.0, None, ViewMask(320.0, 240.0, 240.0)))
     assert [each["in_view"] for each in masked["border"]] == [False, False, True, True] + [False] * 4
     assert masked["fov_deg"]["height"] == pytest.approx(2 * masked["border"][2]["angle_deg"])
-
-
-def load_summary_with_mask():
-    from simtest import ViewMask
-
-    return camera_summary(Camera(640, 480, 200.0, 200.0, 320.0, 240.0, 0.0, None, ViewMask(320.0, 240.0, 240.0)))
 
 
 def test_convert(here, tmp_path):
@@ -107,10 +98,10 @@ def test_converted_poses_are_in_the_unit_that_the_new_file_states(here, tmp_path
 
 def test_convert_with_photometry(here, tmp_path):
     save_camera(FISHEYE, tmp_path / "a.yml")
-    (tmp_path / "p.xml").write_text(PHOTOMETRY)
+    (tmp_path / "p.xml").write_text(PHOTOMETRIC)
     assert here("convert", "a.yml", "--photometric", "p.xml", "--out", "scope.toml")[0] == 0
     made = load_calibration(tmp_path / "scope.toml")
-    assert (made.response.gamma, made.priors.lights_mm) == (2.2, ((0.0, -1.0, 0.0),))
+    assert (made.response.gamma, made.priors.lights_mm) == (2.2, ((0.0, -1.0, -3.0),))
     assert made.camera.distortion == FISHEYE.distortion
 
 
@@ -124,14 +115,18 @@ def test_convert_with_photometry(here, tmp_path):
             ("convert", "a.toml", "--out", "b.yml", "--photometric", "p.xml"),
             "needs --to toml; no other format holds it",
         ),
-        (("convert", "a.toml", "--out", "b.yml", "--poses", "p.xml"), "--poses p.xml: line 1: "),
+        (("convert", "a.toml", "--out", "b.yml", "--poses", "p.xml"), "--poses p.xml: "),
+        (
+            ("convert", "a.toml", "--out", "c.toml", "--photometric", "p.xml", "--poses", "images.txt"),
+            "--photometric and --poses exclude each other",
+        ),
         (("convert", "a.toml#3", "--out", "b.yml"), "a.toml#3: "),
         (("convert", "a.toml", "--out", "b.toml", "--view-radius", "-1"), "view_mask.radius = -1"),
     ],
 )
 def test_what_is_refused_in_one_line(here, tmp_path, arguments, said):
     save_camera(FISHEYE, tmp_path / "a.toml")
-    (tmp_path / "p.xml").write_text(PHOTOMETRY)
+    (tmp_path / "p.xml").write_text(PHOTOMETRIC)
     code, out, lines = here(*arguments)
     assert (code, out, len(lines)) == (2, "", 1)
     assert said in lines[0]
@@ -159,11 +154,3 @@ def test_no_camera_is_written_under_the_name_of_poses(here, tmp_path, name):
     assert (code, len(err)) == (2, 1)
     assert "must be cameras.txt" in err[0]
     assert not (tmp_path / "to" / name).exists()
-
-
-def test_photometry_and_poses_exclude_each_other(here, tmp_path):
-    save_camera(FISHEYE, tmp_path / "cameras.txt", poses=[("a.png", np.eye(4))])
-    (tmp_path / "p.xml").write_text(PHOTOMETRY)
-    code, _, err = here("convert", "cameras.txt", "--out", "c.toml", "--photometric", "p.xml", "--poses", "images.txt")
-    assert (code, len(err)) == (2, 1)
-    assert "--photometric and --poses exclude each other" in err[0]

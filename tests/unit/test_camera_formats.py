@@ -3,13 +3,17 @@
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
+from camera_texts import C3VD, FISHEYE_STRUCT, JSON, KALIBR, ROS_FILE, ROS_MESSAGE, STRUCT, vicalib, written
 from scipy.io import loadmat, savemat
 from scipy.spatial.transform import Rotation
 
 from simtest import BrownConrady, Camera, InputError, KannalaBrandt, Scaramuzza, ViewMask, load_camera, save_camera
 from simtest.spec.camera_formats.files import read_poses, recognise
+from simtest.spec.camera_formats.plain_yaml import parse_yaml
+from tests.refusals import refused
 
 RNG = np.random.default_rng(11)
 RAYS = np.concatenate([RNG.uniform(-0.45, 0.45, (2, 300)), RNG.uniform(0.8, 1.0, (1, 300))]).T
@@ -28,12 +32,6 @@ def agrees(camera, project, rays):
     np.testing.assert_allclose(camera.unproject(pixels), unit, rtol=0, atol=PX / max(camera.fx, camera.fy))
     # Negative control: half a pixel counts.
     assert np.abs(camera.project(rays) - pixels - 0.5).min() > 0.4
-
-
-def written(tmp_path, name, text):
-    path = tmp_path / name
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 # COLMAP -----------------------------------------------------------------------------------------------------------
@@ -99,26 +97,117 @@ CAMERAS = {
         ViewMask(320, 240, 230, 60.0, 200.0),
     ),
 }  # fmt: skip
-LACKS = {"opencv": {"omni"}, "colmap": {"omni"}, "transforms": {"omni", "rational"}, "matlab": {"fisheye", "rational"}}
-NAMES = {"toml": "c.toml", "opencv": "c.yml", "colmap": "cameras.txt", "transforms": "t.json", "matlab": "c.mat"}
+LACKS = {
+    "opencv": {"omni"}, "ros": {"omni"}, "colmap": {"omni"}, "transforms": {"omni", "rational"},
+    "matlab": {"fisheye", "rational"},
+}  # fmt: skip
+FILES = {
+    "toml": "c.toml", "opencv": "c.yml", "ros": "c.yaml", "colmap": "cameras.txt", "transforms": "t.json",
+    "matlab": "c.mat",
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", NAMES)
+@pytest.mark.parametrize("kind", FILES)
 @pytest.mark.parametrize("which", CAMERAS)
 def test_there_and_back(tmp_path, which, kind):
-    path, camera = tmp_path / NAMES[kind], CAMERAS[which]
+    path, camera = tmp_path / FILES[kind], CAMERAS[which]
     if which in LACKS.get(kind, ()):
         with pytest.raises(InputError, match=r"camera\.distortion"):
             save_camera(camera, path, kind)
         return
-    save_camera(camera, path, kind)
-    assert recognise(path) == kind
+    save_camera(camera, path, None if kind == "opencv" else kind)
+    assert recognise(path) == ("opencv" if kind == "ros" else kind)
     back = load_camera(path)
     assert (back.width, back.height, back.view_mask) == (camera.width, camera.height, camera.view_mask)
     pixels = RNG.uniform([0, 0], [640, 480], (200, 2))
     np.testing.assert_allclose(back.unproject(pixels), camera.unproject(pixels), rtol=0, atol=1e-13)
+    if kind != "matlab":
+        np.testing.assert_allclose(back.K, camera.K, rtol=1e-15)
+        assert back.distortion == camera.distortion
     if kind in ("colmap", "toml"):
         assert back == camera
+
+
+# OpenCV and ROS --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("which", "name"),
+    [("pinhole", "c.yml"), ("brown", "c.xml"), ("rational", "c.json"), ("fisheye", "c.yml"), ("fisheye", "c.xml")],
+)
+def test_the_file_means_the_same_to_opencv(tmp_path, which, name):
+    """OpenCV, given the file's own numbers, sees a point half a pixel before simtest."""
+    camera = CAMERAS[which]
+    save_camera(camera, tmp_path / name)
+    storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_READ)
+    matrix = storage.getNode("camera_matrix").mat()
+    coefficients = storage.getNode("distortion_coefficients").mat()
+    points = np.random.default_rng(0).uniform([-3, -3, 8], [3, 3, 10], (50, 1, 3))
+    zero = np.zeros((3, 1))
+    if storage.getNode("fisheye_model").real():
+        seen, _ = cv2.fisheye.projectPoints(points, zero, zero, matrix, coefficients)
+    else:
+        seen, _ = cv2.projectPoints(points, zero, zero, matrix, coefficients)
+    np.testing.assert_allclose(load_camera(tmp_path / name).project(points[:, 0]), seen[:, 0] + 0.5, atol=1e-9)
+
+
+def test_ros_files(tmp_path):
+    lens = BrownConrady(-0.361, 0.123, 0.001, -0.0002)
+    camera = Camera(640, 480, 438.78, 437.35, 305.59 + 0.5, 243.74 + 0.5, 0.0, lens)
+    assert load_camera(written(tmp_path, "c.yaml", ROS_FILE)) == camera
+    message = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, 0.0, KannalaBrandt(0.02, -0.01, 0.003))
+    assert load_camera(written(tmp_path, "c.yaml", ROS_MESSAGE)) == message
+
+
+def test_yaml_as_others_write_it():
+    """A header that is no YAML directive, tags, a second document; line ends of Windows."""
+    text = "%YAML:1.0\n# a comment\n---\ntagged: !!opencv-matrix\n   rows: 1\n   data: [ 1, 2.5e-1,\n       -3 ]\n"
+    tagged = {"tagged": {"rows": 1, "data": [1, 0.25, -3]}}
+    assert parse_yaml(text) == parse_yaml(text + "...\nignored: 1\n") == tagged
+    quoted = 'name: "a: # b"   # and another\nflag: true\nnothing: ~\nflow: { x: 1, z: a b }\n'
+    assert parse_yaml(quoted) == {"name": "a: # b", "flag": True, "nothing": None, "flow": {"x": 1, "z": "a b"}}
+    assert parse_yaml("a: 1\r\nb:\r\n- [1, 2]\r\n") == {"a": 1, "b": [[1, 2]]}
+    assert len(parse_yaml("data: [" + "1.25, " * 20_000 + "2]")["data"]) == 20_001
+    assert parse_yaml("") is parse_yaml("---\n") is None
+
+
+def test_yaml_scalars():
+    """Numbers as calibrations write them; what YAML 1.1 reads as octal, base 60, date or truth value stays plain."""
+    numbers = parse_yaml("[1e-5, 1.e+00, -.5, .5e1, +3, 010, .inf, -.INF, 123456789012345678901]")
+    assert numbers == [1e-5, 1.0, -0.5, 5.0, 3, 10, np.inf, -np.inf, 123456789012345678901.0]
+    assert np.isnan(parse_yaml("[.nan, nan]")).all()
+    assert parse_yaml("[12:30, 2024-01-01, yes, off, 0x1F, 1_000, '1']") == [
+        "12:30", "2024-01-01", "yes", "off", "0x1F", "1_000", "1",
+    ]  # fmt: skip
+    assert parse_yaml("1: a\ntrue: b\n~: c\n") == {"1": "a", "true": "b", "~": "c"}
+
+
+# Each is a way in which JSON's camera is written too.
+SAME = {
+    "as OpenCV has long written it, no valid JSON": [("0.0,", "0.,"), ("400,", "400.,")],
+    "other names": [('"K"', '"cameraMatrix"'), ('"D"', '"distCoeffs"')],
+    "names of the calibration tutorials": [('"K"', '"mtx"'), ('"D": [', '"dist": [['), ("0.0]}", "0.0]]}")],
+    "one size": [('"image_width": 640, "image_height": 480', '"image_size": [640, 480]')],
+    "terms that are not known vanish": [("0.05, 0.0, 0.0", "0.05, " + ", ".join(["0.0"] * 12))],
+}
+
+
+@pytest.mark.parametrize("case", SAME)
+def test_plain_json(tmp_path, case):
+    text = JSON
+    for old, new in SAME[case]:
+        assert old in text
+        text = text.replace(old, new)
+    expected = Camera(640, 480, 400.0, 400.0, 320.0, 240.0, 0.0, BrownConrady(-0.2, 0.05))
+    assert load_camera(written(tmp_path, "c.json", JSON)) == expected
+    assert load_camera(written(tmp_path, "c.json", text)) == expected
+
+
+def test_coefficients_of_zero_are_a_pinhole(tmp_path):
+    assert load_camera(written(tmp_path, "c.json", JSON.replace("-0.2, 0.05", "0, 0"))).distortion is None
+
+
+# Poses -----------------------------------------------------------------------------------------------------------
 
 
 def some_poses(count=4):
@@ -151,11 +240,8 @@ def test_colmaps_poses_are_its_own(tmp_path):
     w, x, y, z, *t = (float(word) for word in line.split()[1:8])
     point = np.array([3.0, -4.0, 5.0])
     seen = Rotation.from_quat([x, y, z, w]).apply(point) + t
-    np.testing.assert_allclose(np.linalg.inv(some_poses_at(tmp_path, 1)) @ [*point, 1], [*seen, 1], atol=1e-12)
-
-
-def some_poses_at(folder, index):
-    return read_poses(folder)[index][1]
+    world_from_camera = read_poses(tmp_path)[1][1]
+    np.testing.assert_allclose(np.linalg.inv(world_from_camera) @ [*point, 1], [*seen, 1], atol=1e-12)
 
 
 # NeRF -------------------------------------------------------------------------------------------------------------
@@ -197,27 +283,6 @@ def test_transforms_json_of_other_kinds(tmp_path):
 
 # Kalibr -----------------------------------------------------------------------------------------------------------
 
-KALIBR = """cam0:
-  cam_overlaps: [1]
-  camera_model: pinhole
-  distortion_coeffs: [-0.27, 0.067, 0.00087, 0.00011]
-  distortion_model: radtan
-  intrinsics: [461.6, 460.1, 362.6, 246.0]
-  resolution: [752, 480]
-  rostopic: /cam0/image_raw
-cam1:
-  T_cn_cnm1:
-  - [0.0, -1.0, 0.0, -0.11]
-  - [1.0, 0.0, 0.0, 0.02]
-  - [0.0, 0.0, 1.0, 0.003]
-  - [0.0, 0.0, 0.0, 1.0]
-  camera_model: pinhole
-  distortion_coeffs: [0.02, -0.01, 0.003, -0.0004]
-  distortion_model: equidistant
-  intrinsics: [300.5, 290.1, 321.2, 239.1]
-  resolution: [640, 480]
-"""
-
 
 def half_a_pixel_on(project):
     """Return a projection whose first pixel has its centre at (0, 0) as simtest counts pixels."""
@@ -245,15 +310,6 @@ def test_kalibr(tmp_path):
 
 
 # Vicalib ----------------------------------------------------------------------------------------------------------
-
-
-def vicalib(kind, params, width=640, height=480, extra=""):
-    return (
-        f'<rig>\n<camera>\n<camera_model name="" index="0" serialno="0" type="{kind}" version="0">\n'
-        f"<width> {width} </width><height> {height} </height>\n<!-- Use RDF matrix -->\n<right> [ 1; 0; 0 ] </right>\n"
-        f"<down> [ 0; 1; 0 ] </down>\n<forward> [ 0; 0; 1 ] </forward>\n{extra}<params> [ {params} ] </params>\n"
-        "</camera_model>\n<pose><T_wc> [ 1, 0, 0, 0; 0, 1, 0, 0; 0, 0, 1, 0 ] </T_wc></pose>\n</camera>\n</rig>\n"
-    )
 
 
 VICALIB = {
@@ -294,12 +350,6 @@ def test_a_calibration_that_folds_over_in_a_corner_takes_a_view_mask(tmp_path):
 
 # Scaramuzza -------------------------------------------------------------------------------------------------------
 
-C3VD = {
-    "width": 1350, "height": 1080, "cx": 678.544839263292, "cy": 542.975887548343, "a0": 769.243600037458, "a1": 0.0,
-    "a2": -0.000812770624150226, "a3": 6.25674244578925e-07, "a4": -1.19662182144280e-09, "c": 0.999986882249990,
-    "d": 0.00288273829525059, "e": -0.00296316513429569,
-}  # fmt: skip
-
 
 def scaramuzza_pixels(told, x, y, z):
     """Return the pixels of directions: the positive root of a4 r^4 + a3 r^3 + a2 r^2 - (z / |xy|) r + a0."""
@@ -330,14 +380,9 @@ def test_c3vd(tmp_path, form):
     np.testing.assert_allclose(camera.unproject([ix + 0.5, iy + 0.5]), ray / np.linalg.norm(ray), atol=1e-14)
 
 
-DIRECT = [-431.7, 0.0, 6.9e-04, 3.7e-07, -2.3e-10]
-
-
-def ocamcalib_text(
-    direct=DIRECT, size="1080 1920", affine="1.000997 0.000342 0.000249", centre="522.593375 949.509793"
-):
+def ocamcalib_text():
     """Return calib_results.txt as the toolbox writes it, with an inverse polynomial fitted as it does."""
-    radius = np.linspace(0.0, 1100.0, 400)
+    direct, radius = [-431.7, 0.0, 6.9e-04, 3.7e-07, -2.3e-10], np.linspace(0.0, 1100.0, 400)
     angle = np.arctan2(np.polynomial.Polynomial(direct)(radius), radius)
     inverse = np.polynomial.Polynomial.fit(angle, radius, 14).convert().coef
     return (
@@ -345,21 +390,20 @@ def ocamcalib_text(
         f"{len(direct)} {' '.join(f'{value:.9e}' for value in direct)} \n\n"
         "#polynomial coefficients for the inverse mapping function (ocam_model.invpol in MATLAB).\n\n"
         f"{len(inverse)} {' '.join(f'{value:.9f}' for value in inverse)} \n\n"
-        f'#center: "row" and "column", starting from 0 (C convention)\n\n{centre}\n\n'
-        f'#affine parameters "c", "d", "e"\n\n{affine}\n\n#image size: "height" and "width"\n\n{size}\n\n'
+        '#center: "row" and "column", starting from 0 (C convention)\n\n522.593375 949.509793\n\n'
+        '#affine parameters "c", "d", "e"\n\n1.000997 0.000342 0.000249\n\n'
+        '#image size: "height" and "width"\n\n1080 1920\n\n'
     )
-
-
-OCAM = ocamcalib_text()
 
 
 def test_ocamcalib(tmp_path):
     """Row before column, z backwards: the direct polynomial is the definition, the inverse one a fit to it."""
-    path = written(tmp_path, "calib_results.txt", OCAM)
+    text = ocamcalib_text()
+    path = written(tmp_path, "calib_results.txt", text)
     assert recognise(path) == "ocamcalib"
     camera = load_camera(path)
     assert (camera.width, camera.height) == (1920, 1080)
-    numbers = [[float(word) for word in line.split()] for line in OCAM.splitlines() if line and line[0] != "#"]
+    numbers = [[float(word) for word in line.split()] for line in text.splitlines() if line and line[0] != "#"]
     ss, inverse, (row_c, column_c), (c, d, e) = numbers[0][1:], numbers[1][1:], numbers[2], numbers[3]
     # cam2world
     row, column = RNG.uniform(0, 1080, 400), RNG.uniform(0, 1920, 400)
@@ -379,26 +423,70 @@ def test_ocamcalib(tmp_path):
     assert np.abs(camera.project(rays) - 0.5 - (there[::-1].T + np.array([column_c, row_c]))).max() < 0.01
 
 
+# MATLAB ----------------------------------------------------------------------------------------------------------
+
+MATLAB = Camera(640, 480, 500.0, 480.0, 320.5, 240.5, 3.0, BrownConrady(-0.3, 0.1, 0.001, -0.002, 0.01))
+
+
+def matlab(tmp_path, data):
+    savemat(tmp_path / "c.mat", data)
+    return load_camera(tmp_path / "c.mat")
+
+
+@pytest.mark.usefixtures("matlab_here")
+def test_matlab_structs(tmp_path):
+    assert matlab(tmp_path, {"s": STRUCT}) == MATLAB
+    assert matlab(tmp_path, {"params": STRUCT, "note": "text", "x": 5.0}) == MATLAB
+    assert matlab(tmp_path, STRUCT) == MATLAB  # save(..., '-struct', 's')
+    newer = {key: value for key, value in STRUCT.items() if key != "IntrinsicMatrix"}
+    newer["K"] = STRUCT["IntrinsicMatrix"].T
+    assert matlab(tmp_path, {"s": newer}) == MATLAB
+    assert (
+        matlab(tmp_path, {"s": {**STRUCT, "FocalLength": [500.0, 480.0], "PrincipalPoint": [321.0, 241.0]}}) == MATLAB
+    )
+    plain = {**STRUCT, "RadialDistortion": np.zeros(2), "TangentialDistortion": np.zeros(2)}
+    assert matlab(tmp_path, {"s": plain}).distortion is None
+    # MATLAB's first pixel is (1, 1): OpenCV's c is 1 less, and half a pixel less than simtest's.
+    point = np.array([[[0.3, -0.2, 2.0]]])
+    K = np.array([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0, 0, 1]])
+    seen, _ = cv2.projectPoints(point, np.zeros(3), np.zeros(3), K, np.array([-0.3, 0.1, 0.001, -0.002, 0.01]))
+    without_skew = matlab(
+        tmp_path, {"s": {**STRUCT, "IntrinsicMatrix": np.array([[500.0, 0, 0], [0, 480, 0], [321, 241, 1]])}}
+    )
+    np.testing.assert_allclose(without_skew.project(point[0, 0]), seen[0, 0] + 0.5, atol=1e-9)
+
+
+@pytest.mark.usefixtures("matlab_here")
 def test_matlabs_fisheye(tmp_path):
-    """MATLAB's first pixel is (1, 1); it names x before y and looks along z."""
-    fields = {
-        "MappingCoefficients": np.array([C3VD[key] for key in ("a0", "a2", "a3", "a4")]),
-        "ImageSize": np.array([1080.0, 1350.0]),
-        "DistortionCenter": np.array([C3VD["cx"] + 1, C3VD["cy"] + 1]),
-        "StretchMatrix": np.array([[C3VD["c"], C3VD["d"]], [C3VD["e"], 1.0]]),
-    }
-    savemat(tmp_path / "c.mat", {"s": fields})
+    savemat(tmp_path / "c.mat", {"s": FISHEYE_STRUCT})
     agrees(load_camera(tmp_path / "c.mat"), half_a_pixel_on(lambda x, y, z: scaramuzza_pixels(C3VD, x, y, z)), WIDE)
-    savemat(tmp_path / "nested.mat", {"params": {"Intrinsics": fields, "EstimateAlignment": 1}})
+    savemat(tmp_path / "nested.mat", {"params": {"Intrinsics": FISHEYE_STRUCT, "EstimateAlignment": 1}})
     assert load_camera(tmp_path / "nested.mat") == load_camera(tmp_path / "c.mat")
     # Written again, the numbers are MATLAB's own.
     save_camera(load_camera(tmp_path / "c.mat"), tmp_path / "again.mat")
     again = loadmat(tmp_path / "again.mat", simplify_cells=True)["camera"]
-    for name, value in fields.items():
+    for name, value in FISHEYE_STRUCT.items():
         np.testing.assert_allclose(again[name], value, rtol=1e-13)
 
 
 # Which format it is -----------------------------------------------------------------------------------------------
+
+
+TOML = """width = 640
+height = 480
+fx = 300.0
+fy = 300.0
+distortion = { type = "kannala_brandt", k1 = 0.01 }
+view_mask = { radius = 200.0 }
+"""
+
+
+def test_own_files(tmp_path):
+    camera = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, 0.0, KannalaBrandt(0.01), ViewMask(320.0, 240.0, 200.0))
+    assert load_camera(written(tmp_path, "c.toml", TOML)) == camera
+    beside = "[vignetting]\nx = 1\n[emission]\ny = 2\n[response]\nz = 3\n"
+    assert load_camera(written(tmp_path, "c.toml", TOML + beside)) == camera
+    assert load_camera(written(tmp_path, "c.toml", "[camera]\n" + TOML + beside)) == camera
 
 
 def test_a_file_is_known_by_what_it_holds(tmp_path):
@@ -417,15 +505,34 @@ def test_a_file_is_known_by_what_it_holds(tmp_path):
     assert load_camera(tmp_path / "a#1.txt") == load_camera(f"{tmp_path / 'a#1.txt'}#1") == CAMERAS["brown"]
 
 
-def test_what_a_format_cannot_hold_is_refused(tmp_path):
-    skewed = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 2.0)
-    for name, kind in (("cameras.txt", "colmap"), ("t.json", "transforms"), ("c.yml", "opencv")):
-        with pytest.raises(InputError, match=r"camera\.skew = 2: must be 0"):
-            save_camera(skewed, tmp_path / name, kind)
-    with pytest.raises(InputError, match="opencv holds no poses; must be one of colmap, transforms"):
-        save_camera(CAMERAS["brown"], tmp_path / "c.yml", "opencv", some_poses())
-    with pytest.raises(InputError, match="must be a name without spaces"):
-        save_camera(CAMERAS["brown"], tmp_path / "cameras.txt", None, [("a b.png", np.eye(4))])
-    with pytest.raises(InputError, match=r"colmap needs a file name that ends in \.txt"):
-        save_camera(CAMERAS["brown"], tmp_path / "c.yml", "colmap")
+SKEWED = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 2.0)
+CUT = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 0.0, None, ViewMask(320, 240, 230, 60.0, 200.0))
+UNSAVED = {
+    "skew for COLMAP": (SKEWED, "cameras.txt", "colmap", "camera.skew = 2: must be 0"),
+    "skew for NeRF": (SKEWED, "t.json", "transforms", "camera.skew = 2: must be 0"),
+    "skew for OpenCV": (SKEWED, "c.yml", None, "camera.skew = 2: must be 0, since OpenCV ignores it"),
+    "skew for ROS": (SKEWED, "c.yml", "ros", "since ROS ignores it"),
+    "cut corners for OpenCV": (CUT, "c.yml", None, "OpenCV and ROS know round views alone"),
+    "OpenCV in .mat": (CAMERAS["brown"], "c.mat", "opencv", "opencv needs a file name that ends in .yml, .yaml, .xml"),
+    "TOML in .yml": (CAMERAS["brown"], "c.yml", "toml", "toml needs a file name that ends in .toml"),
+    "COLMAP in .yml": (CAMERAS["brown"], "c.yml", "colmap", "colmap needs a file name that ends in .txt"),
+    "unknown format": (CAMERAS["brown"], "c.yml", "kalibr", "format = 'kalibr': must be one of toml, opencv, ros"),
+    "no camera": (np.eye(3), "c.yml", None, "camera is a ndarray"),
+    "no folder": (CAMERAS["brown"], "no/c.yml", None, "No such file or directory"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", UNSAVED)
+def test_what_a_format_cannot_hold_is_refused(tmp_path, case):
+    camera, name, kind, fragment = UNSAVED[case]
+    refused(lambda: save_camera(camera, tmp_path / name, kind), fragment)
+    assert not list(tmp_path.iterdir())
+
+
+def test_poses_that_a_format_cannot_hold_are_refused(tmp_path):
+    def save(name, kind, poses):
+        save_camera(CAMERAS["brown"], tmp_path / name, kind, poses)
+
+    refused(lambda: save("c.yml", "opencv", some_poses()), "opencv holds no poses; must be one of colmap, transforms")
+    refused(lambda: save("cameras.txt", None, [("a b.png", np.eye(4))]), "must be a name without spaces")
     assert not list(tmp_path.iterdir())

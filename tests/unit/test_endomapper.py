@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from camera_texts import vicalib
 
 from simtest import load_calibration, save_calibration
 from simtest.calibration import NO_PRIORS
@@ -18,12 +19,12 @@ P_M = np.array([-6.1e-05, -0.001135, -0.003612])
 D = np.array([0.11, -0.04, 0.0])
 D[2] = np.sqrt(1 - D @ D)
 
-GEOMETRY = """<rig><camera><camera_model name="" index="0" serialno="0" type="calibu_fu_fv_u0_v0_kb4" version="0">
-<width> 288 </width><height> 216 </height><right> [ 1; 0; 0 ] </right><down> [ 0; 1; 0 ] </down>
-<forward> [ 0; 0; 1 ] </forward>
-<params> [ 143.5; 143.6; 146.9; 110.4; -0.1396589; -0.0003139987; 0.001505504; -0.0001316715 ] </params>
-</camera_model></camera></rig>
-"""
+GEOMETRY = vicalib(
+    "calibu_fu_fv_u0_v0_kb4",
+    "143.5; 143.6; 146.9; 110.4; -0.1396589; -0.0003139987; 0.001505504; -0.0001316715",
+    288,
+    216,
+)
 PHOTOMETRY = f"""<rig>
     <camera>
         <camera_model index="0" name="" serialno="0" type="gamma" version="1.0">

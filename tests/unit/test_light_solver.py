@@ -171,6 +171,29 @@ def test_radius_error_is_in_the_interval() -> None:
         np.testing.assert_allclose(added, 0.02**2 * np.outer(one.position_mm, one.position_mm), atol=1e-12)
 
 
+def test_residuals_that_are_too_large_widen_the_covariance() -> None:
+    mirrors = balls()
+    highlights, _ = seen(mirrors, LIGHTS)
+    told = replace(highlights, covariance=highlights.covariance / 4)
+    found = find_lights(CAMERA, mirrors, told)
+    assert found is not None
+    result = judge(CAMERA, mirrors, told, found, 0.0, np.zeros((6, 6)))
+    inflation = result.chi2 / result.freedom
+    assert inflation > 1.2
+    for i, light in enumerate(found.bundle.lights):
+        own = min(result.lights, key=lambda each: float(np.linalg.norm(each.position_mm - light)))
+        np.testing.assert_allclose(own.covariance_mm2, inflation * found.bundle.covariance_of(i), rtol=1e-9)
+
+
+def test_a_standard_deviation_of_a_plates_distance_moves_it_by_its_factor() -> None:
+    told = plates()
+    moved = replace(told, offsets=told.offsets + told.factors[:, 2, 2])
+    view, lights = np.arange(8), np.tile(LIGHTS[0], (8, 1))
+    pixels = moved.predict(CAMERA, view, lights, np.zeros((8, 3)))
+    deviations = np.tile([0.0, 0.0, 1.0], (8, 1))
+    np.testing.assert_allclose(told.predict(CAMERA, view, lights, deviations), pixels, atol=1e-9)
+
+
 def test_light_that_moves_between_pictures_is_told() -> None:
     mirrors = balls()
     shifts = np.random.default_rng(8).normal(0, 0.4, (len(mirrors), 1, 3))

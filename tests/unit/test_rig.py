@@ -1,6 +1,7 @@
-"""Rigs: emission against closed forms and Mitsuba's own integrators, presets, position errors, refused values."""
+"""Lights: emission and sources of finite size against closed forms and Mitsuba's integrators, presets, positions."""
 
 import json
+import math
 import subprocess
 import sys
 
@@ -9,14 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import simtest
 from simtest.errors import InputError
 from simtest.rendering import Session
 from simtest.runtime.seeds import Stage, integer
 from simtest.spec import LightSpec, scene_from_dict
-from simtest.spec.lights import AT_CAMERA_MM, PRESETS, Rig
+from simtest.spec.lights import AT_CAMERA_MM, PRESETS, CrescentSource, Rig
 from simtest.spec.recipes import Experiment
 from simtest.spec.toml_files import apply_settings
 from simtest.validation.cases import expand
+from tests.refusals import refused
 
 render = pytest.mark.render
 
@@ -25,6 +28,11 @@ CAMERA = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL}
 MATT = {"type": "phong", "specular": 0.0, "diffuse": 0.5}
 COSINE = {"type": "cosine", "power": 4.0}
 TABLE = {"type": "table", "angle_deg": [0, 10, 35, 60], "value": [1.0, 0.9, 0.4, 0.1]}
+LAMBERTIAN = {"type": "cosine", "power": 1.0}
+DISC = {"type": "disc", "radius_mm": 2.0}
+RING = {"type": "ring", "radius_mm": 3.0, "inner_mm": 2.0}
+CRESCENT = {"type": "crescent", "radius_mm": 3.0, "cut_radius_mm": 2.0, "cut_offset_mm": 2.0, "azimuth_deg": 40.0}
+SOURCES = {"disc": DISC, "ring": RING, "crescent": CRESCENT}
 
 
 def scene(lights=({},), surface=None, reflectance=None, rig=None, **render):
@@ -58,7 +66,6 @@ def matt(light, factor):
 
 EMISSIONS = {
     "cosine": ({"profile": COSINE}, lambda a: np.maximum(np.cos(a), 0) ** 4),
-    "cosine, steep": ({"profile": {"type": "cosine", "power": 60.0}}, lambda a: np.maximum(np.cos(a), 0) ** 60),
     "table": ({"profile": TABLE}, lambda a: np.interp(np.degrees(a), TABLE["angle_deg"], TABLE["value"])),
     "soft spot": (
         {"spot_deg": 60.0, "soft_edge_deg": 12.0}, lambda a: np.clip((30 - np.degrees(a)) / 12, 0, 1)
@@ -88,8 +95,7 @@ def test_radiance_of_a_plane_follows_the_emission(session, name, place):
 
 
 @render
-@pytest.mark.parametrize("power", [100.0, 1000.0])
-@pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [0.2, 0.1, 1.0]], ids=["along", "aslant"])
+@pytest.mark.parametrize(("power", "direction"), [(100.0, [0.0, 0.0, 1.0]), (1000.0, [0.2, 0.1, 1.0])])
 def test_a_narrow_emission_keeps_its_digits(session, power, direction):
     """Down to 1e-3 of the peak; by the power of a dot product the error would be up to 4e-5."""
     light = {"profile": {"type": "cosine", "power": power}, "direction": direction}
@@ -110,21 +116,6 @@ def test_a_hard_spot_ends_at_its_rim(session):
     assert (total[angle > 25.01] == 0).all()
     isotropic = matt({}, lambda a: 1.0)
     np.testing.assert_allclose(total[angle < 24.99], isotropic[angle < 24.99], rtol=1e-4)
-
-
-@render
-def test_lights_add_up(session):
-    lights = [
-        {"offset_mm": 2.0, "profile": COSINE},
-        {"position_mm": [-1.0, 1.0, 0.5], "spot_deg": 90.0},
-        {"power": 0.2},
-    ]
-    alone = []
-    for light in lights:
-        session.update(scene([light]))
-        alone.append(session.radiance().total.astype(float))
-    session.update(scene(lights))
-    np.testing.assert_allclose(session.radiance().total, sum(alone), rtol=1e-5, atol=1e-9)
 
 
 @render
@@ -204,6 +195,179 @@ def test_bounces_are_those_of_mitsubas_path_integrator(session):
     theirs = mitsuba_mean(session, path, range(100, 106), 32)
     error = np.hypot(np.std(ours, ddof=1), np.std(theirs, ddof=1)) / np.sqrt(6)
     assert abs(np.mean(ours) - theirs.mean()) < 3 * error < 0.03 * theirs.mean()
+
+
+# Sources of finite size ----------------------------------------------------------------------------------------------
+
+CUTS = [(3, 2, 1.5), (3, 2, 0.5), (2, 5, 4.5), (3, 1, 3.5), (3, 0.5, 0)]
+
+
+def inside(source, points):
+    """Which points of the source's plane belong to it, by the words of the manual."""
+    radius = np.hypot(*points.T)
+    kept = radius <= source["radius_mm"]
+    if source["type"] == "ring":
+        return kept & (radius >= source["inner_mm"])
+    if source["type"] == "crescent":
+        angle = math.radians(source.get("azimuth_deg", 0.0))
+        cut = source["cut_offset_mm"] * np.array([math.cos(angle), math.sin(angle)])
+        return kept & (np.hypot(*(points - cut).T) >= source["cut_radius_mm"])
+    return kept
+
+
+def lattice(source, step):
+    """Points of a square lattice that lie in the source."""
+    ticks = np.arange(-source["radius_mm"] + step / 2, source["radius_mm"], step)
+    points = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+    return points[inside(source, points)]
+
+
+@pytest.mark.parametrize("cut", CUTS, ids=str)
+def test_area_and_centroid_of_a_crescent_are_those_of_a_lattice(cut):
+    values = dict(zip(("radius_mm", "cut_radius_mm", "cut_offset_mm"), cut, strict=True))
+    values |= {"type": "crescent", "azimuth_deg": 200.0}
+    source, points = CrescentSource.model_validate(values), lattice(values, 0.005)
+    assert source.area_mm2 == pytest.approx(len(points) * 0.005**2, rel=3e-3)
+    np.testing.assert_allclose(source.centroid_mm, points.mean(axis=0), atol=3e-3)
+
+
+@pytest.mark.parametrize("direction", [(0.3, 0.2, 1), (0, 0, -1), (0.1, 0.2, -1)], ids=str)
+def test_the_sources_plane_is_across_its_direction(direction):
+    light = LightSpec(direction=direction)
+    frame = np.vstack([light.across, light.axis])
+    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(frame) == pytest.approx(1)
+
+
+def test_the_place_that_estimators_know_is_the_centroid():
+    for source in (None, DISC, RING):
+        assert LightSpec(position_mm=(1, 2, 3), source=source).nominal_mm == (1, 2, 3)
+    centroid = lattice(CRESCENT, 0.005).mean(axis=0)
+    light = LightSpec(position_mm=(1, 2, 3), source=CRESCENT)
+    np.testing.assert_allclose(light.nominal_mm, [1 + centroid[0], 2 + centroid[1], 3], atol=3e-3)
+
+
+def from_lambertian_disc(radius, place):
+    """Radiance of a matt plane, albedo 1/2, under a Lambertian disc of power 1 parallel to it: its view factor."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    x, y = (u - WIDTH / 2) / FOCAL * D - place[0], (v - HEIGHT / 2) / FOCAL * D - place[1]
+    aside, depth = x**2 + y**2, (D - place[2]) ** 2
+    root = np.sqrt((aside + depth + radius**2) ** 2 - 4 * aside * radius**2)
+    irradiance = (1 - (aside + depth - radius**2) / root) / (2 * radius**2)
+    return 0.5 / np.pi * irradiance
+
+
+@render
+@pytest.mark.parametrize("samples", [1, 16])
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (2.0, -1.0, 1.0)], ids=str)
+def test_a_lambertian_disc_lights_a_plane_as_its_view_factor_says(session, samples, place):
+    light = {"position_mm": place, "profile": LAMBERTIAN}
+    session.update(scene([{**light, "source": {"type": "disc", "radius_mm": 3.0}}], samples_per_pixel=samples))
+    expected = from_lambertian_disc(3.0, place)
+    total = session.radiance().total
+    assert np.abs(total / expected - 1).max() < (5e-3 if samples == 1 else 0.02)
+    assert total.mean() == pytest.approx(expected.mean(), rel=5e-4)
+    # A point of the same power does not.
+    session.update(scene([light], samples_per_pixel=samples))
+    assert np.abs(session.radiance().total / expected - 1).max() > 0.08
+
+
+ASKEW = {"position_mm": [1.0, -0.5, -0.5], "direction": [0.2, -0.3, 1.0], "profile": {"type": "cosine", "power": 2.0}}
+SHINY = {"type": "phong", "exponent": 60.0, "diffuse": 0.3}
+
+
+def sum_of_points(session, light, source, step, surface, reflectance, **render):
+    """Radiance of point lights at the centroids of the source's parts in square cells, by area; 32 a frame."""
+    fine = lattice(source, 0.02)
+    _, cells, count = np.unique(np.floor(fine / step), axis=0, return_inverse=True, return_counts=True)
+    centroids = np.stack([np.bincount(cells.ravel(), axis) / count for axis in fine.T], axis=1)
+    points = centroids @ LightSpec.model_validate(light).across + np.array(light["position_mm"])
+    lights = [
+        {**light, "position_mm": place.tolist(), "power": share}
+        for place, share in zip(points, count / len(fine), strict=True)
+    ]
+    total = 0.0
+    for first in range(0, len(lights), 32):
+        some = lights[first : first + 32]
+        session.update(scene(some, surface, reflectance, **render))
+        total = total + session.radiance().total.astype(float)
+    return total
+
+
+@render
+@pytest.mark.parametrize("name", SOURCES)
+def test_a_source_is_the_sum_of_point_lights_over_its_area(session, name):
+    """On a tilted glossy plane, the source askew; the centroid's point light differs by much more."""
+    surface = {"type": "plane", "tilt_deg": 15.0}
+    expected = sum_of_points(session, ASKEW, SOURCES[name], 0.3, surface, SHINY)
+    peak = expected.max()
+    for samples, bound in ((1, 0.03), (16, 0.08)):
+        session.update(scene([{**ASKEW, "source": SOURCES[name]}], surface, SHINY, samples_per_pixel=samples))
+        total = session.radiance().total
+        assert np.abs(total - expected).max() < bound * peak
+        assert total.mean() == pytest.approx(expected.mean(), rel=4e-3)
+    place = LightSpec.model_validate({**ASKEW, "source": SOURCES[name]}).nominal_mm
+    session.update(scene([{**ASKEW, "position_mm": place}], surface, SHINY))
+    assert np.abs(session.radiance().total - expected).max() > 0.4 * peak
+
+
+@pytest.mark.slow
+@render
+def test_penumbrae_are_those_of_many_point_lights(session):
+    """Behind a fold that hides parts of the source from 6 % of the frame, where the point light's shadow is hard."""
+    surface = {"type": "anatomy", "path": "colon", "viewpoint": 1}
+    light = {"position_mm": [0.0, -6.0, 8.0]}
+    session.update(scene([light], surface))
+    hard = session.radiance().total
+    expected = sum_of_points(session, light, DISC, 0.35, surface, MATT)
+    session.update(scene([{**light, "source": DISC}], surface))
+    fixed = session.radiance().total
+    drawn = 0.0
+    for seed in range(2):
+        session.update(scene([{**light, "source": DISC}], surface, samples_per_pixel=32, seed=seed))
+        drawn = drawn + session.radiance().total.astype(float) / 2
+    partial = (hard == 0) & (expected > 0)
+    assert partial.mean() > 0.03
+    for total in (fixed, drawn):
+        assert total[partial].mean() == pytest.approx(expected[partial].mean(), rel=0.03)
+        assert np.abs(total - expected)[partial].mean() < 0.15 * expected[partial].mean()
+        assert total.mean() == pytest.approx(expected.mean(), rel=4e-3)
+    # What no point of the source sees stays dark.
+    umbra = expected == 0
+    assert umbra.mean() > 0.05
+    assert fixed[umbra].mean() < 1e-3 * expected.mean()
+
+
+@render
+def test_frames_are_the_same_for_the_same_seed_and_other_numbers_compile_nothing(session):
+    def at(radius, seed, **own):
+        light = {"position_mm": [1.0, 0.0, 0.0], "source": {"type": "disc", "radius_mm": radius}, **own}
+        session.update(scene([light], reflectance=SHINY, samples_per_pixel=4, seed=seed))
+        return session.radiance().total
+
+    first = at(2.0, 1)
+    built = session.rebuilds
+    np.testing.assert_array_equal(at(2.0, 1), first)
+    assert not np.array_equal(at(2.0, 2), first)
+    assert not np.array_equal(at(1.0, 1), first)
+    assert session.rebuilds == built
+    at(2.0, 1, source=CRESCENT)
+    assert session.rebuilds == built + 1
+
+
+@render
+def test_bounces_carry_the_power_of_a_point_light(session):
+    """In a closed sphere, where most of the light goes around."""
+    surface = {"type": "sphere", "radius_mm": 12.0, "side": "inside"}
+    matt = {"type": "phong", "specular": 0.0, "diffuse": 0.6}
+    light, means = {"position_mm": [2.0, 0.0, 0.0], "profile": LAMBERTIAN}, {}
+    own_of = {"point": {}, "half": {"power": 0.5}, "disc": {"source": DISC}, "crescent": {"source": CRESCENT}}
+    for name, own in own_of.items():
+        session.update(scene([{**light, **own}], surface, matt, samples_per_pixel=16, path_depth=4))
+        means[name] = session.radiance().indirect.mean(dtype=float)
+    assert means["disc"] == pytest.approx(means["point"], rel=0.02)
+    assert means["crescent"] == pytest.approx(means["point"], rel=0.02)
+    assert means["half"] < 0.6 * means["point"]
 
 
 # True highlights -----------------------------------------------------------------------------------------------------
@@ -301,13 +465,14 @@ def test_presets_stand_on_a_ring_and_share_the_power(preset, count):
 )
 def test_a_presets_numbers_can_be_overridden_and_read_back(count, radius, azimuth, axial, power):
     rig = {"preset": "laparoscope", "count": count, "radius_mm": radius, "azimuth_deg": azimuth, "axial_mm": axial}
-    described = scene(rig={**rig, "power": power, "each": {"spot_deg": 120.0, "profile": TABLE}})
+    described = scene(rig={**rig, "power": power, "each": {"spot_deg": 120.0, "profile": TABLE, "source": DISC}})
     places = described.rig.nominal_mm()
     first = np.radians(azimuth)
     np.testing.assert_allclose(places[0], [radius * np.cos(first), radius * np.sin(first), axial], atol=1e-9)
     gaps = np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1)
     np.testing.assert_allclose(gaps, 2 * radius * np.sin(np.pi / count), rtol=1e-9)
     assert all(light.spot_deg == 120 and light.power == pytest.approx(power / count) for light in described.rig.lights)
+    assert {light.source.radius_mm for light in described.rig.lights} == {2.0}
     assert scene_from_dict(json.loads(described.model_dump_json())) == described
 
 
@@ -328,33 +493,7 @@ def test_a_direction_of_any_length_is_an_axis(size):
     np.testing.assert_array_equal(LightSpec(direction=(size, 0, 0)).axis, [1, 0, 0])
 
 
-# Refused -------------------------------------------------------------------------------------------------------------
-
-REFUSED = {
-    "no lights": ({"lights": []}, "rig.lights = []: must have at least 1 item"),
-    "unknown preset": ({"preset": "torch"}, "rig.preset = 'torch': must be 'colocated', 'laparoscope'"),
-    "preset and lights": ({"preset": "colocated", "lights": [{}]}, "preset and lights exclude each other"),
-    "count alone": ({"count": 3}, "rig: count: belongs to a preset"),
-    "all in one place": ({"preset": "colocated", "count": 3}, "count = 3: with radius_mm = 0"),
-    "wide spot": ({"lights": [{"spot_deg": 200.0}]}, "rig.lights.0: spot_deg = 200: must be at most 180"),
-    "spot 0": ({"lights": [{"spot_deg": 0.0}]}, "rig.lights.0.spot_deg = 0.0: must be greater than 0"),
-    "edge": ({"lights": [{"spot_deg": 50, "soft_edge_deg": 30}]}, "soft_edge_deg = 30: must be at most half of spot"),
-    "edge alone": ({"lights": [{"soft_edge_deg": 3}]}, "soft_edge_deg = 3: needs spot_deg"),
-    "no direction": ({"lights": [{"direction": [0, 0, 0]}]}, "direction = [0.0, 0.0, 0.0]: must have a length"),
-    "black": ({"lights": [{"colour": [0, 0, 0]}]}, "colour = [0.0, 0.0, 0.0]: one of the channels must be positive"),
-    "negative error": ({"lights": [{"position_error_mm": -1}]}, "position_error_mm = -1: must be greater than"),
-    "each of lights": ({"each": {"spot_deg": 200}, "preset": "laparoscope"}, "rig.each: spot_deg = 200"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_bad_rigs_are_refused_in_one_line(name):
-    rig, message = REFUSED[name]
-    with pytest.raises(InputError) as error:
-        scene(rig=rig)
-    assert message in str(error.value)
-    assert str(error.value).isprintable()
-
+# Tissue --------------------------------------------------------------------------------------------------------------
 
 SOLIDS = {
     "plane": {"type": "plane"},
@@ -407,6 +546,55 @@ def test_a_frame_that_no_light_reaches_is_dark(session):
         for part in (frame.radiance.specular, frame.radiance.diffuse, frame.radiance.indirect):
             np.testing.assert_array_equal(part, 0)
         assert not any(h.lit for h in session.highlights(frame.radiance))
+
+
+TOUCHING = {
+    "disc in a plane": ({"type": "plane"}, {"position_mm": [0, 0, 9.5], "direction": [1, 0, 0], "source": DISC}),
+    "rim of a tilted disc": ({"type": "plane"}, {"position_mm": [0, 0, 9], "direction": [1, 0, 1], "source": DISC}),
+    "polyp through a ring": (
+        {"type": "sphere", "radius_mm": 1.0, "distance_mm": 5.0}, {"position_mm": [0, 0, 6.0], "source": RING}
+    ),
+    "disc through the wall of a tube": (
+        {"type": "cylinder", "radius_mm": 12.0, "side": "inside"},
+        {"position_mm": [0, 1.0, 9], "direction": [1, 0, 0], "source": DISC},
+    ),
+}  # fmt: skip
+
+
+@render
+@pytest.mark.parametrize("name", TOUCHING)
+def test_sources_that_touch_tissue_are_refused(session, name):
+    surface, light = TOUCHING[name]
+    refused(
+        lambda: session.update(scene([light], surface)), "rig.lights.0.source: its ", "touches the ", "clearance is"
+    )
+
+
+@render
+def test_a_source_in_free_space_next_to_tissue_is_taken(session):
+    session.update(scene([{"position_mm": [0, 0, 9.9], "source": DISC}]))
+    session.update(scene([{"position_mm": [0, 0, 7.9], "direction": [1, 0, 0], "source": DISC}]))
+
+
+# Export --------------------------------------------------------------------------------------------------------------
+
+EXPORT = {
+    "ring": ({"source": RING, "profile": LAMBERTIAN}, "rig.lights.0.source.type = 'ring': cannot be exported"),
+    "crescent": ({"source": CRESCENT, "profile": LAMBERTIAN}, "rig.lights.0.source.type = 'crescent': cannot be"),
+    "not Lambertian": ({"source": DISC}, "rig.lights.0.profile = 0.0: cannot be exported; Mitsuba's area light is"),
+    "spot": ({"source": DISC, "profile": LAMBERTIAN, "spot_deg": 90.0}, "rig.lights.0.spot_deg = 90.0: cannot be"),
+    "in sight": (
+        {"source": DISC, "profile": LAMBERTIAN, "direction": [1, 0, 1]},
+        "must nowhere lie in front of the camera",
+    ),
+}
+
+
+@render
+@pytest.mark.parametrize("name", EXPORT)
+def test_sources_that_mitsuba_lacks_are_not_exported(tmp_path, name):
+    light, message = EXPORT[name]
+    refused(lambda: simtest.export(scene([light]), tmp_path), message)
 
 
 # Colour --------------------------------------------------------------------------------------------------------------
