@@ -153,6 +153,23 @@ def test_a_name_comes_from_the_module_that_is_stated(tmp_path, monkeypatch):
         package.Ratio  # noqa: B018
 
 
+HEAVY = {"mitsuba", "drjit", "vtk", "vtkmodules", "torch", "pyvista", "polars", "matplotlib", "vl_convert"}
+
+
+@pytest.mark.parametrize("line", ["--help", "render --help", "schema scene"])
+def test_light_commands_load_nothing_heavy(line):
+    assert not HEAVY & loaded(f"import sys\nsys.argv = ['simtest', *{line.split()!r}]\n{COMMAND}")
+
+
+def test_names_and_descriptions_load_no_library():
+    libraries = HEAVY | {"numpy", "scipy", "pydantic", "cv2"}
+    assert not libraries & loaded(
+        "import simtest\ndir(simtest), simtest.__version__, simtest.InputError, simtest.Failure"
+    )
+    described = "from simtest.cli.scenes import names_of\nassert 'inverse_rendering' in names_of('estimators')"
+    assert not {"numpy", "scipy", "mitsuba", "cv2"} & loaded(described)
+
+
 def test_a_name_loads_its_own_module_alone():
     modules = loaded("from simtest.geometry import Camera, Array\nfrom simtest.calibration import Response")
     assert "simtest.geometry.camera" in modules
