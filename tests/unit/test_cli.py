@@ -179,6 +179,8 @@ def test_an_unexpected_error_gives_one_line(here, monkeypatch):
 
 
 # Schemas ---------------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
     ("of", "keys"),
     [
@@ -293,14 +295,6 @@ def test_a_scene_out_of_sight(here):
 
 
 @pytest.mark.render
-def test_the_smallest_camera_renders(tmp_path):
-    done = child(
-        "render", "plane", "--set", "camera.width=1", "--set", "camera.height=1", "--out", "x", folder=tmp_path
-    )
-    assert done.returncode == 0
-
-
-@pytest.mark.render
 def test_an_unknown_variant_exits_2(here):
     code, output, errors = here("render", "plane", *SET_SMALL, "--out", "x", "--variant", "scalar_mono")
     assert (code, output, len(errors)) == (2, "", 1)
@@ -324,6 +318,8 @@ def test_a_stopped_render_writes_nothing(here, monkeypatch, tmp_path):
 
 
 # Validation ------------------------------------------------------------------------------------------------------
+
+
 def test_validate_refuses_what_it_has_not_made(here, tmp_path):
     other = tmp_path / "other"
     other.mkdir()
@@ -415,6 +411,8 @@ def ordinary(monkeypatch):
 
 
 # Lists and completion --------------------------------------------------------------------------------------------
+
+
 def test_the_list_names_what_commands_take(here):
     code, output, errors = here("list", "--json")
     assert (code, errors) == (0, [])
@@ -503,6 +501,8 @@ def test_names_and_files_are_completed(tmp_path, monkeypatch):
 
 
 # Did you mean ----------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
     ("line", "meant"),
     [
@@ -534,6 +534,8 @@ def test_nothing_is_guessed_where_nothing_is_close():
 
 
 # Settings --------------------------------------------------------------------------------------------------------
+
+
 def test_settings_are_gathered_for_the_parser():
     given = ["render", "plane", "--set", "a=1", "--out", "x", "--set", "b=2", "--set", "--quiet", "--", "--set", "c=3"]
     gathered = ["render", "plane", "--set", "a=1\0b=2", "--out", "x", "--set", "--quiet", "--", "--set", "c=3"]
@@ -553,6 +555,8 @@ def test_thousands_of_settings_take_linear_time(here):
 
 
 # JSON ------------------------------------------------------------------------------------------------------------
+
+
 def test_doctor_prints_one_document(here, monkeypatch):
     report = BackendReport("llvm_ad_mono", None, [], {"mitsuba": "3"}, "broken")
     monkeypatch.setattr(backend, "examine", lambda _: report)
@@ -606,6 +610,8 @@ def test_a_command_that_is_gone_says_what_takes_its_place(here):
 
 
 # How much is said ------------------------------------------------------------------------------------------------
+
+
 def test_flags_stand_anywhere_but_behind_two_dashes():
     assert front.take_flags(["--quiet", "render", "x", "--traceback"]) == (["render", "x"], True)
     assert (front.MANNERS.quiet, front.MANNERS.verbose) == (True, False)

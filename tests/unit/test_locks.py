@@ -32,6 +32,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked wit
 MAIN = "from simtest.cli.main import main; main()"
 
 
+def no_room(*_, **__):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 def entered(context):
     with context:
         pass
@@ -219,11 +223,8 @@ def test_a_second_run_is_refused_and_sigterm_ends_the_first(tmp_path):
 
 
 def test_a_disk_that_is_full_is_named_with_file_and_room(tmp_path):
-    def full(_):
-        raise OSError(28, "No space left on device")
-
     with pytest.raises(OSError, match="No space left") as error:
-        write_atomically(tmp_path / "results.parquet", full)
+        write_atomically(tmp_path / "results.parquet", no_room)
     said = explain(error.value)
     assert said.startswith(f"{tmp_path / 'results.parquet'}: No space left on device; ")
     assert f"MB are free on the disk of {tmp_path}" in said
@@ -300,22 +301,14 @@ def run_here(tmp_path, here):
     return lambda *arguments: here(*arguments)[::2]
 
 
-@pytest.mark.parametrize("name", FOLDERS)
-def test_each_command_is_refused_a_folder_in_use(tmp_path, run_here, name):
-    with exclusive_folder(tmp_path / "held"):
-        code, lines = run_here(*FOLDERS[name])
-    option = "--bank" if "bank" in name else "--out"
+@pytest.mark.parametrize("name", [*FOLDERS, *FILES])
+def test_each_command_is_refused_what_is_in_use(tmp_path, run_here, name):
+    words = (FOLDERS | FILES)[name]
+    held = {"nightly": "quick", "fit's bank": "held"}.get(name, words[-1])
+    with (exclusive_folder if name in FOLDERS else exclusive_file)(tmp_path / held):
+        code, lines = run_here(*words)
     assert (code, len(lines)) == (2, 1)
-    assert lines[0].startswith(f"simtest: {option} held: is in use by process {os.getpid()} (")
-    assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_each_command_is_refused_a_file_in_use(tmp_path, run_here, name):
-    held = "quick" if name == "nightly" else FILES[name][-1]
-    with exclusive_file(tmp_path / held):
-        code, lines = run_here(*FILES[name])
-    assert (code, len(lines)) == (2, 1)
+    assert name not in FOLDERS or lines[0].startswith(f"simtest: {'--bank' if 'bank' in name else '--out'} held: ")
     assert f" {held}: is in use by process {os.getpid()} (" in lines[0]
     assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
 
@@ -375,20 +368,14 @@ def test_errors_of_files_elsewhere_do_not_blame_the_folder(tmp_path, monkeypatch
 
 @pytest.mark.filterwarnings("ignore:no calibration")
 def test_a_full_disk_is_exit_1(tmp_path, run_here, monkeypatch):
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("simtest.reconstruction.outputs.write_json", full)
+    monkeypatch.setattr("simtest.reconstruction.outputs.write_json", no_room)
     code, lines = run_here("reconstruct", "a.png", "--fov", "60", "--out", "out")
     assert code == 1
     assert lines[-1] == "simtest: No space left on device"
 
 
 def test_a_full_disk_during_a_run_says_what_is_kept(tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(runner, "run_experiment", full)
+    monkeypatch.setattr(runner, "run_experiment", no_room)
     with pytest.raises(SimtestError) as error:
         simtest.validate("overview", tmp_path / "out")
     assert str(error.value).startswith(f"{tmp_path / 'out'}: No space left on device; ")

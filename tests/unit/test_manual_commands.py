@@ -35,9 +35,7 @@ def test_no_command_of_the_manual_is_stale():
 @pytest.mark.parametrize(
     ("code", "part"),
     [
-        ("simtest render cylinder --out frame --colour red", "--colour"),
         ("simtest render cylindre --out frame", "cylindre"),
-        ("simtest render cylinder --set surface.radius=5 --out frame", "radius"),
         ("simtest dataset tiny --set smaples=3 --out data", "smaples"),
         ("simtest nightly --profile slow", "slow"),
         ("python -m studies.nothing", "studies.nothing"),
@@ -58,7 +56,6 @@ def test_stale_commands_are_found(tmp_path, code, part):
         "simtest render cylinder --set surface.radius_mm=5 --out frame   # a comment",
         "OMP_NUM_THREADS=1 simtest validate curvature --realisations 5 --quiet > log.txt 2>&1",
         "simtest validate anatomy --set surface.path=my_colon.ply",
-        "simtest reconstruct frame.png --camera camera.toml --out normals",
         "make demo",
         "python -m benchmarks dataset",
         "ls frame",
@@ -73,7 +70,6 @@ def test_sound_commands_are_no_faults(tmp_path, code):
     ("language", "code", "part"),
     [
         ("python", "import simtest\nsimtest.rendre('cylinder')", "simtest.rendre"),
-        ("python", "from simtest.dataset import reed", "reed"),
         ("python", "print(", "Python"),
         ("toml", "a = ", "TOML"),
     ],
@@ -166,8 +162,6 @@ def shown(text, *pieces, last_digits=False):
     ("output", "printed"),
     [
         (shown("a\nb"), "a  \n\nb\n"),
-        (shown("...\nb"), "a\nb\n"),
-        (shown("a\n..."), "a\nb\nc\n"),
         (shown("a\n...\nd\n..."), "a\nb\nc\nd\n"),
         (shown("a\n...\nb\n...\nb"), "a\nb\nb\n"),
         (shown("a"), "\x1b[1ma\x1b[0m\n"),
@@ -185,14 +179,11 @@ def test_an_output_as_shown(output, printed):
     ("output", "printed", "part"),
     [
         (shown("a"), "a\nb\n", "+b"),
-        (shown("b"), "a\nb\n", "+a"),
         (shown("a\nb\n..."), "a\n", "-b"),
         (shown("a\n...\nb"), "b\na\n", "-..."),
-        (shown("a b"), "a  b\n", "+a  b"),
         (shown("0.076 deg"), "0.077 deg", "+0.077"),
         (shown("0.076 deg", last_digits=True), "0.078 deg", "+0.078"),
         (shown("0.076 deg", last_digits=True), "0.0765 deg", "+0.0765"),
-        (shown("0.076 deg", last_digits=True), "0.076 rad", "+0.076 rad"),
         (shown("12 found", last_digits=True), "13 found", "+13"),
         (shown("version 3.9.1", "3.9.2"), "version 3.9.2", "'3.9.2' does not stand"),
     ],

@@ -50,6 +50,8 @@ def shell(line, folder=None):
 
 
 # Signals ---------------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(("number", "came"), [("SIGTERM", True), ("SIGINT", False)])
 def test_a_stop_within_an_import_waits_for_its_end(tmp_path, number, came):
     (tmp_path / "broken_off.py").write_text(
@@ -91,6 +93,8 @@ def test_a_stop_while_the_command_is_loaded_is_one_line():
 
 
 # The output ------------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("command", [pytest.param("schema scene", marks=pytest.mark.ci), "list"])
 def test_a_reader_that_has_gone_is_no_error(command):
     done = shell(f"$SIMTEST {command} | true; echo ${{PIPESTATUS[0]}}")
@@ -121,6 +125,8 @@ def test_an_output_that_is_full_is_told(command):
 
 
 # Folders and disks -----------------------------------------------------------------------------------------------
+
+
 def test_a_link_that_leads_nowhere_is_told(tmp_path):
     out = tmp_path / "out"
     out.symlink_to(tmp_path / "nothing")
