@@ -6,6 +6,8 @@ python -m studies.nightly_pictures reports/nightly/full/index.html docs/images
 import os
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from PIL import Image
@@ -13,6 +15,18 @@ from playwright.sync_api import Browser, sync_playwright
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 COLOURS = 128
+
+
+@contextmanager
+def opened() -> Iterator[Browser]:
+    """Open the system's browser."""
+    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if found is None:
+        sys.exit(f"no browser: install one of {', '.join(BROWSERS)}")
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=found, args=["--no-sandbox"] if os.geteuid() == 0 else [])
+        yield browser
+        browser.close()
 
 
 def picture(browser: Browser, page: Path, out: Path, section: str | None, **context: object) -> None:
@@ -33,17 +47,12 @@ def picture(browser: Browser, page: Path, out: Path, section: str | None, **cont
 
 def main(page: Path, folder: Path) -> None:
     """Take the pictures."""
-    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if found is None:
-        sys.exit(f"no browser: install one of {', '.join(BROWSERS)}")
-    with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=found, args=["--no-sandbox"] if os.geteuid() == 0 else [])
-        desktop = {"viewport": {"width": 1100, "height": 1000}}
-        phone = {"viewport": {"width": 390, "height": 844}, "color_scheme": "dark", "device_scale_factor": 2}
+    desktop = {"viewport": {"width": 1100, "height": 1000}}
+    phone = {"viewport": {"width": 390, "height": 844}, "color_scheme": "dark", "device_scale_factor": 2}
+    with opened() as browser:
         picture(browser, page, folder / "nightly.png", None, **desktop)
         picture(browser, page, folder / "nightly_phone.png", None, **phone)
         picture(browser, page, folder / "nightly_trends.png", "#trends", **desktop)
-        browser.close()
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ from simtest.simulation.frame import RenderedView
 from simtest.simulation.highlights import CloudRegions
 from simtest.spec.recipes import load_dataset
 from simtest.validation.scoring import mahalanobis2, match_cloud
-from studies.twins import SCOPES, _rendered, told
+from studies.tissue_views import ORGANS, in_8_bits, rendered, told
 
 SEED = 9642
 """Of the frames; nothing was tuned on them."""
@@ -52,9 +52,6 @@ FRAMES = 36
 
 PLANNED = 120
 """Frames of the plan whose first ones `clouds_alone` judges, so that a longer run goes on where a shorter one ended."""
-
-ORGANS = ("colon", "stomach", "liver", "gallbladder")
-"""Families of the recipe."""
 
 SLOPES_DEG = (2.0, 8.0)
 
@@ -109,7 +106,7 @@ def main(arguments: Sequence[str]) -> int:
     judge, tell = (base_rows, report_base) if "--base" in modes else (_rows, report)
     plan, rows = OneLight(seed, frames), list[Row]()
     for number in range(frames):
-        made = _rendered(plan, number)
+        made = rendered(plan, number)
         if made is not None:
             session, view, family = made
             found = judge(session, view, number, family)
@@ -124,12 +121,11 @@ def clouds_alone(frames: int, seed: int) -> None:
     """Print the table of the clouds of colons, stomachs and livers, a line for each organ."""
     plan, rows = OneLight(seed, PLANNED), list[Row]()
     for number in range(frames):
-        if ORGANS[plan.draw(number).anatomy.family] == "gallbladder" or (made := _rendered(plan, number)) is None:
+        if ORGANS[plan.draw(number).anatomy.family] == "gallbladder" or (made := rendered(plan, number)) is None:
             continue
         session, view, family = made
-        scope = next(name for name, families in SCOPES.items() if family in families)
-        picture = np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
-        clouds = run(picture, told(view, scope), Options(estimators=("cloud",), target="base"))
+        picture = in_8_bits(view)
+        clouds = run(picture, told(view, family), Options(estimators=("cloud",), target="base"))
         rows += _cloud_rows(session, view, clouds, {"frame": number, "organ": ORGANS[family]})
         print(f"frame {number}: {len(rows)} clouds so far", file=sys.stderr, flush=True)
     about = {"all": rows, **{organ: [row for row in rows if row["organ"] == organ] for organ in ORGANS}}
@@ -225,9 +221,8 @@ def _mean(values: Sequence[float]) -> float:
 
 def _rows(session: Session, view: RenderedView, number: int, family: int) -> list[Row]:
     """Return the rows of a frame, for each of what is told of the distance."""
-    picture = np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
-    scope = next(name for name, families in SCOPES.items() if family in families)
-    by_range = told(view, scope)
+    picture = in_8_bits(view)
+    by_range = told(view, family)
     relief = view.scene.surface.relief
     assert relief is not None
     about: Row = {"frame": number, "organ": ORGANS[family], "slope": int(2 * (relief.slope_deg // 2))}
@@ -255,8 +250,8 @@ def _told_rows(
 
 def base_rows(session: Session, view: RenderedView, number: int, family: int) -> list[Row]:
     """Return the rows of a frame's single highlights against the base's normals, with each prior of the slope."""
-    picture = np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
-    calibration = told(view, next(name for name, families in SCOPES.items() if family in families))
+    picture = in_8_bits(view)
+    calibration = told(view, family)
     relief = view.scene.surface.relief
     assert relief is not None
     made = run(picture, calibration, Options(estimators=default_estimators(calibration), target="base"))

@@ -18,7 +18,6 @@ stand in no error. At most `PER_FRAME` highlights of a frame count, drawn at ran
 
 import json
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,37 +30,24 @@ from simtest.advice.twin.bank import Subject, all_spots, make_bank
 from simtest.advice.twin.run import SpotTwins, match_spots
 from simtest.advice.twin.scenes import SceneDraws, look_of
 from simtest.advice.twin.scoring import ScoredSpot, score, usable_spots
-from simtest.calibration import Calibration, Priors, Uniform
+from simtest.calibration import Calibration
 from simtest.dataset.plan import Plan
-from simtest.errors import InputError, SimtestError
-from simtest.geometry import Camera
+from simtest.errors import InputError
 from simtest.reconstruction.assumptions import calibration_of_view
 from simtest.reconstruction.options import Options, complete
 from simtest.reconstruction.pipeline import run
 from simtest.reconstruction.records import Specularities
-from simtest.rendering import Session
 from simtest.runtime.arrays import Array, Image, IntArray
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.frame import RenderedView, render_view
 from simtest.spec.recipes import load_dataset
+from studies.tissue_views import ORGANS, SCOPES, in_8_bits, rendered, told
 
 SEED = 7720
 """Of the frames; nothing was tuned on them. Tuning frames: seeds 7703, 5501 and 7719."""
 
 FRAMES, TWIN_FRAMES, PER_FRAME = 12, 24, 40
 
-SCOPES = {"colonoscope": (0, 1), "laparoscope": (2, 3)}
-"""Families of the recipe by scope: colon and stomach, liver and gallbladder."""
-
-ORGANS = ("colon", "stomach", "liver", "gallbladder")
-"""By family."""
-
 MODES = ("colonoscope", "laparoscope", "unscaled", "view")
-
-RANGES_MM = {"colonoscope": Uniform(8.0, 80.0), "laparoscope": Uniform(30.0, 150.0)}
-"""Working range that a user would tell."""
-
-TRIES, COLOUR = 4, "llvm_ad_rgb"
 
 LARGEST = 0.2
 """Most that the twins' RMS error may be off the true one, as a share of it."""
@@ -196,12 +182,12 @@ def _pictures(count: int, mode: str) -> list[Scored]:
     for number in range(most):
         if len(pictures) == count or plan.draw(number, 0).anatomy.family not in families:
             continue
-        made = _rendered(plan, number)
+        made = rendered(plan, number)
         if made is None:
             continue
         session, view, family = made
-        picture = np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
-        calibration = told(view, next(name for name, each in SCOPES.items() if family in each))
+        picture = in_8_bits(view)
+        calibration = told(view, family)
         if mode == "view":
             camera = calibration.camera
             width_deg = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
@@ -211,27 +197,6 @@ def _pictures(count: int, mode: str) -> list[Scored]:
         if truth:
             pictures.append(Scored(number, ORGANS[family], picture, calibration, truth))
     return pictures
-
-
-def _rendered(plan: Plan, index: int) -> tuple[Session, RenderedView, int] | None:
-    """Return a rendered frame and its family; None where no draw gives one."""
-    for attempt in range(TRIES):
-        drawn = plan.draw(index, attempt)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                session = Session(drawn.scene, COLOUR)
-                return session, render_view(session, drawn.scene), drawn.anatomy.family
-        except SimtestError as error:
-            print(f"frame {index}: {error}", file=sys.stderr)
-    return None
-
-
-def told(view: RenderedView, scope: str) -> Calibration:
-    """Return what a user would tell of a frame's camera."""
-    camera, lights = view.calibration.camera, view.calibration.priors.lights_mm
-    plain = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    return Calibration(plain, priors=Priors(lights_mm=lights, distance_mm=RANGES_MM[scope]))
 
 
 def _rows(pictures: Sequence[Scored], organ: str | None, twin_frames: int) -> list[Row]:

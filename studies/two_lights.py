@@ -18,7 +18,7 @@ from simtest.dataset.plan import Plan
 from simtest.reconstruction.options import Options
 from simtest.reconstruction.pipeline import run
 from simtest.spec.recipes import load_dataset
-from studies.twins import SCOPES, _rendered, told
+from studies.tissue_views import SCOPES, in_8_bits, rendered, told
 
 SEED = 9203
 """Of the frames; nothing was tuned on them."""
@@ -46,12 +46,11 @@ def _scored(frames: int) -> list[ScoredSpot]:
     plan, spots = Plan(load_dataset("endoscopy").model_copy(update=update)), []
     for number in range(frames):
         # Frames of the laparoscope, whose ring has eight lights, are not rendered.
-        made = _rendered(plan, number) if plan.draw(number, 0).anatomy.family in SCOPES["colonoscope"] else None
+        made = rendered(plan, number) if plan.draw(number, 0).anatomy.family in SCOPES["colonoscope"] else None
         if made is None:
             continue
-        session, view, _ = made
-        picture = np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
-        found = score(session, view, run(picture, told(view, "colonoscope"), Options()))
+        session, view, family = made
+        found = score(session, view, run(in_8_bits(view), told(view, family), Options()))
         print(f"frame {number}: {len(found)} usable highlights", file=sys.stderr, flush=True)
         spots += found
     return spots

@@ -10,7 +10,6 @@ from studies.corners import __main__ as command
 from studies.corners import checks, formulas
 from studies.corners.case import Case
 from studies.corners.coverage import Answer, share_by_scene, table
-from studies.corners.design import covering_array, whole_from
 from studies.corners.scenes import FACTORS, MESH, SMOOTH, refusals, rows
 
 QUICK = ("law", "projection", "surface", "search", "mirror", "turn", "answers", "calibration", "flow")
@@ -25,25 +24,6 @@ def test_every_pair_that_is_not_refused_is_in_a_row_and_no_other():
                 held = sum(row[first] == a and row[second] == b for row in array)
                 assert (held == 0) == (((first, a), (second, b)) in refused), (first, a, second, b)
     assert all(list(row) == list(FACTORS) and all(row[name] in FACTORS[name] for name in FACTORS) for row in array)
-
-
-def test_the_rows_that_hold_all_pairs_are_counted():
-    held = [{"a": "x", "b": "1"}, {"a": "y", "b": "1"}, {"a": "x", "b": "1"}]
-    assert whole_from(held) == 2
-    assert 30 <= whole_from(rows()) <= len(rows())
-
-
-def test_refused_pairs_have_the_line_of_the_refusal():
-    pair = ("sensor", "processed"), ("bits", "12")
-    assert refusals()[pair].endswith("bits = 12: must be 8 where coding is given")
-
-
-def test_an_array_is_the_same_for_the_same_seed_and_says_what_fits_in_no_row():
-    factors = {"a": "xy", "b": "12", "c": "pq"}
-    assert covering_array(factors, lambda _: True, 0, 3) == covering_array(factors, lambda _: True, 0, 3)
-    with pytest.raises(ValueError, match="no row holds"):
-        # x goes with 1 and with 2, and neither p nor q with both.
-        covering_array(factors, lambda pair: pair[1][0] != "c" or pair[0][0] != "a", 0)
 
 
 def a_smooth_row(**levels):
@@ -118,14 +98,6 @@ def test_an_exception_is_one_red_line_and_a_refusal_is_none(case, monkeypatch):
     assert checks.run("law", case) == ("red", ["KeyError: 'nothing'"])
     monkeypatch.setitem(checks.CHECKS, "law", refused)
     assert checks.run("law", case) == ("refused", ["key = 1: must be 2"])
-
-
-def test_lenses_of_the_formulas_go_there_and_back():
-    bent = {"type": "brown_conrady", "k1": -0.2, "p1": 0.003, "p2": -0.002}
-    for lens in (None, bent, {"type": "kannala_brandt", "k1": -0.04}):
-        camera = {"width": 16, "height": 12, "fx": 14.0, "fy": 15.0, "cx": 8.4, "cy": 5.5, "distortion": lens}
-        pixels = formulas.pixel_centres(camera)
-        assert np.abs(formulas.project(camera, formulas.sightlines(camera, pixels)) - pixels).max() < 1e-9
 
 
 def answers(inside, outside, **given):

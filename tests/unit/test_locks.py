@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 import simtest
-from simtest.cli.main import Termination, main
+from simtest.cli.main import Termination
 from simtest.errors import InputError, SimtestError
 from simtest.runtime import processes
 from simtest.runtime.boundary import explain, plain, plain_errors
 from simtest.runtime.files import write_atomically, write_json
-from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, waiting_for
+from simtest.runtime.locks import LOCK, exclusive_file, exclusive_folder, is_same, waiting_for
 from simtest.surfaces.mesh_file import write_mesh
 from simtest.surfaces.model import TriangleMesh
 from simtest.validation import runner
@@ -30,6 +30,10 @@ from tests.refusals import refused
 pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 
 MAIN = "from simtest.cli.main import main; main()"
+
+
+def no_room(*_, **__):
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def entered(context):
@@ -68,7 +72,7 @@ def test_what_stays_empty_is_removed(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["c"]
 
 
-@pytest.mark.parametrize("held", [b"", b"{", b"[]", json.dumps({"process": 1, "machine": "x"}).encode(), b"\xff" * 9])
+@pytest.mark.parametrize("held", [b"", json.dumps({"process": 1, "machine": "x"}).encode(), b"\xff" * 9])
 def test_a_lock_left_behind_locks_nothing(tmp_path, held):
     (tmp_path / LOCK).write_bytes(held)
     entered(exclusive_folder(tmp_path))
@@ -86,6 +90,16 @@ def test_a_lock_of_a_killed_process_is_stale(tmp_path):
     assert (tmp_path / LOCK).is_file()
     entered(exclusive_folder(tmp_path))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_file_that_was_replaced_is_another_one(tmp_path):
+    path = tmp_path / LOCK
+    with path.open("wb") as file:
+        assert is_same(path, file)
+        path.rename(tmp_path / "old")
+        assert not is_same(path, file)
+        path.touch()
+        assert not is_same(path, file)
 
 
 def test_a_lock_of_another_machine_is_named(tmp_path, monkeypatch):
@@ -209,11 +223,8 @@ def test_a_second_run_is_refused_and_sigterm_ends_the_first(tmp_path):
 
 
 def test_a_disk_that_is_full_is_named_with_file_and_room(tmp_path):
-    def full(_):
-        raise OSError(28, "No space left on device")
-
     with pytest.raises(OSError, match="No space left") as error:
-        write_atomically(tmp_path / "results.parquet", full)
+        write_atomically(tmp_path / "results.parquet", no_room)
     said = explain(error.value)
     assert said.startswith(f"{tmp_path / 'results.parquet'}: No space left on device; ")
     assert f"MB are free on the disk of {tmp_path}" in said
@@ -237,8 +248,6 @@ def test_a_limit_of_the_system_is_named(tmp_path):
     ("error", "said"),
     [
         (MemoryError("Unable to allocate 9 GiB"), "not enough memory (Unable to allocate 9 GiB); smaller frames"),
-        (MemoryError(), "not enough memory; smaller frames"),
-        (InputError("a.png: no such file"), "a.png: no such file"),
         (PermissionError(13, "Permission denied", "a.png"), "a.png: Permission denied"),
         (RecursionError("maximum recursion depth exceeded"), "a value is nested too deeply"),
         (RuntimeError("write failed: (os error 28)"), "write failed: (os error 28)"),
@@ -278,38 +287,22 @@ FILES = {
 
 
 @pytest.fixture
-def run_here(tmp_path, monkeypatch, capsys):
+def run_here(tmp_path, here):
     """Run commands in a folder with some pictures; return exit code and lines of the error stream."""
     (tmp_path / "frames").mkdir()
     for path in (tmp_path / "a.png", tmp_path / "frames" / "a.png"):
         path.write_bytes(files.encoded(".png"))
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["simtest", *arguments])
-        with pytest.raises(SystemExit) as end:
-            main()
-        return end.value.code, capsys.readouterr().err.splitlines()
-
-    return run
+    return lambda *arguments: here(*arguments)[::2]
 
 
-@pytest.mark.parametrize("name", FOLDERS)
-def test_each_command_is_refused_a_folder_in_use(tmp_path, run_here, name):
-    with exclusive_folder(tmp_path / "held"):
-        code, lines = run_here(*FOLDERS[name])
-    option = "--bank" if "bank" in name else "--out"
+@pytest.mark.parametrize("name", [*FOLDERS, *FILES])
+def test_each_command_is_refused_what_is_in_use(tmp_path, run_here, name):
+    words = (FOLDERS | FILES)[name]
+    held = {"nightly": "quick", "fit's bank": "held"}.get(name, words[-1])
+    with (exclusive_folder if name in FOLDERS else exclusive_file)(tmp_path / held):
+        code, lines = run_here(*words)
     assert (code, len(lines)) == (2, 1)
-    assert lines[0].startswith(f"simtest: {option} held: is in use by process {os.getpid()} (")
-    assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_each_command_is_refused_a_file_in_use(tmp_path, run_here, name):
-    held = "quick" if name == "nightly" else FILES[name][-1]
-    with exclusive_file(tmp_path / held):
-        code, lines = run_here(*FILES[name])
-    assert (code, len(lines)) == (2, 1)
+    assert name not in FOLDERS or lines[0].startswith(f"simtest: {'--bank' if 'bank' in name else '--out'} held: ")
     assert f" {held}: is in use by process {os.getpid()} (" in lines[0]
     assert {path.name for path in tmp_path.iterdir()} == {"frames", "a.png"}
 
@@ -369,20 +362,14 @@ def test_errors_of_files_elsewhere_do_not_blame_the_folder(tmp_path, monkeypatch
 
 @pytest.mark.filterwarnings("ignore:no calibration")
 def test_a_full_disk_is_exit_1(tmp_path, run_here, monkeypatch):
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("simtest.reconstruction.outputs.write_json", full)
+    monkeypatch.setattr("simtest.reconstruction.outputs.write_json", no_room)
     code, lines = run_here("reconstruct", "a.png", "--fov", "60", "--out", "out")
     assert code == 1
     assert lines[-1] == "simtest: No space left on device"
 
 
 def test_a_full_disk_during_a_run_says_what_is_kept(tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(runner, "run_experiment", full)
+    monkeypatch.setattr(runner, "run_experiment", no_room)
     with pytest.raises(SimtestError) as error:
         simtest.validate("overview", tmp_path / "out")
     assert str(error.value).startswith(f"{tmp_path / 'out'}: No space left on device; ")

@@ -80,11 +80,6 @@ def test_installing_an_extra_keeps_the_editable_install_of_make_demo():
     assert copies == []
 
 
-def test_generated_pages_are_not_in_git():
-    ignored = (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
-    assert {f"docs/{name}" for name in PAGES} <= set(ignored)
-
-
 # Reference -----------------------------------------------------------------------------------------------------------
 
 
@@ -100,11 +95,6 @@ def test_every_public_name_is_in_the_reference():
     for protocol in ("estimators.Estimator", "estimators.BatchEstimator", "estimators.FrameEstimator",
                      "detection.Detector", "calibration.Priors"):  # fmt: skip
         assert f"simtest.{protocol}" in named
-
-
-def test_every_public_name_has_a_docstring():
-    undocumented = [path for path, thing in entries().items() if callable(thing) and not inspect.getdoc(thing)]
-    assert undocumented == []
 
 
 def test_every_command_and_option_is_in_the_reference():
@@ -214,9 +204,9 @@ def test_dead_links_are_found(tmp_path):
     ]
 
 
-@pytest.mark.parametrize("page", manual_pages(), ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_no_link_in_markdown_is_dead(page):
-    assert list(dead_in_markdown(page, {DOCS / name for name in PAGES})) == []
+def test_no_link_in_markdown_is_dead():
+    made = {DOCS / name for name in PAGES}
+    assert [dead for page in manual_pages() for dead in dead_in_markdown(page, made)] == []
 
 
 def test_dead_links_in_markdown_are_found(tmp_path):

@@ -1,26 +1,38 @@
-"""Stops and broken surroundings: signals at any moment, readers that have gone, full disks, deleted folders."""
+"""Stops and odd surroundings: signals at any moment, workers, terminals, readers that have gone, disks, odd files."""
 
 import errno
 import importlib
+import io
 import os
 import signal
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import platformdirs
 import pytest
 
-from simtest.cli.main import INTERRUPTED, TERMINATED, Termination, main
+from simtest.cli.common import named_path
+from simtest.cli.main import INTERRUPTED, TERMINATED, Termination, _mend_terminal, main
 from simtest.cli.progress import stop_between_steps
 from simtest.errors import InputError, SimtestError
-from simtest.runtime.boundary import plain
-from simtest.runtime.files import make_folder
+from simtest.geometry import Camera
+from simtest.reconstruction import reconstruct
+from simtest.reconstruction.images import is_coloured
+from simtest.rendering import bitmap
+from simtest.runtime.arrays import cache_folder
+from simtest.runtime.files import make_folder, user_cache
+from simtest.runtime.processes import make_engine
 from simtest.runtime.stops import breakable
 from simtest.simulation import views
+from simtest.spec import load_calibration, load_scene
 from simtest.spec.sensor import Sensor
+from simtest.surfaces.mesh_file import read_mesh
 from tests.refusals import refused
+from tests.unit.engine_tasks import threads
 
 MAIN = "from simtest.cli.main import main; main()"
 
@@ -83,10 +95,15 @@ def test_a_stop_while_the_command_is_loaded_is_one_line():
 # The output ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", [pytest.param("schema scene", marks=pytest.mark.ci), "list", "doctor --help"])
+@pytest.mark.parametrize("command", [pytest.param("schema scene", marks=pytest.mark.ci), "list"])
 def test_a_reader_that_has_gone_is_no_error(command):
     done = shell(f"$SIMTEST {command} | true; echo ${{PIPESTATUS[0]}}")
     assert (done.stdout, done.stderr) == ("0\n", "")
+
+
+def test_a_closed_output_is_no_error():
+    done = shell("$SIMTEST schema scene >&-")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_reader_of_a_table_that_has_gone_is_no_error(tmp_path):
@@ -116,14 +133,6 @@ def test_a_link_that_leads_nowhere_is_told(tmp_path):
     refused(lambda: make_folder(out), f"--out {out}: is a link to {tmp_path / 'nothing'}, which does not exist")
     (tmp_path / "nothing").mkdir()
     make_folder(out)
-
-
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG])
-def test_what_the_disk_cannot_do_is_told_from_what_the_user_may_change(number):
-    error = plain(OSError(number, os.strerror(number), "x.png"))
-    assert type(error) is SimtestError
-    assert str(error).startswith(f"x.png: {os.strerror(number)}")
-    assert isinstance(plain(OSError(errno.EACCES, "Permission denied", "x.png")), InputError)
 
 
 def saved_calibration(path):
@@ -233,3 +242,123 @@ def test_a_stop_does_not_wait_for_the_end_of_a_long_step(monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             signal.pause()
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+ROOT = Path(__file__).resolve().parents[2]
+BLOCKED = """
+import signal
+from simtest.runtime.processes import make_engine
+from tests.unit.engine_tasks import blocked_signals
+
+if __name__ == "__main__":
+    made = dict(make_engine(workers=2).run(blocked_signals, [0, 1], lambda: None))
+    print(all({signal.SIGINT, signal.SIGTERM} <= set(each) for each in made.values()), signal.SIGINT in
+          signal.pthread_sigmask(signal.SIG_BLOCK, []))
+"""
+
+
+def test_no_worker_is_broken_into_while_it_starts(tmp_path):
+    # In a process of its own: the first worker of a process starts multiprocessing's tracker, which lifts masks.
+    path = tmp_path / "blocked.py"
+    path.write_text(f"import sys\nsys.path.insert(0, {str(ROOT)!r})\n{BLOCKED}")
+    done = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, timeout=120, check=True)
+    # Blocked in the workers, and no longer here.
+    assert done.stdout.split() == ["True", "False"], done.stderr
+
+
+def test_each_worker_has_its_share_of_the_cores(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 6)
+    ((_, told),) = make_engine(workers=2).run(threads, [0], lambda: None)
+    # A single task has all of them.
+    assert told == ("6", "6", 6)
+    shares = dict(make_engine(workers=2).run(threads, [0, 1], lambda: None))
+    assert set(shares.values()) == {("3", "3", 3)}
+
+
+Y, X = np.mgrid[:120, :160]
+
+
+def grey_sphere():
+    """A grey picture with a highlight, its channels apart by up to two codes, as coded films have it."""
+    grey = 0.3 + 0.6 * np.exp(-((X - 80) ** 2 + (Y - 60) ** 2) / 200)
+    apart = np.random.default_rng(0).integers(-1, 2, (*grey.shape, 3))
+    return (np.rint(255 * grey)[..., None] + apart).clip(0, 255).astype(np.float32) / 255
+
+
+def test_a_terminal_without_the_characters_gets_others(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    _mend_terminal()
+    print("± deg", flush=True)
+    assert written.getvalue() == b"? deg\n"
+
+
+@pytest.mark.parametrize(("columns", "left"), [("1", None), ("20", "20"), ("wide", "wide")])
+def test_a_terminal_too_narrow_for_tables_counts_as_one_of_no_stated_width(monkeypatch, columns, left):
+    monkeypatch.setenv("COLUMNS", columns)
+    _mend_terminal()
+    assert os.environ.get("COLUMNS") == left
+
+
+def test_a_name_that_is_no_utf8_is_refused():
+    with pytest.raises(ValueError, match=r"is no UTF-8 name: 'o\\udcff'"):
+        named_path(None, [SimpleNamespace(value="o\udcff")])
+
+
+def test_a_user_without_a_home_keeps_nothing(monkeypatch):
+    def homeless(_):
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.setattr(platformdirs, "user_cache_dir", homeless)
+    monkeypatch.delenv("SIMTEST_CACHE", raising=False)
+    assert user_cache() is None
+    assert cache_folder() is None
+
+
+def test_coded_grey_is_grey():
+    assert not is_coloured(grey_sphere())
+    tissue = grey_sphere() * np.float32([1.0, 0.6, 0.5])
+    assert is_coloured(tissue)
+
+
+def test_grey_by_colour_warns_of_nothing():
+    # Warnings are errors here.
+    grey = np.repeat(grey_sphere()[..., :1], 3, axis=2)
+    assert reconstruct(grey, Camera.from_fov(60.0, 160, 120), detector="colour", encoding="srgb") == []
+
+
+def test_a_mark_of_the_encoding_is_read_over(tmp_path):
+    for name, text in (
+        ("scene.toml", 'surface.type = "plane"\n'),
+        ("camera.toml", "[camera]\nwidth = 64\nheight = 48\n"),
+    ):
+        (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert load_scene(tmp_path / "scene.toml").surface.type == "plane"
+    with pytest.raises(InputError, match=r"camera\.toml: fx: missing"):
+        load_calibration(tmp_path / "camera.toml")
+
+
+def test_a_mesh_most_of_whose_faces_have_no_area_is_damaged(tmp_path):
+    corners = "v 0 0 0\nv 90 0 0\nv 0 90 0\nv 0 0 90\n"
+    faces = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "m.obj").write_text(corners + faces + "f 1 1 1\n" * 5)
+    with pytest.raises(InputError, match=r"m\.obj: 4 of 9 faces have an area: it is damaged or cut short"):
+        read_mesh(tmp_path / "m.obj")
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EFBIG])
+def test_an_image_that_cannot_be_written_whole_names_the_cause(tmp_path, monkeypatch, number):
+    path = tmp_path / "o.exr"
+
+    class Stream:
+        def Bitmap(self, _):
+            return self
+
+        def write(self, name):
+            raise RuntimeError(f'[FileStream] "{name}": I/O error while writing: {os.strerror(number)}')
+
+    monkeypatch.setattr(bitmap, "mi", Stream())
+    with pytest.raises(OSError, match=os.strerror(number)) as error:
+        bitmap.write_exr(path, np.ones((4, 4), np.float32))
+    assert (error.value.errno, error.value.filename) == (number, str(path))

@@ -1,22 +1,96 @@
-"""Numbers that were fitted to data: each has its unit and study, each is used, and both hashes cover them."""
+"""Numbers that outlast a process: the seed tree, files of arrays, and what was fitted to data."""
 
 import ast
 import math
 import re
 import shutil
 import tomllib
+import zipfile
 
+import numpy as np
 import pytest
 
 from simtest.runtime import arrays, provenance
+from simtest.runtime.arrays import write_arrays
 from simtest.runtime.fitted import FILE, fitted_number
+from simtest.runtime.seeds import Stage, from_integer, generator, integer, key
+from simtest.spec.recipes import Distribution
+
+
+def test_the_seed_tree_is_that_of_every_release():
+    place = (7, "overview", "plane", 3, Stage.SENSOR)
+    assert key("overview") == 11416273768129411606
+    assert integer(*place) == 2421970951038761668
+    assert generator(*place).integers(2**63, size=2).tolist() == [3954648001182531059, 2709375692794661143]
+    assert from_integer(5).integers(2**63) == 6307306053231797772
+    assert [stage.value for stage in Stage] == [0, 1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    ("form", "values"),
+    [
+        ({"low": 1, "high": 2}, [1.2515898007485415, 1.7324999133472123, 1.0566206926376902]),
+        ({"low": 1, "high": 100, "log": True}, [3.185514611703684, 29.17425849799716, 1.297900456774583]),
+        ({"low": 1, "high": 6, "integer": True}, [2, 2, 1]),
+        ({"low": 1, "high": 1000, "integer": True, "log": True}, [5, 157, 1]),
+        ({"choose": ("a", "b", "c"), "weights": (1, 2, 1)}, ["b", "b", "a"]),
+    ],
+)
+def test_a_recipe_draws_what_every_release_draws(form, values):
+    rng = from_integer(11)
+    assert [Distribution(**form).draw(rng) for _ in range(3)] == values
+
+
+def some_arrays():
+    rng = np.random.default_rng(4)
+    noise = rng.standard_normal((300, 400)).astype(np.float32)
+    return {
+        "noise": noise,
+        "zeros": np.zeros((300, 400, 3), dtype=np.float32),
+        "half": np.where(np.arange(400) < 240, np.float32(np.nan), noise),
+        "mask": noise > 0.5,
+        "turned": np.asfortranarray(noise),
+        "empty": np.zeros((0, 3)),
+        "one": np.array(2.5),
+    }
+
+
+def test_numpy_reads_back_what_was_written(tmp_path):
+    write_arrays(tmp_path / "a.npz", some_arrays())
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as read:
+        assert read.files == list(some_arrays())
+        for name, array in some_arrays().items():
+            assert read[name].dtype == array.dtype
+            np.testing.assert_array_equal(read[name], array)
+
+
+def test_the_same_arrays_give_the_same_bytes(tmp_path):
+    for name in ("a.npz", "b.npz"):
+        write_arrays(tmp_path / name, some_arrays())
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_only_what_shrinks_is_compressed(tmp_path):
+    write_arrays(tmp_path / "a.npz", some_arrays())
+    with zipfile.ZipFile(tmp_path / "a.npz") as file:
+        kinds = {entry.filename: entry.compress_type for entry in file.infolist()}
+        sizes = {entry.filename: entry.compress_size / entry.file_size for entry in file.infolist()}
+    assert kinds["noise.npy"] == zipfile.ZIP_STORED
+    for name in ("zeros.npy", "half.npy", "mask.npy"):
+        assert kinds[name] == zipfile.ZIP_DEFLATED
+    assert sizes["zeros.npy"] < 0.01
+    assert sizes["half.npy"] < 0.6
+
+
+def test_objects_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="Object arrays"):
+        write_arrays(tmp_path / "a.npz", {"objects": np.array([{}], dtype=object)})
+
 
 PACKAGE = FILE.parent
-
 SAYS_FITTED = re.compile(
     r"\b(fitted|calibrated|tuned) (to|on|over|by|with)\b|\b(was|were) (fitted|calibrated|tuned)\b", re.IGNORECASE
 )
-
 EXCEPTIONS = {
     "conventions.SPECULAR_MIN_AREA_PX": "says from how many pixels an ellipse is fitted to a highlight",
     "calibration.priors.UNTOLD_SLOPE_RAD": "is an assumption that spans the recipes' slopes; the recipe was fitted",
