@@ -83,19 +83,6 @@ def test_flipped_maps_of_rendered_frames_score_their_turn(run, here, tmp_path):
 
 
 @pytest.mark.slow
-def test_maps_in_npy_are_exact(run, here, tmp_path):
-    on, truths = run
-    (tmp_path / "maps").mkdir()
-    for seed, truth in enumerate(truths):
-        np.save(tmp_path / "maps" / f"{truth.name}.npy", turned(truth.normal["fine"], 1.0, seed))
-    code, output, _ = here("score", tmp_path / "maps", "--on", on, "--out", tmp_path / "scored", "--json")
-    assert code == 0
-    record = json.loads(output)
-    means = [cell["mean"] for cell in record["sources"]["normal"]["angle_deg"]["fine"]]
-    np.testing.assert_allclose(means, 1.0, atol=1e-9)
-
-
-@pytest.mark.slow
 def test_maps_in_exr_are_read(run, here, tmp_path):
     from simtest.rendering.bitmap import write_exr
 
