@@ -500,7 +500,7 @@ ROWS = (
     row("width and height of a sample swapped", "columns", "dataset.index:_sample_row",
         'camera["width"], camera["height"]', 'camera["height"], camera["width"]', "dataset"),
     row("base normal of a highlight's row is the fine one", "columns", "dataset.index:_highlight_row",
-        '*truth["normal_base"]', '*truth["normal"]', "dataset_relief"),
+        '*truth["normal_base"]', '*truth["normal"]', "dataset_contents"),
     row("noise shared by all samples", "seeds", "dataset.plan:Plan.draw", '"sample", index, Stage.SENSOR',
         '"sample", 0, Stage.SENSOR', "seeds dataset"),
     row("axes of a normal map transposed", "transposes", "dataset.scoring.dense.maps:to_camera",
