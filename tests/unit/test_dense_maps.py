@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -12,7 +13,15 @@ from dense_frames import LENSES, hit, sphere_truth, turned, write_png
 
 from simtest.calibration import Calibration
 from simtest.dataset.scoring.dense.depth import align, normals_of_distance
-from simtest.dataset.scoring.dense.maps import MapFolder, MapOptions, Shading, open_method, parse_axes
+from simtest.dataset.scoring.dense.maps import (
+    MapFolder,
+    MapOptions,
+    RawMap,
+    Shading,
+    channel_vectors,
+    open_method,
+    parse_axes,
+)
 from simtest.dataset.scoring.dense.score import frame_figures, joined_figures, score_frames, write_score
 from simtest.dataset.scoring.dense.shading import shading_maps
 from simtest.dataset.scoring.dense.truth import frame_truth, zones
@@ -118,6 +127,13 @@ def test_encodings_of_integers(encoding, tmp_path):
     write_png(tmp_path / "a.png", vectors, 16, encoding)
     score = scored(tmp_path, truth, encoding=None if encoding == "unit" else encoding, frame="opengl")
     np.testing.assert_allclose(angles(score, "mean"), 1.0, atol=1e-3)
+
+
+def test_values_of_an_encoding_stand_for_exact_components():
+    bytes_of = RawMap(Path("a.png"), "normal", np.uint8([[[128, 128, 1], [255, 1, 128]]]))
+    assert channel_vectors(bytes_of, "centred").tolist() == [[[0, 0, -1], [1, -1, 0]]]
+    shares = RawMap(Path("a.npy"), "normal", np.array([[[0.5, 0.5, 0.0], [1.0, 0.5, 0.5]]]))
+    assert channel_vectors(shares, "unit").tolist() == [[[0, 0, -1], [1, 0, 0]]]
 
 
 def test_floats_between_0_and_1_must_be_stated(tmp_path):
@@ -386,7 +402,8 @@ def test_alignment_is_robust(how):
     rng = np.random.default_rng(2)
     truth = rng.uniform(10, 60, 4000)
     depth = (truth - (3.0 if how == "affine" else 0.0)) / 2.0 * (1 + 0.01 * rng.standard_normal(4000))
-    depth[:400] *= 5
+    depth[:200] *= 5
+    depth[200:400] *= 1.5
     factor, shift = align(depth, truth, how)
     assert factor == pytest.approx(2.0, rel=0.01)
     assert shift == pytest.approx(3.0 if how == "affine" else 0.0, abs=0.4)
