@@ -37,28 +37,12 @@ def _rows(count: int, stated: float = 1.0, seed: int = 0, per_scene: int = 4) ->
         miss = shape @ rng.standard_normal(2)
         angle = np.hypot(*miss)
         truth = np.cos(angle) * normal + np.sin(angle) / angle * (miss @ basis_across(normal))
-        rows.append(
-            dict(
-                setting="plane",
-                realisation=i,
-                specularity=0,
-                true_id=0,
-                status="ok",
-                estimator="x",
-                target="fine",
-                error_deg=float(np.degrees(angle)),
-                normal_x=normal[0],
-                normal_y=normal[1],
-                normal_z=normal[2],
-                truth_x=truth[0],
-                truth_y=truth[1],
-                truth_z=truth[2],
-                cov_11=stated * true[0, 0],
-                cov_12=stated * true[0, 1],
-                cov_22=stated * true[1, 1],
-                mahalanobis2=float(miss @ inverse @ miss),
-            )
-        )
+        row = {"setting": "plane", "realisation": i, "specularity": 0, "true_id": 0, "status": "ok", "estimator": "x"}
+        row |= {"target": "fine", "error_deg": float(np.degrees(angle))}
+        row |= {f"normal_{axis}": value for axis, value in zip("xyz", normal, strict=True)}
+        row |= {f"truth_{axis}": value for axis, value in zip("xyz", truth, strict=True)}
+        row |= {f"cov_{j + 1}{k + 1}": stated * true[j, k] for j, k in ((0, 0), (0, 1), (1, 1))}
+        rows.append(row | {"mahalanobis2": float(miss @ inverse @ miss)})
     return table(rows, {})
 
 
