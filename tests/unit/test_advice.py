@@ -11,7 +11,7 @@ import pytest
 
 import simtest
 from simtest.advice import plan
-from simtest.advice.advise import MAIN, RUN, Advised, advise, narrower, sentence, write_advice, write_scene
+from simtest.advice.advise import MAIN, RUN, advise, narrower, sentence, write_advice, write_scene
 from simtest.advice.answers import break_points, mean_error, read_results, spot_size
 from simtest.advice.plan import (
     DISTANCES,
@@ -33,7 +33,6 @@ from simtest.runtime.arrays import kept
 from simtest.surfaces import make_surface
 from simtest.validation import laws, realisation
 from simtest.validation.cases import RELIEF_SEED
-from studies import advice_strata
 from studies.advice_strata import frames_of, gain
 from tests.unit.given_numbers import of_given_numbers
 
@@ -67,21 +66,15 @@ def test_positions_may_stand_as_in_a_calibration_file(tmp_path):
 
 MALFORMED = [
     ("", "camera"),
-    ("camera = 3\n", "camera"),
-    ("[camera]\nwidth = -4\n", "camera.width = -4"),
-    (CAMERA + "[lens]\nf = 1\n", "lens"),
     (CAMERA + "[rig]\npreset = 'colonoscop'\n", "rig.preset = 'colonoscop'"),
     (CAMERA + "[rig]\nlights_mm = [[1.0, 2.0]]\n", "rig.lights_mm"),
-    (CAMERA + "[rig]\nlights_mm = 'ring'\n", "rig.lights_mm"),
     (CAMERA + "[rig]\nlights_mm = []\n", "rig.lights_mm"),
-    (CAMERA + "[rig]\nlights_mm = [['a', 'b', 'c']]\n", "position_mm"),
     (CAMERA + "[rig]\npreset = 'laparoscope'\nlights_mm = [[1.0, 2.0, 0.0]]\n", "rig.preset"),
     (CAMERA + "[sensor]\npreset = 'eye'\n", "sensor.preset = 'eye'"),
     (CAMERA + "[relief]\nslope_deg = -1.0\n", "slope_deg = -1"),
     (CAMERA + "[relief]\nslope_deg = [4.0, 2.0]\n", "slope_deg"),
     (CAMERA + "[relief]\nslope_deg = [0.0, 2.0]\n", "slope_deg"),
     (CAMERA + "[relief]\nslope_deg = 2.0\nwavelength_mm = 50.0\n", "wavelength_mm"),
-    (CAMERA + "[relief]\nslope_deg = 'steep'\n", "slope_deg"),
     ("[camera\n", "TOML"),
 ]
 
@@ -100,7 +93,6 @@ QUESTIONS = [
     ({"organ": "live"}, "did you mean liver"),
     ({"distances_mm": (-5.0, 20.0)}, "--distances = -5.0"),
     ({"distances_mm": (60.0, 20.0)}, "--distances 60,20"),
-    ({"distances_mm": (20.0, math.nan)}, "--distances = nan"),
     ({"distances_mm": (20.0, 9000.0)}, "500 mm"),
     ({"bound_deg": 0.0}, "--bound = 0.0"),
     ({"bound_deg": 60.0}, "--bound 60"),
@@ -314,7 +306,7 @@ def results(errors, frame_of, status=None):
         "specularity": list(range(n)), "true_id": list(range(n)), "estimator": "cone_axis",
         "status": status or ["ok"] * n, "target": "fine", "error_deg": errors, "error_fine_deg": errors,
         "error_base_deg": [2 * e for e in errors], "visible_id": list(range(n)), "frame_visible": [10] * n,
-        "surface.distance_mm": [20.0 + 10 * (frame % 2) for frame in frame_of], "cov_11": 1e-4, "cov_22": 1e-4,
+        "surface.distance_mm": [20.0 + 10 * (frame % 2) for frame in frame_of], "cov_11": 1e-4, "cov_22": 3e-4,
         "eps_over_d": 0.1, "budget_noise_deg": 0.5, "budget_camera_deg": 0.0,
     })  # fmt: skip
 
@@ -325,7 +317,7 @@ def test_figures_of_known_errors():
     assert method.fine.mean_deg == pytest.approx(3.0)
     assert method.base.mean_deg == pytest.approx(6.0)
     assert method.budget_deg == {"noise": pytest.approx(0.5)}
-    assert method.stated_deg == pytest.approx(math.degrees(math.sqrt(2e-4)))
+    assert method.stated_deg == pytest.approx(math.degrees(math.sqrt(4e-4)))
     assert (found.visible, found.detections, found.false) == (40, 6, 0)
     assert found.choices[0].best == "cone_axis"
     assert set(found.choices[0].by_distance) == {20.0, 30.0}
@@ -450,25 +442,6 @@ def test_strata_are_read_from_the_frames_of_a_run(tmp_path):
     assert frames_of(tmp_path, "curved")[1].sum() == 0
 
 
-def test_strata_of_a_folder_without_an_advice_are_refused_in_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("sys.argv", ["advice_strata", str(tmp_path)])
-    with pytest.raises(SystemExit, match=r"advice\.json: no such file; must be what studies\.advice writes$"):
-        advice_strata.main()
-
-
-@pytest.mark.parametrize("stated", [True, False])
-def test_the_page_says_whose_relief_is_drawn(tmp_path, stated):
-    scope = read_scope(written(tmp_path, CAMERA + "[relief]\nslope_deg = [1.0, 2.0]\n" * stated))
-    question = Question(scope, "colon", frames=8)
-    found = read_results(results([1.0, 3.0], [0, 1]), 8)
-    advised = Advised(question, found, break_points(question), spot_size(question), None,
-                      np.zeros((72, 96, 3), np.uint8), {"errors": "e", "picture": "p"},
-                      surroundings(question).random)  # fmt: skip
-    page = write_advice(advised, tmp_path / "out").read_text(encoding="utf-8")
-    assert ("the relief is that of the scope's file" in page) == stated
-    assert ("relief and film those of the dataset recipe endoscopy" in page) != stated
-
-
 @pytest.mark.parametrize(
     ("high", "said"), [(1.1, None), (1.29, "32 frames"), (2.49, "344 frames"), (200.0, "more frames")]
 )
@@ -527,8 +500,14 @@ def test_every_figure_runs_again_and_the_page_prints_how(tmp_path):
     assert (out / RUN / "results.parquet").stat().st_mtime_ns == kept
 
 
-@pytest.mark.parametrize("organ", ORGANS)
-@pytest.mark.parametrize("relief", ["", "[relief]\nslope_deg = 0.0\n", "[relief]\nslope_deg = 2.0\n"])
+@pytest.mark.parametrize(
+    ("organ", "relief"),
+    [
+        *((organ, "") for organ in ORGANS),
+        ("colon", "[relief]\nslope_deg = 0.0\n"),
+        ("plane", "[relief]\nslope_deg = 2.0\n"),
+    ],
+)
 def test_the_picture_has_a_sound_scene_for_each_organ_and_relief(tmp_path, organ, relief):
     question = Question(read_scope(written(tmp_path, CAMERA + relief)), organ)
     scene = simtest.load_scene(write_scene(question, main_experiment(question), tmp_path / "scene.toml"))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from benchmarks import blender, browser, cores, cost, estimators, growth, memory, nightly_page, ray_nodes
 from benchmarks.__main__ import NAMES, ON_REQUEST, main
-from benchmarks.measuring import Figure, print_markdown
+from benchmarks.measuring import Figure
 from benchmarks.scheduler import shard_times, simulate
 from simtest.dataset.plan import Plan
 from simtest.errors import Failure, Reason
@@ -79,18 +79,6 @@ def test_growth_beyond_the_limit_is_missed_even_under_a_fixed_cost(monkeypatch, 
     figure = growth.grow(growth.Piece("work", "things", Works), rounds=1).figure
     assert figure.met is met
     assert figure.value == pytest.approx(power, abs=0.3 if fixed else 1e-9)
-
-
-def test_growth_needs_five_sizes_and_a_factor_of_sixteen():
-    class Few:
-        def __enter__(self):
-            return {1.0: lambda: None, 2.0: lambda: None}
-
-        def __exit__(self, *_):
-            return None
-
-    with pytest.raises(ValueError, match="needs five sizes"):
-        growth.grow(growth.Piece("work", "things", Few))
 
 
 # Scheduler -------------------------------------------------------------------------------------------------------
@@ -166,16 +154,6 @@ def test_anatomies_are_timed_in_the_families_shares():
     families = [plan.anatomy(block * plan.dataset.samples_per_anatomy).family for block in blocks]
     assert sorted(families) == [0, 0, 1]
     assert len(set(blocks)) == 3
-
-
-def test_each_run_costs_anatomies_that_no_other_has():
-    seeds = {cost.recipes()["tissue"].seed for _ in range(8)}
-    assert len(seeds) == 8
-
-
-def test_tables_are_printed_as_the_manual_holds_them(capsys):
-    print_markdown([["what", "value"], ["time", "1 s"]])
-    assert capsys.readouterr().out == "| what | value |\n| --- | --- |\n| time | 1 s |\n\n"
 
 
 # Nothing is skipped ----------------------------------------------------------------------------------------------

@@ -21,9 +21,9 @@ from simtest.dataset import calibration_of, fields, png, read
 from simtest.dataset.card import make_card, write_preview
 from simtest.dataset.index import TABLES, write_shard_tables, write_tables
 from simtest.dataset.maker import Maker, _share_of
-from simtest.dataset.manifest import NAME, FileEntry, Manifest, _digest, new_manifest, read_manifest
+from simtest.dataset.manifest import NAME, FileEntry, Manifest, _digest, file_entry, new_manifest, read_manifest
 from simtest.dataset.plan import Plan
-from simtest.dataset.shard import BrokenShardError, decode, finish, sample_key, samples, write_sample
+from simtest.dataset.shard import BrokenShardError, decode, finish, read_member, sample_key, samples, write_sample
 from simtest.dataset.shard_writer import _write_shards, write_dataset
 from simtest.dataset.verify import compare, repair_files, reproduce_sample, verify
 from simtest.errors import InputError, SimtestError
@@ -173,11 +173,8 @@ def test_a_shard_is_planned_for_the_largest_frames():
 
 
 BAD = {
-    "samples = 0": ("samples", 0, "samples = 0: must be greater than or equal to 1"),
-    "families": ("families", [], "families = "),
     "no range": ("per_sample", {"sensor.noise_sigma": {}}, "nothing to draw from"),
     "contradiction": ("per_sample", {"sensor.noise_sigma": {"low": 0.2, "high": 0.1}}, "must not exceed high"),
-    "empty choice": ("per_sample", {"sensor.noise_sigma": {"choose": []}}, "nothing to draw from"),
     "outside": ("per_sample", {"sensor.noise_sigma": {"low": 0.0, "high": 2.0}}, "sensor.noise_sigma = 2.0"),
     "no such key": ("per_sample", {"sensor.noise": {"low": 0.0, "high": 0.1}}, "sensor.noise = 0.0: unknown key"),
     "log of 0": ("per_sample", {"sensor.noise_sigma": {"low": 0, "high": 0.1, "log": True}}, "must be above 0"),
@@ -389,15 +386,6 @@ def test_a_shard_cut_anywhere_goes_on(made, tmp_path_factory, cut, noise):
     assert contents(folder) == contents(made)
 
 
-def test_a_finished_shard_that_the_manifest_lost_is_not_made_again(made, copy, monkeypatch):
-    manifest = read_manifest(copy)
-    manifest.shards.pop(sorted(manifest.shards)[0])
-    manifest.save(copy)
-    monkeypatch.setattr("simtest.dataset.maker.Maker.make", lambda *_: pytest.fail("made again"))
-    write_dataset(tiny(**SIX), copy, make_engine())
-    assert contents(copy) == contents(made)
-
-
 @pytest.fixture(scope="module")
 def many():
     return Plan(tiny(samples=360, samples_per_anatomy=6, shard_mb=1e-6))
@@ -467,15 +455,8 @@ def test_tables_from_the_rows_of_workers_are_those_from_the_shards(copy):
             lambda c: c["shards"].update({"../secret.tar": {"bytes": 1, "sha256": "0"}}),
             "shards.../secret.tar = '../secret.tar': must match",
         ),
-        (lambda c: c["shards"].update({"/etc/passwd": {"bytes": 1, "sha256": "0"}}), "must match the pattern"),
         (lambda c: c["tables"].update({"..": {"bytes": 1, "sha256": "0"}}), "must match the pattern"),
-        (
-            lambda c: c["tables"].update({"x.parquet": {"bytes": "1", "sha256": "0"}}),
-            "x.parquet.bytes = '1': must be a valid integer",
-        ),
         (lambda c: c["tables"].update({"x.parquet": {"bytes": 1}}), "x.parquet.sha256: missing"),
-        (lambda c: c.update(shards=["train-000000.tar"]), "shards = ['train-000000.tar']: must be a table"),
-        (lambda c: c.update(origin="here"), "origin = 'here': must be a table"),
     ],
 )
 def test_a_manifest_with_a_digest_that_fits_is_not_trusted(copy, change, said):
@@ -603,8 +584,6 @@ def edit_manifest(folder, change):
 def honest(folder, name):
     """Make the manifest agree with a changed file: only its content then tells."""
     manifest = read_manifest(folder)
-    from simtest.dataset.manifest import file_entry
-
     where = manifest.tables if name in manifest.tables else manifest.shards
     where[name] = file_entry(folder / name)
     manifest.save(folder)
@@ -613,7 +592,7 @@ def honest(folder, name):
 def rewrite(folder, name, change):
     """Write a shard again with changed samples, hashes and all."""
     with (folder / name).open("rb") as file:
-        stored = [(s.key, {x: _member(file, s, x) for x in s.members}, s.meta) for s in samples(file)]
+        stored = [(s.key, {x: read_member(file, s, x) for x in s.members}, s.meta) for s in samples(file)]
     changed = change(stored)
     with (folder / name).open("wb") as file:
         for key, members, meta in changed:
@@ -622,12 +601,6 @@ def rewrite(folder, name, change):
             write_sample(file, key, {**images, "json": json.dumps({**meta, "sha256": hashes}).encode()})
         finish(file)
     honest(folder, name)
-
-
-def _member(file, sample, suffix):
-    start, length = sample.members[suffix]
-    file.seek(start)
-    return file.read(length)
 
 
 def with_image(name, change):
@@ -849,7 +822,7 @@ def test_an_error_of_a_worker_tells_where_it_came_up():
 
 @pytest.mark.parametrize(
     ("cores", "workers", "each"),
-    [((8,), 1, 8), ((8,), 4, 2), ((4, 4), 1, 4), ((16, 4), 2, 10), ((None, 4), 3, 1), ((2,), 8, 1), ((), 1, 1)],
+    [((8,), 4, 2), ((4, 4), 1, 4), ((16, 4), 2, 10), ((None, 4), 3, 1), ((2,), 8, 1), ((), 1, 1)],
 )
 def test_no_task_asks_a_cluster_for_more_cores_than_a_node_has(cores, workers, each):
     nodes = [{"memory": 1e9} if count is None else {"CPU": float(count)} for count in cores]
@@ -899,8 +872,8 @@ def test_samples_below_the_recipes_number_of_highlights_are_counted(tmp_path):
         write_dataset(dataset, tmp_path / "few", make_engine())
 
 
-@pytest.mark.parametrize("index", [0, 3])
-def test_a_samples_metadata_are_a_scene_that_is_rendered_again(made, tmp_path, index):
+def test_a_samples_metadata_are_a_scene_that_is_rendered_again(made, tmp_path):
+    index = 3
     reproduce_sample(made, index, tmp_path)
     variant = read_manifest(made).origin["variant"]
     frame = simtest.render(tmp_path / f"{sample_key(index)}.json", variant=variant)
@@ -915,9 +888,7 @@ def test_a_samples_metadata_are_a_scene_that_is_rendered_again(made, tmp_path, i
     ("text", "message"),
     [
         ("{", "not valid JSON"),
-        ("[1]", "must be an object"),
         ('{"camera": {}}', "scene: must be a table, as in a dataset's sample"),
-        ('{"scene": 1}', "scene: must be a table"),
         ('{"scene": {"surface": {"type": "cube"}}}', "surface"),
     ],
 )

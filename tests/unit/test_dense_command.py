@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from dense_frames import turned, write_png
 
+import simtest
+from simtest.cli.runs import WORDS
+from simtest.dataset.scoring.dense import score
+from simtest.dataset.scoring.dense.maps import METHODS
 from simtest.dataset.scoring.dense.score import frames_of
+from simtest.rendering.bitmap import write_exr
 
 pytestmark = pytest.mark.render
 
@@ -46,30 +51,34 @@ label = "fisheye"
 """
 
 
+@pytest.fixture
+def maps(tmp_path):
+    """Return a folder for maps, which holds nothing yet."""
+    (tmp_path / "maps").mkdir()
+    return tmp_path / "maps"
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Return the folder of a small run whose frames were exported, and the truth of these."""
-    import simtest
-
     folder = tmp_path_factory.mktemp("dense")
     (folder / "small.toml").write_text(EXPERIMENT)
     simtest.validate(folder / "small.toml", folder / "run", export=folder / "frames")
     return folder / "run", list(frames_of(folder / "run"))
 
 
-def test_flipped_maps_of_rendered_frames_score_their_turn(run, here, tmp_path):
+def test_flipped_maps_of_rendered_frames_score_their_turn(run, here, maps, tmp_path):
     on, truths = run
     assert len(truths) == len({truth.scene for truth in truths}) == 3
     assert {truth.excluded["outside_view"] > 0 for truth in truths if truth.setting == "tissue"} == {True}
-    (tmp_path / "maps").mkdir()
     for seed, truth in enumerate(truths):
         # Relief: against the fine surface a degree is scored, against the base more.
-        write_png(tmp_path / "maps" / f"{truth.name}.png", turned(truth.normal["fine"], 1.0, seed) * [1, -1, -1])
-    code, output, _ = here("score", tmp_path / "maps", "--on", on, "--out", tmp_path / "wrong")
+        write_png(maps / f"{truth.name}.png", turned(truth.normal["fine"], 1.0, seed) * [1, -1, -1])
+    code, output, _ = here("score", maps, "--on", on, "--out", tmp_path / "wrong")
     assert code == 0
     assert "warning: normals fit the truth better with --frame x,-y,-z" in output.replace("\n", " ")
     options = ("--frame", "opengl", "--out", tmp_path / "scored")
-    code, output, errors = here("score", tmp_path / "maps", "--on", on, *options)
+    code, output, errors = here("score", maps, "--on", on, *options)
     assert (code, [line for line in errors if "Error" in line]) == (0, [])
     assert "x,-y,-z (opengl), as stated" in output.replace("\n", " ")
     record = json.loads((tmp_path / "scored" / "dense.json").read_text())
@@ -83,28 +92,12 @@ def test_flipped_maps_of_rendered_frames_score_their_turn(run, here, tmp_path):
 
 
 @pytest.mark.slow
-def test_maps_in_npy_are_exact(run, here, tmp_path):
+def test_maps_in_exr_are_read(run, here, maps, tmp_path):
     on, truths = run
-    (tmp_path / "maps").mkdir()
-    for seed, truth in enumerate(truths):
-        np.save(tmp_path / "maps" / f"{truth.name}.npy", turned(truth.normal["fine"], 1.0, seed))
-    code, output, _ = here("score", tmp_path / "maps", "--on", on, "--out", tmp_path / "scored", "--json")
-    assert code == 0
-    record = json.loads(output)
-    means = [cell["mean"] for cell in record["sources"]["normal"]["angle_deg"]["fine"]]
-    np.testing.assert_allclose(means, 1.0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_maps_in_exr_are_read(run, here, tmp_path):
-    from simtest.rendering.bitmap import write_exr
-
-    on, truths = run
-    (tmp_path / "maps").mkdir()
     for truth in truths:
-        write_exr(tmp_path / "maps" / f"{truth.name}_depth.exr", truth.distance)
+        write_exr(maps / f"{truth.name}_depth.exr", truth.distance)
     options = ("--depth", "ray", "--out", tmp_path / "scored", "--json")
-    code, output, _ = here("score", tmp_path / "maps", "--on", on, *options)
+    code, output, _ = here("score", maps, "--on", on, *options)
     assert code == 0
     record = json.loads(output)
     assert record["conventions"]["depths"]["along"] == "ray"
@@ -128,39 +121,32 @@ def test_the_baseline_is_scored_by_its_name(run, here, tmp_path):
         (["--unit-mm", "0"], "--unit-mm 0: must be"),
     ],
 )
-def test_wrong_options_are_one_line(run, here, tmp_path, options, message):
-    (tmp_path / "maps").mkdir()
-    np.save(tmp_path / "maps" / "a.npy", np.zeros((4, 4, 3)))
-    code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", tmp_path / "scored", *options)
+def test_wrong_options_are_one_line(run, here, maps, tmp_path, options, message):
+    np.save(maps / "a.npy", np.zeros((4, 4, 3)))
+    code, _, errors = here("score", maps, "--on", run[0], "--out", tmp_path / "scored", *options)
     assert code != 0
     assert message in errors[-1]
     assert not (tmp_path / "scored" / "dense.json").exists()
 
 
-def test_names_of_maps_are_checked_before_anything_is_rendered(run, here, tmp_path, monkeypatch):
-    from simtest.dataset.scoring.dense import score
-
+def test_names_of_maps_are_checked_before_anything_is_rendered(run, here, maps, tmp_path, monkeypatch):
     def render(*_):
         raise AssertionError("rendered")
 
     monkeypatch.setattr(score, "scored_frames", render)
-    (tmp_path / "maps").mkdir()
-    np.save(tmp_path / "maps" / "stranger.npy", np.zeros((4, 4, 3)))
-    code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", tmp_path / "scored")
+    np.save(maps / "stranger.npy", np.zeros((4, 4, 3)))
+    code, _, errors = here("score", maps, "--on", run[0], "--out", tmp_path / "scored")
     assert code != 0
     assert "no map is called as a frame (found stranger.npy" in errors[-1]
 
 
-def test_a_stopped_score_does_not_say_that_it_goes_on(run, here, tmp_path, monkeypatch):
-    from simtest.dataset.scoring.dense import score
-
+def test_a_stopped_score_does_not_say_that_it_goes_on(run, here, maps, tmp_path, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(score, "scored_frames", stop)
-    (tmp_path / "maps").mkdir()
-    np.save(tmp_path / "maps" / f"{run[1][0].name}.npy", np.zeros((4, 4, 3)))
-    code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", tmp_path / "scored")
+    np.save(maps / f"{run[1][0].name}.npy", np.zeros((4, 4, 3)))
+    code, _, errors = here("score", maps, "--on", run[0], "--out", tmp_path / "scored")
     assert code == 130
     assert errors[-1] == "simtest: stopped; an earlier page stays; the same command begins anew"
 
@@ -172,16 +158,12 @@ def test_options_of_maps_are_refused_for_a_table(run, here, tmp_path):
     assert "for folders of maps alone" in errors[-1]
 
 
-def test_a_run_is_not_written_over(run, here, tmp_path):
-    (tmp_path / "maps").mkdir()
-    np.save(tmp_path / "maps" / "a.npy", np.zeros((4, 4, 3)))
-    code, _, errors = here("score", tmp_path / "maps", "--on", run[0], "--out", run[0])
+def test_a_run_is_not_written_over(run, here, maps, tmp_path):
+    np.save(maps / "a.npy", np.zeros((4, 4, 3)))
+    code, _, errors = here("score", maps, "--on", run[0], "--out", run[0])
     assert code != 0
     assert "holds another page" in errors[-1]
 
 
 def test_the_command_knows_the_methods():
-    from simtest.cli.runs import WORDS
-    from simtest.dataset.scoring.dense.maps import METHODS
-
     assert set(WORDS) == set(METHODS)

@@ -265,15 +265,6 @@ def bank_of_two(bank):
     return Bank(bank.shares[:, :2], bank.summaries, bank.radiance)
 
 
-def test_frames_without_any_highlight_are_a_stated_gap(tmp_path, bank):
-    for number in range(3):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((80, 96, 3), (60, 80, 160 + number), dtype=np.uint8))
-    dataset = small()
-    seen = summarise_scenes(open_frames([tmp_path]))
-    found = fit_to_bank(seen, dataset, fitted_parameters(dataset), bank_of_two(bank), repeats=5)
-    assert any(note.startswith("the frames do not tell: radius") for note in found.notes())
-
-
 def test_ranges_are_those_of_the_fit_and_stay_inside():
     fitted = inference.Fitted(
         np.array([0.5, 0.95, 0.5]), np.array([0.1, 0.1, 0.1]), 0.1, np.zeros((1, 3)), np.zeros((1, 3)),

@@ -96,13 +96,8 @@ def test_page_says_for_which_realism_its_scenes_stand(tmp_path):
     run = make_run(tmp_path / "run", items=0)
     summary = json.loads((run / "summary.json").read_text())
     entries = [
-        {
-            "scenes": [f"curve {i}"],
-            "kind": "smooth",
-            "camera_chain": [],
-            "sentence": f"Smooth <control> {i}.",
-            "distance": None,
-        }
+        {"scenes": [f"curve {i}"], "kind": "smooth", "camera_chain": [], "distance": None}
+        | {"sentence": f"Smooth <control> {i}."}
         for i in range(6)
     ]
     summary["experiments"]["overview"]["realism"] = entries

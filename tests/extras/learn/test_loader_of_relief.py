@@ -1,11 +1,11 @@
 """The loader gives both truths of a dataset with relief."""
 
-import test_dataset_relief
+import test_dataset_contents
 import torch
 
 from simtest.dataset.learn import Samples
 
-made = test_dataset_relief.made
+made = test_dataset_contents.made
 
 
 def test_loader_passes_the_base_on(made):
