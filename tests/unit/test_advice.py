@@ -515,3 +515,9 @@ def test_the_picture_has_a_sound_scene_for_each_organ_and_relief(tmp_path, organ
     assert (scene.surface.relief is None) == smooth
     assert (scene.camera.width, scene.camera.height) == (96, 72)
     assert scene.sensor.preset == ORGANS[organ].sensor
+
+
+def test_frames_that_follow_each_other_share_their_relief():
+    around = surroundings(Question(read_scope("laparoscope"), "liver", (20.0, 60.0), frames=40, seed=3))
+    seeds = np.array(drawn_values(around, 3, 5, DISTANCES)[RELIEF_SEED]).reshape(5, DISTANCES)
+    assert all(len(np.unique(row)) == 1 for row in seeds)

@@ -3,7 +3,9 @@
 import base64
 import io
 import json
+import sys
 import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -222,3 +224,10 @@ def test_pictures_are_embedded_small():
     with Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))) as found:
         assert found.size == (450, 300)
         assert np.abs(np.asarray(found.convert("RGB")).astype(int) - picture[0, 0]).max() < 12
+
+
+def test_figures_have_the_fonts_of_their_own_folder(monkeypatch):
+    told = []
+    monkeypatch.setitem(sys.modules, "vl_convert", SimpleNamespace(register_font_directory=told.append))
+    charts._converter.__wrapped__()
+    assert told == [str(pixels.fonts())]

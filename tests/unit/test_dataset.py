@@ -22,7 +22,7 @@ from simtest.dataset.card import make_card, write_preview
 from simtest.dataset.index import TABLES, write_shard_tables, write_tables
 from simtest.dataset.maker import Maker, _share_of
 from simtest.dataset.manifest import NAME, FileEntry, Manifest, _digest, file_entry, new_manifest, read_manifest
-from simtest.dataset.plan import Plan
+from simtest.dataset.plan import Plan, _draw
 from simtest.dataset.shard import BrokenShardError, decode, finish, read_member, sample_key, samples, write_sample
 from simtest.dataset.shard_writer import _write_shards, write_dataset
 from simtest.dataset.verify import compare, repair_files, reproduce_sample, verify
@@ -34,7 +34,7 @@ from simtest.spec import load_dataset, load_scene, scene_from_dict
 from simtest.spec.recipes import Dataset, Distribution, Splits
 from simtest.spec.spec_model import validate
 from tests.marked import marked
-from tests.unit.engine_tasks import breaks, dies_once, fails, meets_a_full_disk, square
+from tests.unit.engine_tasks import breaks, dies_once, fails, meets_a_full_disk, process, square
 
 ROOT = Path(__file__).resolve().parents[2]
 MESH = str(ROOT / "meshes" / "colon_40mm.ply")
@@ -917,3 +917,14 @@ def test_a_preview_shows_samples_of_the_whole_dataset(made, tmp_path):
     # Histograms are charts of the page.
     assert "<h3>distance of isolated highlights</h3>" in page
     assert page.count('data-chart="histogram-') >= 1
+
+
+def test_the_order_of_keys_in_a_file_does_not_matter():
+    drawn = {name: Distribution(low=0.0, high=1.0) for name in ("b", "a", "c")}
+    one = _draw(drawn, np.random.default_rng(4))
+    assert _draw(dict(reversed(drawn.items())), np.random.default_rng(4)) == one
+
+
+def test_a_process_is_replaced_after_its_tasks():
+    pids = [pid for _, pid in make_engine(workers=2, renew_after=1).run(process, range(6), lambda: None)]
+    assert len(set(pids)) == 6

@@ -281,3 +281,10 @@ NO_LAW = [{"eps": 10.0}, {"isovalue": 0.01}, {"exponent": 30.0}, {"theta_deg": 8
 @pytest.mark.parametrize("values", NO_LAW)
 def test_the_law_says_nothing_with_the_light_off_v_or_the_window_cut(values):
     assert smoothing_bias(PaperSetting(**values)) is None
+
+
+def test_an_information_matrix_that_is_mostly_rounding_gives_no_bound(monkeypatch):
+    assert predictions.MOST_CONDITION == 1e13
+    assert predictions.cramer_rao_bound(PaperSetting()) is not None
+    monkeypatch.setattr(predictions, "MOST_CONDITION", 1.0)
+    assert predictions.cramer_rao_bound(PaperSetting()) is None
