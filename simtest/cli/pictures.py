@@ -134,15 +134,8 @@ def record_tables(spots: "Specularities") -> "Iterator[str | Table]":
              _pair(errors.mean_oracle_deg, errors.std_oracle_deg), _share(errors.inside), _share(errors.inside_organ))
             for name, errors in compared.estimators.items()
         ]  # fmt: skip
-        columns = (
-            "estimator",
-            "n",
-            "mean ± std (deg)",
-            "better candidate (deg)",
-            "inside its 95 %",
-            "the organ's 95 %",
-        )
-        yield Table(columns, rows)
+        of_errors = ("estimator", "n", "mean ± std (deg)", "better candidate (deg)")
+        yield Table((*of_errors, "inside its 95 %", "the organ's 95 %"), rows)
         yield f"{compared.missed} sightlines miss {compared.source}"
 
 

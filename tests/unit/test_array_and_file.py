@@ -163,7 +163,11 @@ def test_the_calibration_states_what_is_not_inferred():
     assert (choices.encoding, choices.saturation_level) == ("gamma", 0.9)
     assert choices.inferred == ("detector", "smoothing_px", "estimators")
     assert choices.priors == calibration.priors
-    assert [each.what for each in choices.assumed] == ["falloff towards the border", "highlights"]
+    assert [each.what for each in choices.assumed] == [
+        "falloff towards the border",
+        "slope of the relief",
+        "highlights",
+    ]
     # An array gets the same default estimators as a file: lights and a distance are enough for one more.
     assert choices.estimators[-1] == "bisector"
 

@@ -12,6 +12,7 @@ import pytest
 import simtest.advice.scope
 import simtest.bench.suite
 import simtest.estimators.process.core
+import simtest.spec.calibration_spec
 import simtest.surfaces.recipe  # noqa: F401  (these modules hold models)
 from simtest.errors import InputError
 from simtest.spec.spec_model import Spec, validate

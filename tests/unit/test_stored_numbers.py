@@ -93,7 +93,6 @@ SAYS_FITTED = re.compile(
 )
 EXCEPTIONS = {
     "conventions.SPECULAR_MIN_AREA_PX": "says from how many pixels an ellipse is fitted to a highlight",
-    "calibration.priors.UNTOLD_SLOPE_RAD": "is an assumption that spans the recipes' slopes; the recipe was fitted",
 }
 """Module constants that say "fitted" and why they are no fitted numbers."""
 
