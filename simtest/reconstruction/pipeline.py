@@ -17,7 +17,7 @@ from simtest.detection.view import View, find_view
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import AnyEstimator, Estimate, load_estimators
 from simtest.estimators.dispatch import prepare, run_in_frame
-from simtest.estimators.prior_parts import relief_part
+from simtest.estimators.prior_parts import relief_part, to_base
 from simtest.estimators.protocol import Target
 from simtest.estimators.small_spots import UNRESOLVED
 from simtest.geometry import Camera, Patch
@@ -261,7 +261,8 @@ def _estimate(
             small = highlight is not None and math.sqrt(highlight.area_px / math.pi) < SMALL_RADIUS * frame.smoothing_px
             dim = highlight is not None and highlight.dim
             results = {name: _flagged(each, patch, frame, small, dim) for name, each in results.items()}
-        spots.append(Specularity(region, patch, results, highlight, frame.calibration.camera, options.target, relief))
+        organ = {name: to_base(each, relief) for name, each in results.items() if isinstance(each, Estimate)}
+        spots.append(Specularity(region, patch, results, highlight, frame.calibration.camera, options.target, organ))
     box = options.roi
     undetected = [
         _undetected(name, estimate, frame, options.target, relief)
@@ -290,7 +291,8 @@ def _undetected(name: str, estimate: Estimate, frame: Frame, target: Target, rel
         box = (low[0], low[1], min(high[0] + 1, width) - low[0], min(high[1] + 1, height) - low[1])
         why = f"a cloud of {len(estimate.cloud.points_px)} highlights, no single one"
     region, no_patch = Region(box, (x, y), None), Failure(Reason.NO_PEAK, why)
-    return Specularity(region, no_patch, {name: estimate}, None, frame.calibration.camera, target, relief)
+    organ = {name: to_base(estimate, relief)}
+    return Specularity(region, no_patch, {name: estimate}, None, frame.calibration.camera, target, organ)
 
 
 def _flagged(result: Estimate | Failure, patch: Patch, frame: Frame, small: bool, dim: bool) -> Estimate | Failure:

@@ -5,7 +5,7 @@ docs/howto/reconstruct.md explains the keys of their JSON. It is what the tables
 
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -20,7 +20,6 @@ from simtest.detection.view import View
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.estimators.budget import deviations, dominant
-from simtest.estimators.prior_parts import to_base
 from simtest.estimators.protocol import Target
 from simtest.geometry import Camera, Patch
 from simtest.reconstruction.options import Choices
@@ -70,9 +69,9 @@ class Specularity:
         Of the frame.
     target : {"fine", "base"}
         The surface whose normal is wanted: the best estimate states it, where there is any.
-    relief : array, shape (2, 2), optional
-        Covariance of a highlight's normal about that of the organ below its relief, rad^2
-        (`simtest.estimators.prior_parts.relief_part`).
+    organ : mapping
+        The same results as normals of the organ below its relief, whose slope is in their budgets
+        (`simtest.estimators.prior_parts.to_base`).
     id : int
         Its place among those of the frame.
     track : int, optional
@@ -96,7 +95,7 @@ class Specularity:
     highlight: Highlight | None = None
     camera: Camera | None = None
     target: Target = "fine"
-    relief: Array | None = None
+    organ: Mapping[str, Estimate] = field(default_factory=dict)
     id: int = 0
     track: int | None = None
     reference: Any = None
@@ -134,13 +133,6 @@ class Specularity:
     def normals(self) -> dict[str, Estimate]:
         """The results of the estimators that did not fail."""
         return {name: result for name, result in self.estimates.items() if isinstance(result, Estimate)}
-
-    @cached_property
-    def organ(self) -> dict[str, Estimate]:
-        """The same results as normals of the organ below its relief, with the relief's slope in their budgets."""
-        if self.relief is None:
-            return {}
-        return {name: to_base(result, self.relief) for name, result in self.normals.items()}
 
     @cached_property
     def _judged(self) -> tuple[str | None, str]:
@@ -278,7 +270,7 @@ class Specularities(list[Specularity]):
     @property
     def stated_of_organ(self) -> "StatedErrors | None":
         """The same of the normals of the organ below its relief."""
-        return stated_errors([each.organ[each.best] for each in self if each.best in each.organ])
+        return stated_errors([each.organ[best] for each in self if (best := each.best) is not None and each.organ])
 
     def to_json(self, drawn: bool = True, origin: provenance.Environment | None = None) -> JsonObject:
         """Return the content of normals.json; without isophotes and curves where it is not `drawn`.
