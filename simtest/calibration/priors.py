@@ -169,8 +169,8 @@ UNTOLD_FALLOFF_POWER = Assumed(0.0, 4.0)
 """Power k of the falloff cos^k of lens and lights over the angle from the optical axis, where none is told."""
 
 UNTOLD_SLOPE_RAD = Assumed(math.radians(3.0), math.radians(20.0))
-"""Slope of the relief an axis, rad, where none is told: one frame hardly tells it (theory.md 8.6). The recipes have 1.4
-to 9 deg (scenes/datasets/endoscopy.toml), a colon's phantom seen through a colonoscope 12 to 18 (8.1, 8.7)."""
+"""Slope of the relief an axis, rad, where none is told: one frame hardly tells it. The recipes have 1.4 to 9 deg
+(scenes/datasets/endoscopy.toml), and highlights of a colon's phantom lie wider than such slopes make them."""
 
 
 @dataclass(frozen=True)

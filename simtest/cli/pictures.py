@@ -111,8 +111,8 @@ def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]
     yield from record_tables(spots)
     if spots.stated is not None:
         yield f"reported: {spots.stated}"
-        if spots.stated_of_organ not in (None, spots.stated):
-            yield f"of the organ below its relief: {spots.stated_of_organ}"
+        if (organ := spots.stated_of_organ) not in (None, spots.stated):
+            yield f"of the organ below its relief: {organ}"
         yield MEANING
     yield from silent_lines(spots)
     yield from assumed_lines(spots.choices.assumed)

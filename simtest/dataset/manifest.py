@@ -41,6 +41,11 @@ class FileEntry(BaseModel):
     bytes: StrictInt
     sha256: str
 
+    def wrong_size(self, path: Path) -> str:
+        """Return what is wrong with the size of the file as it is; nothing where it is right."""
+        size = path.stat().st_size
+        return "" if size == self.bytes else f"has {size} bytes; must have {self.bytes}"
+
 
 # Whoever writes a manifest can write its digest too, so what it lists is not trusted: a name that leaves the folder is
 # never opened.

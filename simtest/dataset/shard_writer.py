@@ -193,11 +193,8 @@ def _open(folder: Path, plan: Plan, variant: str) -> Manifest:
     # A file that was cut or changed since is not taken for a finished one.
     listed = {**there.shards, **{name: entry for name, entry in there.tables.items() if name in TABLES}}
     for name, entry in listed.items():
-        if (path := folder / name).exists() and (size := path.stat().st_size) != entry.bytes:
-            raise InputError(
-                f"--out {folder}: {name} has {size} bytes; must have {entry.bytes}; simtest dataset verify --repair "
-                "mends it"
-            )
+        if (path := folder / name).exists() and (said := entry.wrong_size(path)):
+            raise InputError(f"--out {folder}: {name} {said}; simtest dataset verify --repair mends it")
     return there
 
 

@@ -122,8 +122,8 @@ def _files(folder: Path, manifest: Manifest, plan: Plan) -> Iterator[Fault]:
 def _against(path: Path, entry: FileEntry) -> Iterator[Fault]:
     if path.is_symlink() or not path.is_file():
         yield Fault(path.name, "is no plain file" if path.exists() else "missing")
-    elif path.stat().st_size != entry.bytes:
-        yield Fault(path.name, f"has {path.stat().st_size} bytes; must have {entry.bytes}")
+    elif said := entry.wrong_size(path):
+        yield Fault(path.name, said)
     elif file_entry(path).sha256 != entry.sha256:
         yield Fault(path.name, "differs from its SHA-256 in the manifest")
 

@@ -337,8 +337,7 @@ def check_frame(frame: npt.ArrayLike, camera: Camera, encoding: str | None = Non
         with np.errstate(all="ignore"):
             image = given.astype(np.float32)
     check_size(image, camera)
-    check_finite(image)
-    low, high = float(image.min()), float(image.max())
+    low, high = finite_range(image)
     if is_picture and (low < 0 or high > 1):
         raise InputError(f"frame holds values from {low:g} to {high:g}: encoded real values must lie in [0, 1]")
     if is_picture and image.ndim == 3 and image.shape[2] not in (1, 3):
@@ -348,18 +347,19 @@ def check_frame(frame: npt.ArrayLike, camera: Camera, encoding: str | None = Non
     return image, is_picture
 
 
-def check_finite(image: Image) -> None:
-    """Raise `InputError` where a frame, or the mean of its channels, holds values that are not finite."""
+def finite_range(image: Image) -> tuple[float, float]:
+    """Return the least and the largest value; raise `InputError` where some, or means of channels, are not finite."""
     with np.errstate(all="ignore"):
         # NaN and infinity show at both or either end of the range, which costs less than the means.
         low, high = float(image.min()), float(image.max())
         if max(-low, high) * (1 if image.ndim == 2 else image.shape[2]) < SAFE_SUM:
-            return
+            return low, high
         # The channels' mean may be beyond what float32 holds.
         finite = np.isfinite(image if image.ndim == 2 else image.mean(axis=2, dtype=np.float32))
     if not finite.all():
         bad = int(np.count_nonzero(~finite))
         raise InputError(f"frame holds {bad} values that are NaN, infinite or beyond 3e38: all must be finite")
+    return low, high
 
 
 def check_size(image: Image, camera: Camera) -> None:

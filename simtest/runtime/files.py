@@ -30,13 +30,9 @@ JsonObject = dict[str, Any]
 
 def as_path(value: object, name: str = "path") -> Path:
     """Return a path that a caller from Python gave under a name; raise `InputError` for what is none."""
-    try:
-        path = Path(value)  # type: ignore[arg-type]
-    except TypeError:
-        path = Path("\0")
-    if "\0" in str(path):
-        raise InputError(f"{name} = {shown(value)}: must be a path") from None
-    return path
+    if not isinstance(value, str | os.PathLike) or "\0" in str(value):
+        raise InputError(f"{name} = {shown(value)}: must be a path")
+    return Path(value)
 
 
 def refuse_file(folder: Path, option: str = "--out") -> None:

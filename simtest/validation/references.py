@@ -43,8 +43,8 @@ ROTATION_TOLERANCE = 1e-3
 class ErrorRecord:
     """Angle to a reference, deg: of the proposed normal, and of the better candidate; and whether regions hold it.
 
-    `inside` is of the 95 % region that is stated of the facet's normal, `inside_organ` of that of the organ's; None
-    where there is none.
+    `inside` is of the 95 % region that the estimate states, `inside_organ` of that of the organ's normal; None where
+    there is none.
     """
 
     error_deg: float

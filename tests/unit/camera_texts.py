@@ -128,3 +128,11 @@ FISHEYE_STRUCT = {
     "StretchMatrix": np.array([[C3VD["c"], C3VD["d"]], [C3VD["e"], 1.0]]),
 }
 """MATLAB's fisheyeIntrinsics, whose first pixel is (1, 1); it names x before y and looks along z."""
+
+TOML = """width = 640
+height = 480
+fx = 300.0
+fy = 300.0
+distortion = { type = "kannala_brandt", k1 = 0.01 }
+view_mask = { radius = 200.0 }
+"""

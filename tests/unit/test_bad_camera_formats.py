@@ -6,7 +6,18 @@ import sys
 
 import numpy as np
 import pytest
-from camera_texts import FISHEYE_STRUCT, JSON, KALIBR, PHOTOMETRIC, ROS_FILE, ROS_MESSAGE, STRUCT, vicalib, written
+from camera_texts import (
+    FISHEYE_STRUCT,
+    JSON,
+    KALIBR,
+    PHOTOMETRIC,
+    ROS_FILE,
+    ROS_MESSAGE,
+    STRUCT,
+    TOML,
+    vicalib,
+    written,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
@@ -31,13 +42,6 @@ EIGHT = (
     "image_width: 640\nimage_height: 480\ndistortion_model: PLUMB_BOB\nK: [400, 0, 319.5, 0, 400, 239.5, 0, 0, 1]\n"
     "D: [-0.1, 0, 0, 0, 0, 0, 0, 0]\n"
 )
-OWN = """width = 640
-height = 480
-fx = 300.0
-fy = 300.0
-distortion = { type = "kannala_brandt", k1 = 0.01 }
-view_mask = { radius = 200.0 }
-"""
 
 
 def swap(text, old, new):
@@ -128,8 +132,8 @@ CAMERAS = {
     "c.yaml: model in capitals": (EIGHT, "8 values; must be 4 or 5"),
     "c.yaml: binned": (ROS_MESSAGE.replace("binning_x: 0", "binning_x: 2"), "binning_x = 2: must be 0 or 1"),
     "c.yaml: cropped": (ROS_MESSAGE.replace("x_offset: 0", "x_offset: 8"), "roi.x_offset = 8: must be 0"),
-    "c.toml: empty view": (swap(OWN, "radius = 200.0", "radius = 2, cx = -50"), "view_mask = "),
-    "c.toml: folds": (swap(OWN, "0.01", "-0.9"), "distortion: the lens folds over at 34.87 deg off its axis"),
+    "c.toml: empty view": (swap(TOML, "radius = 200.0", "radius = 2, cx = -50"), "view_mask = "),
+    "c.toml: folds": (swap(TOML, "0.01", "-0.9"), "distortion: the lens folds over at 34.87 deg off its axis"),
     "c.toml: no focal length": ("width = 640\nheight = 480\n", "fx: missing; a camera needs width, height, and"),
 }  # fmt: skip
 

@@ -6,7 +6,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from camera_texts import C3VD, FISHEYE_STRUCT, JSON, KALIBR, ROS_FILE, ROS_MESSAGE, STRUCT, vicalib, written
+from camera_texts import C3VD, FISHEYE_STRUCT, JSON, KALIBR, ROS_FILE, ROS_MESSAGE, STRUCT, TOML, vicalib, written
 from scipy.io import loadmat, savemat
 from scipy.spatial.transform import Rotation
 
@@ -470,15 +470,6 @@ def test_matlabs_fisheye(tmp_path):
 
 
 # Which format it is -----------------------------------------------------------------------------------------------
-
-
-TOML = """width = 640
-height = 480
-fx = 300.0
-fy = 300.0
-distortion = { type = "kannala_brandt", k1 = 0.01 }
-view_mask = { radius = 200.0 }
-"""
 
 
 def test_own_files(tmp_path):
