@@ -13,7 +13,7 @@ TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 # Containers often forbid bytecode, and each process would compile a thousand modules again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo docs docs-commands docs-figures test test-all test-ci test-extras examples bench bench-cycles lint audit \
+.PHONY: help demo docs docs-commands docs-figures test test-all test-ci test-extras examples bench lint audit \
 	hashed-constraints release-check format clean
 
 help:
@@ -26,7 +26,6 @@ help:
 	@echo "make test-extras  tests that need an extra, which it installs beside .venv, or another program"
 	@echo "make test-ci   what CI runs beyond make test: the cases marked ci, and those of test-extras"
 	@echo "make bench     speeds, as ratios within one run"
-	@echo "make bench-cycles  a labelled frame beside Blender's Cycles, which it installs (Python 3.11; 1 GB)"
 	@echo "make lint      ruff, mypy, import-linter"
 	@echo "make audit     risky calls and known vulnerabilities (bandit, pip-audit), where these can run"
 	@echo "make examples  run all examples, renew their pictures in the manual (under 4 minutes of processor time)"
@@ -62,11 +61,6 @@ $(VENV)/.benchmarks: $(VENV)/.installed
 	$(BIN)/python $(PIP) -e ".[bench]"
 	@touch $@
 
-$(VENV)-cycles/.installed: benchmarks/cycles-requirements.txt
-	$(PYTHON) -m venv $(VENV)-cycles
-	$(VENV)-cycles/bin/python -m pip install --quiet --disable-pip-version-check -r benchmarks/cycles-requirements.txt
-	@touch $@
-
 demo: $(VENV)/.installed
 	$(BIN)/simtest validate overview
 
@@ -96,10 +90,6 @@ test-ci: $(EXTRAS)/.extras
 
 bench: $(VENV)/.benchmarks
 	$(BIN)/python -m benchmarks
-
-# Blender's Cycles lives in an environment of its own: its package needs a NumPy older than ours, and Python 3.11.
-bench-cycles: $(VENV)/.installed $(VENV)-cycles/.installed
-	SIMTEST_CYCLES_PYTHON=$(VENV)-cycles/bin/python $(BIN)/python -m benchmarks blender
 
 lint: $(VENV)/.tests
 	$(BIN)/ruff check
@@ -136,4 +126,4 @@ release-check: $(BIN)/python
 	$(BIN)/python .ci/release_check.py --pythons $(RELEASE_PYTHONS) $(RELEASE_OPTIONS)
 
 clean:
-	rm -rf $(VENV) $(EXTRAS) $(VENV)-cycles $(VENV)-audit reports/runs .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(EXTRAS) $(VENV)-audit reports/runs .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -5,21 +5,15 @@ import sys
 
 from benchmarks.measuring import Figure, print_figures
 
-NAMES = ("estimators", "published", "rendering", "colour", "camera_chain", "dataset", "core_protocol")
+NAMES = ("estimators", "rendering", "colour", "dataset", "core_protocol")
 """Modules of this package with a function `figures()`."""
 
 ON_REQUEST = (
-    "blender",
-    "flow",
     "transfers",
     "growth",
     "cost",
-    "cores",
     "memory",
-    "ray_nodes",
-    "dataset_memory",
     "nightly_page",
-    "run_page",
 )
 """The same, run where they are named: they take minutes, or need what is not always there."""
 

@@ -1,7 +1,6 @@
 """Memory at the resolution of real frames, 1280 x 720: of `simtest render anatomy`, and of a dataset's process.
 
-Peaks are those of the whole process as the system counts them. `dataset_memory` follows small frames for long, which
-shows what adds up; this shows how much there must be.
+Peaks are those of the whole process as the system counts them.
 """
 
 import json

@@ -7,8 +7,8 @@
 Frames are those of the recipe `endoscopy` through its camera chains, with a seed of this study alone: colon, stomach,
 liver and gallbladder in equal shares, under the first light of their scope alone, which in every second frame stands at
 the camera; the relief's slope is drawn anew, from 2 to 8 deg. What is told is the camera, the light, and the scope's
-working range; a light beside the camera is also judged with a told distance. The best estimates are scored as in
-`studies.twins`, by kind of highlight. "Before" is the same picture without room for near misses
+working range; a light beside the camera is also judged with a told distance. The best estimates are scored by
+kind of highlight. "Before" is the same picture without room for near misses
 (`simtest.estimators.prior_parts`), the negative control. A second table is of the base's normals: of single highlights,
 and of clouds. Nothing was tuned on the seed. With `--clouds` only those are judged, on colon, stomach and liver. With
 `--base` only single highlights against the base's normal are judged: with the default prior of the relief's slope, with
@@ -18,6 +18,7 @@ the slope told exactly, and, as negative control, with slopes up to 8 deg that a
 import json
 import math
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,8 +30,9 @@ from benchmarks.measuring import print_markdown
 from simtest.advice.twin.scoring import ScoredSpot, score
 from simtest.calibration import Calibration, Normal, Priors, Uniform, exactly
 from simtest.dataset.plan import Drawn, Plan
-from simtest.errors import Failure
+from simtest.errors import Failure, SimtestError
 from simtest.estimators import Estimate, prior_parts
+from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.options import Options, default_estimators
 from simtest.reconstruction.pipeline import run
@@ -39,11 +41,21 @@ from simtest.rendering import Session
 from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import from_integer
-from simtest.simulation.frame import RenderedView
+from simtest.simulation.frame import RenderedView, render_view
 from simtest.simulation.highlights import CloudRegions
 from simtest.spec.recipes import load_dataset
 from simtest.validation.scoring import mahalanobis2, match_cloud
-from studies.tissue_views import ORGANS, in_8_bits, rendered, told
+
+SCOPES = {"colonoscope": (0, 1), "laparoscope": (2, 3)}
+"""Families of the recipe by scope: colon and stomach, liver and gallbladder."""
+
+ORGANS = ("colon", "stomach", "liver", "gallbladder")
+"""By family."""
+
+RANGES_MM = {"colonoscope": Uniform(8.0, 80.0), "laparoscope": Uniform(30.0, 150.0)}
+"""Working range that a user would tell."""
+
+TRIES, COLOUR = 4, "llvm_ad_rgb"
 
 SEED = 9642
 """Of the frames; nothing was tuned on them."""
@@ -92,6 +104,33 @@ class OneLight(Plan):
         rough = scene.surface.model_copy(update={"relief": relief.model_copy(update={"bands": bands})})
         rig = scene.rig.model_copy(update={"lights": (light,)})
         return replace(drawn, scene=scene.model_copy(update={"rig": rig, "surface": rough}))
+
+
+def rendered(plan: Plan, index: int) -> tuple[Session, RenderedView, int] | None:
+    """Return a rendered frame and its family; None where no draw gives one."""
+    for attempt in range(TRIES):
+        drawn = plan.draw(index, attempt)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                session = Session(drawn.scene, COLOUR)
+                return session, render_view(session, drawn.scene), drawn.anatomy.family
+        except SimtestError as error:
+            print(f"frame {index}: {error}", file=sys.stderr)
+    return None
+
+
+def in_8_bits(view: RenderedView) -> Image:
+    """Return the picture of a frame, with the noise of its scene's seed."""
+    return np.asarray(np.rint(255 * view.frame(view.scene.sensor.seed)) / 255, dtype=np.float32)
+
+
+def told(view: RenderedView, family: int) -> Calibration:
+    """Return what a user would tell of a frame's camera: the nominal lights and the scope's working range."""
+    camera, lights = view.calibration.camera, view.calibration.priors.lights_mm
+    plain = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    scope = next(name for name, families in SCOPES.items() if family in families)
+    return Calibration(plain, priors=Priors(lights_mm=lights, distance_mm=RANGES_MM[scope]))
 
 
 def main(arguments: Sequence[str]) -> int:

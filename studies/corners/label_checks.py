@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,12 @@ from scipy import ndimage
 from simtest.calibration import Response
 from simtest.rendering import HighlightPoint, Session
 from simtest.rendering.backend import colour_variant
+from simtest.rendering.rays import Sightlines
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.spec.scene import scene_from_dict
 from studies.corners import formulas
 from studies.corners.case import Case, Faults, NotAskedError, mean
 from studies.corners.scenes import SMOOTH
-from studies.instance_masks import peak_of
 
 MOST_CUT = 0.1
 """Share of an isolated highlight's border that an instrument may make."""
@@ -25,6 +26,24 @@ CLEAR = 0.85
 
 DRAWS = 96
 """Pictures by which the noise is measured: its deviation is then known to 7 %."""
+
+
+DIVISION = 100
+"""Rays along a pixel's side."""
+
+
+def peak_of(session: Session, point_px: Array) -> float:
+    """Render a pixel's area around a point with many rays, and return the lobe's brightest."""
+    camera, corner, size = session.camera, point_px - 0.5, DIVISION
+    x, y = (camera.cx - corner[0]) * DIVISION, (camera.cy - corner[1]) * DIVISION
+    close = replace(
+        camera, fx=camera.fx * DIVISION, fy=camera.fy * DIVISION, cx=x, cy=y, width=size, height=size, view_mask=None
+    )
+    sightlines = Sightlines(close, session.surface.model_from_camera)
+    parts, _ = session._tracer(sightlines).centres(None, True, None)
+    # Of an instrument in front, too.
+    channels = len(parts) // (2 if session.scene.instruments else 1) // 2
+    return float(np.mean(parts[:channels], axis=0).max())
 
 
 def isolated(case: Case) -> Faults:

@@ -175,7 +175,7 @@ ROWS = (
         '("k1", "k2", "k3", "p1", "p2")', '("k1", "k2", "k3", "p2", "p1")', "camera_formats"),
     row("wrong K: focal length told 2 % too long", "lens", "spec.scene:Scene.calibration", "self.camera.model(),",
         "(lambda c: type(c)(c.width, c.height, 1.02 * c.fx, 1.02 * c.fy, c.cx, c.cy))(self.camera.model()),",
-        "validation calibration ladder frames"),
+        "validation calibration frames"),
     # surfaces
     row("degree for radian: tilt of a surface", "units", "surfaces.analytic:placement",
         "np.radians([tilt_deg, azimuth_deg, spin_deg])", "[tilt_deg, azimuth_deg, 0.0]", "analytic_surfaces render"),

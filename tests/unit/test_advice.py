@@ -33,7 +33,6 @@ from simtest.runtime.arrays import kept
 from simtest.surfaces import make_surface
 from simtest.validation import laws, realisation
 from simtest.validation.cases import RELIEF_SEED
-from studies.advice_strata import frames_of, gain
 from tests.unit.given_numbers import of_given_numbers
 
 CAMERA = "[camera]\nwidth = 96\nheight = 72\nfx = 90.0\nfy = 90.0\n"
@@ -405,41 +404,6 @@ def test_intervals_of_few_frames():
     assert interval([3.0] * 8, [*"aaaabbbb"]) == pytest.approx((3.0, 3.0))
     # A frame at a distance of its own widens nothing where others tell the spread.
     assert interval([2.0, 3.0, 2.5, 4.0, 5.0], [*"aaaab"])[1] > 3.3
-
-
-@pytest.mark.parametrize("depends", [pytest.param(True, marks=pytest.mark.ci), False])
-def test_the_gain_of_strata_is_that_of_planted_errors(depends):
-    """Errors of 1 / abs(1 + d k) lie between strata; negative control: the same errors in another order do not.
-
-    The range of chance holds 95 % of orders: of ten draws at most three are outside it, but for a chance of 0.001.
-    """
-    rng, outside = np.random.default_rng(5), 0
-    for seed in range(10):
-        least = rng.uniform(0.1, 2.0, 400)
-        counts = rng.binomial(2, 0.6, 400).astype(float)
-        errors = 1 / (least if depends else rng.permutation(least)) * np.exp(rng.normal(0, 0.1, 400))
-        made = gain(counts * errors, counts, least, seed)
-        outside += not made.chance[0] <= made.between <= made.chance[1]
-        if depends:
-            assert made.between > 0.4
-            assert made.weighted < 0.5
-    assert outside == 10 if depends else outside <= 3
-
-
-def test_strata_are_read_from_the_frames_of_a_run(tmp_path):
-    """Frames without an answer count, and a method's own answers alone."""
-    planned = main_experiment(Question(read_scope("laparoscope"), "liver", (20.0, 60.0), frames=8, seed=3))
-    write_experiment(planned, tmp_path / MAIN)
-    (tmp_path / RUN).mkdir()
-    rows = results([1.0, 3.0, 2.0, 5.0], [0, 0, 6, 7], ["ok", "ok", "ok", "degenerate_conic"])
-    rows.write_parquet(tmp_path / RUN / "results.parquet")
-    totals, counts, least = frames_of(tmp_path, "cone_axis")
-    assert totals.tolist() == [4, 0, 0, 0, 0, 0, 2, 0]
-    assert counts.tolist() == [2, 0, 0, 0, 0, 0, 1, 0]
-    pool = planned.groups[0].pool[0]
-    turns = [1 + pool["surface.distance_mm"][6] * pool[f"surface.{key}_per_mm"][6] for key in ("k1", "k2")]
-    assert least[6] == min(map(abs, turns))
-    assert frames_of(tmp_path, "curved")[1].sum() == 0
 
 
 @pytest.mark.parametrize(

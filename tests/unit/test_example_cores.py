@@ -12,7 +12,6 @@ import pytest
 import simtest
 from simtest.errors import Reason
 from simtest.estimators.isophotes import fit_isophotes
-from studies.authors_core import Agreement
 
 CORES = Path(__file__).resolve().parents[2] / "examples" / "cores"
 PYTHON = [sys.executable, str(CORES / "python" / "core.py")]
@@ -175,23 +174,6 @@ def test_a_script_without_the_functions_is_told_which(tmp_path):
     done = subprocess.run(command, input="", capture_output=True, text=True, timeout=30)
     assert done.returncode == 1
     assert "defines no function dual_conic, fit_ellipse_lstsq, normal_disambiguiting" in done.stderr
-
-
-def test_the_comparison_with_the_scripts_takes_the_pairs_in_any_order():
-    def pair(*tilts_deg, flags=()):
-        angles = np.radians(tilts_deg)
-        normals = np.stack([np.sin(angles), np.zeros(2), -np.cos(angles)], axis=1)
-        return simtest.Estimate(normals[0], normals, np.zeros(2), flags=flags)
-
-    agreement = Agreement()
-    agreement.add(pair(20.0, -10.0), pair(-10.1, 20.05))
-    assert agreement.gaps_deg == pytest.approx([0.1])
-    assert agreement.proposed_deg == pytest.approx([30.1])
-    assert agreement.from_axis_deg == pytest.approx([15.1])
-    agreement.add(pair(20.0, -20.0), pair(90.0, 90.0, flags=("one_normal",)))
-    agreement.add(pair(20.0, -20.0), simtest.Failure(Reason.NOT_KNOWN))
-    assert (agreement.single, agreement.unanswered) == (1, 1)
-    assert agreement.lines()[-1] == "proposed normal along the cone's axis: 0, across it: 1"
 
 
 @pytest.mark.parametrize(
