@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.measuring import Figure, print_figures
-from studies.bad_inputs import files, other_cases, reconstruct_cases, spec_cases
-from studies.bad_inputs.case import Case
-from studies.bad_inputs.run import LIMIT_MIB, LIMIT_S, Outcome, executed, forked, preload, run_all
+from studies.bad_inputs import files
+from studies.bad_inputs.cases import cases as every_case
+from studies.bad_inputs.run import LIMIT_MIB, LIMIT_S, Case, Outcome, executed, forked, preload, run_all
 
 KINDS = ("hang", "slow", "memory", "crash", "internal error", "traceback", "accepted")
 
 
 def all_cases() -> list[Case]:
     """Return all cases, in a fixed order; no two have one name."""
-    made = [*reconstruct_cases.cases(), *spec_cases.cases(), *other_cases.cases()]
+    made = list(every_case())
     twice = [name for name, count in Counter(case.name for case in made).items() if count > 1]
     if twice:
         raise AssertionError(f"two cases are called {twice[0]!r}")

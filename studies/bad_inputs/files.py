@@ -13,6 +13,9 @@ import cv2
 import numpy as np
 import scipy.io
 
+Content = bytes | str | Callable[[Path], None]
+"""Of a file: bytes, text, or a function that makes what stands at a path."""
+
 WIDTH, HEIGHT = 64, 48
 
 SCENE = f"""[surface]

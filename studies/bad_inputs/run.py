@@ -9,13 +9,14 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 
 import psutil
 
-from studies.bad_inputs.case import Case, Wanted
+from studies.bad_inputs.files import Content
 
 LIMIT_S = 10.0
 """Of processor time. A case that takes none and does not end is a hang after `HANG_S`."""
@@ -29,6 +30,54 @@ BAR = re.compile("[\u2501\u2800-\u28ff]")
 
 _LOOK_S = 0.05
 _KEPT = frozenset({"PATH", "HOME", "LANG", "PYTHONPATH", "XDG_CACHE_HOME", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"})
+
+
+class Wanted(StrEnum):
+    """What a command should make of a case."""
+
+    REFUSED = "refused"
+    """One line on stderr, exit code 2 (or 1 where a command's verdict is 1), nothing written."""
+
+    DONE = "done"
+    """Exit code 0: a good input, without which a refusal of its spoilt copies would say nothing."""
+
+    ORDERLY = "orderly"
+    """Either refused so, or done: some damaged bytes are still a good file."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command that is run in a folder of its own.
+
+    Parameters
+    ----------
+    name : str
+        "kind: what", unique.
+    command : tuple of str
+        Arguments of `simtest`.
+    files : mapping
+        What stands in the folder, by name.
+    wanted : Wanted
+        What should come of it.
+    says : str
+        What the line must hold, such as the key's name.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    files: Mapping[str, Content] = field(default_factory=dict)
+    wanted: Wanted = Wanted.REFUSED
+    says: str = ""
+
+    def make_files(self, folder: Path) -> None:
+        """Make the case's files."""
+        for name, content in self.files.items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if callable(content):
+                content(path)
+            else:
+                path.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 @dataclass(frozen=True)
@@ -159,9 +208,7 @@ def _watch(own: _Running) -> None:
     """Kill a case that hangs or eats the machine's memory."""
     try:
         process = psutil.Process(own.pid)
-        with process.oneshot():
-            memory = process.memory_info().rss / 2**20
-            times = process.cpu_times()
+        memory, times = process.memory_info().rss / 2**20, process.cpu_times()
     except psutil.Error:
         return
     own.peak = max(own.peak, memory)

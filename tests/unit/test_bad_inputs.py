@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-PARTS = ("reconstruct: picture", "camera .yaml", "nested", "--out, nothing", "mesh check: .obj", "manifest, FIFO")
+PARTS = ("picture .png", "camera .yaml", "nested", "--out, nothing", "mesh check: .obj", "FIFO")
 
 
 @pytest.mark.slow
