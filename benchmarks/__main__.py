@@ -5,15 +5,13 @@ import sys
 
 from benchmarks.measuring import Figure, print_figures
 
-NAMES = ("estimators", "rendering", "colour", "dataset", "core_protocol")
+NAMES = ("estimators", "rendering", "colour", "dataset")
 """Modules of this package with a function `figures()`."""
 
 ON_REQUEST = (
     "transfers",
     "growth",
     "cost",
-    "memory",
-    "nightly_page",
 )
 """The same, run where they are named: they take minutes, or need what is not always there."""
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from studies.bad_inputs import files
 from studies.bad_inputs.files import Content
 from studies.bad_inputs.run import Case, Wanted
@@ -185,7 +187,8 @@ def _strange_files() -> Iterator[Case]:
         "camera .xml": {"nested deeply": "<a>" * 50_000,
                         "grows": f"{laughs}<opencv_storage><image_width>&j;</image_width></opencv_storage>"},
         "camera .mat": {"K of structs": files.matlab(K={"a": 1}), "K of text": files.matlab(K="K")},
-        "--depth .npy": {"324 TB": header, "turned": files.npy(files.depth().T), "NaN": files.npy(files.depth() * 1e999)},
+        "--depth .npy": {"324 TB": header, "turned": files.npy(files.depth().T),
+                         "NaN": files.npy(np.full((48, 64), np.nan))},
         "--depth .exr": {"large": exr[: at + 29] + b"\xff\xff\xff\x7f" * 2 + exr[at + 37 :]},
         "pose": {"far": files.POSE.replace("40", "1e300"), "mirrored": files.POSE.replace("[[1,", "[[-1,"),
                  "ragged": "matrix = [[1], [2, 3]]", "zero": f"matrix = {[[0] * 4] * 4}"},
@@ -196,7 +199,8 @@ def _strange_files() -> Iterator[Case]:
                              "a negative vertex": files.ply(sides=[(0, 1, -2), *files.SIDES]),
                              "no list": ply.replace("property list uchar int vertex_indices", "property int a"),
                              "NaN": files.ply(((0, 0, 0), ("nan", 0, 0), (0, 40, 0), (0, 0, 40))),
-                             "flat": files.ply([(0, 0, 0)] * 4), "binary": ply.replace("ascii", "binary_little_endian")},
+                             "flat": files.ply([(0, 0, 0)] * 4),
+                             "binary": ply.replace("ascii", "binary_little_endian")},
         "mesh check: .vtk": {"9e9 points": vtk.replace("POINTS 4", "POINTS 9000000000"),
                              "9e9 cells": vtk.replace("POLYGONS 4", "POLYGONS 9000000000"),
                              "a cell of vertex 99": vtk.replace("3 0 2 1", "3 0 2 99"),

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
+from simtest.calibration import Calibration, Response
 from simtest.geometry.camera import Camera
 from simtest.rendering import Session
 from simtest.spec import Scene, scene_from_dict
@@ -106,6 +107,11 @@ def rig_table(lights: Floats) -> dict[str, Any]:
 def camera() -> Camera:
     """Return the camera of the pictures."""
     return Camera(**CAMERA)  # type: ignore[arg-type]
+
+
+def plain_calibration() -> Calibration:
+    """Return what is known of the camera before its lights are measured."""
+    return Calibration(camera(), response=Response("gamma", GAMMA))
 
 
 def places(count: int, radius_mm: float, seed: int) -> Floats:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import browser, cost, estimators, growth, memory, nightly_page
+from benchmarks import cost, estimators, growth
 from benchmarks.__main__ import NAMES, ON_REQUEST, main
 from benchmarks.measuring import Figure
 from benchmarks.scheduler import shard_times, simulate
@@ -156,20 +156,6 @@ def test_anatomies_are_timed_in_the_families_shares():
 
 
 # Nothing is skipped ----------------------------------------------------------------------------------------------
-
-
-def test_a_missing_browser_fails(monkeypatch, tmp_path):
-    monkeypatch.setattr(browser.shutil, "which", lambda name: None)
-    with pytest.raises(SystemExit, match="no browser; install one of chromium"):
-        nightly_page._opened(tmp_path / "index.html")
-
-
-def test_memory_and_processor_time_are_those_of_the_process():
-    used = memory.run(["-c", "held = b'x' * 200_000_000; sum(range(2_000_000))"])
-    assert 0.2 < used.peak_gb < 0.4
-    assert used.processor_s > 0.02
-    with pytest.raises(SystemExit, match="exit 3"):
-        memory.run(["-c", "raise SystemExit(3)"])
 
 
 def test_figures_keep_or_miss_their_limits():

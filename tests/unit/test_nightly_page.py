@@ -12,9 +12,9 @@ from itertools import pairwise
 import numpy as np
 import polars as pl
 import pytest
+from made_nights import history_of, run_of, verdict_of
 from test_report import EVIL, make_rows
 
-from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.nightly.compare import compare
 from simtest.nightly.outputs import MAX_CHARACTERS, summary, write_outputs
 from simtest.nightly.page import comparisons, trends, write_nightly_page

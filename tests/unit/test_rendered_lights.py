@@ -9,9 +9,7 @@ from simtest.calibration import Priors
 from simtest.cli.pictures import calibrate
 from simtest.runtime import chi_squared
 from simtest.spec.calibration_file import load_calibration, save_calibration
-from studies.light_calibration.closed_loop import plain_calibration, rows_of_rig
-from studies.light_calibration.plantings import plant
-from studies.light_calibration.rendered import Floats, Rendering, nearest_errors, places
+from studies.light_calibration.rendered import Floats, Rendering, nearest_errors, places, plain_calibration
 
 pytestmark = [pytest.mark.slow, pytest.mark.render]
 
@@ -79,29 +77,3 @@ def test_dark_background_widens_the_intervals(tmp_path: Path, count: int) -> Non
     assert max(squares) < chi_squared.quantile(0.95, 3)
     # across the view the lights are still known
     assert np.sqrt(priors.lights_covariance[:, [0, 1], [0, 1]]).max() < 1.5
-
-
-def test_calibrated_lights_are_as_good_as_exact_ones_on_frames(tmp_path: Path) -> None:
-    lights = plant(6802, 2).lights
-    wrong = tuple((float(x), float(y) + 9.0, float(z)) for x, y, z in lights)
-    rows = rows_of_rig(lights, 6802, tmp_path, {"wrong": Priors(lights_mm=wrong)})
-
-    def of(told: str, frame: str, what: str) -> Floats:
-        return np.array([getattr(row, what) for row in rows if (row.told, row.frame) == (told, frame)], dtype=float)
-
-    for frame in ("cylinder", "tissue"):
-        held = of("calibrated", frame, "held")
-        assert len(held) == len(of("exact", frame, "held")) > 0
-        # 95 % regions: fewer than this many hold with a probability below 0.001
-        misses = len(held) - held.sum()
-        assert misses <= 1 + len(held) * 0.05 + 3.1 * np.sqrt(len(held) * 0.0475)
-        gap = of("calibrated", frame, "error") - of("exact", frame, "error")
-        assert np.abs(gap).max() < 0.2
-        ratio = of("calibrated", frame, "stated") / of("exact", frame, "stated")
-        assert np.abs(ratio - 1).max() < 0.1
-    # On tissue, the doubt which of the lights made a highlight may exceed what knowing the lights saves.
-    assert of("calibrated", "cylinder", "stated").mean() < of("not told", "cylinder", "stated").mean()
-    assert of("calibrated", "cylinder", "light").max() < 0.1 * of("not told", "cylinder", "light").min()
-    # The negative control: lights 9 mm off.
-    assert len(of("wrong", "cylinder", "held"))
-    assert of("wrong", "cylinder", "held").mean() < 1

@@ -4,10 +4,10 @@ import re
 from datetime import UTC, datetime
 
 import pytest
+from made_nights import history_of, run_of, verdict_of
 from playwright.sync_api import expect
 from test_nightly_page import rows_of
 
-from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.nightly.compare import compare
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun

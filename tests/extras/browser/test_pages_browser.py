@@ -10,11 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from made_nights import history_of, run_of, verdict_of
 from test_nightly_page import rows_of
 from test_realism_page import frames
 from test_report import make_run
 
-from benchmarks.nights import history_of, run_of, verdict_of
 from simtest.api import reconstruct_picture
 from simtest.nightly.page import write_nightly_page
 from simtest.nightly.records import JudgedRun
