@@ -259,19 +259,6 @@ class Case(View):
         tables["camera"] |= {name: 2 * tables["camera"][name] for name in ("width", "height", "fx", "fy", "cx", "cy")}
         return View(tables)
 
-    @cached_property
-    def further(self) -> View:
-        """The scene from a camera that has gone on: across, ahead and turned."""
-        tables = copy.deepcopy(dict(self.tables))
-        far = 4.0 if self.row["surface"] == "liver" else 1.0
-        step = np.eye(4)
-        step[:3, :3] = formulas.rotation(np.radians([3.0, -4.0, 8.0]))
-        step[:3, 3] = far * np.array([0.9, -0.5, 0.3])
-        pose = formulas.moved_pose(self.camera) @ step
-        vector = np.degrees(formulas.rotation_vector(pose[:3, :3]))
-        tables["camera"]["moved"] = {"translation_mm": pose[:3, 3].tolist(), "rotation_deg": vector.tolist()}
-        return View(tables)
-
 
 def _toml(value: Any) -> str:
     """Return a value as TOML writes it on one line."""

@@ -4,16 +4,16 @@ from collections.abc import Callable, Sequence
 
 from simtest.errors import SimtestError
 from studies.corners.case import Case, Faults, NotAskedError
-from studies.corners.file_checks import calibration, counts, experiment, stored, views
-from studies.corners.geometry_checks import flow, law, projection, search, surface
-from studies.corners.label_checks import depth, isolated, labels, radius, snr
+from studies.corners.file_checks import calibration, stored
+from studies.corners.geometry_checks import law, projection, search, surface
+from studies.corners.label_checks import isolated, labels, radius, snr
 from studies.corners.symmetry_checks import answers, double, mirror, turn
 
 CHECKS: dict[str, Callable[[Case], Faults]] = {
     each.__name__: each
     for each in (
-        law, projection, surface, search, mirror, turn, double, answers, isolated, labels, depth, radius, snr, flow,
-        calibration, stored, counts, experiment, views,
+        law, projection, surface, search, mirror, turn, double, answers, isolated, labels, radius, snr,
+        calibration, stored,
     )
 }  # fmt: skip
 

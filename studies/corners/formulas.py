@@ -42,12 +42,6 @@ def rotation_vector(R: Array) -> Array:
     return twice_sine / length * np.arctan2(length, np.trace(R) - 1) if length else np.zeros(3)
 
 
-def rotation_of_quaternion(q: Array) -> Array:
-    """Return the rotation of a unit quaternion (x, y, z, w), by its angle and axis."""
-    sine = float(np.linalg.norm(q[:3]))
-    return rotation(q[:3] / sine * 2 * np.arctan2(sine, q[3])) if sine else np.eye(3)
-
-
 # Camera --------------------------------------------------------------------------------------------------------------
 
 

@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from simtest.rendering import TruthMaps
-from simtest.runtime.arrays import AnyArray, Array
-from simtest.simulation.flow import HIDDEN, INSTRUMENT, NONE, OUT, SEEN, SeenSurface, flow_between
+from simtest.runtime.arrays import Array
 from studies.corners import formulas
 from studies.corners.case import Case, Faults, NotAskedError
 from studies.corners.scenes import SMOOTH
@@ -191,67 +189,3 @@ def _zero_in(w: Array, corner: Array) -> Array | None:
     across, down = ((w[:, 1] - w[:, 0]).mean(0), (w[1] - w[0]).mean(0))
     step = np.linalg.solve(np.stack([across, down], -1), -w.mean((0, 1)))
     return corner + 0.25 + 0.5 * step if (np.abs(step) <= 0.55).all() else None
-
-
-def flow(case: Case) -> Faults:
-    """Check that flow and states follow from depths and poses of the two frames."""
-    other, faults = case.further, []
-    session, step = case.session, np.linalg.inv(formulas.moved_pose(case.camera)) @ formulas.moved_pose(other.camera)
-    here = case.truth
-    session.update(case.scene)
-    first = SeenSurface.of(session)
-    session.update(other.scene)
-    try:
-        second, there = SeenSurface.of(session), session.truth()
-        found = flow_between(session, first, second)
-    finally:
-        session.update(case.scene)
-    gap = np.abs(first.world_from_camera @ step - second.world_from_camera).max()
-    if not gap < 1e-7:
-        faults.append(f"world_from_camera: {gap:.2g} off the stated motion")
-    points = (here.position - step[:3, 3]) @ step[:3, :3]
-    target = formulas.project(other.camera, points)
-    expected = target - formulas.pixel_centres(case.camera)
-    metal = here.instrument > 0
-    known = np.isfinite(here.depth) & ~metal
-    gaps = np.linalg.norm(found.flow_px - expected, axis=-1)[known & (found.state != NONE)]
-    if len(gaps) and not np.nanquantile(gaps, 0.999) < 0.02:
-        faults.append(f"flow: {np.nanquantile(gaps, 0.999):.2g} px off for 0.1 % of the pixels")
-    return faults + _states(case, found.state, here, there, points, target)
-
-
-def _states(case: Case, state: AnyArray, here: TruthMaps, there: TruthMaps, points: Array, target: Array) -> Faults:
-    """Compare states of a flow with what both frames' truth says of points that are imaged at targets in the second."""
-    faults = []
-    metal = here.instrument > 0
-    known = np.isfinite(here.depth) & ~metal
-    height, width = there.depth.shape
-    if (state[metal] != INSTRUMENT).any():
-        faults.append("state: pixels of an instrument are not marked")
-    behind = points[..., 2] <= 0 if "kannala" not in str(case.camera.get("distortion")) else np.zeros_like(known)
-    inside = known & ~behind & (target > 0.05).all(-1) & (target < [width - 0.05, height - 0.05]).all(-1)
-    outside = known & (behind | (target < -0.05).any(-1) | (target > [width + 0.05, height + 0.05]).any(-1))
-    if (state[outside] != OUT).any():
-        faults.append(f"state: {np.count_nonzero(state[outside] != OUT)} points out of view are not marked so")
-    column, row = (np.clip(np.nan_to_num(target[..., k]).astype(int), 0, n - 1) for k, n in ((0, width), (1, height)))
-    covered = inside & (there.instrument[row, column] > 0)
-    if passed := np.count_nonzero(state[covered] == SEEN):
-        faults.append(f"state: {passed} points behind an instrument count as seen")
-    near, far = _around(there.depth)
-    distance = np.linalg.norm(points, axis=-1)
-    with np.errstate(invalid="ignore"):
-        clear = inside & ~covered & (distance < near[row, column] * 1.001 + 1e-6) & (there.instrument[row, column] == 0)
-        shadowed = inside & ~covered & (distance > far[row, column] * 1.02)
-    for mask, expected, text in ((clear, SEEN, "in plain view"), (shadowed, HIDDEN, "behind the surface")):
-        wrong = np.count_nonzero(mask & (state != expected))
-        if wrong > 2 + 0.002 * np.count_nonzero(mask):
-            faults.append(f"state: {wrong} of {np.count_nonzero(mask)} points {text} are not marked so")
-    return faults
-
-
-def _around(depth: Array) -> tuple[Array, Array]:
-    """Return the least and the largest distance of each pixel and those around it; NaN where any has none."""
-    padded = np.pad(depth, 1, constant_values=np.nan)
-    height, width = depth.shape
-    shifted = np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
-    return shifted.min(axis=0), shifted.max(axis=0)

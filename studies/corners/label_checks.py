@@ -212,38 +212,3 @@ def _visible(sample: Mapping[str, Any], specular: Array) -> Faults:
             stated = np.round(spot["centroid_px"], 2)
             faults.append(f"visible {number + 1}: centroid_px {stated} for {centroid.round(2)}")
     return faults
-
-
-def depth(case: Case) -> Faults:
-    """Check a sample's depth, normals and masks against the surface, within what their encoding loses."""
-    sample, truth = case.sample, case.truth
-    faults = []
-    step = sample["meta"]["depth_scale_mm"]
-    off = truth.instrument == 0
-    with np.errstate(invalid="ignore"):
-        gap = np.abs(sample["depth"] - truth.depth) - step
-        angle = formulas.angle_deg(formulas.unit(sample["normal_base"].astype(float)), truth.normal_base)
-    smooth = case.row["surface"] in SMOOTH
-    if not np.nanmedian((gap / truth.depth)[off]) < 1e-3 or (smooth and not np.nanmax((gap / truth.depth)[off]) < 5e-3):
-        faults.append(f"depth: {np.nanmedian(gap[off]):.2g} mm off in the median, {np.nanmax(gap[off]):.2g} at most")
-    if not np.nanmedian(angle[off]) < (0.03 if smooth else 0.5):
-        faults.append(f"normal_base: {np.nanmedian(angle[off]):.2g} deg off in the median")
-    if np.count_nonzero((sample["instrument"] > 0) != (truth.instrument > 0)) > 0:
-        faults.append("instrument: not where the truth has it")
-    if smooth:
-        # Normals by differences of the stored depth, on rays of the checks' formulas.
-        points = case.rays * sample["depth"][..., None].astype(float)
-        crossed = formulas.unit(np.cross(points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]))
-        inner, allowed = truth.normal_base[1:-1, 1:-1], _shrunk(off)[1:-1, 1:-1]
-        with np.errstate(invalid="ignore"):
-            off_deg = formulas.angle_deg(crossed * np.sign(np.sum(crossed * inner, -1, keepdims=True)), inner)[allowed]
-        if not np.nanmedian(off_deg) < 0.3:
-            faults.append(f"depth: normals by differences of it are {np.nanmedian(off_deg):.2g} deg off in the median")
-    return faults
-
-
-def _shrunk(mask: Array) -> Array:
-    """Return where a mask holds for a pixel and all around it."""
-    padded = np.pad(mask, 1, constant_values=True)
-    height, width = mask.shape
-    return np.logical_and.reduce([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])

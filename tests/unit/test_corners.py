@@ -12,7 +12,7 @@ from studies.corners.case import Case
 from studies.corners.coverage import Answer, share_by_scene, table
 from studies.corners.scenes import FACTORS, MESH, SMOOTH, refusals, rows
 
-QUICK = ("law", "projection", "surface", "search", "mirror", "turn", "answers", "calibration", "flow")
+QUICK = ("law", "projection", "surface", "search", "mirror", "turn", "answers", "calibration")
 
 
 def test_every_pair_that_is_not_refused_is_in_a_row_and_no_other():
