@@ -2,15 +2,15 @@
 
 `python -m benchmarks cost` prints the table of docs/performance.md. Samples of anatomies that were never made before
 are timed one by one, encoded and written as a dataset's run does it. An anatomy's own cost is what its first sample
-takes beyond its others. The rest is arithmetic, and a simulation of the scheduler with these times.
+takes beyond its others. The rest is arithmetic.
 """
 
 import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,10 @@ import numpy as np
 import polars as pl
 
 from benchmarks.measuring import Figure, print_markdown
-from benchmarks.scheduler import shard_times, simulate
 from simtest.dataset.index import write_shard_tables, write_tables
 from simtest.dataset.maker import Maker
-from simtest.dataset.manifest import FileEntry, Manifest, new_manifest
 from simtest.dataset.plan import Plan, Shard
 from simtest.dataset.shard import PART, finish, write_sample
-from simtest.dataset.shard_writer import UNSAVED_SHARE
 from simtest.runtime.arrays import Array
 from simtest.spec import load_dataset
 from simtest.spec.recipes import Dataset
@@ -37,12 +34,9 @@ ANATOMIES, SAMPLES = 4, 5
 COPIES = 30
 """Times that a shard is read for the tables."""
 
-WORKERS = (1, 2, 10, 100, 250, 1000)
+WORKERS = 1000
 CORE_HOUR, TB_MONTH = 0.04, 20.0
 """Prices that the table assumes, in any currency: of a core for an hour, and of a TB for a month."""
-
-START_S = 10.0
-"""What a worker takes before its first sample, s: imports, and kernels from disk. Assumed; it hardly matters here."""
 
 LINEAR = 0.9
 
@@ -77,8 +71,6 @@ class Measured:
         Mean size of a sample in its shard.
     tables_s : float
         Time of one sample in the tables that one process makes at the end, s.
-    booking_s : tuple of float
-        Time to book a shard, s: with no others, and for each that is booked already.
     plan : Plan
         The plan of ten million frames.
     """
@@ -87,7 +79,6 @@ class Measured:
     anatomies_s: Array
     sample_bytes: float
     tables_s: float
-    booking_s: tuple[float, float]
     plan: Plan
 
     @property
@@ -142,8 +133,7 @@ def measure(dataset: Dataset, anatomies: int = ANATOMIES, samples: int = SAMPLES
             finish(file)
         sizes.append((folder / "train-000000.tar").stat().st_size / len(made))
         tables_s = _tables(plan, folder, made)
-        booking = _booking(plan, folder)
-    return Measured(np.array(later), np.array(first), float(np.mean(sizes)), tables_s, booking, plan)
+    return Measured(np.array(later), np.array(first), float(np.mean(sizes)), tables_s, plan)
 
 
 def _all_blocks(plan: Plan) -> range:
@@ -183,28 +173,6 @@ def _tables(plan: Plan, folder: Path, made: list[int]) -> float:
     return (times[2] - times[1]) / (COPIES - 1) / (more * len(made))
 
 
-def _booking(plan: Plan, folder: Path) -> tuple[float, float]:
-    """Return the processor time to save the manifest, s, without shards and for each one that it lists."""
-    manifest = new_manifest(plan, "any")
-    counts, times = (1, 20_000), []
-    for count in counts:
-        manifest.shards = {
-            f"train-{number:06d}.tar": FileEntry(bytes=2**28, sha256="0" * 64) for number in range(count)
-        }
-        times.append(_booked(manifest, folder))
-    each = (times[1] - times[0]) / (counts[1] - counts[0])
-    return times[0], each
-
-
-def _booked(manifest: Manifest, folder: Path) -> float:
-    times = []
-    for _ in range(3):
-        start = time.process_time()
-        manifest.save(folder)
-        times.append(time.process_time() - start)
-    return statistics.median(times)
-
-
 def table(measured: Mapping[str, Measured]) -> list[list[str]]:
     """Return the cost model as rows of text, a column a recipe."""
     rows: list[tuple[str, Any]] = [
@@ -237,43 +205,14 @@ def price(measured: Measured) -> float:
 
 
 def figures() -> list[Figure]:
-    """Measure all recipes, print their table, and simulate their runs."""
+    """Measure all recipes, and print their table beside what one process does alone."""
     measured = {name: measure(dataset) for name, dataset in recipes().items()}
     print_markdown(table(measured))
-    return [figure for name, own in measured.items() for figure in scheduled(name, own)]
+    name = f"tables joined by one process, share of a run of {WORKERS} workers, "
+    return [Figure(name + recipe, alone(own), 1 - LINEAR, unit="") for recipe, own in measured.items()]
 
 
-def _bookings(alone: float, each: float) -> Callable[[int], float]:
-    """Return how long a shard takes to book: the manifest is saved when enough of its shards are new."""
-    unsaved = 0
-
-    def booking_s(booked: int) -> float:
-        nonlocal unsaved
-        unsaved += 1
-        if unsaved <= UNSAVED_SHARE * (booked + 1):
-            return 0.0
-        unsaved = 0
-        return alone + each * (booked + 1)
-
-    return booking_s
-
-
-def scheduled(name: str, measured: Measured) -> list[Figure]:
-    """Simulate ten million frames on more and more workers of one core each."""
-    tasks = shard_times(
-        measured.samples_s, measured.anatomies_s, measured.shards, measured.plan.samples_per_shard, measured.per_anatomy
-    )
-    alone, each = measured.booking_s
-    shown = []
-    for workers in WORKERS:
-        run = simulate(tasks, workers, _bookings(alone, each), START_S)
-        # One process joins the tables when all shards are there, while the workers wait.
-        tables_s = FRAMES * measured.tables_s
-        whole = replace(run, makespan_s=run.makespan_s + tables_s, work_s=run.work_s + tables_s)
-        label = f"{name}, {workers} worker{'s' * (workers > 1)}, simulated: share of their time that is work, "
-        ends = {"shards": run, "shards and tables": whole}
-        shown += [
-            Figure(label + end, own.efficiency, LINEAR, True, "", f"{own.makespan_s / 3600:,.1f} h")
-            for end, own in ends.items()
-        ]
-    return shown
+def alone(measured: Measured) -> float:
+    """Return the share of a run of `WORKERS` workers in which they wait for the process that joins the tables."""
+    joining = FRAMES * measured.tables_s
+    return joining / (FRAMES * measured.sample_s / WORKERS + joining)
