@@ -63,16 +63,9 @@ TISSUE = {
 class Measured:
     """What samples of a recipe took.
 
-    Parameters
-    ----------
-    samples_s, anatomies_s : ndarray
-        Processor time of each sample, encoding and writing included, and of each anatomy beyond that of its samples, s.
-    sample_bytes : float
-        Mean size of a sample in its shard.
-    tables_s : float
-        Time of one sample in the tables that one process makes at the end, s.
-    plan : Plan
-        The plan of ten million frames.
+    `samples_s`, `anatomies_s`: processor time of each sample, encoding and writing included, and of each anatomy
+    beyond that of its samples, s; `sample_bytes`: mean size of a sample in its shard; `tables_s`: time of one
+    sample in the tables that one process makes at the end, s; `plan`: the plan of ten million frames.
     """
 
     samples_s: Array

@@ -35,10 +35,7 @@ class Growth:
 def exponent(sizes: Sequence[float], times: Sequence[float]) -> Growth:
     """Fit log time over log size by a line.
 
-    Parameters
-    ----------
-    sizes, times : sequence of float
-        At least three of each, above 0.
+    `sizes`, `times`: at least three of each, above 0.
     """
     x, y = np.log(np.asarray(sizes, float)), np.log(np.asarray(times, float))
     x -= x.mean()
@@ -68,10 +65,7 @@ def measure(works: Mapping[float, Callable[[], object]], rounds: int) -> list[fl
 class Grown:
     """A piece of work that was measured at all its sizes: processor times, s, and exponents.
 
-    Parameters
-    ----------
-    whole, upper : Growth
-        Over all sizes, and over the largest three.
+    `whole`, `upper`: over all sizes, and over the largest three.
     """
 
     piece: Piece

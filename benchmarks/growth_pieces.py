@@ -49,14 +49,8 @@ SETTINGS = (1, 2, 4, 8, 16)
 class Piece:
     """Work that is done at several sizes.
 
-    Parameters
-    ----------
-    name : str
-        What is done.
-    axis : str
-        What the sizes count.
-    opened : callable
-        Returns a context manager that gives the work by its size, sizes rising.
+    `name`: what is done; `axis`: what the sizes count; `opened`: returns a context manager that gives the work by
+    its size, sizes rising.
     """
 
     name: str

@@ -11,20 +11,8 @@ from rich.table import Table
 class Figure:
     """A measured figure beside what the project promises.
 
-    Parameters
-    ----------
-    name : str
-        What was measured.
-    value : float
-        The figure.
-    limit : float or None
-        What it must keep to; None where it is shown alone.
-    at_least : bool
-        Whether the limit is a lower one.
-    unit : str
-        "x" for a ratio.
-    about : str
-        The times behind it.
+    `name`: what was measured; `value`: the figure; `limit`: what it must keep to; None where it is shown alone;
+    `at_least`: whether the limit is a lower one; `unit`: "x" for a ratio; `about`: the times behind it.
     """
 
     name: str

@@ -56,17 +56,8 @@ def memory_of_tree_mib(pid: int) -> float | None:
 class PeakMemory:
     """Context manager that watches the memory of a process and its descendants.
 
-    Parameters
-    ----------
-    pid : int
-        The process.
-    step_s : float
-        Time between two readings.
-
-    Attributes
-    ----------
-    peak_mib : float or None
-        The largest reading so far; None before the first.
+    `pid`: the process; `step_s`: time between two readings; `Attributes`; `----------`; `peak_mib`: the largest
+    reading so far; None before the first.
     """
 
     def __init__(self, pid: int, step_s: float = 0.1) -> None:

@@ -27,18 +27,9 @@ KIB = 1024
 class Transfers:
     """What was launched and read.
 
-    Parameters
-    ----------
-    kernels : int
-        Compiled kernels that were launched.
-    others : int
-        Launches of the library's own small kernels: sums, fills, tables of calls.
-    reads : int
-        Dr.Jit arrays that became NumPy arrays.
-    read_bytes : int
-        Their size together.
-    compiled : int
-        Kernels that had to be compiled or read from disk first.
+    `kernels`: compiled kernels that were launched; `others`: launches of the library's own small kernels: sums,
+    fills, tables of calls; `reads`: dr.Jit arrays that became NumPy arrays; `read_bytes`: their size together;
+    `compiled`: kernels that had to be compiled or read from disk first.
     """
 
     kernels: int = 0

@@ -44,12 +44,7 @@ GLINT_RADII_MM = {"plane": np.inf, "cylinder kd = 1": 20.0, "cylinder kd = -0.5"
 class Patch:
     """A patch over a plane or a cylinder, in coordinates (a, b) on its base: a around the cylinder, b along it.
 
-    Parameters
-    ----------
-    radius : float
-        mm, convex positive; inf for a plane.
-    field : ReliefField
-        Its relief.
+    `radius`: mm, convex positive; inf for a plane; `field`: its relief.
     """
 
     radius: float
@@ -101,12 +96,7 @@ class Patch:
 class TracedPatch:
     """A displaced mesh in Mitsuba.
 
-    Parameters
-    ----------
-    mi : module
-        mitsuba with the variant set.
-    patch : Patch
-        What is displaced.
+    `mi`: mitsuba with the variant set; `patch`: what is displaced.
     """
 
     def __init__(self, mi: Any, patch: Patch) -> None:
@@ -124,12 +114,8 @@ class TracedPatch:
     def judge(self, view_deg: float) -> tuple[Array, float, float]:
         """View the patch's middle under an angle to the base's normal.
 
-        Returns
-        -------
-        difference : ndarray
-            Angle between the normals that a ray sees on the displaced patch and on the smooth one, deg.
-        away, hidden : float
-            Shares of the displaced surface that face away, and that face the view behind others.
+        Returns angle between the normals that a ray sees on the displaced patch and on the smooth one, deg.
+        Returns shares of the displaced surface that face away, and that face the view behind others.
         """
         theta = np.radians(view_deg)
         view = np.array([np.sin(theta), 0.0, np.cos(theta)])
@@ -153,12 +139,8 @@ class TracedPatch:
 def glints(patch: Patch, slope_deg: float) -> tuple[Array, Array, Array]:
     """Find the glints of camera and light at 20 mm over the origin.
 
-    Returns
-    -------
-    moved_px, turned_deg : ndarray
-        How far displacement moves each in the image, and turns its normal.
-    lost : ndarray of bool
-        Which glints displacement removes.
+    Returns how far displacement moves each in the image, and turns its normal. Returns which glints displacement
+    removes.
     """
     camera = np.array([0.0, 0.0, DISTANCE_MM])
     # Starts over the whole cloud, d^2 M^-1 Sigma M^-T.

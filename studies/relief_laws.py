@@ -41,16 +41,8 @@ BOOTSTRAPS = 400
 class Case:
     """Where glints are counted: a plane or a cylinder that faces the camera.
 
-    Parameters
-    ----------
-    surface : str
-        Key of `CURVED`.
-    slope_deg, wavelength_mm : float
-        Of one gaussian band.
-    distance_mm : float
-        Of the anchor.
-    tilt_deg : float
-        Of the surface.
+    `surface`: key of `CURVED`; `slope_deg`, `wavelength_mm`: of one gaussian band; `distance_mm`: of the anchor;
+    `tilt_deg`: of the surface.
     """
 
     surface: str
@@ -409,12 +401,8 @@ TWICE = {"GRID_WAVE": 2 * highlights.GRID_WAVE, "MAX_DIVISION": 2 * highlights.M
 class Seen:
     """A frame with the glints of one search.
 
-    Parameters
-    ----------
-    view : RenderedView
-        The frame.
-    kinds : list of str
-        Of the detections, in their order: on the one isolated glint of a spot, in a spot of none or several, or false.
+    `view`: the frame; `kinds`: of the detections, in their order: on the one isolated glint of a spot, in a spot of
+    none or several, or false.
     """
 
     view: RenderedView

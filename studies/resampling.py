@@ -15,14 +15,8 @@ def interval_of_mean(
 ) -> tuple[float, float]:
     """Return the 95 % interval of the mean of values by bootstrap over their groups.
 
-    Parameters
-    ----------
-    values : ndarray, shape (N,)
-        Finite.
-    groups : ndarray, shape (N,)
-        Number of the group of each; a group keeps all its values, so groups may differ in size.
-    draws, seed : int
-        Of the bootstrap.
+    `values` (shape (N,)): finite; `groups` (shape (N,)): number of the group of each; a group keeps all its values,
+    so groups may differ in size; `draws`, `seed`: of the bootstrap.
     """
     own = np.unique(groups, return_inverse=True)[1]
     sums, counts = np.bincount(own, values), np.bincount(own)

@@ -40,18 +40,10 @@ TERMS = 6
 class Widening:
     """One comparison.
 
-    Parameters
-    ----------
-    distribution : str
-        Of the film's slopes.
-    slope_deg : float
-        Standard deviation of the relief's slope along one direction, deg.
-    seen_deg, expected_deg : float
-        Half-width at half height, deg: rendered with relief; of the rougher film, or by convolution.
-    smooth_deg : float
-        By closed form, of the film without relief.
-    variances_deg : float
-        By closed form, of a film of the same distribution with alpha^2 + 2 s^2.
+    `distribution`: of the film's slopes; `slope_deg`: standard deviation of the relief's slope along one direction,
+    deg; `seen_deg`, `expected_deg`: half-width at half height, deg: rendered with relief; of the rougher film, or
+    by convolution; `smooth_deg`: by closed form, of the film without relief; `variances_deg`: by closed form, of a
+    film of the same distribution with alpha^2 + 2 s^2.
     """
 
     distribution: str

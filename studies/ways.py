@@ -80,12 +80,8 @@ def experiment(value: Any) -> bool:
 class Way:
     """The steps of a way, recorded as a profile function.
 
-    Parameters
-    ----------
-    is_it : callable
-        Whether a value is what is followed, or was made of it.
-    page : Path
-        Where the way ends: steps after this file is there do not count.
+    `is_it`: whether a value is what is followed, or was made of it; `page`: where the way ends: steps after this
+    file is there do not count.
     """
 
     def __init__(self, is_it: Is, page: Path) -> None:

@@ -25,23 +25,11 @@ SUFFIXES = (".png", ".jpg", ".tif", ".webp", ".bmp")
 class Reader:
     """A command that reads a file.
 
-    Parameters
-    ----------
-    command : str
-        Arguments, one of them the file's name or a folder of it.
-    file : str
-        The file's name, below the folder of the case.
-    good : bytes or str
-        A good file.
-    beside : mapping
-        Other files that it needs.
-    wanted : Wanted
-        What comes of the good file; `REFUSED` where that takes too long or is a verdict of its own.
-    damaged : int
-        How many damaged copies are tried, each as bytes and, of a text, as words. A damaged file may still be good, and
-        is then worked on: those of commands that take long are broken at their end.
-    slow : bool
-        Whether a good file takes long.
+    `command`: arguments, one of them the file's name or a folder of it; `file`: the file's name, below the folder
+    of the case; `good`: A good file; `beside`: other files that it needs; `wanted`: what comes of the good file;
+    `REFUSED` where that takes too long or is a verdict of its own; `damaged`: how many damaged copies are tried,
+    each as bytes and, of a text, as words. A damaged file may still be good, and is then worked on: those of
+    commands that take long are broken at their end; `slow`: whether a good file takes long.
     """
 
     command: str

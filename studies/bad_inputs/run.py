@@ -49,18 +49,8 @@ class Wanted(StrEnum):
 class Case:
     """A command that is run in a folder of its own.
 
-    Parameters
-    ----------
-    name : str
-        "kind: what", unique.
-    command : tuple of str
-        Arguments of `simtest`.
-    files : mapping
-        What stands in the folder, by name.
-    wanted : Wanted
-        What should come of it.
-    says : str
-        What the line must hold, such as the key's name.
+    `name`: "kind: what", unique; `command`: arguments of `simtest`; `files`: what stands in the folder, by name;
+    `wanted`: what should come of it; `says`: what the line must hold, such as the key's name.
     """
 
     name: str

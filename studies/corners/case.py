@@ -130,14 +130,7 @@ class View:
 class Case(View):
     """A scene of the array in one of its draws.
 
-    Parameters
-    ----------
-    number : int
-        Of the row, from 0.
-    row : dict
-        Its levels.
-    draw : int
-        Number of the draw.
+    `number`: of the row, from 0; `row`: its levels; `draw`: number of the draw.
     """
 
     def __init__(self, number: int, row: Row, draw: int = 0) -> None:

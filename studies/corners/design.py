@@ -37,10 +37,7 @@ def covering_array(factors: Factors, allowed: Callable[[Pair], bool], least: int
     Rows are grown level by level, so that each adds most of the pairs that are held least often; the best of `TRIES`
     rows in random orders is taken. Once all pairs are held, further rows hold rare pairs again.
 
-    Raises
-    ------
-    ValueError
-        If an allowed pair fits in no row.
+    Raises `ValueError`: if an allowed pair fits in no row.
     """
     rng = np.random.default_rng(seed)
     counts = dict.fromkeys(filter(allowed, pairs_of(factors)), 0)

@@ -47,22 +47,10 @@ WAVES = 10
 class StudyFrame:
     """A frame with all that its truth needs.
 
-    Parameters
-    ----------
-    name : str
-        Anatomy and number.
-    picture : ndarray of uint8, shape (H, W, 3)
-        RGB as encoded.
-    specular, other : ndarray of float32, shape (H, W)
-        Light behind the lens, mean of the channels, over full scale.
-    noise : ndarray of float32, shape (H, W)
-        Standard deviation of the channels' mean, over full scale.
-    camera : Camera
-        With the view mask, if any.
-    radiance : Radiance
-        As rendered.
-    scene : Scene
-        As rendered.
+    `name`: anatomy and number; `picture` (shape (H, W, 3)): RGB as encoded; `specular`, `other` (shape (H, W)):
+    light behind the lens, mean of the channels, over full scale; `noise` (shape (H, W)): standard deviation of the
+    channels' mean, over full scale; `camera`: with the view mask, if any; `radiance`: as rendered; `scene`: as
+    rendered.
     """
 
     name: str
@@ -78,20 +66,7 @@ class StudyFrame:
 def study_frames(split: str, count: int, folder: Path, seed: int = 0) -> Iterator[StudyFrame]:
     """Render the frames of a split, half of them of colons, half of livers.
 
-    Parameters
-    ----------
-    split : {"tuning", "figures"}
-        Which anatomies.
-    count : int
-        Frames in all.
-    folder : Path
-        For the recipes.
-    seed : int
-        Of everything drawn.
-
-    Yields
-    ------
-    StudyFrame
+    `split`: which anatomies; `count`: frames in all; `folder`: for the recipes; `seed`: of everything drawn.
     """
     make_folder(folder)
     session: Session | None = None

@@ -33,18 +33,9 @@ FRAMES = ROOT.parent / "shared" / "data" / "frames"
 class OutlinedFrame:
     """A real frame as outlined by hand; masks have the frame's shape (H, W).
 
-    Parameters
-    ----------
-    name : str
-        The file's name.
-    split : {"tuning", "figures"}
-        Whether thresholds were tuned on it.
-    picture : ndarray of float32, shape (H, W, 3)
-        RGB as encoded, in [0, 1].
-    specular, unclear : ndarray of bool
-        What shines, and what may.
-    forbidden : dict
-        Masks of what must not be marked, by kind: instrument, text, vessel, border.
+    `name`: the file's name; `split`: whether thresholds were tuned on it; `picture` (shape (H, W, 3)): RGB as
+    encoded, in [0, 1]; `specular`, `unclear`: what shines, and what may; `forbidden`: masks of what must not be
+    marked, by kind: instrument, text, vessel, border.
     """
 
     name: str
@@ -59,18 +50,11 @@ class OutlinedFrame:
 class FrameScore:
     """What detection makes of an outlined frame.
 
-    Parameters
-    ----------
-    covered : float
-        Share of the specular area inside the outlines of highlights of any kind; NaN where there is none.
-    answered : float
-        The same inside the outlines of those that may carry one normal.
-    iou : float
-        Marked pixels with the outlined ones: intersection over union, away from what is unclear.
-    marks : dict
-        Highlights of any kind whose peak lies in a forbidden area, by its kind.
-    count, clusters, empty : int
-        Highlights of any kind, clusters among them, and those without an outline.
+    `covered`: share of the specular area inside the outlines of highlights of any kind; NaN where there is none;
+    `answered`: the same inside the outlines of those that may carry one normal; `iou`: marked pixels with the
+    outlined ones: intersection over union, away from what is unclear; `marks`: highlights of any kind whose peak
+    lies in a forbidden area, by its kind; `count`, `clusters`, `empty`: highlights of any kind, clusters among
+    them, and those without an outline.
     """
 
     covered: float

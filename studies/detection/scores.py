@@ -20,12 +20,7 @@ MATCH_IOU = 0.5
 class Scores:
     """Counts of one frame or of many; they add up.
 
-    Parameters
-    ----------
-    hits, false, missed : int
-        Highlights.
-    pixel_hits, pixel_false, pixel_missed : int
-        Pixels.
+    `hits`, `false`, `missed`: highlights; `pixel_hits`, `pixel_false`, `pixel_missed`: pixels.
     """
 
     hits: int = 0
@@ -66,17 +61,9 @@ def _share(part: int, whole: int) -> float:
 def score(detected: Mask, truth: SpecularTruth) -> Scores:
     """Score a frame.
 
-    Parameters
-    ----------
-    detected : ndarray of bool, shape (H, W)
-        Pixels told to be highlights. Connected ones are one highlight.
-    truth : SpecularTruth
-        Of the same frame. Detected pixels of what is unclear are not counted, nor detected highlights that touch it or
-        have too few pixels to be a clear one, where they are on no clear one.
-
-    Returns
-    -------
-    Scores
+    `detected` (shape (H, W)): pixels told to be highlights. Connected ones are one highlight; `truth`: of the same
+    frame. Detected pixels of what is unclear are not counted, nor detected highlights that touch it or have too few
+    pixels to be a clear one, where they are on no clear one.
     """
     found, labels = cv2.connectedComponents(detected.astype(np.uint8), connectivity=8)
     count, true = found - 1, truth.count

@@ -27,24 +27,11 @@ TUNED_ON = ("colon", "liver")
 class TissueFrame:
     """A tissue frame with its visible highlights (theory.md 7.1b).
 
-    Parameters
-    ----------
-    name : str
-        Tissue and seed.
-    picture : ndarray of uint8, shape (H, W, 3)
-        RGB as encoded.
-    peaks : ndarray, shape (N, 2)
-        Peaks of the visible highlights, px.
-    radii : ndarray, shape (N,)
-        Their radii at half height, px.
-    clearness : ndarray, shape (N,)
-        Peak over noise.
-    whole : ndarray of bool, shape (N,)
-        Whether they are clear of the frame's border.
-    clipped : ndarray, shape (N,)
-        Share of their pixels that the sensor clips in the mean of the channels.
-    regions : ndarray of int32, shape (H, W)
-        Number of the visible highlight from 1, 0 elsewhere.
+    `name`: tissue and seed; `picture` (shape (H, W, 3)): RGB as encoded; `peaks` (shape (N, 2)): peaks of the
+    visible highlights, px; `radii` (shape (N,)): their radii at half height, px; `clearness` (shape (N,)): peak
+    over noise; `whole` (shape (N,)): whether they are clear of the frame's border; `clipped` (shape (N,)): share of
+    their pixels that the sensor clips in the mean of the channels; `regions` (shape (H, W)): number of the visible
+    highlight from 1, 0 elsewhere.
     """
 
     name: str

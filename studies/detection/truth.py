@@ -25,13 +25,9 @@ LEAST = 1e-4
 class SpecularTruth:
     """The highlights of a frame, as the sensor gets them.
 
-    Parameters
-    ----------
-    labels : ndarray of int32, shape (H, W)
-        Number of the highlight, from 1; 0 where there is none.
-    unclear : ndarray of bool, shape (H, W)
-        Pixels of highlights that nobody need find: below the noise, or of too few pixels. What is detected there is
-        counted neither as right nor as wrong.
+    `labels` (shape (H, W)): number of the highlight, from 1; 0 where there is none; `unclear` (shape (H, W)):
+    pixels of highlights that nobody need find: below the noise, or of too few pixels. What is detected there is
+    counted neither as right nor as wrong.
     """
 
     labels: Labels
@@ -62,20 +58,10 @@ def specular_truth(
     `diffuse_ratio` times the light that comes from elsewhere at that pixel. Light beyond full scale does not count:
     where the tissue alone clips, no highlight shows.
 
-    Parameters
-    ----------
-    specular, other : ndarray of float32, shape (H, W)
-        Direct specular light, and diffuse and indirect light, behind the lens, mean of the channels, over full scale.
-    noise : float, or ndarray of float32, shape (H, W)
-        Standard deviation of the channels' mean, over full scale.
-    seen : ndarray of bool, shape (H, W), optional
-        The pixels inside the view mask; default all.
-    peak_share, diffuse_ratio : float
-        The two thresholds.
-
-    Returns
-    -------
-    SpecularTruth
+    `specular`, `other` (shape (H, W)): direct specular light, and diffuse and indirect light, behind the lens, mean
+    of the channels, over full scale; `noise` (shape (H, W)): standard deviation of the channels' mean, over full
+    scale; `seen` (shape (H, W)): the pixels inside the view mask; default all; `peak_share`, `diffuse_ratio`: the
+    two thresholds.
     """
     shown = np.clip(np.minimum(specular, 1 - np.minimum(other, 1)), 0, None).astype(np.float32)
     bright = (shown >= diffuse_ratio * other) & (shown > LEAST)

@@ -32,15 +32,8 @@ def experiment(name: str, realisations: int) -> Experiment:
 def load_bank(folder: Path) -> pl.DataFrame:
     """Read the bank's rows; first make a bank that is missing, or not whole, which takes minutes.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds the bank of each version of the code, and while it is made a run of each experiment.
-
-    Returns
-    -------
-    polars.DataFrame
-        `COLUMNS`.
+    `folder`: holds the bank of each version of the code, and while it is made a run of each experiment. Returns
+    `COLUMNS`.
     """
     folder = of_this_code(folder)
     file = folder / "bank.parquet"

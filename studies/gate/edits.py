@@ -186,14 +186,8 @@ EDITS: dict[str, Edit] = {
 class Edited:
     """What the gate said of an edit.
 
-    Parameters
-    ----------
-    name : str
-        Of the edit.
-    changes : bool
-        Whether it changed anything of this night.
-    same, fresh : Verdict
-        Against the night itself, and against one of other seeds.
+    `name`: of the edit; `changes`: whether it changed anything of this night; `same`, `fresh`: against the night
+    itself, and against one of other seeds.
     """
 
     name: str

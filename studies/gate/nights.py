@@ -19,14 +19,8 @@ WORKERS = 2
 class Source:
     """Rows, and their units.
 
-    Parameters
-    ----------
-    rows : polars.DataFrame
-        Columns of `studies.gate.bank.COLUMNS`.
-    unit : ndarray of int, shape (N,)
-        Number of each row's unit: a realisation of a setting.
-    setting : ndarray of int, shape (U,)
-        Number of each unit's setting.
+    `rows`: columns of `studies.gate.bank.COLUMNS`; `unit` (shape (N,)): number of each row's unit: a realisation of
+    a setting; `setting` (shape (U,)): number of each unit's setting.
     """
 
     rows: pl.DataFrame
@@ -84,14 +78,8 @@ Draw = Callable[[np.random.Generator], tuple[NightlyRun, NightlyRun]]
 class Fresh:
     """Nights of n realisations a setting against other n: seeds differ, and nothing else.
 
-    Parameters
-    ----------
-    source : Source
-        The bank.
-    n : int
-        Realisations of each setting.
-    tonight : Source, optional
-        Where tonight is drawn from, of the same units; default the bank.
+    `source`: the bank; `n`: realisations of each setting; `tonight`: where tonight is drawn from, of the same
+    units; default the bank.
     """
 
     source: Source
@@ -109,14 +97,8 @@ class Fresh:
 class Paired:
     """Nights of the same n realisations a setting, made by two versions of the code.
 
-    Parameters
-    ----------
-    baseline, tonight : Source
-        Of the same units in the same order.
-    n : int
-        Realisations of each setting.
-    equal : polars.DataFrame, optional
-        Cells that are the same in both.
+    `baseline`, `tonight`: of the same units in the same order; `n`: realisations of each setting; `equal`: cells
+    that are the same in both.
     """
 
     baseline: Source
@@ -137,16 +119,8 @@ class Paired:
 class Found:
     """The gate's verdict on one night.
 
-    Parameters
-    ----------
-    alarm : bool
-        Whether anything was worse, or must be explained.
-    estimators : tuple of str
-        Of which.
-    tests : int
-        Size of the family.
-    least : float
-        Least corrected p-value; 1 without a test.
+    `alarm`: whether anything was worse, or must be explained; `estimators`: of which; `tests`: size of the family;
+    `least`: least corrected p-value; 1 without a test.
     """
 
     alarm: bool

@@ -45,16 +45,8 @@ TWO_PROCESSES = "two processes of half the threads"
 class Rate:
     """How often the gate raised the alarm.
 
-    Parameters
-    ----------
-    name : str
-        Of what was changed.
-    nights : int
-        How many were judged.
-    alarms : int
-        How many of them were called a regression, or changed.
-    about : str
-        What else is known.
+    `name`: of what was changed; `nights`: how many were judged; `alarms`: how many of them were called a
+    regression, or changed; `about`: what else is known.
     """
 
     name: str
@@ -72,16 +64,8 @@ class Rate:
 class Caught:
     """What saw a planted fault.
 
-    Parameters
-    ----------
-    name : str
-        Of the fault.
-    laws : tuple of str
-        Those that do not hold.
-    paired, fresh : Rate
-        Of nights of the same seeds, and of others.
-    stops : bool
-        Whether the night could not be run: exit 2, which is seen as well.
+    `name`: of the fault; `laws`: those that do not hold; `paired`, `fresh`: of nights of the same seeds, and of
+    others; `stops`: whether the night could not be run: exit 2, which is seen as well.
     """
 
     name: str

@@ -29,20 +29,11 @@ NUMBERS = ("origin_px", "peak_value", "peak_pixel", "smoothing_px", "others_px",
 class Case:
     """A detection with the truth.
 
-    Parameters
-    ----------
-    row : str
-        Of the corpus.
-    patch : Patch
-        The detection's region of interest.
-    normal, normal_base : ndarray, shape (3,), or None
-        True normals of the fine surface and of the base at the highlight point; None where the detection is false.
-    holds : int
-        Lit glints in the spot; 0 where it is none, or has none. Accuracy is scored where it holds exactly one.
-    radius_px : float
-        Of the visible highlight, at half height; NaN where there is none.
-    span_mm : tuple of float
-        Least and largest distance of the highlights in view, mm.
+    `row`: of the corpus; `patch`: the detection's region of interest; `normal`, `normal_base` (shape (3,)): true
+    normals of the fine surface and of the base at the highlight point; None where the detection is false; `holds`:
+    lit glints in the spot; 0 where it is none, or has none. Accuracy is scored where it holds exactly one;
+    `radius_px`: of the visible highlight, at half height; NaN where there is none; `span_mm`: least and largest
+    distance of the highlights in view, mm.
     """
 
     row: str

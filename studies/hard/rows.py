@@ -19,14 +19,8 @@ PRIOR_FOCAL_SD, PRIOR_FALLOFF, PRIOR_SHARPENING = 0.1, (0.0, 4.0), (0.0, 1.2)
 class Told:
     """What reconstruction is told.
 
-    Parameters
-    ----------
-    light : bool
-        The lights' places, and the range of the distances in view.
-    focal : bool
-        The focal length; else it is told one that is off, and that it is.
-    vignetting : bool
-        The falloff towards the border.
+    `light`: the lights' places, and the range of the distances in view; `focal`: the focal length; else it is told
+    one that is off, and that it is; `vignetting`: the falloff towards the border.
     """
 
     light: bool = True
@@ -38,16 +32,8 @@ class Told:
 class Row:
     """A row of the corpus.
 
-    Parameters
-    ----------
-    name : str
-        As in the table.
-    change : callable
-        From a scene's number and tables to what is rendered.
-    sensor : callable
-        From a scene's number to the sensor's keys that differ from the plain ones.
-    told : Told
-        What reconstruction is told.
+    `name`: as in the table; `change`: from a scene's number and tables to what is rendered; `sensor`: from a
+    scene's number to the sensor's keys that differ from the plain ones; `told`: what reconstruction is told.
     """
 
     name: str

@@ -38,24 +38,12 @@ WHITE = 0.45
 class Look:
     """How ball, wall and sensor look.
 
-    Parameters
-    ----------
-    diffuse, specular : float
-        Of the ball: Lambertian albedo relative to the wall's, and peak of the lobe.
-    exponent : float
-        Phong's, about the mirror direction.
-    mirrored : float
-        Light of the room that the ball reflects, as a share of the wall's: 0 of a ball that is no mirror.
-    wall_mm : float
-        Distance of the wall behind the ball's centre.
-    wall_albedo : float
-        Relative; 0: the lights of the scope do not show the wall.
-    room : float
-        Share of the wall's light that is the room's: 0: the scope alone lights it.
-    blur_px, noise : float
-        Standard deviations of the point spread, and of the noise, share of full scale.
-    gamma, bits : float, int
-        Of the coding.
+    `diffuse`, `specular`: of the ball: Lambertian albedo relative to the wall's, and peak of the lobe; `exponent`:
+    phong's, about the mirror direction; `mirrored`: light of the room that the ball reflects, as a share of the
+    wall's: 0 of a ball that is no mirror; `wall_mm`: distance of the wall behind the ball's centre; `wall_albedo`:
+    relative; 0: the lights of the scope do not show the wall; `room`: share of the wall's light that is the room's:
+    0: the scope alone lights it; `blur_px`, `noise`: standard deviations of the point spread, and of the noise,
+    share of full scale; `gamma`, `bits`: of the coding.
     """
 
     diffuse: float = 0.2

@@ -39,12 +39,8 @@ BALL = 0.25
 class Rendering:
     """A ball of `radius_mm` at `centres`, shape (V, 3), mm, camera frame, in the light of `lights`, shape (S, 3), mm.
 
-    Parameters
-    ----------
-    wall : bool
-        Whether a wall in the light of a room is behind the ball.
-    blur_px, noise : float
-        Standard deviations of the point spread, px, and of the noise, share of full scale.
+    `wall`: whether a wall in the light of a room is behind the ball; `blur_px`, `noise`: standard deviations of the
+    point spread, px, and of the noise, share of full scale.
     """
 
     lights: Floats

@@ -22,20 +22,9 @@ COMMAND = re.compile(r"\$? *(?:simtest|python -m|make) ")
 class Block:
     """A code block of a page.
 
-    Parameters
-    ----------
-    page : Path
-        Its page, below the checkout.
-    line : int
-        Number of its first line of code, from 1.
-    language : str
-        Of its fence; `indented` where it has none.
-    code : str
-        What it holds.
-    runs : bool
-        Whether it runs as written.
-    above : str
-        What stands between the block before it and this one.
+    `page`: its page, below the checkout; `line`: number of its first line of code, from 1; `language`: of its
+    fence; `indented` where it has none; `code`: what it holds; `runs`: whether it runs as written; `above`: what
+    stands between the block before it and this one.
     """
 
     page: Path

@@ -37,20 +37,9 @@ CHEAP = 0.34
 class Table:
     """A table of figures, with the command that makes it.
 
-    Parameters
-    ----------
-    place : str
-        Its page, and the line of its comment.
-    command : str
-        What prints it.
-    minutes : float
-        Of the processor, about.
-    within : float
-        Share by which its numbers may differ, where that is more than one unit in the last digit.
-    part : bool
-        Whether a printed row may hold further numbers.
-    rows : tuple of tuple of str
-        The cells of its body.
+    `place`: its page, and the line of its comment; `command`: what prints it; `minutes`: of the processor, about;
+    `within`: share by which its numbers may differ, where that is more than one unit in the last digit; `part`:
+    whether a printed row may hold further numbers; `rows`: the cells of its body.
     """
 
     place: str

@@ -35,14 +35,8 @@ STYLE = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 class Shown:
     """An output as a page shows it.
 
-    Parameters
-    ----------
-    block : Block
-        The `text` block.
-    pieces : tuple of str
-        Pieces of it in whose place anything may be printed.
-    last_digits : bool
-        Whether numbers may differ by one unit in their last digit.
+    `block`: the `text` block; `pieces`: pieces of it in whose place anything may be printed; `last_digits`: whether
+    numbers may differ by one unit in their last digit.
     """
 
     block: Block

@@ -17,12 +17,7 @@ from typing import Any
 class Mutation:
     """A change of one function's source.
 
-    Parameters
-    ----------
-    function : callable
-        Whose code is replaced.
-    old, new : str
-        What of its source, found once, becomes what.
+    `function`: whose code is replaced; `old`, `new`: what of its source, found once, becomes what.
     """
 
     function: Callable[..., Any]

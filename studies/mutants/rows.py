@@ -13,17 +13,10 @@ TESTS = Path(__file__).resolve().parents[2] / "tests"
 class Row:
     """A planted fault.
 
-    Parameters
-    ----------
-    name : str
-        What is wrong, in words.
-    kind : str
-        What sort of fault: a sign, a unit, a seed, ...
-    changes : tuple of (str, str, str)
-        Of the source: where below simtest (see `function_at`), and what of it becomes what.
-    files : tuple of str
-        The test files that could see it, in the order in which they are run: "camera" for the one test_camera.py,
-        "unit/laws" where there are two of a name.
+    `name`: what is wrong, in words; `kind`: what sort of fault: a sign, a unit, a seed,; `changes`: of the source:
+    where below simtest (see `function_at`), and what of it becomes what; `files`: the test files that could see it,
+    in the order in which they are run: "camera" for the one test_camera.py, "unit/laws" where there are two of a
+    name.
     """
 
     name: str

@@ -31,15 +31,9 @@ MOST_FACTORS = 5
 def fitted_range(names: Sequence[str], inputs: AnyArray, taught: AnyArray, judged: AnyArray) -> TrainingRange:
     """Return the range that a network was taught.
 
-    Parameters
-    ----------
-    names : sequence of str, length M
-        Names of the inputs that have a range.
-    inputs : ndarray, shape (N, M)
-        Their values on the train split.
-    taught, judged : ndarray, shapes (N, F) and (V, F)
-        Features of the network on the train split, which give mean and covariance, and on the validation split, which
-        gives the limit: a share `REFUSED` of its rows lies beyond.
+    `names`: names of the inputs that have a range; `inputs` (shape (N, M)): their values on the train split;
+    `taught`, `judged`: features of the network on the train split, which give mean and covariance, and on the
+    validation split, which gives the limit: a share `REFUSED` of its rows lies beyond.
     """
     taught = np.asarray(taught, dtype=float)
     mean, covariance = taught.mean(axis=0), np.atleast_2d(np.cov(taught.T))
@@ -61,16 +55,9 @@ def fitted_scale(
     own: a network may be too sure where it states to be sure, and right elsewhere. No group's factor is below that of
     all examples together, so that no group gains at another's cost.
 
-    Parameters
-    ----------
-    distances : ndarray, shape (N,)
-        Squared Mahalanobis distances of the truths.
-    deviations : ndarray, shape (N,)
-        Mean logarithms of the stated deviations.
-    coverage : float
-        The share.
-    dimensions : int
-        Of what is stated: 2 for a normal, 1 for a distance.
+    `distances` (shape (N,)): squared Mahalanobis distances of the truths; `deviations` (shape (N,)): mean
+    logarithms of the stated deviations; `coverage`: the share; `dimensions`: of what is stated: 2 for a normal, 1
+    for a distance.
     """
     limit = float(chdtri(dimensions, 1 - COVERAGE))
     groups = min(len(distances) // LEAST_FOR_SCALE, MOST_FACTORS)

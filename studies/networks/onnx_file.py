@@ -41,24 +41,11 @@ def export(
 ) -> Path:
     """Write a network as an ONNX file; return its path.
 
-    Parameters
-    ----------
-    network : Module
-        On the processor and in evaluation mode; its ``forward`` takes the inputs in their order and returns a tensor or
-        a tuple of them.
-    inputs : mapping
-        Example inputs by name, whose first axis may have any length. The file is run on them and compared.
-    outputs : sequence of str
-        Names of the outputs.
-    metadata : dict
-        Kept in the file under the key ``simtest``; holds ``format``.
-    path : Path
-        The file, replaced in one piece.
-
-    Raises
-    ------
-    SimtestError
-        If ONNX Runtime's outputs are not those of PyTorch.
+    `network`: on the processor and in evaluation mode; its ``forward`` takes the inputs in their order and returns
+    a tensor or a tuple of them; `inputs`: example inputs by name, whose first axis may have any length. The file is
+    run on them and compared; `outputs`: names of the outputs; `metadata`: kept in the file under the key
+    ``simtest``; holds ``format``; `path`: the file, replaced in one piece. Raises `SimtestError`: if ONNX Runtime's
+    outputs are not those of PyTorch.
     """
     buffer = BytesIO()
     with warnings.catch_warnings(), torch.no_grad():

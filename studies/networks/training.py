@@ -27,22 +27,10 @@ Batch = dict[str, Tensor]
 class Recipe:
     """How a network is trained.
 
-    Parameters
-    ----------
-    title : str
-        For the card.
-    task : str
-        Name of what is learned.
-    seed : int
-        Of weights, order and augmentation.
-    epochs, batch : int
-        Passes over the examples at most, and examples of a step.
-    learning_rate, weight_decay : float
-        Of AdamW.
-    patience : int
-        Epochs without a smaller loss on the validation split after which training stops; 0: never.
-    width : float
-        Factor of the network's numbers of channels.
+    `title`: for the card; `task`: name of what is learned; `seed`: of weights, order and augmentation; `epochs`,
+    `batch`: passes over the examples at most, and examples of a step; `learning_rate`, `weight_decay`: of AdamW;
+    `patience`: epochs without a smaller loss on the validation split after which training stops; 0: never; `width`:
+    factor of the network's numbers of channels.
     """
 
     title: str

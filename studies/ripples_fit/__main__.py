@@ -62,17 +62,9 @@ STATED = dict(zip(AXES, (OF_MEAN, OF_PEAK, OF_APEX), strict=True))
 class Seen:
     """One axis of a highlight: its error, rad in the family's basis, and the covariance in its parts.
 
-    Parameters
-    ----------
-    field : int
-        Number of the field.
-    picture, axis : str
-        As in `PICTURES` and `AXES`.
-    error : ndarray, shape (2,)
-    other, ripples, bends : ndarray, shape (2, 2)
-        Everything but ripples and bends; the ripples at a factor of 1; the bends as stated.
-    bend : float
-        Least residual of the isophotes, over the radius.
+    `field`: number of the field; `picture`, `axis`: as in `PICTURES` and `AXES`; `error` (shape (2,)); `other`,
+    `ripples`, `bends` (shape (2, 2)): everything but ripples and bends; the ripples at a factor of 1; the bends as
+    stated; `bend`: least residual of the isophotes, over the radius.
     """
 
     field: int

@@ -30,18 +30,10 @@ TISSUE = np.array([0.85, 0.45, 0.40], dtype=np.float32)
 class Field:
     """A field of glints.
 
-    Parameters
-    ----------
-    lobe : float
-        Standard deviation of the lobe over the slope, rad.
-    base : ndarray, shape (2, 2)
-        Derivative of the base's slope by position, rad / px.
-    centre : ndarray, shape (2,)
-        Where the base's slope is 0, px.
-    waves : ndarray, shape (W, 2)
-        Wave vectors, 1 / px.
-    phases, amplitudes : ndarray, shape (W,)
-        Of the relief's height, px: the sum of amplitude cos(wave . x + phase).
+    `lobe`: standard deviation of the lobe over the slope, rad; `base` (shape (2, 2)): derivative of the base's
+    slope by position, rad / px; `centre` (shape (2,)): where the base's slope is 0, px; `waves` (shape (W, 2)):
+    wave vectors, 1 / px; `phases`, `amplitudes` (shape (W,)): of the relief's height, px: the sum of amplitude
+    cos(wave . x + phase).
     """
 
     lobe: float
