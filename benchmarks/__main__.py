@@ -5,7 +5,7 @@ import sys
 
 from benchmarks.measuring import Figure, print_figures
 
-NAMES = ("estimators", "rendering", "colour", "dataset")
+NAMES = ("rendering", "colour", "dataset")
 """Modules of this package with a function `figures()`."""
 
 ON_REQUEST = (

@@ -1,4 +1,4 @@
-"""How processor time grows with triangles, pixels, highlights, rows and nights: exponents of power laws.
+"""How processor time grows with triangles, pixels, highlights and rows: exponents of power laws.
 
 `python -m benchmarks growth` prints the table of docs/performance.md. Each piece of work is done at five sizes or more,
 which span a factor of 16 or more. The sizes take turns, so that a slow spell of the machine hits all of them alike. The

@@ -14,14 +14,10 @@ from benchmarks.colour import by_colour, spotted
 from benchmarks.transfers import smooth_scene
 from simtest.calibration import Calibration
 from simtest.geometry import Camera
-from simtest.nightly.quantities import setting_figures
-from simtest.nightly.records import NightlyRun, RunRecord
-from simtest.nightly.run import verdict_on
 from simtest.reconstruction import detect_in_picture
 from simtest.reconstruction.options import default_estimators
 from simtest.rendering import Session, backend
 from simtest.report import write_report
-from simtest.runtime import provenance
 from simtest.runtime.resources import find
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import render_picture
@@ -218,21 +214,8 @@ def _rows(folder: Path, copies: int, settings: bool = False) -> pl.DataFrame:
     return pl.concat(parts)
 
 
-def _gate(rows: pl.DataFrame) -> Callable[[], object]:
-    record = RunRecord(id="made", profile="full", started="2024-02-01T02:30:00+00:00", duration_s=1.0,
-                       command="simtest nightly --profile full", **provenance.environment())  # fmt: skip
-
-    def run_of(rows: pl.DataFrame) -> NightlyRun:
-        return NightlyRun(record, rows, setting_figures(rows))
-
-    before = run_of(rows)
-    return lambda: verdict_on(run_of(rows.with_columns(pl.col("error_deg") * 1.01)), before)
-
-
 _OF_ROWS: dict[str, Callable[[pl.DataFrame], Callable[[], object]]] = {
     "summary of results": lambda rows: lambda: summarise(rows),
-    "a night's figures": lambda rows: lambda: setting_figures(rows),
-    "figures and gate of a night": _gate,
 }
 
 

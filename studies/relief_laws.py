@@ -2,8 +2,7 @@
 
 Parts, default all: `normals` (the glints' normals against the base's, theory.md 7.4), `numbers` (7.2), `clouds` (7.1),
 `centroids` (7.5), `sizes` (7.3), `shown` (7.4 of isolated and visible highlights), `search` (the search for glints
-against an exhaustive one), `tissues` (what the search misses of the shipped tissues, and what that does to counts of
-detections). S scales the number of glints that are wanted; 1 is that of the tables. Every frame has a
+against an exhaustive one). S scales the number of glints that are wanted; 1 is that of the tables. Every frame has a
 relief of its own.
 """
 
@@ -11,19 +10,16 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
-from unittest.mock import patch
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session, highlights
 from simtest.runtime.arrays import Array
 from simtest.runtime.seeds import key
-from simtest.simulation.frame import RenderedView, render_view
-from simtest.spec.scene import Scene, load_scene, scene_from_dict
+from simtest.simulation.frame import render_view
+from simtest.spec.scene import scene_from_dict
 from simtest.validation import laws
-from simtest.validation.scoring import match
 
 CURVED = {"plane": 0.0, "kd = 1": 1.0, "kd = -0.5": -0.5, "kd = 2": 2.0}
 """Distance times curvature across the axis of a cylinder."""
@@ -390,70 +386,9 @@ def print_search(scale: float) -> None:
         print(f"{name:10s} {whole:8d} {found:8d}   {found / whole:.4f}   {max(r[2] for r in rows):.1e}", flush=True)
 
 
-# Shipped tissues -------------------------------------------------------------------------------------------------
-
-TISSUES = ("tissue_colon", "tissue_stomach", "tissue_liver", "tissue_gallbladder")
-TWICE = {"GRID_WAVE": 2 * highlights.GRID_WAVE, "MAX_DIVISION": 2 * highlights.MAX_DIVISION}
-"""The grid twice as fine, against which the search is compared."""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A frame with the glints of one search.
-
-    `view`: the frame; `kinds`: of the detections, in their order: on the one isolated glint of a spot, in a spot of
-    none or several, or false.
-    """
-
-    view: RenderedView
-    kinds: list[str]
-
-    @property
-    def places(self) -> Array:
-        """Light, as a coordinate far from the others', and pixel of each glint, shape (N, 3)."""
-        return np.array([(1e6 * one.light, *one.bp_px) for one in self.view.highlights]).reshape(-1, 3)
-
-
-def seen(scene: Scene) -> Seen:
-    """Render a scene, search for its glints, detect, and count as a run of an experiment does."""
-    view = render_view(Session(scene), scene)
-    detections = reconstruct(view.frame(0), view.calibration, ("brightest_point",))
-    single = match(detections, [one.bp_px for one in view.highlights if one.isolated])
-    spots = match(detections, [spot.peak_px for spot in view.visible_highlights])
-    kinds = ["true" if i in single else "in a spot" if i in spots else "false" for i in range(len(detections))]
-    return Seen(view, kinds)
-
-
-def print_tissues(scale: float) -> None:
-    """Print the table of what the search misses of the shipped tissues."""
-    print("tissues: glints that a grid twice as fine adds, and what counts otherwise with them")
-    print("scene                glints  missed  largest, px  isolated  other  detections  other  false: with, without")
-    for name in TISSUES:
-        number = np.zeros(8, dtype=int)
-        largest = 0.0
-        for i in range(max(1, int(4 * scale))):
-            views = {"surface.relief.seed": i} if name == "tissue_gallbladder" else {"surface.viewpoint": i}
-            scene = load_scene(name, views)
-            coarse = seen(scene)
-            with patch.multiple(highlights, **TWICE):
-                fine = seen(scene)
-            gap, back = (cKDTree(a.places).query(b.places)[0] > SAME_PX for a, b in ((coarse, fine), (fine, coarse)))
-            own, other = ({tuple(h.bp_px.round(1)) for h in a.view.highlights if h.isolated} for a in (coarse, fine))
-            largest = max([largest, *(fine.view.highlights[j].radius_px for j in np.flatnonzero(gap))])
-            changed = sum(a != b for a, b in zip(coarse.kinds, fine.kinds, strict=True))
-            number += (
-                len(gap) + back.sum(), gap.sum(), len(other), len(own ^ other), len(fine.kinds), changed,
-                coarse.kinds.count("false"), fine.kinds.count("false"),
-            )  # fmt: skip
-        whole, missed, isolated, others, detections, changed, false, without = number
-        row = f"{name:20s} {whole:6d} {missed:7d} {largest:12.2f} {isolated:9d} {others:6d}"
-        print(f"{row} {detections:11d} {changed:6d} {without:12d} {false:8d}", flush=True)
-
-
 PARTS = {
     "normals": print_normals, "numbers": print_numbers, "clouds": print_clouds, "sizes": print_sizes,
     "centroids": print_centroids, "shown": print_shown, "search": print_search,
-    "tissues": print_tissues,
 }  # fmt: skip
 
 

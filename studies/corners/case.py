@@ -30,9 +30,6 @@ from studies.corners.scenes import settings
 
 ESTIMATORS = ("brightest_point", "cone_axis", "curved", "circle_pose", "bisector", "photometric")
 
-STORED = ("brightest_point", "cone_axis", "curved")
-"""Estimators whose answers the dataset keeps."""
-
 GROWN_PX = 3
 """A region of interest is the box of the brightest detection, grown on each side by so much."""
 
@@ -189,7 +186,7 @@ class Case(View):
         """The sample of a dataset of this scene alone, as it is read back."""
         recipe = self.folder / "corners.toml"
         recipe.write_text(
-            f"samples = 1\nhighlights = 0\nvisible = true\nradiance = true\nestimators = {json.dumps(STORED)}\n"
+            "samples = 1\nhighlights = 0\nvisible = true\nradiance = true\n"
             f"splits = {{ train = 1.0, validation = 0.0, test = 0.0 }}\n"
             f"[[families]]\nscene = {json.dumps(str(self.written()))}\n"
         )

@@ -3,17 +3,17 @@
 from collections.abc import Callable, Sequence
 
 from simtest.errors import SimtestError
+from studies.corners.calibration_checks import calibration
 from studies.corners.case import Case, Faults, NotAskedError
-from studies.corners.file_checks import calibration, stored
 from studies.corners.geometry_checks import law, projection, search, surface
-from studies.corners.label_checks import isolated, labels, radius, snr
+from studies.corners.label_checks import isolated, labels, radius
 from studies.corners.symmetry_checks import answers, double, mirror, turn
 
 CHECKS: dict[str, Callable[[Case], Faults]] = {
     each.__name__: each
     for each in (
-        law, projection, surface, search, mirror, turn, double, answers, isolated, labels, radius, snr,
-        calibration, stored,
+        law, projection, surface, search, mirror, turn, double, answers, isolated, labels, radius,
+        calibration,
     )
 }  # fmt: skip
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from simtest.calibration import Response
 from simtest.rendering import HighlightPoint, Session
 from simtest.rendering.backend import colour_variant
 from simtest.rendering.rays import Sightlines
@@ -20,13 +19,6 @@ from studies.corners.scenes import SMOOTH
 
 MOST_CUT = 0.1
 """Share of an isolated highlight's border that an instrument may make."""
-
-CLEAR = 0.85
-"""Share of full scale below which a peak is not clipped, nor its noise."""
-
-DRAWS = 96
-"""Pictures by which the noise is measured: its deviation is then known to 7 %."""
-
 
 DIVISION = 100
 """Rays along a pixel's side."""
@@ -112,35 +104,6 @@ def radius(case: Case) -> Faults:
     if 1 / room < ratio < room:
         return []
     return [f"radius_px: {ratio:.3g} of the rendered one in the median of {len(ratios)}"]
-
-
-def snr(case: Case) -> Faults:
-    """Check the noise behind `peak_snr` against that of pictures drawn again."""
-    if case.row["sensor"] == "ideal":
-        raise NotAskedError("no noise")
-    # A clipped peak has less noise than light.
-    most = CLEAR * case.seen.full_scale
-    spots = [s for s in case.seen.visible_highlights if s.instrument is None and s.value < most][:8]
-    response = Response("srgb") if case.row["sensor"] == "processed" else Response()
-    drawn = []
-    places = [(int(s.peak_px[1]), int(s.peak_px[0])) for s in spots]
-    if not places:
-        raise NotAskedError("no visible highlight that is not clipped")
-    for seed in range(DRAWS):
-        linear = response.decode(case.seen.frame(seed))
-        linear = linear if linear.ndim == 2 else linear.mean(axis=2)
-        drawn.append([linear[place] for place in places])
-    values = np.array(drawn)
-    ratios = []
-    for spot, of_spot in zip(spots, values.T, strict=True):
-        # Demosaicing and sharpening may still lift it.
-        if np.quantile(of_spot, 0.95) < 0.97 and math.isfinite(spot.peak_snr):
-            sigma = spot.specular / spot.peak_snr / case.seen.full_scale
-            ratios.append(float(of_spot.std(ddof=1)) / sigma)
-    if not ratios:
-        raise NotAskedError("all visible highlights are clipped")
-    ratio = float(np.median(ratios))
-    return [] if 0.75 < ratio < 1.33 else [f"peak_snr: the noise is {ratio:.3g} times that behind it"]
 
 
 def labels(case: Case) -> Faults:

@@ -1,4 +1,4 @@
-"""Detection of specularities on rendered colon and liver frames, beside two other detectors on the same frames.
+"""Detection of specularities on rendered colon and liver frames.
 
 `python -m studies.detection`: 200 frames of anatomies that were not used for tuning, about 3 minutes of processor time.
 """
@@ -16,17 +16,15 @@ from benchmarks.measuring import Figure, print_figures
 from simtest.conventions import SPECULAR_DIFFUSE_RATIO, SPECULAR_PEAK_SHARE
 from simtest.reconstruction import detect_in_picture
 from studies.detection.frames import StudyFrame, study_frames
-from studies.detection.peers import T2_REL, THRESHOLDS, TUNED_T2_REL, arnold, fixed_threshold
 from studies.detection.scores import Scores, score
 from studies.detection.truth import specular_truth
 
 Mask = npt.NDArray[np.bool_]
 Detector = Callable[[StudyFrame], Mask]
 
-FRAMES, TUNING_FRAMES = 200, 24
+FRAMES = 200
 SHARES = (SPECULAR_PEAK_SHARE, 0.05, 0.20)
 F1, DICE = 0.90, 0.85
-PUBLISHED = f"Arnold 2010, T2rel {T2_REL:g}"
 
 
 FAINT = "simtest, faint ones too"
@@ -50,42 +48,17 @@ def _all_of_ours(frame: StudyFrame) -> Mask:
     return detect_in_picture(frame.picture.astype(np.float32) / 255).detection.mask
 
 
-def _arnold(t2_rel: float) -> Detector:
-    return lambda frame: _inside(arnold(frame.picture, t2_rel), frame)
-
-
-def _fixed(threshold: int) -> Detector:
-    return lambda frame: _inside(fixed_threshold(frame.picture, threshold), frame)
-
-
-def _inside(mask: Mask, frame: StudyFrame) -> Mask:
-    """Spare the others the border of the view, which they do not look for."""
-    return mask if frame.camera.seen is None else mask & frame.camera.seen
-
-
-def figures(frames: int = FRAMES, tuning: int = TUNING_FRAMES) -> list[Figure]:
-    """Return the figures: ours with their limits, the others' beside them."""
+def figures(frames: int = FRAMES) -> list[Figure]:
+    """Return the figures beside their limits."""
+    detectors: dict[str, Detector] = {"simtest": _ours, FAINT: _all_of_ours}
     with tempfile.TemporaryDirectory() as folder:
-        tried = {f"threshold {t}": _fixed(t) for t in THRESHOLDS}
-        tried |= {f"Arnold 2010, T2rel {t:g}": _arnold(t) for t in TUNED_T2_REL}
-        tuned = _run("tuning", tuning, Path(folder), tried, SHARES[:1])
-        detectors: dict[str, Detector] = {"simtest": _ours, FAINT: _all_of_ours}
-        for kind in ("threshold", "Arnold"):
-            best = max((n for n in tried if n.startswith(kind)), key=lambda n: tuned[n, "all", SHARES[0]].dice)
-            detectors[best] = tried[best]
-        detectors.setdefault(PUBLISHED, _arnold(T2_REL))
         scores = _run("figures", frames, Path(folder), detectors, SHARES)
     shown = []
-    ours = scores["simtest", "all", SHARES[0]]
     for name in detectors:
         for part in ("all", "colon", "liver"):
             shown += _lines(name, part, scores[name, part, SHARES[0]], limit=name == "simtest" and part == "all")
     for share in SHARES[1:]:
         shown += _lines("simtest", f"all, peak share {share:g}", scores["simtest", "all", share])
-    for name in list(detectors)[2:]:
-        other = scores[name, "all", SHARES[0]]
-        shown.append(Figure(f"F1 ahead of {name}", ours.f1 - other.f1, 0.0, True, ""))
-        shown.append(Figure(f"Dice ahead of {name}", ours.dice - other.dice, 0.0, True, ""))
     return shown
 
 

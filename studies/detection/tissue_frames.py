@@ -19,9 +19,6 @@ TISSUES = ("colon", "stomach", "liver", "gallbladder")
 SEEDS = {"tuning": 100, "figures": 920}
 """Where the seeds of relief, viewpoint and noise begin: no frame is in both splits."""
 
-TUNED_ON = ("colon", "liver")
-"""Thresholds were looked at on these alone, in the tuning split."""
-
 
 @dataclass(frozen=True)
 class TissueFrame:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from benchmarks.measuring import print_figures
 from studies.gate import figures, proof
 from studies.gate.bank import frames_of, load_bank
-from studies.gate.edits import night_folder, of_last_night, said, told
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
@@ -56,17 +55,8 @@ def noise() -> str:
     )
 
 
-def edits() -> str:
-    """Return the table of results that were edited without touching the code."""
-    rows = [(one.name, said(one), told(one.same)) for one in of_last_night(night_folder())]
-    fine = [name for name, verdict, _ in rows[1:] if verdict in ("fine", "-")]
-    lines = f"{len(rows) - 1 - len(fine)} of {len(rows) - 1} edits of the night are not called fine.\n"
-    return lines + "\n" + _table(("edit", "quick night, same seeds", "first cause"), rows)
-
-
 SECTIONS: dict[str, Callable[[], str]] = {
     "alarms": alarms, "harmless": harmless, "rises": rises, "faults": faults, "noise": noise,
-    "edits": edits,
 }  # fmt: skip
 
 

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import cost, estimators, growth
+from benchmarks import cost, growth
 from benchmarks.__main__ import NAMES, ON_REQUEST, main
 from benchmarks.measuring import Figure
 from simtest.dataset.plan import Plan
-from simtest.errors import Failure, Reason
 
 
 @pytest.mark.parametrize("name", ON_REQUEST)
@@ -116,13 +115,3 @@ def test_figures_keep_or_miss_their_limits():
     assert Figure("x", 1.0, 1.0).met
     assert not Figure("x", 1.1, 1.0).met
     assert not Figure("x", float("nan"), 1.0).met
-
-
-def test_a_piece_without_an_answer_is_not_timed_as_a_fast_one(monkeypatch):
-    monkeypatch.setattr(estimators, "frame_pieces", lambda: {"reconstruct": list})
-    monkeypatch.setattr(estimators, "times_in_turns", None)
-    with pytest.raises(RuntimeError, match="reconstruct: no answer: none of 0 specularities"):
-        estimators.figures()
-    pieces = estimators.estimator_pieces()
-    assert [estimators.no_result(piece()) for piece in pieces.values()] == [""] * 4
-    assert estimators.no_result(Failure(Reason.NO_PEAK, "broken")) == "no_peak: broken"

@@ -3,10 +3,10 @@
 import numpy as np
 import polars as pl
 import pytest
+from gate_edits import EDITS, edited, run_of
 from gate_nights import night, whole
 
 from simtest.nightly.compare import compare
-from studies.gate.edits import EDITS, edited, run_of
 from tests.laws.results import broken_rules
 from tests.marked import marked
 

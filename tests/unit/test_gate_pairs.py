@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from gate_edits import EDITS
 from gate_nights import changed, night, raised, rows, whole, with_signs
 
 from simtest.conventions import MOTION_COLUMNS
 from simtest.nightly.compare import compare
-from studies.gate.edits import EDITS
 
 DATA = Path(__file__).parents[1] / "data"
 STORED = DATA / "gate_pairs.json"

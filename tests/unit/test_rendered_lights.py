@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rendered_balls import Floats, Rendering, nearest_errors, places, plain_calibration
 
 from simtest.calibration import Priors
 from simtest.cli.pictures import calibrate
 from simtest.runtime import chi_squared
 from simtest.spec.calibration_file import load_calibration, save_calibration
-from studies.light_calibration.rendered import Floats, Rendering, nearest_errors, places, plain_calibration
 
 pytestmark = [pytest.mark.slow, pytest.mark.render]
 

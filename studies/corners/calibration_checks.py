@@ -1,62 +1,14 @@
-"""Checks of what is written: calibrations, and answers in datasets."""
-
-import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+"""Checks of the calibrations that are written."""
 
 import numpy as np
 
 from simtest.calibration import Calibration
-from simtest.conventions import DEFAULT_SMOOTHING_PX
-from simtest.dataset import calibration_of
-from simtest.errors import Failure
-from simtest.reconstruction import Specularity, reconstruct
 from simtest.simulation.frame import make_frame
 from simtest.simulation.frame_files import write_frame
 from simtest.spec import load_calibration
 from studies.corners import formulas
-from studies.corners.case import STORED, Case, Faults
+from studies.corners.case import Case, Faults
 from studies.corners.scenes import EMISSION_POWER, VIGNETTING_POWER
-
-
-def stored(case: Case) -> Faults:
-    """Check that answers in a dataset are those of the stored picture with `calibration_of`.
-
-    Either detector may have made them: that of pictures, or peaks.
-    """
-    sample = case.sample
-    calibration = calibration_of(sample["meta"])
-    options: list[dict[str, Any]] = [{}, {"detector": "peaks", "smoothing_px": DEFAULT_SMOOTHING_PX}]
-    found = [reconstruct(sample["image"], calibration, list(STORED), **each) for each in options]
-    return min((_other_answers(sample["meta"], each) for each in found), key=len)
-
-
-def _other_answers(meta: Mapping[str, Any], found: Sequence[Specularity]) -> Faults:
-    """Return how the answers that a sample's metadata keep differ from others."""
-    kept = [entry for entry in meta["estimates"] if entry.get("status") == "ok" and "normal_x" in entry]
-    made = [
-        (name, result) for spot in found for name, result in spot.estimates.items() if not isinstance(result, Failure)
-    ]
-    faults = []
-    if len(meta["detections"]) != len(found):
-        faults.append(f"{len(meta['detections'])} detections stored, {len(found)} in the stored picture")
-    if len(kept) != len(made):
-        faults.append(f"{len(kept)} answers stored, {len(made)} from the stored picture")
-    worst, spread = 0.0, 0.0
-    for entry in kept:
-        normal = np.array([entry[f"normal_{axis}"] for axis in "xyz"])
-        look = np.array([entry["look_x_px"], entry["look_y_px"]])
-        near = [r for name, r in made if name == entry["estimator"] and np.linalg.norm(r.look_px - look) < 2]
-        if near:
-            worst = max(worst, float(min(formulas.angle_deg(normal, r.normal) for r in near)))
-            if near[0].covariance is not None and "cov_11" in entry:
-                ratio = (entry["cov_11"] + entry["cov_22"]) / float(np.trace(near[0].covariance))
-                spread = max(spread, abs(math.log(ratio)) / 2)
-    if worst > 0.01:
-        faults.append(f"a stored normal is {worst:.2g} deg from that of the stored picture")
-    if spread > 0.02:
-        faults.append(f"a stored +- is {math.exp(spread):.3g} times that of the stored picture, or its inverse")
-    return faults
 
 
 def calibration(case: Case) -> Faults:

@@ -1,13 +1,10 @@
 """Results that were edited without touching the code: what the gate says of each.
 
-`python -m studies.gate edits` prints the table. A night is edited, and the gate compares it with the same night as it
-was: the last one of the profile quick, from the folder that GATE_NIGHT names (default: reports/nightly/quick).
+A night is edited, and the gate compares it with the same night as it was.
 """
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -15,7 +12,6 @@ import polars as pl
 from simtest.nightly.compare import compare
 from simtest.nightly.quantities import setting_figures
 from simtest.nightly.records import NightlyRun, RunRecord, Verdict
-from simtest.nightly.store import LATEST_ROWS, load_run
 from simtest.validation.columns import SCHEMA
 
 OK = (pl.col("status") == "ok") & pl.col("true_id").is_not_null()
@@ -212,26 +208,3 @@ def edited(tonight: pl.DataFrame, other: pl.DataFrame | None, seed: int = 0) -> 
         )
         for name, run in runs.items()
     ]  # fmt: skip
-
-
-def night_folder() -> Path:
-    """Return the folder of the night that is edited."""
-    return Path(os.environ.get("GATE_NIGHT") or Path("reports") / "nightly" / "quick")
-
-
-def of_last_night(folder: Path) -> list[Edited]:
-    """Edit the night whose results a folder of reports holds, such as reports/nightly/quick; raise `InputError`."""
-    return edited(load_run(folder, LATEST_ROWS).rows, None)
-
-
-def said(one: Edited) -> str:
-    """Return the verdict against the same seeds in a word, with the number of findings."""
-    if not (one.changes or one.name == "none"):
-        return "-"
-    found = one.same.regressions.height + one.same.unexplained.height
-    return f"{one.same.state} ({found})" if found else one.same.state
-
-
-def told(verdict: Verdict) -> str:
-    """Return the first cause that a verdict names."""
-    return verdict.causes[0] if verdict.causes else "-"
