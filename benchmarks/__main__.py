@@ -8,11 +8,7 @@ from benchmarks.measuring import Figure, print_figures
 NAMES = ("rendering", "colour", "dataset")
 """Modules of this package with a function `figures()`."""
 
-ON_REQUEST = (
-    "transfers",
-    "growth",
-    "cost",
-)
+ON_REQUEST = ("transfers", "growth", "cost")
 """The same, run where they are named: they take minutes, or need what is not always there."""
 
 

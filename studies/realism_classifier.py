@@ -21,6 +21,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize
 from scipy.special import expit
 
 from simtest.calibration import Calibration, Frame, Response
@@ -39,7 +40,7 @@ LEAST_PX = 2
 """Pixels above half height of a highlight that is cropped: one pixel alone is a shoulder of another highlight."""
 
 JPEG_QUALITY = 75
-RIDGE, NEWTON_STEPS = 1.0, 50
+RIDGE = 1.0
 SPLITS, RESAMPLES = 10, 2000
 COLOURS = 9
 """Of the features, the first so many are of colour."""
@@ -210,7 +211,7 @@ def _pair(sides: list[list[Array]], i: int, j: int) -> float:
 
 
 def fitted(rows: Array, labels: Array, weights: Array) -> Array:
-    """Return the coefficients of a logistic regression with a ridge, without its constant, by Newton's method."""
+    """Return the coefficients of a logistic regression with a ridge, without its constant, by minimisation."""
     inputs = np.column_stack([rows, np.ones(len(rows))])
     ridge = np.append(np.full(rows.shape[1], RIDGE), 0.0)
     signs = 2 * labels - 1
@@ -218,19 +219,10 @@ def fitted(rows: Array, labels: Array, weights: Array) -> Array:
     def loss(theta: Array) -> float:
         return float(weights @ np.logaddexp(0, -signs * (inputs @ theta)) + 0.5 * ridge @ theta**2)
 
-    theta = np.zeros(len(ridge))
-    for _ in range(NEWTON_STEPS):
-        chance = expit(inputs @ theta)
-        slope = inputs.T @ (weights * (chance - labels)) + ridge * theta
-        curvature = (inputs.T * (weights * chance * (1 - chance))) @ inputs + np.diag(ridge + 1e-9)
-        step, share = np.linalg.solve(curvature, slope), 1.0
-        # The loss is convex: a shorter step along the descent lowers it.
-        while share > 1e-6 and loss(theta - share * step) > loss(theta):
-            share /= 2
-        theta = theta - share * step
-        if np.abs(share * step).max() < 1e-8:
-            break
-    return theta[:-1]
+    def slope(theta: Array) -> Array:
+        return inputs.T @ (weights * (expit(inputs @ theta) - labels)) + ridge * theta
+
+    return np.asarray(minimize(loss, np.zeros(len(ridge)), jac=slope, method="BFGS", options={"gtol": 1e-6}).x[:-1])
 
 
 def auc(low: Array, high: Array) -> float:

@@ -17,7 +17,6 @@ from simtest.errors import SimtestError
 from studies.corners.case import Case
 from studies.corners.checks import CHECKS, run
 from studies.corners.coverage import Answer, answers_of, table
-from studies.corners.design import whole_from
 from studies.corners.scenes import MESH, refusals, rows
 
 NAMES = (*CHECKS, "coverage")
@@ -64,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", type=int, metavar="K", help="row K of the array alone, from 0")
     given = parser.parse_args(arguments)
     array, tally = rows(), Tally()
-    print(f"{len(array)} scenes; the first {whole_from(array)} hold all pairs of levels of {len(array[0])} features")
+    print(f"{len(array)} scenes hold all pairs of levels of {len(array[0])} features")
     print("pairs that are refused:")
     for (first, second), reason in refusals().items():
         print(f"  {first[0]} {first[1]}, {second[0]} {second[1]}: {reason}")

@@ -242,13 +242,6 @@ class Case(View):
             shaft["tip"] = [1 - shaft["tip"][1], shaft["tip"][0]]
         return View(tables)
 
-    @cached_property
-    def finer(self) -> View:
-        """The scene with twice as many pixels along each side."""
-        tables = copy.deepcopy(dict(self.tables))
-        tables["camera"] |= {name: 2 * tables["camera"][name] for name in ("width", "height", "fx", "fy", "cx", "cy")}
-        return View(tables)
-
 
 def _toml(value: Any) -> str:
     """Return a value as TOML writes it on one line."""

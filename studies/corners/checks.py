@@ -6,13 +6,13 @@ from simtest.errors import SimtestError
 from studies.corners.calibration_checks import calibration
 from studies.corners.case import Case, Faults, NotAskedError
 from studies.corners.geometry_checks import law, projection, search, surface
-from studies.corners.label_checks import isolated, labels, radius
-from studies.corners.symmetry_checks import answers, double, mirror, turn
+from studies.corners.label_checks import isolated, labels
+from studies.corners.symmetry_checks import answers, mirror, turn
 
 CHECKS: dict[str, Callable[[Case], Faults]] = {
     each.__name__: each
     for each in (
-        law, projection, surface, search, mirror, turn, double, answers, isolated, labels, radius,
+        law, projection, surface, search, mirror, turn, answers, isolated, labels,
         calibration,
     )
 }  # fmt: skip

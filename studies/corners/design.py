@@ -55,15 +55,6 @@ def covering_array(factors: Factors, allowed: Callable[[Pair], bool], least: int
     return rows
 
 
-def whole_from(rows: Sequence[Row]) -> int:
-    """Return how many of the first rows hold all pairs that the rows hold."""
-    first: dict[Pair, int] = {}
-    for number, row in enumerate(rows):
-        for pair in pairs_in(row):
-            first.setdefault(pair, number)
-    return max(first.values()) + 1
-
-
 def _worth(count: int) -> float:
     """Return what a pair adds that is held so often: a missing one more than all others of a row."""
     return 1.0 if count == 0 else 1e-3 / count

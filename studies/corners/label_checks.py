@@ -1,6 +1,5 @@
 """Checks of labels against the image: which highlights count, their pixels, size and noise, and the stored maps."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,8 +13,7 @@ from simtest.rendering.rays import Sightlines
 from simtest.runtime.arrays import Array, IntArray, Mask
 from simtest.spec.scene import scene_from_dict
 from studies.corners import formulas
-from studies.corners.case import Case, Faults, NotAskedError, mean
-from studies.corners.scenes import SMOOTH
+from studies.corners.case import Case, Faults, mean
 
 MOST_CUT = 0.1
 """Share of an isolated highlight's border that an instrument may make."""
@@ -78,32 +76,6 @@ def _cut(specular: Array, metal: Mask, start: tuple[int, int]) -> float:
     region = formulas.at_half_height(np.where(metal, 0, specular), formulas.climbed(specular, start), ~metal)
     around = ndimage.binary_dilation(region) & ~region
     return int(np.count_nonzero(around & metal)) / max(int(np.count_nonzero(around)), 1)
-
-
-def radius(case: Case) -> Faults:
-    """Check the radius of isolated highlights against the rendered lobe at half height."""
-    specular = mean(case.frame.radiance.specular).astype(float)
-    smooth = case.row["relief"] == "none"
-    points = [h for h in case.seen.highlights if h.isolated and (not smooth or case.stands_alone(h))]
-    if case.row["relief"] == "not_resolved":
-        raise NotAskedError("the lobe of a relief below a pixel has no closed form")
-    ratios = []
-    for each in points:
-        column, row = (int(v) for v in each.bp_px)
-        start = formulas.climbed(specular, (min(row, specular.shape[0] - 1), min(column, specular.shape[1] - 1)))
-        region = formulas.at_half_height(specular, start)
-        rows, columns = np.nonzero(region)
-        edge = min(rows.min(), columns.min(), specular.shape[0] - 1 - rows.max(), specular.shape[1] - 1 - columns.max())
-        if edge > 0 and len(rows) > 30:
-            ratios.append(each.radius_px / math.sqrt(len(rows) / math.pi))
-    # Single glints are no circles, and few highlights of tissue are.
-    least = 1 if case.row["surface"] in SMOOTH and smooth else 3 if smooth else 5
-    if len(ratios) < least:
-        raise NotAskedError(f"fewer than {least} isolated highlights of more than 30 px in the frame's interior")
-    ratio, room = float(np.median(ratios)), 1.12 if smooth and case.row["surface"] in SMOOTH else 1.35
-    if 1 / room < ratio < room:
-        return []
-    return [f"radius_px: {ratio:.3g} of the rendered one in the median of {len(ratios)}"]
 
 
 def labels(case: Case) -> Faults:

@@ -1,4 +1,4 @@
-"""Checks by symmetry: a scene that is mirrored, turned or divided into finer pixels has the same labels."""
+"""Checks by symmetry: a scene that is mirrored or turned has the same labels."""
 
 import math
 from collections.abc import Callable
@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from simtest.conventions import DEFAULT_SMOOTHING_PX
 from simtest.errors import Failure
 from simtest.estimators import Estimate
 from simtest.geometry import BrownConrady, Camera
@@ -41,47 +40,34 @@ def turn(case: Case) -> Faults:
     return _same(case, other, pixels, TURN, lambda image: np.rot90(image, -1))
 
 
-def double(case: Case) -> Faults:
-    """Check that twice as many pixels along each side show the same highlights."""
-    return _same(case, case.finer, lambda p: 2 * p, np.eye(3), None)
-
-
 def _same(
-    case: Case, other: View, pixels: Callable[[Array], Array], turning: Array, image: Callable[[Array], Array] | None
+    case: Case, other: View, pixels: Callable[[Array], Array], turning: Array, image: Callable[[Array], Array]
 ) -> Faults:
-    """Compare labels with those of the same scene seen otherwise; `image` turns an image, None where sizes differ."""
-    faults = []
+    """Compare labels with those of the same scene seen otherwise; `image` turns an image."""
     size = np.array([case.camera["width"], case.camera["height"]])
     sampled = case.tables["render"]["samples_per_pixel"] > 1
-    if image is not None:
-        faults += _same_maps(case, other, turning, image, sampled)
-    scale = 1.0 if image is not None else 2.0
+    faults = _same_maps(case, other, turning, image, sampled)
     points: list[HighlightPoint] = list(case.seen.highlights)
     left: list[HighlightPoint] = list(other.seen.highlights)
-    if image is None and case.row["relief"] != "none":
-        # Finer pixels resolve more of a relief: the base's highlights stay.
-        points, left = list(case.seen.clouds), list(other.seen.clouds)
     for number, each in enumerate(points):
         if (each.bp_px < BORDER_PX).any() or (each.bp_px > size - BORDER_PX).any():
-            left = [o for o in left if np.linalg.norm(o.bp_px - pixels(each.bp_px)) > 1e-3 * scale]
+            left = [o for o in left if np.linalg.norm(o.bp_px - pixels(each.bp_px)) > 1e-3]
             continue
         near = [o for o in left if o.light == each.light and np.linalg.norm(o.bp_px - pixels(each.bp_px)) < 1e-3]
         if not near:
             faults.append(f"highlight {number} at {each.bp_px.round(2).tolist()} px is not listed there")
             continue
         left = [o for o in left if o is not near[0]]
-        # The smoothing by which they are judged is one of pixels: finer ones part what melts.
-        judged = not sampled and (image is not None or case.stands_alone(each))
-        faults += [f"highlight {number}: {text}" for text in _differences(each, near[0], turning, scale, judged)]
+        faults += [f"highlight {number}: {text}" for text in _differences(each, near[0], turning, not sampled)]
     there = np.array([other.camera["width"], other.camera["height"]])
     for each in left:
-        if (each.bp_px > BORDER_PX * scale).all() and (each.bp_px < there - BORDER_PX * scale).all():
+        if (each.bp_px > BORDER_PX).all() and (each.bp_px < there - BORDER_PX).all():
             faults.append(f"a highlight at {each.bp_px.round(2).tolist()} px is listed there alone")
     return faults
 
 
-def _differences(one: HighlightPoint, other: HighlightPoint, turning: Array, scale: float, judged: bool) -> Faults:
-    """Return how two labels of a highlight differ, of which one is seen turned and in finer pixels.
+def _differences(one: HighlightPoint, other: HighlightPoint, turning: Array, judged: bool) -> Faults:
+    """Return how two labels of a highlight differ, of which one is seen turned.
 
     Verdicts are compared where `judged`.
     """
@@ -100,29 +86,22 @@ def _differences(one: HighlightPoint, other: HighlightPoint, turning: Array, sca
         if getattr(one, name) != getattr(other, name):
             faults.append(f"{name} {getattr(one, name)} and {getattr(other, name)}")
     if isinstance(one, TrueHighlight) and isinstance(other, TrueHighlight) and judged:
-        faults += _other_verdicts(one, other, scale)
+        faults += _other_verdicts(one, other)
     return faults
 
 
-def _other_verdicts(one: TrueHighlight, other: TrueHighlight, scale: float) -> Faults:
-    """Return how the verdicts on a highlight differ, of which one is of finer pixels."""
+def _other_verdicts(one: TrueHighlight, other: TrueHighlight) -> Faults:
+    """Return how the verdicts on a highlight differ, of which one is seen turned."""
     faults = []
     if one.why_not != other.why_not:
         faults.append(f"why_not {one.why_not!r} and {other.why_not!r} there")
     if one.isolated and other.isolated:
-        if not abs(other.radius_px / one.radius_px / scale - 1) < 1e-3:
+        if not abs(other.radius_px / one.radius_px - 1) < 1e-3:
             faults.append(f"radius_px {one.radius_px:.4g} and {other.radius_px:.4g}")
         # The noise behind a chain of stages is that of few draws, known to 13 %.
-        expected = _left(other.radius_px) / _left(one.radius_px)
-        if math.isfinite(one.peak_snr) and not abs(math.log(other.peak_snr / one.peak_snr / expected)) < 0.4:
+        if math.isfinite(one.peak_snr) and not abs(math.log(other.peak_snr / one.peak_snr)) < 0.4:
             faults.append(f"peak_snr {one.peak_snr:.4g} and {other.peak_snr:.4g}")
     return faults
-
-
-def _left(radius_px: float) -> float:
-    """Return what the smoothing by which highlights are judged leaves of a Gaussian's height, by its half width."""
-    variance = radius_px**2 / (2 * math.log(2))
-    return variance / (variance + DEFAULT_SMOOTHING_PX**2)
 
 
 def _same_maps(case: Case, other: View, turning: Array, image: Callable[[Array], Array], sampled: bool) -> Faults:

@@ -1,6 +1,5 @@
 """Scores of a detected mask against the true one: highlight by highlight, and pixel by pixel."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -84,8 +83,3 @@ def score(detected: Mask, truth: SpecularTruth) -> Scores:
         int(np.count_nonzero(detected & ~truth.mask & ~truth.unclear)),
         int(np.count_nonzero(truth.mask)) - pixel_hits,
     )
-
-
-def total(scores: Iterable[Scores]) -> Scores:
-    """Add scores up."""
-    return sum(scores, Scores())

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import polars as pl
 import pytest
+from drawn_cores import claims, cores, rankings, with_any
 from scipy.stats import binom, chi2
 
 from simtest.bench.scores import (
@@ -19,7 +20,6 @@ from simtest.bench.scores import (
 from simtest.bench.table import ALPHA, SceneSums, margin, rank
 from simtest.geometry.vectors import basis_across
 from simtest.validation.columns import table
-from studies.bench_ranking import claims, cores, rankings, with_any
 
 SD = np.radians(0.5)
 LAYOUT = {"plane": (600, 4)}

@@ -9,6 +9,7 @@ import tomllib
 import numpy as np
 import pytest
 from docstring_parser import parse
+from markdown_links import anchors_of, dead_in_markdown
 
 import simtest
 from simtest.calibration import Calibration
@@ -27,7 +28,7 @@ from studies.manual.blocks import ROOT, manual_pages
 from studies.manual.commands_page import command, commands, commands_page, shipped_page
 from studies.manual.files_page import files_page
 from studies.manual.keys_page import MODELS, keys_page
-from studies.manual.links import anchors_of, dead_in_markdown, dead_links
+from studies.manual.links import dead_links
 from studies.manual.pages import PAGES
 
 DOCS = ROOT / "docs"
