@@ -12,8 +12,7 @@ from studies.corners.symmetry_checks import answers, mirror, turn
 CHECKS: dict[str, Callable[[Case], Faults]] = {
     each.__name__: each
     for each in (
-        law, projection, surface, search, mirror, turn, answers, isolated, labels,
-        calibration,
+        law, projection, surface, search, mirror, turn, answers, isolated, labels, calibration,
     )
 }  # fmt: skip
 
