@@ -13,13 +13,14 @@ TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 # Containers often forbid bytecode, and each process would compile a thousand modules again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo docs docs-commands test test-all test-ci test-extras examples bench lint audit \
+.PHONY: help demo docs docs-commands docs-figures test test-all test-ci test-extras examples bench lint audit \
 	hashed-constraints release-check format clean
 
 help:
 	@echo "make demo      install, run the overview experiment, print the page's path"
 	@echo "make docs      build/manual: the manual as a site; a warning or a dead link is an error"
 	@echo "make docs-commands  run the manual's commands as they stand; QUICK=--quick leaves out what takes minutes"
+	@echo "make docs-figures  make the manual's tables of measured figures anew and compare; CHEAP=--cheap leaves out what takes minutes"
 	@echo "make test      fast tests (about 4 minutes on 2 cores)"
 	@echo "make test-all  all tests, the slow ones too"
 	@echo "make test-extras  tests that need an extra, which it installs beside .venv, or another program"
@@ -70,6 +71,9 @@ docs: $(VENV)/.docs
 
 docs-commands: $(VENV)/.docs
 	$(BIN)/python -m studies.manual commands $(QUICK) $(PAGES)
+
+docs-figures: $(VENV)/.docs
+	$(BIN)/python -m studies.manual figures $(CHEAP) $(PAGES)
 
 # A few examples of each property; the others draw all.
 test: $(VENV)/.tests

@@ -6,6 +6,9 @@
     python -m studies.manual commands [PAGE...] [--quick] [--timeout S] [--log FILE]
                                                         run every `sh` and `python` block, page by page, and compare
                                                         what they print with what the page shows
+    python -m studies.manual figures [PAGE...] [--cheap] [--timeout S]
+                                                        make the tables anew that name their command, and compare their
+                                                        numbers
 
 Each exits with 1 where something is wrong, and names it.
 """
@@ -29,6 +32,10 @@ def main() -> int:
     runner.add_argument("--quick", action="store_true", help="leave out what takes minutes")
     runner.add_argument("--timeout", type=float, default=3600.0, help="seconds that a block may take")
     runner.add_argument("--log", type=Path, help="file for the outputs of the blocks")
+    figures = checks.add_parser("figures", help="make the tables of measured figures anew")
+    figures.add_argument("pages", nargs="*", type=Path)
+    figures.add_argument("--cheap", action="store_true", help="leave out what takes more than 20 s of processor time")
+    figures.add_argument("--timeout", type=float, default=3600.0, help="seconds that a command may take")
     return _run(parser.parse_args())
 
 
@@ -43,6 +50,10 @@ def _run(given: argparse.Namespace) -> int:
         from studies.manual.runner import run_pages
 
         return run_pages(pages, given.quick, given.timeout, given.log)
+    if given.check == "figures":
+        from studies.manual.figures import check_figures
+
+        return check_figures(pages, given.cheap, given.timeout)
     if given.check == "links":
         from studies.manual.links import dead_links
 
