@@ -2,14 +2,16 @@
 
     python -m studies.one_light [FRAMES] [SEED] [ROWS.json]
     python -m studies.one_light --base [FRAMES] [SEED] [ROWS.json]
+    python -m studies.one_light --clouds [FRAMES] [SEED]
 
 Frames are those of the recipe `endoscopy` through its camera chains, with a seed of this study alone: colon, stomach,
 liver and gallbladder in equal shares, under the first light of their scope alone, which in every second frame stands at
 the camera; the relief's slope is drawn anew, from 2 to 8 deg. What is told is the camera, the light, and the scope's
 working range; a light beside the camera is also judged with a told distance. The best estimates are scored by
 kind of highlight. "Before" is the same picture without room for near misses
-(`simtest.estimators.prior_parts`), the negative control. Nothing was tuned on the seed. With
-`--base` single highlights against the base's normal are judged: with the default prior of the relief's slope, with
+(`simtest.estimators.prior_parts`), the negative control. A second table is of the base's normals: of single highlights,
+and of clouds. Nothing was tuned on the seed. With `--clouds` only those are judged, on colon, stomach and liver. With
+`--base` only single highlights against the base's normal are judged: with the default prior of the relief's slope, with
 the slope told exactly, and, as negative control, with slopes up to 8 deg that are no steeper at highlights.
 """
 
@@ -31,14 +33,18 @@ from simtest.dataset.plan import Drawn, Plan
 from simtest.errors import Failure, SimtestError
 from simtest.estimators import Estimate, prior_parts
 from simtest.geometry import Camera
+from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.options import Options, default_estimators
 from simtest.reconstruction.pipeline import run
 from simtest.reconstruction.records import Specularities
 from simtest.rendering import Session
+from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, Image
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import RenderedView, render_view
+from simtest.simulation.highlights import CloudRegions
 from simtest.spec.recipes import load_dataset
+from simtest.validation.scoring import mahalanobis2, match_cloud
 
 SCOPES = {"colonoscope": (0, 1), "laparoscope": (2, 3)}
 """Families of the recipe by scope: colon and stomach, liver and gallbladder."""
@@ -55,6 +61,9 @@ SEED = 9642
 """Of the frames; nothing was tuned on them."""
 
 FRAMES = 36
+
+PLANNED = 120
+"""Frames of the plan whose first ones `clouds_alone` judges, so that a longer run goes on where a shorter one ended."""
 
 SLOPES_DEG = (2.0, 8.0)
 
@@ -130,6 +139,9 @@ def main(arguments: Sequence[str]) -> int:
     arguments = [given for given in arguments if given not in modes]
     usual = BASE_SEED if "--base" in modes else SEED
     frames, seed = (int(arguments[i]) if len(arguments) > i else default for i, default in ((0, FRAMES), (1, usual)))
+    if "--clouds" in modes:
+        clouds_alone(frames, seed)
+        return 0
     judge, tell = (base_rows, report_base) if "--base" in modes else (_rows, report)
     plan, rows = OneLight(seed, frames), list[Row]()
     for number in range(frames):
@@ -142,6 +154,23 @@ def main(arguments: Sequence[str]) -> int:
         if len(arguments) > 2:
             Path(arguments[2]).write_text(json.dumps(rows), encoding="ascii")
     return tell(rows)
+
+
+def clouds_alone(frames: int, seed: int) -> None:
+    """Print the table of the clouds of colons, stomachs and livers, a line for each organ."""
+    plan, rows = OneLight(seed, PLANNED), list[Row]()
+    for number in range(frames):
+        if ORGANS[plan.draw(number).anatomy.family] == "gallbladder" or (made := rendered(plan, number)) is None:
+            continue
+        session, view, family = made
+        picture = in_8_bits(view)
+        clouds = run(picture, told(view, family), Options(estimators=("cloud",), target="base"))
+        rows += _cloud_rows(session, view, clouds, {"frame": number, "organ": ORGANS[family]})
+        print(f"frame {number}: {len(rows)} clouds so far", file=sys.stderr, flush=True)
+    about = {"all": rows, **{organ: [row for row in rows if row["organ"] == organ] for organ in ORGANS}}
+    about["about no highlight point"] = [row for row in rows if row["of"] == "none"]
+    lines = [_line(name, part)[:6] for name, part in about.items() if part]
+    print_markdown([["clouds", "frames", "n", "RMS error, deg", "stated, deg", "held"], *lines])
 
 
 def report_base(rows: Sequence[Row]) -> int:
@@ -169,6 +198,7 @@ def _base_line(name: str, rows: Sequence[Row]) -> list[str]:
 
 def report(rows: Sequence[Row]) -> int:
     """Print the tables of the rows; return 1 where the coverage is not what is aimed at."""
+    base, rows = ([row for row in rows if ("of" in row) == is_base] for is_base in (True, False))
     false = [row for row in rows if row["kind"] == "false"]
     none = [row for row in rows if row["kind"] != "false" and math.isnan(float(row["held"]))]
     print(f"false detections: {len(false)} of {len(rows)}; without a stated region: {len(none)}\n")
@@ -197,6 +227,9 @@ def report(rows: Sequence[Row]) -> int:
         f"cases, each a frame of more than three highlights with one statement of its distance: {len(cases)}; "
         f"{len(worst)} hold less than {LEAST:.0%}, the worst {min(worst, default=math.nan):.0%}\n"
     )
+    of = {"single highlights": "single", "clouds": "cloud", "clouds about no highlight point": "none"}
+    lines = [_line(name, [row for row in base if row["of"] == value]) for name, value in of.items()]
+    print_markdown([["against the base's normal", *head[1:6]], *(line[:6] for line in lines if line)])
     held = [[float(row["held"]) for row in rows if row[key] == value] for key, value in list(cells.values())[2:]]
     low, high = AIMED_AT
     of_all = float(np.mean([row["held"] for row in rows]))
@@ -232,9 +265,11 @@ def _rows(session: Session, view: RenderedView, number: int, family: int) -> lis
     relief = view.scene.surface.relief
     assert relief is not None
     about: Row = {"frame": number, "organ": ORGANS[family], "slope": int(2 * (relief.slope_deg // 2))}
+    base = _base_rows(session, view, picture, by_range, about)
     if number % 2:
-        return [*_told_rows(session, view, picture, by_range, {**about, "told": "light at the camera"})]
+        return [*_told_rows(session, view, picture, by_range, {**about, "told": "light at the camera"}), *base]
     return [
+        *base,
         *_told_rows(session, view, picture, by_range, {**about, "told": "range"}),
         *_told_rows(session, view, picture, _with_distance(by_range, view), {**about, "told": "distance"}),
     ]
@@ -289,6 +324,49 @@ def _with_part(estimate: Estimate | Failure, part: Array) -> Estimate | Failure:
     if isinstance(estimate, Failure) or estimate.budget is None or estimate.cloud is not None:
         return estimate
     return replace(estimate, budget={**estimate.budget, "relief": part}, covariance=None)
+
+
+def _base_rows(
+    session: Session, view: RenderedView, picture: Image, calibration: Calibration, about: Mapping[str, float | str]
+) -> list[Row]:
+    """Return the rows of what the picture says of the base's normals: single highlights, and clouds of them."""
+    names = (*default_estimators(calibration), "cloud")
+    made = run(picture, calibration, Options(estimators=names, target="base"))
+    rows: list[Row] = [
+        {
+            **about,
+            "of": "single",
+            "error": spot.base_error_deg,
+            "stated": _stated(spot.spot.estimate),
+            "held": spot.held,
+        }
+        for spot in score(session, view, made)
+        if spot.held is not None and spot.kind != "false"
+    ]
+    return rows + _cloud_rows(session, view, made, about)
+
+
+def _cloud_rows(
+    session: Session, view: RenderedView, made: Specularities, about: Mapping[str, float | str]
+) -> list[Row]:
+    """Return the rows of a picture's clouds; one whose spots belong to no point of the base is not held."""
+    rows: list[Row] = []
+    regions = CloudRegions.of(session, view.clouds)
+    for specularity in made:
+        cloud = specularity.estimates.get("cloud")
+        if not isinstance(cloud, Estimate):
+            continue
+        # Lights are one here, so a cloud belongs to one point of the base.
+        numbers = match_cloud(regions, view, cloud)
+        if not numbers:
+            rows.append({**about, "of": "none", "error": math.nan, "stated": _stated(cloud), "held": 0.0})
+        for number in numbers[:1]:
+            truth = view.clouds[number].normal_base
+            distance = mahalanobis2(cloud, truth)
+            held = math.nan if distance is None else float(distance <= chi_squared.quantile(0.95, 2))
+            error = float(angle_deg(cloud.normal, truth))
+            rows.append({**about, "of": "cloud", "error": error, "stated": _stated(cloud), "held": held})
+    return rows
 
 
 def _stated(estimate: Estimate) -> float:

@@ -98,7 +98,7 @@ READERS = {
                                 {"x.toml": files.PROFILE}, damaged=0),
     "nightly accept": Reader("nightly accept --reason x --reports out", "out/nightly/quick/run.json", "{", damaged=0),
     "realism": Reader("realism x.png --against plane --out out", "x.png", PICTURE, damaged=0),
-    "fit, frames": Reader("fit x.png --recipe tiny --scene plane --out o.toml", "x.png", PICTURE, damaged=0),
+    "fit, frames": Reader("fit x.png --recipe tiny --out o.toml", "x.png", PICTURE, damaged=0),
 }  # fmt: skip
 """By the start of the cases' names."""
 

@@ -2,7 +2,7 @@
 
 Convention: above a table stands the command that makes it, run from the checkout's root:
 
-    <!-- made by: python -m studies.translucency; minutes: 0.2 -->
+    <!-- made by: simtest validate rig --out $OUT/rig && python -m studies.run_tables rig $OUT/rig; minutes: 0.2 -->
 
 `$OUT` is an empty folder, the same for all tables; a part between `&&` that several tables name runs once. `minutes`
 are those of the processor. Every row of the table must be printed: the numbers of its first cell as they stand, the
