@@ -30,7 +30,7 @@ WIDEST_PINHOLE_DEG = 100.0
 
 LENS_SD = 0.17
 """Standard deviation of k1 about such a lens whose edge is given: of a stereographic one k1 is 1/12, equisolid -1/24,
-orthographic -1/6, a pinhole 1/3; of pinholes from 90 deg on few are held."""
+orthographic -1/6, a pinhole 1/3. `python -m studies.wide_fov` draws them; of pinholes from 90 deg on few are held."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ NEAR_MISSES = Assumption(
     "its normal is then off by 2 to 3 deg, which the budget holds where a frame shows more than three for each light",
     "compare the normals of neighbouring highlights; in Python Priors(plane=True), if the surface is a plane",
 )
-"""Shares and errors: docs/concepts/uncertainty.md, human meshes."""
+"""Shares and errors: python -m studies.human_meshes (docs/concepts/uncertainty.md)."""
 
 
 def calibration_of_view(fov_deg: float, width: int, height: int, across: Extent = "width") -> Calibration:

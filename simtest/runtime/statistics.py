@@ -2,7 +2,7 @@
 
 The group is the frame, or in a dataset the anatomy: highlights of one frame share its noise, its light and its surface.
 Strata are what was chosen and not drawn, such as the settings of an experiment or the cases of a benchmark: the spread
-between them is no chance.
+between them is no chance. `studies/intervals.py` prints how often these intervals hold what they are of.
 """
 
 import math

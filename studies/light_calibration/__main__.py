@@ -14,7 +14,6 @@ from simtest.errors import InputError
 from simtest.reconstruction.light_calibration.run import Ball, Calibrated, calibrate_lights
 from simtest.runtime import chi_squared
 from studies.light_calibration.plantings import Planting, plant, write_pictures
-from studies.light_calibration.points import about, measured_points
 
 WITHIN_MM = 0.2
 LIMIT = chi_squared.quantile(0.95, 3)
@@ -27,21 +26,20 @@ def measured(planting: Planting, told_radius: float | None = None, lights: Any =
     return calibrate_lights(planting.pictures(lights), calibration, Ball(radius))
 
 
-def row(planting: Planting, with_pictures: bool) -> dict[str, Any]:
+def row(planting: Planting) -> dict[str, Any]:
     """Return one planting as a row of the table."""
     told: dict[str, Any] = {
         "seed": planting.seed, "lens": planting.lens, "kind": planting.kind, "planted": len(planting.lights),
         "radius_mm": planting.radius_mm,
     }  # fmt: skip
     try:
-        result = measured(planting).result if with_pictures else measured_points(planting)
+        result = measured(planting).result
     except InputError as error:
         return told | {"status": str(error), "lights": []}
-    if result is None:
-        return told | {"status": "no light found", "lights": []}
     status = "doubtful" if result.problems else "ok"
+    fit = {name: getattr(result, name) for name in ("chi2", "freedom", "inflation", "rms_px")}
     own = {"found": len(result.own), "lights": compared(result, planting), "problems": list(result.problems)}
-    return told | {"status": status, **own, **about(result)}
+    return told | {"status": status, **own, **fit}
 
 
 def compared(result: LightCalibration, planting: Planting) -> list[dict[str, Any]]:
@@ -112,7 +110,6 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=90)
     parser.add_argument("--first", type=int, default=1000, help="seed of the first rig")
     parser.add_argument("--out", type=Path, default=Path("out/light_calibration.jsonl"))
-    parser.add_argument("--points", action="store_true", help="without pictures: the solver alone, on drawn centres")
     parser.add_argument("--resume", action="store_true", help="keep the rigs that --out holds, and add the others")
     parser.add_argument("--write", type=Path, help="folder for the pictures of the rig --first; nothing is measured")
     told = parser.parse_args()
@@ -128,7 +125,7 @@ def main() -> None:
         for seed in range(told.first, told.first + told.rigs):
             if seed in kept:
                 continue
-            rows.append(row(plant(seed), not told.points))
+            rows.append(row(plant(seed)))
             file.write(json.dumps(rows[-1]) + "\n")
             file.flush()
     print("\n".join(summary(rows)))

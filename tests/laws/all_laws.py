@@ -2,8 +2,8 @@
 
 Expected values are made without the code that is watched: closed forms, formulas written down anew in plain NumPy, and
 numbers that other programs measured. `geometry`, `lenses` and `sensors` render nothing; `rendered`, `reflections`,
-`tissues` and `labels` check radiance, truth and files; `tables`, `estimates`, `seeds` and `randomness` what is
-made of them, `results` the rows of a run. `by_hand` holds what several of them compare with.
+`tissues` and `labels` check radiance, truth and files; `tables`, `estimates`, `seeds`, `randomness` and `ladder` what
+is made of them, `results` the rows of a run. `by_hand` holds what several of them compare with.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,7 @@ from tests.laws import (
     estimates,
     geometry,
     labels,
+    ladder,
     lenses,
     randomness,
     reflections,
@@ -32,7 +33,7 @@ ALONE = (
     sensors.photon_noise, sensors.stated_noise, sensors.curves, sensors.quantisation, sensors.vignetting,
     sensors.widths,
     seeds.branches, tables.statistics, tables.law_values, estimates.coverage, estimates.budgets,
-    labels.encodings, tissues.translucency, tissues.glints,
+    labels.encodings, tissues.translucency, tissues.glints, ladder.error_ladder,
 )  # fmt: skip
 IN_SESSION = (
     rendered.photometry, rendered.exposure, rendered.truth,

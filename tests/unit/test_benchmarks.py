@@ -1,4 +1,4 @@
-"""The benchmarks' own arithmetic: exponents, the simulated scheduler, costs, counts; and that nothing is skipped."""
+"""The benchmarks' own arithmetic: exponents, costs, counts; and that nothing is skipped."""
 
 import importlib
 
@@ -10,10 +10,7 @@ from hypothesis import strategies as st
 from benchmarks import cost, growth
 from benchmarks.__main__ import NAMES, ON_REQUEST, main
 from benchmarks.measuring import Figure
-from benchmarks.scheduler import shard_times, simulate
 from simtest.dataset.plan import Plan
-
-EACH = lambda booked: 0.0  # noqa: E731
 
 
 @pytest.mark.parametrize("name", ON_REQUEST)
@@ -79,52 +76,13 @@ def test_growth_beyond_the_limit_is_missed_even_under_a_fixed_cost(monkeypatch, 
     assert figure.value == pytest.approx(power, abs=0.3 if fixed else 1e-9)
 
 
-# Scheduler -------------------------------------------------------------------------------------------------------
-
-
-def test_equal_tasks_on_a_divisor_of_their_number_are_linear():
-    run = simulate(np.full(12, 2.0), 4, EACH)
-    assert (run.makespan_s, run.efficiency) == (6.0, 1.0)
-    # A thirteenth keeps three of the four waiting.
-    assert simulate(np.full(13, 2.0), 4, EACH).makespan_s == 8.0
-    assert simulate(np.full(3, 2.0), 10, EACH, 1.0).makespan_s == 3.0
-
-
-def test_one_process_that_books_bounds_the_run():
-    tasks = np.ones(100)
-    assert simulate(tasks, 100, lambda booked: 0.5).makespan_s == pytest.approx(1 + 50)
-    assert simulate(tasks, 1, lambda booked: 0.5).makespan_s == pytest.approx(150)
-    # Each booking costs more than the one before: 0 + 1 + ... + 99, and the first task.
-    assert simulate(tasks, 100, float).makespan_s == pytest.approx(1 + 99 * 100 / 2)
-
-
-@given(st.lists(st.floats(0.01, 100), min_size=1, max_size=40), st.integers(1, 12), st.floats(0, 2))
-def test_a_run_takes_neither_less_nor_more_than_it_must(lengths, workers, booking):
-    tasks = np.array(lengths)
-    run = simulate(tasks, workers, lambda booked: booking)
-    bookings = booking * len(tasks)
-    assert run.makespan_s >= max(tasks.sum() / workers, tasks.max() + booking, bookings) * (1 - 1e-9)
-    # Graham's bound of list scheduling, each booking counted as if all had to wait for it.
-    assert run.makespan_s <= (tasks.sum() / workers + tasks.max() + bookings) * (1 + 1e-9)
-    assert 0 < run.efficiency <= 1 + 1e-9
-
-
-def test_shards_are_drawn_from_the_measured_times():
-    samples, anatomies = np.array([1.0, 3.0]), np.array([10.0])
-    times = shard_times(samples, anatomies, 4000, 40, 20)
-    # 40 samples of 2 s in the mean, on three anatomies of 20 samples: two, and the one begun before
-    assert times.mean() == pytest.approx(40 * 2 + 30, rel=0.01)
-    assert times.std() == pytest.approx(np.sqrt(40), rel=0.1)
-    assert np.array_equal(times, shard_times(samples, anatomies, 4000, 40, 20))
-
-
 # Cost ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def measured():
     plan = Plan(cost.recipes()["smooth"])
-    return cost.Measured(np.array([1.0, 2.0]), np.array([10.0]), 1.5e6, 1e-3, (0.0, 0.0), plan)
+    return cost.Measured(np.array([1.0, 2.0]), np.array([10.0]), 1.5e6, 1e-3, plan)
 
 
 def test_the_cost_model_is_what_the_measured_times_say(measured):
@@ -138,12 +96,8 @@ def test_the_cost_model_is_what_the_measured_times_say(measured):
 
 
 def test_tables_by_one_process_count_against_many_workers(measured):
-    figures = {figure.name: figure for figure in cost.scheduled("it", measured)}
-    of_many = [figure for name, figure in figures.items() if ", 1000 workers" in name]
-    shards, whole = (next(f for f in of_many if f.name.endswith(end)) for end in ("work, shards", "and tables"))
-    assert shards.met
-    assert not whole.met
-    assert all(figure.met for name, figure in figures.items() if ", 1 worker," in name)
+    # 1 ms a sample alone, 2 ms shared by a thousand
+    assert cost.alone(measured) == pytest.approx(1 / 3)
 
 
 def test_anatomies_are_timed_in_the_families_shares():
