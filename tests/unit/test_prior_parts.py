@@ -7,7 +7,6 @@ import pytest
 from scipy.stats import chi2
 
 from simtest.calibration import LIGHT_AT_CAMERA, CameraPrior, LogUniform, Normal, Priors, Uniform, exactly
-from simtest.errors import InputError
 from simtest.estimators import prior_parts
 from simtest.estimators.budget import equivalent_variance, line_covariance
 from simtest.estimators.family import fit_isophote_family
@@ -256,23 +255,6 @@ def test_a_single_highlight_states_the_base_with_the_relief_in_its_budget():
     np.testing.assert_array_equal(base.normal, fine.normal)
     assert to_base(base, relief) is base
     assert to_base(fine.without_uncertainty(), relief).covariance is None
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"light_offset_mm": Uniform(-1.0, 2.0)}, "light_offset_mm = -1.0"),
-        ({"light_offset_mm": None}, "must be a Uniform"),
-        ({"falloff_power": Normal(-1.0, 1.0)}, "falloff_power = -1.0"),
-        ({"relief_slope": 3.0}, "relief_slope = 3.0"),
-        ({"camera": 0.1}, "priors camera is a float"),
-    ],
-)
-def test_malformed_priors_are_refused(given, said):
-    with pytest.raises(InputError, match=said):
-        Priors(**given)
-    with pytest.raises(InputError, match="focal_sd = -1"):
-        CameraPrior(focal_sd=-1)
 
 
 # The falloff ----------------------------------------------------------------------------------------------------------
