@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -16,7 +15,7 @@ from studies.detection.real_frames import OutlinedFrame
 from studies.hard.cases import scene_of
 from studies.hard.scenes import KINDS
 from studies.learned_transfer import answers as answering
-from studies.learned_transfer import frames, kept, networks, real, sheet, tables
+from studies.learned_transfer import frames, kept, real, tables
 from studies.learned_transfer.answers import OK, Answer
 from studies.learned_transfer.frames import FIRST, GUIDES, LENS, ONE_LIGHT, ROWS, HardFrame, hard_frames
 
@@ -218,21 +217,3 @@ def test_answers_are_kept_by_the_hash_of_the_network(tmp_path, monkeypatch):
     (read,) = folder.normals(frame, {"n, other": Network(tmp_path / "same")})
     assert (read.estimator, read.base_deg, math.isnan(read.stated_deg)) == ("n, other", 1.5, True)
     assert asked == [sorted(networks)]
-
-
-def test_a_sheet_is_small_and_needles_point_as_normals_do(tmp_path):
-    picture = np.random.default_rng(0).random((90, 120, 3)).astype(np.float32)
-    dark = np.zeros_like(picture)
-    estimate = replace(an_estimate(math.pi / 4, 1e-4), look_px=np.array([60.0, 45.0]))
-    columns = np.nonzero((sheet.needles(dark, [a_specularity({"n": estimate})], "n") > 0).any(axis=(0, 2)))[0]
-    assert 57 <= columns.min() <= 60 < 66 <= columns.max() <= 71
-    assert not sheet.needles(dark, [a_specularity({"n": Failure(Reason.NO_PEAK, "")})], "n").any()
-    drawn = sheet.needles(picture, [a_specularity({"n": estimate})], "n", 2)
-    assert drawn.shape == (180, 240, 3)
-    sheet.write_sheet([[drawn] * 3] * 4, ["one", "two", "three"], tmp_path / "sheet.jpg")
-    assert (tmp_path / "sheet.jpg").stat().st_size <= sheet.LARGEST_BYTES
-    assert cv2.imread(str(tmp_path / "sheet.jpg")).shape[1] == 3 * (sheet.TILE_PX + 3)
-
-
-def test_without_files_the_classical_methods_alone_are_measured():
-    assert tuple(networks.estimators(None, None)) == networks.CLASSICAL
