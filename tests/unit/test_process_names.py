@@ -100,32 +100,26 @@ def test_files_among_the_arguments_are_absolute(folder):
     assert set(core.hashes()) == {sys.executable, str(folder / "script.py"), str(folder / "model.onnx")}
 
 
-def test_absolute_names_mean_the_same_elsewhere(folder, monkeypatch):
+def test_absolute_names_are_those_of_the_same_cores_elsewhere(folder, monkeypatch):
     (folder / "inside" / "core.toml").write_text(TABLE.format(command=f"{sys.executable} ../script.py"))
-    names = [f"command: {sys.executable} script.py 'two words'", "inside/core.toml", "cone_axis"]
-    before = [parse_core(name) for name in names[:2]]
-    absolute = absolute_names(names)
-    monkeypatch.chdir("/")
-    after = [parse_core(name) for name in absolute[:2]]
-    assert [core.arguments[:3] for core in after] == [core.arguments[:3] for core in before]
-    assert [core.name for core in after] == [core.name for core in before] == ["script", "mine"]
-    assert absolute[2] == "cone_axis"
-
-
-@pytest.mark.parametrize("command", ["{python} script.py --config settings.toml", "launcher script.py settings.toml"])
-def test_an_absolute_name_is_that_of_the_same_core(folder, monkeypatch, command):
     (folder / "settings.toml").write_text("[core]\n")
     (folder / "bin").mkdir()
     (folder / "bin" / "launcher").symlink_to(sys.executable)
     monkeypatch.setenv("PATH", str(folder / "bin"))
-    name = f"command: {command.format(python=sys.executable)}"
-    before = parse_core(name)
-    (absolute,) = absolute_names([name])
+    names = [
+        f"command: {sys.executable} script.py 'two words'",
+        f"command: {sys.executable} script.py --config settings.toml",
+        "command: launcher script.py settings.toml",
+        "inside/core.toml",
+    ]
+    before = [parse_core(name) for name in names]
+    *absolute, other = absolute_names([*names, "cone_axis"])
     monkeypatch.chdir("/")
-    after = parse_core(absolute)
-    assert after.arguments == before.arguments
-    assert after.name == before.name == "script"
-    assert absolute_names([absolute]) == (absolute,)
+    after = [parse_core(name) for name in absolute]
+    assert [core.arguments for core in after] == [core.arguments for core in before]
+    assert [core.name for core in after] == [core.name for core in before] == ["script", "script", "script", "mine"]
+    assert absolute_names(absolute) == tuple(absolute)
+    assert other == "cone_axis"
 
 
 def test_files_of_a_toml_file_are_looked_for_in_its_folder(folder):
@@ -212,9 +206,8 @@ def test_the_command_line_takes_a_core(folder, here):
     assert "hello: protocol 2; simtest speaks 1" in errors[0]
 
 
-@pytest.mark.parametrize(
-    ("command", "name"),
-    [
+def test_a_command_has_the_name_of_what_the_user_wrote(folder):
+    for command, name in (
         ("./program --table model.onnx", "program"),
         ("./program", "program"),
         ("python3 script.py", "script"),
@@ -222,9 +215,6 @@ def test_the_command_line_takes_a_core(folder, here):
         (f"{sys.executable} script.py --weights model.onnx", "script"),
         (f"{sys.executable} -c pass", Path(sys.executable).stem),
         ("true", "true"),
-    ],
-)
-def test_a_command_has_the_name_of_what_the_user_wrote(folder, command, name):
-    text = f"command: {command}"
-    assert parse_core(text).name == name
-    assert short_names(["cone_axis", text]) == ("cone_axis", name)
+    ):
+        assert parse_core(f"command: {command}").name == name
+        assert short_names(["cone_axis", f"command: {command}"]) == ("cone_axis", name)
