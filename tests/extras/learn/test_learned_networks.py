@@ -212,14 +212,9 @@ def rewritten(made, folder, change):
 
 
 OTHERS = {
-    "no metadata": (
-        lambda model: model.metadata_props.pop(),
-        r"is no network for learned_(dense|spot) \(JSONDecodeError",
-    ),
     "another task": (changed(format="simtest lines, version 2"), "format 'simtest lines"),
     "a scale missing": (changed(scales={}), "KeyError"),
     "a scale of an older form": (changed(scales={"base": 1.0, "fine": 1.0, "distance": 1.0}), "TypeError"),
-    "a scale of 0": (changed(scales=scales((0.0,), (0.0,))), "above 0"),
     "a scale below 0": (changed(scales=scales((0.0,), (-1.0,))), "above 0"),
     "too few scales": (changed(scales=scales((0.0,), (1.0, 2.0))), "as many factors as deviations"),
     "scales in disorder": (changed(scales=scales((1.0, 0.0), (1.0, 2.0))), "must ascend"),
