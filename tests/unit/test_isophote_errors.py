@@ -77,21 +77,19 @@ def coverage(estimator, patches, without=()):
     return np.mean([distance2(estimate, without) <= QUANTILE for estimate in made])
 
 
-@pytest.mark.parametrize("harmonic", [3, 4, 5, 6, 7])
 @pytest.mark.parametrize("points", [40, 203])
-def test_a_ripple_is_measured_as_it_was_drawn(harmonic, points):
+def test_a_ripple_is_measured_as_it_was_drawn(points):
     rng = np.random.default_rng(points)
     phase = np.sort(rng.uniform(0, 2 * np.pi, points) / 20 + np.arange(points) * 2 * np.pi / points)
-    radius = 1 + 0.01 * np.cos(harmonic * phase) - 0.02 * np.sin(harmonic * phase)
     # An ellipse of half-axes 0.05 and 0.03 about (0.01, -0.02); phases are those in which it is the unit circle.
-    circle = radius * np.array([np.cos(phase), np.sin(phase)])
-    x, y = 0.05 * circle[0] + 0.01, 0.03 * circle[1] - 0.02
     a, c = 1 / 0.05**2, 1 / 0.03**2
     conic = np.array([a, 0.0, c, -2 * a * 0.01, 2 * c * 0.02]) / (1 - a * 0.01**2 - c * 0.02**2)
-    order = rng.permutation(points)
-    found = ripples(np.array([x, y])[:, order], conic[None], np.array([points]))[0]
-    drawn = np.where(harmonic == HARMONICS, 0.01 + 0.02j, 0)
-    np.testing.assert_allclose(found, drawn, atol=3e-3)
+    for harmonic in range(3, 8):
+        radius = 1 + 0.01 * np.cos(harmonic * phase) - 0.02 * np.sin(harmonic * phase)
+        x, y = [[0.05], [0.03]] * radius * [np.cos(phase), np.sin(phase)] + [[0.01], [-0.02]]
+        order = rng.permutation(points)
+        found = ripples(np.array([x, y])[:, order], conic[None], np.array([points]))[0]
+        np.testing.assert_allclose(found, np.where(harmonic == HARMONICS, 0.01 + 0.02j, 0), atol=3e-3)
 
 
 def test_spectrum_of_white_noise_on_a_circle():

@@ -72,19 +72,19 @@ def test_a_line_is_one_line_of_json_without_nan():
     assert json.loads(line) == {"a": None, "b": [2.5, None], "c": [0, 1], "d": "a\nb"}
 
 
-@pytest.mark.parametrize(
-    "arrays",
-    [
-        3, {}, [3], [{}], [{"name": 3}], [{"name": "a", "dtype": "<f8"}], [{"name": "a", "shape": [1]}],
-        [{"name": "a", "dtype": "<f8", "shape": [True]}], [{"name": "a", "dtype": "<f8", "shape": [1.0]}],
-        [{"name": "a", "dtype": "<f8", "shape": [1] * 5}], [{"name": "a", "dtype": ["<f8"], "shape": [1]}],
-        [{"name": "a", "dtype": "<f8", "shape": [0, 10**30]}], [{"name": "a", "dtype": "<f8", "shape": [1]}] * 2,
-        [{"name": str(i), "dtype": "<f8", "shape": [0]} for i in range(100)],
-    ],
-)  # fmt: skip
-def test_malformed_lists_of_arrays_break_the_protocol(arrays):
-    with pytest.raises(CoreFault, match="array"):
-        MessageReader().feed(json.dumps({"type": "estimate", "arrays": arrays}).encode() + b"\n")
+BAD_LISTS = [
+    3, {}, [3], [{}], [{"name": 3}], [{"name": "a", "dtype": "<f8"}], [{"name": "a", "shape": [1]}],
+    [{"name": "a", "dtype": "<f8", "shape": [True]}], [{"name": "a", "dtype": "<f8", "shape": [1.0]}],
+    [{"name": "a", "dtype": "<f8", "shape": [1] * 5}], [{"name": "a", "dtype": ["<f8"], "shape": [1]}],
+    [{"name": "a", "dtype": "<f8", "shape": [0, 10**30]}], [{"name": "a", "dtype": "<f8", "shape": [1]}] * 2,
+    [{"name": str(i), "dtype": "<f8", "shape": [0]} for i in range(100)],
+]  # fmt: skip
+
+
+def test_malformed_lists_of_arrays_break_the_protocol():
+    for arrays in BAD_LISTS:
+        with pytest.raises(CoreFault, match="array"):
+            MessageReader().feed(json.dumps({"type": "estimate", "arrays": arrays}).encode() + b"\n")
 
 
 # Greetings ------------------------------------------------------------------------------------------------------------
@@ -248,31 +248,31 @@ def test_a_budget_is_kept_part_by_part():
     np.testing.assert_allclose(found.covariance, [[3e-4, 0], [0, 1e-4]])
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"normal": None}, {"normal": [True, 0, -1]}, {"normal": [[0, 0, -1]]}, {"normal": [0, 0, [-1]]},
-        {"normal": {"x": 0}}, {"normal": [0, 0, 10**400]}, {"candidates": []}, {"candidates": [[0, 0, -1]] * 65},
-        {"axis_ratio_deviation": 0}, {"axis_ratio": "0.5"},
-        {"axis_ratio": [0.5]}, {"target": ["fine"]}, {"flags": "small"}, {"flags": [3]},
-        {"flags": ["x" * 61]}, {"flags": ["a"] * 17}, {"curvature": 3}, {"curvature": {"axis_ratio": 0.5}},
-        {"curvature": {"directions": [[1, 0, 0], [0, 1, 0]], "axis_ratio": 2}}, {"budget": []}, {"budget": {}},
-        {"budget": {"a b": [[1, 0], [0, 1]]}}, {"budget": {"noise": [1, 2]}}, {"covariance": [[1, 2], [0, 1]]},
-        {"axis_ratio": -5}, {"axis_ratio": 1e308}, {"look_px": [-500, 20]}, {"look_px": [1e300, 20]},
-        {"look_px": None, "look_ray": [5, 0, 1e-3]}, {"covariance": [[1e308, 0], [0, 1]]},
-        {"covariance": [[25.0, 0], [0, 25.0]]}, {"covariance": np.eye(2, dtype=bool)},
-        {"isophotes": 3}, {"isophotes": [{"isovalue": 2, "cone": [[1, 0, 0], [0, 1, 0], [0, 0, -1]],
-                                          "sightline": [0, 0, 1]}]},
-        {"isophotes": [{"isovalue": 0.5, "cone": [[0, 0, 0]] * 3, "sightline": [0, 0, 1]}]},
-        {"budget": {"noise": [[1e-4, 0], [0, 1e-4]], "shape": [1, 2]}},
-    ],
-)  # fmt: skip
-def test_a_malformed_field_refuses_the_estimate(fields):
-    found = answered(**fields)
-    assert isinstance(found, Failure)
-    assert found.reason == Reason.ESTIMATOR_ERROR
-    assert "\n" not in found.detail
-    assert len(found.detail) < 300
+BAD_FIELDS = [
+    {"normal": None}, {"normal": [True, 0, -1]}, {"normal": [[0, 0, -1]]}, {"normal": [0, 0, [-1]]},
+    {"normal": {"x": 0}}, {"normal": [0, 0, 10**400]}, {"candidates": []}, {"candidates": [[0, 0, -1]] * 65},
+    {"axis_ratio_deviation": 0}, {"axis_ratio": "0.5"},
+    {"axis_ratio": [0.5]}, {"target": ["fine"]}, {"flags": "small"}, {"flags": [3]},
+    {"flags": ["x" * 61]}, {"flags": ["a"] * 17}, {"curvature": 3}, {"curvature": {"axis_ratio": 0.5}},
+    {"curvature": {"directions": [[1, 0, 0], [0, 1, 0]], "axis_ratio": 2}}, {"budget": []}, {"budget": {}},
+    {"budget": {"a b": [[1, 0], [0, 1]]}}, {"budget": {"noise": [1, 2]}}, {"covariance": [[1, 2], [0, 1]]},
+    {"axis_ratio": -5}, {"axis_ratio": 1e308}, {"look_px": [-500, 20]}, {"look_px": [1e300, 20]},
+    {"look_px": None, "look_ray": [5, 0, 1e-3]}, {"covariance": [[1e308, 0], [0, 1]]},
+    {"covariance": [[25.0, 0], [0, 25.0]]}, {"covariance": np.eye(2, dtype=bool)},
+    {"isophotes": 3}, {"isophotes": [{"isovalue": 2, "cone": [[1, 0, 0], [0, 1, 0], [0, 0, -1]],
+                                      "sightline": [0, 0, 1]}]},
+    {"isophotes": [{"isovalue": 0.5, "cone": [[0, 0, 0]] * 3, "sightline": [0, 0, 1]}]},
+    {"budget": {"noise": [[1e-4, 0], [0, 1e-4]], "shape": [1, 2]}},
+]  # fmt: skip
+
+
+def test_a_malformed_field_refuses_the_estimate():
+    for fields in BAD_FIELDS:
+        found = answered(**fields)
+        assert isinstance(found, Failure), fields
+        assert found.reason == Reason.ESTIMATOR_ERROR, fields
+        assert "\n" not in found.detail
+        assert len(found.detail) < 300, fields
 
 
 @pytest.mark.parametrize(
