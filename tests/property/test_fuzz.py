@@ -16,6 +16,7 @@ from simtest.estimators.highlight import fit_highlight
 from simtest.estimators.photometric import photometric
 from simtest.geometry import Camera, FittedArc, FittedConic, KannalaBrandt, Patch, circle_pose, fit_arc, fit_ellipse
 from simtest.validation.paper.plane_from_aside import photometric_plane
+from tests.marked import marked
 
 ESTIMATORS = {
     "cone_axis": cone_axis,
@@ -161,15 +162,17 @@ def check_patch(rng):
 CHECKS = {"conics": check_conic, "contours": check_contour, "patches": check_patch}
 
 
-def go(check, first, count):
-    answered = sum(check(np.random.default_rng([first + i, 7])) for i in range(count))
+OFTEN = [("conics", 10**6, 60_000), ("contours", 10**6, 25_000), ("patches", 10**6, 15_000)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "first", "count"),
+    marked([("conics", 0, 300), ("contours", 0, 150), ("patches", 0, 150), *OFTEN], slow=OFTEN),
+)
+def test_nothing_raises_and_nothing_ok_holds_nan(kind, first, count):
+    answered = sum(CHECKS[kind](np.random.default_rng([first + i, 7])) for i in range(count))
     # Both outcomes must occur, or the inputs are not what they are meant to be.
     assert 0.02 * count < answered < 0.98 * count
-
-
-@pytest.mark.parametrize(("kind", "count"), [("conics", 300), ("contours", 150), ("patches", 150)])
-def test_nothing_raises_and_nothing_ok_holds_nan(kind, count):
-    go(CHECKS[kind], 0, count)
 
 
 def test_an_isophote_that_is_no_ellipse_across_the_axis_is_a_failure():
@@ -180,9 +183,3 @@ def test_an_isophote_that_is_no_ellipse_across_the_axis_is_a_failure():
     assert family.are_ellipses.all()
     assert Reason.NOT_AN_ELLIPSE in [failure.reason for failure in family.failures]
     assert "missing_isovalues" in run(cone_axis, made, camera, Priors()).flags
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "count"), [("conics", 60_000), ("contours", 25_000), ("patches", 15_000)])
-def test_nothing_raises_in_a_hundred_thousand(kind, count):
-    go(CHECKS[kind], 10**6, count)

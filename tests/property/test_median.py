@@ -1,7 +1,6 @@
 """Medians and quantiles are NumPy's, without what NumPy loads for them."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -19,22 +18,15 @@ def test_it_is_numpys_to_the_last_bit(values):
     assert np.array_equal(values, kept, equal_nan=True)
 
 
-@pytest.mark.parametrize("odd", [0, 1])
-@pytest.mark.parametrize("kind", ["noise", "rising", "in periods of the sample", "few values", "doubles"])
-def test_that_of_many_values_is_numpys_too(kind, odd):
-    count = 40 * SAMPLE + odd
-    noise = np.random.default_rng(3).normal(size=count).astype(np.float32)
-    values = {
-        "noise": noise,
-        "rising": np.sort(noise),
-        # The sample, every 40th value, then lies far above the rest.
-        "in periods of the sample": np.where(np.arange(count) % 40 == 0, 9, noise).astype(np.float32),
-        "few values": np.rint(noise),
-        "doubles": noise.astype(np.float64) / 3,
-    }[kind]
-    found = median(values)
-    assert found == np.median(values)
-    assert found.dtype == values.dtype
+def test_that_of_many_values_is_numpys_too():
+    for count in (40 * SAMPLE, 40 * SAMPLE + 1):
+        noise = np.random.default_rng(3).normal(size=count).astype(np.float32)
+        # The sample, every 40th value, may lie far above the rest.
+        periods = np.where(np.arange(count) % 40 == 0, 9, noise).astype(np.float32)
+        for values in (noise, np.sort(noise), periods, np.rint(noise), noise.astype(np.float64) / 3):
+            found = median(values)
+            assert found == np.median(values)
+            assert found.dtype == values.dtype
 
 
 @given(arrays(float, st.integers(1, 70), elements=st.floats(0, 1e30)), st.floats(0.01, 0.99))

@@ -232,7 +232,20 @@ def covered(made, true, key):
     return np.array([mahalanobis2(e[key], true.normal) for e in made]) <= stats.chi2.ppf(0.95, 2)
 
 
-def check_covariances(bench, shape, count, low, high):
+QUICK_COUNT = 60
+BINOMIAL = stats.binom.ppf([ALPHA / 12, 1 - ALPHA / 12], QUICK_COUNT, 0.95) / QUICK_COUNT
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(
+    ("shape", "count", "bounds"),
+    [
+        pytest.param(tube(1.0), QUICK_COUNT, BINOMIAL, id="60"),
+        *(pytest.param(s, 5000, (0.93, 0.97), marks=pytest.mark.slow) for s in ({"type": "plane"}, tube(1.0))),
+    ],
+)
+def test_stated_regions_cover_the_truth(bench, shape, count, bounds):
+    low, high = bounds
     exact = lambda number, true: Priors(RIG, exactly(true.distance), falloff_power=None)  # noqa: E731
     told = {"cone_axis": cone_axis, "curved": curved, "photometric": photometric}
     made, true = bench.estimates(shape, told, count=count)
@@ -246,21 +259,6 @@ def check_covariances(bench, shape, count, low, high):
             # The RMS angle is that of two components.
             semi = [np.degrees(np.sqrt(np.linalg.eigvalsh(e[key].covariance))) for e in each]
             assert np.median(np.max(semi, axis=1)) <= 1.5 * rms / np.sqrt(2), key
-
-
-@pytest.mark.render
-@pytest.mark.parametrize("shape", [tube(1.0)], ids=name)
-def test_stated_regions_cover_the_truth(bench, shape):
-    count = 60
-    low, high = stats.binom.ppf([ALPHA / 12, 1 - ALPHA / 12], count, 0.95) / count
-    check_covariances(bench, shape, count, low, high)
-
-
-@pytest.mark.slow
-@pytest.mark.render
-@pytest.mark.parametrize("shape", [{"type": "plane"}, tube(1.0)], ids=name)
-def test_stated_regions_cover_the_truth_in_five_thousand_realisations(bench, shape):
-    check_covariances(bench, shape, 5000, 0.93, 0.97)
 
 
 # The choice of circle pose ------------------------------------------------------------------------------------------

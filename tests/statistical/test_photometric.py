@@ -9,11 +9,10 @@ import pytest
 from scipy.stats import chi2
 
 from simtest.calibration import LIGHT_AT_CAMERA, Calibration, Frame, NoiseModel
-from simtest.errors import Failure, Reason
-from simtest.estimators.cone_axis import cone_axis
+from simtest.errors import Failure
 from simtest.estimators.least_squares import fit_lobe
 from simtest.estimators.photometric import ColocatedQuadric, HighlightPixels, photometric
-from simtest.geometry import Camera, Patch, smooth
+from simtest.geometry import Camera
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
@@ -187,14 +186,3 @@ def test_censoring_recovers_a_clipped_lobe():
     censored, naive = fit_lobe(start, observed, clipped), fit_lobe(start, observed)
     assert angle_deg(censored.model.normal, model.normal) < 1e-3
     assert naive is None or angle_deg(naive.model.normal, model.normal) > 0.1
-
-
-def test_what_has_no_highlight_fails_for_its_reason():
-    camera = PaperSetting().camera
-    x, y = np.meshgrid(np.arange(60), np.arange(50))
-    ramp = Patch.cut(smooth(x + 0.1 * y, 1.0), (0, 0, 60, 50))
-    assert isinstance(ramp, Patch)
-    for estimator in (photometric, photometric_plane, cone_axis):
-        result = estimator.estimate(ramp, camera)
-        assert isinstance(result, Failure)
-        assert result.reason is Reason.NO_CLOSED_ISOPHOTE

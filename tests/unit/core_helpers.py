@@ -39,6 +39,13 @@ def bad_command(*arguments, limit_s=20.0, start_s=20.0):
     return CoreCommand("bad core", "bad_core", line, (BAD_CORE,), limit_s, start_s), mark
 
 
+def script_command(folder, text):
+    """Return the command of a core of this text."""
+    script = folder / "core.py"
+    script.write_text(text)
+    return CoreCommand("script core", "core", (sys.executable, "-S", str(script)), (script,))
+
+
 def processes_with(mark):
     """Return the processes whose command line holds a word; this one and its own parents aside."""
     found = []

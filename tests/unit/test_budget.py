@@ -6,17 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from simtest.calibration import LIGHT_AT_CAMERA
-from simtest.errors import Failure
-from simtest.estimators import load_estimators
-from simtest.estimators.budget import PARTS, STATED, deviations, dominant, equivalent_covariance, total
-from simtest.estimators.dispatch import run
+from simtest.estimators.budget import STATED, deviations, dominant, equivalent_covariance, total
 from simtest.estimators.protocol import Estimate
-from simtest.geometry import Camera, Patch, smooth
-from simtest.validation.paper.plane_from_aside import photometric_plane
 
 NORMAL = np.array([0.0, 0.0, -1.0])
-CAMERA = Camera.from_fov(60.0, 32, 32)
 SMALL, LARGE = np.diag([1e-6, 2e-6]), np.diag([4e-4, 1e-4])
 
 
@@ -40,36 +33,6 @@ def test_a_covariance_without_a_budget_is_one_part():
     assert list(stated.budget) == [STATED]
     np.testing.assert_array_equal(total(stated.budget), LARGE)
     assert estimate().budget is None
-
-
-class Stated:
-    def __init__(self, **given):
-        self.given = given
-
-    def estimate(self, patch, camera, priors):
-        return estimate(**self.given)
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"budget": {"noise": np.eye(3)}}, "budget noise: must be an array of shape (2, 2)"),
-        ({"budget": {"noise": np.full((2, 2), np.nan)}}, "holds NaN or infinity"),
-        ({"budget": {"noise": SMALL}, "covariance": LARGE}, "must be the sum of the budget's parts"),
-        ({"target": "bottom"}, "target 'bottom'; must be fine or base"),
-    ],
-)
-def test_malformed_budgets_are_failures(given, said):
-    values = np.ones((9, 9), np.float32)
-    values[4, 4] = 2
-    patch = Patch.cut(values, (0, 0, 9, 9), origin_px=(12, 12))
-    result = run(Stated(**given), patch, CAMERA)
-    assert isinstance(result, Failure)
-    assert said in result.detail
-
-
-def test_names_of_parts_are_the_contract():
-    assert PARTS == ("noise", "resolution", "shape", "light_offset", "camera", "distance", "response", "relief")
 
 
 @given(st.floats(0.01, 1), st.floats(-0.9, 0.9), st.integers(0, 2**31))
@@ -97,20 +60,3 @@ def test_no_moves_have_no_covariance():
     line = equivalent_covariance(np.array([[1.0, 0.0], [-1.0, 0.0], [0.5, 0.0]]))
     assert line[0, 0] > 0.1
     assert np.isfinite(line).all()
-
-
-@pytest.mark.parametrize("sigma_px", [12.0, 1.5])
-def test_where_the_noise_is_not_known_no_estimator_states_an_uncertainty(sigma_px):
-    camera = Camera.from_fov(60.0, 160, 120)
-    y, x = np.mgrid[:120, :160] + 0.5
-    lobe = np.exp(-((x - 80) ** 2 + (y - 60) ** 2) / (2 * sigma_px**2))
-    lobe += 0.01 * np.random.default_rng(3).standard_normal(lobe.shape)
-    names = ("cone_axis", "curved", "brightest_point", "photometric", "bisector", "circle_pose")
-    estimators = {**load_estimators(names), "photometric_plane": photometric_plane}
-    for noise, told in ((0.01, True), (None, False)):
-        patch = Patch.cut(smooth(lobe, 2.0), (0, 0, 160, 120), raw=lobe, noise=noise, smoothing_px=2.0, others_px=())
-        made = {name: run(each, patch, camera, LIGHT_AT_CAMERA) for name, each in estimators.items()}
-        stated = {name for name, each in made.items() if isinstance(each, Estimate) and each.covariance is not None}
-        answered = {name for name, each in made.items() if isinstance(each, Estimate)} - {"circle_pose"}
-        assert len(answered) >= 5
-        assert stated == (answered if told else set())

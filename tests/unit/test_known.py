@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from simtest.calibration import LIGHT_AT_CAMERA, Calibration, LogUniform, Normal, Priors, Uniform, exactly
+from simtest.calibration import LIGHT_AT_CAMERA, Calibration, CameraPrior, LogUniform, Normal, Priors, Uniform, exactly
 from simtest.errors import Failure, InputError, Reason
 from simtest.estimators import Estimate
 from simtest.estimators.bisector import bisector
@@ -23,6 +23,7 @@ from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
 from simtest.spec import load_calibration, scene_from_dict
 from simtest.validation import laws
+from tests.marked import marked
 
 CAMERA = Camera(200, 160, 200.0, 200.0, 100.0, 80.0)
 ISOVALUES = (0.3, 0.4, 0.5, 0.6, 0.7)
@@ -38,35 +39,31 @@ def lobe(sigma=0.0, widths=(14.0, 9.0), seed=0, smoothing=2.0):
     return patch
 
 
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        ({"lights_mm": ((0.0, 1.0),)}, "lights_mm"),
-        ({"lights_mm": ((0.0, 1.0, float("nan")),)}, "lights_mm"),
-        ({"distance_mm": exactly(-1.0)}, "distance_mm = -1.0"),
-        ({"distance_mm": Uniform(-1.0, 5.0)}, "distance_mm = -1.0"),
-        ({"distance_mm": 5.0}, r"must be a Uniform, Normal or LogUniform, or exactly\(5.0\)"),
-        ({"lobe_curvature": exactly(0.0)}, "lobe_curvature = 0.0"),
-    ],
-)
-def test_what_is_known_is_checked(values, said):
-    with pytest.raises(InputError, match=said):
-        Priors(**values)
+MALFORMED = [
+    (Priors, {"lights_mm": ((0.0, 1.0),)}, "lights_mm"),
+    (Priors, {"lights_mm": ((0.0, 1.0, float("nan")),)}, "lights_mm"),
+    (Priors, {"distance_mm": exactly(-1.0)}, "distance_mm = -1.0"),
+    (Priors, {"distance_mm": Uniform(-1.0, 5.0)}, "distance_mm = -1.0"),
+    (Priors, {"distance_mm": 5.0}, r"must be a Uniform, Normal or LogUniform, or exactly\(5.0\)"),
+    (Priors, {"lobe_curvature": exactly(0.0)}, "lobe_curvature = 0.0"),
+    (Priors, {"light_offset_mm": Uniform(-1.0, 2.0)}, "light_offset_mm = -1.0"),
+    (Priors, {"light_offset_mm": None}, "must be a Uniform"),
+    (Priors, {"falloff_power": Normal(-1.0, 1.0)}, "falloff_power = -1.0"),
+    (Priors, {"relief_slope": 3.0}, "relief_slope = 3.0"),
+    (Priors, {"camera": 0.1}, "priors camera is a float"),
+    (CameraPrior, {"focal_sd": -1}, "focal_sd = -1"),
+    (Normal, {"mean": 5.0, "sd": -1.0}, "Normal sd = -1.0"),
+    (Normal, {"mean": float("nan"), "sd": 1.0}, "Normal mean = nan"),
+    (Uniform, {"low": 2.0, "high": 2.0}, "low must be less than high"),
+    (Uniform, {"low": 0.0, "high": float("inf")}, "Uniform high = inf"),
+    (LogUniform, {"low": 0.0, "high": 2.0}, "LogUniform low = 0.0"),
+]
 
 
-@pytest.mark.parametrize(
-    ("made", "said"),
-    [
-        (lambda: Normal(5.0, -1.0), "Normal sd = -1.0"),
-        (lambda: Normal(float("nan"), 1.0), "Normal mean = nan"),
-        (lambda: Uniform(2.0, 2.0), "low must be less than high"),
-        (lambda: Uniform(0.0, float("inf")), "Uniform high = inf"),
-        (lambda: LogUniform(0.0, 2.0), "LogUniform low = 0.0"),
-    ],
-)
-def test_a_malformed_distribution_is_refused(made, said):
-    with pytest.raises(InputError, match=said):
-        made()
+def test_what_is_known_is_checked():
+    for kind, values, said in MALFORMED:
+        with pytest.raises(InputError, match=said):
+            kind(**values)
 
 
 @pytest.mark.parametrize("prior", [Uniform(2.0, 5.0), LogUniform(2.0, 50.0), Normal(3.0, 0.5), exactly(3.0)])
@@ -361,15 +358,27 @@ def test_branch_point_and_look():
     assert laws.look_error([0.0, 0.01], 1.0, 3.0) == pytest.approx(0.04)
 
 
-# What the bisector makes of a distance that nobody told ------------------------------------------------------------
+# What the bisector makes of a distance that is not known exactly -----------------------------------------------------
+
+
+PAIR = ((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
+
+
+def bisected(sigma, lights, distance=None):
+    told = exactly(distance) if isinstance(distance, float) else distance
+    return bisector.estimate(lobe(sigma), CAMERA, Priors(lights, told, falloff_power=None))
+
+
+def share_held(stated, sigma, lights, distances):
+    """Return the share of distances and lights whose normals lie in a stated region."""
+    made = [bisected(sigma, (light,), d) for d in distances.tolist() for light in lights]
+    moves = np.array([tangent_coordinates(stated.normal, each.normal) for each in made])
+    return np.mean(np.einsum("ni,ni->n", moves, np.linalg.solve(stated.covariance, moves.T).T) <= 5.991)
 
 
 def test_an_untold_distance_is_the_working_range():
     light = (3.0, -1.0, 0.0)
-    told = [
-        bisector.estimate(lobe(0.01), CAMERA, Priors((light,), exactly(d), falloff_power=None)) for d in (5.0, 80.0)
-    ]
-    vague = bisector.estimate(lobe(0.01), CAMERA, Priors((light,), falloff_power=None))
+    told, vague = [bisected(0.01, (light,), d) for d in (5.0, 80.0)], bisected(0.01, (light,))
     # Between the two ends, whose normals lie within twice its region.
     ends = [tangent_coordinates(vague.normal, each.normal) for each in told]
     assert ends[0] @ ends[1] < 0
@@ -378,54 +387,31 @@ def test_an_untold_distance_is_the_working_range():
     assert set(told[0].budget) - {"shape"} == {"noise", "resolution", "distance"}
     assert np.trace(told[0].budget["distance"]) == 0
     # The share of the working range whose normals lie in the region.
-    distances = np.linspace(5.0, 80.0, 151)
-    normals = [bisector.estimate(lobe(0.01), CAMERA, Priors((light,), exactly(d))).normal for d in distances[::5]]
-    moves = np.array([tangent_coordinates(vague.normal, normal) for normal in normals])
-    covariance = vague.covariance
-    inside = np.einsum("ni,ni->n", moves, np.linalg.solve(covariance, moves.T).T) <= 5.99
-    assert 0.9 <= inside.mean() < 1
+    assert 0.9 <= share_held(vague, 0.01, [light], np.linspace(5.0, 80.0, 31)) < 1
 
 
 @pytest.mark.parametrize("sd", [2.0, 8.0, 12.0])
 def test_regions_hold_over_a_normal_prior_on_the_distance(sd):
     # The light's angle goes with 1/d, which is no line over a wide prior: linear propagation would cover 18 of 20.
-    light, prior = (4.0, 0.0, 0.0), Normal(40.0, sd)
-    stated = bisector.estimate(lobe(0.001), CAMERA, Priors((light,), prior, falloff_power=None))
-    held = []
-    for distance in prior.quantile((np.arange(20) + 0.5) / 20):
-        true = bisector.estimate(lobe(0.001), CAMERA, Priors((light,), exactly(float(distance)), falloff_power=None))
-        moved = tangent_coordinates(stated.normal, true.normal)
-        held.append(moved @ np.linalg.solve(stated.covariance, moved) <= 5.991)
-    assert sum(held) >= 19
+    prior = Normal(40.0, sd)
+    stated = bisected(0.001, PAIR[:1], prior)
+    assert share_held(stated, 0.001, PAIR[:1], prior.quantile((np.arange(20) + 0.5) / 20)) >= 0.95
 
 
 def test_lights_that_are_not_told_apart_are_in_the_budget():
-    lights = ((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
-    found = bisector.estimate(lobe(0.01), CAMERA, Priors(lights, exactly(20.0), falloff_power=None))
+    found = bisected(0.01, PAIR, 20.0)
     assert "ambiguous_light" in found.flags
     half = np.arctan(4.0 / 20.0) / 2
     assert np.trace(found.budget["light_offset"]) == pytest.approx(half**2, rel=0.05)
 
 
 @pytest.mark.parametrize(
-    "prior",
-    [
-        None,
-        pytest.param(Uniform(8.0, 60.0), marks=pytest.mark.ci),
-        pytest.param(Normal(30.0, 9.0), marks=pytest.mark.ci),
-    ],
+    "prior", marked([None, Uniform(8.0, 60.0), Normal(30.0, 9.0)], ci=[Uniform(8.0, 60.0), Normal(30.0, 9.0)])
 )
 def test_regions_hold_over_the_distance_where_lights_are_not_told_apart(prior):
     # Lights on both sides: their mean lies at the camera, so that the distance moves nothing of what it gives.
-    lights = ((4.0, 0.0, 0.0), (-4.0, 0.0, 0.0))
-    priors = Priors(lights, prior, falloff_power=None)
-    stated = bisector.estimate(lobe(0.001), CAMERA, priors)
+    stated = bisected(0.001, PAIR, prior)
     assert "ambiguous_light" in stated.flags
-    held = []
-    for distance in priors.distance.quantile((np.arange(40) + 0.5) / 40):
-        for light in lights:
-            told = Priors((light,), exactly(float(distance)), falloff_power=None)
-            moved = tangent_coordinates(stated.normal, bisector.estimate(lobe(0.001), CAMERA, told).normal)
-            held.append(moved @ np.linalg.solve(stated.covariance, moved) <= 5.991)
+    distances = Priors(PAIR, prior).distance.quantile((np.arange(40) + 0.5) / 40)
     # The spread of the lights at the median distance alone would hold 85 and 90 % over the first two priors.
-    assert 0.92 <= np.mean(held) < 1
+    assert 0.92 <= share_held(stated, 0.001, PAIR, distances) < 1

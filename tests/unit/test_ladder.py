@@ -139,23 +139,14 @@ def test_a_rung_without_an_answer_is_counted(monkeypatch):
     assert rungs["cone_axis", "exact pose"].mean_deg < 1e-9
 
 
-def no_peak(*_, **__):
-    return Failure(Reason.NO_PEAK, "none")
-
-
-def test_a_frame_without_a_peak_is_a_rung_without_an_answer(monkeypatch):
-    monkeypatch.setattr(Patch, "cut", no_peak)
+@pytest.mark.parametrize(
+    ("holder", "name", "silent"), [(Patch, "cut", NAMES[:4]), (ladder, "pose_of_cone", ["exact cone"])]
+)
+def test_a_rung_whose_stage_fails_is_without_an_answer(monkeypatch, holder, name, silent):
+    monkeypatch.setattr(holder, name, lambda *_, **__: Failure(Reason.NO_PEAK, "none"))
     found = means(PLANE, realisations=1)
-    for name in ladder.ESTIMATORS:
-        assert [rung for rung in NAMES if found[name, rung] is None] == NAMES[:4]
-
-
-def test_a_cone_without_a_pose_is_a_rung_without_an_answer(monkeypatch):
-    monkeypatch.setattr(ladder, "pose_of_cone", no_peak)
-    found = means(PLANE, realisations=1)
-    assert {rung for rung, value in found.items() if value is None} == {
-        (name, "exact cone") for name in ladder.ESTIMATORS
-    }
+    for estimator in ladder.ESTIMATORS:
+        assert [rung for rung in NAMES if found[estimator, rung] is None] == silent
 
 
 def test_the_first_rung_has_the_noise_that_it_says(monkeypatch):

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import polars as pl
@@ -82,6 +83,20 @@ def published(tmp_path):
     return path
 
 
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """Run one of ours, the same as a core, and a foreign core; return the run, that core and what is left of it."""
+    folder = tmp_path_factory.mktemp("told")
+    (folder / "published.toml").write_text(PUBLISHED)
+    mark = f"--mark={folder}"
+    core = command(BAD_CORE, "none", mark)
+    run = simtest.validate(
+        folder / "published.toml", folder / "run", estimators=["cone_axis", own_core(folder, "cone_axis"), core]
+    )
+    left = [*processes_with(mark), *(c for c in psutil.Process().children() if "simtest-core" in " ".join(c.cmdline()))]
+    return run, core, left
+
+
 @pytest.fixture(autouse=True)
 def no_core_stays():
     yield
@@ -101,9 +116,13 @@ def same_but_for_the_name(results, first, second):
     assert all(name in OF_LAWS and other[name].null_count() == len(other) for name in differing), differing
 
 
-@pytest.mark.parametrize("transport", ["", pytest.param("--files", marks=pytest.mark.ci)])
-def test_an_estimator_of_ours_gives_the_same_rows_as_a_core(tmp_path, published, transport):
-    core = own_core(tmp_path, "cone_axis", transport)
+def test_an_estimator_of_ours_gives_the_same_rows_as_a_core(told):
+    same_but_for_the_name(told[0].results, "cone_axis", "own_core")
+
+
+@pytest.mark.ci
+def test_an_estimator_of_ours_gives_the_same_rows_as_a_core_over_files(tmp_path, published):
+    core = own_core(tmp_path, "cone_axis", "--files")
     run = simtest.validate(published, tmp_path / "run", estimators=["cone_axis", core])
     same_but_for_the_name(run.results, "cone_axis", "own_core")
 
@@ -202,49 +221,41 @@ print(estimator.core._child.folder, flush=True)
 """
 
 
-def parent(then, core):
-    return subprocess.Popen([sys.executable, "-c", PARENT.format(then=then), core], stdout=subprocess.PIPE, text=True)
+@contextmanager
+def parent(then, fault, mark):
+    """Give a process that holds a core, and the core's folder; at the end neither core nor folder may be left."""
+    line = [sys.executable, "-c", PARENT.format(then=then), command(BAD_CORE, fault, mark)]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as started:
+        folder = started.stdout.readline().strip()
+        yield started, folder
+    assert wait_until(lambda: not processes_with(mark))
+    assert wait_until(lambda: not os.path.exists(folder))
+    assert wait_until(lambda: not processes_with(folder))
 
 
 @pytest.mark.parametrize("fault", ["stays", "ignores_term"])
 def test_a_core_dies_with_a_parent_that_is_killed(tmp_path, fault):
     mark = f"--mark={tmp_path}-{fault}"
-    started = parent("time.sleep(60)", command(BAD_CORE, fault, mark))
-    folder = started.stdout.readline().strip()
-    assert len(processes_with(mark)) == 2  # the parent's own command line holds it too
-    assert os.path.isdir(folder)
-    started.send_signal(signal.SIGKILL)
-    started.wait()
-    started.stdout.close()
-    assert wait_until(lambda: not processes_with(mark))
-    assert wait_until(lambda: not os.path.exists(folder))
+    with parent("time.sleep(60)", fault, mark) as (started, folder):
+        assert len(processes_with(mark)) == 2  # the parent's own command line holds it too
+        assert os.path.isdir(folder)
+        started.kill()
 
 
 def test_a_guard_is_no_child_so_that_who_kills_all_children_leaves_it(tmp_path):
-    mark = f"--mark={tmp_path}"
-    started = parent("time.sleep(60)", command(BAD_CORE, "stays", mark))
-    folder = started.stdout.readline().strip()
-    process = psutil.Process(started.pid)
-    (core,) = process.children(recursive=True)
-    for each in (core, process):
-        each.kill()
-    started.wait()
-    started.stdout.close()
-    assert wait_until(lambda: not os.path.exists(folder))
-    assert wait_until(lambda: not processes_with(folder))
+    with parent("time.sleep(60)", "stays", f"--mark={tmp_path}") as (started, _):
+        process = psutil.Process(started.pid)
+        (core,) = process.children(recursive=True)
+        for each in (core, process):
+            each.kill()
 
 
 @pytest.mark.parametrize(
     "then", marked(["", "raise SystemExit(1)", "import os; os._exit(0)"], ci=["", "import os; os._exit(0)"])
 )
 def test_a_core_ends_with_its_parent(tmp_path, then):
-    mark = f"--mark={tmp_path}"
-    started = parent(then, command(BAD_CORE, "none", mark))
-    folder = started.stdout.readline().strip()
-    started.wait()
-    started.stdout.close()
-    assert wait_until(lambda: not processes_with(mark))
-    assert wait_until(lambda: not os.path.exists(folder))
+    with parent(then, "none", f"--mark={tmp_path}"):
+        pass
 
 
 @pytest.mark.parametrize(
@@ -253,20 +264,11 @@ def test_a_core_ends_with_its_parent(tmp_path, then):
 @pytest.mark.slow
 def test_a_run_that_is_stopped_leaves_no_process(tmp_path, number, workers):
     mark = f"--mark={tmp_path}"
-    line = [
-        sys.executable,
-        "-m",
-        "simtest",
-        "validate",
-        "paper",
-        "--out",
-        str(tmp_path / "run"),
-        "--workers",
-        str(workers),
-    ]
+    line = f"-m simtest validate paper --out {tmp_path / 'run'} --workers {workers} --estimator".split()
     core = command(BAD_CORE, "hang", "--spared3", mark)
-    started = subprocess.Popen([*line, "--estimator", core], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-                               start_new_session=True)  # fmt: skip
+    started = subprocess.Popen(
+        [sys.executable, *line, core], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
     held = lambda: [p for p in processes_with(mark) if p.pid != started.pid]  # noqa: E731
     assert wait_until(held, 60)
     time.sleep(1)
@@ -275,29 +277,30 @@ def test_a_run_that_is_stopped_leaves_no_process(tmp_path, number, workers):
     assert wait_until(lambda: not processes_with(mark))
 
 
+def test_a_run_closes_its_cores(told):
+    assert told[2] == []
+
+
+@pytest.mark.ci
 @pytest.mark.filterwarnings("ignore:bad_core:RuntimeWarning")
-@pytest.mark.parametrize("kind", ["published", pytest.param("experiment", marks=pytest.mark.ci)])
-def test_a_run_closes_its_cores(tmp_path, kind, request):
+def test_a_run_of_rendered_frames_closes_its_cores(tmp_path, experiment):
     mark = f"--mark={tmp_path}"
-    core = command(BAD_CORE, "none", mark)
-    simtest.validate(request.getfixturevalue(kind), tmp_path / "run", realisations=1, estimators=[core])
+    simtest.validate(experiment, tmp_path / "run", realisations=1, estimators=[command(BAD_CORE, "none", mark)])
     assert processes_with(mark) == []
-    assert [child for child in psutil.Process().children() if "simtest-core" in " ".join(child.cmdline())] == []
 
 
 # What is told of it ---------------------------------------------------------------------------------------------------
 
 
-def test_a_run_tells_of_its_cores(tmp_path, published):
-    core = command(BAD_CORE, "none")
-    run = simtest.validate(published, tmp_path / "run", realisations=1, estimators=["cone_axis", core])
-    assert set(run.results["estimator"]) == {"cone_axis", "bad_core"}
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+def test_a_run_tells_of_its_cores(told):
+    run, core, _ = told
+    assert set(run.results["estimator"]) == {"cone_axis", "own_core", "bad_core"}
+    summary = json.loads((run.folder / "summary.json").read_text())
     record = summary["run"]["cores"]["bad_core"]
     assert (record["command"], record["name"], record["version"]) == (core, "bad core", "0.1")
     assert len(record["files"][str(BAD_CORE)]) == 64
     assert "bad core 0.1" in summary["experiments"]["published-few"]["estimators"]["bad_core"]
-    assert "bad_core" in (tmp_path / "run" / "index.html").read_text()
+    assert "bad_core" in run.page.read_text()
 
 
 def test_an_experiment_and_a_nightly_profile_name_a_core(tmp_path, published):
@@ -329,15 +332,6 @@ def test_a_changed_program_is_another_run(tmp_path, published):
         simtest.validate(published, tmp_path / "run", **arguments)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["run"]["cores"]["core"]["version"] == "0.2"
-
-
-@pytest.mark.filterwarnings("ignore:bad_core:RuntimeWarning")
-def test_the_rows_of_a_core_that_breaks_down_depend_on_no_part_before(tmp_path, published):
-    # Every request breaks down: at the sixth in a row the core is not asked any more, in each part anew.
-    arguments = {"realisations": 3, "estimators": [command(BAD_CORE, "exit")]}
-    whole = simtest.validate(published, tmp_path / "run", **arguments).results
-    assert len(whole) == 6
-    assert not whole["flags"].str.contains("not asked").any()
 
 
 @pytest.mark.parametrize("extra", [pytest.param("", marks=pytest.mark.ci), "'$HOME' '\"!'"])
@@ -387,20 +381,22 @@ def test_a_worker_of_a_dataset_finds_its_core_in_any_folder(tmp_path, monkeypatc
 @pytest.mark.filterwarnings("ignore:.*is kept, since:UserWarning")
 def test_the_failures_of_a_core_are_counted(tmp_path, published):
     def validate():
-        return simtest.validate(published, tmp_path / "run", realisations=1, estimators=[command(BAD_CORE, "exit")])
+        return simtest.validate(published, tmp_path / "run", realisations=3, estimators=[command(BAD_CORE, "exit")])
 
-    with pytest.warns(RuntimeWarning, match="bad_core: core_died: .*no licence for this highlight.*, 2 times") as told:
+    with pytest.warns(RuntimeWarning, match="bad_core: core_died: .*no licence for this highlight.*, 6 times") as told:
         run = validate()
     assert len(told) == 1
     assert set(run.results["status"]) == {"core_died"}
-    assert "no licence for this highlight" in run.results["flags"][0]
+    # At the sixth fault in a row the core is not asked any more, in each part anew.
+    assert run.results["flags"].str.contains("no licence for this highlight").all()
+    assert not run.results["flags"].str.contains("not asked").any()
     # Its text stands in summary.json and on the page, and the guide calls it failed.
     (fault,) = run.summary["experiments"]["published-few"]["faults"]
-    assert (fault["estimator"], fault["reason"], fault["count"]) == ("bad_core", "core_died", 2)
+    assert (fault["estimator"], fault["reason"], fault["count"]) == ("bad_core", "core_died", 6)
     assert "no licence for this highlight" in run.page.read_text()
     guide = json.loads((run.folder / "guide.json").read_text())
     figures = [row["methods"]["bad_core"] for row in guide["rows"]]
-    assert (sum(each["failed"] for each in figures), sum(each["refused"] for each in figures)) == (2, 0)
+    assert (sum(each["failed"] for each in figures), sum(each["refused"] for each in figures)) == (6, 0)
     # A finished run that is asked for again tells it again.
     with pytest.warns(RuntimeWarning, match="no licence for this highlight"):
         validate()

@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
-import test_spot_inputs
+import test_network_geometry
 import torch
-from test_spot_inputs import LIGHTS, PEAK, WIDTH, frame
+from test_network_geometry import LIGHTS, PEAK, WIDTH, frame
 
 from simtest.estimators.learned import rotation_of
 from simtest.estimators.learned_spot import spot_inputs
 from studies.networks.spots import moved as moved_batch
 
-picture = test_spot_inputs.picture
+picture = test_network_geometry.picture
 
 
 @pytest.mark.parametrize(

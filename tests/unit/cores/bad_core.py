@@ -1,4 +1,7 @@
-"""A core that breaks down as its first argument says; it needs Python alone. Others make it a frame core or slow."""
+"""A core that breaks down as its first argument says, one fault an answer; it needs Python alone.
+
+Further arguments make it a frame core, or spare the first answers.
+"""
 
 import json
 import os
@@ -8,7 +11,8 @@ import subprocess
 import sys
 import time
 
-FAULT = sys.argv[1] if len(sys.argv) > 1 else "none"
+FAULTS = sys.argv[1].split(",") if len(sys.argv) > 1 else ["none"]
+FAULT = FAULTS[0]
 KIND = "frame" if "--frame" in sys.argv else "patch"
 SPARED = next((int(word[8:]) for word in sys.argv if word.startswith("--spared")), 0)
 SIZES = {"<f8": 8, "<f4": 4, "<u2": 2, "|u1": 1, "<i4": 4, "|b1": 1}
@@ -66,7 +70,7 @@ def good(number):
     return {"type": "estimate", "id": number, **estimate}
 
 
-def changed(number):
+def changed(number, fault):
     """Return a good answer with the fault's fields."""
     fields = {
         "nan": {"normal": [float("nan")] * 3}, "zero": {"normal": [0, 0, 0]}, "long": {"normal": [0, 0, -2]},
@@ -75,7 +79,7 @@ def changed(number):
         "target": {"target": "liver"}, "flags": {"flags": ["a b"]}, "candidates": {"candidates": [[0, 0.6, -0.8]]},
         "infinite_covariance": {"covariance": [[1e999, 0], [0, 1]]},
         "basis": {"covariance": [[1, 0], [0, 1]], "basis": [[1, 0, 0], [1, 0, 0]]},
-    }[FAULT]  # fmt: skip
+    }[fault]  # fmt: skip
     answer = good(number)
     if KIND == "frame":
         answer["estimates"][0].update(fields)
@@ -152,12 +156,12 @@ ACTIONS = {
 }
 
 
-def break_down(number):
+def break_down(number, fault):
     """Do what the fault says instead of answering."""
     if FAULT in ACTIONS:
         ACTIONS[FAULT](number)
     elif not wire(number) and not frame_counts(number):
-        send(changed(number))
+        send(changed(number, fault))
 
 
 def begin():
@@ -190,7 +194,7 @@ def main():
         if FAULT in ("none", "stays") or answered < SPARED:
             send(good(asked[0]["id"]))
         else:
-            break_down(asked[0]["id"])
+            break_down(asked[0]["id"], FAULTS[answered % len(FAULTS)])
         answered += 1
     if FAULT == "stays":
         hang()
