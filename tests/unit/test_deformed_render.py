@@ -140,36 +140,4 @@ def test_analytic_surfaces_deform(surface, part):
     assert seen.mean() > 0.3
     assert np.quantile(np.linalg.norm(moved.labels.normal - truth.normal, axis=-1)[seen], 0.98) < 1e-3
     assert np.quantile(np.abs(moved.labels.depth - truth.depth)[seen], 0.98) < 1e-2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("anatomy", ["colon", "liver"])
-def test_anatomies_deform(anatomy):
-    """The exact points on a deformed anatomy have the normals of differences of neighbouring exact points."""
-    surface = {"type": "anatomy", "path": anatomy, "viewpoint": 1}
-    camera = {"width": 80, "height": 60, "fx": 70.0, "fy": 70.0, "cx": 40.0, "cy": 30.0}
-    still = Session(scene_from_dict({"surface": surface, "camera": camera}))
-    pose = still.surface.model_from_camera
-    near = {"centre_mm": (pose[:3, 3] + 20 * pose[:3, 2]).tolist()}
-    wave = {"type": "peristalsis", "amplitude_mm": 3.0, "period_s": 3.0, "axis": pose[:3, 2].tolist(),
-            "radius_mm": 15.0, "wavelength_mm": 40.0, **near}  # fmt: skip
-    table = {"surface": surface, "camera": camera, "time_s": 0.7, "deformation": [wave, {**WARP, **near}]}
-    session = Session(scene_from_dict(table))
-    pixels, step = np.random.default_rng(0).uniform([5, 5], [75, 55], (300, 2)), 2e-3
-    points = session.exact_points(pixels)
-    seen = points.valid
-    assert seen.mean() > 0.5
-
-    def along(direction):
-        near, far = (
-            session.exact_points(pixels + n * step * np.array(direction)).position
-            - session.exact_points(pixels - n * step * np.array(direction)).position
-            for n in (1, 2)
-        )
-        return 8 * near - far
-
-    normal = np.cross(along((1, 0)), along((0, 1)))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    gap = np.linalg.norm(np.cross(normal, points.normal), axis=1)
-    # Where a neighbour lies behind a fold there is no difference.
-    assert np.nanpercentile(gap[seen], 95) < 1e-8
+    assert np.quantile(np.abs(moved.labels.k_min - truth.k_min)[seen], 0.98) < 5e-3
