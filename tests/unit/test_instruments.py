@@ -321,21 +321,6 @@ def test_absent_instruments_change_no_byte(session):
     assert not session.truth().instrument.any()
 
 
-def test_moved_instrument_builds_nothing_and_is_the_same_as_a_fresh_one():
-    moved = {**SHAFT, "tip": [0.3, 0.6]}
-    kept = Session(described(SHAFT), labelled=True)
-    kept.frame()
-    kept.update(described(moved, {"kind": "grasper", "depth_mm": 30.0}))
-    kept.frame()
-    kept.update(described(moved))
-    fresh = Session(described(moved), labelled=True)
-    first, second = kept.frame(), fresh.frame()
-    assert kept.rebuilds == 1
-    assert first.radiance.total.tobytes() == second.radiance.total.tobytes()
-    assert first.labels.depth.tobytes() == second.labels.depth.tobytes()
-    assert first.labels.instrument.tobytes() == second.labels.instrument.tobytes()
-
-
 BAD = {
     "over_camera": ({**SHAFT, "depth_mm": 1.0}, "instruments.0: lies .* mm over the camera"),
     "over_light": (

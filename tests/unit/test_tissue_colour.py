@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from simtest.rendering import Session, trace
+from simtest.rendering import Session
 from simtest.spec import scene_from_dict
 from simtest.spec.reflectance import TISSUE_PRESETS, TissueColour
 from simtest.surfaces import make_surface, vessels
@@ -402,17 +402,6 @@ def test_no_pattern_has_a_kernel_of_its_own():
     assert np.abs(frames[0] - frames[1]).max() > 0.01 * frames[0].max()
     fresh = Session(scene(tissue=patterns[-1], samples_per_pixel=4), "llvm_ad_rgb").radiance().diffuse
     np.testing.assert_array_equal(fresh, frames[-1])
-
-
-@pytest.mark.render
-def test_the_launches_size_changes_nothing_of_coloured_tissue(monkeypatch):
-    session = Session(scene("colon", samples_per_pixel=8), "llvm_ad_rgb")
-    whole = session.radiance()
-    # Runs of five samples.
-    monkeypatch.setattr(trace, "RAYS", 5 * session.camera.width * session.camera.height)
-    cut = session.radiance()
-    for a, b in ((whole.specular, cut.specular), (whole.diffuse, cut.diffuse)):
-        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.render
