@@ -131,13 +131,6 @@ def test_another_unit_than_mm_is_guessed(tmp_path, scale, unit):
             prepare(path, 0)
 
 
-def test_huge_meshes_are_refused_by_their_size_alone(tmp_path, monkeypatch):
-    path = save(tmp_path / "ball.obj", *ball())
-    monkeypatch.setenv("SIMTEST_LIMITS", "mesh_bytes=1000")
-    with pytest.raises(InputError, match="bytes; at most 1000 are allowed: decimate"):
-        read_mesh(path)
-
-
 def test_large_meshes_are_not_searched_and_it_is_said(tmp_path, monkeypatch):
     path = save(tmp_path / "ball.ply", *ball())
     monkeypatch.setattr("simtest.surfaces.mesh_file.MAX_CROSSING_FACES", 100)
