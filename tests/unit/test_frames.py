@@ -1,14 +1,12 @@
-"""Labelled frames, frames of several samples and through lenses: against the exact truth and closed forms."""
+"""Labelled frames and frames of several samples: against the exact truth and closed forms."""
 
 import numpy as np
 import pytest
 from surface_helpers import angle
 
-from simtest.geometry.camera import Camera
 from simtest.rendering import Session
-from simtest.rendering.rays import TILE, is_pinhole, untile
+from simtest.rendering.rays import TILE, untile
 from simtest.spec import scene_from_dict
-from simtest.spec.camera import CameraSpec
 from tests.marked import marked
 
 pytestmark = pytest.mark.render
@@ -164,100 +162,3 @@ def test_untile_puts_tiles_in_rows():
     tile, cell = np.divmod(index, TILE * TILE)
     row, column = tile // 3 * TILE + cell // TILE, tile % 3 * TILE + cell % TILE
     np.testing.assert_array_equal(untile((row * width + column)[None], (height, width))[0].ravel(), index)
-
-
-# Other cameras -------------------------------------------------------------------------------------------------------
-
-
-class Lens(Camera):
-    """A lens that turns its outer sightlines inwards, and has none beyond a radius."""
-
-    strength, reach = 0.0, np.inf
-
-    def unproject(self, points_px):
-        rays = super().unproject(points_px)
-        rays = rays / rays[..., 2:]
-        squared = (rays[..., :2] ** 2).sum(axis=-1, keepdims=True)
-        rays[..., :2] *= 1 - self.strength * squared
-        rays[np.sqrt(squared[..., 0]) > self.reach] = np.nan
-        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-
-
-def test_only_a_pinhole_has_its_rays_made_in_the_kernel():
-    plain = Camera(90, 70, 80.0, 76.0, 44.0, 37.0, 1.5)
-    assert is_pinhole(plain)
-    lens = Lens(90, 70, 80.0, 76.0, 44.0, 37.0, 1.5)
-    assert is_pinhole(lens)
-    for name, value in (("strength", 1e-4), ("reach", 0.5)):
-        other = type("Other", (Lens,), {name: value})
-        assert not is_pinhole(other(90, 70, 80.0, 76.0, 44.0, 37.0, 1.5))
-
-
-def lens_session(monkeypatch, described, **settings):
-    """A session whose camera is a lens."""
-    model = CameraSpec.model
-    lens = type("Other", (Lens,), settings)
-
-    def made(self):
-        camera = model(self)
-        return lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.skew)
-
-    monkeypatch.setattr(CameraSpec, "model", made)
-    return Session(described)
-
-
-@pytest.mark.parametrize("samples", [1, 3])
-def test_rays_that_are_given_trace_as_those_made_in_the_kernel(session, monkeypatch, samples):
-    described = scene(LABELLED["sphere"][0], (ASIDE,), {"diffuse": 0.3}, samples_per_pixel=samples, seed=2)
-    session.update(described)
-    expected = session.frame()
-    lens = lens_session(monkeypatch, described, strength=0.0)
-    lens.sightlines.in_kernel = False
-    frame = lens.frame()
-    scale = expected.radiance.total.max()
-    inside = (angle(expected.labels.normal.astype(float), -expected.labels.position.astype(float)) < 1.2) & (
-        expected.labels.mask
-    )
-    for a, b in zip(parts(frame.radiance), parts(expected.radiance), strict=True):
-        assert np.percentile(np.abs(a - b)[inside], 99) < 1e-5 * scale
-    np.testing.assert_allclose(frame.labels.depth[inside], expected.labels.depth[inside], rtol=1e-4)
-
-
-@pytest.mark.parametrize("samples", [1, 4])
-def test_a_lens_bends_the_picture_and_what_it_does_not_see_is_dark(monkeypatch, samples):
-    """Positions of the plane follow the lens; no NaN reaches the renderer."""
-    described = scene(reflectance={"diffuse": 0.3}, samples_per_pixel=samples)
-    lens = lens_session(monkeypatch, described, strength=0.2, reach=0.4)
-    assert not lens.sightlines.in_kernel
-    frame, truth = lens.frame(), lens.truth()
-    sightlines = lens.camera.unproject(lens.camera.pixel_centres())
-    seen = np.isfinite(sightlines).all(axis=-1)
-    assert 0 < seen.sum() < seen.size
-    np.testing.assert_array_equal(frame.labels.mask, seen)
-    np.testing.assert_array_equal(truth.mask, seen)
-    expected = sightlines[seen] / sightlines[seen][:, 2:] * 10.0
-    np.testing.assert_allclose(frame.labels.position[seen], expected, rtol=1e-5, atol=1e-5)
-    for part in parts(frame.radiance):
-        assert np.isfinite(part).all()
-    inner = np.hypot(*(lens.camera.pixel_centres() - [44.0, 37.0]).transpose(2, 0, 1)) > 0.5 * 80
-    assert (frame.radiance.total[inner] == 0).all()
-    assert (frame.radiance.total[37, 40:48] > 0).all()
-
-
-@pytest.mark.parametrize("lens", [None, {"type": "brown_conrady", "k1": -0.1}])
-@pytest.mark.parametrize("samples", [1, 4])
-def test_a_round_field_of_view_darkens_the_pixels_outside(session, samples, lens):
-    """Whole pixels, by their centres, whatever the samples."""
-    camera = {"distortion": lens, "view_mask": {"cx": 44.5, "cy": 36.5, "radius": 30.0}}
-    session.update(scene(reflectance={"diffuse": 0.3}, samples_per_pixel=samples, camera=camera))
-    assert session.sightlines.in_kernel == (lens is None)
-    frame, truth = session.frame(), session.truth()
-    x, y = session.camera.pixel_centres().transpose(2, 0, 1)
-    inside = np.hypot(x - 44.5, y - 36.5) <= 30.0
-    np.testing.assert_array_equal(session.camera.seen, inside)
-    np.testing.assert_array_equal(frame.radiance.total > 0, inside)
-    np.testing.assert_array_equal(frame.labels.mask, inside)
-    np.testing.assert_array_equal(truth.mask, inside)
-    for maps, name in ((frame.labels, "depth"), (frame.labels, "normal"), (truth, "position"), (truth, "k_min")):
-        assert np.isnan(getattr(maps, name)[~inside]).all(), name
-        assert np.isfinite(getattr(maps, name)[inside]).all(), name
