@@ -162,9 +162,11 @@ SURFACES = {
     "quadric": {"type": "quadric", "distance_mm": 15, "k1_per_mm": 0.05, "k2_per_mm": -0.03},
     "colon": COLON,
     "colon, polyps": {**COLON, "recipe": {"polyps": SESSILE, "relief_mm": 0.01, "relief_length_mm": 5.0}},
+    "colon, tight": {**COLON, "recipe": {"length_mm": 60, "radius_mm": 6, "bend_deg": 170, "sway_deg": 20,
+                                         "sway_length_mm": 60, "fold_depth_mm": 2.5, "taenia_mm": 0.3}},
     "colon, stalks": {**COLON, "recipe": {"polyps": [*STALKED, SESSILE[1]]}},
     "liver": {"type": "anatomy", "path": "liver"},
-}
+}  # fmt: skip
 ON_RELIEF = ("plane", "sphere", "cylinder inside", "quadric", "colon", "liver")
 WAVE = {"type": "peristalsis", "amplitude_mm": 4.0, "period_s": 3.0, "centre_mm": [1, 2, 3], "axis": [1, 2, 0.5],
         "radius_mm": 12.0, "wavelength_mm": 30.0}  # fmt: skip
@@ -180,10 +182,12 @@ CASES = [(name, None, "at rest") for name in SURFACES]
 CASES += [(name, film, "at rest") for name, film in product(ON_RELIEF, ("bare", -0.5))]
 CASES += [(name, None, "moved") for name in list(SURFACES)[:6]]
 CASES += [("sphere", None, "ringed"), ("quadric", "bare", "moved")]
-CASES += [(name, None, "breathing") for name in ("colon", "liver")]
+BREATHING = [(name, None, "breathing") for name in ("colon", "liver")]
+CASES += BREATHING
 """Surface; without relief, with a bare one, or one under a film up to a level; and its deformation."""
-DEAR = [("colon, polyps", None, "at rest"), ("colon", "bare", "at rest"), ("liver", "bare", "at rest")]
-DEAR += [("liver", -0.5, "at rest"), ("sphere", None, "ringed"), ("quadric", "bare", "moved")]
+DEAR = [(name, None, "at rest") for name in ("colon, polyps", "colon, tight")]
+DEAR += [("colon", "bare", "at rest"), ("liver", "bare", "at rest"), ("liver", -0.5, "at rest")]
+DEAR += [("sphere", None, "ringed"), ("quadric", "bare", "moved")]
 DEAR += [(name, None, "moved") for name in list(SURFACES)[:6] if name != "sphere inside"]
 
 
@@ -252,7 +256,7 @@ def by_differences(session, pixels, step):
     return Differences(replace(points, **some), base, normal, curvatures(J, normal, dn))
 
 
-@pytest.mark.parametrize(("name", "relief", "deformation"), marked(CASES, ci=DEAR, slow=CASES[-2:]))
+@pytest.mark.parametrize(("name", "relief", "deformation"), marked(CASES, ci=DEAR, slow=BREATHING))
 def test_points_have_the_normals_and_curvatures_of_differences(session, name, relief, deformation):
     surface = placed(session, name, relief, deformation)
     pixels = np.random.default_rng(5).uniform([4, 4], [60, 44], (300, 2))
@@ -276,7 +280,10 @@ def test_points_have_the_normals_and_curvatures_of_differences(session, name, re
     assert relative(fine.curvature, exact).max() < bent
 
 
-@pytest.mark.parametrize(("name", "relief"), [("sphere", None), ("colon", None), ("colon", "bare")])
+@pytest.mark.parametrize(
+    ("name", "relief"),
+    [("sphere", None), ("colon", None), ("colon, polyps", None), ("colon, tight", None), ("colon", "bare")],
+)
 def test_blocks_give_what_one_piece_gives_and_a_miss_is_one_in_all(session, name, relief, monkeypatch):
     monkeypatch.setattr(truth, "BLOCK", 64)
     monkeypatch.setattr(tube_kernel, "BLOCK", 256)
@@ -285,11 +292,13 @@ def test_blocks_give_what_one_piece_gives_and_a_miss_is_one_in_all(session, name
     origins, directions = session.sightlines.in_model(pixels)
     hits = session.exact_hits(origins, directions)
     hits.distance[::7] = np.inf
+    directions[8] = np.nan  # no ray
     backend.load()
     for count in (0, 1, 150, 1000):
         some = origins[:count], directions[:count], hits.rows(slice(count))
         whole, blocks = truth.solve(surface, *some), truth.solve_frame(surface, *some)
         assert not whole.valid[::7].any()
+        assert not whole.valid[8:9].any()
         assert count < 2 or whole.valid.mean() > 0.2
         well_formed(whole)
         for field in fields(SurfacePoints):
