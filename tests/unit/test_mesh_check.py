@@ -155,11 +155,12 @@ def test_half_width_is_that_of_the_theory():
 
 def test_the_verdict_follows_the_edges(tmp_path):
     """On a sphere of R = d the half-width is half that of a plane, everywhere the same."""
-    for level, fine in ((3, False), (5, True)):
+    for level, fine in ((3, False), (4, False), (5, True)):
         verdict = check_mesh(save(tmp_path / f"{level}.ply", *ball(level, 30.0)), 30.0, C)
         expected = half_width(30.0, C, 1 / 30) / EDGES_PER_HALF_WIDTH
         assert verdict.needed_edge_mm == pytest.approx(expected, rel=0.02)
         assert verdict.fine == fine
+        assert verdict.fine_share == fine
         assert (verdict.edge_p95_mm < expected) == fine
         assert ("fine enough" in said(verdict)) == fine
 

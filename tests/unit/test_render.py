@@ -50,7 +50,10 @@ def test_one_wall_throws_a_shadow_on_another(session):
     inside = {"type": "sphere", "radius_mm": 8.0, "side": "inside"}
     session.update(scene(inside, ({"position_mm": [0.0, 0.0, 13.0]},), {"diffuse": 0.5}))
     assert session.radiance().total.max() == 0
-    assert not any(highlight.lit for highlight in session.highlights(session.radiance()))
+    # One behind the wall at the camera's back, and one beside the camera: both have a highlight, the latter is lit.
+    lights = tuple({"position_mm": place} for place in ([1.0, 0.0, -20.0], [2.0, 0.0, 0.0]))
+    session.update(scene(inside | {"radius_mm": 14.0}, lights))
+    assert {(highlight.light, bool(highlight.lit)) for highlight in session.highlights()} == {(0, False), (1, True)}
 
 
 def test_lights_of_equal_power_are_updated_apart(session):
