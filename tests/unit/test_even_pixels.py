@@ -235,9 +235,7 @@ def test_progress_ends_at_its_total_and_rises():
 
 
 SHAPES = {
-    "plane": {"type": "plane", "tilt_deg": 30.0},
     "sphere": {"type": "sphere", "radius_mm": 6.0},
-    "cylinder inside": {"type": "cylinder", "radius_mm": 11.0, "side": "inside"},
     "saddle": {"type": "quadric", "k1_per_mm": 0.06, "k2_per_mm": -0.04},
 }
 

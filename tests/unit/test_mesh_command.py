@@ -80,14 +80,11 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_use_is_one_line_and_exit_2(here, name):
-    arguments, message = BAD[name]
-    code, output, errors = here("mesh", *arguments)
-    assert code == 2
-    assert output == ""
-    assert len(errors) == 1
-    assert message in errors[0]
+def test_bad_use_is_one_line_and_exit_2(here):
+    for name, (arguments, message) in BAD.items():
+        code, output, errors = here("mesh", *arguments)
+        assert (code, output, len(errors)) == (2, "", 1), name
+        assert message in errors[0], name
 
 
 def test_verdicts_and_exit_codes(here, tmp_path):

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from surface_helpers import angle
 
 from simtest.rendering import Session
 from simtest.rendering.built_scene import make_shape
@@ -183,24 +182,3 @@ def test_a_mesh_is_shaded_with_the_normals_given(session):
     hit = mi.load_dict({"type": "scene", "shape": made}).ray_intersect(mi.Ray3f([1.0, 2.0, 10.0], [0.0, 0.0, -1.0]))
     np.testing.assert_allclose(np.array(hit.sh_frame.n).ravel(), normal, atol=1e-6)
     np.testing.assert_allclose(np.array(hit.n).ravel(), [0, 0, 1], atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("surface", "limit"),
-    [
-        ({"type": "quadric", "k1_per_mm": 0.08, "k2_per_mm": -0.05, "tilt_deg": 20.0}, 1e-5),
-        pytest.param({"type": "anatomy", "path": "colon"}, 3e-3, marks=pytest.mark.ci),
-    ],
-    ids=["quadric", "colon"],
-)
-def test_vertex_normals_of_rendered_meshes_are_the_exact_ones(session, surface, limit):
-    session.update(scene(surface))
-    session.update(scene(surface, (ASIDE,), {"exponent": 77.0}))  # an update must not recompute them
-    mesh = session._shape.mesh
-    parameters = session._built.parameters
-    stored = np.array(parameters["surface.vertex_normals"]).reshape(-1, 3)
-    np.testing.assert_array_equal(stored, mesh.normals.astype(np.float32))
-    truth = session.truth()
-    away = angle(truth.normal, truth.shading_normal)[truth.mask]
-    assert np.median(away) < limit / 5
-    assert np.percentile(away, 99) < limit
