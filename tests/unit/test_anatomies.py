@@ -37,10 +37,10 @@ def test_generated_colon_and_liver_have_isolated_highlights(tmp_path):
 @pytest.mark.parametrize("name", ["colon_edingca_00090", "liver_sksurgery"])
 def test_real_meshes_give_results(shared_data, tmp_path, name):
     path = shared_data / "meshes" / f"{name}.ply"
-    results = results_of(path, range(4), tmp_path / name)
+    results = results_of(path, range(20), tmp_path / name)
     error, count = median_error(results, "cone_axis")
     assert set(results["surface"]) == {name}
-    assert count >= 3
+    assert count >= 20
     assert error < 1.5, error
     # The published pose does not hold on curved tissue: the control that the truth is not made from the estimate.
     assert median_error(results, "circle_pose")[0] > 20
@@ -67,13 +67,6 @@ def test_a_finer_grid_of_seeds_finds_nothing_more(monkeypatch):
     assert len(quick) >= 8
     assert quick.shape == full.shape
     np.testing.assert_allclose(quick, full, atol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["colon_edingca_00090", "liver_sksurgery"])
-def test_real_meshes_give_at_least_20_specularities(shared_data, tmp_path, name):
-    results = results_of(shared_data / "meshes" / f"{name}.ply", range(20), tmp_path / name)
-    assert median_error(results, "cone_axis")[1] >= 20
 
 
 @pytest.mark.slow

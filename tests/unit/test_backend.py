@@ -2,15 +2,14 @@
 
 import json
 import os
-import re
 import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from simtest.cli import main as command_line
 from simtest.errors import BackendError, InputError
 from simtest.rendering import backend
 from simtest.rendering.backend import Candidate, candidates, choose_library, colour_variant, probe, requested_variant
@@ -19,18 +18,14 @@ SYSTEM = Path("/usr/lib/x86_64-linux-gnu")
 MAIN = "from simtest.cli.main import main; main()"
 
 
-def no_file(folder):
-    return folder / "none.so"
+def file_of(text):
+    """Return what makes a file of a text in a folder."""
 
+    def give(folder):
+        (folder / "library.so").write_text(text)
+        return folder / "library.so"
 
-def empty_file(folder):
-    (folder / "empty.so").touch()
-    return folder / "empty.so"
-
-
-def text_file(folder):
-    (folder / "text.so").write_text("not a library\n")
-    return folder / "text.so"
+    return give
 
 
 def installed(name):
@@ -44,9 +39,9 @@ def installed(name):
 
 BAD = {
     "folder": (lambda folder: folder, "is a folder; must be the file libLLVM.so itself"),
-    "missing": (no_file, "no such file"),
-    "empty": (empty_file, "is not a usable libLLVM ("),
-    "text": (text_file, "is not a usable libLLVM ("),
+    "missing": (lambda folder: folder / "none.so", "no such file"),
+    "empty": (file_of(""), "is not a usable libLLVM ("),
+    "text": (file_of("not a library\n"), "is not a usable libLLVM ("),
     "another library": (installed("libm.so.6"), "lacks core API"),
     "LLVM 14": (installed("libLLVM-14.so.1"), "(14) is too old"),
     "LLVM 15": (installed("libLLVM-15.so.1"), "aborts the process when a kernel is compiled"),
@@ -82,45 +77,27 @@ def no_child(monkeypatch):
     return tried
 
 
-def simtest(*arguments, **variables):
-    environment = {**os.environ, **variables}
-    command = [sys.executable, "-c", MAIN, *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
-
-
-def run_here(monkeypatch, capfd, *arguments):
-    """Run the command in this process; gives exit code, output and error lines."""
-    monkeypatch.setattr(sys, "argv", ["simtest", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        command_line.main()
-    output, errors = capfd.readouterr()
-    return stop.value.code, output, errors.splitlines()
-
-
 # The doctor ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.render
-def test_doctor_says_that_it_renders(tmp_path):
-    bad = no_file(tmp_path)
-    done = simtest("doctor", "--json", DRJIT_LIBLLVM_PATH=str(bad), SIMTEST_VARIANT="llvm_ad_rgb")
-    assert done.stderr == ""
+def test_doctor_says_that_it_renders_and_knows_variants(tmp_path):
+    def doctor(**variables):
+        command, environment = [sys.executable, "-c", MAIN, "doctor", "--json"], {**os.environ, **variables}
+        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+
+    bad = str(tmp_path / "none.so")
+    done = doctor(DRJIT_LIBLLVM_PATH=bad, SIMTEST_VARIANT="llvm_ad_rgb")
+    assert (done.stderr, done.returncode) == ("", 0)
     report = json.loads(done.stdout)
-    assert done.returncode == 0
-    assert report["can_render"] is True
-    assert report["problem"] is None
-    assert report["variant"] == "llvm_ad_rgb"
+    assert (report["can_render"], report["problem"], report["variant"]) == (True, None, "llvm_ad_rgb")
     assert Path(report["library"]).is_file()
     # A bad variable is reported, and passed over.
-    assert report["candidates"][0] == {"origin": "DRJIT_LIBLLVM_PATH", "path": str(bad), "verdict": "no such file"}
+    assert report["candidates"][0] == {"origin": "DRJIT_LIBLLVM_PATH", "path": bad, "verdict": "no such file"}
     assert report["candidates"][-1]["verdict"] == "ok"
     assert set(report["versions"]) == {"mitsuba", "drjit"}
-
-
-@pytest.mark.render
-def test_doctor_knows_variants():
-    done = simtest("doctor", "--json", SIMTEST_VARIANT="llvm_nope")
     # Bad input, as of every other command.
+    done = doctor(SIMTEST_VARIANT="llvm_nope")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("simtest: SIMTEST_VARIANT 'llvm_nope': cannot be used; allowed: llvm, cuda, ")
     assert done.stderr.count("\n") == 1
@@ -130,11 +107,11 @@ def test_doctor_knows_variants():
 
 
 @pytest.mark.usefixtures("nothing_else")
-@pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 @pytest.mark.parametrize("name", BAD)
-def test_a_bad_library_gives_its_own_message_and_three_ways_to_mend_it(name, monkeypatch, tmp_path, capfd):
+def test_a_bad_library_gives_its_own_message_and_three_ways_to_mend_it(here, name, monkeypatch, tmp_path):
     make, verdict = BAD[name]
-    library, place = make(tmp_path), tmp_path / "place"
+    (tmp_path / "library").mkdir()
+    library, place = make(tmp_path / "library"), tmp_path / "place"
     place.mkdir()
     monkeypatch.chdir(place)
     monkeypatch.setenv(backend.LIBRARY_VARIABLE, str(library))
@@ -148,13 +125,13 @@ def test_a_bad_library_gives_its_own_message_and_three_ways_to_mend_it(name, mon
     assert "\n" not in tried.verdict
     assert not list(place.iterdir())
 
-    code, output, errors = run_here(monkeypatch, capfd, "doctor")
+    code, output, errors = here("doctor")
     assert (code, errors) == (1, [])
     assert "rendering   does not work" in output
     for word in (str(library), verdict, "(1) pip install karellen-llvm-core", "(2) install", "(3) set DRJIT_LIBLLVM"):
         assert word in output
 
-    code, output, errors = run_here(monkeypatch, capfd, "render", "plane", "--out", str(place))
+    code, output, errors = here("render", "plane", "--out", place)
     assert (code, output, len(errors)) == (1, "", 1)
     assert errors[0].startswith("simtest: no usable libLLVM: ")
     assert "(3) set DRJIT_LIBLLVM_PATH" in errors[0]
@@ -179,7 +156,7 @@ def test_no_library_at_all(monkeypatch):
 
 def test_a_probe_that_hangs_is_given_up_and_not_remembered(monkeypatch, tmp_path):
     monkeypatch.setattr(backend, "PROBE_TIMEOUT_S", 0.01)
-    library = text_file(tmp_path)
+    library = file_of("x")(tmp_path)
     assert probe(Candidate("test", str(library))).verdict == "could not be tried (TimeoutExpired)"
     assert not backend._cache_file().exists()
 
@@ -211,15 +188,11 @@ def test_the_first_that_works_is_chosen_and_the_rest_is_not_tried(monkeypatch, t
     assert no_child == [str(first)]
 
 
-def test_the_packaged_library_is_a_file():
-    packaged = backend._packaged_library()
-    assert packaged is None or Path(packaged).is_file()
-
-
-def test_system_libraries_are_files_and_each_comes_once():
+def test_libraries_that_are_found_are_files_and_each_comes_once():
     found = backend._system_libraries()
     assert len(set(found)) == len(found)
-    assert all(Path(path).is_file() for path in found)
+    packaged = backend._packaged_library()
+    assert all(Path(path).is_file() for path in [*found, *([packaged] if packaged else [])])
 
 
 # The cache -------------------------------------------------------------------------------------------------------
@@ -248,23 +221,20 @@ def test_a_verdict_is_kept_by_path_size_and_time(tmp_path, no_child):
     assert [path.name for path in file.parent.iterdir()] == ["libllvm.json"]
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[1, 2]", b'"text"', b"null", b"\xff\xfe\x00", b"{}"])
-def test_a_corrupt_cache_does_no_harm(tmp_path, no_child, content):
-    library = text_file(tmp_path)
-    file = tmp_path / "cache" / "simtest" / "libllvm.json"
+def test_a_corrupt_cache_or_one_that_cannot_be_written_costs_only_time(tmp_path, no_child):
+    library, file = file_of("x")(tmp_path), tmp_path / "cache" / "simtest" / "libllvm.json"
     file.parent.mkdir(parents=True)
-    file.write_bytes(content)
-    assert probe(Candidate("test", str(library))).verdict == "ok"
-    assert len(no_child) == 1
-    assert list(json.loads(file.read_text()).values()) == ["ok"]
-
-
-def test_a_cache_that_cannot_be_written_costs_only_time(tmp_path, no_child):
-    library = text_file(tmp_path)
+    contents = [b"", b"{", b"[1, 2]", b'"text"', b"null", b"\xff\xfe\x00", b"{}"]
+    for tried, content in enumerate(contents, start=1):
+        file.write_bytes(content)
+        assert probe(Candidate("test", str(library))).verdict == "ok"
+        assert len(no_child) == tried
+        assert list(json.loads(file.read_text()).values()) == ["ok"]
+    shutil.rmtree(tmp_path / "cache")
     (tmp_path / "cache").write_text("a file where the folder should be")
     for _ in range(2):
         assert probe(Candidate("test", str(library))).verdict == "ok"
-    assert len(no_child) == 2
+    assert len(no_child) == len(contents) + 2
 
 
 # Variants --------------------------------------------------------------------------------------------------------
@@ -272,10 +242,9 @@ def test_a_cache_that_cannot_be_written_costs_only_time(tmp_path, no_child):
 
 def test_the_variant_is_the_argument_or_the_variable_or_the_default(monkeypatch):
     assert requested_variant() == "llvm_ad_mono"
-    monkeypatch.setenv(backend.VARIANT_VARIABLE, "")
-    assert requested_variant() == "llvm_ad_mono"
-    monkeypatch.setenv(backend.VARIANT_VARIABLE, "llvm_ad_rgb")
-    assert requested_variant() == "llvm_ad_rgb"
+    for variable, used in (("", "llvm_ad_mono"), ("llvm_ad_rgb", "llvm_ad_rgb")):
+        monkeypatch.setenv(backend.VARIANT_VARIABLE, variable)
+        assert requested_variant() == used
     assert requested_variant("cuda_ad_mono") == "cuda_ad_mono"
 
 
@@ -299,16 +268,9 @@ def test_a_device_alone_has_as_many_channels_as_the_scene_needs(monkeypatch):
     assert backend.needs_gpu("cuda_ad_mono")
 
 
-def test_no_other_module_names_a_variant_or_a_device():
-    package = Path(backend.__file__).parents[1]
-    named = re.compile(r"""_ad_(mono|rgb)|["'](llvm|cuda)["']\)""")
-    found = {file for file in package.rglob("*.py") if named.search(file.read_text(encoding="utf-8"))}
-    assert found == {Path(backend.__file__)}
-
-
-@pytest.mark.parametrize("name", ["nope", "scalar_mono", "LLVM_AD_MONO", "scalar_rgb", "llvm_ad_spectral"])
-def test_unknown_variants_name_the_allowed_ones(monkeypatch, name):
-    for given in (name, None):
+def test_unknown_variants_name_the_allowed_ones(monkeypatch):
+    unknown = ["nope", "scalar_mono", "LLVM_AD_MONO", "scalar_rgb", "llvm_ad_spectral"]
+    for name, given in [*zip(unknown, unknown, strict=True), *((name, None) for name in unknown)]:
         monkeypatch.setenv(backend.VARIANT_VARIABLE, name)
         with pytest.raises(InputError) as error:
             backend.load(given)

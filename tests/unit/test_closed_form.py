@@ -1,6 +1,6 @@
-"""Direct light off a plane and a sphere against formulas in double precision, written here from theory.md section 1.
+"""Normals and direct light against formulas in double precision, written here from theory.md section 1.
 
-Phong, as published and normalised, with and without a base, one point light wherever it may be: at every pixel.
+Phong, as published and normalised, with and without a base, point lights wherever they may be: at every pixel.
 """
 
 from itertools import product
@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 from scipy import stats
+from surface_helpers import angle
 
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
@@ -15,8 +16,8 @@ from tests.marked import marked
 
 pytestmark = pytest.mark.render
 
-WIDTH, HEIGHT, FOCAL, CX, CY = 120, 96, 110.0, 63.0, 45.0
-DISTANCE, RADIUS = 10.0, 6.0
+WIDTH, HEIGHT, FX, FY, CX, CY, SKEW = 120, 96, 110.0, 105.0, 63.0, 45.0, 4.0
+DISTANCE = 10.0
 PLACES = [
     (0.0, 0.0, 0.0),
     (0.01, 0.0, 0.0),
@@ -45,8 +46,14 @@ TINY = 1e-30
 
 
 def sightlines(x, y):
-    rays = np.stack([(x - CX) / FOCAL, (y - CY) / FOCAL, np.ones_like(x)], axis=-1)
+    """Unit rays through pixel positions, from K written out."""
+    down = (y - CY) / FY
+    rays = np.stack([(x - CX - SKEW * down) / FX, down, np.ones_like(x)], axis=-1)
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def centres():
+    return sightlines(*np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5))
 
 
 def anchor_normal(tilt_deg, azimuth_deg):
@@ -54,28 +61,55 @@ def anchor_normal(tilt_deg, azimuth_deg):
     return np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)])
 
 
-def plane(s):
-    N = anchor_normal(20.0, 130.0)
+def plane(s, tilt_deg, azimuth_deg):
+    """Return positions and normals on sightlines; NaN where there is none."""
+    N = anchor_normal(tilt_deg, azimuth_deg)
     t = DISTANCE * N[2] / (s @ N)
     return np.where(t > 0, t, np.nan)[..., None] * s, np.broadcast_to(N, s.shape)
 
 
-def sphere(s):
-    centre = np.array([0.0, 0.0, DISTANCE]) - RADIUS * anchor_normal(15.0, 70.0)
+def sphere(s, radius, inside, tilt_deg, azimuth_deg):
+    centre = np.array([0.0, 0.0, DISTANCE]) + anchor_normal(tilt_deg, azimuth_deg) * (radius if inside else -radius)
     along = s @ centre
     with np.errstate(invalid="ignore"):
-        P = (along - np.sqrt(along**2 - centre @ centre + RADIUS**2))[..., None] * s
-    return P, (P - centre) / RADIUS
+        root = np.sqrt(along**2 - centre @ centre + radius**2)
+    P = (along + (root if inside else -root))[..., None] * s
+    return P, (P - centre) / radius * (-1 if inside else 1)
+
+
+def cylinder(s, radius, inside):
+    """At tilt 0 and spin 0: curved along x, straight along y."""
+    z = DISTANCE + (-radius if inside else radius)
+    across = s[..., 0] ** 2 + s[..., 2] ** 2
+    with np.errstate(invalid="ignore"):
+        root = np.sqrt((s[..., 2] * z) ** 2 - across * (z**2 - radius**2))
+    P = ((s[..., 2] * z + (root if inside else -root)) / across)[..., None] * s
+    return P, (P - [0, 0, z]) * [1, 0, 1] / radius * (-1 if inside else 1)
+
+
+def shape(kind, *placed, radius=None, inside=False):
+    """Return the table of a surface, and its formula; a plane or sphere placed by its tilt and azimuth."""
+    leaned = dict(zip(("tilt_deg", "azimuth_deg"), placed, strict=False))
+    if kind == "plane":
+        return {"type": kind, **leaned}, lambda s: plane(s, *placed)
+    table = {"type": kind, "radius_mm": radius, **leaned} | ({"side": "inside"} if inside else {})
+    return table, lambda s: (sphere if kind == "sphere" else cylinder)(s, radius, inside, *placed)
 
 
 SURFACES = {
-    "plane": ({"type": "plane", "tilt_deg": 20.0, "azimuth_deg": 130.0}, plane),
-    "sphere": ({"type": "sphere", "radius_mm": RADIUS, "tilt_deg": 15.0, "azimuth_deg": 70.0}, sphere),
+    "plane": shape("plane", 20.0, 130.0),
+    "sphere": shape("sphere", 15.0, 70.0, radius=6.0),
+    "grazing plane": shape("plane", 75.0, -20.0),
+    "large sphere": shape("sphere", 0.0, 0.0, radius=1000.0),
+    "sphere inside": shape("sphere", 15.0, 0.0, radius=14.0, inside=True),
+    "cylinder": shape("cylinder", radius=4.0),
+    "large cylinder": shape("cylinder", radius=1000.0),
+    "cylinder inside": shape("cylinder", radius=11.2, inside=True),
 }
 
 
-def radiance(P, N, place, exponent, specular, albedo, normalised):
-    """Return the radiance of a light of power 1; 0 in its own shadow, where the normal turns away from it."""
+def parts(P, N, place, exponent, specular, albedo, normalised):
+    """Return lobe and base of a light of power 1; 0 in its own shadow, where the normal turns away, and cos_light."""
     to_camera = -P / np.linalg.norm(P, axis=-1, keepdims=True)
     to_light = np.asarray(place) - P
     squared = np.sum(to_light**2, axis=-1)
@@ -84,17 +118,24 @@ def radiance(P, N, place, exponent, specular, albedo, normalised):
     mirrored = 2 * cos_light[..., None] * N - to_light
     cos_beta = np.maximum(np.sum(mirrored * to_camera, axis=-1), 0)
     scale = (exponent + 2) / (2 * np.pi) * cos_light if normalised else 1.0
-    value = specular * scale * cos_beta**exponent + albedo / np.pi * cos_light
-    return np.nan_to_num(np.where(cos_light > 0, value / squared, 0.0)), cos_light
+    values = specular * scale * cos_beta**exponent, albedo / np.pi * cos_light
+    return [np.nan_to_num(np.where(cos_light > 0, value / squared, 0.0)) for value in values], cos_light
 
 
-def described(surface, places, exponent, specular, albedo, normalised):
+def radiance(*given):
+    values, cos_light = parts(*given)
+    return sum(values), cos_light
+
+
+def described(surface, places, exponent, specular, albedo, normalised, powers=None):
     reflectance = {"type": "phong", "exponent": exponent, "specular": specular, "diffuse": albedo}
+    camera = {"width": WIDTH, "height": HEIGHT, "fx": FX, "fy": FY, "cx": CX, "cy": CY, "skew": SKEW}
+    lights = zip(places, powers or [1.0] * len(places), strict=True)
     return scene_from_dict(
         {
             "surface": surface,
-            "camera": {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": CX, "cy": CY},
-            "rig": {"lights": [{"position_mm": list(place)} for place in places]},
+            "camera": camera,
+            "rig": {"lights": [{"position_mm": list(place), "power": power} for place, power in lights]},
             "reflectance": {**reflectance, "normalised": normalised},
         }
     )
@@ -105,18 +146,48 @@ def session():
     return Session(described(SURFACES["plane"][0], PLACES[:1], 50.0, 1.0, 0.0, False))
 
 
+LIT = ["plane", "sphere"]
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_normals_are_those_of_the_formula_at_every_pixel(session, name):
+    surface, formula = SURFACES[name]
+    session.update(described(surface, PLACES[:1], 50.0, 1.0, 0.0, False))
+    P, N = formula(centres())
+    truth = session.truth()
+    seen = np.isfinite(P).all(axis=-1) & (np.nan_to_num(P)[..., 2] > 0)
+    if surface["type"] != "sphere":
+        # The rendered shape is finite.
+        seen &= np.linalg.norm(np.nan_to_num(P), axis=-1) < 45 * DISTANCE
+        assert not (seen & ~truth.mask).any()
+    else:
+        # At the silhouette single precision may decide otherwise than double.
+        assert np.count_nonzero(seen != truth.mask) <= 2
+    both = seen & truth.mask
+    assert both.sum() > 2000
+    cosine = -np.sum(N * P, axis=-1)[both] / np.linalg.norm(P, axis=-1)[both]
+    well = cosine > 0.01
+    assert angle(truth.normal[both], N[both])[well].max() < 1e-6
+    assert angle(truth.shading_normal[both], N[both])[well].max() < 1e-4
+    assert angle(truth.geometric_normal[both], N[both])[well].max() < 1e-4
+    np.testing.assert_allclose(truth.position[both][well], P[both][well], rtol=1e-9, atol=1e-8)
+    np.testing.assert_allclose(truth.depth[both][well], np.linalg.norm(P, axis=-1)[both][well], rtol=1e-9)
+    for normal in (truth.normal, truth.shading_normal, truth.geometric_normal):
+        assert (np.sum(normal * P, axis=-1)[both][well] < 0).all()
+        assert np.isnan(normal[~truth.mask]).all()
+
+
 @pytest.mark.parametrize(
     ("name", "exponent"),
     marked(
-        product(SURFACES, [10.0, 50.0, 100.0, 500.0]),
+        product(LIT, [10.0, 50.0, 100.0, 500.0]),
         ci=[("plane", 500.0), ("sphere", 10.0)],
-        slow=product(SURFACES, [50.0, 100.0]),
+        slow=product(LIT, [50.0, 100.0]),
     ),
 )
 def test_every_pixel_has_the_radiance_of_the_formula(session, name, exponent):
     surface, formula = SURFACES[name]
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    P, N = formula(sightlines(x, y))
+    P, N = formula(centres())
     compared = dark = 0
     for place in PLACES:
         for specular, albedo, normalised in SHARES:
@@ -138,6 +209,31 @@ def test_every_pixel_has_the_radiance_of_the_formula(session, name, exponent):
     assert dark > 10_000 or name == "plane"
 
 
+@pytest.mark.parametrize("name", [name for name in SURFACES if name not in ("grazing plane", "large cylinder")])
+def test_lobe_and_base_of_several_lights_are_those_of_the_formula(session, name):
+    surface, formula = SURFACES[name]
+    P, N = formula(centres())
+    at_camera, aside = ((0.0, 0.0, 0.0), 1.0), ((2.0, -1.5, 1.0), 3.0)
+    for lights, normalised in product([(at_camera,), (aside,), (at_camera, aside)], [False, True]):
+        places, powers = zip(*lights, strict=True)
+        given = (30.0, 0.6, 0.4, normalised)
+        session.update(described(surface, places, *given, powers))
+        rendered = session.radiance()
+        expected = np.sum([power * np.array(parts(P, N, place, *given)[0]) for place, power in lights], axis=0)
+        compared = 0
+        for part, formula_part in zip((rendered.specular, rendered.diffuse), expected, strict=True):
+            assert part.dtype == np.float32
+            assert part.shape == (HEIGHT, WIDTH)
+            bright = formula_part > 1e-3 * formula_part.max()
+            compared += np.count_nonzero(bright)
+            # The specular part is a difference: its rounding is that of the whole.
+            allowed = 1e-4 * formula_part[bright] + 1e-7 * sum(expected).max()
+            assert (np.abs(part[bright] - formula_part[bright]) < allowed).all()
+        assert compared > 1000
+        np.testing.assert_array_equal(rendered.indirect, 0)
+        np.testing.assert_array_equal(rendered.total, rendered.specular + rendered.diffuse)
+
+
 # Mitsuba's own integrators -----------------------------------------------------------------------------------------
 
 SIDE = 6
@@ -145,7 +241,7 @@ SIDE = 6
 
 SAMPLED = [
     (name, integrator, places)
-    for name in SURFACES
+    for name in LIT
     for integrator in ({"type": "direct"}, {"type": "path", "max_depth": 2})
     for places in (PLACES[:1], [PLACES[5], PLACES[9]])
 ]
@@ -206,10 +302,8 @@ def test_colour_tints_the_base_alone():
     colour = (0.9, 0.45, 0.3)
     tinted = scene.reflectance.model_copy(update={"colour": colour})
     rendered = Session(scene.model_copy(update={"reflectance": tinted}), "llvm_ad_rgb").radiance()
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    P, N = sphere(sightlines(x, y))
-    lobe, _ = radiance(P, N, PLACES[5], 50.0, 0.5, 0.0, False)
-    base, _ = radiance(P, N, PLACES[5], 50.0, 0.0, 0.5, False)
+    P, N = SURFACES["sphere"][1](centres())
+    (lobe, base), _ = parts(P, N, PLACES[5], 50.0, 0.5, 0.5, False)
     assert rendered.total.shape == (HEIGHT, WIDTH, 3)
     for channel, share in enumerate(colour):
         expected = lobe + share * base

@@ -26,24 +26,6 @@ def scene(time_s=0.0, deformation=(WARP, DENT), moved=None, **changes):
     return scene_from_dict({**data, **changes})
 
 
-@pytest.mark.ci  # meanwhile: a rigid motion and analytic surfaces deform
-def test_moments_are_rendered_without_rebuilding():
-    session = Session(scene(), labelled=True)
-    first = session.frame()
-    for time_s in (0.6, 1.0):
-        session.update(scene(time_s))
-    moved = session.frame()
-    assert session.rebuilds == 1
-    assert np.abs(moved.labels.depth - first.labels.depth).max() > 0.5
-    # The same as a session that begins there.
-    fresh = Session(scene(1.0), labelled=True).frame()
-    assert np.array_equal(fresh.radiance.total, moved.radiance.total)
-    assert np.array_equal(fresh.labels.k_max, moved.labels.k_max)
-    # And back to the start.
-    session.update(scene(0.0))
-    assert np.array_equal(session.frame().radiance.total, first.radiance.total)
-
-
 def test_at_rest_the_frame_is_that_without_deformation():
     with_table = Session(scene(0.0)).frame()
     without = Session(scene(0.0, deformation=())).frame()
@@ -92,16 +74,6 @@ def test_a_rigid_motion_of_tissue_is_the_reverse_motion_of_the_camera(reflectanc
     assert np.abs(seen.radiance.total - still.radiance.total).max() > 0.05 * still.radiance.total.max()
 
 
-def test_a_failed_moment_leaves_the_session_where_it_was():
-    press = {**DENT, "amplitude_mm": 30.0, "radius_mm": 30.0, "direction": [0, 0, 1]}
-    session = Session(scene(0.0, deformation=(press,)))
-    before = session.frame().radiance.total
-    told = r"deformation: the camera lies .* mm inside the wall at time_s = 1; .*: lower amplitude_mm or turn_deg, or"
-    with pytest.raises(InputError, match=told):
-        session.update(scene(1.0, deformation=(press,)))
-    assert np.array_equal(session.frame().radiance.total, before)
-
-
 def test_a_body_that_passed_over_the_camera_is_refused():
     ball = {"type": "sphere", "distance_mm": 20.0, "radius_mm": 3.0}
     ride = {"type": "breathing", "amplitude_mm": 100.0, "period_s": 2.0, "direction": [0, 0, 1], "warp": 0.0}
@@ -140,36 +112,4 @@ def test_analytic_surfaces_deform(surface, part):
     assert seen.mean() > 0.3
     assert np.quantile(np.linalg.norm(moved.labels.normal - truth.normal, axis=-1)[seen], 0.98) < 1e-3
     assert np.quantile(np.abs(moved.labels.depth - truth.depth)[seen], 0.98) < 1e-2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("anatomy", ["colon", "liver"])
-def test_anatomies_deform(anatomy):
-    """The exact points on a deformed anatomy have the normals of differences of neighbouring exact points."""
-    surface = {"type": "anatomy", "path": anatomy, "viewpoint": 1}
-    camera = {"width": 80, "height": 60, "fx": 70.0, "fy": 70.0, "cx": 40.0, "cy": 30.0}
-    still = Session(scene_from_dict({"surface": surface, "camera": camera}))
-    pose = still.surface.model_from_camera
-    near = {"centre_mm": (pose[:3, 3] + 20 * pose[:3, 2]).tolist()}
-    wave = {"type": "peristalsis", "amplitude_mm": 3.0, "period_s": 3.0, "axis": pose[:3, 2].tolist(),
-            "radius_mm": 15.0, "wavelength_mm": 40.0, **near}  # fmt: skip
-    table = {"surface": surface, "camera": camera, "time_s": 0.7, "deformation": [wave, {**WARP, **near}]}
-    session = Session(scene_from_dict(table))
-    pixels, step = np.random.default_rng(0).uniform([5, 5], [75, 55], (300, 2)), 2e-3
-    points = session.exact_points(pixels)
-    seen = points.valid
-    assert seen.mean() > 0.5
-
-    def along(direction):
-        near, far = (
-            session.exact_points(pixels + n * step * np.array(direction)).position
-            - session.exact_points(pixels - n * step * np.array(direction)).position
-            for n in (1, 2)
-        )
-        return 8 * near - far
-
-    normal = np.cross(along((1, 0)), along((0, 1)))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    gap = np.linalg.norm(np.cross(normal, points.normal), axis=1)
-    # Where a neighbour lies behind a fold there is no difference.
-    assert np.nanpercentile(gap[seen], 95) < 1e-8
+    assert np.quantile(np.abs(moved.labels.k_min - truth.k_min)[seen], 0.98) < 5e-3

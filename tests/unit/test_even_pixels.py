@@ -189,19 +189,31 @@ def test_outlines_sharp_edges_and_shadows_of_a_mesh_are_marked():
     hidden = [[-2, -2, 30], [2, -2, 30], [-2, 2, 30], [2, 2, 30]]
     vertices = np.array([*wall, *square, *hidden], dtype=float)
     faces = np.concatenate([np.array([[0, 2, 1], [1, 2, 3]]) + start for start in (0, 4, 8)])
-    mesh = TriangleMesh(vertices, faces, np.tile([0.0, 0.0, -1.0], (12, 1)))
-    made = session.mi.Mesh("m", 12, 6, has_vertex_normals=True)
-    parameters = session.mi.traverse(made)
-    for name, values, dtype in (("vertex_positions", vertices, np.float32), ("faces", faces, np.uint32)):
-        parameters[name] = np.ascontiguousarray(values, dtype=dtype).ravel()
-    parameters.update()
-    parameters["vertex_normals"] = np.ascontiguousarray(mesh.normals, dtype=np.float32).ravel()
-    parameters.update()
-    mitsuba_scene = session.mi.load_dict({"type": "scene", "m": made})
     camera = session.camera
     inside = np.abs((camera.pixel_centres() - [32, 24]) / 50 * 10).max(axis=-1) < 2
     depth = (np.where(inside, 10.0, 20.0) / camera.unproject(camera.pixel_centres())[..., 2]).astype(np.float32)
-    marks = MeshEdges(mitsuba_scene, mesh).marks(camera, np.eye(4), np.array([[5.0, 0.0, 0.0]]), depth, 0.1, 50.0)
+
+    def marks_of(lights, bent=False):
+        normals = np.tile([0.0, 0.0, -1.0], (12, 1))
+        normals[6] = [0.5, 0.0, -np.sqrt(0.75)] if bent else normals[6]
+        mesh = TriangleMesh(vertices, faces, normals)
+        made = session.mi.Mesh("m", 12, 6, has_vertex_normals=True)
+        parameters = session.mi.traverse(made)
+        for name, values, dtype in (("vertex_positions", vertices, np.float32), ("faces", faces, np.uint32)):
+            parameters[name] = np.ascontiguousarray(values, dtype=dtype).ravel()
+        parameters.update()
+        parameters["vertex_normals"] = np.ascontiguousarray(mesh.normals, dtype=np.float32).ravel()
+        parameters.update()
+        edges = MeshEdges(session.mi.load_dict({"type": "scene", "m": made}), mesh)
+        return edges.marks(camera, np.eye(4), lights, depth, 0.01 if bent else 0.1, 50.0)
+
+    # Without a light the rim alone; where the normal turns along the diagonal, it too.
+    rim, sharp = (marks_of(np.empty((0, 3)), bent) for bent in (False, True))
+    assert rim[14, 22:42].all()
+    assert not rim[16:32, 24:40].any()
+    assert not rim[:, :20].any()
+    assert sharp[16:32, 24:40].sum() > 12
+    marks = marks_of(np.array([[5.0, 0.0, 0.0]]))
     # The rim of the square: 10 px from the centre.
     assert marks[14, 22:42].all()
     assert marks[14:34, 22].all()
@@ -223,9 +235,7 @@ def test_progress_ends_at_its_total_and_rises():
 
 
 SHAPES = {
-    "plane": {"type": "plane", "tilt_deg": 30.0},
     "sphere": {"type": "sphere", "radius_mm": 6.0},
-    "cylinder inside": {"type": "cylinder", "radius_mm": 11.0, "side": "inside"},
     "saddle": {"type": "quadric", "k1_per_mm": 0.06, "k2_per_mm": -0.04},
 }
 

@@ -14,6 +14,7 @@ from simtest.geometry import BrownConrady, Camera, KannalaBrandt, Patch, Scaramu
 from simtest.geometry.vectors import angle_deg
 from simtest.reconstruction.pipeline import reconstruct
 from simtest.rendering import Session
+from simtest.rendering.rays import is_pinhole
 from simtest.runtime.seeds import from_integer
 from simtest.simulation.frame import render_view
 from simtest.simulation.sensor import expose
@@ -206,52 +207,52 @@ def tilted(kind, angle, pointed):
     return surface | ({"radius_mm": 5.0, "spin_deg": 120.0} if kind == "cylinder" else {})
 
 
+def seen_through(session, camera, surface, sigma=0.0, seed=3):
+    """Return frame, truth, and the estimate of the one highlight through the session's own lens or another."""
+    seen = render_view(session, scene_from_dict({"surface": surface, "camera": camera}))
+    (truth,) = [t for t in seen.highlights if t.isolated]
+    # The true BP: the surface's point on its pixel's ray, where the normal is the reversed sightline.
+    np.testing.assert_allclose(session.camera.project(truth.position), truth.bp_px, atol=1e-6)
+    assert angle_deg(truth.normal, -session.camera.unproject(truth.bp_px)) < 1e-6
+    frame = expose(seen.radiance.total, seen.full_scale, sigma, from_integer(seed))
+
+    def estimate(**other):
+        (found,) = reconstruct(frame, dataclasses.replace(session.camera, **other), ["cone_axis"])
+        return found.estimates["cone_axis"]
+
+    return truth, estimate
+
+
 @pytest.mark.render
 @pytest.mark.parametrize(("kind", "angle"), [("plane", 2.0), ("plane", 60.0), ("cylinder", 30.0), ("cylinder", 60.0)])
 def test_normals_through_a_fisheye_equal_those_through_a_pinhole(session, kind, angle):
     """The same highlight, off the axis of a 140 deg fisheye and on the axis of a pinhole pointed at it."""
-    normals, shape = {}, {}
-    for name, camera in (("fisheye", FISHEYE), ("pinhole", PINHOLE)):
-        pointed = name == "pinhole"
-        scene = scene_from_dict(
-            {"surface": tilted(kind, angle, pointed), "camera": camera, "reflectance": {"type": "phong"}}
-        )
-        seen = render_view(session, scene)
-        (truth,) = [t for t in seen.highlights if t.isolated]
-        # The true BP: the surface's point on its pixel's ray, where the normal is the reversed sightline.
-        np.testing.assert_allclose(session.camera.project(truth.position), truth.bp_px, atol=1e-6)
-        assert angle_deg(truth.normal, -session.camera.unproject(truth.bp_px)) < 1e-6
-        for sigma in (0.0, 0.01):
-            frame = expose(seen.radiance.total, seen.full_scale, sigma, from_integer(3))
-            (found,) = reconstruct(frame, session.camera, ["cone_axis"])
-            estimate = found.estimates["cone_axis"]
-            # Expressed against the true normal, the two cameras' frames are comparable.
-            normals[name, sigma], shape[name, sigma] = angle_deg(estimate.normal, truth.normal), estimate.axis_ratio
     for sigma in (0.0, 0.01):
-        assert normals["fisheye", sigma] < 0.025
-        assert normals["pinhole", sigma] < 0.025
-        assert shape["fisheye", sigma] == pytest.approx(shape["pinhole", sigma], rel=0.01)
+        shapes = []
+        for camera in (FISHEYE, PINHOLE):
+            truth, estimate = seen_through(session, camera, tilted(kind, angle, camera is PINHOLE), sigma)
+            found = estimate()
+            # Against the true normal, so that the two cameras' frames are comparable.
+            assert angle_deg(found.normal, truth.normal) < 0.025
+            shapes.append(found.axis_ratio)
+        assert shapes[0] == pytest.approx(shapes[1], rel=0.01)
 
 
 @pytest.mark.render
-@pytest.mark.parametrize(("kind", "angle"), [("plane", 2.0), ("plane", 45.0), ("cylinder", 30.0)])
-def test_normals_through_an_omnidirectional_lens(session, kind, angle):
-    """As through the fisheye, without noise to 0.02 deg; wrong signs of small coefficients, or no lens, are seen."""
-    scene = scene_from_dict({"surface": tilted(kind, angle, False), "camera": OMNI, "reflectance": {"type": "phong"}})
-    seen = render_view(session, scene)
-    (truth,) = [t for t in seen.highlights if t.isolated]
-    np.testing.assert_allclose(session.camera.project(truth.position), truth.bp_px, atol=1e-6)
-    frame = expose(seen.radiance.total, seen.full_scale, 0.0, from_integer(3))
-    (found,) = reconstruct(frame, session.camera, ["cone_axis"])
-    assert angle_deg(found.estimates["cone_axis"].normal, truth.normal) < 0.02
-    if angle > 20:
-        plain = dataclasses.replace(session.camera, distortion=None)
-        (ignored,) = reconstruct(frame, plain, ["cone_axis"])
-        assert angle_deg(ignored.estimates["cone_axis"].normal, truth.normal) > 2
+@pytest.mark.parametrize(
+    ("camera", "kind", "angle"),
+    [(OMNI, "plane", 2.0), (OMNI, "plane", 45.0), (OMNI, "cylinder", 30.0), (BARREL, "plane", 20.0)],
+)
+def test_normals_through_a_lens_and_without_its_model(session, camera, kind, angle):
+    """Without noise to 0.02 deg; wrong signs of an omnidirectional lens's small coefficients, or no lens, are seen."""
+    truth, estimate = seen_through(session, camera, tilted(kind, angle, False))
+    assert angle_deg(estimate().normal, truth.normal) < (0.02 if camera is OMNI else 0.01)
+    if angle < 15:
+        return
+    assert angle_deg(estimate(distortion=None).normal, truth.normal) > (2 if camera is OMNI else 0.5)
+    if camera is OMNI:
         wrong = dataclasses.replace(session.camera.distortion, d=-0.00296, e=0.00288)
-        swapped = dataclasses.replace(session.camera, distortion=wrong)
-        (other,) = reconstruct(frame, swapped, ["cone_axis"])
-        assert angle_deg(other.estimates["cone_axis"].normal, truth.normal) > 0.05
+        assert angle_deg(estimate(distortion=wrong).normal, truth.normal) > 0.05
 
 
 @pytest.mark.render
@@ -262,70 +263,105 @@ def test_normals_over_the_view_of_an_omnidirectional_lens(session):
     for i in range(24):
         kind, angle = ("plane", "cylinder")[i % 2], float(rng.uniform(0, 50))
         surface = tilted(kind, angle, False) | {"azimuth_deg": float(rng.uniform(0, 360))}
-        seen = render_view(session, scene_from_dict({"surface": surface, "camera": OMNI}))
-        (truth,) = [t for t in seen.highlights if t.isolated]
-        frame = expose(seen.radiance.total, seen.full_scale, 0.005, from_integer(i))
-        (found,) = reconstruct(frame, session.camera, ["cone_axis"])
-        errors.append(angle_deg(found.estimates["cone_axis"].normal, truth.normal))
+        truth, estimate = seen_through(session, OMNI, surface, 0.005, i)
+        errors.append(angle_deg(estimate().normal, truth.normal))
     assert np.median(errors) < 0.02
     assert max(errors) < 0.05
 
 
-@pytest.mark.render
-def test_normals_through_a_barrel_lens_and_without_its_model(session):
-    scene = scene_from_dict({"surface": tilted("plane", 20.0, False), "camera": BARREL})
-    seen = render_view(session, scene)
-    (truth,) = [t for t in seen.highlights if t.isolated]
-    np.testing.assert_allclose(session.camera.project(truth.position), truth.bp_px, atol=1e-6)
-    frame = expose(seen.radiance.total, seen.full_scale, 0.0, from_integer(0))
-    (found,) = reconstruct(frame, session.camera, ["cone_axis"])
-    assert angle_deg(found.estimates["cone_axis"].normal, truth.normal) < 0.01
-    plain = dataclasses.replace(session.camera, distortion=None)
-    (ignored,) = reconstruct(frame, plain, ["cone_axis"])
-    assert angle_deg(ignored.estimates["cone_axis"].normal, truth.normal) > 0.5
-
-
-SURFACES = [
-    {"type": "plane"},
-    {"type": "sphere", "radius_mm": 30.0, "side": "inside"},
-    {"type": "cylinder", "radius_mm": 20.0, "side": "inside"},
-    {"type": "quadric", "k1_per_mm": 0.02, "k2_per_mm": -0.03},
-    pytest.param({"type": "anatomy", "path": "colon"}, marks=pytest.mark.ci),
+SMALL = {"width": 160, "height": 120, "fx": 40.0, "fy": 40.0}
+COLON = {"type": "anatomy", "path": "colon"}
+VIEWS = [
+    ({"type": "plane"}, {"distortion": None, "fx": 80.0}, 4),
+    ({"type": "plane"}, {}, 1),
+    ({"type": "sphere", "radius_mm": 30.0, "side": "inside"}, {}, 4),
+    (
+        {"type": "cylinder", "radius_mm": 20.0, "side": "inside"},
+        {"distortion": {"type": "brown_conrady", "k1": -0.02}},
+        1,
+    ),
+    ({"type": "quadric", "k1_per_mm": 0.02, "k2_per_mm": -0.03}, {}, 1),
+    pytest.param(COLON, {}, 1, marks=pytest.mark.ci),
 ]
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("surface", SURFACES, ids=lambda surface: surface["type"])
-def test_frames_and_truth_through_a_masked_fisheye(session, surface):
-    """Each pixel's truth lies on its own sightline; outside the view there is neither radiance nor truth."""
-    camera = {**FISHEYE, "width": 160, "height": 120, "fx": 40.0, "fy": 40.0, "view_mask": {"radius": 50, "cx": 83.0}}
-    reflectance = {"type": "phong", "diffuse": 0.3}
-    session.update(scene_from_dict({"surface": surface, "camera": camera, "reflectance": reflectance}))
-    model, truth, radiance = session.camera, session.truth(), session.radiance()
-    seen = model.seen
-    assert 0 < seen.sum() < seen.size
-    assert not radiance.total[~seen].any()
-    assert radiance.total[truth.mask].all()
-    assert not truth.mask[~seen].any()
-    assert truth.mask[seen].mean() > 0.4  # the quadric is a patch
+@pytest.mark.parametrize(("surface", "lens", "samples"), VIEWS, ids=str)
+def test_frames_labels_and_truth_through_a_masked_lens(session, surface, lens, samples):
+    """Each pixel's truth lies on its own sightline; outside the view there is neither radiance nor truth.
+
+    A pixel is seen or not by its centre, whatever its samples.
+    """
+    mask = {"radius": 50, "cx": 83.0}
+    camera = SMALL | {"distortion": {"type": "kannala_brandt"}, "view_mask": mask} | lens
+    tables = {"surface": surface, "camera": camera, "render": {"samples_per_pixel": samples}}
+    session.update(scene_from_dict({**tables, "reflectance": {"type": "phong", "diffuse": 0.3}}))
+    assert session.sightlines.in_kernel == (session.camera.distortion is None)
+    model, frame, truth = session.camera, session.frame(), session.truth()
+    x, y = model.pixel_centres().transpose(2, 0, 1)
+    np.testing.assert_array_equal(model.seen, np.hypot(x - 83.0, y - 60.0) <= 50)
+    assert not frame.radiance.total[~model.seen].any()
+    assert frame.radiance.total[truth.mask].all()
+    np.testing.assert_array_equal(frame.labels.mask[~model.seen], False)
+    assert not truth.mask[~model.seen].any()
+    assert truth.mask[model.seen].mean() > 0.4  # the quadric is a patch
     for name in ("depth", "position", "normal", "shading_normal", "geometric_normal", "k_min", "direction_max"):
-        assert np.isnan(getattr(truth, name)[~seen]).all(), name
-    sightlines = truth.position / truth.depth[..., None]
-    np.testing.assert_allclose(sightlines[truth.mask], model.unproject(model.pixel_centres())[truth.mask], atol=1e-5)
-    assert all(model.contains(highlight.bp_px) for highlight in session.highlights(radiance))
+        assert np.isnan(getattr(truth, name)[~model.seen]).all(), name
+    for name in ("depth", "position", "normal", "k_min"):
+        assert np.isnan(getattr(frame.labels, name)[~model.seen]).all(), name
+    sightlines = model.unproject(model.pixel_centres())
+    np.testing.assert_allclose((truth.position / truth.depth[..., None])[truth.mask], sightlines[truth.mask], atol=1e-5)
+    both = truth.mask & frame.labels.mask
+    np.testing.assert_allclose(
+        (frame.labels.position / frame.labels.depth[..., None])[both], sightlines[both], atol=1e-4
+    )
+    assert all(model.contains(highlight.bp_px) for highlight in session.highlights(frame.radiance))
 
 
 @pytest.mark.render
-def test_more_samples_leave_the_border_of_the_view(session):
-    """A pixel is seen or not, as `Camera.seen` says, whatever its samples."""
-    camera = {"width": 40, "height": 30, "fx": 40.0, "fy": 40.0, "view_mask": {"radius": 8.3}}
-    scene = {"surface": {"type": "plane"}, "camera": camera, "reflectance": {"type": "phong", "diffuse": 1.0}}
-    session.update(scene_from_dict({**scene, "render": {"samples_per_pixel": 16}}))
-    np.testing.assert_array_equal(session.radiance().total > 0, session.camera.seen)
-    tiny = {**camera, "view_mask": {"radius": 0.6, "cx": 20.5, "cy": 15.5}}
-    session.update(scene_from_dict({**scene, "camera": tiny, "render": {"samples_per_pixel": 4}}))
+def test_a_view_of_one_pixel_is_that_pixel(session):
+    camera = {"width": 40, "height": 30, "fx": 40.0, "fy": 40.0, "view_mask": {"radius": 0.6, "cx": 20.5, "cy": 15.5}}
+    tables = {"surface": {"type": "plane"}, "reflectance": {"type": "phong", "diffuse": 1.0}}
+    session.update(scene_from_dict({**tables, "camera": camera, "render": {"samples_per_pixel": 4}}))
     np.testing.assert_array_equal(session.radiance().total > 0, session.camera.seen)
     assert np.count_nonzero(session.camera.seen) == 1
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("samples", [1, 3])
+def test_rays_that_are_given_trace_as_those_made_in_the_kernel(session, samples):
+    tables = {"surface": {"type": "sphere", "radius_mm": 6.0}, "camera": {**PINHOLE, "skew": 1.5}}
+    render = {"samples_per_pixel": samples, "seed": 2}
+    session.update(scene_from_dict({**tables, "reflectance": {"type": "phong", "diffuse": 0.3}, "render": render}))
+    expected = session.frame()
+    assert session.sightlines.in_kernel
+    session.sightlines.in_kernel = False
+    given = session.frame()
+    session.sightlines.in_kernel = True
+    slope = -np.sum(expected.labels.normal * expected.labels.position, axis=-1) / expected.labels.depth
+    inside = np.nan_to_num(slope) > np.cos(1.2)
+    assert inside.sum() > 1000
+    for part in ("specular", "diffuse"):
+        a, b = getattr(given.radiance, part), getattr(expected.radiance, part)
+        assert np.percentile(np.abs(a - b)[inside], 99) < 1e-5 * expected.radiance.total.max()
+    np.testing.assert_allclose(given.labels.depth[inside], expected.labels.depth[inside], rtol=1e-4)
+
+
+def test_only_a_pinhole_has_its_rays_made_in_the_kernel():
+    """Whatever its class: a lens may turn its outer sightlines inwards, or have none beyond a radius."""
+
+    class Lens(Camera):
+        strength, reach = 0.0, np.inf
+
+        def unproject(self, points_px):
+            rays = super().unproject(points_px)
+            squared = (rays[..., :2] ** 2).sum(axis=-1, keepdims=True)
+            rays[..., :2] *= 1 - self.strength * squared
+            return np.where(np.sqrt(squared) > self.reach, np.nan, rays)
+
+    for values, plain in (({}, True), ({"strength": 1e-4}, False), ({"reach": 0.5}, False)):
+        camera = type("Other", (Lens,), values)(90, 70, 80.0, 76.0, 44.0, 37.0, 1.5)
+        assert is_pinhole(camera) == plain
 
 
 @pytest.mark.render

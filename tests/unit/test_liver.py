@@ -1,13 +1,13 @@
-"""The generated liver: derivatives against finite differences, Newton points, a closed even mesh."""
+"""The generated liver: derivatives against finite differences, a closed even mesh; its points: test_surfaces."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+from surface_helpers import gradient, hits_on, interpolated_normals
 
 from simtest.errors import InputError
 from simtest.surfaces.liver import _project, build
-from simtest.surfaces.model import RayHits
 from simtest.surfaces.poses import at_viewpoint
 from simtest.surfaces.recipe import LiverRecipe, load_recipe
 
@@ -26,81 +26,14 @@ def recipe() -> LiverRecipe:
     return recipe
 
 
-def chosen_hits(recipe, count=4000, seed=0):
-    mesh = build(recipe).mesh
-    rng = np.random.default_rng(seed)
-    face, (b, c) = rng.integers(len(mesh.faces), size=count), np.sort(rng.random((2, count)), axis=0)
-    b, c = b, c - b
-    points = np.einsum("cn,nci->ni", np.stack([1 - b - c, b, c]), mesh.vertices[mesh.faces[face]])
-    facing = mesh.normals[mesh.faces[face, 0]]
-    origins = points + 60.0 * facing + rng.normal(size=(count, 3)) * 15
-    directions = points - origins
-    distance = np.linalg.norm(directions, axis=1)
-    return origins, directions / distance[:, None], RayHits(distance, face, np.stack([b, c], axis=1)), facing
-
-
-def gradient(f, points, h=STEP):
-    """4th-order finite differences of a function of points, shape (N, 3), on the last axis of the result."""
-    parts = []
-    for axis in np.eye(3):
-        m2, m1, p1, p2 = (f(points + k * h * axis) for k in (-2, -1, 1, 2))
-        parts.append((m2 - 8 * m1 + 8 * p1 - p2) / (12 * h))
-    return np.stack(parts, axis=-1)
-
-
 def test_gradient_and_hessian_match_finite_differences(recipe):
     body = build(recipe).body
     points = build(recipe).mesh.vertices[::37] + np.random.default_rng(0).normal(size=3)
     at = body.evaluate(points)
     np.testing.assert_allclose(at.value, body.values(points), atol=1e-12)
-    np.testing.assert_allclose(at.gradient, gradient(body.values, points), atol=2e-7)
-    np.testing.assert_allclose(at.hessian, gradient(lambda p: body.evaluate(p).gradient, points), atol=2e-7)
+    np.testing.assert_allclose(at.gradient, gradient(body.values, points, STEP), atol=2e-7)
+    np.testing.assert_allclose(at.hessian, gradient(lambda p: body.evaluate(p).gradient, points, STEP), atol=2e-7)
     np.testing.assert_allclose(at.hessian, at.hessian.transpose(0, 2, 1), atol=1e-14)
-
-
-def test_normals_and_curvatures_match_finite_differences_of_the_surface(recipe):
-    """The surface as a height over its tangent plane: heights by bisection of F, differenced for normal and S."""
-    body = build(recipe).body
-    origins, directions, hits, _ = chosen_hits(recipe, 300)
-    points = make_liver(recipe, 0).points(origins, directions, hits)
-    ok = points.valid
-    p, n = points.position[ok], points.normal[ok]
-    first, second = points.direction_min[ok], points.direction_max[ok]
-
-    def height(x, y):
-        foot = p + x * first + y * second
-        low, high = np.full(len(p), -0.5), np.full(len(p), 0.5)
-        for _ in range(52):
-            middle = (low + high) / 2
-            outside = body.values(foot + middle[:, None] * n) > 0
-            low, high = np.where(outside, low, middle), np.where(outside, middle, high)
-        return (low + high) / 2
-
-    h = 0.05
-    for k, (x, y) in ((points.k_min[ok], (1, 0)), (points.k_max[ok], (0, 1))):
-        m2, m1, z, p1, p2 = (height(s * h * x, s * h * y) for s in (-2, -1, 0, 1, 2))
-        slope = (m2 - 8 * m1 + 8 * p1 - p2) / (12 * h)
-        bend = -(-m2 + 16 * m1 - 30 * z + 16 * p1 - p2) / (12 * h * h)
-        assert np.abs(slope).max() < 1e-6
-        assert (np.abs(bend - k) <= 1e-4 * np.maximum(np.abs(k), 1 / 30)).all()
-    twist = (height(h, h) - height(h, -h) - height(-h, h) + height(-h, -h)) / (4 * h * h)
-    assert np.abs(twist).max() < 2e-4  # of second order only
-
-
-def test_newton_points_lie_on_ray_and_surface(recipe):
-    origins, directions, hits, _ = chosen_hits(recipe)
-    hits.distance[0] = np.inf
-    points = make_liver(recipe, 0).points(origins, directions, hits)
-    assert not points.valid[0]
-    assert np.isnan(points.normal[0]).all()
-    assert points.valid.mean() > 0.998
-    ok = points.valid
-    assert np.abs(build(recipe).body.values(points.position[ok])).max() < 1e-10
-    np.testing.assert_allclose(
-        points.position[ok], origins[ok] + points.distance[ok, None] * directions[ok], atol=1e-12
-    )
-    assert np.abs(points.distance - hits.distance)[ok].max() < 0.5
-    assert (np.einsum("ni,ni->n", points.normal, directions)[ok] < 0).all()
 
 
 def test_mesh_is_closed_even_and_on_the_surface(recipe):
@@ -126,8 +59,10 @@ def test_mesh_is_closed_even_and_on_the_surface(recipe):
 
 
 def test_outside_is_convex_and_the_inferior_edge_sharp(recipe):
-    origins, directions, hits, _ = chosen_hits(recipe)
+    origins, directions, hits, _ = hits_on(build(recipe).mesh, 4000, 60.0, 15.0)
     points = make_liver(recipe, 0).points(origins, directions, hits)
+    assert points.valid.mean() > 0.998
+    assert np.nanmax(np.abs(points.distance - hits.distance)) < 0.5
     assert np.nanmedian(points.k_max) > 1 / 100
     assert 0.1 < np.nanmax(points.k_max) < 0.6
     assert np.nanmin(points.k_min) < 0  # the hollow of the visceral face
@@ -149,12 +84,8 @@ def test_impossible_bodies_are_refused(recipe):
 
 def test_interpolated_normals_are_those_of_the_surface(recipe):
     body, mesh = build(recipe).body, build(recipe).mesh
-    rng = np.random.default_rng(0)
+    face, weights, shown = interpolated_normals(mesh)
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    face, weights = rng.choice(len(area), 100_000, p=area / area.sum()), rng.dirichlet([1, 1, 1], 100_000)
-    shown = np.einsum("nc,nci->ni", weights, mesh.normals[mesh.faces[face]])
-    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
     exact = body.normals(_project(body, np.einsum("nc,nci->ni", weights, corners[face]), 4))
     error = np.degrees(np.arcsin(np.linalg.norm(np.cross(shown, exact), axis=1).clip(max=1)))
     assert error.mean() < 0.05

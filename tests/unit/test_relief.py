@@ -1,6 +1,6 @@
-"""The relief against 4th-order differences of its height, its told statistics, and the same inside a kernel."""
+"""The relief: its told statistics, film and diffuse light; its normals on all surfaces stand in test_surfaces."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from surface_helpers import RELIEF, STENCIL, curvatures, derivative, normals, relative
 
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
@@ -18,30 +19,7 @@ from simtest.surfaces.relief_field import NODES, make_relief, normal_derivative
 from tests.example_counts import examples
 from tests.marked import marked
 
-STENCIL = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))
-"""Central differences of 4th order."""
-
-SECOND_STENCIL = ((-2, -1 / 12), (-1, 16 / 12), (0, -30 / 12), (1, 16 / 12), (2, -1 / 12))
-
-RELIEF = {
-    "bands": [
-        {"slope_deg": 4, "wavelength_mm": 1.5},
-        {"slope_deg": 2, "wavelength_mm": 0.9, "kind": "ridged", "anisotropy": 2, "direction": [1, 2, 0]},
-        {"slope_deg": 1.5, "wavelength_mm": 2.2, "kind": "pits"},
-    ],
-    "seed": 3,
-}
-
 MESH = Path(__file__).resolve().parents[2] / "meshes" / "colon_40mm.ply"
-
-SURFACES = {
-    "plane": {"type": "plane", "distance_mm": 20, "tilt_deg": 25},
-    "sphere": {"type": "sphere", "distance_mm": 20, "radius_mm": 15},
-    "inside of a cylinder": {"type": "cylinder", "distance_mm": 12, "radius_mm": 20, "side": "inside"},
-    "quadric": {"type": "quadric", "distance_mm": 15, "k1_per_mm": 0.05, "k2_per_mm": -0.03},
-    "colon": {"type": "anatomy", "path": "colon"},
-    "liver": {"type": "anatomy", "path": "liver"},
-}
 
 BAND = {"slope_deg": 4.0, "wavelength_mm": 1.5}
 
@@ -54,136 +32,6 @@ def scene(surface, relief):
 def make(level=None, seed=0, **values):
     """Return the field of one band."""
     return make_relief(Relief(bands=({**BAND, **values},), seed=seed), level)
-
-
-@dataclass(frozen=True)
-class Differences:
-    """Fine normals and principal curvatures, (N, 2), by differences over the image, and the exact points."""
-
-    points: object
-    base: np.ndarray
-    normal: np.ndarray
-    curvature: np.ndarray
-
-
-def normals(J, dh, away):
-    """Return base and fine normals, against the vectors `away`, of tangents J = dX/dx, (N, 3, 2), and dh/dx, (N, 2)."""
-    base = np.cross(J[:, :, 0], J[:, :, 1])
-    base *= -np.sign(np.sum(base * away, axis=1, keepdims=True)) / np.linalg.norm(base, axis=1, keepdims=True)
-    inverse = np.linalg.inv(np.einsum("nij,nik->njk", J, J))
-    normal = base - np.einsum("nij,njk,nk->ni", J, inverse, dh)
-    return base, normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-
-def curvatures(J, normal, dn):
-    """Return the principal curvatures, (N, 2), of fine normals with derivatives dn/dx, (N, 3, 2)."""
-    inverse = np.linalg.inv(np.einsum("nij,nik->njk", J, J))
-    # A tangent f of the fine surface stands over the base's tangent f - N (N.f) = J a.
-    first = np.cross(normal, np.roll(normal, 1, axis=1))
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    tangents = np.stack([first, np.cross(normal, first)], axis=2)
-    a = np.einsum("njk,nij,nit->nkt", inverse, J, tangents)
-    form = np.einsum("nif,nik,nkt->nft", tangents, dn, a)
-    return np.linalg.eigvalsh((form + np.swapaxes(form, 1, 2)) / 2)
-
-
-def by_differences(session, pixels, step):
-    """Difference positions, heights and fine normals along the image: each pixel position is a point of the base.
-
-    With J = dX/dx the base's normal is across J's columns, the surface gradient is J (J^T J)^-1 dh/dx. Nothing here
-    uses gradient or Hessian of the relief, or the base's normal. The model frame is the camera's here.
-    """
-    pose = session.surface.model_from_camera
-
-    def heights(points):
-        return session.surface.relief.jets(points.position @ pose[:3, :3].T + pose[:3, 3]).value
-
-    points = session.exact_points(pixels)
-    J, dn, dh = np.zeros((len(pixels), 3, 2)), np.zeros((len(pixels), 3, 2)), np.zeros((len(pixels), 2))
-    for axis in range(2):
-        for k, weight in STENCIL:
-            near = session.exact_points(pixels + k * step * np.eye(2)[axis])
-            J[:, :, axis] += weight / step * near.position
-            dn[:, :, axis] += weight / step * near.normal
-            dh[:, axis] += weight / step * np.nan_to_num(heights(replace(near, position=np.nan_to_num(near.position))))
-    usable = np.flatnonzero(np.isfinite(J).all(axis=(1, 2)) & points.valid)
-    some = {name: getattr(points, name)[usable] for name in points.__dataclass_fields__}
-    J, dn, dh = J[usable], dn[usable], dh[usable]
-    base, normal = normals(J, dh, some["position"])
-    return Differences(replace(points, **some), base, normal, curvatures(J, normal, dn))
-
-
-def relative(found, curvature):
-    """Return the error of both curvatures over the larger one's size, at least that of a radius of 1 m.
-
-    In pools on a plane both vanish, and differences know nothing relative to that.
-    """
-    return np.abs(found - curvature).max(axis=1) / np.maximum(np.abs(curvature).max(axis=1), 1e-3)
-
-
-@pytest.mark.parametrize(
-    ("name", "level"),
-    marked(
-        product(SURFACES, [None, -0.5]),
-        ci=[("quadric", None), ("quadric", -0.5), ("colon", None)],
-        slow=[("liver", None), ("liver", -0.5)],
-    ),
-)
-def test_fine_normals_and_curvatures_are_those_of_the_height(name, level):
-    session = Session(scene(SURFACES[name], RELIEF))
-    session.surface.relief = make_relief(session.scene.surface.relief, level)
-    pixels = np.random.default_rng(5).uniform([4, 4], [60, 44], (300, 2))
-    wide, fine = by_differences(session, pixels, 1e-3), by_differences(session, pixels, 1e-4)
-    assert len(wide.points.normal) >= 200
-    assert np.linalg.norm(wide.normal - wide.points.normal, axis=1).max() < 1e-6
-    assert np.linalg.norm(wide.base - wide.points.normal_base, axis=1).max() < 1e-6
-    # Not smooth by chance
-    assert np.median(np.linalg.norm(wide.points.normal - wide.points.normal_base, axis=1)) > np.radians(1)
-    exact = np.stack([fine.points.k_min, fine.points.k_max], axis=1)
-    assert relative(fine.curvature, exact).max() < 1e-4
-
-
-def test_principal_directions_of_the_fine_surface():
-    session = Session(scene(SURFACES["inside of a cylinder"], RELIEF))
-    pixels = np.random.default_rng(5).uniform([4, 4], [60, 44], (200, 2))
-    points = session.exact_points(pixels)
-    for direction in (points.direction_min, points.direction_max):
-        assert np.abs(np.sum(direction * points.normal, axis=1)).max() < 1e-12
-        assert np.allclose(np.linalg.norm(direction, axis=1), 1)
-    assert np.abs(np.sum(points.direction_min * points.direction_max, axis=1)).max() < 1e-12
-    assert (points.k_min <= points.k_max).all()
-
-
-def test_on_a_plane_the_relief_is_the_graph_of_its_height():
-    """The closed form of a graph's normal and curvature, from differences of the height in the plane alone."""
-    session = Session(scene({"type": "plane", "distance_mm": 20}, RELIEF))
-    points = session.exact_points(np.random.default_rng(2).uniform([4, 4], [60, 44], (300, 2)))
-    height = session.surface.relief.jets
-    pose = session.surface.model_from_camera
-    step = 1e-4
-
-    def h(x, y):
-        # The plane faces the camera: its height points along -z.
-        moved = points.position + np.array([x, y, 0.0])
-        return height(moved @ pose[:3, :3].T + pose[:3, 3]).value
-
-    hx, hy = (sum(w * h(*(k * step * np.eye(2)[i])) for k, w in STENCIL) / step for i in range(2))
-    wide = 1e-3
-    hxx, hyy = (sum(w * h(*(k * wide * np.eye(2)[i])) for k, w in SECOND_STENCIL) / wide**2 for i in range(2))
-    hxy = sum(v * w * h(j * wide, k * wide) for j, v in STENCIL for k, w in STENCIL) / wide**2
-    root = np.sqrt(1 + hx**2 + hy**2)
-    normal = np.stack([-hx, -hy, -np.ones_like(hx)], axis=1) / root[:, None]
-    assert np.linalg.norm(normal - points.normal, axis=1).max() < 1e-6
-    gauss = (hxx * hyy - hxy**2) / root**4
-    mean = -((1 + hy**2) * hxx - 2 * hx * hy * hxy + (1 + hx**2) * hyy) / (2 * root**3)
-    size = np.maximum(np.abs(points.k_min), np.abs(points.k_max))
-    # Here the step is wide, and a spline's third derivative jumps at the knots that it straddles.
-    off = np.maximum(
-        np.abs(points.k_min + points.k_max - 2 * mean) / size, np.abs(points.k_min * points.k_max - gauss) / size**2
-    )
-    assert np.median(off) < 1e-5
-    assert np.quantile(off, 0.95) < 1e-4
-    assert off.max() < 1e-2
 
 
 @pytest.mark.filterwarnings("ignore:.*inside out")
@@ -373,34 +221,14 @@ def test_film_fills_valleys_smoothly(height, level, gradient):
     filled = field.fill(jets)
     surface = max(height, field.level)
     assert surface - 1e-15 <= filled.value[0] <= surface + np.log(2) * field.meniscus + 1e-15
-    # phi' from differences of phi
-    e = 1e-6
-    near = [field.fill(Jet(jets.value + k * e, *jets.parts[1:])).value for k, _ in STENCIL]
-    share = sum(w * value for (_, w), value in zip(STENCIL, near, strict=True)) / e
+
+    def near(k):
+        return field.fill(Jet(jets.value + k, *jets.parts[1:]))
+
+    # phi' from differences of phi, and phi'' from those of phi'
+    share, bend = (derivative(lambda k, n=n: near(k).parts[n], 1e-6) for n in (0, 1))
     assert np.allclose(filled.gradient, share[:, None] * G, atol=1e-8)
-    # and phi'' from those of phi'
-    steps = [field.fill(Jet(jets.value + k * e, *jets.parts[1:])).gradient for k, _ in STENCIL]
-    bend = sum(w * value for (_, w), value in zip(STENCIL, steps, strict=True)) / e
     assert np.allclose(filled.hessian[0], np.outer(bend[0], G[0]), atol=1e-5 * (1 + np.abs(filled.hessian).max()))
-
-
-def test_pools_are_smooth_and_crests_keep_their_relief():
-    relief = {**RELIEF, "bands": RELIEF["bands"][:1]}
-    session = Session(scene(SURFACES["plane"], relief))
-    pixels = session.camera.pixel_centres().reshape(-1, 2)
-    rough = session.exact_points(pixels)
-    assert not rough.pool.any()
-    session.surface.relief = make_relief(session.scene.surface.relief, 0.3)
-    wet, field = session.exact_points(pixels), session.surface.relief
-    pose = session.surface.model_from_camera
-    height = field.tissue_jets(wet.position @ pose[:3, :3].T + pose[:3, 3]).value
-    assert np.array_equal(wet.pool, height < field.level)
-    # Of a gaussian field 62 % lie below 0.3 deviations.
-    assert wet.pool.mean() == pytest.approx(0.618, abs=0.08)
-    deep, high = height < field.level - 10 * field.meniscus, height > field.level + 10 * field.meniscus
-    assert np.linalg.norm(wet.normal - wet.normal_base, axis=1)[deep].max() < 2e-5
-    assert np.linalg.norm(wet.normal - rough.normal, axis=1)[high].max() < 2e-5
-    assert min(deep.sum(), high.sum()) > 50
 
 
 def test_diffuse_light_sees_the_field_smoothed_in_space():
@@ -429,7 +257,7 @@ def test_short_waves_are_not_seen_by_diffuse_light_and_long_ones_are():
 
 def test_the_kernel_finds_the_lattices_nodes():
     """In single precision, at whole numbers of cells far from the origin too."""
-    session = Session(scene(SURFACES["plane"], RELIEF))
+    session = Session(scene({"type": "plane"}, RELIEF))
     import drjit as dr
 
     from simtest.rendering.tissue_kernels import _modulo

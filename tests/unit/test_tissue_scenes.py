@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.special import erf
 
 from simtest.rendering import Session
 from simtest.spec import scene_from_dict
+from tests.lobe_formulas import film_value
 
 pytestmark = pytest.mark.render
 
@@ -26,18 +26,6 @@ def scene(film, relief=None, diffuse=0.4, lights=({},), focal=FOCAL, **surface):
     )
 
 
-def fresnel(cosine, index):
-    inside = np.sqrt(1 - (1 - cosine**2) / index**2)
-    s = (cosine - index * inside) / (cosine + index * inside)
-    p = (index * cosine - inside) / (index * cosine + inside)
-    return (s**2 + p**2) / 2
-
-
-def smith(cosine, alpha):
-    a = 1 / np.maximum(alpha * np.sqrt(1 - cosine**2) / cosine, 1e-9)
-    return 2 / (1 + erf(a) + np.exp(-(a**2)) / (a * np.sqrt(np.pi)))
-
-
 def plane_film(alpha, index, tilt_deg, light):
     """Radiance of a tilted plane's Beckmann film at all pixels, by theory: I/r^2 F D G / (4 cos) towards the camera."""
     tilt = np.radians(tilt_deg)
@@ -48,30 +36,28 @@ def plane_film(alpha, index, tilt_deg, light):
     towards = np.array(light) - P
     squared = np.sum(towards**2, axis=-1)
     wi, wo = -P / np.linalg.norm(P, axis=-1, keepdims=True), towards / np.sqrt(squared)[..., None]
-    h = wi + wo
-    h /= np.linalg.norm(h, axis=-1, keepdims=True)
-    cosine = h @ N
-    D = np.exp((1 - 1 / cosine**2) / alpha**2) / (np.pi * alpha**2 * cosine**4)
-    G = smith(wi @ N, alpha) * smith(wo @ N, alpha)
-    return fresnel(np.sum(wi * h, axis=-1), index) * D * G / (4 * (wi @ N)) / squared
+    first = np.array([np.cos(tilt), 0.0, np.sin(tilt)])
+    axes = np.stack([first, np.cross(N, first), N], axis=1)
+    return film_value(wi @ axes, wo @ axes, alpha, index, "beckmann") / squared
 
 
 @pytest.mark.parametrize(("alpha", "index"), [(0.01, 1.33), (0.03, 1.36), (0.1, 1.4)])
-@pytest.mark.parametrize(("tilt_deg", "light"), [(0.0, (0.0, 0.0, 0.0)), (20.0, (8.0, 1.0, 1.0))])
-def test_a_planes_highlight_is_the_closed_forms(alpha, index, tilt_deg, light):
+def test_a_planes_highlight_is_the_closed_forms(alpha, index):
     """The peak and all of the lobe down to a thousandth of it, within 1e-3."""
-    film = {"index": index, "alpha": alpha}
-    rendered = Session(scene(film, tilt_deg=tilt_deg, lights=({"position_mm": list(light)},))).radiance().specular
-    expected = plane_film(alpha, index, tilt_deg, light)
-    seen = expected > 1e-3 * expected.max()
-    assert seen.sum() > 100
-    assert rendered.max() == pytest.approx(expected.max(), rel=1e-3)
-    assert np.unravel_index(rendered.argmax(), rendered.shape) == np.unravel_index(expected.argmax(), expected.shape)
-    np.testing.assert_allclose(rendered[seen], expected[seen], rtol=1e-3)
-    if tilt_deg == 0:
-        # Straight on: F(0) / (4 pi alpha^2) over the squared distance.
-        straight = ((index - 1) / (index + 1)) ** 2 / (4 * np.pi * alpha**2) / DISTANCE**2
-        assert rendered.max() == pytest.approx(straight, rel=1e-3)
+    session = Session(scene({"index": index, "alpha": alpha}))
+    for tilt_deg, light in ((0.0, (0.0, 0.0, 0.0)), (20.0, (8.0, 1.0, 1.0))):
+        lights = ({"position_mm": list(light)},)
+        session.update(scene({"index": index, "alpha": alpha}, tilt_deg=tilt_deg, lights=lights))
+        rendered, expected = session.radiance().specular, plane_film(alpha, index, tilt_deg, light)
+        seen = expected > 1e-3 * expected.max()
+        assert seen.sum() > 100
+        assert rendered.max() == pytest.approx(expected.max(), rel=1e-3)
+        assert rendered.argmax() == expected.argmax()
+        np.testing.assert_allclose(rendered[seen], expected[seen], rtol=1e-3)
+        if tilt_deg == 0:
+            # Straight on: F(0) / (4 pi alpha^2) over the squared distance.
+            straight = ((index - 1) / (index + 1)) ** 2 / (4 * np.pi * alpha**2) / DISTANCE**2
+            assert rendered.max() == pytest.approx(straight, rel=1e-3)
 
 
 # What estimators are told ---------------------------------------------------------------------------------------------
@@ -117,39 +103,32 @@ def kernel_hits(session):
     return np.array(hit.jets.height, dtype=float), fine, base
 
 
-def test_pools_are_smooth_and_crests_are_rough():
-    """A film up to the mean height: below it the rendered normals are the base's, above it the relief's."""
-    session = Session(scene({**FILM, "level": 0.0}, RELIEF, focal=WIDE))
-    height, fine, base = kernel_hits(session)
+def test_pools_are_smooth_and_crests_are_rough_and_the_truth_tells_them_apart():
+    """Below the film's level the rendered normals are the base's, above it the relief's."""
     bare = kernel_hits(Session(scene(FILM, RELIEF, focal=WIDE)))[1]
-    deviation, meniscus = session.surface.relief.deviation, session.surface.relief.meniscus
-    # Here the meniscus, a tenth of a deviation wide, has ended.
-    deep, high = height < -1.2 * deviation, height > 1.2 * deviation
-    assert min(deep.sum(), high.sum()) > 300
-    turned = np.linalg.norm(fine - base, axis=1)
-    assert turned[deep].max() < 1e-5
-    assert np.linalg.norm(bare - base, axis=1)[deep].mean() > np.radians(3)
-    assert np.linalg.norm(fine - bare, axis=1)[high].max() < 1e-5
-    assert turned[high].mean() > np.radians(3)
-    # Between them the film's surface bends by the softplus's slope.
-    share = 1 / (1 + np.exp(-height / meniscus))
-    # On a plane the fine normal's tangent part over its normal part is the gradient.
-    slope, bare_slope = (np.linalg.norm(n[:, :2], axis=1) / np.abs(n[:, 2]) for n in (fine, bare))
-    np.testing.assert_allclose(slope, share * bare_slope, atol=2e-5)
-
-
-def test_the_truth_tells_pools_from_crests():
-    session = Session(scene({**FILM, "level": 0.5}, RELIEF, focal=WIDE))
-    height, _, _ = kernel_hits(session)
-    level = session.surface.relief.level
-    truth = session.truth()
-    clear = np.abs(height - level) > 1e-4 * session.surface.relief.deviation
-    assert clear.mean() > 0.99
-    np.testing.assert_array_equal(truth.pool.ravel()[clear], (height < level)[clear])
-    # About as many as a Gaussian has below half a deviation.
-    assert 0.6 < truth.pool.mean() < 0.78
-    deep = truth.pool & (height.reshape(truth.pool.shape) < level - session.surface.relief.deviation)
-    np.testing.assert_allclose(truth.normal[deep], truth.normal_base[deep], atol=1e-5)
+    for film_level, least, most in ((0.0, 0.42, 0.6), (0.5, 0.6, 0.78)):
+        session = Session(scene({**FILM, "level": film_level}, RELIEF, focal=WIDE))
+        height, fine, base = kernel_hits(session)
+        relief, truth = session.surface.relief, session.truth()
+        # There the meniscus, a tenth of a deviation wide, has ended.
+        deep, high = (sign * (height - relief.level) > 1.2 * relief.deviation for sign in (-1, 1))
+        assert min(deep.sum(), high.sum()) > 100
+        turned = np.linalg.norm(fine - base, axis=1)
+        assert turned[deep].max() < 1e-5
+        assert np.linalg.norm(bare - base, axis=1)[deep].mean() > np.radians(3)
+        assert np.linalg.norm(fine - bare, axis=1)[high].max() < 1e-5
+        assert turned[high].mean() > np.radians(3)
+        # Between them the film's surface bends by the softplus's slope. On a plane the fine normal's tangent part over
+        # its normal part is the gradient.
+        share = 1 / (1 + np.exp(-(height - relief.level) / relief.meniscus))
+        slope, bare_slope = (np.linalg.norm(n[:, :2], axis=1) / np.abs(n[:, 2]) for n in (fine, bare))
+        np.testing.assert_allclose(slope, share * bare_slope, atol=2e-5)
+        clear = np.abs(height - relief.level) > 1e-4 * relief.deviation
+        assert clear.mean() > 0.99
+        np.testing.assert_array_equal(truth.pool.ravel()[clear], (height < relief.level)[clear])
+        # About as many as a Gaussian has below the level.
+        assert least < truth.pool.mean() < most
+        np.testing.assert_allclose(truth.normal.reshape(-1, 3)[deep], truth.normal_base.reshape(-1, 3)[deep], atol=1e-5)
     assert not Session(scene(FILM, RELIEF, focal=WIDE)).truth().pool.any()
 
 

@@ -1,6 +1,6 @@
-"""What is computed twice, in NumPy and in a kernel, is the same: relief, colour, light, a colon's points.
+"""What is computed twice, in NumPy and in a kernel, is the same: relief, colour, light.
 
-The misfit's twins are compared in test_highlight_search, the instruments' in test_instruments.
+A colon's points are compared in test_surfaces, the misfit in test_highlight_search, instruments in test_instruments.
 """
 
 import numpy as np
@@ -9,18 +9,14 @@ import pytest
 from simtest.rendering import backend
 from simtest.rendering.elements.lights import LightPose, factor, kind_of, parameters
 from simtest.rendering.tissue_kernels import AlbedoKernel, ReliefKernel
-from simtest.rendering.tube_kernel import TubeKernel
 from simtest.spec import load_scene
 from simtest.spec.lights import LightSpec
 from simtest.spec.reflectance import TissueColour
 from simtest.spec.scene import scene_from_dict
 from simtest.spec.surfaces import Relief
-from simtest.surfaces import RayHits, make_surface
-from simtest.surfaces.model import pack_points
-from simtest.surfaces.recipe import ColonRecipe, Polyp
+from simtest.surfaces import make_surface
 from simtest.surfaces.relief_field import make_relief
 from simtest.surfaces.tissue_pattern import make_pattern
-from simtest.surfaces.tube import Tube, TubeChart
 from simtest.surfaces.vessels import surface_patch
 
 pytestmark = pytest.mark.render
@@ -48,24 +44,28 @@ def in_kernel(kind, values):
     return kind(np.ascontiguousarray(rounded.T)), rounded.astype(float)
 
 
-@pytest.mark.parametrize("level", [None, 0.2])
 @pytest.mark.parametrize("name", ["all kinds", *TISSUES])
-def test_relief(mi, name, level):
-    spec = KINDS if name == "all kinds" else load_scene(name).surface.relief
-    field = make_relief(spec, level)
-    lanes, points = in_kernel(mi.Point3f, np.random.default_rng(9).uniform(-40, 40, (COUNT, 3)))
-    jets = ReliefKernel(field).jets(lanes, True, bent=True)
+def test_relief(mi, name):
     import drjit as dr
 
-    dr.eval(jets.height, jets.gradient, jets.diffused, jets.hessian)
-    exact, diffused, tissue = field.jets(points), field.tissue_jets(points, diffused=True), field.tissue_jets(points)
-    # A place up to 70 mm from the origin is rounded by 5e-6 mm in the lattice.
-    atol = 1e-5 if name == "all kinds" else 5e-6 * np.abs(exact.hessian).max()
-    assert np.abs(np.array(jets.gradient).T - exact.gradient).max() < atol
-    assert np.abs(np.array(jets.diffused).T - diffused.gradient).max() < atol
-    assert np.abs(np.array(jets.height) - tissue.value).max() < 1e-4 * field.deviation
-    six = exact.hessian[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T
-    assert np.abs(np.array(jets.hessian) - six).max() < 1e-4 * np.abs(six).max()
+    spec = KINDS if name == "all kinds" else load_scene(name).surface.relief
+    lanes, points = in_kernel(mi.Point3f, np.random.default_rng(9).uniform(-40, 40, (COUNT, 3)))
+    for level in (None, 0.2):
+        field = make_relief(spec, level)
+        jets = ReliefKernel(field).jets(lanes, True, bent=True)
+        dr.eval(jets.height, jets.gradient, jets.diffused, jets.hessian)
+        exact, diffused, tissue = (
+            field.jets(points),
+            field.tissue_jets(points, diffused=True),
+            field.tissue_jets(points),
+        )
+        # A place up to 70 mm from the origin is rounded by 5e-6 mm in the lattice.
+        atol = 1e-5 if name == "all kinds" else 5e-6 * np.abs(exact.hessian).max()
+        assert np.abs(np.array(jets.gradient).T - exact.gradient).max() < atol
+        assert np.abs(np.array(jets.diffused).T - diffused.gradient).max() < atol
+        assert np.abs(np.array(jets.height) - tissue.value).max() < 1e-4 * field.deviation
+        six = exact.hessian[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T
+        assert np.abs(np.array(jets.hessian) - six).max() < 1e-4 * np.abs(six).max()
 
 
 COLOURED = {
@@ -107,57 +107,17 @@ LIGHTS = {
 }
 
 
-@pytest.mark.parametrize("name", LIGHTS)
-def test_emission(mi, name):
-    light = LightSpec(**LIGHTS[name])
+def test_emission(mi):
     directions = np.random.default_rng(4).normal(size=(COUNT, 3))
     directions[::2, 2] = 2 * np.abs(directions[::2, 2])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     lanes, away = in_kernel(mi.Vector3f, directions)
-    values = parameters(light, LightPose(np.zeros(3), light.axis, light.across))
-    found = np.broadcast_to(np.array(factor(kind_of(light), values, lanes)), COUNT)
-    # Next to the rim of a spot single precision may decide otherwise.
-    angle = np.degrees(np.arccos(np.clip(away @ light.axis, -1, 1)))
-    apart = np.abs(angle - (light.spot_deg or 720.0) / 2) > 1e-4
-    np.testing.assert_allclose(found[apart], light.factor(away)[apart], atol=1e-5)
-    assert apart.mean() > 0.99
-
-
-RECIPES = [
-    ColonRecipe(),
-    ColonRecipe(relief_mm=0.1, seed=7),
-    ColonRecipe(length_mm=60, radius_mm=6, bend_deg=170, sway_deg=20, sway_length_mm=60, fold_depth_mm=2.5,
-                taenia_mm=0.3),
-    ColonRecipe(polyps=(Polyp(along_mm=60, around_deg=90),)),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("recipe", RECIPES)
-def test_tube(recipe):
-    tube, rng = Tube(recipe), np.random.default_rng(5)
-    count = 300
-    u, v = rng.uniform(0, recipe.length_mm, count), rng.uniform(0, 2 * np.pi, count)
-    target = tube.tangents(u, v)[0]
-    origins = tube.centreline(np.clip(u + rng.uniform(-3, 3, count), 0, recipe.length_mm))
-    directions = target - origins
-    distance = np.linalg.norm(directions, axis=1)
-    directions /= distance[:, None]
-    # Triangles about the start, which is off by some tenths of a millimetre; every seventh ray misses, one is no ray.
-    corners = np.stack([u, v], axis=1)[:, None] + rng.uniform(-0.2, 0.2, (count, 3, 2)) * [1, 1 / recipe.radius_mm]
-    missed = np.arange(count) % 7 == 0
-    directions[3] = np.nan
-    start = np.where(missed, np.inf, distance + rng.uniform(-0.1, 0.1, count))
-    hits = RayHits(start, np.arange(count), rng.uniform(0, 0.5, (count, 2)))
-    backend.load()
-    found = TubeKernel(TubeChart(tube, corners)).solve(origins, directions, hits, np.eye(4))
-    u0, v0 = np.einsum("nc,nck->kn", hits.weights, corners)
-    t, u1, v1 = tube.solve(origins, directions, start, u0, v0)
-    normal, S = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
-    good = np.isfinite(t)
-    normal[good], S[good] = tube.normal_and_shape_operator(u1[good], v1[good])
-    expected = pack_points(origins, directions, t, normal, S)
-    assert not expected.valid[missed].any()
-    assert not expected.valid[3]
-    assert expected.valid.sum() > 200
-    for name, values in found.items():
-        np.testing.assert_allclose(values, getattr(expected, name), rtol=0, atol=1e-10, err_msg=name)
+    for name, table in LIGHTS.items():
+        light = LightSpec(**table)
+        values = parameters(light, LightPose(np.zeros(3), light.axis, light.across))
+        found = np.broadcast_to(np.array(factor(kind_of(light), values, lanes)), COUNT)
+        # Next to the rim of a spot single precision may decide otherwise.
+        angle = np.degrees(np.arccos(np.clip(away @ light.axis, -1, 1)))
+        apart = np.abs(angle - (light.spot_deg or 720.0) / 2) > 1e-4
+        np.testing.assert_allclose(found[apart], light.factor(away)[apart], atol=1e-5, err_msg=name)
+        assert apart.mean() > 0.99

@@ -1,30 +1,20 @@
-"""Fine and base truth of surfaces with a relief: labels, maps, highlights, frame files."""
+"""Fine and base truth of surfaces with a relief: pools, maps, highlights, frame files; labels stand in test_frames."""
 
 import json
 
 import numpy as np
 import pytest
+from surface_helpers import angle
 
 from simtest.rendering import Session
 from simtest.simulation.frame import make_frame
 from simtest.simulation.frame_files import write_frame
 from simtest.spec import scene_from_dict
-from tests.marked import marked
 
 pytestmark = pytest.mark.render
 
 CAMERA = {"width": 90, "height": 70, "fx": 80.0, "fy": 76.0, "cx": 44.0, "cy": 37.0}
 RELIEF = {"bands": [{"slope_deg": 4.0, "wavelength_mm": 2.0}, {"slope_deg": 2.0, "wavelength_mm": 1.0}], "seed": 3}
-
-# Limits at 99 of 100 pixels: angle of the normals, and curvature 1/mm; of the fine surface. A mesh's are looser: its
-# triangles shift the point, where the relief has another normal.
-SURFACES = {
-    "plane": ({"type": "plane", "tilt_deg": 30.0, "azimuth_deg": 50.0}, 2e-5, 1e-4),
-    "sphere": ({"type": "sphere", "radius_mm": 6.0, "tilt_deg": 10.0}, 1e-4, 1e-3),
-    "cylinder inside": ({"type": "cylinder", "radius_mm": 11.0, "side": "inside"}, 1e-4, 1e-3),
-    "saddle": ({"type": "quadric", "k1_per_mm": 0.06, "k2_per_mm": -0.04, "tilt_deg": 15.0}, 3e-3, 3e-3),
-    "colon": ({"type": "anatomy", "path": "colon"}, 6e-3, 0.03),
-}
 
 
 def scene(surface, relief=RELIEF, samples=1, **more):
@@ -35,43 +25,6 @@ def scene(surface, relief=RELIEF, samples=1, **more):
 @pytest.fixture(scope="module")
 def session():
     return Session(scene({"type": "plane"}))
-
-
-def angle(a, b):
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
-
-
-def compare(session, turned, bent):
-    """Compare labels with the exact truth; return the truth and where both see a surface."""
-    labels, truth = session.frame().labels, session.truth()
-    both = labels.mask & truth.mask
-    assert both.sum() > 1000
-
-    def near(error, limit):
-        assert np.percentile(error[both], 99) < limit, (np.percentile(error[both], 99), limit)
-
-    near(angle(labels.normal.astype(float), truth.normal), turned)
-    near(angle(labels.normal_base.astype(float), truth.normal_base), turned)
-    for name in ("k_min", "k_max", "k_min_base", "k_max_base"):
-        near(np.abs(getattr(labels, name) - getattr(truth, name)), bent)
-        assert np.isnan(getattr(labels, name)[~labels.mask]).all()
-    # The light off the lobe sees the fine normal, and the truth says so.
-    near(angle(truth.shading_normal, labels.normal.astype(float)), 1e-6)
-    # The two truths differ by the relief's slope, and the fine one is far more curved.
-    slope = np.degrees(np.mean(angle(labels.normal, labels.normal_base)[both]))
-    assert 0.7 * 4.47 * np.sqrt(np.pi / 2) < slope < 1.3 * 4.47 * np.sqrt(np.pi / 2)
-    assert np.median((truth.k_max - truth.k_max_base)[both]) > 0.1
-    assert not labels.pool.any()
-    assert not truth.pool.any()
-    return truth, both
-
-
-@pytest.mark.parametrize("samples", [1, 3])
-@pytest.mark.parametrize("name", marked(SURFACES, ci=["saddle", "colon"]))
-def test_labels_are_both_exact_truths_to_the_meshs_fineness(session, name, samples):
-    surface, turned, bent = SURFACES[name]
-    session.update(scene(surface, samples=samples))
-    compare(session, turned, bent)
 
 
 @pytest.mark.parametrize(
