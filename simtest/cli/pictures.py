@@ -115,6 +115,8 @@ def _record_parts(spots: "Specularities", image: Path) -> "Iterator[str | Table]
             yield f"of the organ below its relief: {organ}"
         yield MEANING
     yield from silent_lines(spots)
+    if note := spots.rule_note:
+        yield f"note: {note}"
     yield from assumed_lines(spots.choices.assumed)
     yield from count_lines(spots, image)
 
@@ -132,23 +134,26 @@ def record_tables(spots: "Specularities") -> "Iterator[str | Table]":
         rows = [
             (name, str(errors.n), _pair(errors.mean_deg, errors.std_deg),
              _pair(errors.mean_oracle_deg, errors.std_oracle_deg), _share(errors.inside), _share(errors.inside_organ))
-            for name, errors in compared.estimators.items()
+            for name, errors in compared.rows.items()
         ]  # fmt: skip
         of_errors = ("estimator", "n", "mean ± std (deg)", "better candidate (deg)")
         yield Table((*of_errors, "inside its 95 %", "the organ's 95 %"), rows)
         yield f"{compared.missed} sightlines miss {compared.source}"
 
 
-def _summary(spots: "Sequence[Specularity]") -> Table:
+def _summary(spots: "Specularities") -> Table:
     """Return how many specularities of each kind have which best estimator, and what that states."""
     from collections import Counter
     from statistics import median
 
     from simtest.reconstruction.explanations import kind_name
+    from simtest.reconstruction.records import SIGHTLINE_RULE
 
     groups: dict[tuple[str, str], list[Specularity]] = {}
+    rule = spots.sightline_rule
     for spot in spots:
-        groups.setdefault((kind_name(spot.kind), spot.best or "none"), []).append(spot)
+        best = SIGHTLINE_RULE if spot.best in rule else spot.best or "none"
+        groups.setdefault((kind_name(spot.kind), best), []).append(spot)
     rows = []
     for (kind, best), held in sorted(groups.items(), key=lambda item: -len(item[1])):
         stated = [d for s in held if s.best_estimate and (d := s.best_estimate.deviation_deg) is not None]

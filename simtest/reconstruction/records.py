@@ -35,6 +35,9 @@ WITHOUT_UNCERTAINTY = ("bisector", "curved", "photometric", "cone_axis", "bright
 which follow the lobe to its peak, that which averages isophotes, and the one that needs none. Other packages' follow,
 and `circle_pose` last, which takes a curved surface for a plane."""
 
+SIGHTLINE_RULE, SAME_COSINE = "sightline rule", 1e-9
+"""What estimators are called together that give the reversed sightline of a pixel, and how near they come to it."""
+
 SAME_GLINT_PX = 2.5
 """A glint of a cloud and a highlight whose peaks are nearer to each other are the same: two detectors found them."""
 
@@ -263,6 +266,29 @@ class Specularities(list[Specularity]):
         return "1 specularity" if len(self) == 1 else f"{len(self)} specularities"
 
     @property
+    def sightline_rule(self) -> tuple[str, ...]:
+        """Names of the estimators that give nothing but the reversed sightline of a pixel, as no light is told.
+
+        They differ in the pixel alone, so none is a better method than another. Empty where there are not two of them.
+        """
+        if len(self.choices.calibration.priors.lights):
+            return ()
+        names = dict.fromkeys(name for spot in self for name in spot.normals)
+        answers = {name: [spot.normals[name] for spot in self if name in spot.normals] for name in names}
+        rule = tuple(name for name, own in answers.items() if all(_is_reversed(each, self.camera) for each in own))
+        return rule if len(rule) > 1 else ()
+
+    @property
+    def rule_note(self) -> str:
+        """Which estimators are one rule, and what would tell them apart; an empty text where none are."""
+        if not (rule := self.sightline_rule):
+            return ""
+        return (
+            f"{', '.join(rule[:-1])} and {rule[-1]} are one {SIGHTLINE_RULE} here: without a light they differ in "
+            "nothing but the pixel that they look at; simtest calibrate light finds the light"
+        )
+
+    @property
     def stated(self) -> "StatedErrors | None":
         """What the best estimates state, with the medians of their budgets; None where none states anything."""
         return stated_errors([best for each in self if (best := each.best_estimate) is not None])
@@ -311,6 +337,11 @@ class Specularities(list[Specularity]):
         from simtest.reconstruction.page import specularities_html
 
         return specularities_html(self)
+
+
+def _is_reversed(estimate: Estimate, camera: Camera) -> bool:
+    """Return whether an estimate is the reversed sightline of the pixel that it looks at."""
+    return estimate.cloud is None and bool(estimate.normal @ camera.unproject(estimate.look_px) < -1 + SAME_COSINE)
 
 
 def drawable(curve: Array) -> Points:

@@ -18,7 +18,7 @@ from simtest.estimators import Estimate
 from simtest.geometry import Camera
 from simtest.geometry.axes import ALL, described, matrix
 from simtest.geometry.vectors import angle_deg
-from simtest.reconstruction.records import Specularities, Specularity
+from simtest.reconstruction.records import SIGHTLINE_RULE, Specularities, Specularity
 from simtest.runtime import chi_squared
 from simtest.runtime.arrays import Array, IntArray
 from simtest.runtime.boundary import suggestion
@@ -83,13 +83,27 @@ class ErrorSummary:
 
 @dataclass(frozen=True)
 class ComparisonRecord:
-    """How normals compare with a reference: its file, what is wrong with it, and each estimator's errors."""
+    """How normals compare with a reference: its file, what is wrong with it, and each estimator's errors.
+
+    `sightline_rule` names the estimators that are one rule (`Specularities.sightline_rule`), `of_sightline_rule` has
+    the errors of that.
+    """
 
     source: str
     problems: list[str]
     compared: int
     missed: int
     estimators: dict[str, ErrorSummary]
+    sightline_rule: tuple[str, ...] = ()
+    of_sightline_rule: ErrorSummary | None = None
+
+    @property
+    def rows(self) -> dict[str, ErrorSummary]:
+        """The errors as a table shows them: a rule that several estimators share has one row."""
+        if self.of_sightline_rule is None:
+            return self.estimators
+        others = {name: each for name, each in self.estimators.items() if name not in self.sightline_rule}
+        return {SIGHTLINE_RULE: self.of_sightline_rule, **others}
 
 
 @dataclass(frozen=True)
@@ -273,13 +287,18 @@ def compare(spots: Specularities, reference: Reference) -> None:
     ]
     # summarise the sightlines that meet the reference
     met = [spot.reference.errors for spot in spots if spot.reference is not None and spot.reference.normal is not None]
-    names = dict.fromkeys(name for errors in met for name in errors)
+    names, rule = dict.fromkeys(name for errors in met for name in errors), spots.sightline_rule
+    # One normal a highlight: of the best of them, as it is shown.
+    best = [spot.best for spot in spots if spot.reference is not None and spot.reference.normal is not None]
+    of_rule = [errors[name] for errors, name in zip(met, best, strict=True) if name in rule]
     spots.reference = ComparisonRecord(
         source=reference.source,
         problems=list(reference.notes),
         compared=len(met),
         missed=len(peaks) - len(met),
         estimators={name: _summary([errors[name] for errors in met if name in errors]) for name in names},
+        sightline_rule=rule,
+        of_sightline_rule=_summary(of_rule) if of_rule else None,
     )
 
 

@@ -82,3 +82,34 @@ def test_a_reference_is_held_against_both_regions(off_deg, inside, inside_organ)
     compare(spots, Tilted())
     (summary,) = spots.reference.estimators.values()
     assert (summary.inside, summary.inside_organ) == (inside, inside_organ)
+
+
+def rule_and_rows(priors):
+    """Return which estimators are one rule, and the table's rows against a reference that faces the camera."""
+
+    class Facing:
+        source, notes = "facing", ()
+
+        def normals_at(self, pixels, camera):
+            return np.tile([0.0, 0.0, -1.0], (len(pixels), 1))
+
+    spots = reconstruct(
+        picture(), Calibration(CAMERA, priors=priors), estimators=["brightest_point", "cone_axis", "curved"]
+    )
+    compare(spots, Facing())
+    return spots, spots.sightline_rule, list(spots.reference.rows)
+
+
+def test_estimators_that_are_the_reversed_sightline_are_one_row():
+    spots, rule, rows = rule_and_rows(Priors())
+    assert set(rule) == {"brightest_point", "cone_axis", "curved"}
+    assert rows == ["sightline rule"]
+    assert spots.reference.rows["sightline rule"].mean_deg == spots[0].reference.errors[spots[0].best].error_deg
+    assert set(spots.reference.estimators) == set(rule)
+    assert "are one sightline rule here" in spots.rule_note
+
+
+def test_with_a_light_beside_the_camera_each_estimator_has_its_row():
+    spots, rule, rows = rule_and_rows(Priors(lights_mm=((4.0, 0.0, 0.0),), distance_mm=exactly(30.0)))
+    assert (rule, spots.rule_note) == ((), "")
+    assert set(rows) == {"brightest_point", "cone_axis", "curved"}
