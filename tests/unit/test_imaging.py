@@ -26,6 +26,7 @@ from simtest.reconstruction.tracking import Tracker
 from simtest.runtime import provenance
 from simtest.validation.depth_maps import depth_normals, depth_points, depth_problems, depths_at, read_depth
 from simtest.validation.references import load_reference, read_pose
+from tests.refusals import refused
 
 SPOTS = [(90, 70, 5.0), (230, 160, 6.0)]
 FOV = 60.0
@@ -50,12 +51,7 @@ def shot(tmp_path):
 def told(run, *fragments):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with pytest.raises(InputError) as caught:
-            run()
-    message = str(caught.value)
-    assert "\n" not in message
-    for fragment in fragments:
-        assert fragment in message, message
+        refused(run, *fragments)
 
 
 def by_fov(path, out, extras=None, **options):
@@ -131,12 +127,30 @@ def test_grey_pictures_keep_to_peaks(tmp_path, detector):
 # Bad pictures -----------------------------------------------------------------------------------------------------
 
 
-def test_files_that_are_no_pictures(tmp_path):
-    (tmp_path / "text.png").write_text("this is no picture\n")
-    (tmp_path / "empty.png").write_bytes(b"")
-    told(lambda: by_fov(tmp_path / "text.png", tmp_path / "o"), "text.png: no picture (19 bytes)")
-    told(lambda: by_fov(tmp_path / "empty.png", tmp_path / "o"), "empty.png: no picture (0 bytes)")
-    assert not (tmp_path / "o").exists()
+@pytest.mark.parametrize(
+    ("name", "write", "fragments"),
+    [
+        ("text.png", lambda p: p.write_text("this is no picture\n"), ("no picture (19 bytes)",)),
+        ("empty.png", lambda p: p.write_bytes(b""), ("no picture (0 bytes)",)),
+        ("huge.png", lambda p: PillowImage.new("1", (20000, 20000)).save(p), ("400000000 px", "at most 50000000 are")),
+        ("large.png", lambda p: PillowImage.new("1", (12000, 9000)).save(p), ("12000 x 9000 px", "at most 50000000")),
+        (
+            "clip.mp4",
+            lambda p: p.write_text("no video"),
+            ("read (8 bytes, of no known container)",),
+        ),
+        ("none.avi", lambda p: p.write_bytes(b""), ("read (0 bytes, of no known container)",)),
+        ("nothing", lambda p: p.mkdir(), ("holds no pictures",)),
+        ("missing.mp4", lambda p: None, ("no such file",)),
+    ],
+)
+def test_files_that_are_no_pictures(tmp_path, name, write, fragments):
+    path = tmp_path / name
+    write(path)
+    told(lambda: (read_picture if path.suffix == ".png" else open_source)(path), name, *fragments)
+    if path.suffix == ".png":
+        told(lambda: by_fov(path, tmp_path / "o"), name, *fragments)
+        assert not (tmp_path / "o").exists()
 
 
 @pytest.mark.parametrize(("suffix", "words"), [("jpg", "as they are stored"), ("tif", "as the tag turns them")])
@@ -152,13 +166,6 @@ def test_a_picture_with_an_orientation_says_how_it_is_taken(tmp_path, suffix, wo
     assert np.allclose(turned, plain if suffix == "jpg" else plain[::-1, ::-1], atol=0.02)
 
 
-def test_a_huge_picture_is_refused_before_it_is_decoded(tmp_path):
-    PillowImage.new("1", (20000, 20000)).save(tmp_path / "huge.png")
-    told(lambda: read_picture(tmp_path / "huge.png"), "huge.png", "400000000 px", "at most 50000000 are allowed")
-    PillowImage.new("1", (12000, 9000)).save(tmp_path / "large.png")
-    told(lambda: read_picture(tmp_path / "large.png"), "12000 x 9000 px", "at most 50000000 are allowed")
-
-
 def test_other_depths_and_channels_are_read(tmp_path):
     values = frame()
     wide = np.rint(65535 * values[:, :, ::-1]).astype(np.uint16)
@@ -170,8 +177,6 @@ def test_other_depths_and_channels_are_read(tmp_path):
     assert read_picture(tmp_path / "grey.png").shape == (HEIGHT, WIDTH)
     assert is_coloured(read_picture(tmp_path / "alpha.png"))
     assert not is_coloured(np.repeat(read_picture(tmp_path / "grey.png")[:, :, None], 3, axis=2))
-    for name in ("wide", "alpha"):
-        assert len(quietly(tmp_path / f"{name}.png", tmp_path / name)[0]) == 2
 
 
 def test_a_camera_of_another_size(shot, tmp_path):
@@ -416,22 +421,6 @@ def test_a_video_that_stops_half_way_keeps_what_was_read(tmp_path):
     assert "ends after" in texts
     assert "what was read is kept" in texts
     assert (tmp_path / "out" / "timeline.csv").stat().st_size > 1000
-
-
-def test_what_is_no_sequence(tmp_path):
-    (tmp_path / "clip.mp4").write_text("no video")
-    (tmp_path / "none.avi").write_bytes(b"")
-    (tmp_path / "nothing").mkdir()
-    told(
-        lambda: open_source(tmp_path / "clip.mp4"),
-        "clip.mp4: no video that can be read (8 bytes, of no known container)",
-    )
-    told(
-        lambda: open_source(tmp_path / "none.avi"),
-        "none.avi: no video that can be read (0 bytes, of no known container)",
-    )
-    told(lambda: open_source(tmp_path / "nothing"), "holds no pictures")
-    told(lambda: open_source(tmp_path / "missing.mp4"), "no such file")
 
 
 def test_tracks_cross_gaps_and_do_not_jump():
