@@ -78,6 +78,7 @@ FRAMES = {
     "NaN": (with_value(np.nan), "frame holds 1 values that are NaN, infinite"),
     "infinities of both signs": (np.stack([SPOT + np.inf, SPOT - np.inf], 2), "frame holds 768 values"),
     "beyond float32": (with_value(1e300), "frame holds 1 values", "beyond 3e38: all must be finite"),
+    "none above 0": (np.where(SPOT > 0.5, 0.0, -1.0), "frame holds values from -1 to 0: some must be above 0"),
     "turned": (SPOT.T, "frame is 24 x 32 px: must be 32 x 24, the size of the camera's calibration"),
     "one number": (1.0, "frame has shape (): must be (H, W) or (H, W, C)"),
     "four dimensions": (SPOT[None, None], "frame has shape (1, 1, 24, 32): must be (H, W) or (H, W, C)"),

@@ -276,24 +276,6 @@ def test_an_experiment_sweeps_a_velocity():
         assert made.rows[0]["camera.motion.velocity_mm_s.1"] in (0.0, 25.0)
 
 
-@pytest.mark.parametrize(
-    ("motion", "words"),
-    [
-        ({"velocity_mm_s": [1.0, 2.0]}, "camera.motion.velocity_mm_s.2: missing"),
-        ({"velocity_mm_s": [1e9, 0, 0]}, "camera.motion.velocity_mm_s.0 = 1000000000.0"),
-        ({"angular_velocity_deg_s": "fast"}, "camera.motion.angular_velocity_deg_s = 'fast'"),
-        ({"exposure_s": 0}, "camera.motion.exposure_s = 0"),
-        ({"steps": 1}, "camera.motion.steps = 1"),
-        ({"speed": 1}, "camera.motion.speed = 1: unknown key"),
-    ],
-)
-def test_bad_motions_are_named_in_one_line(motion, words):
-    with pytest.raises(InputError) as caught:
-        scene(motion=motion)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def test_a_camera_that_enters_the_wall_is_refused_and_the_session_stays():
     session = Session(scene())
     still = session.radiance().total

@@ -42,7 +42,7 @@ def sensor(**keys):
 # Lens and noise -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sigma", [0.6, 1.5, 4.0])
+@pytest.mark.parametrize("sigma", [0.6, 4.0])
 def test_the_point_spread_is_scipys_gaussian(sigma):
     radiance = np.random.default_rng(0).exponential(1.0, (50, 60, 3)).astype(np.float32)
     found = camera_chain.collect(radiance, Sensor(point_spread_px=sigma), Camera(60, 50, 60.0, 60.0, 30.0, 25.0))
@@ -131,8 +131,10 @@ def edge_aware(plane, pattern):
     return filled
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
-@pytest.mark.parametrize(("method", "reference"), [("bilinear", bilinear), ("edge_aware", edge_aware)])
+@pytest.mark.parametrize(
+    ("pattern", "method", "reference"),
+    zip(PATTERNS, ("bilinear", "edge_aware") * 2, (bilinear, edge_aware) * 2, strict=True),
+)
 def test_demosaicing_equals_a_plain_reference_to_rounding(pattern, method, reference):
     spec = Mosaic(pattern=pattern, demosaicing=method)
     plane = camera_chain.behind_filters(picture((24, 30, 3), smooth=1.0), spec)
@@ -260,7 +262,7 @@ def between(size, count):
     return np.maximum(1 - np.abs(at[:, None] - np.arange(size)), 0)
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.6, 2 / 3, 2.0])
+@pytest.mark.parametrize("factor", [0.6, 2.0])
 def test_scaling_equals_plain_matrices(factor):
     """Smaller: areas are averaged, then lines are drawn between the centres; larger: the other way round."""
     frame = np.random.default_rng(0).uniform(0, 1, (30, 48)).astype(np.float32)
@@ -363,9 +365,8 @@ CURVES = [Response("srgb"), Response("gamma", 2.2), Response("table", light=(0, 
 
 
 @pytest.mark.parametrize("curve", CURVES, ids=lambda curve: curve.kind)
-@pytest.mark.parametrize("shape", [(7, 9), (5, 6, 3)])
-def test_the_fast_curve_is_the_curve(curve, shape):
-    light = np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32)
+def test_the_fast_curve_is_the_curve(curve):
+    light = np.random.default_rng(0).uniform(0, 1, (5, 6, 3)).astype(np.float32)
     light.ravel()[:4] = 0.0, 1.0, 0.0031308, 1e-6
     found = curve.encode_picture(light)
     assert found.dtype == np.float32

@@ -1,5 +1,7 @@
 """The noise behind the whole camera chain at highlights' peaks, against frames that are drawn again and again."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -32,14 +34,14 @@ def drawn_sigma(view, row, column, draws=150):
     return np.sqrt(values.var(axis=0, ddof=1).mean()) * view.full_scale
 
 
+COLOURS = ((0.9, 0.4, 0.3), (1.0, 1.0, 1.0))
 SENSORS = {name: {"preset": name} for name in PRESETS} | {
     "plain": {"full_well": 4000.0, "read_noise": 5.0},
     "mosaic": {"full_well": 4000.0, "mosaic": {}, "colour": {"white_balance": [1.8, 1.0, 2.2]}},
 }
 
 
-@pytest.mark.parametrize("name", SENSORS)
-@pytest.mark.parametrize("colour", [(1.0, 1.0, 1.0), (0.9, 0.4, 0.3)])
+@pytest.mark.parametrize(("name", "colour"), zip(SENSORS, itertools.cycle(COLOURS)))
 def test_the_noise_at_a_peak_is_that_of_frames_drawn_again(name, colour, session):
     sensor = {**SENSORS[name], "exposure": {"percentile": 100.0, "gain": 0.5}}
     scene = load_scene("sphere", {**SCENE, "reflectance.colour": list(colour), "sensor": sensor})
@@ -69,8 +71,9 @@ def test_a_chain_that_draws_no_noise_has_that_of_its_steps():
     assert found == pytest.approx(1 / 255 / np.sqrt(12), rel=1e-3)
 
 
-@pytest.mark.parametrize("factor", [0.45, 0.6, 1.5])
-@pytest.mark.parametrize("coding", [None, {"type": "jpeg", "quality": 85}])
+@pytest.mark.parametrize(
+    ("factor", "coding"), [(0.45, None), (0.6, {"type": "jpeg", "quality": 85}), (1.5, {"type": "jpeg", "quality": 85})]
+)
 def test_scaling_a_small_highlight_is_no_noise(factor, coding):
     # Each draw falls otherwise between the recorded pixels of a row of cells that were scaled as one picture.
     sensor = Sensor(full_well=5000, scaling={"factor": factor}, coding=coding, bits=8 if coding else None)

@@ -57,8 +57,7 @@ def same_patches(detection, made):
 
 
 @pytest.mark.parametrize("name", list(CALIBRATIONS))
-@pytest.mark.parametrize("isolated", [True, False])
-@pytest.mark.parametrize("smoothing_px", [0.0, 2.0])
+@pytest.mark.parametrize(("isolated", "smoothing_px"), [(True, 2.0), (False, 0.0)])
 def test_peaks_are_those_of_the_pipeline(name, isolated, smoothing_px):
     calibration = CALIBRATIONS[name]
     frame = Frame(lobes(), calibration, smoothing_px)
@@ -69,8 +68,7 @@ def test_peaks_are_those_of_the_pipeline(name, isolated, smoothing_px):
     same_patches(found, made)
 
 
-@pytest.mark.parametrize("isolated", [True, False])
-@pytest.mark.parametrize("name", ["camera alone", "view mask"])
+@pytest.mark.parametrize(("name", "isolated"), [("camera alone", True), ("view mask", False)])
 def test_colour_is_that_of_the_pipeline(name, isolated):
     calibration = CALIBRATIONS[name]
     found = ColourDetector(isolated).detect(Frame(tissue(), complete(calibration, None), 1.0), calibration.camera)
@@ -142,7 +140,6 @@ def fails(frame):
     [
         (lambda frame: None, "returned a NoneType; must be a Detection"),
         (lambda frame: Detection((Region((0.5, 0, 9, 9), (3, 3), 1.0),), frame), "must be 4 integers x, y, w, h"),
-        (lambda frame: Detection((Region((0, 0, 9), (3, 3), 1.0),), frame), "must be 4 integers x, y, w, h"),
         (lambda frame: Detection((Region((0, 0, 9, 9), (3.5, 3), 1.0),), frame), "must be 2 integers column, row"),
         (lambda frame: Detection((Region((5, 5, 45, 45), (2, 2), 0.1),), frame), r"peak \(2, 2\): must lie in its box"),
         (lambda frame: Detection((Region((5, 5, 45, 45), (50, 9), 0.1),), frame), r"peak \(50, 9\): must lie in its"),
@@ -168,7 +165,7 @@ def test_a_detector_may_hand_on_other_light_of_a_grey_frame():
     assert not isinstance(spot.patch, Failure)
 
 
-@pytest.mark.parametrize("channels", [None, 1, 2, 4])
+@pytest.mark.parametrize("channels", [None, 2])
 def test_colour_takes_three_channels(channels):
     shape = (CAMERA.height, CAMERA.width) if channels is None else (CAMERA.height, CAMERA.width, channels)
     with pytest.raises(InputError, match=r"takes \(H, W, 3\)"):

@@ -50,6 +50,19 @@ def test_light_counts_up_to_the_clip():
     assert judged(1.0, 0.0, clip=0.5).why_not == "peak below 10 sigma"
 
 
+def test_on_a_relief_an_isolated_highlight_holds_one_lit_glint_alone():
+    y, x = np.mgrid[:60, :80] + 0.5
+    light = np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 72).astype(np.float32)
+    pair = [replace(POINT, bp_px=np.array(at)) for at in ((40.2, 30.1), (43.0, 31.0))]
+
+    def told(points, single):
+        return [own.why_not for own in examine(points, light, single=single)]
+
+    assert told(pair, True) == ["holds several glints", "part of a brighter one"]
+    assert told(pair, False) == ["", "part of a brighter one"]
+    assert told([pair[0], replace(pair[1], lit=False)], True) == ["", "in shadow"]
+
+
 @pytest.mark.render
 @pytest.mark.parametrize("gain", [1.0, 2.0, 3.0])
 def test_a_highlight_on_tissue_whose_red_is_clipped_stands_as_high_as_its_channels_show(gain):

@@ -33,8 +33,7 @@ def patch_of(image, box=None, peak=None):
     return patch
 
 
-@pytest.mark.parametrize("box", [None, (5, 3, 80, 60), (11, 10, 60, 50)])
-@pytest.mark.parametrize("t", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize(("box", "t"), [(None, 0.3), ((5, 3, 80, 60), 0.5), ((11, 10, 60, 50), 0.7)])
 def test_contour_of_a_radial_image_lies_where_the_formula_says(box, t):
     """A shift of half a pixel, or x and y exchanged, would be 20 times the tolerance or more."""
     image = spot()
@@ -57,7 +56,7 @@ def test_x_is_the_column():
     assert abs(fitted.angle) < 1e-3
 
 
-@pytest.mark.parametrize("shift", np.linspace(0, 1, 6))
+@pytest.mark.parametrize("shift", [0.0, 0.3, 0.5, 0.9])
 def test_peak_is_found_between_pixels(shift):
     centre = CENTRE + np.array([shift, -0.7 * shift])
     patch = patch_of(spot(centre))
@@ -146,16 +145,6 @@ def test_crossings_of_a_quantised_image_are_each_there_once(number, steps, width
 
 def encloses_all(polygon, points):
     return np.array([encloses(polygon, point) for point in points])
-
-
-def test_a_pixel_at_the_level_is_one_point():
-    """A plus of pixels: 8 points of the polygon, of which its 4 outer corners are crossed twice."""
-    image = np.zeros((7, 7), np.float32)
-    image[2:5, 2:5] = 0.5
-    image[3, 2:5] = image[2:5, 3] = 1.0
-    patch = patch_of(image)
-    polygon = patch.isophote(0.5)
-    assert len(patch.crossings(0.5)) == len(polygon) - 1 == 8
 
 
 @given(

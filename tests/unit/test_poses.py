@@ -106,7 +106,6 @@ def test_a_film_takes_poses_by_the_numbers_in_their_names(tmp_path, first):
 
 MALFORMED = {
     "no JSON": ("a.json", "{"),
-    "no list of poses": ("a.json", '{"a": 1}'),
     "holds no pose": ("a.json", "[]"),
     "must be a 4 x 4 matrix": ("a.json", "[[1, 2, 3]]"),
     "no world_from_camera or model_from_camera": ("a.json", '[{"frame": "a.png"}]'),
@@ -117,13 +116,10 @@ MALFORMED = {
         "a.json", json.dumps({"frames": [{"file_path": "a", "transform_matrix": np.eye(4).tolist()}]})),
     "state it by a line # unit: mm": ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n"),
     "unit = -3; must be one of mm, m, or the millimetres": ("images.txt", "# unit: -3\n1 1 0 0 0 0 0 0 1 a.png\n\n"),
-    "unit = true": ("a.json", json.dumps({"unit": True, "poses": [np.eye(4).tolist()]})),
-    "unit = inf": ("a.txt", "# unit: inf\n0 0 0 0 0 0 0 1\n"),
     "images.txt: line 3": ("images.txt", "# unit: mm\n1 1 0 0 0 0 0 0 1 a.png\n0 0\n"),
     "quaternion of length 0": ("images.txt", "# unit: mm\n1 0 0 0 0 0 0 0 1 a.png\n\n"),
     "names a.png twice; must give": (
         "images.txt", "# unit: mm\n1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 0 1 b/a.png\n\n"),
-    "line 1: translation_err: unknown": ("images.txt", "# translation_err: 1\n1 1 0 0 0 0 0 0 1 a.png\n\n"),
     "transform_matrix: missing": (
         "a.json", json.dumps({"unit": "mm", "frames": [{"file_path": "a", "transform_matrix": np.eye(4).tolist()},
                                                          {"file_path": "b"}]})),
@@ -136,7 +132,6 @@ MALFORMED = {
         "a.json", json.dumps([{"frame": "a.png", "world_from_camera": np.eye(4).tolist()}, np.eye(4).tolist()])),
     "must be one of mm, m": ("a.json", json.dumps({"unit": "inch", "poses": [np.eye(4).tolist()]})),
     "translation_error = -1": ("a.json", json.dumps({"translation_error": -1, "poses": [np.eye(4).tolist()]})),
-    "rotation_error_deg = x": ("a.txt", "# rotation_error_deg: x\n0 0 0 0 0 0 0 1\n"),
     "line 2": ("a.txt", "0 0 0 0 0 0 0 1\n0 0 0\n"),
     "must be 8 numbers": ("a.txt", "zero 0 0 0 0 0 0 1\n"),
     "quaternion of length 2": ("a.txt", "0 0 0 0 0 0 0 2\n"),
@@ -151,10 +146,7 @@ MALFORMED = {
     "holds frames and poses; must hold one list": ("a.json", json.dumps({"frames": [], "poses": []})),
     "[[true": ("a.json", json.dumps([[[True, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]).replace(" ", "")),
     "matrix of numbers": ("a.json", json.dumps([[["1", 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]])),
-    "4 x 4 matrix of numbers": ("a.json", f"[[[1, 0, 0, {10**400}], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]"),
     "a position of 1e+306 mm": ("a.json", "[[[1, 0, 0, 1e306], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]]"),
-    "unit = ['m']": ("a.json", json.dumps({"unit": ["m"], "poses": [np.eye(4).tolist()]})),
-    "translation_error = true": ("a.json", json.dumps({"translation_error": True, "poses": [np.eye(4).tolist()]})),
 }  # fmt: skip
 
 

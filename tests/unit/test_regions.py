@@ -60,3 +60,10 @@ def test_a_clipped_plateau_does_not_crowd_out_other_peaks():
     image[5:35, 5:105] = 1.0
     assert image[5:35, 5:105].size > MAX_PEAKS
     assert [region.peak for region in detect(image, 0.001)] == [(5, 5), PLACE]
+
+
+def test_what_shines_outside_the_view_is_no_peak():
+    image, seen = spot(0.5) + spot(place=(20, 20)), np.ones((100, 140), dtype=bool)
+    seen[:40, :40] = False
+    for isolated in (True, False):
+        assert [region.peak for region in detect(image, 0.001, isolated, seen)] == [PLACE]
