@@ -12,12 +12,12 @@ from PIL import Image as PillowImage
 from test_colour_detection import HEIGHT, WIDTH, lobe, picture
 
 import simtest
-from simtest.calibration import Calibration, Priors, Response, exactly, srgb_encode
+from simtest.calibration import Calibration, Frame, NoiseModel, Priors, Response, exactly, srgb_encode
 from simtest.detection.colour import ColourDetector
 from simtest.errors import Failure
 from simtest.geometry import Camera
 from simtest.reconstruction.images import read_picture
-from simtest.reconstruction.options import DEFAULT_ESTIMATORS, Options, calibration_for
+from simtest.reconstruction.options import DEFAULT_ESTIMATORS, Options, calibration_for, complete
 from simtest.reconstruction.pipeline import reconstruct, reconstruct_values
 
 CAMERA = Camera.from_fov(60.0, WIDTH, HEIGHT)
@@ -218,3 +218,42 @@ def test_any_picture_is_the_same_as_file_and_as_array(tmp_path_factory, seed, ki
     camera = Camera.from_fov(60.0, 64, 48)
     found = reconstruct(read, camera, encoding=encoding)
     same(found, by_file(folder / "frame.png", folder, camera, encoding=encoding))
+
+
+# What a calibration does not know -------------------------------------------------------------------------------------
+
+
+SMALL = Camera.from_fov(60.0, 160, 120)
+
+
+def bright():
+    """Return a colour frame of linear light beyond 1, with two highlights."""
+    y, x = np.mgrid[:120, :160] + 0.5
+    lobes = sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / 60) for a, b in ((50, 40), (110, 80)))
+    noise = np.random.default_rng(0).normal(0, 0.004, (120, 160, 3))
+    return (0.35 * np.array([1.0, 0.55, 0.45]) + 1.2 * lobes[..., None] + noise).astype(np.float32)
+
+
+@pytest.mark.parametrize("values", [bright(), bright()[..., 0]], ids=["colour", "grey"])
+def test_a_frame_without_a_response_is_linear_light_for_every_step(values):
+    frame = Frame(values, Calibration(SMALL), 1.0)
+    assert (frame.channels == values).all()
+    assert not frame.clipped.any()
+    same = Frame(values, Calibration(SMALL, Response("linear")), 1.0)
+    assert (frame.corrected.intensity == same.corrected.intensity).all()
+    assert frame.noise == same.noise
+
+
+def test_light_by_colour_is_that_of_a_stated_linear_response():
+    found, stated = (reconstruct(bright(), Calibration(SMALL, r), detector="colour") for r in (None, Response()))
+    assert len(found) == len(stated) == 2
+    for first, second in zip(found, stated, strict=True):
+        assert first.region == second.region
+        for name, estimate in first.estimates.items():
+            assert np.array_equal(estimate.normal, second.estimates[name].normal)
+
+
+@pytest.mark.parametrize("encoding", [None, "srgb", "linear"])
+def test_the_noise_of_a_picture_has_the_steps_of_its_encoding(encoding):
+    known = complete(Calibration(SMALL, noise=NoiseModel(bits=8)), encoding)
+    assert known.noise.response == known.response == Response(encoding or "srgb")

@@ -6,7 +6,7 @@ from simtest.calibration import Calibration, Frame, NoiseModel, srgb_decode, srg
 from simtest.detection import colour as colour_detection
 from simtest.detection.classify import _around, _isophotes
 from simtest.detection.detector import Kind
-from simtest.detection.spots import ColourPicture, SpecularSpot, SplitLight, fill, split_light
+from simtest.detection.spots import ColourPicture, SpecularSpot, SplitLight, split_light
 from simtest.detection.view import find_view
 from simtest.estimators import Estimate
 from simtest.geometry import Camera
@@ -172,17 +172,6 @@ def test_text_is_looked_for_before_spots_go_that_do_not_stand_out(monkeypatch):
     monkeypatch.setattr(colour_detection, "find_foreign", lambda bright: asked.append(bright) or np.zeros_like(bright))
     assert kinds(lobe(160, 120, 6.0)) == []
     assert asked[0][120, 160]
-
-
-def test_fill_keeps_what_is_known_and_is_smooth_between():
-    x, y = places()
-    values = (0.2 + x / WIDTH + 0.5 * y / HEIGHT).astype(np.float32)
-    known = np.ones(values.shape, dtype=bool)
-    known[90:150, 100:200] = False
-    filled = fill(np.where(known, values, 9.0).astype(np.float32), known)
-    np.testing.assert_allclose(filled[known], values[known], atol=1e-6)
-    assert np.abs(filled - values)[~known].max() < 0.12
-    assert not fill(values, np.zeros_like(known)).any()
 
 
 def test_normals_of_a_sphere_point_back_along_the_sightlines():

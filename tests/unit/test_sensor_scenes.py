@@ -388,21 +388,6 @@ def test_the_automatic_exposure_goes_by_what_is_in_view(session):
     assert np.mean(seen.light[inside] > seen.full_scale) == pytest.approx(0.5, abs=0.01)
 
 
-def test_known_emission_reads_back(tmp_path):
-    """A cos^4 light at the camera and a plain sensor: the files alone undo the falloff."""
-    described = scene(tilt=20.0, size=560, focal=406.0, rig={"lights": [{"profile": COS4}]})
-    frame = render(described)
-    write_frame(frame, tmp_path)
-    assert load_calibration(tmp_path / "calibration.toml").emission == described.calibration().emission
-    errors = {}
-    for told in ("calibration.toml", "camera.toml"):
-        _, (file, *_) = reconstruct_picture(tmp_path / "frame.png", tmp_path / "normals", Options(tmp_path / told))
-        (read,) = json.loads(file.read_text())["specularities"]
-        normal = np.array(read["estimates"]["cone_axis"]["normal"])
-        errors[told] = angle_deg(normal, frame.highlights[0].normal)
-    assert errors["calibration.toml"] < LIMIT_DEG < 0.3 < errors["camera.toml"]
-
-
 def test_the_picture_of_a_plain_sensor_is_calibrated_too(tmp_path):
     frame = render(scene({"noise_sigma": 0.02}, size=80, focal=80.0))
     names = "frame.png radiance.exr truth.npz frame.json camera.toml calibration.toml preview.jpg"
