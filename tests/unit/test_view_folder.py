@@ -1,4 +1,4 @@
-"""The folder of `simtest views`: the camera's pose in every record, and a sequence's labels."""
+"""The folder of `simtest views`: which places are sampled, the camera's pose in every record, a sequence's labels."""
 
 import itertools
 import json
