@@ -77,7 +77,7 @@ SMALL_GRAZING = Circle(np.array([0.0, 0, 1]), np.array([np.sqrt(1 - 0.05**2), 0,
 HEAD_ON = Circle(np.array([0.0, 0, 1]), np.array([0.0, 0, -1]), 0.1)
 
 
-@settings(max_examples=examples(600), deadline=None, derandomize=True)
+@settings(max_examples=examples(300), deadline=None, derandomize=True)
 @given(circles())
 @example(SMALL_GRAZING)
 @example(HEAD_ON)
@@ -90,7 +90,7 @@ def test_one_candidate_is_the_true_normal(circle):
     assert pose.normals[best] @ circle.sight < 0
 
 
-@settings(max_examples=examples(300), deadline=None, derandomize=True)
+@settings(max_examples=examples(150), deadline=None, derandomize=True)
 @given(circles())
 @example(SMALL_GRAZING)
 def test_both_candidates_lean_alike_in_the_plane_of_e1_and_the_axis(circle):
@@ -103,7 +103,7 @@ def test_both_candidates_lean_alike_in_the_plane_of_e1_and_the_axis(circle):
     np.testing.assert_allclose(pose.normals @ vectors[:, 1], 0, atol=1e-9)
 
 
-@settings(max_examples=examples(600), deadline=None, derandomize=True)
+@settings(max_examples=examples(300), deadline=None, derandomize=True)
 @given(circles(max_off_axis_deg=80))
 @example(SMALL_GRAZING)
 @example(HEAD_ON)

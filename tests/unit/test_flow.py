@@ -180,7 +180,7 @@ WARP = {"type": "breathing", "amplitude_mm": 1.5, "period_s": 4.0, "direction": 
 
 def deforming(time_s, across_mm):
     surface = {"type": "quadric", "distance_mm": 20.0, "k1_per_mm": 0.03, "k2_per_mm": -0.02}
-    camera = {"width": 96, "height": 72, "fx": 84.0, "fy": 84.0, "cx": 48.0, "cy": 36.0}
+    camera = {"width": 48, "height": 36, "fx": 42.0, "fy": 42.0, "cx": 24.0, "cy": 18.0}
     moved = {"translation_mm": [across_mm, 0.0, 0.0]}
     return scene_from_dict(
         {"surface": surface, "camera": {**camera, "moved": moved}, "deformation": [WARP, PRESS], "time_s": time_s}
@@ -203,14 +203,14 @@ def test_flow_is_that_of_the_tissue():
     assert (forward.state == SEEN).mean() > 0.7
     # To the next frame's pixels: cast the rays there, move back, project.
     where = forward.state == SEEN
-    pixels = (session.camera.pixel_centres() + forward.flow_px)[where][::50]
+    pixels = (session.camera.pixel_centres() + forward.flow_px)[where][::20]
     session.update(told_scenes[1])
     world = session.to_model(session.exact_points(pixels).position)
     returned = seen[0].project(back(world))
-    assert np.abs(returned - session.camera.pixel_centres()[where][::50]).max() < 1e-6
+    assert np.abs(returned - session.camera.pixel_centres()[where][::20]).max() < 1e-6
     # Control: as if the tissue stood still.
     rigid = flow_between(session, *seen)
-    assert np.nanmedian(np.linalg.norm(rigid.flow_px - forward.flow_px, axis=-1)) > 0.1
+    assert np.nanmedian(np.linalg.norm(rigid.flow_px - forward.flow_px, axis=-1)) > 0.05
 
 
 @pytest.mark.slow

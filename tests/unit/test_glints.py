@@ -1,7 +1,7 @@
 """True highlights: glints and clouds of a relief, the spots that can be seen, and verdicts.
 
-A signal over noise is the height over the noise at its level, and 10 of them make a detection. Verdicts are those of the
-scene: another number of pixels, or a mirrored or turned picture, changes none.
+A signal over noise is the height over the noise at its level, and 10 of them make a detection. Verdicts are those of
+the scene: another number of pixels, or a mirrored or turned picture, changes none.
 """
 
 from dataclasses import replace
@@ -205,7 +205,7 @@ def test_glints_on_a_users_mesh():
     found = glints_in(session)
     assert len(found) >= 10
     assert off_zero(session, found, np.zeros(3)).max() < 1e-8
-    zeros = boxed_zeros(session)
+    zeros = boxed_zeros(session, 0.5)
     missing = [zero for zero in zeros if np.linalg.norm(found - zero, axis=1).min() > 0.5]
     # Creases of the mesh hold some.
     assert len(missing) <= 0.05 * len(zeros)
