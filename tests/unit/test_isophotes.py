@@ -215,12 +215,6 @@ def test_what_has_no_peak_fails():
     assert isinstance(Patch.cut(holed, (0, 0, 30, 30)), Patch)
 
 
-@pytest.mark.parametrize("box", [(-1, 0, 5, 5), (0, 0, 0, 5), (0, 0, WIDTH + 1, 5), (0, HEIGHT, 1, 1)])
-def test_a_region_outside_the_frame_is_refused(box):
-    with pytest.raises(InputError, match="roi"):
-        Patch.cut(spot(), box)
-
-
 @pytest.mark.parametrize("t", [0.0, 1.0, -0.1, 2.0, float("nan")])
 def test_isovalues_outside_the_open_interval_are_refused(t):
     with pytest.raises(InputError, match="isovalue"):
