@@ -382,6 +382,21 @@ def test_automatic_exposure_reaches_its_mean(average, response, unit):
     assert (frame[10:14, 10:14] == 1).all()
 
 
+@given(st.floats(-9, 9), st.floats(0.2, 5.0))
+@settings(max_examples=40, deadline=None)
+def test_a_zero_is_found_in_few_steps(zero, power):
+    asked = []
+
+    def falling(x):
+        asked.append(x)
+        return float(np.exp(-power * x) - np.exp(-power * zero)) if power > 1 else -np.arctan(power * (x - zero))
+
+    assert camera_chain._zero_of(falling, -10.0, 10.0) == pytest.approx(zero, abs=2e-7)
+    assert len(asked) < 60
+    assert camera_chain._zero_of(lambda x: 1.0 - x, 2.0, 3.0) == 2.0
+    assert camera_chain._zero_of(lambda x: 9.0 - x, 2.0, 3.0) == 3.0
+
+
 @pytest.mark.parametrize("shape", [(60, 80), (60, 80, 3)])
 def test_where_no_surface_is_seen_does_not_count(shape):
     """A liver before an empty background is exposed as it is where it fills the picture."""
