@@ -1,3 +1,5 @@
+"""Detection as the studies measure it: on rendered frames, and on real ones that were outlined by hand."""
+
 from collections import defaultdict
 from pathlib import Path
 

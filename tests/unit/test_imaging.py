@@ -30,6 +30,7 @@ from tests.refusals import refused
 
 SPOTS = [(90, 70, 5.0), (230, 160, 6.0)]
 FOV = 60.0
+TABLES = ("timeline.csv", "tracks.json")
 CAMERA = Camera.from_fov(FOV, WIDTH, HEIGHT)
 
 
@@ -240,47 +241,60 @@ def test_a_stopped_run_goes_on(folder, tmp_path):
     run(folder, tmp_path / "out")
     assert kept.stat().st_mtime_ns == before
     run(folder, tmp_path / "whole")
-    for name in ("timeline.csv", "tracks.json"):
+    for name in TABLES:
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     other = Options(fov_deg=FOV, every=True)
     told(lambda: reconstruct_sequence(folder, tmp_path / "out", other), "holds a run with another every")
 
 
-def test_where_the_first_frame_is_lost_all_files_have_one_numbering(folder, tmp_path):
-    # One step lies within the reach of a track, two lie beyond: without frame 0 the tracks are counted otherwise.
-    out = tmp_path / "out"
-    for i in (1, 2, 10):
-        save(folder / f"frame{i}.png", frame(8.0 * i))
-    run(folder, out)
+def lost(folder, out):
+    """The first frame can no longer be read: without it the tracks are counted otherwise."""
     (folder / "frame1.png").write_text("no picture")
     (out / "frames" / "000000.json").unlink()
-    with pytest.warns(UserWarning, match="frame 0: |angles depend"):
-        reconstruct_sequence(folder, out, Options(fov_deg=FOV))
-    rows = list(csv.DictReader((out / "timeline.csv").read_text().splitlines()))
-    in_table = {(int(row["frame"]), int(row["track"])) for row in rows}
-    tracks = json.loads((out / "tracks.json").read_text())
-    assert {(index, track["track"]) for track in tracks for index in track["frames"]} == in_table
-    stored = [json.loads(path.read_text()) for path in sorted((out / "frames").glob("*.json"))]
-    assert {(each["frame_index"], spot["track"]) for each in stored for spot in each["specularities"]} == in_table
-    assert min(track["track"] for track in tracks) == 0
-    # So has what is drawn: all files are those of a run that never saw the frame.
-    with pytest.warns(UserWarning, match="frame 0: |angles depend"):
-        reconstruct_sequence(folder, tmp_path / "whole", Options(fov_deg=FOV))
-    for name in ("000001.json", "000001.jpg", "000002.json", "000002.jpg"):
-        assert (out / "frames" / name).read_bytes() == (tmp_path / "whole" / "frames" / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("key", ["peak_px", "track", "estimates"])
-def test_a_frame_whose_file_lacks_what_the_tables_need_is_done_again(folder, tmp_path, key):
-    out = tmp_path / "out"
-    run(folder, out)
-    whole, path = (out / "tracks.json").read_bytes(), out / "frames" / "000001.json"
-    content = json.loads(path.read_text())
-    del content["specularities"][0][key]
-    path.write_text(json.dumps(content))
-    run(folder, out)
-    assert (out / "tracks.json").read_bytes() == whole
-    assert key in json.loads(path.read_text())["specularities"][0]
+def broken(folder):
+    (folder / "frame2.png").write_text("no picture")
+
+
+def repaired(folder, out):
+    save(folder / "frame2.png", frame(16.0))
+
+
+def lacking(folder, out):
+    """Each frame's file lacks another thing that the tables need."""
+    keys = ("peak_px", "box_px", "track", "estimates", "best")
+    for key, path in zip(keys, sorted((out / "frames").glob("*.json")), strict=True):
+        content = json.loads(path.read_text())
+        del content["specularities"][0][key]
+        path.write_text(json.dumps(content))
+
+
+GOING_ON = {"lost": (None, lost), "repaired": (broken, repaired), "lacking": (None, lacking)}
+
+
+@pytest.mark.parametrize("name", GOING_ON)
+def test_a_run_that_goes_on_ends_with_the_files_of_one_that_saw_all(tmp_path, name):
+    # One step lies within the reach of a track, two lie beyond.
+    before, after = GOING_ON[name]
+    folder, out, whole = tmp_path / "pictures", tmp_path / "out", tmp_path / "whole"
+    folder.mkdir()
+    for i in (1, 2, 3, 4, 5):
+        save(folder / f"frame{i}.png", frame(8.0 * i))
+    if before:
+        before(folder)
+    noted(folder, out)
+    after(folder, out)
+    noted(folder, out)
+    noted(folder, whole)
+    # The later frames of a repaired film were done after another one.
+    same = [path for path in whole.rglob("*.*") if path.parent.name == "frames" or path.name in TABLES]
+    assert len(same) >= 8
+    for path in same:
+        made, wanted = (each.read_bytes() for each in (out / path.relative_to(whole), path))
+        if name == "repaired" and path.suffix == ".json" and path.parent != whole:
+            made, wanted = ([spot["track"] for spot in json.loads(text)["specularities"]] for text in (made, wanted))
+        assert made == wanted, path.name
 
 
 @pytest.mark.parametrize("given", [{"estimators": {"mine": object()}}, {"detector": load_detector("peaks")}])
@@ -346,26 +360,6 @@ def test_a_broken_picture_behind_a_stranger_is_passed_over(folder, tmp_path):
     with pytest.warns(UserWarning, match="frame 0: .* must be 320 x 240|frame 1: .* no picture"):
         made = reconstruct_sequence(folder, tmp_path / "out", options)
     assert (made.frames, made.failed) == (4, 2)
-
-
-def test_tracks_behind_a_repaired_picture_are_those_of_a_whole_run(folder, tmp_path):
-    # One step lies within the reach of a track, two lie beyond.
-    for i in (1, 2, 3, 4):
-        save(folder / f"frame{i}.png", frame(8.0 * i))
-    good = (folder / "frame2.png").read_bytes()
-    (folder / "frame2.png").write_text("no picture")
-    noted(folder, tmp_path / "out")
-    (folder / "frame2.png").write_bytes(good)
-    run(folder, tmp_path / "out")
-    run(folder, tmp_path / "whole")
-    for path in sorted((tmp_path / "whole" / "frames").iterdir()):
-        made = tmp_path / "out" / "frames" / path.name
-        if path.suffix == ".json":
-            numbers = [[s["track"] for s in json.loads(each.read_text())["specularities"]] for each in (made, path)]
-            assert numbers[0] == numbers[1], path.name
-        else:
-            assert made.read_bytes() == path.read_bytes()
-    assert (tmp_path / "out" / "tracks.json").read_bytes() == (tmp_path / "whole" / "tracks.json").read_bytes()
 
 
 @pytest.mark.ci
