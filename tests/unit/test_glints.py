@@ -272,8 +272,9 @@ def test_spot_shape():
     assert shape.centroid_px == pytest.approx([50.75, 40.5], abs=0.05)
     assert shape.axis_ratio == pytest.approx(0.5, rel=0.02)
     assert shape.whole
-    cut = lobe[:, 50:]
-    assert not describe(find_spots(cut, cut), cut, cut, np.zeros(1), [])[0].whole
+    for turns in range(4):
+        cut = np.rot90(lobe[:, 50:], turns)
+        assert not describe(find_spots(cut, cut), cut, cut, np.zeros(1), [])[0].whole
 
 
 @pytest.mark.parametrize(("sigma", "snr"), [(0.0, np.inf), (0.1, 10.0)])
